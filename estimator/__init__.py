@@ -1,0 +1,1 @@
+"""The back end: initialisation, self-calibration, covariance, diagnostics."""

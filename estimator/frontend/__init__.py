@@ -1,0 +1,1 @@
+"""From images to measurements: dots, their numbering, bubbles."""

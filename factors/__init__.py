@@ -1,0 +1,1 @@
+"""Residuals with analytic Jacobians and their thin GTSAM wrappers."""

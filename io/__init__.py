@@ -1,0 +1,1 @@
+"""What comes in and goes out: rig file, images, tables, simulator, results."""

@@ -1,0 +1,1 @@
+"""Reports and pictures, made from nothing but a results folder."""

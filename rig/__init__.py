@@ -1,0 +1,1 @@
+"""Pure geometry: cameras, targets, rotations, triangulation. No images, no files, no solver."""

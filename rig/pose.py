@@ -1,0 +1,85 @@
+"""Rigid transformations as (rotation, translation), with GTSAM's Pose3 tangent order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def hat(v: ArrayLike) -> Array:
+    """(..., 3) -> (..., 3, 3) cross-product matrix."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def rotation_from_rotvec(rotvec_rad: ArrayLike) -> Array:
+    """(..., 3) rotation vectors -> (..., 3, 3); Rodrigues' formula, exact near zero."""
+    w = np.asarray(rotvec_rad, float)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = hat(w)
+    half = np.sinc(angle / (2 * np.pi))
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * half**2 * (k @ k))
+
+
+def rotvec_from_rotation(rotation: ArrayLike) -> Array:
+    """(..., 3, 3) -> (..., 3) rotation vectors, angles in [0, pi]."""
+    from scipy.spatial.transform import Rotation
+
+    r = np.asarray(rotation, float)
+    return np.asarray(Rotation.from_matrix(r.reshape(-1, 3, 3)).as_rotvec().reshape(r.shape[:-1]))
+
+
+def nearest_rotation(matrix: ArrayLike) -> Array:
+    """(..., 3, 3) -> the nearest proper rotation in the Frobenius norm (SVD)."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, float))
+    u[..., :, 2] *= np.linalg.det(u @ vt)[..., None]
+    return np.asarray(u @ vt)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """``target_from_source``: x_target = rotation @ x_source + translation.
+
+    rotation : (..., 3, 3); translation_mm : (..., 3).
+    """
+
+    rotation: Array
+    translation_mm: Array
+
+    @staticmethod
+    def identity() -> Pose:
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_rotvec(rotvec_rad: ArrayLike, translation_mm: ArrayLike = (0.0, 0.0, 0.0)) -> Pose:
+        return Pose(rotation_from_rotvec(rotvec_rad), np.asarray(translation_mm, float))
+
+    @property
+    def rotvec_rad(self) -> Array:
+        return rotvec_from_rotation(self.rotation)
+
+    def apply(self, points_mm: ArrayLike) -> Array:
+        """(..., N, 3) -> (..., N, 3)."""
+        rotated = np.asarray(points_mm, float) @ np.swapaxes(self.rotation, -1, -2)
+        return np.asarray(rotated + self.translation_mm[..., None, :])
+
+    def inverse(self) -> Pose:
+        back = np.swapaxes(self.rotation, -1, -2)
+        return Pose(back, -np.einsum("...ij,...j->...i", back, self.translation_mm))
+
+    def __matmul__(self, other: Pose) -> Pose:
+        turned = np.einsum("...ij,...j->...i", self.rotation, other.translation_mm)
+        return Pose(self.rotation @ other.rotation, turned + self.translation_mm)
+
+    def twin(self) -> Pose:
+        """The mirror twin (D R D, D t), D = diag(1, 1, -1): the same pixels when kappa = 0."""
+        flip = np.array([1.0, 1.0, -1.0])
+        return Pose(flip[:, None] * self.rotation * flip, flip * self.translation_mm)

@@ -1,0 +1,294 @@
+"""The telecentric projection factor: dots of a target seen by the cameras of the rig.
+
+The residuals of *all* images are one pure function of arrays (`whitened_residuals`); the GTSAM
+factor of one image reads its rows from an evaluation that all images share (`ImageFactors`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.rig import projection
+from telerig.rig.pose import hat
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that is estimated, as arrays.
+
+    intrinsics : (C, 18), order `telerig.rig.projection.PARAMETERS`.
+    rig_from_camera : (C, 4, 4); the first is the identity.
+    rig_from_target : (V, 4, 4).
+    dots_mm : (N, 3) in the target's frame.
+    """
+
+    intrinsics: Array
+    rig_from_camera: Array
+    rig_from_target: Array
+    dots_mm: Array
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Dots measured in images, sorted by image (view, camera).
+
+    view, camera, dot : (M,) indices.  uv_px : (M, 2).
+    whitener : (M, 2, 2), W with W^T W = inverse covariance; a weight multiplies its square.
+    plate_shift : (V, C) +1 or -1 where the camera sees the dots through the plate, else 0.
+    plate : (thickness_mm, index).
+    """
+
+    view: Ints
+    camera: Ints
+    dot: Ints
+    uv_px: Array
+    whitener: Array
+    plate_shift: Array
+    plate: tuple[float, float] = (0.0, 1.5)
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Whitened residuals (M, 2) and their derivatives (M, 2, k).
+
+    by_dot : 3 columns; by_view, by_camera : 6, GTSAM's Pose3 tangent (rotation, translation),
+    right perturbation of rig_from_target and rig_from_camera; by_intrinsics : 18.
+    """
+
+    value: Array
+    by_dot: Array
+    by_view: Array
+    by_camera: Array
+    by_intrinsics: Array
+
+
+def apparent_shift_mm(cosine: Array, thickness_mm: float, index: float) -> tuple[Array, Array]:
+    """How much nearer a dot looks, along the plate's normal, through a parallel plate.
+
+    Snell's law for the parallel rays of a telecentric lens at angle acos(cosine) to the normal:
+    d (1 - tan(refracted) / tan(incident)). Returns the shift and its slope d(shift)/d(cosine).
+    """
+    root2 = index**2 - 1 + cosine**2
+    shift = thickness_mm * (1 - cosine / np.sqrt(root2))
+    return shift, -thickness_mm * (index**2 - 1) / root2**1.5
+
+
+def camera_points(state: State, obs: Observations) -> tuple[Array, Array, Array]:
+    """Dots in their camera's frame: (M, 3) camera points, (M, 3) target points, (M, 3, 3) rotation.
+
+    The target points carry the shift of the plate that they are seen through.
+    """
+    points = state.dots_mm[obs.dot]
+    view, camera = state.rig_from_target, state.rig_from_camera
+    camera_from_rig = np.swapaxes(camera[:, :3, :3], -1, -2)
+    rotations = camera_from_rig[None] @ view[:, None, :3, :3]
+    if np.any(obs.plate_shift):
+        shift, _ = apparent_shift_mm(np.abs(rotations[..., 2, 2]), *obs.plate)
+        points = points.copy()
+        points[:, 2] += (obs.plate_shift * shift)[obs.view, obs.camera]
+    offset = view[:, None, :3, 3] - camera[None, :, :3, 3]
+    offset = np.einsum("cij,vcj->vci", camera_from_rig, offset)
+    rotation = rotations[obs.view, obs.camera]
+    in_camera = np.einsum("mij,mj->mi", rotation, points) + offset[obs.view, obs.camera]
+    return in_camera, points, rotation
+
+
+def pixels(state: State, obs: Observations, rho_mm: Sequence[float]) -> Array:
+    """(M, 2) predicted pixels."""
+    in_camera, _, _ = camera_points(state, obs)
+    out = np.empty((len(obs), 2))
+    for c, rho in enumerate(rho_mm):
+        mine = obs.camera == c
+        out[mine] = projection.pixel_from_camera(in_camera[mine], state.intrinsics[c], rho)
+    return out
+
+
+def whitened_error(state: State, obs: Observations, rho_mm: Sequence[float]) -> Array:
+    """(M, 2) whitened residuals, predicted minus measured, without derivatives."""
+    residual = pixels(state, obs, rho_mm) - obs.uv_px
+    return np.einsum("mij,mj->mi", obs.whitener, residual)
+
+
+def whitened_residuals(state: State, obs: Observations, rho_mm: Sequence[float]) -> Residuals:
+    """Whitened residuals, predicted minus measured, with all derivatives."""
+    in_camera, in_target, rotation = camera_points(state, obs)
+    uv = np.empty((len(obs), 2))
+    by_point = np.empty((len(obs), 2, 3))
+    by_intrinsics = np.empty((len(obs), 2, len(projection.PARAMETERS)))
+    for c, rho in enumerate(rho_mm):
+        mine = obs.camera == c
+        uv[mine], by_point[mine], by_intrinsics[mine] = projection.pixel_jacobians(
+            in_camera[mine], state.intrinsics[c], rho
+        )
+    white_by_point = obs.whitener @ by_point
+    by_dot = white_by_point @ rotation
+    by_view = np.concatenate([-by_dot @ hat(in_target), by_dot], -1)
+    # right perturbation of rig_from_target moves the point by R (w x X + v) in camera axes
+    by_camera = np.concatenate([white_by_point @ hat(in_camera), -white_by_point], -1)
+    if np.any(obs.plate_shift):
+        _add_plate_slopes(by_view, by_camera, by_dot[..., 2], rotation, obs)
+    value = np.einsum("mij,mj->mi", obs.whitener, uv - obs.uv_px)
+    return Residuals(value, by_dot, by_view, by_camera, obs.whitener @ by_intrinsics)
+
+
+def _add_plate_slopes(
+    by_view: Array, by_camera: Array, by_normal: Array, rotation: Array, obs: Observations
+) -> None:
+    cosine = rotation[:, 2, 2]
+    _, slope = apparent_shift_mm(np.abs(cosine), *obs.plate)
+    slope = obs.plate_shift[obs.view, obs.camera] * slope * np.sign(cosine)
+    gain = by_normal * slope[:, None]
+    by_view[..., 0] -= gain * rotation[:, 2, 1, None]
+    by_view[..., 1] += gain * rotation[:, 2, 0, None]
+    by_camera[..., 0] -= gain * rotation[:, 1, 2, None]
+    by_camera[..., 1] += gain * rotation[:, 0, 2, None]
+
+
+@dataclass(frozen=True)
+class ImageKeys:
+    """The graph's keys, and which intrinsics are free.
+
+    free : per camera, indices into `PARAMETERS`; unit : per camera, the step of each free
+    parameter that moves a pixel at the image corner by about one, so that all variables of the
+    graph are alike in size.
+    """
+
+    intrinsics: tuple[int, ...]
+    camera: tuple[int, ...]
+    view: tuple[int, ...]
+    dots: int
+    free: tuple[Ints, ...]
+    unit: tuple[Array, ...]
+
+
+class ImageFactors:
+    """GTSAM factors, one per image, over one shared evaluation of all residuals.
+
+    GTSAM asks for one image at a time, NumPy is fast only for all at once. The first image asked
+    at a new point evaluates every image; the others find their own variables unchanged and take
+    their rows. An image whose variables differ from the shared point evaluates again, so what is
+    returned is always that of the values given.
+    """
+
+    def __init__(
+        self, obs: Observations, keys: ImageKeys, start: State, rho_mm: Sequence[float]
+    ) -> None:
+        self.obs, self.keys, self.rho_mm = obs, keys, tuple(rho_mm)
+        self._start = start
+        self._images = sorted(set(zip(obs.view.tolist(), obs.camera.tolist())))
+        self._shared: dict[tuple[int, int], bytes] = {}
+        self._at: State | None = None
+        self._value: Array | None = None
+        self._full: Residuals | None = None
+
+    def graph_factors(self) -> list[Any]:
+        """One `gtsam.CustomFactor` for each image that has dots."""
+        import gtsam
+
+        image = self.obs.view * len(self.rho_mm) + self.obs.camera
+        starts = np.r_[0, np.flatnonzero(np.diff(image)) + 1, len(image)]
+        out = []
+        for first, last in zip(starts[:-1], starts[1:]):
+            view, camera = int(self.obs.view[first]), int(self.obs.camera[first])
+            rows = slice(int(first), int(last))
+            noise = gtsam.noiseModel.Unit.Create(2 * int(last - first))
+            callback = self._callback(rows, view, camera)
+            out.append(gtsam.CustomFactor(noise, self._image_keys(view, camera), callback))
+        return out
+
+    def _image_keys(self, view: int, camera: int) -> list[int]:
+        keys = [self.keys.view[view], self.keys.dots]
+        if len(self.keys.free[camera]):
+            keys.append(self.keys.intrinsics[camera])
+        if camera:
+            keys.append(self.keys.camera[camera])
+        return keys
+
+    def _callback(self, rows: slice, view: int, camera: int) -> Any:
+        me, free, unit = self, self.keys.free[camera], self.keys.unit[camera]
+        size = 2 * (rows.stop - rows.start)
+
+        def error(_this: Any, values: Any, jacobians: list[Array] | None) -> Array:
+            me._move_to(values, view, camera)
+            if jacobians is None:
+                return me._values()[rows].ravel()
+            full = me._residuals()
+            blocks = [full.by_view[rows].reshape(size, 6), me._dot_block(full, rows, size)]
+            if len(free):
+                blocks.append((full.by_intrinsics[rows][..., free] * unit).reshape(size, -1))
+            if camera:
+                blocks.append(full.by_camera[rows].reshape(size, 6))
+            for i, block in enumerate(blocks):
+                jacobians[i] = np.asfortranarray(block)
+            return full.value[rows].ravel()
+
+        return error
+
+    def _dot_block(self, full: Residuals, rows: slice, size: int) -> Array:
+        dots = self.obs.dot[rows]
+        block = np.zeros((len(dots), 2, len(self._start.dots_mm), 3))
+        block[np.arange(len(dots)), :, dots] = full.by_dot[rows]
+        return block.reshape(size, -1)
+
+    def _move_to(self, values: Any, view: int, camera: int) -> None:
+        asked = self._variables(values, view, camera)
+        if self._shared.get((view, camera)) == asked:
+            return
+        self._at = state_from_values(values, self.keys, self._start)
+        self._value = self._full = None
+        self._shared = {image: self._variables(values, *image) for image in self._images}
+
+    def _variables(self, values: Any, view: int, camera: int) -> bytes:
+        """What one image depends on, as bytes: equality is exact and cheap to test."""
+        keys = self.keys
+        parts = [values.atVector(keys.dots).tobytes(), values.atPose3(keys.view[view]).matrix()]
+        if len(keys.free[camera]):
+            parts.append(values.atVector(keys.intrinsics[camera]))
+        if camera:
+            parts.append(values.atPose3(keys.camera[camera]).matrix())
+        return b"".join(p if isinstance(p, bytes) else p.tobytes() for p in parts)
+
+    def _values(self) -> Array:
+        if self._value is None:
+            assert self._at is not None
+            self._value = whitened_error(self._at, self.obs, self.rho_mm)
+        return self._value
+
+    def _residuals(self) -> Residuals:
+        if self._full is None:
+            assert self._at is not None
+            self._full = whitened_residuals(self._at, self.obs, self.rho_mm)
+            self._value = self._full.value
+        return self._full
+
+
+def intrinsics_from_values(values: Any, keys: ImageKeys, start: State, camera: int) -> Array:
+    """(18,) intrinsics of one camera: the start with the free ones moved."""
+    out = start.intrinsics[camera].copy()
+    if len(keys.free[camera]):
+        out[keys.free[camera]] += values.atVector(keys.intrinsics[camera]) * keys.unit[camera]
+    return out
+
+
+def state_from_values(values: Any, keys: ImageKeys, start: State) -> State:
+    """Read a `gtsam.Values` into arrays; what is not in the graph is taken from ``start``."""
+    intrinsics = [
+        intrinsics_from_values(values, keys, start, c) for c in range(len(start.intrinsics))
+    ]
+    cameras = start.rig_from_camera.copy()
+    for c in range(1, len(cameras)):
+        cameras[c] = values.atPose3(keys.camera[c]).matrix()
+    views = np.array([values.atPose3(k).matrix() for k in keys.view])
+    dots = values.atVector(keys.dots).reshape(-1, 3)
+    return State(np.array(intrinsics), cameras, views, dots)

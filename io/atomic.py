@@ -1,0 +1,135 @@
+"""Files that are either complete or absent: write beside, then rename into place."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from telerig.errors import InputError
+
+WRITE_TODO = "choose a folder that can be written (--out) or make room on the disk"
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``, with its suffix; renamed to it when all went well.
+
+    Missing parent folders are made. On an exception the temporary file is removed and what was
+    at ``path`` before stays. Raises InputError when the place cannot be written.
+    """
+    final = Path(path)
+    if final.is_dir():
+        raise InputError(
+            "is a folder, a file must be written there",
+            where=str(final),
+            todo="rename the folder or choose another file name",
+        )
+    _make_parent(final)
+    temporary = _beside(final, final.suffix)
+    try:
+        yield temporary
+        _rename(temporary, final)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield an empty temporary folder; its files are renamed into ``folder`` at the very end.
+
+    Until then ``folder`` is as before, so an interrupted command leaves the old results whole.
+    Files that are already in ``folder`` and are not written anew stay.
+    Raises InputError when the place cannot be written.
+    """
+    final = Path(folder)
+    if final.exists() and not final.is_dir():
+        raise InputError(
+            "is a file, a folder of results must be written there",
+            where=str(final),
+            todo="choose another --out",
+        )
+    _make_parent(final)
+    temporary = _beside(final, "")
+    try:
+        try:
+            temporary.mkdir()
+        except OSError as error:
+            raise _unwritable(temporary, error) from error
+        yield temporary
+        for staged in sorted(p for p in temporary.rglob("*") if p.is_file()):
+            target = final / staged.relative_to(temporary)
+            _make_parent(target)
+            _rename(staged, target)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
+    """UTF-8, line ends as they stand in ``text``. Raises InputError when it cannot be written."""
+    with atomic_path(path) as temporary:
+        try:
+            temporary.write_bytes(text.encode("utf-8"))
+        except OSError as error:
+            raise _unwritable(Path(path), error) from error
+
+
+def write_json_atomic(path: str | os.PathLike[str], content: Any) -> None:
+    """Strict JSON with NumPy arrays as lists, dataclasses as objects, NaN and infinity as null.
+
+    Floats keep every digit. Raises TypeError for an object that has no form in JSON.
+    """
+    text = json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False)
+    write_text_atomic(path, text + "\n")
+
+
+def plain(content: Any) -> Any:
+    """``content`` in the types of JSON; non-finite numbers become None."""
+    if isinstance(content, dict):
+        return {str(key): plain(value) for key, value in content.items()}
+    if isinstance(content, np.ndarray | np.generic):
+        return plain(content.tolist())
+    if isinstance(content, list | tuple):
+        return [plain(value) for value in content]
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, Path):
+        return str(content)
+    if is_dataclass(content) and not isinstance(content, type):
+        return {field.name: plain(getattr(content, field.name)) for field in fields(content)}
+    if content is None or isinstance(content, str | bool | int):
+        return content
+    raise TypeError(f"{type(content).__name__} has no form in JSON: {content!r}")
+
+
+def _beside(final: Path, suffix: str) -> Path:
+    return final.with_name(f".{final.name}.{os.getpid()}-{secrets.token_hex(4)}.part{suffix}")
+
+
+def _make_parent(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path.parent, error) from error
+
+
+def _rename(source: Path, target: Path) -> None:
+    try:
+        os.replace(source, target)  # noqa: PTH105
+    except OSError as error:
+        raise _unwritable(target, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(
+        f"cannot be written: {error.strerror or error}", where=str(path), todo=WRITE_TODO
+    )

@@ -27,21 +27,28 @@ GAUGE_SIGMA_MM = 1e-4
 _CENTRE = ("centre_u_px", "centre_v_px")
 MODELS: dict[str, tuple[str, ...]] = {
     "none": (),
-    "radial": ("k1", *_CENTRE),
-    "radial2": ("k1", "k2", *_CENTRE),
-    "tangential": ("k1", "p1", "p2", *_CENTRE),
-    "brown": ("k1", "k2", "p1", "p2", *_CENTRE),
-    "prism": ("k1", "k2", "p1", "p2", "s1", "s3", *_CENTRE),
-    "kappa": ("kappa_per_mm", *_CENTRE),
-    "kappa+radial": ("kappa_per_mm", "k1", *_CENTRE),
-    "kappa+tangential": ("kappa_per_mm", "k1", "p1", "p2", *_CENTRE),
-    "kappa+brown": ("kappa_per_mm", "k1", "k2", "p1", "p2", *_CENTRE),
+    "radial": ("k1",),
+    "tangential": ("k1", "p1", "p2"),
+    "brown": ("k1", "k2", "p1", "p2"),
+    "prism": ("k1", "k2", "p1", "p2", "s1", "s3"),
+    "kappa": ("kappa_per_mm",),
+    "kappa+radial": ("kappa_per_mm", "k1"),
+    "kappa+tangential": ("kappa_per_mm", "k1", "p1", "p2"),
+    "kappa+brown": ("kappa_per_mm", "k1", "k2", "p1", "p2"),
+    "kappa+radial+centre": ("kappa_per_mm", "k1", *_CENTRE),
+    "kappa+tangential+centre": ("kappa_per_mm", "k1", "p1", "p2", *_CENTRE),
+    "kappa+brown+centre": ("kappa_per_mm", "k1", "k2", "p1", "p2", *_CENTRE),
     "affine": ("aspect", "skew"),
-    "affine+radial": ("aspect", "skew", "k1", *_CENTRE),
-    "tilt": ("tilt_x", "tilt_y", "image_convergence_per_mm", *_CENTRE),
-    "tilt+radial": ("tilt_x", "tilt_y", "image_convergence_per_mm", "k1", *_CENTRE),
+    "affine+radial": ("aspect", "skew", "k1"),
+    "tilt": ("tilt_x", "tilt_y", "image_convergence_per_mm"),
+    "tilt+radial": ("tilt_x", "tilt_y", "image_convergence_per_mm", "k1"),
 }
-"""Free intrinsics besides the scale, by the name that ``--model`` takes."""
+"""Free intrinsics besides the scale, by the name that ``--model`` takes.
+
+Without kappa the image centre acts through the distortion alone, where it is the same as the
+tangential terms to first order and otherwise a gauge freedom, so it is held at the middle of the
+image and p1, p2 carry a decentred lens (docs/decisions/003).
+"""
 
 PRIOR_SIGMA = {
     "scale_px_per_mm": 0.5,  # relative

@@ -1,0 +1,148 @@
+"""The joint covariance of a self-calibration, and what of it reaches a triangulated point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from telerig.errors import CalibrationError
+from telerig.estimator.graph import Solution
+from telerig.estimator.problem import Problem
+from telerig.factors.projection import whitened_residuals
+from telerig.rig.camera import Camera
+from telerig.rig.pose import hat
+from telerig.rig.projection import INDEX
+from telerig.rig.triangulation import stacked_jacobian
+
+Array = NDArray[np.float64]
+
+POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """matrix : (D, D) in physical units, names : D strings such as ``left.k1`` or ``view 03.rx_rad``.
+
+    Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
+    effective_dof : degrees of freedom that are left to the residuals.
+    """
+
+    names: tuple[str, ...]
+    matrix: Array
+    rig: int
+    effective_dof: float
+
+    def rig_block(self) -> tuple[tuple[str, ...], Array]:
+        """Names and covariance of the cameras alone: intrinsics, then the second camera's pose."""
+        return self.names[: self.rig], self.matrix[: self.rig, : self.rig]
+
+
+def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
+    """Inverse of the information at the solution, equilibrated before it is factorised.
+
+    Raises CalibrationError when it is singular to working precision.
+    """
+    information = solution.information
+    scale = 1 / np.sqrt(np.diag(information))
+    equilibrated = information * scale[:, None] * scale
+    try:
+        factor = cho_factor(equilibrated)
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError(
+            "the measurements leave a direction of the calibration undetermined",
+            todo="add views with other tilts, or fix the model with --model",
+        ) from error
+    inverse = cho_solve(factor, np.eye(len(scale))) * scale[:, None] * scale
+    units = _units(problem, len(scale))
+    names = _names(problem)
+    rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
+    dof = _effective_dof(problem, solution, inverse)
+    return JointCovariance(names, inverse * units[:, None] * units, rig, dof)
+
+
+def _units(problem: Problem, size: int) -> Array:
+    units = np.ones(size)
+    at = 0
+    for unit in problem.keys().unit:
+        units[at : at + len(unit)] = unit
+        at += len(unit)
+    return units
+
+
+def _names(problem: Problem) -> tuple[str, ...]:
+    names = [f"{c.name}.{p}" for c, free in zip(problem.cameras, problem.free) for p in free]
+    names += [f"{c.name}.{p}" for c in problem.cameras[1:] for p in POSE_COMPONENTS]
+    names += [f"view {v}.{p}" for v in problem.views for p in POSE_COMPONENTS]
+    names += [f"dot {d}.{p}" for d in problem.dot_ids for p in ("x_mm", "y_mm", "z_mm")]
+    return tuple(names)
+
+
+def _effective_dof(problem: Problem, solution: Solution, inverse: Array) -> float:
+    """E[sum of squared whitened residuals] = rows - trace(J C J^T)."""
+    leverages = hat_matrix_blocks(problem, solution, inverse)
+    return float(2 * len(leverages) - np.trace(leverages, axis1=-2, axis2=-1).sum())
+
+
+def hat_matrix_blocks(problem: Problem, solution: Solution, inverse: Array) -> Array:
+    """(M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs."""
+    obs = problem.observations()
+    jac = whitened_residuals(solution.state, obs, problem.rho_mm)
+    keys, slots = problem.keys(), solution.slots
+    out = np.empty((len(obs), 2, 2))
+    image = obs.view * len(problem.cameras) + obs.camera
+    for k in np.unique(image):
+        rows = np.flatnonzero(image == k)
+        v, c = divmod(int(k), len(problem.cameras))
+        parts = [jac.by_intrinsics[rows][..., keys.free[c]] * keys.unit[c], jac.by_view[rows]]
+        where = [np.arange(len(inverse))[s] for s in (slots["intrinsics"][c], slots["view"][v])]
+        if c:
+            parts.append(jac.by_camera[rows])
+            where.append(np.arange(len(inverse))[slots["camera"][c]])
+        common = np.concatenate(parts, -1)
+        index = np.concatenate(where)
+        dots = slots["dots"][0].start + 3 * obs.dot[rows][:, None] + np.arange(3)
+        every = np.concatenate([np.broadcast_to(index, (len(rows), len(index))), dots], 1)
+        full = np.concatenate([common, jac.by_dot[rows]], -1)
+        block = inverse[every[:, :, None], every[:, None, :]]
+        out[rows] = full @ block @ np.swapaxes(full, -1, -2)
+    return out
+
+
+def rig_jacobian(
+    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
+) -> Array:
+    """(..., 2C, P) derivative of the pixels of rig points by the rig block's parameters."""
+    _, by_point, by_intrinsics = stacked_jacobian(cameras, points_mm)
+    columns = sum(len(f) for f in free) + 6 * (len(cameras) - 1)
+    out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), columns))
+    at = 0
+    for c, names in enumerate(free):
+        index = [INDEX[n] for n in names]
+        out[..., 2 * c : 2 * c + 2, at : at + len(index)] = by_intrinsics[c][..., index]
+        at += len(index)
+    for c, camera in enumerate(cameras[1:], 1):
+        pose = camera.camera_from_rig
+        in_camera = pose.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
+        by_camera_point = by_point[..., 2 * c : 2 * c + 2, :] @ pose.rotation.T
+        block = np.concatenate([by_camera_point @ hat(in_camera), -by_camera_point], -1)
+        out[..., 2 * c : 2 * c + 2, at : at + 6] = block
+        at += 6
+    return out
+
+
+def point_shift_jacobian(
+    cameras: tuple[Camera, Camera],
+    free: tuple[tuple[str, ...], ...],
+    points_mm: Array,
+    information_px: Array,
+) -> Array:
+    """(..., 3, P): how a triangulated point moves when the rig block's parameters move."""
+    _, by_point, _ = stacked_jacobian(cameras, points_mm)
+    weighted = np.swapaxes(by_point, -1, -2) @ information_px
+    by_rig = rig_jacobian(cameras, free, points_mm)
+    return -np.linalg.solve(weighted @ by_point, weighted @ by_rig)
+
+

@@ -1,0 +1,284 @@
+"""Read one grey image from TIFF, PNG, BMP or JPEG, and refuse what would falsify it.
+
+A file that is cut short must never come back padded: OpenCV pads truncated JPEG files with grey
+and says nothing, so each format is checked here before, or by another decoder.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+
+Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+
+EXTENSIONS = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
+
+_FORMATS = "telerig reads TIFF, PNG, BMP and JPEG"
+_COPY = "copy or record it again, or leave it out"
+_MONO = "save it with one grey channel; set a colour camera to a mono mode"
+_SENSOR_BITS = (8, 10, 12, 14, 16)
+
+
+def read_image(
+    path: str | PathLike[str], *, expected_size_px: tuple[int, int] | None = None
+) -> Image:
+    """(height, width) pixels as the file holds them: uint8, uint16, or float32 (float TIFF).
+
+    expected_size_px : (width, height) that the image must have.
+    Three equal channels count as grey and an opaque alpha channel is dropped. No EXIF rotation,
+    no gamma, no scaling. Raises InputError for a file that is missing, truncated or of no known
+    format, that holds several pages, colour or non-finite values, or has another size.
+    """
+    file = Path(path)
+    data = _bytes(file)
+    pixels = _native(_grey(_decoder(data, file)(data, file), file), file)
+    if expected_size_px is not None:
+        _check_size(pixels, expected_size_px, file)
+    return pixels
+
+
+def list_images(folder: str | PathLike[str]) -> list[Path]:
+    """The image files in a folder by their extensions, in natural order (2 before 10).
+
+    Hidden files are left out. Raises InputError when there is no such folder.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise InputError("is not a folder", where=str(place), todo="check the path")
+    files = (p for p in place.iterdir() if p.suffix.lower() in EXTENSIONS and p.is_file())
+    return sorted((p for p in files if not p.name.startswith(".")), key=lambda p: natural(p.name))
+
+
+def natural(name: str) -> tuple[Any, ...]:
+    """Sorting key in which runs of digits count as numbers."""
+    parts = re.split(r"(\d+)", name)
+    return (*(int(p) if i % 2 else p.lower() for i, p in enumerate(parts)), name)
+
+
+def effective_bits(image: Image) -> int:
+    """Bits of the sensor behind an integer image: 12 for 12-bit data at either end of 16 bits.
+
+    One of 8, 10, 12, 14, 16. Data in the low bits are told by their largest value, so a dark
+    image may be taken for one of fewer bits; data in the high bits by the zeros below them.
+    Raises InputError for a float image, which has no full scale.
+    """
+    return _bits_and_step(image)[0]
+
+
+def full_scale(image: Image) -> int:
+    """Largest grey level that the sensor can give in this image (4095, 65520, ...)."""
+    bits, step = _bits_and_step(image)
+    return ((1 << bits) - 1) * step
+
+
+def _bits_and_step(image: Image) -> tuple[int, int]:
+    if image.dtype == np.uint8:
+        return 8, 1
+    if image.dtype != np.uint16:
+        raise InputError(
+            f"a {image.dtype} image has no full scale",
+            where="image",
+            todo="give an 8- or 16-bit image",
+        )
+    values = np.flatnonzero(np.bincount(image.ravel(), minlength=1))
+    step = int(np.gcd.reduce(values)) if values.size else 0
+    if step and step % 257 == 0:
+        return 8, 257
+    unused = (step & -step).bit_length() - 1 if step and values.size >= 16 else 0
+    if unused and values[-1] >= 1 << (16 - unused):
+        bits = _sensor_bits(16 - unused)
+        return bits, 1 << (16 - bits)
+    return _sensor_bits(int(values[-1]).bit_length() if step else 16), 1
+
+
+def _sensor_bits(least: int) -> int:
+    return next(bits for bits in _SENSOR_BITS if bits >= least)
+
+
+def _bytes(file: Path) -> bytes:
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror}",
+            where=str(file),
+            todo="check the path and its permissions",
+        ) from error
+    if not data:
+        raise InputError("is empty (0 bytes)", where=str(file), todo=_COPY)
+    return data
+
+
+def _decoder(data: bytes, file: Path) -> Callable[[bytes, Path], NDArray[Any]]:
+    """By the first bytes, not by the extension."""
+    if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _tiff
+    for magic, decode in ((b"\x89PNG\r\n\x1a\n", _png), (b"BM", _bmp), (b"\xff\xd8", _jpeg)):
+        if data.startswith(magic):
+            return decode
+    raise InputError("is not an image of a known format", where=str(file), todo=_FORMATS)
+
+
+def _truncated(file: Path, detail: str) -> InputError:
+    return InputError(f"is truncated or damaged: {detail}", where=str(file), todo=_COPY)
+
+
+def _opencv(data: bytes, file: Path) -> NDArray[Any]:
+    import cv2
+
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise _truncated(file, "it cannot be decoded") from error
+    if pixels is None:
+        raise _truncated(file, "it cannot be decoded")
+    return np.asarray(pixels)
+
+
+def _png(data: bytes, file: Path) -> NDArray[Any]:
+    position, kind = 8, b""
+    while kind != b"IEND":
+        if position + 12 > len(data):
+            raise _truncated(file, f"the PNG ends after {len(data)} bytes, within its data")
+        length, kind = struct.unpack_from(">I4s", data, position)
+        position += 12 + length
+        crc = zlib.crc32(data[position - 8 - length : position - 4])
+        if position > len(data) or crc != struct.unpack_from(">I", data, position - 4)[0]:
+            raise _truncated(file, f"PNG chunk {kind!r} is incomplete or fails its checksum")
+    return _opencv(data, file)
+
+
+def _bmp(data: bytes, file: Path) -> NDArray[Any]:
+    if len(data) < 54:
+        raise _truncated(file, "the BMP header is incomplete")
+    offset, _, width, height, _, depth, packed = struct.unpack_from("<IIiiHHI", data, 10)
+    needed = offset + (width * depth + 31) // 32 * 4 * abs(height)
+    if packed in (0, 3) and len(data) < needed:
+        raise _truncated(file, f"it has {len(data)} bytes, its header asks for {needed}")
+    return _opencv(data, file)
+
+
+def _jpeg(data: bytes, file: Path) -> NDArray[Any]:
+    import imageio.v3 as iio
+
+    if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+        raise _truncated(file, "the JPEG has no end marker")
+    try:
+        return np.asarray(iio.imread(data, plugin="pillow", extension=".jpg"))
+    except Exception as error:
+        raise _truncated(file, str(error)) from error
+
+
+def _tiff(data: bytes, file: Path) -> NDArray[Any]:
+    """What tifffile needs imagecodecs for (LZW, 12 packed bits), OpenCV reads as well."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(file) as tiff:
+            _check_tiff(tiff, len(data), file)
+            page = tiff.pages[0]
+            pixels = np.asarray(page.asarray())
+            return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
+    except InputError:
+        raise
+    except Exception as error:
+        if "imagecodecs" in str(error):
+            return _opencv(data, file)
+        raise _truncated(file, str(error)) from error
+
+
+def _check_tiff(tiff: Any, size: int, file: Path) -> None:
+    if len(tiff.pages) == 0:
+        raise _truncated(file, "the TIFF has no page")
+    page = tiff.pages[0]
+    frames = max(len(tiff.pages), int(np.prod(tiff.series[0].shape)) // max(page.size, 1))
+    if frames > 1:
+        raise InputError(
+            f"holds {frames} images",
+            where=str(file),
+            todo="save one image per file here; multi-page files belong in runs/",
+        )
+    end = max((o + n for o, n in zip(page.dataoffsets, page.databytecounts)), default=0)
+    if end > size or 0 in page.databytecounts:
+        raise _truncated(file, f"it has {size} bytes, its tags ask for {end}")
+    if page.photometric == 0:
+        raise InputError(
+            "stores white as 0 (photometric MINISWHITE)",
+            where=str(file),
+            todo="save it again with black as 0",
+        )
+
+
+def _grey(pixels: NDArray[Any], file: Path) -> NDArray[Any]:
+    if pixels.ndim == 3 and pixels.shape[-1] in (2, 4):
+        opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else pixels[0, 0, -1]
+        if np.any(pixels[..., -1] != opaque):
+            raise InputError(
+                "has a fourth channel that is not constant (transparency or CMYK)",
+                where=str(file),
+                todo=_MONO,
+            )
+        pixels = pixels[..., :-1]
+    if pixels.ndim == 2:
+        return pixels
+    if pixels.ndim != 3 or pixels.shape[-1] not in (1, 3):
+        raise InputError(
+            f"has the shape {pixels.shape}, not one of an image", where=str(file), todo=_MONO
+        )
+    if np.any(pixels != pixels[..., :1]):
+        raise InputError("is a colour image: its channels differ", where=str(file), todo=_MONO)
+    return pixels[..., 0]
+
+
+def _native(pixels: NDArray[Any], file: Path) -> Image:
+    """uint8, uint16 or float32, contiguous; wider integers are narrowed when nothing is lost."""
+    if pixels.size == 0:
+        raise _truncated(file, "it has no pixels")
+    if pixels.dtype in (np.uint8, np.uint16):
+        return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
+    if pixels.dtype.kind == "f":
+        return _finite(pixels, file)
+    if pixels.dtype.kind in "iu" and pixels.min() >= 0 and pixels.max() <= 65535:
+        return np.ascontiguousarray(pixels, dtype=np.uint16)
+    raise InputError(
+        f"has pixels of type {pixels.dtype}, which do not fit 16 bits",
+        where=str(file),
+        todo="save it with 8 or 16 bits per pixel (not 1 bit: a "
+        "thresholded image has lost its sub-pixel information)",
+    )
+
+
+def _finite(pixels: NDArray[Any], file: Path) -> NDArray[np.float32]:
+    bad = np.argwhere(~np.isfinite(pixels))
+    if len(bad):
+        row, column = bad[0]
+        raise InputError(
+            f"has {len(bad)} pixels that are NaN or infinite, the first at column "
+            f"{column}, row {row}",
+            where=str(file),
+            todo="save the raw 8- or 16-bit image, or replace those pixels",
+        )
+    return np.ascontiguousarray(pixels, dtype=np.float32)
+
+
+def _check_size(pixels: Image, expected: tuple[int, int], file: Path) -> None:
+    height, width = pixels.shape
+    if (width, height) == tuple(expected):
+        return
+    swapped = " (width and height swapped?)" if (height, width) == tuple(expected) else ""
+    raise InputError(
+        f"is {width} x {height} px, expected {expected[0]} x {expected[1]}{swapped}",
+        where=str(file),
+        todo="correct image_size_px = [width, height] of that "
+        "camera in rig.toml, or put the right image there",
+    )

@@ -120,31 +120,30 @@ def _transpose(x: Array) -> Array:
     return np.swapaxes(x, -1, -2)
 
 
-def signed_distance_px(
-    shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 4
+def foot_points(
+    shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 3
 ) -> tuple[Array, Array]:
-    """Signed distance (positive outside) and foot-point parameter t of points near an ellipse.
+    """Nearest points of an ellipse: (cos t, sin t) with foot = M (cos t, sin t), each (P,).
 
-    ``shape_px`` (3,); offsets from the centre (P,). Newton on (p - x(t)) . x'(t) = 0, from the
-    radial start; for points nearer than the smallest radius of curvature.
+    ``shape_px`` (3,); offsets from the centre (P,). Newton on (p - x(t)) . x'(t) = 0 from the
+    radial start, for points nearer than the smallest radius of curvature. Steps turn the unit
+    vector instead of its angle, which saves the trigonometry.
     """
     m11, m12, m22 = shape_px
     determinant = m11 * m22 - m12 * m12
-    x, y = (m22 * du_px - m12 * dv_px) / determinant, (m11 * dv_px - m12 * du_px) / determinant
-    t = np.arctan2(y, x)
-    a2 = m11 * m11 + m12 * m12, m12 * (m11 + m22), m12 * m12 + m22 * m22
+    c, s = m22 * du_px - m12 * dv_px, m11 * dv_px - m12 * du_px
+    shrink = 1.0 / np.sqrt(c * c + s * s + 1e-300)
+    c, s = c * shrink, s * shrink
+    g11, g12, g22 = m11 * m11 + m12 * m12, m12 * (m11 + m22), m12 * m12 + m22 * m22
     pu, pv = m11 * du_px + m12 * dv_px, m12 * du_px + m22 * dv_px
     for _ in range(steps):
-        c, s = np.cos(t), np.sin(t)
-        along_c, along_s = a2[0] * c + a2[1] * s, a2[1] * c + a2[2] * s
-        value = -pu * s + pv * c + along_c * s - along_s * c
-        slope = -pu * c - pv * s + (a2[0] - a2[2]) * (c * c - s * s) + 4.0 * a2[1] * s * c
-        t = t - value / np.where(slope < 0.0, slope, -determinant)
-    c, s = np.cos(t), np.sin(t)
-    normal_u, normal_v = m22 * c - m12 * s, m11 * s - m12 * c
-    length = np.hypot(normal_u, normal_v)
-    gap_u, gap_v = du_px - m11 * c - m12 * s, dv_px - m12 * c - m22 * s
-    return (gap_u * normal_u + gap_v * normal_v) / length, t
+        cs, c2 = c * s, c * c
+        value = pv * c - pu * s + (g11 - g22) * cs + g12 * (1.0 - 2.0 * c2)
+        slope = -pu * c - pv * s + (g11 - g22) * (2.0 * c2 - 1.0) + 4.0 * g12 * cs
+        turn = -value / np.where(slope < 0.0, slope, -determinant)
+        shrink = 1.0 / np.sqrt(1.0 + turn * turn)
+        c, s = (c - turn * s) * shrink, (s + turn * c) * shrink
+    return c, s
 
 
 def coverage_near_edge(
@@ -158,27 +157,34 @@ def coverage_near_edge(
     minus the normal motion of the foot point; the curvature's own change is left out of the
     derivatives (relative error (k s)^2 / 2).
     """
-    distance, t = signed_distance_px(shape_px, du_px, dv_px)
-    c, s = np.cos(t), np.sin(t)
     m11, m12, m22 = shape_px
+    c, s = foot_points(shape_px, du_px, dv_px)
     normal_u, normal_v = m22 * c - m12 * s, m11 * s - m12 * c
-    length = np.hypot(normal_u, normal_v)
-    bend = (m11 * m22 - m12 * m12) / length**3 * sigma_px
-    normal_u, normal_v = normal_u / length, normal_v / length
+    shrink = 1.0 / np.sqrt(normal_u * normal_u + normal_v * normal_v)
+    normal_u, normal_v = normal_u * shrink, normal_v * shrink
+    distance = (du_px - m11 * c - m12 * s) * normal_u + (dv_px - m12 * c - m22 * s) * normal_v
+    bend = (m11 * m22 - m12 * m12) * sigma_px * (shrink * shrink * shrink)
     z = distance / sigma_px
-    density = np.exp(-0.5 * z * z) / _ROOT_2PI
-    fourth = _FOURTH / sigma_px**4 * (normal_u**4 + normal_v**4)
-    he3, he4 = z * (z * z - 3.0), z * z * (z * z - 6.0) + 3.0
-    curved = -0.5 * bend + 0.375 * bend**2 * z + fourth * he3
-    coverage = ndtr(-z) + density * curved
-    by_z = density * (-1.0 + 0.5 * bend * z + 0.375 * bend**2 * (1.0 - z * z) - fourth * he4)
-    by_distance = by_z / sigma_px
-    by_sigma = (
-        -z * by_distance
-        + density * (-0.5 * bend + 0.75 * bend**2 * z - 4.0 * fourth * he3) / sigma_px
+    z2 = z * z
+    density = np.exp(-0.5 * z2) / _ROOT_2PI
+    across = normal_u * normal_v
+    fourth = _FOURTH / sigma_px**4 * (1.0 - 2.0 * across * across)
+    third = fourth * z * (z2 - 3.0)
+    half, bend2 = 0.5 * bend, 0.375 * bend * bend
+    coverage = ndtr(-z) + density * (bend2 * z - half + third)
+    by_distance = (
+        density
+        / sigma_px
+        * (half * z - 1.0 + bend2 * (1.0 - z2) - fourth * (z2 * (z2 - 6.0) + 3.0))
     )
-    u_rate, v_rate = -by_distance * normal_u, -by_distance * normal_v
-    gradient = np.stack([u_rate, v_rate, u_rate * c, u_rate * s + v_rate * c, v_rate * s, by_sigma])
+    by_sigma = density / sigma_px * (2.0 * bend2 * z - half - 4.0 * third) - z * by_distance
+    gradient = np.empty((6, *z.shape))
+    np.multiply(by_distance, -normal_u, out=gradient[0])
+    np.multiply(by_distance, -normal_v, out=gradient[1])
+    np.multiply(gradient[0], c, out=gradient[2])
+    gradient[3] = gradient[0] * s + gradient[1] * c
+    np.multiply(gradient[1], s, out=gradient[4])
+    gradient[5] = by_sigma
     return coverage, gradient
 
 

@@ -110,13 +110,9 @@ def _spread(values: Grey, weight: Grey) -> Grey:
     product = cv2.GaussianBlur(values * (weight / peak), (0, 0), 1.0)
     mass = cv2.GaussianBlur(weight / peak, (0, 0), 1.0)
     local = product / np.maximum(mass, 1e-30)
-    coarse = _spread(
-        cv2.resize(local, half, interpolation=cv2.INTER_AREA)
-        if False
-        else cv2.resize(product, half, interpolation=cv2.INTER_AREA)
-        / np.maximum(cv2.resize(mass, half, interpolation=cv2.INTER_AREA), 1e-30),
-        cv2.resize(mass, half, interpolation=cv2.INTER_AREA),
-    )
+    coarse_mass = cv2.resize(mass, half, interpolation=cv2.INTER_AREA)
+    coarse_product = cv2.resize(product, half, interpolation=cv2.INTER_AREA)
+    coarse = _spread(coarse_product / np.maximum(coarse_mass, 1e-30), coarse_mass)
     filled = cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_LINEAR)
     share = mass / (mass + 1e-3)
     spread: Grey = share * local + (1.0 - share) * filled
@@ -169,11 +165,10 @@ def _first_look(
     cv2.drawContours(filled, [(outline - (u, v)).reshape(-1, 1, 2)], -1, 1, cv2.FILLED)
     area, centre, shape = _moments(filled)
     centre = centre + (u, v)
-    a, b, _ = axes_from_shape(shape)
     reason = ""
     if u <= 0 or v <= 0 or u + width >= image_shape[1] or v + height >= image_shape[0]:
         reason = TOUCHES_BORDER
-    elif 2.0 * a < min_diameter_px:
+    elif 2.0 * axes_from_shape(shape)[0] < min_diameter_px:
         reason = TOO_SMALL
     else:
         reason = _outline_verdict(outline, centre, shape)

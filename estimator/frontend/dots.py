@@ -12,14 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from telerig.estimator.frontend.blurred_ellipse import (
-    PIXEL_VARIANCE_PX2,
-    approximate_distance_px,
-    axes_from_shape,
-    extent_px,
-)
+from telerig.estimator.frontend.blurred_ellipse import PIXEL_VARIANCE_PX2, axes_from_shape
+from telerig.estimator.frontend.contrast_field import contrast_gradients
 from telerig.estimator.frontend.dot_candidates import (
-    TOUCHES_BORDER,
     Candidate,
     Candidates,
     Polarity,
@@ -27,7 +22,19 @@ from telerig.estimator.frontend.dot_candidates import (
     edge_map,
     find_candidates,
 )
-from telerig.estimator.frontend.luminance import DotFit, GradientPrior, Start, Window, fit_dot
+from telerig.estimator.frontend.dot_verdicts import (
+    is_ring,
+    reason_against_blob,
+    reason_against_fit,
+    reference_radius_px,
+    saturation_level,
+)
+from telerig.estimator.frontend.dot_windows import (
+    close_neighbours,
+    dot_window,
+    without_neighbours,
+)
+from telerig.estimator.frontend.luminance import DotFit, GradientPrior, Start, fit_dot
 from telerig.estimator.frontend.noise import (
     NoiseModel,
     estimate_noise,
@@ -42,7 +49,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_MAX_EDGE_RESIDUAL = 0.12
 _FIRST_SIGMA_PX = 1.0
 
 
@@ -139,78 +145,72 @@ def _rough_noise(grey: NDArray[np.float32]) -> float:
     return float(np.mean(quiet))
 
 
+@dataclass(frozen=True)
+class _Rejection:
+    centre_px: Array
+    shape_px: Array
+    reason: str
+
+
 def _measure(grey: NDArray[np.float32], found: Candidates, noise: NoiseModel) -> DotMeasurement:
-    fits: list[tuple[Candidate, DotFit]] = []
-    rejected: list[tuple[Array, Array, str]] = []
-    sigma = _FIRST_SIGMA_PX
+    saturation = saturation_level(grey)
+    reference_px = reference_radius_px(found)
+    rejected: list[_Rejection] = []
+    blobs: list[Candidate] = []
     for blob in found.blobs:
-        if blob.reason:
-            rejected.append((blob.centre_px, blob.shape_px, blob.reason))
-            continue
-        start = Start(blob.centre_px, blob.shape_px, sigma)
-        fit = fit_dot(_window(grey, found, blob, start), start, noise, GradientPrior())
-        fits.append((blob, fit))
-    priors = _contrast_gradients([fit for _, fit in fits])
-    accepted: list[tuple[Candidate, DotFit]] = []
-    for (blob, fit), prior in zip(fits, priors):
-        start = Start(fit.centre_px, fit.shape_px, fit.sigma_px)
-        again = fit_dot(_window(grey, found, blob, start), start, noise, prior)
-        reason = _verdict(again, blob, grey.shape, found.polarity)
+        reason = reason_against_blob(blob, grey, reference_px, saturation)
         if reason:
-            rejected.append((again.centre_px, again.shape_px, reason))
+            rejected.append(_Rejection(blob.centre_px, blob.shape_px, reason))
         else:
-            accepted.append((blob, again))
+            blobs.append(blob)
+    fits = _first_pass(grey, found, blobs, noise)
+    fits = _second_pass(grey, found, blobs, fits, noise)
+    usual_contrast = float(np.median([abs(fit.contrast) for fit in fits])) if fits else 0.0
+    accepted: list[tuple[Candidate, DotFit]] = []
+    for blob, fit in zip(blobs, fits):
+        reason = reason_against_fit(fit, grey, found.polarity, usual_contrast, saturation)
+        if reason:
+            rejected.append(_Rejection(fit.centre_px, fit.shape_px, reason))
+        else:
+            accepted.append((blob, fit))
     return DotMeasurement(
         _dots_table(accepted, noise), _rejected_table(rejected), noise, found.polarity
     )
 
 
-def _window(grey: NDArray[np.float32], found: Candidates, blob: Candidate, start: Start) -> Window:
-    """The pixels round a dot that serve its fit: no hole, no neighbour, margins wide enough."""
-    import cv2
-
-    a, b, _ = axes_from_shape(start.shape_px)
-    radius = float(np.sqrt(a * b))
-    outer = float(np.clip(1.3 * radius, 4.0 * start.sigma_px + 2.0, 12.0))
-    inner = max(8.0, 4.0 * start.sigma_px + 2.0)
-    half = extent_px(start.shape_px) + outer
-    low = np.maximum(np.floor(start.centre_px - half).astype(int), 0)
-    high = np.minimum(np.ceil(start.centre_px + half).astype(int) + 1, grey.shape[::-1])
-    crop = np.s_[low[1] : high[1], low[0] : high[0]]
-    du = np.arange(low[0], high[0]) - start.centre_px[0]
-    dv = np.arange(low[1], high[1]) - start.centre_px[1]
-    distance = approximate_distance_px(start.shape_px, du[None, :], dv[:, None])
-    mask = (distance < outer) & (distance > -inner)
-    labels = found.labels[crop]
-    others = (labels != 0) & (labels != blob.label)
-    clear = 3.5 * start.sigma_px
-    if np.any(others):
-        gap = cv2.distanceTransform((~others).astype(np.uint8), cv2.DIST_L2, 5) - 0.5
-        mask &= (gap > clear) | (distance < gap)
-    if blob.holes:
-        canvas = np.ones(labels.shape, np.uint8)
-        for hole in blob.holes:
-            cv2.drawContours(canvas, [(hole - low).reshape(-1, 1, 2)], -1, 0, cv2.FILLED)
-        mask &= cv2.distanceTransform(canvas, cv2.DIST_L2, 5) > clear + 0.5
-    return Window(grey[crop].astype(np.float64), int(low[0]), int(low[1]), mask)
+def _first_pass(
+    grey: NDArray[np.float32], found: Candidates, blobs: list[Candidate], noise: NoiseModel
+) -> list[DotFit]:
+    """Every dot by itself; the blur of the dots so far is where the next one starts."""
+    fits: list[DotFit] = []
+    sigma = _FIRST_SIGMA_PX
+    for blob in blobs:
+        start = Start(blob.centre_px, blob.shape_px, sigma)
+        window = dot_window(grey, found.labels, blob, start)
+        fits.append(fit_dot(window, start, noise, GradientPrior(), tolerance=0.3, outlier_rounds=1))
+        sigma = float(np.median([fit.sigma_px for fit in fits[-9:]]))
+    return fits
 
 
-def _contrast_gradients(fits: list[DotFit]) -> list[GradientPrior]:
-    """Each dot's expected relative contrast gradient, from how contrast varies over the image."""
-    return [GradientPrior() for _ in fits]
-
-
-def _verdict(fit: DotFit, blob: Candidate, image_shape: tuple[int, ...], polarity: Polarity) -> str:
-    half = extent_px(fit.shape_px)
-    size = np.array(image_shape[::-1])
-    if np.any(fit.centre_px - half < 0) or np.any(fit.centre_px + half > size - 1):
-        return TOUCHES_BORDER
-    if fit.edge_residual > _MAX_EDGE_RESIDUAL:
-        times = float(np.sqrt(fit.chi2_dof))
-        return f"does not look like a dot (residual {times:.0f} x noise)"
-    if (fit.levels[3] > 0.0) != (polarity == "white_on_black"):
-        return "does not look like a dot (contrast has the wrong sign)"
-    return ""
+def _second_pass(
+    grey: NDArray[np.float32],
+    found: Candidates,
+    blobs: list[Candidate],
+    fits: list[DotFit],
+    noise: NoiseModel,
+) -> list[DotFit]:
+    """Every dot again, knowing the light and its neighbours."""
+    priors = contrast_gradients(fits, grey.shape, ties=True)
+    neighbours = close_neighbours(fits)
+    for _ in range(2 if any(neighbours) else 1):
+        known, updated = list(fits), []
+        for blob, fit, prior, near in zip(blobs, known, priors, neighbours):
+            start = Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
+            window = dot_window(grey, found.labels, blob, start)
+            window = without_neighbours(window, [known[k] for k in near])
+            updated.append(fit_dot(window, start, noise, prior))
+        fits = updated
+    return fits
 
 
 def _dots_table(accepted: list[tuple[Candidate, DotFit]], noise: NoiseModel) -> pd.DataFrame:
@@ -218,35 +218,17 @@ def _dots_table(accepted: list[tuple[Candidate, DotFit]], noise: NoiseModel) -> 
 
     rows = []
     for blob, fit in accepted:
-        a, b, angle = axes_from_shape(fit.shape_px)
-        x, y = (fit.centre_px - fit.origin_px) / fit.radius_px
-        outer = float(fit.levels[:3] @ (1.0, x, y))
-        inner = outer + float(fit.levels[3:] @ (1.0, x, y))
         blur = float(np.sqrt(max(fit.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0)))
         (suu, suv), (_, svv) = fit.covariance_px2
-        rows.append(
-            (
-                *fit.centre_px,
-                suu,
-                suv,
-                svv,
-                a,
-                b,
-                angle,
-                fit.chi2_dof,
-                inner,
-                outer,
-                blur,
-                bool(blob.holes),
-                noise.sigma_at(outer),
-            )
-        )
+        place = (*fit.centre_px, suu, suv, svv, *axes_from_shape(fit.shape_px), fit.chi2_dof)
+        levels = (fit.background + fit.contrast, fit.background)
+        rows.append((*place, *levels, blur, is_ring(blob), noise.sigma_at(fit.background)))
     names = "u_px v_px suu_px2 suv_px2 svv_px2 a_px b_px angle_rad chi2_dof inner_level outer_level"
     return pd.DataFrame(rows, columns=[*names.split(), "blur_px", "ring", "noise"])
 
 
-def _rejected_table(rejected: list[tuple[Array, Array, str]]) -> pd.DataFrame:
+def _rejected_table(rejected: list[_Rejection]) -> pd.DataFrame:
     import pandas as pd
 
-    rows = [(*centre, *axes_from_shape(shape), reason) for centre, shape, reason in rejected]
+    rows = [(*r.centre_px, *axes_from_shape(r.shape_px), r.reason) for r in rejected]
     return pd.DataFrame(rows, columns=["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"])

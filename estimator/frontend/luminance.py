@@ -57,11 +57,15 @@ class Window:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit begins: centre (2,) and shape (3,) in image px, edge sigma [px]."""
+    """Where a fit begins: centre (2,) and shape (3,) in image px, edge sigma [px].
+
+    ``previous`` is an earlier fit of the same dot: its levels are then the start too.
+    """
 
     centre_px: Array
     shape_px: Array
     sigma_px: float
+    previous: DotFit | None = None
 
 
 @dataclass(frozen=True)
@@ -88,10 +92,25 @@ class DotFit:
     edge_residual: float
     converged: bool
 
+    @property
+    def contrast(self) -> float:
+        """Contrast [grey] at the dot's centre (negative for a dark dot)."""
+        return float(self.levels[3:] @ self._position)
+
+    @property
+    def background(self) -> float:
+        """Background [grey] carried on under the dot's centre."""
+        return float(self.levels[:3] @ self._position)
+
+    @property
+    def _position(self) -> Array:
+        x, y = (self.centre_px - self.origin_px) / self.radius_px
+        return np.array([1.0, x, y])
+
 
 @dataclass(frozen=True)
 class _Problem:
-    """Pixels of one fit, flattened: coordinates relative to the origin pixel, data, weights."""
+    """Pixels of one fit, flattened: coordinates relative to the origin pixel, and data."""
 
     columns: Array
     rows: Array
@@ -99,26 +118,30 @@ class _Problem:
     x: Array
     y: Array
     grey: Array
+    origin: Array
     radius: float
-
-    def without(self, bad: Mask) -> _Problem:
-        mask = self.mask.copy()
-        mask[self.mask] = ~bad
-        return replace(self, mask=mask, x=self.x[~bad], y=self.y[~bad], grey=self.grey[~bad])
+    noise: NoiseModel
+    prior: GradientPrior
 
 
-def _problem(window: Window, origin: Array, radius: float) -> _Problem:
+def _problem(window: Window, start: Start, noise: NoiseModel, prior: GradientPrior) -> _Problem:
+    origin, radius = np.round(start.centre_px), float(axes_from_shape(start.shape_px)[0])
+    if start.previous is not None:
+        origin, radius = start.previous.origin_px, start.previous.radius_px
     columns = np.arange(window.grey.shape[1]) + window.first_u - origin[0]
     rows = np.arange(window.grey.shape[0]) + window.first_v - origin[1]
-    y_index, x_index = np.nonzero(window.mask)
+    at_row, at_column = np.nonzero(window.mask)
     return _Problem(
         columns,
         rows,
         window.mask,
-        columns[x_index],
-        rows[y_index],
+        columns[at_column],
+        rows[at_row],
         window.grey[window.mask],
+        origin,
         radius,
+        noise,
+        prior,
     )
 
 
@@ -130,8 +153,8 @@ def _coverage(problem: _Problem, theta: Array) -> tuple[Array, Array]:
     return value[problem.mask], gradient[:, problem.mask]
 
 
-def _model(problem: _Problem, theta: Array, levels: Array) -> tuple[Array, Array, Array]:
-    """Grey levels (P,), their derivatives (12, P) by theta and levels, and the coverage (P,)."""
+def _model(problem: _Problem, theta: Array, levels: Array) -> tuple[Array, Array]:
+    """Grey levels (P,) and their derivatives (12, P) by theta and levels."""
     coverage, gradient = _coverage(problem, theta)
     x, y = problem.x / problem.radius, problem.y / problem.radius
     contrast = levels[3] + levels[4] * x + levels[5] * y
@@ -142,7 +165,7 @@ def _model(problem: _Problem, theta: Array, levels: Array) -> tuple[Array, Array
     jacobian[9] = coverage
     np.multiply(coverage, x, out=jacobian[10])
     np.multiply(coverage, y, out=jacobian[11])
-    return grey, jacobian, coverage
+    return grey, jacobian
 
 
 def _prior_rows(prior: GradientPrior, levels: Array, radius: float) -> tuple[Array, Array]:
@@ -174,73 +197,77 @@ def _admissible(theta: Array) -> bool:
 
 
 @dataclass(frozen=True)
-class _Solution:
-    theta: Array
-    levels: Array
-    information: Array
+class _State:
+    """One point of the iteration: parameters (12,), model, Jacobian (12, P), chi-square."""
+
+    parameters: Array
+    model: Array
+    jacobian: Array
     residual: Array
-    variance: Array
-    coverage: Array
+    weight: Array
     chi2: float
-    converged: bool
 
 
-def _solve(
-    problem: _Problem,
-    theta: Array,
-    levels: Array,
-    noise: NoiseModel,
-    prior: GradientPrior,
-    *,
-    iterations: int,
-) -> _Solution:
-    """Levenberg-Marquardt over the 12 parameters; the weights follow the model's grey level."""
-    damping, converged = 1e-3, False
-    best = _evaluate(
-        problem, theta, levels, noise.variance(_model(problem, theta, levels)[0]), prior
-    )
+def _state(problem: _Problem, parameters: Array, weight: Array | None) -> _State:
+    model, jacobian = _model(problem, parameters[:6], parameters[6:])
+    residual = problem.grey - model
+    if weight is None:
+        weight = 1.0 / problem.noise.variance(model)
+    return _State(parameters, model, jacobian, residual, weight, 0.0)
+
+
+def _weighted(problem: _Problem, state: _State, weight: Array) -> _State:
+    """The same point under other pixel weights (0 leaves a pixel out)."""
+    _, gap = _prior_rows(problem.prior, state.parameters[6:], problem.radius)
+    chi2 = float(state.residual @ (weight * state.residual) + gap @ gap)
+    return replace(state, weight=weight, chi2=chi2)
+
+
+def _normal_equations(problem: _Problem, state: _State) -> tuple[Array, Array]:
+    rows, gap = _prior_rows(problem.prior, state.parameters[6:], problem.radius)
+    weighted = state.jacobian * state.weight
+    information = weighted @ state.jacobian.T
+    information[6:, 6:] += rows.T @ rows
+    pull = weighted @ state.residual
+    pull[6:] += rows.T @ gap
+    return information, pull
+
+
+def _damped_step(information: Array, pull: Array, damping: float) -> Array:
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    equilibrated = information / np.outer(scale, scale)
+    equilibrated[np.diag_indices_from(equilibrated)] += damping
+    step: Array = np.linalg.solve(equilibrated, pull / scale) / scale
+    return step
+
+
+def _descend(
+    problem: _Problem, state: _State, *, iterations: int, tolerance: float
+) -> tuple[_State, bool]:
+    """Levenberg-Marquardt at fixed weights, until a step would gain less than ``tolerance``.
+
+    The gain is in chi-square, relative to the chi-square per degree of freedom where that is
+    above 1. The last step is taken without looking again: it is small against the noise.
+    """
+    damping = 1e-4
     for _ in range(iterations):
-        information, pull, solution = best
-        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        equilibrated = information / np.outer(scale, scale)
-        equilibrated[np.diag_indices(12)] += damping
-        step = np.linalg.solve(equilibrated, pull / scale) / scale
-        gain = float(step @ pull)
-        floor = max(1.0, solution.chi2 / max(problem.grey.size - 12, 1))
-        if gain < 1e-3 * floor and damping <= 1e-3:
-            converged = True
-            break
-        moved = np.concatenate([solution.theta, solution.levels]) + step
+        information, pull = _normal_equations(problem, state)
+        step = _damped_step(information, pull, damping)
+        moved = state.parameters + step
+        small = float(step @ pull) < tolerance * max(1.0, state.chi2 / problem.grey.size)
+        if small and damping <= 1e-3 and _admissible(moved[:6]):
+            residual = state.residual - step @ state.jacobian
+            return replace(state, parameters=moved, residual=residual), True
         trial = None
         if _admissible(moved[:6]):
-            trial = _evaluate(problem, moved[:6], moved[6:], solution.variance, prior)
-        if trial is not None and trial[2].chi2 <= solution.chi2 * (1.0 + 1e-12):
-            damping = max(damping / 10.0, 1e-9)
-            best = trial
+            trial = _weighted(problem, _state(problem, moved, state.weight), state.weight)
+        if trial is not None and trial.chi2 <= state.chi2 * (1.0 + 1e-12):
+            damping, state = max(damping / 10.0, 1e-9), trial
         else:
             damping = max(damping, 1e-4) * 10.0
             if damping > 1e8:
                 break
-    return replace(best[2], converged=converged)
-
-
-def _evaluate(
-    problem: _Problem, theta: Array, levels: Array, variance: Array, prior: GradientPrior
-) -> tuple[Array, Array, _Solution]:
-    grey, jacobian, coverage = _model(problem, theta, levels)
-    residual = problem.grey - grey
-    weighted = jacobian / variance
-    rows, gap = _prior_rows(prior, levels, problem.radius)
-    information = weighted @ jacobian.T
-    information[6:, 6:] += rows.T @ rows
-    pull = weighted @ residual
-    pull[6:] += rows.T @ gap
-    chi2 = float(residual @ (residual / variance) + gap @ gap)
-    return (
-        information,
-        pull,
-        _Solution(theta, levels, information, residual, variance, coverage, chi2, False),
-    )
+    return state, False
 
 
 def fit_dot(
@@ -249,65 +276,64 @@ def fit_dot(
     noise: NoiseModel,
     prior: GradientPrior,
     *,
-    levels: Array | None = None,
-    iterations: int = 20,
+    iterations: int = 25,
+    tolerance: float = 0.02,
+    outlier_rounds: int = 3,
 ) -> DotFit:
     """Fit one dot's luminance model to the pixels of ``window``, leaving outliers out.
 
-    Pixels more than 5 sigma off (sigma widened by the fit's own chi-square, so that a rough print
-    edge is kept) are dropped and the fit repeated, as long as they are few. The covariance is
+    Pixels more than 5 sigma off (sigma widened by the fit's own spread, so that a rough print
+    edge is kept) are dropped and the fit goes on, as long as they are few. The covariance is
     widened by chi2_dof where that is significantly above 1.
     """
-    origin = np.round(start.centre_px)
-    radius = float(axes_from_shape(start.shape_px)[0])
-    problem = _problem(window, origin, radius)
-    theta = np.concatenate([start.centre_px - origin, start.shape_px, [start.sigma_px]])
-    first = _first_levels(problem, theta) if levels is None else levels
-    solution = _solve(problem, theta, first, noise, prior, iterations=iterations)
-    dropped = 0
-    for _ in range(3):
-        bad = _outliers(solution)
-        count = int(np.count_nonzero(bad))
-        if count == 0 or count + dropped > _MAX_OUTLIER_SHARE * np.count_nonzero(window.mask):
+    problem = _problem(window, start, noise, prior)
+    theta = np.concatenate([start.centre_px - problem.origin, start.shape_px, [start.sigma_px]])
+    levels = _first_levels(problem, theta) if start.previous is None else start.previous.levels
+    state = _state(problem, np.concatenate([theta, levels]), None)
+    state = _weighted(problem, state, state.weight)
+    state, converged = _descend(problem, state, iterations=iterations, tolerance=tolerance)
+    for _ in range(outlier_rounds):
+        variance = noise.variance(state.model)
+        bad = _outliers(state.residual, variance)
+        if np.mean(bad) > _MAX_OUTLIER_SHARE or np.array_equal(bad, state.weight == 0.0):
             break
-        dropped += count
-        problem = problem.without(bad)
-        solution = _solve(
-            problem, solution.theta, solution.levels, noise, prior, iterations=iterations
-        )
-    return _result(problem, solution, origin, dropped)
+        state = _weighted(problem, state, np.where(bad, 0.0, 1.0 / variance))
+        state, converged = _descend(problem, state, iterations=iterations, tolerance=tolerance)
+    return _result(problem, state, converged)
 
 
-def _outliers(solution: _Solution) -> Mask:
-    whitened = np.abs(solution.residual) / np.sqrt(solution.variance)
-    spread = max(1.0, 1.4826 * float(np.median(whitened)), 0.5 * float(np.quantile(whitened, 0.95)))
-    bad: Mask = whitened > _OUTLIER_SIGMA * spread
+def _outliers(residual: Array, variance: Array) -> Mask:
+    whitened = np.abs(residual) / np.sqrt(variance)
+    middle, high = np.quantile(whitened, [0.5, 0.95])
+    bad: Mask = whitened > _OUTLIER_SIGMA * max(1.0, 1.4826 * middle, 0.51 * high)
     return bad
 
 
-def _result(problem: _Problem, solution: _Solution, origin: Array, dropped: int) -> DotFit:
-    dof = max(problem.grey.size - 12, 1)
-    chi2_dof = float(np.sum(solution.residual**2 / solution.variance)) / dof
-    scale = np.sqrt(np.maximum(np.diag(solution.information), 1e-300))
-    inverse = np.linalg.pinv(solution.information / np.outer(scale, scale), hermitian=True)
+def _result(problem: _Problem, state: _State, converged: bool) -> DotFit:
+    information, _ = _normal_equations(problem, state)
+    used = state.weight > 0.0
+    dof = max(int(np.count_nonzero(used)) - 10, 1)
+    chi2_dof = float(np.sum(state.weight * state.residual**2)) / dof
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
     covariance = inverse / np.outer(scale, scale)
     inflation = chi2_dof if chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / dof) else 1.0
-    theta, contrast = solution.theta, abs(float(solution.levels[3]))
+    theta, contrast = state.parameters[:6], abs(float(state.parameters[9]))
     distance = approximate_distance_px(theta[2:5], problem.x - theta[0], problem.y - theta[1])
-    band = solution.residual[np.abs(distance) < 2.0 * theta[5]]
+    band = state.residual[(np.abs(distance) < 2.0 * theta[5]) & used]
     edge = float(np.sqrt(np.mean(band**2))) / max(contrast, 1e-12) if band.size else np.inf
     return DotFit(
-        theta[:2] + origin,
+        theta[:2] + problem.origin,
         theta[2:5],
         float(theta[5]),
-        solution.levels,
-        origin,
+        state.parameters[6:],
+        problem.origin,
         problem.radius,
         covariance[:2, :2] * inflation,
-        float(np.sqrt(covariance[9, 9])),
+        float(np.sqrt(covariance[9, 9] * inflation)),
         chi2_dof,
-        problem.grey.size,
-        dropped,
+        int(problem.grey.size),
+        int(problem.grey.size - np.count_nonzero(used)),
         edge,
-        solution.converged,
+        converged,
     )

@@ -182,9 +182,11 @@ def solve(
 
 
 def _damped_step(information: Array, gradient: Array, damping: float) -> tuple[Array, float]:
-    scale = 1 / np.sqrt(np.diag(information))
+    diagonal = np.diag(information)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     equilibrated = information * scale[:, None] * scale
-    equilibrated[np.diag_indices_from(equilibrated)] += damping
+    # a variable that no measurement touches (a view left out) stays where it is
+    equilibrated[np.diag_indices_from(equilibrated)] += np.where(diagonal > 0, damping, 1.0)
     scaled = gradient * scale
     step = cho_solve(cho_factor(equilibrated, check_finite=False), scaled, check_finite=False)
     return step * scale, float(0.5 * step @ scaled)

@@ -7,7 +7,7 @@ rotation that fits all views; the global mirror twin is left for the caller to d
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from telerig.rig.pose import nearest_rotation
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
+STRONG_PERSPECTIVE = 0.01
+"""kappa * rho above which the start takes the perspective that the views show."""
 _FLIP = np.array([1.0, 1.0, -1.0])
 _MIRROR = np.outer(_FLIP, _FLIP)
 
@@ -208,8 +210,26 @@ def _assemble(
         baseline = _place_views(views, shifts, second_from_first)
         cameras[1, :3, :3] = second_from_first.T
         cameras[1, :3, 3] = -second_from_first.T @ np.r_[baseline, 0]
-    start = replace(state, intrinsics=intrinsics, rig_from_camera=cameras, rig_from_target=views)
-    return replace(start, dots_mm=dots_mm.copy())
+    start = State(intrinsics, cameras, views, dots_mm.copy())
+    for c, camera in enumerate(problem.cameras):
+        kappa = perspective_from_maps(maps, start, c)
+        if abs(kappa) * camera.rho_mm > STRONG_PERSPECTIVE:
+            intrinsics[c, INDEX["kappa_per_mm"]] = kappa
+    return start
+
+
+def perspective_from_maps(
+    maps: dict[tuple[int, int], ImageMap], state: State, camera: int
+) -> float:
+    """kappa of one camera (1/mm) from how the scale changes over each tilted view."""
+    turn = state.rig_from_camera[camera, :3, :3].T
+    top = bottom = 0.0
+    for (v, c), m in maps.items():
+        if c == camera:
+            depth_slope = (turn @ state.rig_from_target[v, :3, :3])[2, :2]
+            top += float(m.perspective @ depth_slope)
+            bottom += float(depth_slope @ depth_slope)
+    return top / bottom if bottom > 0 else 0.0
 
 
 def _place_views(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.graph import solve
-from telerig.estimator.problem import Problem
+from telerig.estimator.problem import Problem, held_at_nominal
 from telerig.factors.projection import Observations, State, whitened_error, whitened_residuals
 from telerig.rig.pose import rotation_from_rotvec
 
@@ -87,7 +87,8 @@ def climb(problem: Problem, start: State, models: tuple[str, ...] = LADDER) -> l
     rungs = []
     for model in models:
         candidate = problem.with_model(model)
-        solution = solve(candidate, start, max_iterations=40, relative=1e-7)
+        begin = held_at_nominal(candidate, start)
+        solution = solve(candidate, begin, max_iterations=40, relative=1e-7)
         obs = candidate.observations()
         rungs.append(_rung(model, candidate, solution.state, solution.cost, obs))
     return rungs

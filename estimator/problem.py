@@ -186,3 +186,12 @@ def matrix_from_camera(camera: Camera) -> Array:
     pose, out = camera.rig_from_camera, np.eye(4)
     out[:3, :3], out[:3, 3] = pose.rotation, pose.translation_mm
     return out
+
+
+def held_at_nominal(problem: Problem, state: State) -> State:
+    """The state with every intrinsic that is not free put back to its nominal value."""
+    intrinsics = np.array([c.intrinsics for c in problem.cameras])
+    for c in range(len(problem.cameras)):
+        free = problem.free_indices(c)
+        intrinsics[c, free] = state.intrinsics[c, free]
+    return replace(state, intrinsics=intrinsics)

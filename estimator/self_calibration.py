@@ -1,0 +1,204 @@
+"""Self-calibration from a table of dots: start, model, robust fit, twin, covariance, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator import checks, initial, model_choice, numbering, twins
+from telerig.estimator.calibration import Calibration
+from telerig.estimator.covariance import joint_covariance
+from telerig.estimator.graph import Progress, Solution, solve
+from telerig.estimator.initial_unknown import dots_from_images
+from telerig.estimator.measurements import problem_from_dots
+from telerig.estimator.model_choice import Rung
+from telerig.estimator.problem import MODELS, Problem, held_at_nominal
+from telerig.estimator.results import calibration_from_fit
+from telerig.estimator.robust import RobustFit, robust_solve
+from telerig.factors.projection import State
+from telerig.rig.camera import Camera
+from telerig.rig.projection import INDEX
+from telerig.rig.target import Target
+
+Array = NDArray[np.float64]
+
+RICH = "kappa+tangential"
+"""The model that finds outliers and the noise floor before a model is chosen."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Everything that a finished self-calibration knows, before it is put into words."""
+
+    robust: RobustFit
+    twin_cost: float
+    twin_by: str
+    twin_words: str
+    model: str
+    model_words: str
+    rungs: list[Rung]
+    pre: checks.PreCheck
+    notes: tuple[str, ...]
+
+
+def self_calibrate(
+    dots: pd.DataFrame,
+    cameras: Sequence[Camera],
+    target: Target,
+    *,
+    nominal_rotvec_deg: Sequence[float] | None = None,
+    model: str = "auto",
+    dots_free: str = "3d",
+    progress: Progress | None = None,
+    notes: Sequence[str] = (),
+    name: str = "",
+) -> Calibration:
+    """Calibrate one or two cameras from measured dots.
+
+    dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
+    cameras : nominal, the first defines the rig frame.
+    nominal_rotvec_deg : of second_from_first; decides the mirror twin.
+    model : a name of `telerig.estimator.problem.MODELS`, or "auto".
+    dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
+
+    Raises CalibrationError when the views cannot determine a calibration, with the remedy.
+    """
+    if model != "auto" and model not in MODELS:
+        raise CalibrationError(f"unknown model {model!r}", todo=f"known: auto, {', '.join(MODELS)}")
+    nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
+    problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
+    unknown = dots_unknown(problem)
+    start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
+    pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
+    said = [*notes, *pre.notes]
+    if target.symmetry_order() > 1 and len(cameras) == 2:
+        problem, words = numbering.settle(problem, nominal)
+        said += words
+        start_dots = problem.nominal_mm
+    problem = with_plate(problem)
+    start = best_start(problem, start_dots)
+    by, words_twin = "mono", "one camera: its mirror twin has the same pixels and is not decided"
+    if len(cameras) == 2:
+        start, by, words_twin = twins.choose_twin(start, problem, nominal)
+    fit = _fit(problem, start, model, progress)
+    state, by, words_twin = _settled_twin(fit, nominal, by, words_twin)
+    twin_cost = _twin_cost(fit, state)
+    robust = replace(fit.robust, solution=replace(fit.robust.solution, state=state))
+    done = replace(
+        fit, robust=robust, twin_cost=twin_cost, twin_by=by, twin_words=words_twin, pre=pre,
+        notes=tuple(said),
+    )  # fmt: skip
+    joint = joint_covariance(done.robust.problem, done.robust.solution)
+    return calibration_from_fit(done, joint, nominal_rotvec_deg=nominal, name=name)
+
+
+def dots_unknown(problem: Problem) -> bool:
+    """True when the nominal places are too vague to start from: a tenth of the spacing."""
+    spread = np.ptp(problem.nominal_mm[:, :2], axis=0).max()
+    spacing = spread / max(1.0, np.sqrt(len(problem.dot_ids)))
+    return bool(problem.target.print_sigma_mm > 0.1 * spacing)
+
+
+def hold_dots(problem: Problem, dots_free: str) -> Problem:
+    """The problem with its dots free in 3-D, in the plane, or not at all."""
+    held = 1e-6
+    sigma = problem.dot_sigma_mm.copy()
+    if dots_free not in ("3d", "plane", "nominal"):
+        raise CalibrationError(f"unknown choice {dots_free!r}", todo="3d, plane or nominal")
+    if dots_free in ("plane", "nominal"):
+        sigma[:, 2] = held
+    if dots_free == "nominal":
+        sigma[:] = held
+    return replace(problem, dot_sigma_mm=sigma)
+
+
+def with_plate(problem: Problem) -> Problem:
+    """Where a two-sided plate is seen from behind, the side that fits the pixels better."""
+    target = problem.target
+    if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
+        return problem
+    hands = np.zeros((len(problem.views), len(problem.cameras)))
+    for (v, c), sign in _handedness(problem).items():
+        hands[v, c] = sign
+    options = [replace(problem, plate_shift=np.where(hands == h, -hands, 0.0)) for h in (1, -1)]
+    costs = []
+    for option in options:
+        state = best_start(option, option.nominal_mm)
+        both = (state, twins.twin_state(state))
+        costs.append(min(solve(option, s, max_iterations=20).cost for s in both))
+    return options[int(np.argmin(costs))]
+
+
+def _handedness(problem: Problem) -> dict[tuple[int, int], int]:
+    maps = initial.image_maps(problem, problem.nominal_mm)
+    return {k: int(np.sign(np.linalg.det(m.jacobian))) for k, m in maps.items()}
+
+
+def best_start(problem: Problem, dots_mm: Array) -> State:
+    """The closed-form start that a short solve likes best."""
+    if len(problem.cameras) == 1:
+        return initial.mono_state(problem, dots_mm)
+    starts = initial.stereo_states(problem, dots_mm)
+    fits: list[Solution] = []
+    for start in starts:
+        perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)
+        candidate = problem.with_model("kappa" if perspective else "none")
+        fits.append(solve(candidate, start, max_iterations=15, relative=1e-4))
+    return min(fits, key=lambda f: f.cost).state
+
+
+def _fit(problem: Problem, start: State, model: str, progress: Progress | None) -> Any:
+    """Outliers and floor with a rich model, the ladder, then the chosen model to the end."""
+    rungs: list[Rung] = []
+    mono = len(problem.cameras) == 1
+    if model == "auto":
+        rich = "tangential" if mono else RICH
+        first = robust_solve(problem.with_model(rich), start, progress=progress)
+        ladder = model_choice.LADDER if not mono else ("none", "radial", "tangential")
+        rungs = model_choice.climb(first.problem, first.solution.state, ladder)
+        chosen, words = model_choice.choose(rungs)
+        model, start = chosen.model, chosen.state
+        if model.startswith("kappa") and _strong(start, problem):
+            model, more = _with_centre(model)
+            words += more
+    else:
+        words = f"{model}: as asked"
+    final = problem.with_model(model)
+    robust = robust_solve(final, held_at_nominal(final, start), progress=progress)
+    return Fit(robust, np.nan, "", "", model, words, rungs, checks.PreCheck({}, ()), ())
+
+
+def _strong(state: State, problem: Problem) -> bool:
+    strength = np.abs(state.intrinsics[:, INDEX["kappa_per_mm"]]) * np.array(problem.rho_mm)
+    return bool(np.any(strength > twins.ENTOCENTRIC))
+
+
+def _with_centre(model: str) -> tuple[str, str]:
+    freed = f"{'kappa+tangential' if model in ('kappa', 'kappa+radial') else model}+centre"
+    return freed, (
+        "; the perspective is strong, so the image centre (where the axis meets the image) is "
+        "free too, and the inter-camera angle is as uncertain as it makes it"
+    )
+
+
+def _settled_twin(
+    fit: Fit, nominal: Array | None, by: str, words: str
+) -> tuple[State, str, str]:
+    """The final fit may know the sign of kappa that the start did not."""
+    state, problem = fit.robust.solution.state, fit.robust.problem
+    if len(problem.cameras) == 1:
+        return state, by, words
+    return twins.choose_twin(state, problem, nominal)
+
+
+def _twin_cost(fit: Fit, state: State) -> float:
+    if len(fit.robust.problem.cameras) == 1:
+        return fit.robust.solution.cost
+    other = solve(fit.robust.problem, twins.twin_state(state), max_iterations=20)
+    return other.cost

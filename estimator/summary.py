@@ -1,0 +1,49 @@
+"""A calibration in plain words, for the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration import Calibration
+
+
+def summary(calibration: Calibration) -> str:
+    """Verdict first, then residuals, cameras with standard deviations, twin, warnings."""
+    s = calibration.statistics
+    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.get('status', '?')}"]
+    lines += [f"  ! {reason}" for reason in calibration.verdict.get("reasons", [])]
+    lines.append(
+        f"  {s['views']} views, {s['dots_kept']} of {s['dots_measured']} dots kept "
+        f"({s['share_kept']:.1%}), residual {s['rms_px']:.4f} px RMS per coordinate, "
+        f"chi-square {s['chi2_dof']:.2f} per degree of freedom"
+    )
+    if s["noise_floor_px"]:
+        lines.append(
+            f"  the dots scatter by {s['noise_floor_px']:.4f} px beyond their image noise of "
+            f"{s['image_noise_px']:.4f} px (print, compression or lens); it is in every covariance"
+        )
+    lines.append(f"  model {calibration.model['words']}")
+    for camera, free in zip(calibration.cameras, calibration.free):
+        parts = [
+            f"{name} {camera[name]:.6g} +- {calibration.sd(f'{camera.name}.{name}'):.2g}"
+            for name in free
+        ]
+        lines.append(f"  camera {camera.name}: " + ", ".join(parts))
+    if "axes_angle_deg" in s:
+        lines.append(
+            f"  angle between the axes {s['axes_angle_deg']:.4f} +- {s['axes_angle_sd_deg']:.2g} "
+            "degrees"
+        )
+    if "space_sd_um" in s:
+        lines.append(
+            f"  in space: dots {s['space_rms_um']:.2f} um RMS from the fit; a point triangulated "
+            f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um per axis"
+        )
+    t = calibration.twin
+    lines.append(
+        f"  mirror twin: cost {t['cost']:.9g} kept, {t['other_cost']:.9g} for the other; "
+        f"decided by {t['decided_by']}: {t['words']}"
+    )
+    lines += [f"  note: {n}" for n in (*calibration.notes, *calibration.diagnostics["weak"])]
+    return "\n".join(lines)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 
 import numpy as np
 
@@ -16,14 +16,17 @@ FARTHEST = 4095
 GRID_KEYS = ("rows", "columns", "pitch_mm")
 
 
-def target_problems(table: TargetTable) -> list[Problem]:
-    """Every fault that shows only when the keys are taken together."""
-    found = [
-        *(_points_problems(table) if table.layout == "points" else _grid_problems(table)),
-        *_mark_problems(table),
-        *_scale_problems(table),
-        *_plate_problems(table),
-    ]
+def target_problems(table: TargetTable, faulty: Set[str] = frozenset()) -> list[Problem]:
+    """Every fault that shows only when the keys are taken together.
+
+    What depends on a ``faulty`` key, or on one found faulty here, would only repeat that fault
+    and is left out.
+    """
+    layout = _points_problems if table.layout == "points" else _grid_problems
+    found: list[Problem] = []
+    for check in (layout, _mark_problems, _scale_problems, _plate_problems):
+        known = faulty | {problem.key for problem in found}
+        found += [p for p in check(table) if not known & {p.key, *p.involved}]
     return found
 
 
@@ -179,7 +182,7 @@ def _scale_problems(t: TargetTable) -> Iterator[Problem]:
         )
     if t.scale_dots is None:
         return
-    keys = ("rows", "columns", "layout", "extent", "points_mm", "marks", "mark_style")
+    keys = ("rows", "columns", "layout", "extent", "points_mm")
     cells, countable = _scale_cells(t), t.layout == "points" or t.columns is not None
     if cells is None:
         todo = (
@@ -204,6 +207,8 @@ def _scale_problems(t: TargetTable) -> Iterator[Problem]:
                 f"has {given}, which is a missing mark: no dot is there",
                 "choose two dots that are printed",
                 *keys,
+                "marks",
+                "mark_style",
             )
     if cells[0] == cells[1]:
         yield _problem("scale_dots", "names the same dot twice", "name two different dots", *keys)

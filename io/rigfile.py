@@ -206,7 +206,6 @@ def _target(raw: dict[str, Any], problems: list[Problem]) -> Target | None:
     table, found = validate(TargetTable, raw["target"], "target")
     faulty = {key for problem in found for key in (problem.key, *problem.involved)}
     if table is not None:
-        together = target_problems(table)
-        found += [p for p in together if not faulty & {p.key, *p.involved}]
+        found += target_problems(table, faulty)
     problems += found
     return target_from_table(table) if table is not None and not found else None

@@ -172,7 +172,7 @@ def _cell_coverage(nodes: Array, size: NDArray[np.int64], radius_mm: float) -> A
     distance = np.sqrt(square[band])
     outward = np.stack([x[band], y[band]], -1) / np.maximum(distance, 1e-12)[:, None]
     coverage[band] = _half_plane_share(radius_mm - distance, outward @ jacobian)
-    return coverage
+    return np.asarray(coverage)
 
 
 def _mean_jacobian(x: Array, y: Array) -> Array:

@@ -127,6 +127,10 @@ def _cells(file: Path) -> tuple[list[str], list[Sequence[str]], list[int]]:
     if not numbers:
         raise InputError("is empty", where=str(file), todo=_EXPORT)
     lines = [lines[i - 1] for i in numbers]
+    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
+        if mark in lines[0] and "," not in lines[0]:
+            what = f"the columns are separated by {word}"
+            raise InputError(what, where=f"{file} row {numbers[0]}", todo=_EXPORT)
     if '"' in text:
         rows = [next(csv.reader([line]), []) for line in lines]
         counts = [len(row) for row in rows]
@@ -167,9 +171,6 @@ def _decoded(file: Path) -> str:
 
 def _check_header(header: list[str], columns: Sequence[Column], extra: bool, file: Path) -> None:
     where, known = f"{file} row 1", [column.name for column in columns]
-    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
-        if len(header) == 1 and mark in header[0]:
-            raise InputError(f"the columns are separated by {word}", where=where, todo=_EXPORT)
     for name in header:
         if header.count(name) > 1:
             raise InputError(f"the column {name!r} stands twice", where=where, todo="remove one")

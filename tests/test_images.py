@@ -180,6 +180,17 @@ def test_a_tail_of_zeros_is_a_truncated_file_too(suffix: str, tmp_path: Path) ->
     assert "truncated or damaged" in error_of(file)
 
 
+def test_a_tiff_whose_last_strips_were_never_written(tmp_path: Path) -> None:
+    """tifffile fills strips of no bytes with zeros and says nothing."""
+    file = tmp_path / "a.tif"
+    tifffile.imwrite(file, GREY12, rowsperstrip=16, compression="zlib")
+    with tifffile.TiffFile(file, mode="r+b") as tiff:
+        counts = tiff.pages[0].databytecounts
+        tiff.pages[0].tags["StripByteCounts"].overwrite([*counts[:-1], 0])
+    assert tifffile.imread(file)[-1].max() == 0
+    assert "truncated or damaged" in error_of(file)
+
+
 def test_a_flipped_bit_in_a_png_is_found(tmp_path: Path) -> None:
     file = tmp_path / "a.png"
     data = bytearray(written(".png", file))
@@ -274,6 +285,11 @@ def test_effective_bits_of_8_bit_data() -> None:
     stretched = GREY8.astype(np.uint16) * 257
     assert (effective_bits(stretched), full_scale(stretched)) == (8, 65535)
     assert effective_bits(np.zeros((4, 4), np.uint16)) == 16
+
+
+def test_few_grey_levels_do_not_look_left_justified() -> None:
+    levels = np.array([[0, 1024], [2048, 3072]], np.uint16)
+    assert (effective_bits(levels), full_scale(levels)) == (12, 4095)
 
 
 def test_natural_order() -> None:

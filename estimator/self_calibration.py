@@ -14,6 +14,7 @@ from telerig.errors import CalibrationError
 from telerig.estimator import checks, initial, model_choice, numbering, twins
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import joint_covariance
+from telerig.estimator.eccentricity import eccentricity_px
 from telerig.estimator.graph import Progress, Solution, solve
 from telerig.estimator.initial_unknown import dots_from_images
 from telerig.estimator.measurements import problem_from_dots
@@ -170,7 +171,13 @@ def _fit(problem: Problem, start: State, model: str, progress: Progress | None) 
     else:
         words = f"{model}: as asked"
     final = problem.with_model(model)
-    robust = robust_solve(final, held_at_nominal(final, start), progress=progress)
+    start = held_at_nominal(final, start)
+    begin = solve(final, start, max_iterations=15, relative=1e-5).state if rungs else start
+    if not rungs:
+        begin = robust_solve(final, start).solution.state
+    shift = eccentricity_px(final, begin)
+    final = replace(final, uv_px=final.uv_px - shift)
+    robust = robust_solve(final, begin, progress=progress)
     return Fit(robust, np.nan, "", "", model, words, rungs, checks.PreCheck({}, ()), ())
 
 

@@ -8,6 +8,8 @@ of M are the semi-axes. The point spread (Gaussian blur and square pixel) is a G
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
@@ -91,7 +93,8 @@ def coverage_on_grid(
     """
     centre, shape = np.asarray(centre_px, dtype=np.float64), np.asarray(shape_px, dtype=np.float64)
     sigma = np.asarray(sigma_px, dtype=np.float64)
-    count = quadrature_nodes(float(np.max(axes_from_shape(shape)[..., 0])), float(np.min(sigma)))
+    longest = float(np.max(axes_from_shape(shape)[..., 0]))
+    count = quadrature_nodes(longest, float(np.min(sigma)))
     t = 2.0 * np.pi / count * np.arange(count)
     c, s = np.cos(t), np.sin(t)
     m11, m12, m22 = (shape[..., i, None] for i in range(3))
@@ -121,7 +124,7 @@ def _transpose(x: Array) -> Array:
 
 
 def foot_points(
-    shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 3
+    shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 2
 ) -> tuple[Array, Array]:
     """Nearest points of an ellipse: (cos t, sin t) with foot = M (cos t, sin t), each (P,).
 
@@ -188,7 +191,14 @@ def coverage_near_edge(
     return coverage, gradient
 
 
+def semi_axes(shape_px: Array) -> tuple[float, float]:
+    """Semi-axes (a, b) [px] of one ellipse, as plain numbers."""
+    m11, m12, m22 = shape_px.tolist()
+    mean, half = 0.5 * (m11 + m22), math.hypot(0.5 * (m11 - m22), m12)
+    return mean + half, mean - half
+
+
 def largest_curvature(shape_px: Array) -> float:
-    """The ellipse's largest curvature a / b^2 [1/px]."""
-    a, b, _ = axes_from_shape(shape_px)
-    return float(a / b**2)
+    """One ellipse's largest curvature a / b^2 [1/px]."""
+    a, b = semi_axes(shape_px)
+    return a / (b * b)

@@ -30,6 +30,8 @@ _BLOCK = 4
 _COARSE_WINDOW = 5
 _STRONG_SHARE = 0.15
 _STRONG_SIGMA = 7.0
+_FLAT_DISTANCES_PX = (6, 5, 4, 3, 2)
+_FLAT_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -80,20 +82,39 @@ def edge_map(image: Grey, sigma: float) -> EdgeMap:
     padded = np.pad(smooth, ((0, -rows % _BLOCK), (0, -columns % _BLOCK)), mode="edge")
     square = np.ones((_BLOCK, _BLOCK), np.uint8)
     anchor = (0, 0)
-    high = cv2.dilate(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
-    low = cv2.erode(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
-    fine_span = high - low
+    fine_high = cv2.dilate(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
+    fine_low = cv2.erode(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
     window = np.ones((_COARSE_WINDOW, _COARSE_WINDOW), np.uint8)
-    high, low = cv2.dilate(high, window), cv2.erode(low, window)
+    high, low = cv2.dilate(fine_high, window), cv2.erode(fine_low, window)
     span = high - low
     strong_span = max(_STRONG_SHARE * float(np.quantile(span, 0.995)), _STRONG_SIGMA * sigma)
     strong = span > strong_span
-    weight = np.where(strong, span, 0.0).astype(np.float32) ** 2 * (fine_span + 1e-6)
+    weight = np.where(strong, span, 0.0).astype(np.float32) ** 2 * (fine_high - fine_low + 1e-6)
     middle = _spread(0.5 * (high + low), weight)
     size = (padded.shape[1], padded.shape[0])
     threshold = cv2.resize(middle, size, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
-    flat = cv2.resize((~strong).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    return EdgeMap(smooth, threshold, flat[:rows, :columns] > 0, bool(np.any(strong)))
+    flat = _away_from(smooth > threshold)
+    return EdgeMap(smooth, threshold, flat, bool(np.any(strong)))
+
+
+def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels far from any crossing of the threshold, as far as leaves enough of them.
+
+    Chosen by place alone: choosing quiet pixels would bias the noise that they are to tell.
+    """
+    import cv2
+
+    grey = bright.astype(np.uint8)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
+    flat = crossing == 0
+    for distance in _FLAT_DISTANCES_PX:
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * distance + 1, 2 * distance + 1))
+        flat = cv2.dilate(crossing, disc) == 0
+        flat[[0, -1]] = flat[:, [0, -1]] = False
+        if np.count_nonzero(flat) > _FLAT_SHARE * flat.size:
+            break
+    return flat
 
 
 def _spread(values: Grey, weight: Grey) -> Grey:

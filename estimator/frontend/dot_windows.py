@@ -23,12 +23,18 @@ _EDGE_SIGMA = 2.7
 
 
 def dot_window(
-    grey: NDArray[np.float32], labels: NDArray[np.int32], blob: Candidate, start: Start
+    grey: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    blob: Candidate,
+    start: Start,
+    *,
+    coarse: bool = False,
 ) -> Window:
     """Crop and mask round one dot: its edge, what is inside, background as far as it is free.
 
     Pixels nearer to another blob than to this dot, or near a hole in it, are left out. Of a large
-    dot, only the surroundings of its edge count, and one in four of those beyond its blur.
+    dot, only the surroundings of its edge count, and one in four of those beyond its blur
+    (``coarse``: one in four everywhere, for a first look).
     """
     a, b, _ = axes_from_shape(start.shape_px)
     reach = 4.0 * start.sigma_px + 2.0
@@ -49,9 +55,9 @@ def dot_window(
     if blob.holes:
         mask &= _distance_to(_holes(blob, low, mask.shape)) > clear + 0.5
     if np.count_nonzero(mask) > _THIN_ABOVE_PIXELS:
-        far = np.abs(distance) > _EDGE_SIGMA * start.sigma_px
-        far[::2, ::2] = False
-        mask &= ~far
+        thin = np.abs(distance) > (0.0 if coarse else _EDGE_SIGMA * start.sigma_px)
+        thin[::2, ::2] = False
+        mask &= ~thin
     return Window(grey[crop].astype(np.float64), int(low[0]), int(low[1]), mask)
 
 

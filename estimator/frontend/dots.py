@@ -37,6 +37,7 @@ from telerig.estimator.frontend.dot_windows import (
 from telerig.estimator.frontend.luminance import DotFit, GradientPrior, Start, fit_dot
 from telerig.estimator.frontend.noise import (
     NoiseModel,
+    agreed_factor,
     estimate_noise,
     grey_step,
     high_pass,
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _FIRST_SIGMA_PX = 1.0
+_ROUGH_PIXELS = 500_000
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,7 @@ def _rough_noise(grey: NDArray[np.float32]) -> float:
     response = high_pass(grey)
     rows, columns = (n // 8 * 8 for n in response.shape)
     tiles = response[:rows, :columns].reshape(rows // 8, 8, columns // 8, 8)
+    tiles = tiles[:: max(1, response.size // _ROUGH_PIXELS)]
     spread = np.sqrt(np.mean(tiles**2, axis=(1, 3)))
     quiet = spread[spread <= np.quantile(spread, 0.2)]
     return float(np.mean(quiet))
@@ -165,6 +168,10 @@ def _measure(grey: NDArray[np.float32], found: Candidates, noise: NoiseModel) ->
             blobs.append(blob)
     fits = _first_pass(grey, found, blobs, noise)
     fits = _second_pass(grey, found, blobs, fits, noise)
+    factor = agreed_factor(
+        noise, np.array([fit.chi2_dof for fit in fits]), np.array([fit.dof for fit in fits])
+    )
+    fits, noise = [fit.under_noise(factor) for fit in fits], noise.scaled(factor)
     usual_contrast = float(np.median([abs(fit.contrast) for fit in fits])) if fits else 0.0
     accepted: list[tuple[Candidate, DotFit]] = []
     for blob, fit in zip(blobs, fits):
@@ -186,7 +193,7 @@ def _first_pass(
     sigma = _FIRST_SIGMA_PX
     for blob in blobs:
         start = Start(blob.centre_px, blob.shape_px, sigma)
-        window = dot_window(grey, found.labels, blob, start)
+        window = dot_window(grey, found.labels, blob, start, coarse=True)
         fits.append(fit_dot(window, start, noise, GradientPrior(), tolerance=0.3, outlier_rounds=1))
         sigma = float(np.median([fit.sigma_px for fit in fits[-9:]]))
     return fits
@@ -219,7 +226,7 @@ def _dots_table(accepted: list[tuple[Candidate, DotFit]], noise: NoiseModel) -> 
     rows = []
     for blob, fit in accepted:
         blur = float(np.sqrt(max(fit.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0)))
-        (suu, suv), (_, svv) = fit.covariance_px2
+        (suu, suv), (_, svv) = fit.inflated_covariance_px2
         place = (*fit.centre_px, suu, suv, svv, *axes_from_shape(fit.shape_px), fit.chi2_dof)
         levels = (fit.background + fit.contrast, fit.background)
         rows.append((*place, *levels, blur, is_ring(blob), noise.sigma_at(fit.background)))

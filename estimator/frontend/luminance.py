@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from telerig.estimator.frontend.blurred_ellipse import (
     approximate_distance_px,
-    axes_from_shape,
     coverage_near_edge,
     coverage_on_grid,
     largest_curvature,
+    semi_axes,
 )
 from telerig.estimator.frontend.noise import NoiseModel
 
@@ -27,6 +27,7 @@ Mask = NDArray[np.bool_]
 EDGE_EXPANSION_LIMIT = 0.08
 _MIN_SIGMA_PX = 0.3
 _MIN_SEMI_AXIS_PX = 0.6
+_PARAMETERS = 10  # the contrast gradient's two are held by their prior
 _OUTLIER_SIGMA = 5.0
 _MAX_OUTLIER_SHARE = 0.15
 
@@ -93,6 +94,25 @@ class DotFit:
     converged: bool
 
     @property
+    def dof(self) -> int:
+        return max(self.pixels - self.dropped - _PARAMETERS, 1)
+
+    @property
+    def inflated_covariance_px2(self) -> Array:
+        """The centre's covariance (2, 2), times chi2_dof where that is significantly above 1."""
+        significant = self.chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / self.dof)
+        return self.covariance_px2 * (self.chi2_dof if significant else 1.0)
+
+    def under_noise(self, factor: float) -> DotFit:
+        """The same fit judged by a noise variance ``factor`` times as large."""
+        return replace(
+            self,
+            covariance_px2=self.covariance_px2 * factor,
+            contrast_sigma=self.contrast_sigma * np.sqrt(factor),
+            chi2_dof=self.chi2_dof / factor,
+        )
+
+    @property
     def contrast(self) -> float:
         """Contrast [grey] at the dot's centre (negative for a dark dot)."""
         return float(self.levels[3:] @ self._position)
@@ -125,7 +145,7 @@ class _Problem:
 
 
 def _problem(window: Window, start: Start, noise: NoiseModel, prior: GradientPrior) -> _Problem:
-    origin, radius = np.round(start.centre_px), float(axes_from_shape(start.shape_px)[0])
+    origin, radius = np.round(start.centre_px), semi_axes(start.shape_px)[0]
     if start.previous is not None:
         origin, radius = start.previous.origin_px, start.previous.radius_px
     columns = np.arange(window.grey.shape[1]) + window.first_u - origin[0]
@@ -192,7 +212,7 @@ def _first_levels(problem: _Problem, theta: Array) -> Array:
 
 
 def _admissible(theta: Array) -> bool:
-    a, b, _ = axes_from_shape(theta[2:5])
+    a, b = semi_axes(theta[2:5])
     return bool(b > _MIN_SEMI_AXIS_PX and _MIN_SIGMA_PX <= theta[5] <= 1.5 * a + 1.0)
 
 
@@ -283,8 +303,7 @@ def fit_dot(
     """Fit one dot's luminance model to the pixels of ``window``, leaving outliers out.
 
     Pixels more than 5 sigma off (sigma widened by the fit's own spread, so that a rough print
-    edge is kept) are dropped and the fit goes on, as long as they are few. The covariance is
-    widened by chi2_dof where that is significantly above 1.
+    edge is kept) are dropped and the fit goes on, as long as they are few.
     """
     problem = _problem(window, start, noise, prior)
     theta = np.concatenate([start.centre_px - problem.origin, start.shape_px, [start.sigma_px]])
@@ -312,12 +331,12 @@ def _outliers(residual: Array, variance: Array) -> Mask:
 def _result(problem: _Problem, state: _State, converged: bool) -> DotFit:
     information, _ = _normal_equations(problem, state)
     used = state.weight > 0.0
-    dof = max(int(np.count_nonzero(used)) - 10, 1)
+    dropped = int(problem.grey.size - np.count_nonzero(used))
+    dof = max(int(np.count_nonzero(used)) - _PARAMETERS, 1)
     chi2_dof = float(np.sum(state.weight * state.residual**2)) / dof
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
     covariance = inverse / np.outer(scale, scale)
-    inflation = chi2_dof if chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / dof) else 1.0
     theta, contrast = state.parameters[:6], abs(float(state.parameters[9]))
     distance = approximate_distance_px(theta[2:5], problem.x - theta[0], problem.y - theta[1])
     band = state.residual[(np.abs(distance) < 2.0 * theta[5]) & used]
@@ -329,11 +348,11 @@ def _result(problem: _Problem, state: _State, converged: bool) -> DotFit:
         state.parameters[6:],
         problem.origin,
         problem.radius,
-        covariance[:2, :2] * inflation,
-        float(np.sqrt(covariance[9, 9] * inflation)),
+        covariance[:2, :2],
+        float(np.sqrt(covariance[9, 9])),
         chi2_dof,
         int(problem.grey.size),
-        int(problem.grey.size - np.count_nonzero(used)),
+        dropped,
         edge,
         converged,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,21 @@ Array = NDArray[np.float64]
 _PLANE_KILLER = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
 _CLIP = 3.0
 _CLIPPED_VARIANCE = 0.973337  # variance of a unit normal cut at +-3 sigma
+_CORRELATED = 3.8  # sum of the filter's squared autocorrelation: neighbours share pixels
 _MAX_SAMPLES = 400_000
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of a pixel's grey level: ``alpha + beta * level``, at least that of rounding."""
+    """Variance of a pixel's grey level: ``alpha + beta * level``, at least that of rounding.
+
+    ``step`` between grey levels; ``relative_error`` of the variance.
+    """
 
     alpha: float
     beta: float
     step: float
+    relative_error: float
 
     def variance(self, level: Array) -> Array:
         """Variance [grey^2] at the given grey levels."""
@@ -32,6 +37,27 @@ class NoiseModel:
     def sigma_at(self, level: float) -> float:
         """Standard deviation [grey] at one grey level."""
         return float(np.sqrt(self.variance(np.asarray(level))))
+
+    def scaled(self, factor: float) -> NoiseModel:
+        """The same model with every variance times ``factor``."""
+        return replace(self, alpha=self.alpha * factor, beta=self.beta * factor)
+
+
+def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
+    """What the dots' own residuals, chi2_dof (N,) with dof (N,), add to the noise variance.
+
+    Where edges crowd, few flat pixels tell the noise but the fits' residuals do. Their median
+    joins the estimate by inverse variance if it agrees with it to 3 sigma; if it does not,
+    the excess is misfit rather than noise and the factor is 1.
+    """
+    if chi2_dof.size == 0:
+        return 1.0
+    own = noise.relative_error**2
+    error = 1.25**2 * 2.0 / (float(np.mean(dof)) * chi2_dof.size)
+    excess = float(np.median(chi2_dof)) - 1.0
+    if excess**2 > 9.0 * (own + error):
+        return 1.0
+    return 1.0 + excess * own / (own + error)
 
 
 def grey_step(image: NDArray[np.generic]) -> float:
@@ -72,33 +98,41 @@ def estimate_noise(
 ) -> NoiseModel:
     """Noise of ``image`` (rows, columns) over the pixels marked ``flat``, which show no edges.
 
-    Levels are grouped in ``bins`` of equal population; the line through their clipped variances
-    is weighted by their accuracy and kept from falling below zero at either end.
+    Pixels are grouped by the level of their surroundings (their own would pick the noise); the
+    clipped variances of the groups make a line if they differ with significance.
     """
-    response, level = high_pass(image)[flat], image[flat]
-    if response.size > _MAX_SAMPLES:
-        stride = response.size // _MAX_SAMPLES + 1
-        response, level = response[::stride], level[::stride]
-    if response.size < 32:
-        response, level = high_pass(image).ravel(), image.ravel()
-    edges = np.unique(np.quantile(level, np.linspace(0.0, 1.0, bins + 1)))
-    index = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(edges.size - 2, 0))
-    groups = [index == k for k in range(max(edges.size - 1, 1))]
+    import cv2
+
+    response, level = high_pass(image), cv2.blur(image, (5, 5))
+    if np.count_nonzero(flat) >= 64:
+        response, level = response[flat], level[flat]
+    stride = response.size // _MAX_SAMPLES + 1
+    response, level = response.ravel()[::stride], level.ravel()[::stride]
+    low, high = np.quantile(level, [0.002, 0.998])
+    width = max((high - low) / bins, 6.0 * clipped_sigma(response.astype(np.float64)), 1e-12)
+    index = np.clip((level - low) / width, 0, bins - 1).astype(int)
+    groups = [index == k for k in range(bins)]
     groups = [group for group in groups if np.count_nonzero(group) >= 200]
     if not groups:
         groups = [np.ones(level.shape, dtype=np.bool_)]
     variances = np.array([clipped_sigma(response[g].astype(np.float64)) ** 2 for g in groups])
     levels = np.array([float(np.mean(level[g])) for g in groups])
-    return _line(levels, np.maximum(variances, step**2 / 12.0), step)
+    counts = np.array([np.count_nonzero(g) for g in groups])
+    return _line(levels, np.maximum(variances, step**2 / 12.0), counts, step)
 
 
-def _line(levels: Array, variances: Array, step: float) -> NoiseModel:
-    mean = float(np.mean(variances))
+def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float) -> NoiseModel:
+    """Line through variances against level; flat unless the slope stands out of its own error."""
+    relative = np.sqrt(2.0 * _CORRELATED / counts)
+    total = float(np.sqrt(2.0 * _CORRELATED / np.sum(counts)))
+    mean = float(np.average(variances, weights=counts))
+    level_free = NoiseModel(mean, 0.0, step, total)
     if levels.size < 3 or float(np.ptp(levels)) <= 4.0 * np.sqrt(mean):
-        return NoiseModel(mean, 0.0, step)
-    relative = 1.0 / np.maximum(variances, 0.05 * mean)
-    design = np.stack([np.ones_like(levels), levels], axis=1) * relative[:, None]
-    alpha, beta = np.linalg.lstsq(design, variances * relative, rcond=None)[0]
-    if beta <= 0.0 or alpha + beta * levels.min() < 0.2 * variances.min():
-        return NoiseModel(float(np.average(variances, weights=relative)), 0.0, step)
-    return NoiseModel(float(alpha), float(beta), step)
+        return level_free
+    precision = 1.0 / ((relative + 0.01) * np.maximum(variances, 0.05 * mean))
+    design = np.stack([np.ones_like(levels), levels], axis=1) * precision[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    alpha, beta = covariance @ (design.T @ (variances * precision))
+    if beta <= 4.0 * np.sqrt(covariance[1, 1]) or alpha + beta * levels.min() <= 0.0:
+        return level_free
+    return NoiseModel(float(alpha), float(beta), step, total)

@@ -20,6 +20,7 @@ from telerig.estimator.frontend.local_fit import (
     fit_homography,
     fit_neighbours,
     leave_one_out,
+    nearest,
 )
 
 from telerig.errors import DetectionError
@@ -72,6 +73,7 @@ def circle_from_ellipses(shapes_px2: ArrayLike) -> Array:
     The median is taken over the logarithms of the shapes, so that neither dirt nor marks matter.
     """
     values, vectors = np.linalg.eigh(np.asarray(shapes_px2, float))
+    values = np.maximum(values, 1e-6)
     logs = np.einsum("nij,nj,nkj->nik", vectors, np.log(values), vectors)
     values, vectors = np.linalg.eigh(np.median(logs, axis=0))
     return np.asarray((vectors * np.exp(-0.5 * values)) @ vectors.T)
@@ -94,17 +96,18 @@ def grow_lattice(
             todo=f"at least {MIN_DOTS} dots of the target must be whole and sharp",
         )
     circle = circle_from_ellipses(shapes)
+    back = np.asarray(np.linalg.inv(circle), float)
     flat = points @ circle.T
     best = _best_growth(flat, pitch_ratio)
     if best is not None:
-        _drop_false_dots(best, np.linalg.inv(circle), floor_px)
+        _drop_false_dots(best, back, floor_px)
     if best is None or best.placed().sum() < MIN_DOTS:
         found = 0 if best is None else int(best.placed().sum())
         raise DetectionError(
             f"of {len(points)} dots only {found} lie on a grid with the target's pitch ratio",
             todo="check [target] pitch_mm and polarity, and that the target is sharp and in view",
         )
-    return _lattice(best, np.linalg.inv(circle), shapes)
+    return _lattice(best, back, shapes)
 
 
 def _best_growth(flat: Array, pitch_ratio: float) -> _Growth | None:
@@ -139,7 +142,7 @@ def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
     """(K, 2) steps between near dots, each up to sign, and how often each occurs (K,)."""
     middle = np.median(flat, axis=0)
     patch = np.argsort(np.sum((flat - middle) ** 2, axis=1))[:_PATCH]
-    _, near = cKDTree(flat).query(flat[patch], neighbours + 1)
+    _, near = nearest(cKDTree(flat), flat[patch], neighbours + 1)
     steps = (flat[near[:, 1:]] - flat[patch][:, None]).reshape(-1, 2)
     steps = np.concatenate([steps, -steps])
     reach = 0.15 * np.linalg.norm(steps, axis=1)
@@ -161,7 +164,7 @@ def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
 def _seeds(flat: Array, basis: Array) -> Iterator[int]:
     """Dots with good neighbours on all sides, best first and well apart."""
     steps = np.concatenate([basis, -basis])
-    miss, _ = cKDTree(flat).query((flat[:, None] + steps).reshape(-1, 2))
+    miss, _ = nearest(cKDTree(flat), (flat[:, None] + steps).reshape(-1, 2))
     pitch = np.linalg.norm(steps, axis=1)
     part = np.minimum(miss.reshape(-1, 4) / pitch, 1.0)
     order = np.argsort(np.sum(part, axis=1), kind="stable")
@@ -185,7 +188,7 @@ class _Growth:
         self._put(np.array([seed]), np.array([[self.half, self.half]]))
 
     def placed(self) -> NDArray[np.bool_]:
-        return self.place[:, 0] >= 0
+        return np.asarray(self.place[:, 0] >= 0)
 
     def score(self, pitch_ratio: float) -> float:
         """Dots on the grid, less when they leave many places empty or it is not upright."""
@@ -218,10 +221,10 @@ class _Growth:
         wanted = wanted[np.all((wanted > 2) & (wanted < 2 * self.half - 2), axis=1)]
         wanted = wanted[self.at[tuple(wanted.T)] < 0]
         if not len(wanted):
-            return wanted
+            return np.asarray(wanted)
         expected, basis, _ = fit_neighbours(self.at, self.flat, wanted, self.basis)
         reach = _REACH * np.linalg.norm(basis, axis=2).min(axis=1)
-        miss, dot = self.tree.query(expected, 2)
+        miss, dot = nearest(self.tree, expected, 2)
         free = ~self.placed()[dot] & ~self.banned[dot]
         pick = np.where(free[:, 0], 0, 1)
         rows = np.arange(len(dot))
@@ -232,7 +235,7 @@ class _Growth:
         good = good[first]
         self.basis[dot[good]] = basis[good]
         self._put(dot[good], wanted[good])
-        return wanted[good]
+        return np.asarray(wanted[good])
 
     def _put(self, dots: Ints, places: Ints) -> None:
         self.at[tuple(places.T)] = dots
@@ -273,8 +276,8 @@ def _lattice(growth: _Growth, image_from_flat: Array, shapes_px2: Array) -> Latt
     shape = pitch_from_px @ shapes_px2[index] @ np.swapaxes(pitch_from_px, -1, -2)
     unplaced = np.flatnonzero(~growth.placed())
     reach = np.linalg.norm(basis, axis=2).min(axis=1)
-    miss, nearest = cKDTree(growth.flat[index]).query(growth.flat[unplaced])
-    second = miss < _REACH * reach[nearest]
+    miss, next_to = nearest(cKDTree(growth.flat[index]), growth.flat[unplaced])
+    second = miss < _REACH * reach[next_to]
     reasons = np.where(second, SECOND_DOT, NOT_ON_GRID)
     reasons = np.where(growth.banned[unplaced] & ~second, OFF_PLACE, reasons)
     return Lattice(

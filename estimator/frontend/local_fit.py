@@ -1,9 +1,10 @@
-"""Affine fits to the neighbours of a lattice place, and homographies, in plain NumPy."""
+"""Affine fits to the neighbours of a lattice place, homographies, nearest points."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -50,6 +51,12 @@ def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
     expected, _, spread = fit_neighbours(at, residuals, places, flat)
     own = residuals[at[tuple(places.T)]]
     return np.asarray(np.linalg.norm(own - expected, axis=1) / np.sqrt(1 + spread))
+
+
+def nearest(tree: cKDTree, points: Array, count: int = 1) -> tuple[Array, Ints]:
+    """Distances and positions of the ``count`` nearest; (...,) for one, (..., count) for more."""
+    distance, index = tree.query(points, count)
+    return np.asarray(distance, float), np.asarray(index, np.int64)
 
 
 def fit_homography(source: ArrayLike, target: ArrayLike) -> Array:

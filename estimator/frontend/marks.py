@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
 from telerig.estimator.frontend.lattice import Lattice
 from telerig.rig.target import Target
 
@@ -56,7 +55,7 @@ class MarkEvidence:
         """(...,) whether each of the (..., 2) places looks like a mark."""
         if not len(self.seen):
             return np.zeros(places.shape[:-1], bool)
-        return np.any(np.all(places[..., None, :] == self.seen, axis=-1), axis=-1)
+        return np.asarray(np.any(np.all(places[..., None, :] == self.seen, axis=-1), axis=-1))
 
 
 def relative_diameter(lattice: Lattice) -> Array:

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-
-from telerig.errors import DetectionError
 from telerig.estimator.frontend.candidates import (
     MAX_TIED,
     Candidates,
@@ -27,6 +25,8 @@ from telerig.estimator.frontend.lattice import MIN_DOTS, Lattice, grow_lattice, 
 from telerig.estimator.frontend.marks import MarkEvidence, mark_evidence
 from telerig.estimator.frontend.point_layout import match_points
 from telerig.rig.target import Target
+
+from telerig.errors import DetectionError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,14 +9,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations, permutations
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
+from telerig.estimator.frontend.lattice import MIN_DOTS, circle_from_ellipses
+from telerig.estimator.frontend.local_fit import (
+    apply_homography,
+    fit_affine,
+    fit_homography,
+    nearest,
+)
 
 from telerig.errors import DetectionError
-from telerig.estimator.frontend.lattice import MIN_DOTS, circle_from_ellipses
-from telerig.estimator.frontend.local_fit import apply_homography, fit_affine, fit_homography
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -85,7 +91,7 @@ def match_points(
 def _triangles(points: Array) -> Ints:
     """(T, 3) triangles of each point and two of its near ones, without slivers or repeats."""
     count = min(_NEAR, len(points) - 1)
-    _, near = cKDTree(points).query(points, count + 1)
+    _, near = nearest(cKDTree(points), points, count + 1)
     pairs = np.array(list(combinations(range(1, count + 1), 2)))
     corners = np.concatenate(
         [np.repeat(near[:, :1, None], len(pairs), 1), near[:, pairs]], axis=2
@@ -119,7 +125,7 @@ def _proposals(flat: Array, wanted: Array, handedness: tuple[int, ...]) -> list[
         return []
     theirs = np.concatenate([theirs[:, list(order)] for order in permutations(range(3))])
     tree = cKDTree(_signature(_sides(wanted, theirs)))
-    near = tree.query_ball_point(_signature(_sides(flat, ours)), 0.12)
+    near: Any = tree.query_ball_point(_signature(_sides(flat, ours)), 0.12)
     mine = np.repeat(np.arange(len(ours)), [len(n) for n in near])
     other = np.concatenate([np.asarray(n, np.int64) for n in near])
     if not len(mine):
@@ -128,9 +134,9 @@ def _proposals(flat: Array, wanted: Array, handedness: tuple[int, ...]) -> list[
     right = np.isin(np.sign(np.linalg.det(affine[:, :2, :2])), handedness)
     affine, corner = affine[right], theirs[other][right][:, 0]
     count = min(_LOCAL, len(wanted))
-    _, around = cKDTree(wanted).query(wanted, count)
+    _, around = nearest(cKDTree(wanted), wanted, count)
     expected = apply_homography(affine, wanted[around[corner]])
-    miss, _ = cKDTree(flat).query(expected)
+    miss, _ = nearest(cKDTree(flat), expected)
     hits = np.sum(miss < 0.25 * _spacing(flat), axis=1)
     top = np.argsort(-hits, kind="stable")[: 40 * _REFINED]
     return _spread_out(affine[top], corner[top], wanted)
@@ -187,8 +193,8 @@ def _extend(flat: Array, wanted: Array, start: Array, middle: int) -> tuple[Ints
 
 
 def _mutual(tree: cKDTree, flat: Array, expected: Array, reach: float) -> tuple[Ints, Ints]:
-    miss, dot = tree.query(expected)
-    _, back = cKDTree(expected).query(flat)
+    miss, dot = nearest(tree, expected)
+    _, back = nearest(cKDTree(expected), flat)
     good = np.flatnonzero((miss < reach) & (back[dot] == np.arange(len(expected))))
     return dot[good], good
 
@@ -225,7 +231,8 @@ def _fit(source: Array, target: Array) -> _Model:
     residual = target - apply_homography(homography, source)
     design = _monomials((source - centre) / scale)
     normal = design.T @ design + 1e-3 * np.eye(design.shape[1])
-    return _Model(homography, np.linalg.solve(normal, design.T @ residual), centre, scale)
+    cubic = np.asarray(np.linalg.solve(normal, design.T @ residual), float)
+    return _Model(homography, cubic, centre, scale)
 
 
 def _monomials(p: Array) -> Array:
@@ -240,5 +247,5 @@ def _same(one: PointMatch, two: PointMatch) -> bool:
 
 
 def _spacing(flat: Array) -> float:
-    near, _ = cKDTree(flat).query(flat, 2)
+    near, _ = nearest(cKDTree(flat), flat, 2)
     return float(np.median(near[:, 1]))

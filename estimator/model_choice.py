@@ -101,24 +101,28 @@ def _rung(model: str, problem: Problem, state: State, cost: float, obs: Observat
     sigma = np.sqrt(np.trace(problem.covariance_px2, axis1=-2, axis2=-1).mean() / 2)
     rows = error.size
     return Rung(
-        model, count, 2 * cost / rows, 2 * cost + count * np.log(rows),
+        model, count, 2 * cost / rows, float(2 * cost + count * np.log(rows)),
         float(np.sqrt((error**2).mean()) * sigma), float(np.nanmean(per_view)), per_view, state,
     )  # fmt: skip
 
 
 def choose(rungs: list[Rung]) -> tuple[Rung, str]:
-    """The simplest model whose prediction is not significantly worse than the best one's.
+    """The lowest information criterion among the models that predict left-out views well.
 
-    Significant: by more than two standard errors of the difference paired by view, or 2 %.
+    Well: not worse than the best predictor by more than two standard errors of the difference,
+    paired by view, nor by more than 5 %.
     """
     best = min(rungs, key=lambda r: r.held_out)
-    for rung in sorted(rungs, key=lambda r: r.parameters):
-        loss = rung.per_view - best.per_view
-        loss = loss[np.isfinite(loss)]
-        error = loss.std(ddof=1) / np.sqrt(len(loss)) if len(loss) > 1 else np.inf
-        if rung is best or (loss.mean() < 2 * error and loss.mean() < 0.02 * best.held_out):
-            return rung, _words(rung, rungs)
-    return best, _words(best, rungs)
+    good = [r for r in rungs if r is best or _predicts_as_well(r, best)]
+    chosen = min(good, key=lambda r: r.bic)
+    return chosen, _words(chosen, rungs)
+
+
+def _predicts_as_well(rung: Rung, best: Rung) -> bool:
+    loss = rung.per_view - best.per_view
+    loss = loss[np.isfinite(loss)]
+    error = loss.std(ddof=1) / np.sqrt(len(loss)) if len(loss) > 1 else np.inf
+    return bool(loss.mean() < 2 * error and loss.mean() < 0.05 * best.held_out)
 
 
 def _words(chosen: Rung, rungs: list[Rung]) -> str:

@@ -1,5 +1,49 @@
-"""telerig: telecentric stereo self-calibration and shake-free 3-D bubble trajectories."""
+"""telerig: telecentric stereo self-calibration and shake-free 3-D bubble trajectories.
+
+The public names; each is loaded when it is first used.
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from telerig.errors import TelerigError as TelerigError
+    from telerig.estimator.calibrate import calibrate as calibrate
+    from telerig.estimator.calibration import Calibration as Calibration
+    from telerig.estimator.calibration import load_calibration as load_calibration
+    from telerig.estimator.frontend.dots import locate_dots as locate_dots
+    from telerig.estimator.frontend.target_detection import detect_target as detect_target
+    from telerig.io.dataset import Dataset as Dataset
+    from telerig.io.dataset import load_dataset as load_dataset
+    from telerig.io.simulation import simulate as simulate
+    from telerig.io.simulation_presets import SimulationConfig as SimulationConfig
+    from telerig.rig.triangulation import Triangulation as Triangulation
+
+_WHERE = {
+    "Calibration": "telerig.estimator.calibration",
+    "Dataset": "telerig.io.dataset",
+    "SimulationConfig": "telerig.io.simulation_presets",
+    "TelerigError": "telerig.errors",
+    "Triangulation": "telerig.rig.triangulation",
+    "calibrate": "telerig.estimator.calibrate",
+    "detect_target": "telerig.estimator.frontend.target_detection",
+    "load_calibration": "telerig.estimator.calibration",
+    "load_dataset": "telerig.io.dataset",
+    "locate_dots": "telerig.estimator.frontend.dots",
+    "simulate": "telerig.io.simulation",
+}
+__all__ = ["__version__", *_WHERE]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'telerig' has no attribute {name!r}")
+    return getattr(import_module(_WHERE[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,111 @@
+"""`telerig.calibrate`: from a dataset to a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from telerig.errors import CalibrationError
+from telerig.estimator.calibration import Calibration
+from telerig.rig.camera import Camera
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.estimator.frontend.dataset_dots import DatasetDots
+    from telerig.io.dataset import Dataset
+    from telerig.io.rig_description import RigDescription
+
+Stage = Callable[[str, int, int], None]
+"""Progress: (what, done, of)."""
+
+SOLVERS = ("auto", "gtsam")
+
+
+@dataclass(frozen=True)
+class CalibrationRun:
+    """A calibration with the detections it came from; None when it came from dots.csv."""
+
+    calibration: Calibration
+    detected: DatasetDots | None
+
+
+def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
+    """The cameras as `rig.toml` states them, all at the rig's origin."""
+    return tuple(
+        Camera.create(
+            c.name, c.image_size_px, c.scale_px_per_mm,
+            kappa_per_mm=c.telecentricity_per_mm or 0.0,
+        )
+        for c in rig.cameras.values()
+    )  # fmt: skip
+
+
+def calibrate(
+    dataset: Dataset, *, model: str = "auto", solver: str = "auto", seed: int = 0
+) -> Calibration:
+    """Calibrate a rig from the images or the dots of a dataset.
+
+    model : "auto" or a name of `telerig.estimator.problem.MODELS`.
+    solver : "auto" or "gtsam".
+    seed : recorded with the result; the calibration itself draws no random numbers.
+
+    Raises InputError, DetectionError or CalibrationError, each with what, where and what to do.
+    """
+    return run_calibration(dataset, model=model, solver=solver, seed=seed).calibration
+
+
+def run_calibration(
+    dataset: Dataset,
+    *,
+    model: str = "auto",
+    solver: str = "auto",
+    seed: int = 0,
+    dots_free: str = "3d",
+    stage: Stage | None = None,
+) -> CalibrationRun:
+    """Like `calibrate`, with progress, the choice of what dots may do, and the detections."""
+    from telerig.estimator.self_calibration import self_calibrate
+
+    if solver not in SOLVERS:
+        raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
+    detected, table, notes = None, None, list(dataset.notes)
+    if dataset.source == "images":
+        from telerig.estimator.frontend.dataset_dots import detect_dataset
+
+        detected = detect_dataset(
+            dataset, progress=None if stage is None else lambda i, n: stage("images", i, n)
+        )
+        table, notes = detected.dots, [*notes, *detected.notes]
+    else:
+        table = dataset.dots()
+    rig = dataset.rig
+    calibration = self_calibrate(
+        table,
+        nominal_cameras(rig),
+        dataset.target,
+        nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
+        model=model,
+        dots_free=dots_free,
+        progress=None if stage is None else lambda i, _: stage("solve", i, 0),
+        notes=notes,
+        name=rig.name,
+    )
+    return CalibrationRun(_with_measured(calibration, table, seed), detected)
+
+
+def _with_measured(calibration: Calibration, table: pd.DataFrame, seed: int) -> Calibration:
+    """Put the covariance and chi-square of the image fit beside the dots; record the seed."""
+    from dataclasses import replace
+
+    columns = ["suu_px2", "suv_px2", "svv_px2", "chi2_dof"]
+    measured = table.reindex(columns=["view", "camera", "dot", *columns]).copy()
+    measured["view"] = measured["view"].astype(str)
+    dots = calibration.dots.merge(measured, on=["view", "camera", "dot"], how="left")
+    dots["chi2_dof"] = dots["chi2_dof"].astype(float).fillna(np.nan)
+    return replace(
+        calibration, dots=dots, statistics={**calibration.statistics, "seed": seed}
+    )

@@ -1,0 +1,104 @@
+"""Write the results folder of a calibration: data first, pictures, then the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from telerig.estimator.calibrate import CalibrationRun
+from telerig.io.atomic import atomic_folder, write_json_atomic
+from telerig.io.provenance import run_record
+from telerig.io.tables import write_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.estimator.frontend.dataset_dots import DatasetDots, ImageDots
+    from telerig.io.dataset import Dataset
+
+OVERLAY_WIDTH_PX = 900
+OVERLAY_QUALITY = 80
+
+
+def input_files(dataset: Dataset) -> list[Path]:
+    """The files that a calibration reads."""
+    files = [dataset.path / "rig.toml"]
+    if dataset.source == "dots":
+        return [*files, dataset.path / "calibration" / "dots.csv"]
+    return files + [path for view in dataset.views for path in view.image_paths.values()]
+
+
+def write_results(
+    dataset: Dataset,
+    run: CalibrationRun,
+    folder: Path,
+    *,
+    command: str,
+    options: Mapping[str, Any],
+    seconds: Mapping[str, float],
+    report: bool = True,
+) -> Path:
+    """Fill ``folder`` with what docs/files.md lists; returns the report's path.
+
+    Files appear together at the end, so an interrupted command leaves the old ones.
+    """
+    from telerig.io.report.calibration_report import write_calibration_report
+
+    record = run_record(command, dataset.path, input_files(dataset), options, seconds)
+    with atomic_folder(folder) as staged:
+        run.calibration.save(staged)
+        write_json_atomic(staged / "run.json", record)
+        if run.detected is not None:
+            write_detections(dataset, run.detected, staged)
+            _write_example(dataset, run, staged / "dot_example.npz")
+        if report:
+            write_calibration_report(staged)
+    return folder / "report.html"
+
+
+def write_detections(dataset: Dataset, detected: DatasetDots, folder: Path) -> None:
+    """rejected.csv and overlays/<camera>/<view>.jpg."""
+    write_table(detected.rejected, folder / "rejected.csv")
+    paths = {view.name: view for view in dataset.views}
+    for image in detected.images:
+        _write_overlay(dataset, paths[image.view], image, folder / "overlays")
+
+
+def _write_overlay(dataset: Dataset, view: Any, image: ImageDots, folder: Path) -> None:
+    import cv2
+
+    from telerig.io.report.overlay import draw_overlay
+
+    picture = draw_overlay(
+        dataset.image(view, image.camera), image.dots, image.rejected, max_width_px=OVERLAY_WIDTH_PX
+    )
+    target = folder / image.camera / f"{image.view}.jpg"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, OVERLAY_QUALITY]
+    _, encoded = cv2.imencode(".jpg", picture[..., ::-1], quality)
+    target.write_bytes(encoded.tobytes())
+
+
+def _write_example(dataset: Dataset, run: CalibrationRun, path: Path) -> None:
+    """One well-kept dot with its fit, for the picture of the 2004 paper's figure 2."""
+    from telerig.estimator.frontend.dots import dot_example
+
+    assert run.detected is not None
+    chosen = _typical_dot(run.detected.dots)
+    view = next(v for v in dataset.views if v.name == chosen["view"])
+    example = dot_example(
+        dataset.image(view, chosen["camera"]), float(chosen["u_px"]), float(chosen["v_px"]),
+        polarity=dataset.target.polarity,
+    )  # fmt: skip
+    if example is not None:
+        with path.open("wb") as stream:
+            np.savez_compressed(stream, **example, view=chosen["view"], camera=chosen["camera"])
+
+
+def _typical_dot(dots: pd.DataFrame) -> Any:
+    """The dot of median chi-square."""
+    order = np.argsort(dots["chi2_dof"].to_numpy())
+    return dots.iloc[int(order[len(order) // 2])]

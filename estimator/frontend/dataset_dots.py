@@ -1,0 +1,135 @@
+"""The numbered dots of every image of a dataset, with what was rejected and why."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+
+from telerig.errors import DetectionError, InputError
+from telerig.estimator.frontend.ordering import check_handedness
+from telerig.estimator.frontend.target_detection import ambiguous_numbering, find_target
+from telerig.io.dataset import Dataset, View
+from telerig.rig.target import Target
+
+Progress = Callable[[int, int], None]
+
+MEGAPIXELS_FOR_WORKERS = 40
+"""Below this, starting worker processes costs more than it saves."""
+
+
+@dataclass(frozen=True)
+class ImageDots:
+    """One image: its numbered dots, its rejected candidates, and why it was left out, if it was."""
+
+    view: str
+    camera: str
+    dots: pd.DataFrame
+    rejected: pd.DataFrame
+    handedness: int
+    failure: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class DatasetDots:
+    """dots, rejected : tables of all images, first columns view and camera.
+
+    images : per image, in the order of views and cameras.  notes : words for the user.
+    """
+
+    dots: pd.DataFrame
+    rejected: pd.DataFrame
+    images: tuple[ImageDots, ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+
+def detect_dataset(
+    dataset: Dataset, *, progress: Progress | None = None, workers: int | None = None
+) -> DatasetDots:
+    """Detect the target in every calibration image.
+
+    workers : processes; None takes one per core for large images, none for small ones.
+
+    Raises InputError for images that cannot be read, DetectionError when no image shows the
+    target or when images contradict each other's handedness.
+    """
+    tasks = [(view, camera) for view in dataset.views for camera in view.image_paths]
+    count = _workers(dataset, len(tasks)) if workers is None else workers
+    found: list[ImageDots] = []
+    for done, image in enumerate(_run(dataset, tasks, count), 1):
+        found.append(image)
+        if progress is not None:
+            progress(done, len(tasks))
+    failures = [i for i in found if i.failure]
+    if len(failures) == len(found):
+        raise DetectionError(
+            f"the target was found in none of {len(found)} images",
+            where=str(dataset.path / "calibration"),
+            todo=f"first failure: view {failures[0].view}, camera {failures[0].camera}: "
+            f"{failures[0].failure}",
+        )
+    hands = {(i.view, i.camera): i.handedness for i in found if not i.failure}
+    check_handedness(hands, dataset.target.two_sided)
+    notes = [f"view {i.view}, camera {i.camera} left out: {i.failure}" for i in failures]
+    notes += [f"view {i.view}, camera {i.camera}: {n}" for i in found for n in i.notes]
+    return DatasetDots(_joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(notes))
+
+
+def _joined(images: list[ImageDots], name: str) -> pd.DataFrame:
+    tables = []
+    for image in images:
+        table = getattr(image, name).copy()
+        table.insert(0, "camera", image.camera)
+        table.insert(0, "view", image.view)
+        tables.append(table)
+    kept = [t for t in tables if len(t)] or tables[:1]
+    return pd.concat(kept, ignore_index=True)
+
+
+def _workers(dataset: Dataset, images: int) -> int:
+    pixels = sum(np.prod(c.image_size_px) for c in dataset.rig.cameras.values())
+    total = pixels * images / max(len(dataset.rig.cameras), 1) / 1e6
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(cores or 1, images) if total > MEGAPIXELS_FOR_WORKERS else 1
+
+
+def _run(dataset: Dataset, tasks: list[tuple[View, str]], workers: int):  # type: ignore[no-untyped-def]
+    if workers <= 1:
+        return (_one(dataset, view, camera) for view, camera in tasks)
+    from joblib import Parallel, delayed
+
+    pool = Parallel(n_jobs=workers, return_as="generator")
+    return pool(delayed(_one)(dataset, view, camera) for view, camera in tasks)
+
+
+def _one(dataset: Dataset, view: View, camera: str) -> ImageDots:
+    image = dataset.image(view, camera)
+    target: Target = dataset.target
+    smallest = _smallest_px(dataset, camera)
+    empty = pd.DataFrame(columns=["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"])
+    try:
+        found = find_target(image, target, min_diameter_px=smallest)
+        if found.numbering.ambiguous:
+            raise ambiguous_numbering(found.numbering, target)
+    except DetectionError as error:
+        words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
+        return ImageDots(view.name, camera, empty.iloc[:, :0], empty, 0, words)
+    except InputError as error:
+        raise InputError(
+            error.what, where=str(view.image_paths[camera]), todo=error.todo
+        ) from error
+    numbering = found.numbering
+    notes = tuple(n for n in numbering.notes if "assumed" not in n)
+    return ImageDots(
+        view.name, camera, found.table, found.rejected, numbering.handedness, notes=notes
+    )
+
+
+def _smallest_px(dataset: Dataset, camera: str) -> float:
+    """A third of the nominal dot, so that dirt is passed over; tilts foreshorten to 0.3."""
+    nominal = dataset.target.dot_diameter_mm * dataset.rig.cameras[camera].scale_px_per_mm
+    return float(max(5.0, 0.35 * nominal))

@@ -1,0 +1,66 @@
+"""telerig calibrate: from target images or dots to a stereo calibration with its covariance."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, say
+
+
+def calibrate(
+    dataset: Annotated[Path, typer.Argument(help="Dataset folder with rig.toml and calibration/.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Results folder [DATASET/results/calibration].")
+    ] = None,
+    model: Annotated[
+        str, typer.Option(help="auto, or a lens model: none, radial, tangential, kappa, ...")
+    ] = "auto",
+    solver: Annotated[str, typer.Option(help="auto or gtsam.")] = "auto",
+    dots: Annotated[
+        str, typer.Option(help="What dots may do: 3d, plane (stay in the plane), nominal (held).")
+    ] = "3d",
+    source: Annotated[
+        str | None, typer.Option("--from", help="images or dots, when the dataset has both.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Recorded; the calibration draws nothing.")] = 0,
+    report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
+    quiet: Annotated[bool, typer.Option(help="Print only the summary.")] = False,
+) -> None:
+    """Calibrate the rig from views of the target.
+
+    Finds and numbers the dots, calibrates both cameras, their pose, every target pose and the
+    dots' own positions together, and writes calibration.json, covariance.npz, dots.csv,
+    residuals.csv, run.json and report.html.
+
+    Exit code 0: calibrated. 1: calibrated, but the verdict is REJECTED. 2: the input cannot be
+    used, with what, where and what to do. 130: interrupted.
+    """
+    with errors_in_words():
+        from telerig.estimator.calibrate import run_calibration
+        from telerig.estimator.calibration_results import write_results
+        from telerig.io.dataset import load_dataset
+
+        begun = time.perf_counter()
+        data = load_dataset(dataset, source=source)
+        options = {"model": model, "solver": solver, "dots": dots, "from": source, "seed": seed}
+        with progress(quiet) as stage:
+            run = run_calibration(
+                data, model=model, solver=solver, seed=seed, dots_free=dots, stage=stage
+            )
+        folder = out or data.results / "calibration"
+        seconds = {"calibrate": time.perf_counter() - begun}
+        write_results(
+            data, run, folder, command="calibrate", options=options, seconds=seconds, report=report
+        )
+        say(run.calibration.report())
+        say(f"written: {folder}" + ("/report.html" if report else ""))
+        if run.calibration.verdict["status"] == "REJECTED":
+            raise typer.Exit(EXIT_REJECTED)
+
+
+if __name__ == "__main__":
+    typer.run(calibrate)

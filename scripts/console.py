@@ -1,0 +1,73 @@
+"""What all commands share: errors in words, progress, exit codes."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from telerig.errors import TelerigError
+
+EXIT_REJECTED = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+def say(text: str) -> None:
+    """A line for the user, on standard output."""
+    typer.echo(text)
+
+
+@contextmanager
+def errors_in_words() -> Iterator[None]:
+    """Turn telerig's errors and Ctrl-C into a message and an exit code."""
+    try:
+        yield
+    except TelerigError as error:
+        typer.echo(f"telerig: {error}", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
+    except KeyboardInterrupt:
+        typer.echo("telerig: interrupted; nothing was half-written", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+@contextmanager
+def progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A callback (what, done, of): a rich bar on a terminal, plain lines elsewhere."""
+    if quiet:
+        yield lambda *_: None
+    elif sys.stderr.isatty():
+        yield from _bar()
+    else:
+        yield _plain_lines()
+
+
+def _bar() -> Iterator[Callable[[str, int, int], None]]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def update(what: str, done: int, of: int) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=of or None)
+            bar.update(tasks[what], completed=done)
+
+        yield update
+
+
+def _plain_lines() -> Callable[[str, int, int], None]:
+    last = {"time": 0.0}
+
+    def update(what: str, done: int, of: int) -> None:
+        now = time.monotonic()
+        if (of and done == of) or now - last["time"] > 2:
+            last["time"] = now
+            typer.echo(f"{what}: {done}" + (f" of {of}" if of else ""), err=True)
+
+    return update

@@ -1,0 +1,45 @@
+"""The command `telerig`."""
+
+from __future__ import annotations
+
+import typer
+
+from telerig import __version__
+from telerig.scripts.calibrate import calibrate
+from telerig.scripts.demo import demo
+from telerig.scripts.detect import detect
+from telerig.scripts.simulate import simulate
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Telecentric stereo self-calibration, with a covariance that is true.",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"telerig {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: bool = typer.Option(
+        False, "--version", help="Print the version.", callback=_version, is_eager=True
+    ),
+) -> None:
+    """Calibrate a telecentric stereo rig from hand-held views of a target of dots."""
+
+
+for command in (demo, simulate, detect, calibrate):
+    app.command()(command)
+
+
+def run() -> None:
+    """Entry point of the installed command."""
+    app()
+
+
+if __name__ == "__main__":
+    run()

@@ -84,14 +84,14 @@ def _write_overlay(dataset: Dataset, view: Any, image: ImageDots, folder: Path) 
 
 def _write_example(dataset: Dataset, run: CalibrationRun, path: Path) -> None:
     """One well-kept dot with its fit, for the picture of the 2004 paper's figure 2."""
-    from telerig.estimator.frontend.dots import dot_example
+    from telerig.estimator.frontend.dot_example import dot_example
 
     assert run.detected is not None
     chosen = _typical_dot(run.detected.dots)
     view = next(v for v in dataset.views if v.name == chosen["view"])
     example = dot_example(
         dataset.image(view, chosen["camera"]), float(chosen["u_px"]), float(chosen["v_px"]),
-        polarity=dataset.target.polarity,
+        float(chosen["a_px"]), polarity=dataset.target.polarity,
     )  # fmt: skip
     if example is not None:
         with path.open("wb") as stream:

@@ -56,7 +56,7 @@ def build(problem: Problem, start: State) -> tuple[Any, Any, ImageKeys]:
     sigma = np.broadcast_to(problem.dot_sigma_mm, problem.nominal_mm.shape)
     graph.add(diagonal_prior(keys.dots, problem.nominal_mm.ravel(), sigma.ravel()))
     if problem.scale is not None:
-        graph.add(_distance_factor(keys.dots, problem.scale))
+        graph.add(_distance_factor(keys.dots, problem.nominal_mm.size, problem.scale))
     for c in range(len(problem.cameras)):
         _add_camera(graph, problem, keys, start, c)
     for factor in _view_priors(problem, keys):
@@ -79,14 +79,14 @@ def _values(problem: Problem, start: State, keys: ImageKeys) -> Any:
     return values
 
 
-def _distance_factor(key: int, scale: tuple[tuple[int, int], float, float]) -> Any:
+def _distance_factor(key: int, size: int, scale: tuple[tuple[int, int], float, float]) -> Any:
     pair, distance, sigma = scale
 
     def residual(values: Any) -> tuple[Array, list[Array]]:
         value, jac = distance_residual(values.atVector(key).reshape(-1, 3), pair, distance, sigma)
         return value, [jac]
 
-    return custom_factor([key], 1, residual)
+    return custom_factor([key], 1, [size], residual)
 
 
 def _add_camera(graph: Any, problem: Problem, keys: ImageKeys, start: State, c: int) -> None:
@@ -103,7 +103,7 @@ def _add_camera(graph: Any, problem: Problem, keys: ImageKeys, start: State, c: 
             value, jac = depth_gauge_residual(values.atPose3(key).matrix(), GAUGE_SIGMA_MM)
             return value, [jac]
 
-        graph.add(custom_factor([key], 2, residual))
+        graph.add(custom_factor([key], 2, [6], residual))
 
 
 def _view_priors(problem: Problem, keys: ImageKeys) -> list[Any]:

@@ -46,21 +46,25 @@ def depth_gauge_residual(rig_from_camera: Array, sigma_mm: float) -> tuple[Array
 
 
 def custom_factor(
-    keys: Sequence[int], rows: int, residual: Callable[[Any], tuple[Array, list[Array]]]
+    keys: Sequence[int],
+    rows: int,
+    columns: Sequence[int],
+    residual: Callable[[Any], tuple[Array, list[Array]]],
 ) -> Any:
     """A `gtsam.CustomFactor` of unit noise round ``residual(values) -> (r, [J per key])``.
 
-    A Jacobian with the wrong number of rows is a segmentation fault in GTSAM and a wrong number
-    of columns goes unseen, so shapes are checked here.
+    columns : dimension of each key's variable. A Jacobian with the wrong number of rows is a
+    segmentation fault in GTSAM and a wrong number of columns goes unseen, so shapes are checked.
     """
+    shapes = [(rows, n) for n in columns]
     import gtsam
 
     def error(_this: Any, values: Any, jacobians: list[Array] | None) -> Array:
         value, blocks = residual(values)
-        if value.shape != (rows,) or any(b.shape[0] != rows for b in blocks):
+        if value.shape != (rows,):
             raise AssertionError(f"factor of {rows} rows returned {value.shape}")
-        if len(blocks) != len(keys):
-            raise AssertionError(f"factor of {len(keys)} keys returned {len(blocks)} blocks")
+        if [b.shape for b in blocks] != shapes or len(shapes) != len(keys):
+            raise AssertionError(f"factor of Jacobians {shapes} gave {[b.shape for b in blocks]}")
         if jacobians is not None:
             for i, block in enumerate(blocks):
                 jacobians[i] = np.asfortranarray(block)

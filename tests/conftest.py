@@ -1,0 +1,107 @@
+"""Simulated calibration scenes in memory, shared by the tests of the self-calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.estimator.calibration import Calibration
+from telerig.estimator.self_calibration import self_calibrate
+from telerig.io.simulation import exact_dots
+from telerig.io.simulation_presets import SimulationConfig, preset
+from telerig.io.simulation_scene import View, hand_held_views, true_cameras, true_target
+from telerig.rig.camera import Camera
+from telerig.rig.target import Target
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A simulated calibration: what is measured and known, and the truth.
+
+    dots : the table that `self_calibrate` takes.  exact : noise-free pixels of the same rows.
+    outlier : (M,) which rows were displaced.  cameras : nominal;  true_cameras : by name.
+    """
+
+    dots: pd.DataFrame
+    exact: pd.DataFrame
+    outlier: Any
+    cameras: list[Camera]
+    target: Target
+    nominal_rotvec_deg: tuple[float, float, float] | None
+    true_cameras: dict[str, Camera]
+    true_views: dict[str, View]
+    true_dots_mm: dict[int, Any]
+
+    def calibrate(self, model: str = "radial", **options: Any) -> Calibration:
+        """`self_calibrate` on this scene."""
+        given = {"nominal_rotvec_deg": self.nominal_rotvec_deg, "model": model} | options
+        return self_calibrate(self.dots, self.cameras, self.target, **given)
+
+    def with_dots(self, dots: pd.DataFrame) -> Scene:
+        """The same scene with another table of measured dots."""
+        return replace(self, dots=dots)
+
+
+def measured(
+    exact: pd.DataFrame, sigma_px: float, rng: np.random.Generator, share: float, outlier_px: float
+) -> tuple[pd.DataFrame, Any]:
+    """The table with noise, a share of it displaced by ``outlier_px`` in a random direction."""
+    dots = exact.copy()
+    outlier = rng.random(len(dots)) < share
+    angle = rng.uniform(0, 2 * np.pi, len(dots))
+    jump = outlier_px * np.stack([np.cos(angle), np.sin(angle)], -1)
+    noise = sigma_px * rng.standard_normal((len(dots), 2)) + outlier[:, None] * jump
+    dots[["u_px", "v_px"]] = dots[["u_px", "v_px"]].to_numpy() + noise
+    dots["suu_px2"] = dots["svv_px2"] = max(sigma_px, 1e-4) ** 2
+    dots["suv_px2"] = 0.0
+    return dots, outlier
+
+
+def make_scene(
+    config: str | SimulationConfig = "paper",
+    seed: int = 0,
+    outlier_share: float = 0.0,
+    outlier_px: float = 20.0,
+    **changes: Any,
+) -> Scene:
+    """A scene from a preset (with changed fields) or a configuration."""
+    settings = preset(config, **changes) if isinstance(config, str) else config
+    scene_rng, noise_rng = np.random.default_rng(seed).spawn(2)
+    cameras = dict(true_cameras(settings))
+    target = true_target(settings, scene_rng)
+    views = hand_held_views(settings, cameras, target, scene_rng)
+    exact = exact_dots(settings, cameras, target, views)
+    exact = exact[exact["inside"] == 1].reset_index(drop=True)
+    dots, outlier = measured(exact, settings.sigma_px, noise_rng, outlier_share, outlier_px)
+    nominal = [
+        Camera.create(
+            c.name,
+            c.image_size_px,
+            c.nominal_scale_px_per_mm,
+            kappa_per_mm=c.nominal_telecentricity_per_mm or 0.0,
+        )
+        for c in settings.cameras
+    ]
+    side = (0.0, settings.angle_deg, 0.0) if len(nominal) == 2 else None
+    return Scene(
+        dots,
+        exact,
+        outlier,
+        nominal,
+        replace(settings.target, scale_distance_mm=target.scale_distance_mm),
+        side,
+        cameras,
+        {v.name: v for v in views},
+        dict(zip(target.ids.tolist(), target.points_mm)),
+    )
+
+
+@pytest.fixture(scope="session")
+def scene() -> Callable[..., Scene]:
+    """`make_scene`: scene("paper", seed, outlier_share=0.05, angle_deg=60.0, ...)."""
+    return make_scene

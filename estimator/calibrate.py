@@ -106,6 +106,4 @@ def _with_measured(calibration: Calibration, table: pd.DataFrame, seed: int) -> 
     measured["view"] = measured["view"].astype(str)
     dots = calibration.dots.merge(measured, on=["view", "camera", "dot"], how="left")
     dots["chi2_dof"] = dots["chi2_dof"].astype(float).fillna(np.nan)
-    return replace(
-        calibration, dots=dots, statistics={**calibration.statistics, "seed": seed}
-    )
+    return replace(calibration, dots=dots, statistics={**calibration.statistics, "seed": seed})

@@ -145,7 +145,7 @@ class Calibration:
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read ``calibration.json`` (or the folder that holds it), with covariance.npz if it is there."""
+    """Read ``calibration.json`` (or its folder), with covariance.npz if it is there."""
     from telerig.estimator.calibration_files import read_calibration
 
     return read_calibration(Path(path))

@@ -21,7 +21,9 @@ SCHEMA = 1
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
     """Write into the folder ``path``, or as ``path`` itself when it ends in .json."""
-    folder, file = (path.parent, path) if path.suffix == ".json" else (path, path / "calibration.json")
+    folder, file = (
+        (path.parent, path) if path.suffix == ".json" else (path, path / "calibration.json")
+    )
     folder.mkdir(parents=True, exist_ok=True)
     write_json_atomic(file, as_dict(calibration))
     if calibration.joint_names:
@@ -48,7 +50,10 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
         "units": {"length": "mm", "image": "px", "angle": "rad unless the name ends in _deg"},
         "gauge": calibration.diagnostics.get("gauge", ""),
         "verdict": dict(calibration.verdict),
-        "cameras": {c.name: _camera(calibration, c, f) for c, f in zip(calibration.cameras, calibration.free)},
+        "cameras": {
+            c.name: _camera(calibration, c, f)
+            for c, f in zip(calibration.cameras, calibration.free)
+        },
         "target": {
             "dots": calibration.dot_ids.tolist(),
             "points_mm": calibration.target_points_mm.tolist(),
@@ -123,7 +128,8 @@ def _from_dict(data: dict[str, Any], file: Path) -> Calibration:
     cameras = tuple(
         Camera(
             name, (int(c["image_size_px"][0]), int(c["image_size_px"][1])), float(c["rho_mm"]),
-            np.array([c["parameters"][p] for p in PARAMETERS], float), _pose_from(c["camera_from_rig"]),
+            np.array([c["parameters"][p] for p in PARAMETERS], float),
+            _pose_from(c["camera_from_rig"]),
         )
         for name, c in data["cameras"].items()
     )  # fmt: skip

@@ -95,7 +95,7 @@ def _write_example(dataset: Dataset, run: CalibrationRun, path: Path) -> None:
     )  # fmt: skip
     if example is not None:
         with path.open("wb") as stream:
-            np.savez_compressed(stream, **example, view=chosen["view"], camera=chosen["camera"])
+            np.savez_compressed(stream, allow_pickle=False, **example)
 
 
 def _typical_dot(dots: pd.DataFrame) -> Any:

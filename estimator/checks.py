@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
 from telerig.estimator.covariance import JointCovariance
-from telerig.estimator.initial import image_maps, rotation_from_jacobian
+from telerig.estimator.initial import ImageMap, image_maps, rotation_from_jacobian
 from telerig.estimator.problem import Problem, prior_sigma
 from telerig.factors.projection import State
 from telerig.rig.projection import INDEX
@@ -112,7 +112,7 @@ def _tilt_deg(jacobian: Array) -> float:
 
 
 def _refuse_parallel(
-    problem: Problem, maps: dict[tuple[int, int], object], usable: list[int]
+    problem: Problem, maps: dict[tuple[int, int], ImageMap], usable: list[int]
 ) -> None:
     """Views are parallel when every camera sees them all under one foreshortening."""
     if len(usable) < 2:
@@ -120,12 +120,12 @@ def _refuse_parallel(
     spread = 0.0
     for c in range(len(problem.cameras)):
         normals = [
-            rotation_from_jacobian(m.jacobian)[0][:, 2]  # type: ignore[attr-defined]
+            rotation_from_jacobian(m.jacobian)[0][:, 2]
             for (v, k), m in maps.items()
             if k == c and v in usable
         ]
         if len(normals) > 1:
-            axes = np.array([np.outer(n[:2], n[:2]) / max(n[:2] @ n[:2], 1e-9) for n in normals])
+            axes = np.array([_unit_outer(n[:2]) for n in normals])
             tilt = np.degrees(np.arccos(np.clip(np.abs([n[2] for n in normals]), 0, 1)))
             sine = np.sin(np.radians(tilt))[:, None, None]
             vectors = axes * sine
@@ -136,6 +136,11 @@ def _refuse_parallel(
             "so depth can be stretched against the tilt (a bas-relief) without any pixel moving",
             todo="tilt the target differently in every view, by 20-40 degrees about several axes",
         )
+
+
+def _unit_outer(v: Array) -> Array:
+    """(2, 2) projector onto a direction: the axis of a tilt without its sign."""
+    return np.asarray(np.outer(v, v) / max(float(v @ v), 1e-9))
 
 
 def _coverage_note(problem: Problem, c: int) -> list[str]:

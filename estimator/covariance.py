@@ -24,7 +24,7 @@ POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """matrix : (D, D) in physical units, names : D strings such as ``left.k1`` or ``view 03.rx_rad``.
+    """matrix : (D, D) in physical units; names : D strings, ``left.k1``, ``view 03.rx_rad``.
 
     Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
     effective_dof : degrees of freedom that are left to the residuals.
@@ -143,6 +143,4 @@ def point_shift_jacobian(
     _, by_point, _ = stacked_jacobian(cameras, points_mm)
     weighted = np.swapaxes(by_point, -1, -2) @ information_px
     by_rig = rig_jacobian(cameras, free, points_mm)
-    return -np.linalg.solve(weighted @ by_point, weighted @ by_rig)
-
-
+    return np.asarray(-np.linalg.solve(weighted @ by_point, weighted @ by_rig), np.float64)

@@ -54,12 +54,14 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
     middle = xy_mm.mean(0)
     size = np.sqrt(((xy_mm - middle) ** 2).sum(1).mean())
     design = np.c_[(xy_mm - middle) / size, np.ones(len(xy_mm))]
-    affine, *_ = np.linalg.lstsq(design, uv_px, rcond=None)
+    affine: Array = np.asarray(np.linalg.lstsq(design, uv_px, rcond=None)[0], np.float64)
     misfit = ((uv_px - design @ affine) ** 2).sum()
     bend = np.zeros(2)
     if len(xy_mm) >= 8:
         homography, bend_h = _homography(design, uv_px, affine)
-        better = ((uv_px - (design @ homography) / (1 + design[:, :2] @ bend_h)[:, None]) ** 2).sum()
+        better = (
+            (uv_px - (design @ homography) / (1 + design[:, :2] @ bend_h)[:, None]) ** 2
+        ).sum()
         if better < 0.5 * misfit:
             affine, bend = homography, bend_h
     # the target point imaged to the image centre: there the off-axis terms vanish
@@ -123,7 +125,9 @@ def rotation_hypotheses(first: Array, second: Array, count: int = 3) -> list[Arr
     found: list[tuple[float, Array]] = []
     for candidate in candidates:
         rotation, cost = _refined(candidate, plain, crossed)
-        same = [min(angle_between(rotation, r), angle_between(mirrored(rotation), r)) for _, r in found]
+        same = [
+            min(angle_between(rotation, r), angle_between(mirrored(rotation), r)) for _, r in found
+        ]
         if not same or min(same) > np.radians(3):
             found.append((cost, rotation))
     return [rotation for _, rotation in sorted(found, key=lambda x: x[0])[:count]]
@@ -166,7 +170,7 @@ def _signs(
         if a is None and b is None:
             continue
         if a is None or b is None:
-            out[v] = a if b is None else second_from_first.T @ b
+            out[v] = second_from_first.T @ b if b is not None else rotations[v, 0]
             continue
         left = [a, mirrored(a)]
         pairs = [(second_from_first @ x, y, x) for x in left for y in (b, mirrored(b))]

@@ -64,7 +64,7 @@ def _factorise(problem: Problem) -> tuple[dict[tuple[int, int], Array], Array]:
 
 def _affine(plane: Array, uv_px: Array) -> Array:
     solution, *_ = np.linalg.lstsq(np.c_[plane, np.ones(len(plane))], uv_px, rcond=None)
-    return solution
+    return np.asarray(solution, np.float64)
 
 
 def _plane_points(
@@ -78,11 +78,10 @@ def _plane_points(
         linear = maps[k][:2].T
         normal[dots] += linear.T @ linear
         right[dots] += (uv - maps[k][2]) @ linear
-    plane = np.linalg.solve(normal, right[..., None])[..., 0]
-    misfit = sum(
-        float(((plane[dots] @ maps[k][:2] + maps[k][2] - uv) ** 2).sum())
-        for k, (dots, uv) in images.items()
-    )
+    plane = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
+    misfit = 0.0
+    for k, (dots, uv) in images.items():
+        misfit += float(((plane[dots] @ maps[k][:2] + maps[k][2] - uv) ** 2).sum())
     return plane, misfit
 
 
@@ -97,10 +96,10 @@ def _metric(maps: list[Array]) -> Array:
     rows = []
     for m in (m / size for m in maps):
         a, b, c = (m[:, 0] @ m[:, 0], m[:, 0] @ m[:, 1], m[:, 1] @ m[:, 1])
-        rows.append([a, 2 * b, c, -np.linalg.det(m) ** 2])
+        rows.append([a, 2 * b, c, -(np.linalg.det(m) ** 2)])
     design = np.array(rows)
     solution, _, rank, singular = np.linalg.lstsq(design, np.ones(len(design)), rcond=None)
-    c11, c12, c22, determinant = solution
+    c11, c12, c22, _ = solution
     metric = np.array([[c11, c12], [c12, c22]])
     if rank < 4 or singular[-1] < 1e-6 * singular[0] or np.linalg.eigvalsh(metric)[0] <= 0:
         raise CalibrationError(
@@ -122,4 +121,4 @@ def _onto_nominal(shape: Array, nominal_mm: Array) -> Array:
     target = nominal_mm[:, :2]
     a, b = shape - shape.mean(0), target - target.mean(0)
     u, _, vt = np.linalg.svd(a.T @ b)
-    return np.c_[a @ (u @ vt) + target.mean(0), np.zeros(len(shape))]
+    return np.asarray(np.c_[a @ (u @ vt) + target.mean(0), np.zeros(len(shape))])

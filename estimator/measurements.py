@@ -32,8 +32,8 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
     _check_finite(table)
     views = tuple(sorted(table["view"].astype(str).unique(), key=_natural))
     ids = np.unique(table["dot"].to_numpy(np.int64))
-    camera = table["camera"].map({n: i for i, n in enumerate(names)}).to_numpy(np.int64)
-    view = table["view"].astype(str).map({v: i for i, v in enumerate(views)}).to_numpy(np.int64)
+    camera = _index(table["camera"], names)
+    view = _index(table["view"].astype(str), views)
     order = np.lexsort((table["dot"].to_numpy(), camera, view))
     table = table.iloc[order]
     covariance = np.empty((len(table), 2, 2))
@@ -58,6 +58,11 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
         scale=_scale(target, ids),
         plate_shift=np.zeros((len(views), len(cameras))),
     )
+
+
+def _index(column: pd.Series[str], names: Sequence[str]) -> NDArray[np.int64]:
+    numbers = column.map({name: i for i, name in enumerate(names)})
+    return np.asarray(numbers, dtype=np.int64)
 
 
 def _natural(name: str) -> tuple[int, float, str]:

@@ -15,7 +15,7 @@ from telerig.errors import CalibrationError
 from telerig.estimator import initial
 from telerig.estimator.graph import solve
 from telerig.estimator.problem import Problem
-from telerig.factors.projection import State, camera_points, whitened_residuals
+from telerig.factors.projection import State, whitened_residuals
 from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
 from telerig.rig.target import Target
 
@@ -150,14 +150,13 @@ def _print_errors(problem: Problem, state: State) -> Array:
     """(V, N, 2) where each view sees the dots, minus nominal, in the target's plane (mm)."""
     obs = problem.unweighted()
     jac = whitened_residuals(state, obs, problem.rho_mm)
-    camera_points(state, obs)
     normal = np.tile(1e-6 * np.eye(2), (len(problem.views), len(problem.dot_ids), 1, 1))
     right = np.zeros((*normal.shape[:2], 2))
     plane = jac.by_dot[..., :2]
     np.add.at(normal, (obs.view, obs.dot), np.swapaxes(plane, -1, -2) @ plane)
     np.add.at(right, (obs.view, obs.dot), -np.einsum("mij,mi->mj", plane, jac.value))
     errors = np.linalg.solve(normal, right[..., None])[..., 0]
-    return errors - errors.mean(1, keepdims=True)
+    return np.asarray(errors - errors.mean(1, keepdims=True))
 
 
 def _turned(marks: Array, label: Ints, k: int, order: int) -> Array:

@@ -53,7 +53,8 @@ image and p1, p2 carry a decentred lens (docs/decisions/003).
 PRIOR_SIGMA = {
     "scale_px_per_mm": 0.5,  # relative
     "aspect": 0.1, "skew": 0.1, "kappa_per_mm": 0.5,  # kappa: per rho
-    "k1": 0.5, "k2": 0.5, "k3": 0.5, "p1": 0.2, "p2": 0.2, "s1": 0.2, "s2": 0.2, "s3": 0.2, "s4": 0.2,
+    "k1": 0.5, "k2": 0.5, "k3": 0.5, "p1": 0.2, "p2": 0.2,
+    "s1": 0.2, "s2": 0.2, "s3": 0.2, "s4": 0.2,
     "tilt_x": 0.3, "tilt_y": 0.3, "image_convergence_per_mm": 0.05,
     "centre_u_px": 0.05, "centre_v_px": 0.05,  # of the image width
 }  # fmt: skip

@@ -169,8 +169,7 @@ def _geometry(problem: Problem, state: State, joint: JointCovariance) -> dict[st
     kappas = [k[5] for k in state.intrinsics]
     if all(abs(k) > 1e-9 for k in kappas):
         centres = [
-            (m @ np.array([0, 0, -1 / k, 1]))[:3]
-            for m, k in zip(state.rig_from_camera, kappas)
+            (m @ np.array([0, 0, -1 / k, 1]))[:3] for m, k in zip(state.rig_from_camera, kappas)
         ]
         out["perspective_centres_distance_mm"] = float(np.linalg.norm(centres[1] - centres[0]))
     return out
@@ -219,7 +218,7 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
 
 
 def _paired(problem: Problem, state: State) -> tuple[Array, Array]:
-    """(K, 2, 2) pixels of dots kept in both cameras of a view, and (K, 3) where the fit has them."""
+    """(K, 2, 2) pixels of dots kept in both cameras of a view, (K, 3) their fitted places."""
     keyed: dict[tuple[int, int], dict[int, Array]] = {}
     for v, c, d, uv, w in zip(
         problem.view, problem.camera, problem.dot, problem.uv_px, problem.weight
@@ -242,8 +241,7 @@ def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
         reasons.append(
             f"the model {fit.model!r} does not describe these images: the dots scatter by "
             f"{statistics['scatter_px']:.2g} px round it, their own image noise is "
-            f"{statistics['image_noise_px']:.2g} px"
-            + _kappa_hint(fit)
+            f"{statistics['image_noise_px']:.2g} px" + _kappa_hint(fit)
         )
     if statistics["share_kept"] < BAD_KEPT:
         reasons.append(

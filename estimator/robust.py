@@ -65,7 +65,7 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float)
 
 def free_share(problem: Problem) -> float:
     """Roughly the degrees of freedom per measured coordinate."""
-    rows = 2 * np.sum(problem.weight > 0)
+    rows = int(2 * np.sum(problem.weight > 0))
     used = sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1)
     used += 6 * len(problem.views) + 3 * len(problem.dot_ids)
     return float(max(0.3, 1 - used / max(rows, 1)))

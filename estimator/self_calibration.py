@@ -194,9 +194,7 @@ def _with_centre(model: str) -> tuple[str, str]:
     )
 
 
-def _settled_twin(
-    fit: Fit, nominal: Array | None, by: str, words: str
-) -> tuple[State, str, str]:
+def _settled_twin(fit: Fit, nominal: Array | None, by: str, words: str) -> tuple[State, str, str]:
     """The final fit may know the sign of kappa that the start did not."""
     state, problem = fit.robust.solution.state, fit.robust.problem
     if len(problem.cameras) == 1:

@@ -65,7 +65,9 @@ def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
 
 
-def space_error(calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array) -> SpaceError:
+def space_error(
+    calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array
+) -> SpaceError:
     """Triangulate the true pixels of true points with the estimated rig, and align rigidly."""
     pixels = [camera.project(points_mm) for camera in truth]
     found = calibration.triangulate(*pixels, sigma_px=1.0, include_calibration=False).points_mm
@@ -115,7 +117,9 @@ def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Co
     return Comparison("\n".join(lines), words, passed, space)
 
 
-def _row(name: str, estimate: float, truth: float, sd: float) -> tuple[str, float, float, float, float]:
+def _row(
+    name: str, estimate: float, truth: float, sd: float
+) -> tuple[str, float, float, float, float]:
     return name, estimate, truth, sd, (estimate - truth) / sd
 
 

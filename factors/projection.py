@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -117,7 +118,7 @@ def pixels(state: State, obs: Observations, rho_mm: Sequence[float]) -> Array:
 def whitened_error(state: State, obs: Observations, rho_mm: Sequence[float]) -> Array:
     """(M, 2) whitened residuals, predicted minus measured, without derivatives."""
     residual = pixels(state, obs, rho_mm) - obs.uv_px
-    return np.einsum("mij,mj->mi", obs.whitener, residual)
+    return np.asarray(np.einsum("mij,mj->mi", obs.whitener, residual))
 
 
 def whitened_residuals(state: State, obs: Observations, rho_mm: Sequence[float]) -> Residuals:
@@ -199,7 +200,7 @@ class ImageFactors:
         image = self.obs.view * len(self.rho_mm) + self.obs.camera
         starts = np.r_[0, np.flatnonzero(np.diff(image)) + 1, len(image)]
         out = []
-        for first, last in zip(starts[:-1], starts[1:]):
+        for first, last in pairwise(starts):
             view, camera = int(self.obs.view[first]), int(self.obs.camera[first])
             rows = slice(int(first), int(last))
             noise = gtsam.noiseModel.Unit.Create(2 * int(last - first))
@@ -275,7 +276,7 @@ class ImageFactors:
 
 def intrinsics_from_values(values: Any, keys: ImageKeys, start: State, camera: int) -> Array:
     """(18,) intrinsics of one camera: the start with the free ones moved."""
-    out = start.intrinsics[camera].copy()
+    out: Array = start.intrinsics[camera].copy()
     if len(keys.free[camera]):
         out[keys.free[camera]] += values.atVector(keys.intrinsics[camera]) * keys.unit[camera]
     return out

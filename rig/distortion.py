@@ -48,7 +48,7 @@ def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
 
 
 def coefficient_jacobian(xy: Array) -> Array:
-    """(..., 2, 9) derivative of `distort` with respect to the coefficients: it is linear in them."""
+    """(..., 2, 9) derivative of `distort` by the coefficients, in which it is linear."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     out = np.zeros((*r2.shape, 2, 9))

@@ -144,4 +144,4 @@ class Target:
 
 
 def _rows_as_set(rows: Iterable[Any]) -> set[tuple[int, ...]]:
-    return {tuple(int(round(2 * x)) for x in row) for row in rows}
+    return {tuple(round(2 * x) for x in row) for row in rows}

@@ -99,13 +99,11 @@ def triangulate(
 
 
 def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Array, Array, Array]:
-    """(..., 2C) pixels of all cameras, (..., 2C, 3) by the rig point, (C, ..., 2, 18) intrinsics."""
+    """(..., 2C) pixels, (..., 2C, 3) by the rig point, (C, ..., 2, 18) by the intrinsics."""
     pixels, jacobians, by_intrinsics = [], [], []
     for camera in cameras:
         in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
-        uv, by_point, by_k = projection.pixel_jacobians(
-            in_camera, camera.intrinsics, camera.rho_mm
-        )
+        uv, by_point, by_k = projection.pixel_jacobians(in_camera, camera.intrinsics, camera.rho_mm)
         pixels.append(uv)
         jacobians.append(by_point @ camera.camera_from_rig.rotation)
         by_intrinsics.append(by_k)

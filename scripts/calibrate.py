@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, say
+from telerig.scripts.console import EXIT_REJECTED, checked_source, errors_in_words, progress, say
 
 
 def calibrate(
@@ -45,7 +45,7 @@ def calibrate(
         from telerig.io.dataset import load_dataset
 
         begun = time.perf_counter()
-        data = load_dataset(dataset, source=source)
+        data = load_dataset(dataset, source=checked_source(source))
         options = {"model": model, "solver": solver, "dots": dots, "from": source, "seed": seed}
         with progress(quiet) as stage:
             run = run_calibration(

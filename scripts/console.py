@@ -6,11 +6,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import typer
 
-from telerig.errors import TelerigError
+from telerig.errors import InputError, TelerigError
 
 EXIT_REJECTED = 1
 EXIT_BAD_INPUT = 2
@@ -20,6 +20,17 @@ EXIT_INTERRUPTED = 130
 def say(text: str) -> None:
     """A line for the user, on standard output."""
     typer.echo(text)
+
+
+def checked_source(source: str | None) -> Literal["images", "dots"] | None:
+    """The value of ``--from``; raises InputError for another word."""
+    if source is None:
+        return None
+    if source == "images":
+        return "images"
+    if source == "dots":
+        return "dots"
+    raise InputError(f"--from {source}", todo="use --from images or --from dots")
 
 
 @contextmanager

@@ -23,7 +23,7 @@ def simulate(
         bool, typer.Option(help="Render images; without, write calibration/dots.csv.")
     ] = True,
 ) -> None:
-    """Simulate a calibration: target images of both cameras, rig.toml, and the truth beside them."""
+    """Simulate a calibration: target images of both cameras, rig.toml, and the truth."""
     with errors_in_words():
         import numpy as np
 

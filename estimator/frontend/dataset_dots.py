@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -76,11 +76,13 @@ def detect_dataset(
     check_handedness(hands, dataset.target.two_sided)
     notes = [f"view {i.view}, camera {i.camera} left out: {i.failure}" for i in failures]
     notes += [f"view {i.view}, camera {i.camera}: {n}" for i in found for n in i.notes]
-    return DatasetDots(_joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(notes))
+    return DatasetDots(
+        _joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(notes)
+    )
 
 
 def _joined(images: list[ImageDots], name: str) -> pd.DataFrame:
-    tables = []
+    tables: list[pd.DataFrame] = []
     for image in images:
         table = getattr(image, name).copy()
         table.insert(0, "camera", image.camera)
@@ -97,13 +99,14 @@ def _workers(dataset: Dataset, images: int) -> int:
     return min(cores or 1, images) if total > MEGAPIXELS_FOR_WORKERS else 1
 
 
-def _run(dataset: Dataset, tasks: list[tuple[View, str]], workers: int):  # type: ignore[no-untyped-def]
+def _run(dataset: Dataset, tasks: list[tuple[View, str]], workers: int) -> Iterator[ImageDots]:
     if workers <= 1:
-        return (_one(dataset, view, camera) for view, camera in tasks)
+        yield from (_one(dataset, view, camera) for view, camera in tasks)
+        return
     from joblib import Parallel, delayed
 
     pool = Parallel(n_jobs=workers, return_as="generator")
-    return pool(delayed(_one)(dataset, view, camera) for view, camera in tasks)
+    yield from pool(delayed(_one)(dataset, view, camera) for view, camera in tasks)
 
 
 def _one(dataset: Dataset, view: View, camera: str) -> ImageDots:

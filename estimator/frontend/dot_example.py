@@ -40,12 +40,14 @@ def dot_example(
     shape = shape_from_axes(dot["a_px"], dot["b_px"], dot["angle_rad"])
     columns, rows = np.arange(patch.shape[1], dtype=float), np.arange(patch.shape[0], dtype=float)
     u, v = np.meshgrid(columns, rows)
-    covered = coverage_on_grid(columns, rows, dot[["u_px", "v_px"]].to_numpy(float), shape, sigma)[0]
+    covered = coverage_on_grid(columns, rows, dot[["u_px", "v_px"]].to_numpy(float), shape, sigma)[
+        0
+    ]
     model = _with_levels(patch, np.asarray(covered), u - dot["u_px"], v - dot["v_px"])
-    numbers = {n: np.float64(dot[n]) for n in ("a_px", "b_px", "angle_rad", "noise")}
+    numbers = {n: np.array(dot[n]) for n in ("a_px", "b_px", "angle_rad", "noise")}
     place = {
-        "u0": np.float64(u0), "v0": np.float64(v0),
-        "u_px": np.float64(dot["u_px"] + u0), "v_px": np.float64(dot["v_px"] + v0),
+        "u0": np.array(float(u0)), "v0": np.array(float(v0)),
+        "u_px": np.array(dot["u_px"] + u0), "v_px": np.array(dot["v_px"] + v0),
     }  # fmt: skip
     return {"patch": patch, "model": model, **place, **numbers}
 

@@ -10,9 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from telerig.estimator.calibrate import nominal_cameras
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.self_calibration import self_calibrate
-from telerig.io.simulation import exact_dots
+from telerig.io.simulation import exact_dots, rig_description
 from telerig.io.simulation_presets import SimulationConfig, preset
 from telerig.io.simulation_scene import View, hand_held_views, true_cameras, true_target
 from telerig.rig.camera import Camera
@@ -78,23 +79,14 @@ def make_scene(
     exact = exact_dots(settings, cameras, target, views)
     exact = exact[exact["inside"] == 1].reset_index(drop=True)
     dots, outlier = measured(exact, settings.sigma_px, noise_rng, outlier_share, outlier_px)
-    nominal = [
-        Camera.create(
-            c.name,
-            c.image_size_px,
-            c.nominal_scale_px_per_mm,
-            kappa_per_mm=c.nominal_telecentricity_per_mm or 0.0,
-        )
-        for c in settings.cameras
-    ]
-    side = (0.0, settings.angle_deg, 0.0) if len(nominal) == 2 else None
+    rig = rig_description(settings, target)
     return Scene(
         dots,
         exact,
         outlier,
-        nominal,
-        replace(settings.target, scale_distance_mm=target.scale_distance_mm),
-        side,
+        list(nominal_cameras(rig)),
+        rig.target,
+        rig.second_from_first_rotvec_deg,
         cameras,
         {v.name: v for v in views},
         dict(zip(target.ids.tolist(), target.points_mm)),

@@ -133,6 +133,27 @@ def rig_jacobian(
     return out
 
 
+def aligned_covariance(
+    cameras: tuple[Camera, Camera],
+    free: tuple[tuple[str, ...], ...],
+    covariance: Array,
+    points_mm: Array,
+) -> Array:
+    """(3 N, 3 N) calibration covariance of rig points, their common rigid motion projected out.
+
+    What is left is the error of shapes, distances and motions inside the rig; where the rig's own
+    frame lies is a matter of definition (Baarda's S-transformation to the points' own frame).
+    """
+    information = np.broadcast_to(np.eye(4), (len(points_mm), 4, 4))
+    shift = point_shift_jacobian(cameras, free, points_mm, information)
+    shift = shift.reshape(-1, shift.shape[-1])
+    centred = points_mm - points_mm.mean(0)
+    motion = np.concatenate([np.tile(np.eye(3), (len(points_mm), 1, 1)), -hat(centred)], -1)
+    basis, _ = np.linalg.qr(motion.reshape(-1, 6))
+    inner = shift - basis @ (basis.T @ shift)
+    return np.asarray(inner @ covariance @ inner.T)
+
+
 def point_shift_jacobian(
     cameras: tuple[Camera, Camera],
     free: tuple[tuple[str, ...], ...],

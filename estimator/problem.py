@@ -38,6 +38,8 @@ MODELS: dict[str, tuple[str, ...]] = {
     "kappa+radial+centre": ("kappa_per_mm", "k1", *_CENTRE),
     "kappa+tangential+centre": ("kappa_per_mm", "k1", "p1", "p2", *_CENTRE),
     "kappa+brown+centre": ("kappa_per_mm", "k1", "k2", "p1", "p2", *_CENTRE),
+    "kappa+prism": ("kappa_per_mm", "k1", "k2", "p1", "p2", "s1", "s3"),
+    "kappa+prism+centre": ("kappa_per_mm", "k1", "k2", "p1", "p2", "s1", "s3", *_CENTRE),
     "affine": ("aspect", "skew"),
     "affine+radial": ("aspect", "skew", "k1"),
     "tilt": ("tilt_x", "tilt_y", "image_convergence_per_mm"),

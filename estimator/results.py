@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator import checks
 from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import JointCovariance
+from telerig.estimator.covariance import JointCovariance, aligned_covariance
 from telerig.estimator.problem import Problem
 from telerig.estimator.robust import LIMIT, pixel_residuals, squared_distance
 from telerig.factors.projection import State
@@ -40,7 +40,7 @@ def calibration_from_fit(
     cameras = cameras_from_state(problem, state)
     rig_names, rig_covariance = joint.rig_block()
     residuals = residual_table(problem, state)
-    statistics = _statistics(fit, joint, residuals) | _geometry(problem, state, joint)
+    statistics = _statistics(fit, joint, residuals) | _geometry(fit, joint)
     weak = checks.weak_parameters(problem, state, joint)
     calibration = Calibration(
         cameras=cameras,
@@ -148,7 +148,8 @@ def _rms(values: Array) -> float:
     return float(np.sqrt((values**2).mean())) if values.size else float("nan")
 
 
-def _geometry(problem: Problem, state: State, joint: JointCovariance) -> dict[str, Any]:
+def _geometry(fit: Fit, joint: JointCovariance) -> dict[str, Any]:
+    problem, state = fit.robust.problem, fit.robust.solution.state
     out = _target_shape(problem, state, joint)
     if len(problem.cameras) < 2:
         return out
@@ -164,7 +165,8 @@ def _geometry(problem: Problem, state: State, joint: JointCovariance) -> dict[st
     out |= {
         "inter_camera_rotvec_deg": np.degrees(rotvec).tolist(),
         "axes_angle_deg": float(np.degrees(angle)),
-        "axes_angle_sd_deg": float(np.degrees(sd)),
+        "axes_angle_formal_sd_deg": float(np.degrees(sd)),
+        "axes_angle_sd_deg": float(np.degrees(np.hypot(sd, _angle_systematic(fit, angle)))),
     }
     kappas = [k[5] for k in state.intrinsics]
     if all(abs(k) > 1e-9 for k in kappas):
@@ -173,6 +175,18 @@ def _geometry(problem: Problem, state: State, joint: JointCovariance) -> dict[st
         ]
         out["perspective_centres_distance_mm"] = float(np.linalg.norm(centres[1] - centres[0]))
     return out
+
+
+def _angle_systematic(fit: Fit, angle_rad: float) -> float:
+    """How far the angle moves when the image centres are held at the middle of the image.
+
+    With strong perspective the angle trades with the centres; the centres come from the
+    perspective alone only as far as the distortion model is right. 0 when they are held anyway.
+    """
+    held = [r for r in fit.rungs if f"{r.model}+centre" == fit.model]
+    if not held:
+        return 0.0
+    return float(angle_rad - np.arccos(held[0].state.rig_from_camera[1, 2, 2]))
 
 
 def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dict[str, Any]:
@@ -196,7 +210,10 @@ def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dic
 
 
 def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str, Any]:
-    """Residuals in space, and the predicted uncertainty of a triangulated point (um)."""
+    """Residuals in space, and the predicted uncertainty of a triangulated point (um per axis).
+
+    The calibration's share is without the common rigid motion of all points.
+    """
     if len(problem.cameras) < 2:
         return {}
     pixels, truth = _paired(problem, state)
@@ -205,14 +222,16 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
     pair = (calibration.cameras[0], calibration.cameras[1])
     sigma = calibration.statistics["scatter_px"]
     found = triangulate(pair, (pixels[:, 0], pixels[:, 1]), sigma)
-    whole = calibration.triangulate(pixels[:, 0], pixels[:, 1], sigma_px=sigma)
-    total = np.sqrt(np.trace(whole.covariance_mm2, axis1=-2, axis2=-1) / 3)
-    mine = np.sqrt(np.trace(found.covariance_mm2, axis1=-2, axis2=-1) / 3)
+    some = found.points_mm[:: max(1, len(truth) // 200)]
+    shared = aligned_covariance(pair, calibration.free, calibration.covariance, some)
+    measurement = np.trace(found.covariance_mm2, axis1=-2, axis2=-1).mean() / 3
+    from_calibration = np.trace(shared) / len(shared)
     error = found.points_mm - truth
     return {
         "space_rms_um": float(1e3 * np.sqrt((error**2).mean())),
-        "space_sd_um": float(1e3 * np.median(total)),
-        "space_sd_measurement_um": float(1e3 * np.median(mine)),
+        "space_sd_um": float(1e3 * np.sqrt(measurement + from_calibration)),
+        "space_sd_measurement_um": float(1e3 * np.sqrt(measurement)),
+        "space_sd_calibration_um": float(1e3 * np.sqrt(from_calibration)),
         "ray_miss_rms_um": float(1e3 * np.sqrt((found.ray_miss_mm**2).mean())),
     }
 

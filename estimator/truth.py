@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import point_shift_jacobian
+from telerig.estimator.covariance import aligned_covariance
 from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose, hat, nearest_rotation
+from telerig.rig.pose import Pose, nearest_rotation
 from telerig.rig.projection import PARAMETERS
 
 Array = NDArray[np.float64]
@@ -74,24 +74,12 @@ def space_error(
     a, b = found - found.mean(0), points_mm - points_mm.mean(0)
     turn = nearest_rotation(b.T @ a)
     errors = a @ turn.T - b
-    covariance = aligned_covariance(calibration, found)
+    pair = (calibration.cameras[0], calibration.cameras[1])
+    covariance = aligned_covariance(pair, calibration.free, calibration.covariance, found)
     predicted = np.sqrt(np.trace(covariance) / errors.size)
     return SpaceError(
         float(1e3 * np.sqrt((errors**2).mean())), float(1e3 * predicted), errors, covariance
     )
-
-
-def aligned_covariance(calibration: Calibration, points_mm: Array) -> Array:
-    """(3 N, 3 N) calibration covariance of rig points, their common rigid motion projected out."""
-    pair = (calibration.cameras[0], calibration.cameras[1])
-    information = np.broadcast_to(np.eye(4), (len(points_mm), 4, 4))
-    shift = point_shift_jacobian(pair, calibration.free, points_mm, information)
-    shift = shift.reshape(-1, shift.shape[-1])
-    centred = points_mm - points_mm.mean(0)
-    motion = np.concatenate([np.tile(np.eye(3), (len(points_mm), 1, 1)), -hat(centred)], -1)
-    basis, _ = np.linalg.qr(motion.reshape(-1, 6))
-    free = shift - basis @ (basis.T @ shift)
-    return np.asarray(free @ calibration.covariance @ free.T)
 
 
 def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Comparison:

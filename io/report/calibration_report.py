@@ -1,0 +1,129 @@
+"""The report of a calibration: one page that needs no network, made from a results folder."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from telerig.io.atomic import write_text_atomic
+from telerig.io.report import calibration_tables as tables
+from telerig.io.report.calibration_results import CalibrationResults, read_results
+from telerig.io.report.figures_common import data_uri
+from telerig.io.report.figures_coverage import coverage, tilts
+from telerig.io.report.figures_dot import dot_pictures
+from telerig.io.report.figures_residuals import residual_field, residual_histogram
+from telerig.io.report.figures_rig import rig_plan
+from telerig.io.report.figures_target import target_pictures
+from telerig.io.report.scene import dots_are_drawn, plotly_javascript, scene_json
+from telerig.io.report.words import ABSENT, flat_rows, is_number
+
+OVERLAY_BUDGET_BYTES = 1_500_000
+"""Pictures beyond this are linked, not carried in the page: a report stays below 8 MB."""
+
+_COLOURS = {"GOOD": "good", "USABLE": "usable", "REJECTED": "rejected"}
+_SHOWN = {
+    "schema", "kind", "name", "pixel_origin", "units", "gauge", "verdict", "cameras", "target",
+    "views", "covariance", "model", "twin", "statistics", "diagnostics", "notes",
+}  # fmt: skip
+
+
+def write_calibration_report(results_folder: Path) -> Path:
+    """Write report.html into a calibration's results folder and return its path.
+
+    It reads nothing but that folder: calibration.json and residuals.csv, and if they are there
+    dots.csv, covariance.npz, run.json, overlays/<camera>/<view>.jpg and dot_example.npz. The page
+    is written whole or not at all. Raises InputError for a folder that holds no calibration, or
+    files that cannot be read or do not fit together.
+    """
+    folder = Path(results_folder)
+    page = render(read_results(folder))
+    write_text_atomic(folder / "report.html", page)
+    return folder / "report.html"
+
+
+def render(results: CalibrationResults) -> str:
+    """The page as text."""
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+    files = resources.files("telerig.io.report")
+    template = (files / "template_calibration.html").read_text(encoding="utf-8")
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    context = _words(results) | _tables(results) | _pictures(results)
+    context["css"] = Markup((files / "report.css").read_text(encoding="utf-8"))
+    context["scene"] = Markup(scene_json(results))
+    context["plotly"] = Markup(plotly_javascript())
+    return environment.from_string(template).render(context)
+
+
+def _words(results: CalibrationResults) -> dict[str, Any]:
+    content = results.content
+    verdict = content["verdict"]
+    twin = content.get("twin") or {}
+    costs = [twin.get("cost"), twin.get("other_cost")]
+    return {
+        "name": content.get("name") or "calibration",
+        "status": verdict["status"],
+        "colour": _COLOURS.get(str(verdict["status"]).split(",")[0].split()[0], "usable"),
+        "reasons": verdict.get("reasons") or [],
+        "cameras": results.camera_names,
+        "model": content.get("model") or {},
+        "twin": twin,
+        "twin_costs": [f"{c:.10g}" if is_number(c) else ABSENT for c in costs],
+        "gauge": content.get("gauge") or ABSENT,
+        "weak": (content.get("diagnostics") or {}).get("weak") or [],
+        "notes": content.get("notes") or [],
+        "absent": results.absent,
+        "dots_drawn": dots_are_drawn(results),
+    }
+
+
+def _tables(results: CalibrationResults) -> dict[str, Any]:
+    extra = {k: v for k, v in results.content.items() if k not in _SHOWN}
+    return {
+        "figures": tables.key_numbers(results),
+        "parameters": tables.parameter_rows(results),
+        "pose": tables.pose_rows(results),
+        "ladder": tables.ladder_rows(results),
+        "worst": tables.worst_rows(results),
+        "left_out": int((~results.residuals["kept"]).sum()),
+        "lowered": int((results.residuals["weight"] < 1).sum()),
+        "measured": len(results.residuals),
+        "statistics": list(flat_rows(results.statistics)),
+        "extra": list(flat_rows(extra)),
+        "run": list(flat_rows(results.run)),
+    }
+
+
+def _pictures(results: CalibrationResults) -> dict[str, Any]:
+    every = range(len(results.cameras))
+    overlays, linked = _contact_sheet(results)
+    return {
+        "fields": [residual_field(results, i) for i in every],
+        "spread": [residual_histogram(results)],
+        "covered": [*(coverage(results, i) for i in every), tilts(results)],
+        "target": target_pictures(results),
+        "dot": dot_pictures(results.dot_example),
+        "plan": rig_plan(results),
+        "overlays": overlays,
+        "linked": linked,
+    }
+
+
+def _contact_sheet(results: CalibrationResults) -> tuple[list[dict[str, Any]], int]:
+    """One entry per view with each camera's picture or None; how many are linked only."""
+    entries, linked, left = [], 0, OVERLAY_BUDGET_BYTES
+    for view in results.views if results.overlays else ():
+        cells = []
+        for name in results.camera_names:
+            file = results.overlays.get((name, view))
+            content = b"" if file is None else file.read_bytes()
+            inside = file is not None and len(content) <= left
+            left -= len(content) if inside else 0
+            linked += int(file is not None and not inside)
+            source = data_uri("image/jpeg", content) if inside else None
+            link = f"overlays/{name}/{view}.jpg" if file is not None else None
+            cells.append({"camera": name, "source": source, "link": link})
+        entries.append({"view": view, "cells": cells})
+    return entries, linked

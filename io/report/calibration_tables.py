@@ -1,0 +1,250 @@
+"""The report's tables: what calibration.json says, in words and with units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import GeometryError
+from telerig.io.report.calibration_results import CalibrationResults
+from telerig.io.report.words import ABSENT, is_number, number, share, with_sd
+from telerig.rig import projection
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
+from telerig.rig.projection import PARAMETERS
+
+Array = NDArray[np.float64]
+
+WORST = 15
+_WORDS = {
+    "scale_px_per_mm": "scale, px/mm",
+    "aspect": "aspect, v scale over u scale",
+    "skew": "skew",
+    "centre_u_px": "image centre u, px",
+    "centre_v_px": "image centre v, px",
+    "kappa_per_mm": "residual perspective κ, 1/mm",
+    "k1": "radial distortion 1",
+    "k2": "radial distortion 2",
+    "k3": "radial distortion 3",
+    "p1": "tangential distortion 1",
+    "p2": "tangential distortion 2",
+    "s1": "thin prism 1",
+    "s2": "thin prism 2",
+    "s3": "thin prism 3",
+    "s4": "thin prism 4",
+    "tilt_x": "sensor tilt about v, tangent",
+    "tilt_y": "sensor tilt about u, tangent",
+    "image_convergence_per_mm": "image-side convergence, 1/mm",
+}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A key number: its name, the number with its unit, and what to compare it with."""
+
+    name: str
+    value: str
+    remark: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """A table row: the cells as text; ``strong`` is set off, ``faint`` set back."""
+
+    cells: tuple[str, ...]
+    strong: bool = False
+    faint: bool = False
+
+
+def key_numbers(results: CalibrationResults) -> list[Figure]:
+    """What a reader wants first."""
+    s = results.statistics
+    per_camera = [f"{n} {number(s.get(f'rms_{n}_px'))}" for n in results.camera_names]
+    kept, measured = s.get("dots_kept"), s.get("dots_measured")
+    figures = [
+        Figure("Residual", f"{number(s.get('rms_px'))} px", f"RMS; {', '.join(per_camera)} px"),
+        Figure(
+            "Chi-square",
+            f"{number(s.get('chi2_dof'))} per dof",
+            f"1 is expected; {number(s.get('degrees_of_freedom'))} degrees of freedom",
+        ),
+        Figure(
+            "Dots kept",
+            share(kept, measured),
+            f"{number(kept, 9)} of {number(measured, 9)} in {len(results.views)} views",
+        ),
+    ]
+    return figures + _space_numbers(results, s)
+
+
+def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Figure]:
+    if len(results.cameras) < 2:
+        return [Figure("In space", "no depth", "one camera never sees the depth along its axis")]
+    precision = f"{number(s.get('space_sd_um'))} µm"
+    remark = (
+        f"1 sd per axis of a triangulated point; dots are {number(s.get('space_rms_um'))} µm RMS "
+        f"from the fit, rays miss by {number(s.get('ray_miss_rms_um'))} µm"
+    )
+    angle = with_sd(s.get("axes_angle_deg"), s.get("axes_angle_sd_deg"))
+    figures = [
+        Figure("In space", precision, remark),
+        Figure("Angle between axes", f"{angle} °", "1 sd; between the optical axes"),
+    ]
+    if "perspective_centres_distance_mm" in s:
+        distance = f"{number(s['perspective_centres_distance_mm'], 6)} mm"
+        figures.append(Figure("Base", distance, "between the centres of perspective"))
+    return figures
+
+
+def parameter_rows(results: CalibrationResults) -> list[Row]:
+    """One row per parameter, one cell per camera: value +- sd, or that it was held."""
+    cameras = list(results.content["cameras"].values())
+    rows = []
+    for name in PARAMETERS:
+        cells = [_parameter_cell(camera, name) for camera in cameras]
+        free = any(name in camera.get("free", []) for camera in cameras)
+        rows.append(Row((f"{_WORDS[name]} ({name})", *cells), faint=not free))
+    largest = [_largest_distortion(camera) for camera in results.cameras]
+    perspective = [f"{number(1e6 * c['kappa_per_mm'])} ppm" for c in results.cameras]
+    return [
+        *rows,
+        Row(("largest distortion in the image", *largest)),
+        Row(("scale lost per mm of depth", *perspective)),
+        Row(("field of view, mm", *(_field(camera) for camera in results.cameras))),
+    ]
+
+
+def _parameter_cell(camera: Mapping[str, Any], name: str) -> str:
+    value = camera["parameters"][name]
+    if name not in camera.get("free", []):
+        return f"{number(value, 7)} (held)"
+    return with_sd(value, (camera.get("standard_deviations") or {}).get(name))
+
+
+def _field(camera: Camera) -> str:
+    width, height = np.array(camera.image_size_px) / camera["scale_px_per_mm"]
+    return f"{number(float(width))} × {number(float(height / camera['aspect']))}"
+
+
+def _largest_distortion(camera: Camera) -> str:
+    """How far distortion and sensor tilt move a point, at most, within the image."""
+    grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 9) for n in camera.image_size_px)), -1)
+    straight = camera.with_parameters(**dict.fromkeys(PARAMETERS[PARAMETERS.index("k1") :], 0.0))
+    try:
+        ideal = projection.ideal_from_pixel(grid, camera.intrinsics, camera.rho_mm)
+    except GeometryError:
+        return "not invertible in the whole image"
+    points = np.concatenate([ideal, np.zeros((*ideal.shape[:-1], 1))], -1)
+    moved = grid - projection.pixel_from_camera(points, straight.intrinsics, camera.rho_mm)
+    return f"{number(float(np.hypot(moved[..., 0], moved[..., 1]).max()))} px"
+
+
+def pose_rows(results: CalibrationResults) -> list[Row]:
+    """The second camera against the first; empty for one camera."""
+    if len(results.cameras) < 2:
+        return []
+    second = results.cameras[1]
+    pose = second.camera_from_rig
+    nominal = (results.content.get("twin") or {}).get("nominal_rotvec_deg")
+    turn, place = _tangent_sd(results, "r", "_rad"), _tangent_sd(results, "t", "_mm")
+    statistics = results.statistics
+    return [
+        Row(("angle between the axes, °", with_sd(statistics.get("axes_angle_deg"),
+                                                  statistics.get("axes_angle_sd_deg"))), True),
+        Row(("distance between the axes, mm", _gap(results, pose))),
+        Row((f"{second.name}_from_{results.cameras[0].name} as rotation vector, °",
+             _vector(np.degrees(pose.rotvec_rad), 7))),
+        Row(("the same, nominal (rig.toml)", _vector(nominal, 4))),
+        Row((f"sd of turns about {second.name}'s x, y, z, °", _vector(_degrees(turn), 2))),
+        Row((f"{second.name}_from_{results.cameras[0].name} translation, mm",
+             _vector(pose.translation_mm, 5))),
+        Row((f"sd of shifts along {second.name}'s x, y, z, mm", _vector(place, 2))),
+    ]  # fmt: skip
+
+
+def _degrees(radians: list[float] | None) -> list[float] | None:
+    return None if radians is None else [float(np.degrees(r)) for r in radians]
+
+
+def _rig_block(results: CalibrationResults, names: list[str]) -> Array | None:
+    block = results.content.get("covariance") or {}
+    known = list(block.get("names", []))
+    if not set(names) <= set(known):
+        return None
+    index = [known.index(name) for name in names]
+    return np.array(block["matrix"], float)[np.ix_(index, index)]
+
+
+def _tangent_names(results: CalibrationResults, kind: str, unit: str) -> list[str]:
+    return [f"{results.cameras[1].name}.{kind}{axis}{unit}" for axis in "xyz"]
+
+
+def _tangent_sd(results: CalibrationResults, kind: str, unit: str) -> list[float] | None:
+    block = _rig_block(results, _tangent_names(results, kind, unit))
+    return None if block is None else [float(s) for s in np.sqrt(np.diag(block))]
+
+
+def _gap(results: CalibrationResults, camera_from_rig: Pose) -> str:
+    """Length of the common perpendicular; the tangent is of rig_from_second, in its own axes."""
+    across = np.cross([0.0, 0.0, 1.0], camera_from_rig.rotation[2])
+    if np.linalg.norm(across) < 1e-6:
+        return "the axes are parallel"
+    across /= np.linalg.norm(across)
+    gap = abs(float(across @ camera_from_rig.inverse().translation_mm))
+    block = _rig_block(results, _tangent_names(results, "t", "_mm"))
+    if block is None:
+        return number(gap, 5)
+    inside = camera_from_rig.rotation @ across
+    return with_sd(gap, float(np.sqrt(inside @ block @ inside)))
+
+
+def _vector(values: Any, digits: int) -> str:
+    if values is None:
+        return ABSENT
+    return "(" + ", ".join(number(float(v), digits) for v in values) + ")"
+
+
+def ladder_rows(results: CalibrationResults) -> list[Row]:
+    """The models that were tried; empty when one was fixed."""
+    model = results.content.get("model") or {}
+    ladder = model.get("ladder") or []
+    bics = [rung["bic"] for rung in ladder if is_number(rung.get("bic"))]
+    return [
+        Row(
+            (
+                str(rung.get("model")), number(rung.get("parameters"), 4),
+                number(rung.get("rms_px"), 4), number(rung.get("chi2_dof")),
+                _above(rung.get("bic"), bics), number(rung.get("held_out")),
+            ),
+            strong=rung.get("model") == model.get("name"),
+        )
+        for rung in ladder
+    ]  # fmt: skip
+
+
+def _above(bic: Any, bics: list[float]) -> str:
+    return f"{bic - min(bics):.1f}" if is_number(bic) else ABSENT
+
+
+def worst_rows(results: CalibrationResults) -> list[Row]:
+    """The dots that agree least: the down-weighted ones first, then by their residual."""
+    table = results.residuals
+    size = table["length_px"]
+    if "whitened_u" in table:
+        size = np.hypot(table["whitened_u"], table["whitened_v"])
+    order = np.lexsort((-size.to_numpy(), table["kept"].to_numpy()))
+    return [
+        Row(
+            (
+                dot.view, dot.camera, str(dot.dot), f"{dot.row}, {dot.column}",
+                f"{dot.du_px:+.4f}", f"{dot.dv_px:+.4f}", f"{dot.length_px:.4f}",
+                f"{dot.weight:.3g}", dot.reason,
+            ),
+            strong=not dot.kept,
+        )
+        for dot in table.iloc[order[:WORST]].itertuples()
+    ]  # fmt: skip

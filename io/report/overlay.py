@@ -1,0 +1,174 @@
+"""What was found in an image, drawn over it: accepted dots in green, rejected ones in red."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.atomic import atomic_path
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Picture = NDArray[np.uint8]
+Array = NDArray[np.float64]
+
+GREEN, RED, PAPER, INK = (40, 200, 70), (235, 45, 45), (255, 255, 255), (30, 30, 30)
+_ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
+_LARGEST_ID = 9999
+_FRACTION_BITS = 4
+_SCALE, _LINE_PX = 0.36, 14
+
+
+def draw_overlay(
+    image: NDArray[Any],
+    accepted: pd.DataFrame,
+    rejected: pd.DataFrame,
+    *,
+    max_width_px: int = 480,
+) -> Picture:
+    """The image, small, with its dots: an RGB picture (h, w, 3) with a legend underneath.
+
+    image : grey (H, W), 8 or 16 bit or float. accepted : u_px, v_px, a_px, b_px, angle_rad, dot,
+    row, column; its dots are green with their index (row,column where ids are opaque), as far as
+    there is room for it. rejected : u_px, v_px, a_px, b_px, angle_rad, reason; red with the
+    number of the reason, which the legend spells out with the count of its dots.
+
+    Raises InputError for what is no grey image or a table without these columns.
+    """
+    _check(image, accepted, ["dot", "row", "column"], "accepted")
+    _check(image, rejected, ["reason"], "rejected")
+    factor = min(1.0, max_width_px / image.shape[1])
+    picture = _grey_picture(image, factor)
+    numbers = {r: i + 1 for i, r in enumerate(rejected["reason"].value_counts().index)}
+    taken = np.zeros(picture.shape[:2], bool)
+    _draw(picture, rejected, [str(numbers[r]) for r in rejected["reason"]], factor, RED, taken)
+    _draw(picture, accepted, _labels(accepted), factor, GREEN, taken)
+    counts = rejected["reason"].value_counts()
+    lines = [f"{len(accepted)} dots accepted, {len(rejected)} rejected"]
+    lines += [f"{n}: {reason} ({counts[reason]})" for reason, n in numbers.items()]
+    return np.concatenate([picture, _legend(lines, picture.shape[1])])
+
+
+def write_overlay(picture: Picture, path: str | PathLike[str], *, quality: int = 80) -> None:
+    """Write an RGB picture as JPEG. Raises InputError when the place cannot be written."""
+    import cv2
+
+    with atomic_path(path) as temporary:
+        coded, content = cv2.imencode(
+            ".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, int(quality)]
+        )
+        if not coded:
+            raise InputError("this picture cannot be coded as JPEG", where=str(path))
+        temporary.write_bytes(content.tobytes())
+
+
+def _check(image: NDArray[Any], table: pd.DataFrame, extra: list[str], name: str) -> None:
+    if image.ndim != 2 or min(image.shape) < 1:
+        raise InputError(
+            f"an overlay is drawn on a grey image, this one has shape {image.shape}",
+            todo="pass one channel, (height, width)",
+        )
+    missing = [column for column in _ELLIPSE + extra if column not in table]
+    if missing:
+        raise InputError(
+            f"the table of {name} dots lacks {', '.join(missing)}",
+            todo=f"it needs {', '.join(_ELLIPSE + extra)}",
+        )
+
+
+def _grey_picture(image: NDArray[Any], factor: float) -> Picture:
+    """8-bit RGB; the darkest and brightest thousandth of the pixels become black and white."""
+    import cv2
+
+    height, width = image.shape
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    grey = np.nan_to_num(image.astype(np.float32))
+    if factor < 1:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    low, high = np.percentile(grey, [0.1, 99.9])
+    stretched = np.clip((grey - low) / max(high - low, 1e-9), 0, 1) * 255
+    return np.repeat(stretched.astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _labels(accepted: pd.DataFrame) -> list[str]:
+    if len(accepted) and accepted["dot"].max() > _LARGEST_ID:
+        return [f"{r},{c}" for r, c in zip(accepted["row"], accepted["column"])]
+    return [str(dot) for dot in accepted["dot"]]
+
+
+def _draw(
+    picture: Picture,
+    table: pd.DataFrame,
+    labels: Iterable[str],
+    factor: float,
+    colour: tuple[int, int, int],
+    taken: NDArray[np.bool_],
+) -> None:
+    """Ellipses and labels; ``taken`` marks the pixels under labels that are already there."""
+    import cv2
+
+    ellipses = table[_ELLIPSE].to_numpy(float)
+    for u, v, a, b, angle in ellipses[np.isfinite(ellipses).all(axis=1)]:
+        centre = (np.array([u, v]) + 0.5) * factor - 0.5
+        axes = np.maximum(np.array([a, b]) * factor, 1.5)
+        cv2.ellipse(
+            picture, _fixed(centre), _fixed(axes), float(np.degrees(angle)), 0, 360, colour, 1,
+            cv2.LINE_AA, _FRACTION_BITS,
+        )  # fmt: skip
+    for (u, v, a, _, _), label in zip(ellipses, labels):
+        if np.isfinite([u, v, a]).all():
+            _label(picture, label, ((u + 0.5) * factor, (v + 0.5) * factor), colour, taken)
+
+
+def _fixed(point: Array) -> tuple[int, int]:
+    x, y = np.rint(point * 2**_FRACTION_BITS).astype(int)
+    return int(x), int(y)
+
+
+def _label(
+    picture: Picture,
+    label: str,
+    centre: tuple[float, float],
+    colour: tuple[int, int, int],
+    taken: NDArray[np.bool_],
+) -> None:
+    """Text in the middle of a dot, with a dark rim, if no other text is there."""
+    import cv2
+
+    (width, height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, 1)
+    x = int(np.clip(round(centre[0] - width / 2), 0, max(picture.shape[1] - width, 0)))
+    y = int(np.clip(round(centre[1] + height / 2), height, max(picture.shape[0] - 1, height)))
+    place = (slice(max(y - height - 1, 0), y + 2), slice(max(x - 1, 0), x + width + 2))
+    if taken[place].any():
+        return
+    taken[place] = True
+    for shade, thickness in ((INK, 3), (colour, 1)):
+        cv2.putText(
+            picture, label, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _SCALE, shade, thickness, cv2.LINE_AA
+        )
+
+
+def _legend(lines: list[str], width_px: int) -> Picture:
+    """The lines in dark ink on white, wrapped to the width."""
+    import textwrap
+
+    import cv2
+
+    letters = max(8, int((width_px - 8) / (18.5 * _SCALE)))
+    wrapped = [part for line in lines for part in textwrap.wrap(_ascii(line), letters)]
+    strip = np.full((_LINE_PX * len(wrapped) + 6, width_px, 3), PAPER, np.uint8)
+    for i, line in enumerate(wrapped):
+        at = (4, _LINE_PX * (i + 1))
+        cv2.putText(strip, line, at, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, INK, 1, cv2.LINE_AA)
+    return strip
+
+
+def _ascii(text: str) -> str:
+    """OpenCV's letters are ASCII only."""
+    return text.replace("µ", "u").encode("ascii", "replace").decode("ascii")

@@ -1,0 +1,84 @@
+"""Numbers as a reader wants them: digits that mean something, units, nothing for nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+ABSENT = "not available"
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def is_number(value: Any) -> bool:
+    """True for a finite int or float (files write null for what is not finite)."""
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return plain and math.isfinite(value)
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """``value`` to so many significant digits, without an exponent where that is short."""
+    if not is_number(value):
+        return ABSENT
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if -4 <= exponent < 7:
+        return f"{value:,.{max(0, digits - 1 - exponent)}f}".replace(",", "\u202f")
+    return f"{value / 10.0**exponent:.{digits - 1}f}·{_power(exponent)}"
+
+
+def with_sd(value: Any, sd: Any) -> str:
+    """``value`` and its standard deviation, both cut where the deviation has two digits."""
+    if not is_number(value):
+        return ABSENT
+    if not is_number(sd) or sd <= 0:
+        return number(value, 7)
+    largest = max(abs(value), sd)
+    exponent = math.floor(math.log10(largest))
+    if -3 <= exponent < 6:
+        decimals = max(0, 1 - math.floor(math.log10(sd)))
+        return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
+    value, sd = value / 10.0**exponent, sd / 10.0**exponent
+    decimals = max(0, 1 - math.floor(math.log10(sd)))
+    return f"({value:.{decimals}f} ± {sd:.{decimals}f})·{_power(exponent)}"
+
+
+def share(part: Any, whole: Any) -> str:
+    """``part`` of ``whole`` in per cent; 100 % only when nothing is missing."""
+    if not is_number(part) or not is_number(whole) or whole <= 0:
+        return ABSENT
+    percent = 100 * part / whole
+    return "100 %" if part == whole else f"{min(percent, 99.9):.1f} %"
+
+
+def nice_below(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above ``value`` (1 for 0)."""
+    if not is_number(value) or value <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= value * 1.0001) * power)
+
+
+def flat_rows(content: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Every leaf of nested mappings and lists as (dotted name, text)."""
+    if isinstance(content, Mapping):
+        for key, value in content.items():
+            yield from flat_rows(value, f"{path}.{key}" if path else str(key))
+    elif isinstance(content, list) and any(isinstance(item, Mapping | list) for item in content):
+        for i, value in enumerate(content):
+            yield from flat_rows(value, f"{path}[{i}]")
+    elif isinstance(content, list):
+        yield path, ", ".join(_leaf(item) for item in content)
+    else:
+        yield path, _leaf(content)
+
+
+def _leaf(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    return ABSENT if value is None else str(value)
+
+
+def _power(exponent: int) -> str:
+    return "10" + str(exponent).translate(_SUPERSCRIPT)

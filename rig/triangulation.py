@@ -54,9 +54,12 @@ def midpoint(
 
 
 def pixel_covariance(sigma_px: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Standard deviations (scalar or (...,)) or covariances (..., 2, 2) -> (..., 2, 2)."""
+    """Standard deviations (scalar or (...,)) or covariances (..., 2, 2) -> (..., 2, 2).
+
+    An array of the points' own shape is taken for standard deviations, even when that is (2, 2).
+    """
     sigma = np.asarray(sigma_px, float)
-    if sigma.ndim >= 2 and sigma.shape[-2:] == (2, 2):
+    if sigma.shape != shape and sigma.ndim >= 2 and sigma.shape[-2:] == (2, 2):
         return np.broadcast_to(sigma, (*shape, 2, 2))
     if np.any(~(sigma > 0)):
         raise InputError("sigma_px must be positive", todo="give the pixel noise in px")
@@ -76,13 +79,20 @@ def triangulate(
     Gauss-Newton from the mid-point) or "midpoint" (the 2004 method; its covariance is propagated
     through its own formula's weights, equal for both rays).
 
-    Raises InputError for unequal shapes or an unknown method, GeometryError for parallel rays.
+    Raises InputError for unequal shapes, pixels that are not finite or an unknown method,
+    GeometryError for parallel rays.
     """
     first, second = (np.asarray(uv, float) for uv in uv_px)
     if first.shape != second.shape or first.shape[-1:] != (2,):
         raise InputError(
             f"pixels of shapes {first.shape} and {second.shape} do not pair up",
             todo="give two arrays (N, 2), row i of one matching row i of the other",
+        )
+    bad = ~(np.isfinite(first) & np.isfinite(second)).all(-1)
+    if np.any(bad):
+        raise InputError(
+            f"{int(bad.sum())} of {bad.size} points have pixels that are not finite",
+            todo="leave out points that one camera did not see",
         )
     if method not in ("ml", "midpoint"):
         raise InputError(f"unknown method {method!r}", todo='use "ml" or "midpoint"')

@@ -1,9 +1,11 @@
-"""Simulated calibration scenes in memory, shared by the tests of the self-calibration."""
+"""What several test files share: datasets simulated once, and calibration scenes in memory."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -97,3 +99,19 @@ def make_scene(
 def scene() -> Callable[..., Scene]:
     """`make_scene`: scene("paper", seed, outlier_share=0.05, angle_deg=60.0, ...)."""
     return make_scene
+
+
+@pytest.fixture(scope="session")
+def paper_images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The preset `paper` with images; read only."""
+    import telerig
+
+    folder = tmp_path_factory.mktemp("paper") / "set"
+    telerig.simulate("paper", rng=np.random.default_rng(11), out=folder)
+    return folder
+
+
+@pytest.fixture
+def paper_copy(paper_images: Path, tmp_path: Path) -> Path:
+    """A copy of `paper_images` to spoil."""
+    return Path(shutil.copytree(paper_images, tmp_path / "set"))

@@ -121,7 +121,10 @@ class Target:
         return np.where(self.is_mark(dot), mark, self.dot_diameter_mm).astype(float)
 
     def symmetry_order(self) -> int:
-        """How many proper rotations (by multiples of 90 deg) leave the nominal target unchanged."""
+        """How many proper rotations (by multiples of 90 deg) leave the nominal target unchanged.
+
+        On an unbounded grid rotations may come with a shift. Of the layout "points": 1.
+        """
         if self.layout == "points":
             return 1
         rotations = 4 if np.isclose(*self.pitch_mm) else 2
@@ -132,15 +135,19 @@ class Target:
         if quarter_turns % 2 and self.bounded and self.rows != self.columns:
             return False
         marks = np.array(self.marks, float).reshape(-1, 2)
-        if not self.bounded:
-            return len(marks) == 0 or quarter_turns == 0
-        centre = np.array([self.rows - 1, self.columns - 1]) / 2
         turn = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarter_turns)
+        if not self.bounded:
+            return not len(marks) or _from_corner(marks @ turn.T) == _from_corner(marks)
+        centre = np.array([self.rows - 1, self.columns - 1]) / 2
         turned = (marks - centre) @ turn.T + centre
         return _rows_as_set(turned) == _rows_as_set(marks)
 
     def _points(self) -> Array:
         return np.zeros((0, 2)) if self.points_mm is None else np.asarray(self.points_mm, float)
+
+
+def _from_corner(places: Array) -> set[tuple[int, ...]]:
+    return _rows_as_set(places - places.min(0))
 
 
 def _rows_as_set(rows: Iterable[Any]) -> set[tuple[int, ...]]:

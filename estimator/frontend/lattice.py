@@ -14,16 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
+
+from telerig.errors import DetectionError
 from telerig.estimator.frontend.local_fit import (
     NEIGHBOURS,
     apply_homography,
+    fit_affine,
     fit_homography,
     fit_neighbours,
     leave_one_out,
     nearest,
 )
-
-from telerig.errors import DetectionError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,6 +36,8 @@ SECOND_DOT = "a second dot at an occupied place"
 
 _REACH = 0.25
 """A dot is at a predicted place when it is within this part of the local pitch."""
+_ROUGH = 0.05
+"""Of a true grid the median dot is within this part of the pitch of where its neighbours say."""
 _PATCH = 60
 _SEEDS = 4
 
@@ -101,7 +104,7 @@ def grow_lattice(
     best = _best_growth(flat, pitch_ratio)
     if best is not None:
         _drop_false_dots(best, back, floor_px)
-    if best is None or best.placed().sum() < MIN_DOTS:
+    if best is None or not _is_grid(best):
         found = 0 if best is None else int(best.placed().sum())
         raise DetectionError(
             f"of {len(points)} dots only {found} lie on a grid with the target's pitch ratio",
@@ -265,6 +268,20 @@ def _drop_false_dots(growth: _Growth, image_from_flat: Array, floor_px: float) -
             return
         growth.remove(false)
         growth.grow()
+
+
+def _is_grid(growth: _Growth) -> bool:
+    """Whether enough dots lie on it, closely enough: scattered dots can look like a few places."""
+    dots = np.flatnonzero(growth.placed())
+    if len(dots) < max(MIN_DOTS, 0.3 * len(growth.flat)):
+        return False
+    places = growth.place[dots]
+    fit = fit_homography if len(dots) > 9 else fit_affine
+    residual = np.zeros_like(growth.flat)
+    residual[dots] = growth.flat[dots] - apply_homography(fit(places, growth.flat[dots]), places)
+    pitch = np.linalg.norm(growth.basis[dots], axis=2).min(axis=1)
+    rough = np.median(leave_one_out(growth.at, residual, places) / pitch)
+    return bool(rough < _ROUGH)
 
 
 def _lattice(growth: _Growth, image_from_flat: Array, shapes_px2: Array) -> Lattice:

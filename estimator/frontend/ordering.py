@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+
+from telerig.errors import DetectionError, InputError
 from telerig.estimator.frontend.candidates import (
     MAX_TIED,
     Candidates,
@@ -26,11 +28,10 @@ from telerig.estimator.frontend.marks import MarkEvidence, mark_evidence
 from telerig.estimator.frontend.point_layout import match_points
 from telerig.rig.target import Target
 
-from telerig.errors import DetectionError
-
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+NEEDED = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 OUTSIDE = "on the grid, outside the target's rows and columns"
 CLEAR_LEAD = 0.8
 """Of two matches of points, the lesser must explain fewer than this part of the better one's."""
@@ -79,12 +80,14 @@ def number_dots(
     allow_mirrored : consider that the image shows the target mirrored. handedness : +1 or -1 when
     it is known from other images.
 
-    Raises DetectionError when there are too few dots, no grid, no marks, or too many candidates.
+    Raises DetectionError when there are too few dots, no grid, no marks, or too many candidates,
+    InputError when a column is missing or a value is not finite.
     """
     if not len(dots):
         raise DetectionError(
             "no dots found", todo="check [target] polarity, the exposure, and that it is in view"
         )
+    _check_columns(dots)
     hands = _hands(target, allow_mirrored, handedness)
     if target.layout == "points":
         return _number_points(dots, target, hands)
@@ -97,6 +100,16 @@ def number_dots(
     ranked = rank_candidates(lattice, evidence, target, hands)
     ranked, ambiguous = _settle(ranked, evidence, target)
     return _numbering(lattice, evidence, ranked, ambiguous, target)
+
+
+def _check_columns(dots: pd.DataFrame) -> None:
+    missing = [name for name in NEEDED if name not in dots]
+    if missing:
+        raise InputError(f"the table of dots has no column {', '.join(missing)}")
+    finite = np.isfinite(dots[NEEDED].to_numpy(float)).all(axis=1)
+    if not finite.all():
+        rows = ", ".join(str(k) for k in np.flatnonzero(~finite)[:5])
+        raise InputError("the table of dots holds values that are not finite", where=f"row {rows}")
 
 
 def check_handedness(handedness_by_image: Mapping[tuple[str, str], int], two_sided: bool) -> None:

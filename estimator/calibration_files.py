@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.calibration import Calibration
@@ -15,6 +17,8 @@ from telerig.io.tables import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
+
+Array = NDArray[np.float64]
 
 SCHEMA = 1
 
@@ -33,6 +37,8 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
                 names=np.array(calibration.joint_names),
                 covariance=calibration.joint_covariance.astype(np.float64),
             )
+    else:
+        (folder / "covariance.npz").unlink(missing_ok=True)
     if path.suffix != ".json":
         if calibration.dots is not None:
             write_table(calibration.dots, folder / "dots.csv")
@@ -116,7 +122,7 @@ def read_calibration(path: Path) -> Calibration:
                 todo="update telerig",
             )
         return _from_dict(data, file)
-    except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(
             f"not a calibration that telerig wrote ({error!r})",
             where=str(file),
@@ -133,18 +139,14 @@ def _from_dict(data: dict[str, Any], file: Path) -> Calibration:
         )
         for name, c in data["cameras"].items()
     )  # fmt: skip
-    names: tuple[str, ...] = ()
-    joint = np.zeros((0, 0))
-    beside = file.parent / "covariance.npz"
-    if beside.is_file():
-        with np.load(beside) as archive:
-            names, joint = tuple(archive["names"].tolist()), archive["covariance"]
+    rig = np.array(data["covariance"]["matrix"], float)
+    names, joint = _joint_covariance(file.parent / "covariance.npz", rig)
     return Calibration(
         cameras=cameras,
         dot_ids=np.array(data["target"]["dots"], np.int64),
         target_points_mm=np.array(data["target"]["points_mm"], float).reshape(-1, 3),
         target_poses={v: _pose_from(p) for v, p in data["views"].items()},
-        covariance=np.array(data["covariance"]["matrix"], float),
+        covariance=rig,
         covariance_names=tuple(data["covariance"]["names"]),
         free=tuple(tuple(c["free"]) for c in data["cameras"].values()),
         name=data["name"],
@@ -157,3 +159,25 @@ def _from_dict(data: dict[str, Any], file: Path) -> Calibration:
         joint_names=names,
         joint_covariance=joint,
     )
+
+
+def _joint_covariance(beside: Path, rig: Array) -> tuple[tuple[str, ...], Array]:
+    """Names and matrix of the whole estimate; empty when the file is not there."""
+    if not beside.is_file():
+        return (), np.zeros((0, 0))
+    try:
+        with np.load(beside) as archive:
+            names, joint = tuple(archive["names"].tolist()), archive["covariance"]
+    except (ValueError, KeyError, OSError, BadZipFile) as error:
+        raise InputError(
+            f"not a covariance that telerig wrote ({error!r})",
+            where=str(beside),
+            todo="calibrate again, or delete this file: only the full covariance is lost",
+        ) from error
+    if not np.allclose(joint[: len(rig), : len(rig)], rig, rtol=1e-9, atol=0):
+        raise InputError(
+            "this covariance belongs to another calibration than the calibration.json beside it",
+            where=str(beside),
+            todo="copy both files together, or delete this one",
+        )
+    return names, joint

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.frontend.target_detection import MEASURED, detect_target, find_target
@@ -63,16 +64,21 @@ def draw(
     inside = away < target.diameter_mm(nearest) / 2
     if target.mark_style == "ring":
         inside &= ~(target.is_mark(nearest) & (away < target.dot_diameter_mm / 5))
-    cover = inside.reshape(size_px, 4, size_px, 4).mean((1, 3))
+    cover = gaussian_filter(inside.reshape(size_px, 4, size_px, 4).mean((1, 3)), 0.8)
     if target.polarity == "black_on_white":
         cover = 1 - cover
     noise = np.random.default_rng(seed).normal(0, 1.5, cover.shape)
     return np.clip(30 + 180 * cover + noise, 0, 255).astype(np.uint8), xy @ affine.T + offset
 
 
-@pytest.mark.parametrize("target", [DESIGN, RING, replace(DESIGN, polarity="black_on_white")])
 @pytest.mark.parametrize(
-    ("tilt_deg", "roll_deg", "mirrored"), [(0, 5, False), (50, 130, True), (68, 290, False)]
+    ("target", "tilt_deg", "roll_deg", "mirrored"),
+    [
+        (DESIGN, 0, 5, False),
+        (DESIGN, 65, 290, False),
+        (RING, 50, 130, True),
+        (replace(DESIGN, polarity="black_on_white"), 35, 200, True),
+    ],
 )
 def test_drawn_plates_are_numbered_at_their_centres(
     target: Target, tilt_deg: float, roll_deg: float, mirrored: bool
@@ -126,7 +132,8 @@ def test_real_printed_grid_is_numbered_from_its_rings(camera: int) -> None:
     import cv2
 
     image = cv2.imread(str(REAL / f"CalB-sys2-0014_{camera}.jpeg"), cv2.IMREAD_GRAYSCALE)
-    found = find_target(np.asarray(image), PRINTED)
+    half = np.asarray(image, float).reshape(1024, 2, 1224, 2).mean((1, 3))
+    found = find_target(half.astype(np.uint8), PRINTED)
     table = found.table
     assert 80 <= len(table) <= 91
     assert table["column"].between(-2, 8).all()
@@ -138,4 +145,4 @@ def test_real_printed_grid_is_numbered_from_its_rings(camera: int) -> None:
     bilinear = np.column_stack([one, row, column, row * column, row**2, column**2])
     for axis in ("u_px", "v_px"):
         fit = np.linalg.lstsq(bilinear, table[axis], rcond=None)[0]
-        assert np.abs(bilinear @ fit - table[axis]).max() < 8
+        assert np.abs(bilinear @ fit - table[axis]).max() < 4

@@ -48,6 +48,8 @@ def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
         right = np.zeros((len(views), 6))
         np.add.at(normal, obs.view, np.swapaxes(jac.by_view, -1, -2) @ jac.by_view)
         np.add.at(right, obs.view, -np.einsum("mij,mi->mj", jac.by_view, jac.value))
+        # a view seen by one telecentric camera has a depth that nothing moves
+        normal += 1e-9 * np.trace(normal, axis1=-2, axis2=-1)[:, None, None] * np.eye(6)
         step = np.linalg.solve(normal, right[..., None])[..., 0]
         views[:, :3, 3] += np.einsum("vij,vj->vi", views[:, :3, :3], step[:, 3:])
         views[:, :3, :3] = views[:, :3, :3] @ rotation_from_rotvec(step[:, :3])

@@ -10,8 +10,15 @@ import numpy as np
 import pandas as pd
 
 from telerig.errors import DetectionError, InputError
-from telerig.estimator.frontend.ordering import check_handedness
-from telerig.estimator.frontend.target_detection import ambiguous_numbering, find_target
+from telerig.estimator.frontend.dots import DotMeasurement, measure_dots
+from telerig.estimator.frontend.ordering import check_handedness, number_dots
+from telerig.estimator.frontend.target_detection import (
+    MEASURED,
+    REJECTED,
+    ambiguous_numbering,
+    numbered_table,
+    rejected_table,
+)
 from telerig.io.dataset import Dataset, View
 from telerig.rig.target import Target
 
@@ -19,6 +26,9 @@ Progress = Callable[[int, int], None]
 
 MEGAPIXELS_FOR_WORKERS = 40
 """Below this, starting worker processes costs more than it saves."""
+
+
+NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
 
 
 @dataclass(frozen=True)
@@ -113,23 +123,29 @@ def _one(dataset: Dataset, view: View, camera: str) -> ImageDots:
     image = dataset.image(view, camera)
     target: Target = dataset.target
     smallest = _smallest_px(dataset, camera)
-    empty = pd.DataFrame(columns=["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"])
     try:
-        found = find_target(image, target, min_diameter_px=smallest)
-        if found.numbering.ambiguous:
-            raise ambiguous_numbering(found.numbering, target)
-    except DetectionError as error:
-        words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
-        return ImageDots(view.name, camera, empty.iloc[:, :0], empty, 0, words)
+        measured = measure_dots(image, polarity=target.polarity, min_diameter_px=smallest)
     except InputError as error:
         raise InputError(
             error.what, where=str(view.image_paths[camera]), todo=error.todo
         ) from error
-    numbering = found.numbering
+    try:
+        numbering = number_dots(measured.dots, target)
+        if numbering.ambiguous:
+            raise ambiguous_numbering(numbering, target)
+    except DetectionError as error:
+        words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
+        return ImageDots(view.name, camera, NO_DOTS, _all_rejected(measured, error.what), 0, words)
+    rejected = rejected_table(measured.dots, measured.rejected, numbering)
+    table = numbered_table(measured.dots, numbering)
     notes = tuple(n for n in numbering.notes if "assumed" not in n)
-    return ImageDots(
-        view.name, camera, found.table, found.rejected, numbering.handedness, notes=notes
-    )
+    return ImageDots(view.name, camera, table, rejected, numbering.handedness, notes=notes)
+
+
+def _all_rejected(measured: DotMeasurement, reason: str) -> pd.DataFrame:
+    parts = [measured.dots.assign(reason=reason)[REJECTED], measured.rejected[REJECTED]]
+    filled = [part for part in parts if len(part)]
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=REJECTED)
 
 
 def _smallest_px(dataset: Dataset, camera: str) -> float:

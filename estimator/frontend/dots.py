@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from telerig.errors import InputError
 from telerig.estimator.frontend.blurred_ellipse import PIXEL_VARIANCE_PX2, axes_from_shape
-from telerig.estimator.frontend.contrast_field import contrast_gradients
+from telerig.estimator.frontend.contrast_field import contrast_gradients, with_common_blur
 from telerig.estimator.frontend.dot_candidates import (
     Candidate,
     Candidates,
@@ -34,7 +36,7 @@ from telerig.estimator.frontend.dot_windows import (
     dot_window,
     without_neighbours,
 )
-from telerig.estimator.frontend.luminance import DotFit, GradientPrior, Start, fit_dot
+from telerig.estimator.frontend.luminance import DotFit, Prior, Start, fit_dot
 from telerig.estimator.frontend.noise import (
     NoiseModel,
     agreed_factor,
@@ -43,14 +45,15 @@ from telerig.estimator.frontend.noise import (
     high_pass,
 )
 
-from telerig.errors import InputError
-
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
 
 _FIRST_SIGMA_PX = 1.0
+_FEWEST_PIXELS = 25
+"""A first fit that ran out of the image leaves no window for a second one."""
+_ROUNDS = 2
 _ROUGH_PIXELS = 500_000
 
 
@@ -194,7 +197,7 @@ def _first_pass(
     for blob in blobs:
         start = Start(blob.centre_px, blob.shape_px, sigma)
         window = dot_window(grey, found.labels, blob, start, coarse=True)
-        fits.append(fit_dot(window, start, noise, GradientPrior(), tolerance=0.3, outlier_rounds=1))
+        fits.append(fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1))
         sigma = float(np.median([fit.sigma_px for fit in fits[-9:]]))
     return fits
 
@@ -207,15 +210,16 @@ def _second_pass(
     noise: NoiseModel,
 ) -> list[DotFit]:
     """Every dot again, knowing the light and its neighbours."""
-    priors = contrast_gradients(fits, grey.shape, ties=True)
+    priors = with_common_blur(contrast_gradients(fits, grey.shape), fits)
     neighbours = close_neighbours(fits)
-    for _ in range(2 if any(neighbours) else 1):
+    for _ in range(_ROUNDS if any(neighbours) else 1):
         known, updated = list(fits), []
         for blob, fit, prior, near in zip(blobs, known, priors, neighbours):
             start = Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
             window = dot_window(grey, found.labels, blob, start)
             window = without_neighbours(window, [known[k] for k in near])
-            updated.append(fit_dot(window, start, noise, prior))
+            lost = np.count_nonzero(window.mask) < _FEWEST_PIXELS
+            updated.append(fit if lost else fit_dot(window, start, noise, prior))
         fits = updated
     return fits
 

@@ -66,7 +66,7 @@ def find_target(
     numbering = number_dots(measured.dots, target, handedness=handedness)
     return TargetDetection(
         table=numbered_table(measured.dots, numbering),
-        rejected=_rejected(measured.dots, measured.rejected, numbering),
+        rejected=rejected_table(measured.dots, measured.rejected, numbering),
         numbering=numbering,
         dots=measured.dots,
     )
@@ -91,7 +91,8 @@ def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
     )
 
 
-def _rejected(dots: pd.DataFrame, blobs: pd.DataFrame, numbering: Numbering) -> pd.DataFrame:
+def rejected_table(dots: pd.DataFrame, blobs: pd.DataFrame, numbering: Numbering) -> pd.DataFrame:
+    """What was not numbered, with reasons: rejected blobs and dots off the target."""
     index = numbering.unplaced["index"].to_numpy()
     unplaced = dots.iloc[index].reset_index(drop=True)
     unplaced = unplaced.assign(reason=numbering.unplaced["reason"])

@@ -1,0 +1,225 @@
+"""The commands on real files: what they write, and what they say of bad input."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+import telerig
+from telerig.scripts.main import app
+
+runner = CliRunner()
+
+
+def run(*arguments: str | Path, code: int = 0) -> str:
+    result = runner.invoke(app, [str(a) for a in arguments])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    text = result.output + result.stderr
+    assert result.exit_code == code, text
+    return text
+
+
+def images(folder: Path, camera: str) -> list[Path]:
+    return sorted((folder / "calibration" / camera).iterdir())
+
+
+def spoil(path: Path, change) -> None:  # type: ignore[no-untyped-def]
+    tifffile.imwrite(path, change(tifffile.imread(path)))
+
+
+@pytest.fixture(scope="module")
+def calibrated(paper_images: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    out = tmp_path_factory.mktemp("out") / "calibration"
+    return out, run("calibrate", paper_images, "--out", out, "--quiet")
+
+
+def test_calibrate_writes_every_file_of_the_contract(calibrated):
+    out, text = calibrated
+    for name in ("calibration.json", "covariance.npz", "dots.csv", "residuals.csv", "report.html",
+                 "run.json"):  # fmt: skip
+        assert (out / name).is_file(), name
+    dots = pd.read_csv(out / "dots.csv")
+    assert list(dots.columns) == [
+        "view", "camera", "dot", "row", "column", "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2",
+        "chi2_dof",
+    ]  # fmt: skip
+    residuals = pd.read_csv(out / "residuals.csv")
+    assert list(residuals.columns) == [
+        "view", "camera", "dot", "row", "column", "u_px", "v_px", "du_px", "dv_px", "weight",
+        "reason",
+    ]  # fmt: skip
+    assert len(dots) == len(residuals) == 12 * 2 * 15
+    data = json.loads((out / "calibration.json").read_text())
+    assert data["pixel_origin"] == "centre" and data["gauge"]
+    assert "GOOD" in text
+    record = json.loads((out / "run.json").read_text())
+    assert set(record["inputs_sha256"]) >= {"rig.toml", "calibration/left/01.tif"} or len(
+        record["inputs_sha256"]
+    ) == 25
+
+
+def test_residuals_are_measured_minus_predicted(calibrated, paper_images):
+    out, _ = calibrated
+    calibration = telerig.load_calibration(out)
+    row = pd.read_csv(out / "residuals.csv", dtype={"view": str}).iloc[7]
+    index = list(calibration.dot_ids).index(row["dot"])
+    pose = calibration.target_poses[row["view"]]
+    point = pose.apply(calibration.target_points_mm[index : index + 1])
+    predicted = calibration.project(row["camera"], point)[0]
+    # up to the eccentricity of the dot's image, which is below a milli-pixel here
+    np.testing.assert_allclose(
+        row[["u_px", "v_px"]].to_numpy(float) - predicted,
+        row[["du_px", "dv_px"]].to_numpy(float),
+        atol=1e-3,
+    )
+
+
+def test_calibration_agrees_with_the_truth(calibrated, paper_images):
+    from telerig.estimator.truth import compare_with_truth
+
+    out, _ = calibrated
+    truth = telerig.load_dataset(paper_images).truth
+    comparison = compare_with_truth(telerig.load_calibration(out), truth)
+    assert comparison.passed, comparison.table
+    assert comparison.space.rms_um < 1.2
+
+
+def test_a_second_run_gives_the_same_bytes(calibrated, paper_images, tmp_path):
+    out, _ = calibrated
+    run("calibrate", paper_images, "--out", tmp_path / "again", "--quiet", "--no-report")
+    for name in ("calibration.json", "residuals.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+
+
+def test_detect_says_what_it_found_and_draws_it(paper_images, tmp_path):
+    text = run("detect", paper_images, "--out", tmp_path / "found", "--quiet")
+    assert len(re.findall(r"15 dots", text)) == 24
+    assert len(list((tmp_path / "found" / "overlays").glob("*/*.jpg"))) == 24
+
+
+def test_mirrored_camera_is_named(paper_copy):
+    for path in images(paper_copy, "right"):
+        spoil(path, np.fliplr)
+    text = run("calibrate", paper_copy, "--quiet", code=2)
+    assert "camera 'right' is mirrored against camera 'left'" in text
+    assert "two_sided" in text
+    assert not (paper_copy / "results").exists()
+
+
+def test_one_mirrored_image_is_named(paper_copy):
+    spoil(images(paper_copy, "left")[4], np.flipud)
+    text = run("calibrate", paper_copy, "--quiet", code=2)
+    name = images(paper_copy, "left")[4].stem
+    assert f"camera 'left' view '{name}'" in text and "mirrored image" in text
+
+
+def test_view_of_one_camera_only_is_used_and_said(paper_copy):
+    gone = images(paper_copy, "right")[0]
+    gone.unlink()
+    text = run("calibrate", paper_copy, "--quiet")
+    assert re.search(rf"view '?{gone.stem}'?.*(only|alone|one camera)", text), text
+
+
+def test_image_without_dots_is_left_out_with_the_reason(paper_copy):
+    path = images(paper_copy, "left")[2]
+    spoil(path, lambda image: np.full_like(image, 40))
+    text = run("calibrate", paper_copy, "--quiet")
+    assert f"view {path.stem}, camera left left out: no dots found" in text
+
+
+def test_dots_merged_by_glare_are_rejected_and_the_rest_used(paper_copy):
+    path = images(paper_copy, "left")[3]
+    before = telerig.detect_target(tifffile.imread(path), telerig.load_dataset(paper_copy).target)
+    pair = before[before["dot"].isin([0, 1])][["u_px", "v_px"]].to_numpy()
+
+    def glare(image):
+        out = image.copy()
+        ends = [tuple(int(round(x)) for x in p) for p in pair]
+        cv2.line(out, ends[0], ends[1], int(image.max()), 9)
+        return out
+
+    spoil(path, glare)
+    text = run("calibrate", paper_copy, "--quiet")
+    rejected = pd.read_csv(paper_copy / "results/calibration/rejected.csv", dtype={"view": str})
+    dots = pd.read_csv(paper_copy / "results/calibration/dots.csv", dtype={"view": str})
+    mine = dots[(dots["view"] == path.stem) & (dots["camera"] == "left")]
+    assert len(mine) == 13 and not set(mine["dot"]) & {0, 1}
+    assert len(rejected[(rejected["view"] == path.stem) & (rejected["camera"] == "left")]) >= 1
+    assert "GOOD" in text or "USABLE" in text
+
+
+def test_twelve_bits_in_sixteen(paper_copy, tmp_path):
+    for camera in ("left", "right"):
+        for path in images(paper_copy, camera):
+            spoil(path, lambda image: image.astype(np.uint16) * 16)
+    text = run("calibrate", paper_copy, "--quiet", "--no-report")
+    assert "360 of 360 dots" in text
+
+
+def test_colour_image_is_refused(paper_copy):
+    path = images(paper_copy, "left")[0]
+    image = tifffile.imread(path)
+    cv2.imwrite(str(path.with_suffix(".png")), np.dstack([image, image // 2, image]))
+    path.unlink()
+    text = run("calibrate", paper_copy, "--quiet", code=2)
+    assert path.with_suffix(".png").name in text and "colour" in text
+
+
+def test_truncated_image_is_refused_and_nothing_is_written(paper_copy):
+    path = images(paper_copy, "right")[5]
+    path.write_bytes(path.read_bytes()[:3000])
+    text = run("calibrate", paper_copy, "--quiet", code=2)
+    assert path.name in text
+    assert not (paper_copy / "results").exists()
+
+
+def test_wrong_size_names_both(paper_copy):
+    spoil(images(paper_copy, "right")[1], lambda image: image[:500])
+    text = run("calibrate", paper_copy, "--quiet", code=2)
+    assert "512" in text and "500" in text
+
+
+def test_nominal_rotation_on_the_wrong_side_shows_both_twins(paper_copy):
+    rig = paper_copy / "rig.toml"
+    text = rig.read_text()
+    turned = re.sub(r"(right_from_left_rotvec_deg = \[).*\]", r"\g<1>0.0, -90.0, 0.0]", text)
+    assert turned != text
+    rig.write_text(turned)
+    said = run("calibrate", paper_copy, "--quiet", "--no-report")
+    assert "mirror twin: cost" in said
+    calibration = telerig.load_calibration(paper_copy / "results/calibration")
+    assert calibration.statistics["inter_camera_rotvec_deg"][1] < -80
+    np.testing.assert_allclose(
+        calibration.twin["cost"], calibration.twin["other_cost"], rtol=1e-9
+    )
+
+
+def test_existing_results_survive_a_failure(paper_copy):
+    results = paper_copy / "results" / "calibration"
+    results.mkdir(parents=True)
+    (results / "calibration.json").write_text("old")
+    shutil.rmtree(paper_copy / "calibration" / "right")
+    for path in images(paper_copy, "left")[1:]:
+        path.unlink()
+    run("calibrate", paper_copy, "--quiet", code=2)
+    assert (results / "calibration.json").read_text() == "old"
+
+
+def test_unknown_preset_and_model_are_named(paper_images, tmp_path):
+    assert "paper" in run("simulate", "papper", "--out", tmp_path / "x", code=2)
+    assert "radial" in run("calibrate", paper_images, "--model", "radail", code=2)
+
+
+def test_help_of_every_command():
+    for command in ("demo", "simulate", "detect", "calibrate"):
+        assert "Exit" in run(command, "--help") or command != "calibrate"

@@ -6,11 +6,12 @@ smoothly across the flats between edges, so it needs no dot size and no even lig
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
 from telerig.estimator.frontend.blurred_ellipse import (
     approximate_distance_px,
     axes_from_shape,
@@ -32,6 +33,11 @@ _STRONG_SHARE = 0.15
 _STRONG_SIGMA = 7.0
 _FLAT_DISTANCES_PX = (6, 5, 4, 3, 2)
 _FLAT_SHARE = 0.1
+_PIECE_LEVELS = (0.15, 0.3, 0.45, 0.6, 0.75)
+_PIECE_SHARE = 0.6
+_PIECE_SEMI_AXIS_PX = 4.0
+_PIECE_GROWTH_PX = 0.5
+_MIN_PIECE_PIXELS = 4
 
 
 @dataclass(frozen=True)
@@ -142,68 +148,115 @@ def _spread(values: Grey, weight: Grey) -> Grey:
 
 def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) -> Candidates:
     """Every blob of one polarity, with the reason why it cannot be a dot if there is one."""
-    import cv2
-
-    bright = polarity == "white_on_black"
-    inside = edges.smooth > edges.threshold if bright else edges.smooth < edges.threshold
+    sign = 1.0 if polarity == "white_on_black" else -1.0
     labels = np.zeros(edges.smooth.shape, np.int32)
+    blobs: list[Candidate] = []
     if not edges.has_edges:
         return Candidates(polarity, (), labels)
-    outlines, tree = cv2.findContours(
-        inside.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE
-    )
-    if not outlines:
-        return Candidates(polarity, (), labels)
-    hierarchy = np.asarray(tree).reshape(-1, 4)
-    outlines = [np.asarray(outline, dtype=np.int32).reshape(-1, 2) for outline in outlines]
-    blobs: list[Candidate] = []
-    for index, outline in enumerate(outlines):
-        if hierarchy[index, 3] >= 0:
-            continue
-        blob = _first_look(len(blobs) + 1, outline, inside.shape, min_diameter_px)
-        if blob is None:
-            continue
-        holes = (
-            tuple(outlines[k] for k in np.flatnonzero(hierarchy[:, 3] == index))
-            if hierarchy[index, 2] >= 0
-            else ()
-        )
-        blobs.append(Candidate(**{**blob.__dict__, "holes": holes}))
-        cv2.drawContours(labels, [outline.reshape(-1, 1, 2)], -1, len(blobs), cv2.FILLED)
+    above: Grey = (edges.smooth - edges.threshold) * np.float32(sign)
+    for outline, holes in _outlines(above > 0):
+        blob = _first_look(outline, holes, labels.shape, min_diameter_px)
+        pieces = _pieces(above, blob) if blob is not None and blob.reason else []
+        looks = [_first_look(piece, (), labels.shape, min_diameter_px) for piece in pieces]
+        parts = [(piece, look) for piece, look in zip(pieces, looks) if look is not None]
+        for shown, part in parts or [(outline, blob)]:
+            if part is not None:
+                grown = part.shape_px + (_PIECE_GROWTH_PX if parts else 0.0) * np.array([1, 0, 1])
+                blobs.append(replace(part, label=len(blobs) + 1, shape_px=grown))
+                _fill(labels, shown, len(blobs))
     return Candidates(polarity, tuple(blobs), labels)
 
 
-def _first_look(
-    label: int, outline: NDArray[np.int32], image_shape: tuple[int, ...], min_diameter_px: float
-) -> Candidate | None:
-    """Moments and first verdict of one outline; None for specks below half the smallest dot."""
+def _fill(canvas: NDArray[np.generic], outline: NDArray[np.int32], value: int) -> None:
     import cv2
 
-    u, v, width, height = cv2.boundingRect(outline.reshape(-1, 1, 2))
-    if max(width, height) < 0.5 * min_diameter_px:
+    cv2.drawContours(canvas, [outline.reshape(-1, 1, 2)], -1, value, cv2.FILLED)
+
+
+def _outlines(
+    inside: NDArray[np.bool_],
+) -> list[tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]]:
+    """Outer outline (N, 2) of each connected region, with the outlines of its holes."""
+    import cv2
+
+    found, tree = cv2.findContours(inside.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if not found:
+        return []
+    parents = np.asarray(tree).reshape(-1, 4)[:, 3]
+    outlines = [np.asarray(outline, dtype=np.int32).reshape(-1, 2) for outline in found]
+    holes: dict[int, list[NDArray[np.int32]]] = {}
+    for index in np.flatnonzero(parents >= 0):
+        holes.setdefault(int(parents[index]), []).append(outlines[index])
+    return [(outlines[k], tuple(holes.get(int(k), ()))) for k in np.flatnonzero(parents < 0)]
+
+
+def _pieces(above: Grey, blob: Candidate) -> list[NDArray[np.int32]]:
+    """Outlines of small dots whose blur runs together, told apart by a higher threshold.
+
+    Only dots of the blur's own size are: larger ones that touch do so in the world.
+    """
+    u, v, width, height = blob.box
+    crop = above[v : v + height, u : u + width]
+    if blob.reason == TOO_SMALL or crop.size < 2 * _MIN_PIECE_PIXELS:
+        return []
+    peak = float(np.quantile(crop[crop > 0], 0.95))
+    best: list[NDArray[np.int32]] = []
+    for level in _PIECE_LEVELS:
+        inside = crop > level * peak
+        pieces = [piece + (u, v) for piece, _ in _outlines(inside)]
+        small = [piece for piece in pieces if _is_small_dot(piece, above.shape)]
+        covered = sum(_filled_moments(piece)[0] for piece in small)
+        if len(small) > max(1, len(best)) and covered > _PIECE_SHARE * np.count_nonzero(inside):
+            best = small
+    return best
+
+
+def _is_small_dot(outline: NDArray[np.int32], image_shape: tuple[int, ...]) -> bool:
+    if len(outline) < 4:
+        return False
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    if low.min() <= 0 or high[0] >= image_shape[1] - 1 or high[1] >= image_shape[0] - 1:
+        return True
+    area, centre, shape = _filled_moments(outline)
+    small = axes_from_shape(shape)[1] <= _PIECE_SEMI_AXIS_PX
+    return bool(
+        area >= _MIN_PIECE_PIXELS and small and not _outline_verdict(outline, centre, shape)
+    )
+
+
+def _first_look(
+    outline: NDArray[np.int32],
+    holes: tuple[NDArray[np.int32], ...],
+    image_shape: tuple[int, ...],
+    min_diameter_px: float,
+) -> Candidate | None:
+    """Moments and first verdict of one outline; None for specks below half the smallest dot."""
+    low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
+    if size.max() < 0.5 * min_diameter_px:
         return None
-    filled = np.zeros((height, width), np.uint8)
-    cv2.drawContours(filled, [(outline - (u, v)).reshape(-1, 1, 2)], -1, 1, cv2.FILLED)
-    area, centre, shape = _moments(filled)
-    centre = centre + (u, v)
-    reason = ""
-    if u <= 0 or v <= 0 or u + width >= image_shape[1] or v + height >= image_shape[0]:
+    area, centre, shape = _filled_moments(outline)
+    if low.min() <= 0 or np.any(low + size >= image_shape[::-1]):
         reason = TOUCHES_BORDER
     elif 2.0 * axes_from_shape(shape)[0] < min_diameter_px:
         reason = TOO_SMALL
     else:
         reason = _outline_verdict(outline, centre, shape)
-    return Candidate(label, centre, shape, (u, v, width, height), area, (), reason)
+    box = (int(low[0]), int(low[1]), int(size[0]), int(size[1]))
+    return Candidate(0, centre, shape, box, area, holes, reason)
 
 
-def _moments(filled: NDArray[np.uint8]) -> tuple[float, Array, Array]:
+def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
+    """Area, centre (2,) and ellipse of equal second moments (3,) of a filled outline's pixels."""
     import cv2
 
+    low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
+    filled = np.zeros((int(size[1]), int(size[0])), np.uint8)
+    _fill(filled, outline - low, 1)
     m = cv2.moments(filled, binaryImage=True)
     area = float(m["m00"])
     variance = (m["mu20"] / area + 1 / 12, m["mu11"] / area, m["mu02"] / area + 1 / 12)
-    squared = shape_from_matrix(variance)
-    return area, np.array([m["m10"], m["m01"]]) / area, squared
+    centre = np.array([m["m10"], m["m01"]]) / area + low
+    return area, centre, shape_from_matrix(variance)
 
 
 def shape_from_matrix(variance: tuple[float, float, float]) -> Array:

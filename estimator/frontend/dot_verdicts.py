@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from telerig.estimator.frontend.blurred_ellipse import axes_from_shape, extent_px
 from telerig.estimator.frontend.dot_candidates import (
     MERGED,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from telerig.estimator.frontend.blurred_ellipse import (
     approximate_distance_px,
     axes_from_shape,
@@ -48,9 +49,8 @@ def dot_window(
     distance = approximate_distance_px(start.shape_px, du[None, :], dv[:, None])
     mask: Mask = (distance < outer) & (distance > -max(8.0, reach))
     clear = CLEAR_SIGMA * start.sigma_px
-    others = (labels[crop] != 0) & (labels[crop] != blob.label)
-    if np.any(others):
-        gap = _distance_to(others)
+    gap = _distance_to_others(labels, blob.label, low, high, int(np.ceil(max(clear, outer))) + 1)
+    if gap is not None:
         mask &= (gap > clear) | (distance < gap)
     if blob.holes:
         mask &= _distance_to(_holes(blob, low, mask.shape)) > clear + 0.5
@@ -66,6 +66,25 @@ def _distance_to(marked: Mask) -> Array:
 
     distance: Array = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, 5) - 0.5
     return distance
+
+
+def _distance_to_others(
+    labels: NDArray[np.int32],
+    label: int,
+    low: NDArray[np.int_],
+    high: NDArray[np.int_],
+    reach: int,
+) -> Array | None:
+    """Distance to other blobs, also those just outside the crop; None where there is none."""
+    first = np.maximum(low - reach, 0)
+    wide = labels[first[1] : high[1] + reach, first[0] : high[0] + reach]
+    others = (wide != 0) & (wide != label)
+    if not np.any(others):
+        return None
+    inner = low - first
+    size = high - low
+    distance = _distance_to(others)
+    return distance[inner[1] : inner[1] + size[1], inner[0] : inner[0] + size[0]]
 
 
 def _holes(blob: Candidate, low: NDArray[np.int_], shape: tuple[int, ...]) -> Mask:

@@ -1,9 +1,9 @@
 """Least-squares fit of a dot's grey levels: the luminance model of Lavest, Viala, Dhome (1999).
 
-A pixel's grey level is ``B0 + B1 x + B2 y + (C + C1 x + C2 y) F`` with F the blurred ellipse of
-:mod:`telerig.estimator.frontend.blurred_ellipse` and (x, y) the offset from the window's middle in
-units of the dot's radius. A dot's contrast gradient (C1, C2) can hardly be told from a shift of
-its centre, so it never floats freely: it carries a Gaussian prior.
+A pixel's grey level is ``B0 + B1 x + B2 y`` plus the blurred image of an ellipse of grey level
+``C + C1 x + C2 y``, with (x, y) the offset from the window's middle in units of the dot's radius
+(:mod:`telerig.estimator.frontend.blurred_ellipse`). A dot's contrast gradient (C1, C2) can hardly
+be told from a shift of its centre, so it never floats freely: it carries a Gaussian prior.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
 from telerig.estimator.frontend.blurred_ellipse import (
     approximate_distance_px,
     coverage_near_edge,
@@ -33,17 +34,20 @@ _MAX_OUTLIER_SHARE = 0.15
 
 
 @dataclass(frozen=True)
-class GradientPrior:
-    """Relative contrast gradient (dC/du)/C, (dC/dv)/C [1/px] expected at a dot, and its sigma.
+class Prior:
+    """What the image's other dots tell about one dot.
 
-    ``tie_to_background`` instead expects the same relative gradient as the background's (light
-    falls on both), up to ``sigma_per_px``.
+    Relative contrast gradient (dC/du)/C, (dC/dv)/C [1/px] and its sigma; with
+    ``tie_to_background`` instead the background's own relative gradient (light falls on both) up
+    to ``sigma_per_px``. The edge's sigma ``edge_px`` up to ``edge_spread_px`` (infinite: unknown).
     """
 
     u_per_px: float = 0.0
     v_per_px: float = 0.0
     sigma_per_px: float = 3e-4
     tie_to_background: bool = False
+    edge_px: float = 1.0
+    edge_spread_px: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -141,10 +145,10 @@ class _Problem:
     origin: Array
     radius: float
     noise: NoiseModel
-    prior: GradientPrior
+    prior: Prior
 
 
-def _problem(window: Window, start: Start, noise: NoiseModel, prior: GradientPrior) -> _Problem:
+def _problem(window: Window, start: Start, noise: NoiseModel, prior: Prior) -> _Problem:
     origin, radius = np.round(start.centre_px), semi_axes(start.shape_px)[0]
     if start.previous is not None:
         origin, radius = start.previous.origin_px, start.previous.radius_px
@@ -174,32 +178,42 @@ def _coverage(problem: _Problem, theta: Array) -> tuple[Array, Array]:
 
 
 def _model(problem: _Problem, theta: Array, levels: Array) -> tuple[Array, Array]:
-    """Grey levels (P,) and their derivatives (12, P) by theta and levels."""
+    """Grey levels (P,) and their derivatives (12, P) by theta and levels.
+
+    The light's slope acts before the blur: the Gaussian of x F_sharp is x F + sigma^2 dF/dx.
+    Left out, this shifts a centre by sigma^2 times the relative slope. (How that small term
+    itself changes with theta is left out of the derivatives.)
+    """
     coverage, gradient = _coverage(problem, theta)
     x, y = problem.x / problem.radius, problem.y / problem.radius
-    contrast = levels[3] + levels[4] * x + levels[5] * y
-    grey = levels[0] + levels[1] * x + levels[2] * y + contrast * coverage
+    spread = theta[5] ** 2 / problem.radius
     jacobian = np.empty((12, coverage.size))
-    np.multiply(gradient, contrast, out=jacobian[:6])
     jacobian[6], jacobian[7], jacobian[8] = 1.0, x, y
     jacobian[9] = coverage
-    np.multiply(coverage, x, out=jacobian[10])
-    np.multiply(coverage, y, out=jacobian[11])
+    jacobian[10] = coverage * x - spread * gradient[0]
+    jacobian[11] = coverage * y - spread * gradient[1]
+    grey: Array = levels @ jacobian[6:]
+    contrast = levels[3] + levels[4] * x + levels[5] * y
+    np.multiply(gradient, contrast, out=jacobian[:6])
     return grey, jacobian
 
 
-def _prior_rows(prior: GradientPrior, levels: Array, radius: float) -> tuple[Array, Array]:
-    """Two whitened prior rows: Jacobian (2, 6) by the levels, and residual (2,)."""
+def _prior_rows(prior: Prior, parameters: Array, radius: float) -> tuple[Array, Array]:
+    """Three whitened prior rows: Jacobian (3, 12) by the parameters, and residual (3,)."""
+    levels = parameters[6:]
     weight = 1.0 / (prior.sigma_per_px * radius * max(abs(levels[3]), 1e-12))
-    rows = np.zeros((2, 6))
-    rows[0, 4] = rows[1, 5] = weight
+    rows = np.zeros((3, 12))
+    rows[0, 10] = rows[1, 11] = weight
     if prior.tie_to_background:
         ratio = levels[3] / levels[0] * weight
-        rows[0, 1] = rows[1, 2] = -ratio
+        rows[0, 7] = rows[1, 8] = -ratio
     else:
-        rows[0, 3] = -prior.u_per_px * radius * weight
-        rows[1, 3] = -prior.v_per_px * radius * weight
-    return rows, -rows @ levels
+        rows[0, 9] = -prior.u_per_px * radius * weight
+        rows[1, 9] = -prior.v_per_px * radius * weight
+    rows[2, 5] = 1.0 / prior.edge_spread_px
+    gap = -rows @ parameters
+    gap[2] += prior.edge_px / prior.edge_spread_px
+    return rows, gap
 
 
 def _first_levels(problem: _Problem, theta: Array) -> Array:
@@ -238,18 +252,18 @@ def _state(problem: _Problem, parameters: Array, weight: Array | None) -> _State
 
 def _weighted(problem: _Problem, state: _State, weight: Array) -> _State:
     """The same point under other pixel weights (0 leaves a pixel out)."""
-    _, gap = _prior_rows(problem.prior, state.parameters[6:], problem.radius)
+    _, gap = _prior_rows(problem.prior, state.parameters, problem.radius)
     chi2 = float(state.residual @ (weight * state.residual) + gap @ gap)
     return replace(state, weight=weight, chi2=chi2)
 
 
 def _normal_equations(problem: _Problem, state: _State) -> tuple[Array, Array]:
-    rows, gap = _prior_rows(problem.prior, state.parameters[6:], problem.radius)
+    rows, gap = _prior_rows(problem.prior, state.parameters, problem.radius)
     weighted = state.jacobian * state.weight
     information = weighted @ state.jacobian.T
-    information[6:, 6:] += rows.T @ rows
+    information += rows.T @ rows
     pull = weighted @ state.residual
-    pull[6:] += rows.T @ gap
+    pull += rows.T @ gap
     return information, pull
 
 
@@ -294,7 +308,7 @@ def fit_dot(
     window: Window,
     start: Start,
     noise: NoiseModel,
-    prior: GradientPrior,
+    prior: Prior,
     *,
     iterations: int = 25,
     tolerance: float = 0.02,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
 from telerig.estimator.covariance import JointCovariance
+from telerig.estimator.frontend.ordering import check_handedness
 from telerig.estimator.initial import ImageMap, image_maps, rotation_from_jacobian
 from telerig.estimator.problem import Problem, prior_sigma
 from telerig.factors.projection import State
@@ -34,17 +35,19 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     """Refuse what cannot be solved, warn of what will be weak.
 
     Raises CalibrationError for too few views, too few dots or views that are all parallel; the
-    message names what is undetermined and what to do.
+    message names what is undetermined and what to do. DetectionError for mirrored images of an
+    opaque plate.
     """
     maps = image_maps(problem, dots_mm)
     stereo = len(problem.cameras) == 2
     shared = [v for v in range(len(problem.views)) if all((v, c) in maps for c in range(2))]
     usable = shared if stereo else sorted({v for v, _ in maps})
     _refuse_too_few(problem, usable, stereo=stereo, unknown_dots=unknown_dots)
+    mirrored = _mirrored_note(problem, maps)
     tilts = {k: _tilt_deg(m.jacobian) for k, m in maps.items()}
     if not unknown_dots:
         _refuse_parallel(problem, maps, usable)
-    notes = []
+    notes = mirrored
     if len(usable) < RECOMMENDED_VIEWS:
         notes.append(
             f"only {len(usable)} views that {'both cameras' if stereo else 'the camera'} can use: "
@@ -104,6 +107,22 @@ def _refuse_too_few(
         todo=f"take at least {RECOMMENDED_VIEWS} views at different tilts, seen by "
         + ("both cameras" if stereo else "the camera"),
     )
+
+
+def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[str]:
+    """Refuse images of which some are mirrored; an image seen nearly edge on is not judged."""
+    hands = {}
+    for (v, c), m in maps.items():
+        singular = np.linalg.svd(m.jacobian, compute_uv=False)
+        sign = int(np.sign(np.linalg.det(m.jacobian))) if singular[1] > 0.02 * singular[0] else 0
+        hands[problem.views[v], problem.cameras[c].name] = sign
+    check_handedness(hands, problem.target.two_sided)
+    if problem.target.two_sided or not hands or max(hands.values()) > 0:
+        return []
+    return [
+        "every image shows the target as a mirror image of rig.toml: right if its rows are "
+        "numbered upwards, but if the images are flipped, so is every helix"
+    ]
 
 
 def _tilt_deg(jacobian: Array) -> float:

@@ -9,12 +9,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.initial import image_maps
 from telerig.estimator.problem import Problem
 from telerig.rig.camera import Camera
 from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
+
+IMPOSSIBLE_SD = 20.0
 
 
 def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Target) -> Problem:
@@ -22,14 +23,15 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
 
     dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
 
-    Raises InputError for values that are not finite, CalibrationError when there are no dots or
-    the dots that set the scale are never seen.
+    Raises InputError for values that are not finite, covariances that are none, cameras or dots
+    that the rig does not have and rows given twice, CalibrationError when there are no dots, the
+    dots that set the scale are never seen or their distance contradicts their nominal places.
     """
     if len(dots) == 0:
         raise CalibrationError("no dots in any image", todo="run `telerig detect` and look at why")
     names = [c.name for c in cameras]
-    table = dots[dots["camera"].isin(names)].sort_values(["view", "camera", "dot"])
-    _check_finite(table)
+    _check(dots, names, target)
+    table = dots.sort_values(["view", "camera", "dot"])
     views = tuple(sorted(table["view"].astype(str).unique(), key=_natural))
     ids = np.unique(table["dot"].to_numpy(np.int64))
     camera = _index(table["camera"], names)
@@ -69,16 +71,36 @@ def _natural(name: str) -> tuple[int, float, str]:
     return (0, float(name), name) if name.isdigit() else (1, 0.0, name)
 
 
-def _check_finite(table: pd.DataFrame) -> None:
+def _check(table: pd.DataFrame, names: Sequence[str], target: Target) -> None:
+    """Refuse rows that cannot be used, naming the first."""
     columns = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
-    bad = ~np.isfinite(table[columns].to_numpy(float)).all(1)
-    if bad.any():
-        row = table[bad].iloc[0]
-        raise InputError(
-            f"{int(bad.sum())} dot(s) are not finite",
-            where=f"view {row['view']}, camera {row['camera']}, dot {row['dot']}",
-            todo="remove these rows or measure the dots again",
-        )
+    uu, uv, vv = (table[name].to_numpy(float) for name in columns[2:])
+    finite = np.isfinite(table[columns].to_numpy(float)).all(1)
+    known = ", ".join(repr(n) for n in names)
+    faults = {
+        "are not finite": (~finite, "remove these rows or measure the dots again"),
+        "have no positive definite covariance": (
+            finite & ~((uu > 0) & (vv > 0) & (uu * vv > uv**2)),
+            "give the standard deviation of each dot's centre",
+        ),
+        "are of a camera that the rig does not have": (
+            ~table["camera"].isin(list(names)).to_numpy(), f"the rig has {known}",
+        ),
+        "are none of the target's": (
+            ~target.known_id(table["dot"]), "compare the target in rig.toml with the table",
+        ),
+        "are given twice": (
+            table.duplicated(["view", "camera", "dot"]).to_numpy(), "keep one of the two rows",
+        ),
+    }  # fmt: skip
+    for what, (bad, todo) in faults.items():
+        if bad.any():
+            row = table[bad].iloc[0]
+            raise InputError(
+                f"{int(bad.sum())} of {len(table)} dots {what}",
+                where=f"view {row['view']}, camera {row['camera']}, dot {row['dot']}",
+                todo=todo,
+            )
 
 
 def _scale(target: Target, ids: NDArray[np.int64]) -> tuple[tuple[int, int], float, float] | None:
@@ -91,11 +113,22 @@ def _scale(target: Target, ids: NDArray[np.int64]) -> tuple[tuple[int, int], flo
             where="rig.toml [target] scale_dots",
             todo="name two dots that are seen, or leave scale_dots out to trust the nominal pitch",
         )
+    _check_distance(target)
     a, b = (int(np.searchsorted(ids, d)) for d in target.scale_dots)
     return (a, b), float(target.scale_distance_mm), float(target.scale_sigma_mm)
 
 
-def handedness(problem: Problem) -> dict[tuple[int, int], int]:
-    """(view, camera) -> +1 or -1: the sign of d(u, v) / d(x, y) of each image."""
-    maps = image_maps(problem, problem.nominal_mm)
-    return {k: int(np.sign(np.linalg.det(m.jacobian))) for k, m in maps.items()}
+def _check_distance(target: Target) -> None:
+    """The stated distance must be what the nominal places and their tolerance allow."""
+    assert target.scale_dots is not None and target.scale_distance_mm is not None
+    ends = target.nominal_mm(np.array(target.scale_dots))
+    nominal = float(np.linalg.norm(ends[1] - ends[0]))
+    tolerance = IMPOSSIBLE_SD * np.sqrt(2) * target.print_sigma_mm
+    if abs(nominal - target.scale_distance_mm) > tolerance:
+        raise CalibrationError(
+            f"the distance of dots {target.scale_dots} is {target.scale_distance_mm:g} mm, but "
+            f"their nominal places are {nominal:.4g} mm apart and good to "
+            f"{target.print_sigma_mm:g} mm each",
+            where="rig.toml [target]",
+            todo="correct scale_distance_mm, scale_dots or the pitch, or raise print_sigma_mm",
+        )

@@ -225,9 +225,11 @@ def _first_levels(problem: _Problem, theta: Array) -> Array:
     return np.array([b0, b1, b2, c, 0.0, 0.0])
 
 
-def _admissible(theta: Array) -> bool:
+def _admissible(theta: Array, radius: float) -> bool:
+    """Near where the fit began, whose radius it was: a fit must not run away over the image."""
     a, b = semi_axes(theta[2:5])
-    return bool(b > _MIN_SEMI_AXIS_PX and _MIN_SIGMA_PX <= theta[5] <= 1.5 * a + 1.0)
+    near = max(abs(theta[0]), abs(theta[1])) < radius + 2.0 and a < 2.0 * radius + 3.0
+    return bool(near and b > _MIN_SEMI_AXIS_PX and _MIN_SIGMA_PX <= theta[5] <= 1.5 * a + 1.0)
 
 
 @dataclass(frozen=True)
@@ -288,12 +290,12 @@ def _descend(
         information, pull = _normal_equations(problem, state)
         step = _damped_step(information, pull, damping)
         moved = state.parameters + step
-        small = float(step @ pull) < tolerance * max(1.0, state.chi2 / problem.grey.size)
-        if small and damping <= 1e-3 and _admissible(moved[:6]):
+        small = float(step @ pull) < tolerance * max(1.0, state.chi2 / max(problem.grey.size, 1))
+        if small and damping <= 1e-3 and _admissible(moved[:6], problem.radius):
             residual = state.residual - step @ state.jacobian
             return replace(state, parameters=moved, residual=residual), True
         trial = None
-        if _admissible(moved[:6]):
+        if _admissible(moved[:6], problem.radius):
             trial = _weighted(problem, _state(problem, moved, state.weight), state.weight)
         if trial is not None and trial.chi2 <= state.chi2 * (1.0 + 1e-12):
             damping, state = max(damping / 10.0, 1e-9), trial

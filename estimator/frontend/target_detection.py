@@ -7,11 +7,11 @@ from typing import Any
 
 import pandas as pd
 from numpy.typing import NDArray
+
+from telerig.errors import DetectionError
 from telerig.estimator.frontend.dots import measure_dots
 from telerig.estimator.frontend.ordering import Numbering, number_dots
 from telerig.rig.target import Target
-
-from telerig.errors import DetectionError
 
 MEASURED = [
     *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"),

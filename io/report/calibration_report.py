@@ -9,7 +9,7 @@ from typing import Any
 from telerig.io.atomic import write_text_atomic
 from telerig.io.report import calibration_tables as tables
 from telerig.io.report.calibration_results import CalibrationResults, read_results
-from telerig.io.report.figures_common import data_uri
+from telerig.io.report.contact_sheet import contact_sheet
 from telerig.io.report.figures_coverage import coverage, tilts
 from telerig.io.report.figures_dot import dot_pictures
 from telerig.io.report.figures_residuals import residual_field, residual_histogram
@@ -17,9 +17,6 @@ from telerig.io.report.figures_rig import rig_plan
 from telerig.io.report.figures_target import target_pictures
 from telerig.io.report.scene import dots_are_drawn, plotly_javascript, scene_json
 from telerig.io.report.words import ABSENT, flat_rows, is_number
-
-OVERLAY_BUDGET_BYTES = 1_500_000
-"""Pictures beyond this are linked, not carried in the page: a report stays below 8 MB."""
 
 _COLOURS = {"GOOD": "good", "USABLE": "usable", "REJECTED": "rejected"}
 _SHOWN = {
@@ -98,7 +95,6 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
 
 def _pictures(results: CalibrationResults) -> dict[str, Any]:
     every = range(len(results.cameras))
-    overlays, linked = _contact_sheet(results)
     return {
         "fields": [residual_field(results, i) for i in every],
         "spread": [residual_histogram(results)],
@@ -106,24 +102,5 @@ def _pictures(results: CalibrationResults) -> dict[str, Any]:
         "target": target_pictures(results),
         "dot": dot_pictures(results.dot_example),
         "plan": rig_plan(results),
-        "overlays": overlays,
-        "linked": linked,
+        "sheet": contact_sheet(results),
     }
-
-
-def _contact_sheet(results: CalibrationResults) -> tuple[list[dict[str, Any]], int]:
-    """One entry per view with each camera's picture or None; how many are linked only."""
-    entries, linked, left = [], 0, OVERLAY_BUDGET_BYTES
-    for view in results.views if results.overlays else ():
-        cells = []
-        for name in results.camera_names:
-            file = results.overlays.get((name, view))
-            content = b"" if file is None else file.read_bytes()
-            inside = file is not None and len(content) <= left
-            left -= len(content) if inside else 0
-            linked += int(file is not None and not inside)
-            source = data_uri("image/jpeg", content) if inside else None
-            link = f"overlays/{name}/{view}.jpg" if file is not None else None
-            cells.append({"camera": name, "source": source, "link": link})
-        entries.append({"view": view, "cells": cells})
-    return entries, linked

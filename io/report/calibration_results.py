@@ -187,11 +187,9 @@ def _with_whitened(table: pd.DataFrame, file: Path, floor_px: float) -> pd.DataF
     uu, vv = uu + floor_px**2, vv + floor_px**2
     if not np.all((uu > 0) & (uu * vv > uv**2)):
         return table
-    along = np.sqrt(uu)
-    whitened_u = merged["du_px"] / along
+    du, dv = merged["du_px"].to_numpy(), merged["dv_px"].to_numpy()
     across = np.sqrt(vv - uv**2 / uu)
-    whitened_v = (merged["dv_px"] - uv / uu * merged["du_px"]) / across
-    return table.assign(whitened_u=whitened_u.to_numpy(), whitened_v=whitened_v.to_numpy())
+    return table.assign(whitened_u=du / np.sqrt(uu), whitened_v=(dv - uv / uu * du) / across)
 
 
 def _covariance(file: Path) -> tuple[dict[str, int], Array]:

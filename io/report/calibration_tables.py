@@ -75,7 +75,7 @@ def key_numbers(results: CalibrationResults) -> list[Figure]:
         Figure(
             "Dots kept",
             share(kept, measured),
-            f"{number(kept, 9)} of {number(measured, 9)} in {len(results.views)} views",
+            f"{number(kept)} of {number(measured)} in {len(results.views)} views",
         ),
     ]
     return figures + _space_numbers(results, s)
@@ -127,7 +127,7 @@ def _parameter_cell(camera: Mapping[str, Any], name: str) -> str:
 
 def _field(camera: Camera) -> str:
     width, height = np.array(camera.image_size_px) / camera["scale_px_per_mm"]
-    return f"{number(float(width))} × {number(float(height / camera['aspect']))}"
+    return f"{number(float(width))} x {number(float(height / camera['aspect']))}"
 
 
 def _largest_distortion(camera: Camera) -> str:
@@ -153,16 +153,16 @@ def pose_rows(results: CalibrationResults) -> list[Row]:
     turn, place = _tangent_sd(results, "r", "_rad"), _tangent_sd(results, "t", "_mm")
     statistics = results.statistics
     return [
-        Row(("angle between the axes, °", with_sd(statistics.get("axes_angle_deg"),
+        Row(("angle between the axes (°)", with_sd(statistics.get("axes_angle_deg"),
                                                   statistics.get("axes_angle_sd_deg"))), True),
-        Row(("distance between the axes, mm", _gap(results, pose))),
-        Row((f"{second.name}_from_{results.cameras[0].name} as rotation vector, °",
-             _vector(np.degrees(pose.rotvec_rad), 7))),
-        Row(("the same, nominal (rig.toml)", _vector(nominal, 4))),
-        Row((f"sd of turns about {second.name}'s x, y, z, °", _vector(_degrees(turn), 2))),
-        Row((f"{second.name}_from_{results.cameras[0].name} translation, mm",
-             _vector(pose.translation_mm, 5))),
-        Row((f"sd of shifts along {second.name}'s x, y, z, mm", _vector(place, 2))),
+        Row(("distance between the axes (mm)", _gap(results, pose))),
+        Row((f"{second.name}_from_{results.cameras[0].name} as rotation vector (°)",
+             _fixed(np.degrees(pose.rotvec_rad), 5))),
+        Row(("the same, nominal (rig.toml)", _fixed(nominal, 1))),
+        Row((f"sd of turns about {second.name}'s x, y, z (°)", _fixed(_degrees(turn), 5))),
+        Row((f"{second.name}_from_{results.cameras[0].name} translation (mm)",
+             _fixed(pose.translation_mm, 5))),
+        Row((f"sd of shifts along {second.name}'s x, y, z (mm)", _fixed(place, 5))),
     ]  # fmt: skip
 
 
@@ -202,10 +202,10 @@ def _gap(results: CalibrationResults, camera_from_rig: Pose) -> str:
     return with_sd(gap, float(np.sqrt(inside @ block @ inside)))
 
 
-def _vector(values: Any, digits: int) -> str:
+def _fixed(values: Any, decimals: int) -> str:
     if values is None:
         return ABSENT
-    return "(" + ", ".join(number(float(v), digits) for v in values) + ")"
+    return "(" + ", ".join(f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in values) + ")"
 
 
 def ladder_rows(results: CalibrationResults) -> list[Row]:
@@ -216,7 +216,7 @@ def ladder_rows(results: CalibrationResults) -> list[Row]:
     return [
         Row(
             (
-                str(rung.get("model")), number(rung.get("parameters"), 4),
+                str(rung.get("model")), number(rung.get("parameters")),
                 number(rung.get("rms_px"), 4), number(rung.get("chi2_dof")),
                 _above(rung.get("bic"), bics), number(rung.get("held_out")),
             ),
@@ -233,18 +233,18 @@ def _above(bic: Any, bics: list[float]) -> str:
 def worst_rows(results: CalibrationResults) -> list[Row]:
     """The dots that agree least: the down-weighted ones first, then by their residual."""
     table = results.residuals
-    size = table["length_px"]
-    if "whitened_u" in table:
-        size = np.hypot(table["whitened_u"], table["whitened_v"])
-    order = np.lexsort((-size.to_numpy(), table["kept"].to_numpy()))
+    whitened = "whitened_u" in table
+    columns = ["whitened_u", "whitened_v"] if whitened else ["du_px", "dv_px"]
+    size = np.hypot(*table[columns].to_numpy().T)
+    order = np.lexsort((-size, table["kept"].to_numpy()))
     return [
         Row(
             (
-                dot.view, dot.camera, str(dot.dot), f"{dot.row}, {dot.column}",
+                str(dot.view), str(dot.camera), str(dot.dot), f"{dot.row}, {dot.column}",
                 f"{dot.du_px:+.4f}", f"{dot.dv_px:+.4f}", f"{dot.length_px:.4f}",
-                f"{dot.weight:.3g}", dot.reason,
+                f"{dot.weight:.3g}", str(dot.reason),
             ),
-            strong=not dot.kept,
+            strong=not bool(dot.kept),
         )
         for dot in table.iloc[order[:WORST]].itertuples()
     ]  # fmt: skip

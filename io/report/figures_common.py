@@ -54,7 +54,9 @@ def drawing(height_in: float) -> Iterator[tuple[Any, Any]]:
             1 - (left + right) / WIDTH_IN,
             1 - (bottom + top) / height_in,
         )
-        yield figure, figure.add_axes(box)
+        axes = figure.add_axes(box)
+        axes.locator_params(nbins=5)
+        yield figure, axes
 
 
 def svg(figure: Any) -> str:
@@ -64,7 +66,7 @@ def svg(figure: Any) -> str:
     return data_uri("image/svg+xml", stream.getvalue())
 
 
-def png(figure: Any, dpi: int = 170) -> str:
+def png(figure: Any, dpi: int = 130) -> str:
     """``figure`` as a data URI of pixels, for what would be thousands of shapes."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})

@@ -17,6 +17,7 @@ from telerig.io.report.figures_common import (
     image_height_in,
     svg,
 )
+from telerig.io.report.words import short_names
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ def coverage(results: CalibrationResults, index: int) -> Picture:
     uv = mine[["u_px", "v_px"]].to_numpy()
     size = camera.image_size_px
     edges = [np.linspace(-0.5, n - 0.5, _CELLS + 1) for n in size]
-    count, *_ = np.histogram2d(*uv.T, bins=edges)
+    count, _ = np.histogramdd(uv, bins=edges)
     with drawing(image_height_in(size)) as (figure, axes):
         image_axes(axes, size)
         axes.pcolormesh(
@@ -41,7 +42,7 @@ def coverage(results: CalibrationResults, index: int) -> Picture:
             edgecolors="#e3e5e8", linewidth=0.4,
         )  # fmt: skip
         axes.plot(
-            *uv.T, ".", color=camera_colour(index), markersize=3.5, markeredgewidth=0,
+            *uv.T, ".", color=camera_colour(index), markersize=5, markeredgewidth=0,
             alpha=0.7, rasterized=len(uv) > _MOST_MARKERS,
         )  # fmt: skip
         source = svg(figure)
@@ -71,7 +72,7 @@ def tilt_angles_rad(results: CalibrationResults, index: int) -> tuple[list[str],
 
 def tilts(results: CalibrationResults) -> Picture:
     """Tilt and its direction for every view and camera, as a disc with 90 degrees at its rim."""
-    every = []
+    every: list[float] = []
     with drawing(4.0) as (figure, axes):
         _disc(axes)
         for i, camera in enumerate(results.cameras):
@@ -81,7 +82,7 @@ def tilts(results: CalibrationResults) -> Picture:
             x, y = radius * np.cos(direction), radius * np.sin(direction)
             axes.plot(x, y, "o^sD"[i % 4], color=camera_colour(i), markersize=5, label=camera.name)
             if len(views) <= _MOST_LABELS:
-                for view, a, b in zip(views, x, y):
+                for view, a, b in zip(short_names(views), x, y):
                     axes.annotate(view, (a, b), (4, 3), textcoords="offset points", fontsize=7)
         axes.legend(loc="upper left", bbox_to_anchor=(-0.1, 1.04))
         source = svg(figure)

@@ -7,10 +7,21 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.report.figures_common import LEFT_OUT, MODEL, Picture, drawing, png, svg
+from telerig.io.report.figures_common import (
+    LEFT_OUT,
+    MODEL,
+    WIDTH_IN,
+    Picture,
+    drawing,
+    png,
+    svg,
+)
 from telerig.io.report.words import number
 
 Array = NDArray[np.float64]
+
+_MESH = 40
+_MOST_SHAPES = 1500
 
 
 def edge_distance_px(example: Mapping[str, Array]) -> Array:
@@ -30,7 +41,26 @@ def edge_distance_px(example: Mapping[str, Array]) -> Array:
 
 def dot_pictures(example: Mapping[str, Array]) -> list[Picture]:
     """Image, surface and profile; empty when there is no example."""
-    return [_image(example), _surface(example), _profile(example)] if example else []
+    if not example:
+        return []
+    near = _cropped(example)
+    return [_image(near), _surface(near), _profile(near)]
+
+
+def _cropped(example: Mapping[str, Array]) -> dict[str, Array]:
+    """The part of the patch that lies no farther from the ellipse than its neighbours might."""
+    near = edge_distance_px(example) <= _reach_px(example)
+    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    if len(rows) < 3 or len(columns) < 3:
+        return dict(example)
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    images = {name: example[name][part] for name in ("patch", "model")}
+    corner = {"u0": example["u0"] + columns[0], "v0": example["v0"] + rows[0]}
+    return {**example, **images, **corner}
+
+
+def _reach_px(example: Mapping[str, Array]) -> float:
+    return max(5.0, 0.8 * float(example["b_px"]))
 
 
 def _extent(example: Mapping[str, Array]) -> tuple[float, float, float, float]:
@@ -45,9 +75,7 @@ def _image(example: Mapping[str, Array]) -> Picture:
     cos, sin = np.cos(float(example["angle_rad"])), np.sin(float(example["angle_rad"]))
     u, v = float(example["u_px"]), float(example["v_px"])
     with drawing(3.6) as (figure, axes):
-        axes.imshow(
-            example["patch"], cmap="gray", extent=_extent(example), interpolation="nearest"
-        )
+        axes.imshow(example["patch"], cmap="gray", extent=_extent(example), interpolation="nearest")
         axes.plot(u + x * cos - y * sin, v + x * sin + y * cos, color=LEFT_OUT, linewidth=1)
         axes.plot(u, v, "+", color=LEFT_OUT, markersize=9)
         axes.set(xlabel="u / px", ylabel="v / px")
@@ -68,11 +96,11 @@ def _surface(example: Mapping[str, Array]) -> Picture:
     left, right, bottom, top = _extent(example)
     u, v = np.arange(left + 0.5, right), np.arange(top + 0.5, bottom)
     with rc_context({"font.size": 8}):
-        figure = Figure(figsize=(4.4, 3.6))
-        axes = Axes3D(figure, rect=(-0.02, 0.02, 1.0, 1.05))
+        figure = Figure(figsize=(WIDTH_IN, 3.6))
+        axes = Axes3D(figure, rect=(-0.04, 0.06, 1.0, 1.0))
         figure.add_axes(axes)
         axes.plot_surface(
-            *np.meshgrid(u, v), patch, rcount=48, ccount=48, cmap="gray", edgecolor="#5577aa",
+            *np.meshgrid(u, v), patch, rcount=_MESH, ccount=_MESH, cmap="gray", edgecolor="#5577aa",
             linewidth=0.25,
         )  # fmt: skip
         axes.view_init(elev=38, azim=-60)
@@ -87,26 +115,29 @@ def _surface(example: Mapping[str, Array]) -> Picture:
 
 
 def _profile(example: Mapping[str, Array]) -> Picture:
-    distance = edge_distance_px(example).ravel()
-    patch, model = example["patch"].ravel(), example["model"].ravel()
+    distance = edge_distance_px(example)
+    near = distance <= _reach_px(example)
+    distance, patch, model = distance[near], example["patch"][near], example["model"][near]
     noise = float(example["noise"])
     order = np.argsort(distance)
     with drawing(3.6) as (figure, axes):
         box = axes.get_position()
         axes.set_position((box.x0, box.y0 + 0.3 * box.height, box.width, 0.7 * box.height))
         lower = figure.add_axes((box.x0, box.y0, box.width, 0.22 * box.height), sharex=axes)
-        axes.plot(distance, patch, ".", color="#666666", markersize=3, label="pixels")
+        pixels = {"color": "#666666", "rasterized": len(patch) > _MOST_SHAPES}
+        axes.plot(distance, patch, ".", markersize=3, label="pixels", **pixels)
         axes.plot(distance[order], model[order], color=MODEL, linewidth=1, label="model")
         axes.set(ylabel="grey value")
         axes.legend(loc="best")
         axes.tick_params(labelbottom=False)
-        lower.plot(distance, (patch - model) / (noise or 1.0), ".", color="#666666", markersize=2.5)
+        lower.plot(distance, (patch - model) / (noise or 1.0), ".", markersize=2.5, **pixels)
         lower.axhline(0, color=MODEL, linewidth=0.8)
-        lower.set(xlabel="distance from the ellipse / px (outside > 0)", ylabel="misfit\n/ noise")
+        lower.set(xlabel="distance from the ellipse / px (outside > 0)", ylabel="misfit")
         source = svg(figure)
     rms = float(np.sqrt(np.mean((patch - model) ** 2)))
     caption = (
-        "Every pixel against its distance from the ellipse, and the model; misfits should be a "
-        f"level band within ±3 (RMS {number(rms)}, noise {number(noise)} grey values)."
+        "Every pixel against its distance from the ellipse, and the model; misfits over "
+        f"the noise should be a level band within ±3 (RMS {number(rms)} grey values, noise "
+        f"{number(noise)})."
     )
     return Picture("Profile and model", source, caption)

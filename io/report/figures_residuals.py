@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from telerig.io.report.calibration_results import CalibrationResults
 from telerig.io.report.figures_common import (
     LEFT_OUT,
-    MODEL,
     Picture,
     camera_colour,
     drawing,
@@ -49,7 +48,7 @@ def residual_field(results: CalibrationResults, index: int) -> Picture:
         _draw(axes, *_left_out_arrows(left_out, magnified, _LONGEST * width), LEFT_OUT)
         key_px = nice_below(0.15 * width / magnified)
         axes.quiverkey(
-            quiver, 0.5, 1 + 0.5 * above / height, key_px * magnified,
+            quiver, 0.02, 1 + 0.5 * above / height, key_px * magnified,
             f"{number(key_px, 1)} px, drawn {magnified:,.0f} times as long",
             labelpos="E", coordinates="axes", labelsep=0.06,
         )  # fmt: skip
@@ -119,9 +118,11 @@ def residual_histogram(results: CalibrationResults) -> Picture:
         x = np.linspace(edges[0], edges[-1], 120)
         curve = np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
         label = "unit normal" if whitened else f"normal, sigma {number(sigma)} px"
-        axes.plot(x, curve, color=MODEL if len(results.cameras) < 2 else "black", label=label)
+        axes.plot(x, curve, color="black", label=label)
         axes.set(xlabel="residual / its sigma" if whitened else "residual / px", ylabel="density")
-        axes.set_xlim(edges[0], edges[-1])
+        axes.set(
+            xlim=(edges[0], edges[-1]), ylim=(0, 1.45 * max(curve.max(), axes.get_ylim()[1] / 1.3))
+        )
         axes.legend(loc="upper left")
         source = svg(figure)
     beyond = int(np.sum(np.abs(kept) > edges[-1]))

@@ -84,7 +84,7 @@ def target_pictures(results: CalibrationResults) -> list[Picture]:
 
 def _axes_height_in(place_mm: Array) -> float:
     width, height = np.ptp(place_mm, axis=0) + 0.2 * np.ptp(place_mm, axis=0).max()
-    return float(np.clip(0.9 + (WIDTH_IN - 0.7) * height / width, 2.2, 6.0))
+    return float(np.clip(0.57 + (WIDTH_IN - 0.7) * height / width, 1.6, 6.0))
 
 
 def _target_axes(axes: Any, place_mm: Array) -> None:
@@ -100,11 +100,11 @@ def _in_plane(results: CalibrationResults, shape: TargetShape) -> Picture:
     extent = np.ptp(shape.place_mm, axis=0).max()
     typical = max(float(np.quantile(np.hypot(*off.T), 0.9)), 1e-9)
     per_um = nice_below(0.08 * extent / typical * 1e3) / 1e3
-    height = _axes_height_in(shape.place_mm) + 0.2
+    height = _axes_height_in(shape.place_mm) + 0.25
     with drawing(height) as (figure, axes):
         _target_axes(axes, shape.place_mm)
         box = axes.get_position()
-        axes.set_position((box.x0, box.y0, box.width, box.height - 0.2 / height))
+        axes.set_position((box.x0, box.y0, box.width, box.height - 0.25 / height))
         quiver = axes.quiver(
             *shape.place_mm.T, *(off * per_um).T, angles="xy", scale_units="xy", scale=1,
             color="#1f5fa8", width=0.005,
@@ -117,8 +117,9 @@ def _in_plane(results: CalibrationResults, shape: TargetShape) -> Picture:
         )
         source = svg(figure)
     caption = (
-        f"Arrows (drawn {1e3 * per_um:,.0f} times as long) from a perfect, evenly stretched grid to "
-        f"the estimated dots: RMS {number(_rms(off))} µm per axis, known to {_known(sd)}."
+        f"Arrows (drawn {1e3 * per_um:,.0f} times as long) from a perfect, evenly stretched grid "
+        f"to the estimated dots: RMS {number(_rms(off))} µm per axis, known to {_known(sd)}; rings "
+        "are one sd."
     )
     return Picture("Print errors in the plane", source, caption)
 
@@ -128,8 +129,8 @@ def _circles(axes: Any, tip: Array, sd: Array) -> None:
 
     axes.add_collection(
         EllipseCollection(
-            2 * sd[:, 0], 2 * sd[:, 1], np.zeros(len(sd)), units="xy", offsets=tip,
-            offset_transform=axes.transData, facecolors="none", edgecolors="#c2570c", linewidths=0.8,
+            2 * sd[:, 0], 2 * sd[:, 1], np.zeros(len(sd)), units="xy", offsets=tip, linewidths=0.8,
+            offset_transform=axes.transData, facecolors="none", edgecolors="#c2570c",
         )
     )  # fmt: skip
 
@@ -137,7 +138,7 @@ def _circles(axes: Any, tip: Array, sd: Array) -> None:
 def _heights(results: CalibrationResults, shape: TargetShape) -> Picture:
     height, sd = shape.off_um[:, 2], shape.sd_um[:, 2]
     limit = max(float(np.abs(height).max()), 1e-9)
-    with drawing(_axes_height_in(shape.place_mm) + 0.45) as (figure, axes):
+    with drawing(_axes_height_in(shape.place_mm) + 0.7) as (figure, axes):
         _target_axes(axes, shape.place_mm)
         size = np.clip(9000 / len(height), 12, 320)
         dots = axes.scatter(

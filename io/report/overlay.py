@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.atomic import atomic_path
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,19 +51,6 @@ def draw_overlay(
     lines = [f"{len(accepted)} dots accepted, {len(rejected)} rejected"]
     lines += [f"{n}: {reason} ({counts[reason]})" for reason, n in numbers.items()]
     return np.concatenate([picture, _legend(lines, picture.shape[1])])
-
-
-def write_overlay(picture: Picture, path: str | PathLike[str], *, quality: int = 80) -> None:
-    """Write an RGB picture as JPEG. Raises InputError when the place cannot be written."""
-    import cv2
-
-    with atomic_path(path) as temporary:
-        coded, content = cv2.imencode(
-            ".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, int(quality)]
-        )
-        if not coded:
-            raise InputError("this picture cannot be coded as JPEG", where=str(path))
-        temporary.write_bytes(content.tobytes())
 
 
 def _check(image: NDArray[Any], table: pd.DataFrame, extra: list[str], name: str) -> None:

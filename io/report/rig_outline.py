@@ -13,7 +13,7 @@ from telerig.rig.projection import PARAMETERS
 
 Array = NDArray[np.float64]
 
-_BEFORE, _BEHIND = 2.2, 1.3
+_BEFORE, _BEHIND = 1.7, 1.2
 """How far a drawn field reaches before and behind the poses, in radii of the poses."""
 
 
@@ -76,7 +76,7 @@ def _camera_outline(camera: Camera, points_mm: Array) -> CameraOutline:
     field = np.array([_section(camera, z) for z in (near, middle + _BEHIND * reach)])
     centre = _on_axis(camera, near)
     face = centre + 0.55 * (field[0] - centre)
-    back = camera.camera_from_rig.rotation[2] * 0.9 * half_field
+    back = camera.camera_from_rig.rotation[2] * 0.7 * half_field
     axis = [_on_axis(camera, near), _on_axis(camera, middle + _BEHIND * reach)]
     return CameraOutline(camera.name, field, np.array([face - back, face]), np.array(axis))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from telerig.io.report.calibration_results import CalibrationResults
 from telerig.io.report.figures_common import MUTED, camera_colour
 from telerig.io.report.rig_outline import CameraOutline, RigOutline, rig_outline
+from telerig.io.report.words import short_names
 
 Array = NDArray[np.float64]
 Trace = dict[str, Any]
@@ -66,7 +67,7 @@ def _target_traces(outline: RigOutline) -> list[Trace]:
         _lines(loops.reshape(-1, 3), MUTED, 2)
         | {"name": "target, every view", "text": names, "hoverinfo": "text", "showlegend": True},
         _xyz("scatter3d", outline.plates_mm[:, 0])
-        | {"mode": "text", "text": list(outline.view_names), "hoverinfo": "skip",
+        | {"mode": "text", "text": short_names(outline.view_names), "hoverinfo": "skip",
            "textfont": {"size": 10, "color": "#444444"}, "name": "names of the views"},
     ]  # fmt: skip
     corners = outline.plates_mm.reshape(-1, 3)
@@ -99,10 +100,11 @@ def _lines(points_mm: Array, colour: str, width: float) -> Trace:
 
 def _layout() -> dict[str, Any]:
     axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
-    view = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 1.0, "y": -0.9, "z": -1.1}}
+    view = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.85, "y": -0.8, "z": -1.0}}
     return {
         "scene": axes | {"aspectmode": "data", "camera": view},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "legend": {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"},
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MUTED, "activecolor": "#333333"},
         "paper_bgcolor": "rgba(0,0,0,0)",
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 ABSENT = "not available"
@@ -17,11 +17,13 @@ def is_number(value: Any) -> bool:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """``value`` to so many significant digits, without an exponent where that is short."""
+    """``value`` to so many significant digits (a whole number to all of its digits)."""
     if not is_number(value):
         return ABSENT
     if value == 0:
         return "0"
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
     exponent = math.floor(math.log10(abs(value)))
     if -4 <= exponent < 7:
         return f"{value:,.{max(0, digits - 1 - exponent)}f}".replace(",", "\u202f")
@@ -38,10 +40,10 @@ def with_sd(value: Any, sd: Any) -> str:
     exponent = math.floor(math.log10(largest))
     if -3 <= exponent < 6:
         decimals = max(0, 1 - math.floor(math.log10(sd)))
-        return f"{value:.{decimals}f} ± {sd:.{decimals}f}"
+        return f"{value:.{decimals}f} ±\u00a0{sd:.{decimals}f}"
     value, sd = value / 10.0**exponent, sd / 10.0**exponent
     decimals = max(0, 1 - math.floor(math.log10(sd)))
-    return f"({value:.{decimals}f} ± {sd:.{decimals}f})·{_power(exponent)}"
+    return f"({value:.{decimals}f} ±\u00a0{sd:.{decimals}f})·{_power(exponent)}"
 
 
 def share(part: Any, whole: Any) -> str:
@@ -58,6 +60,17 @@ def nice_below(value: float) -> float:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
     return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= value * 1.0001) * power)
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """The names without what they all begin with, digits kept: view00, view01 -> 00, 01."""
+    if len(names) < 2:
+        return list(names)
+    alike = [len(set(letters)) == 1 for letters in zip(*names)]
+    shared = names[0][: [*alike, False].index(False)].rstrip("0123456789")
+    if any(name == shared for name in names):
+        return list(names)
+    return [name[len(shared) :] for name in names]
 
 
 def flat_rows(content: Any, path: str = "") -> Iterator[tuple[str, str]]:

@@ -21,6 +21,8 @@ RECOMMENDED_VIEWS = 6
 MINIMUM_DOTS = 4
 PARALLEL_DEG = 3.0
 SMALL_TILT_DEG = 10.0
+CLEAR_MISFIT = 0.1
+"""Misfit of an image's map, over the spread of its dots, up to which the map is believed."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +112,16 @@ def _refuse_too_few(
 
 
 def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[str]:
-    """Refuse images of which some are mirrored; an image seen nearly edge on is not judged."""
+    """Refuse images of which some are mirrored.
+
+    Not judged: an image seen nearly edge on, and one in which the dots are not where any view of
+    the target has them.
+    """
     hands = {}
     for (v, c), m in maps.items():
         singular = np.linalg.svd(m.jacobian, compute_uv=False)
-        sign = int(np.sign(np.linalg.det(m.jacobian))) if singular[1] > 0.02 * singular[0] else 0
+        clear = singular[1] > 0.02 * singular[0] and m.misfit < CLEAR_MISFIT
+        sign = int(np.sign(np.linalg.det(m.jacobian))) if clear else 0
         hands[problem.views[v], problem.cameras[c].name] = sign
     check_handedness(hands, problem.target.two_sided)
     if problem.target.two_sided or not hands or max(hands.values()) > 0:

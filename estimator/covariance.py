@@ -43,9 +43,13 @@ class JointCovariance:
 def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
     """Inverse of the information at the solution, equilibrated before it is factorised.
 
+    What no measurement touches (the pose of a view that was left out) is infinitely uncertain.
+
     Raises CalibrationError when it is singular to working precision.
     """
     information = solution.information
+    untouched = np.diag(information) <= 0
+    information = information + np.diag(untouched.astype(float))
     scale = 1 / np.sqrt(np.diag(information))
     equilibrated = information * scale[:, None] * scale
     try:
@@ -60,6 +64,7 @@ def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
     names = _names(problem)
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
     dof = _effective_dof(problem, solution, inverse)
+    inverse[untouched, untouched] = np.inf
     return JointCovariance(names, inverse * units[:, None] * units, rig, dof)
 
 

@@ -29,12 +29,14 @@ class ImageMap:
     """The map of the target's plane in one image, at the point imaged to the image centre.
 
     jacobian : (2, 2) px/mm; offset_px : (2,) pixels of the target origin minus the image centre;
-    perspective : (2,) relative change of scale per mm of the target's x and y (0 if affine).
+    perspective : (2,) relative change of scale per mm of the target's x and y (0 if affine);
+    misfit : RMS distance of the dots from the map, over their RMS distance from their mean.
     """
 
     jacobian: Array
     offset_px: Array
     perspective: Array
+    misfit: float
 
 
 def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageMap]:
@@ -63,14 +65,15 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
             (uv_px - (design @ homography) / (1 + design[:, :2] @ bend_h)[:, None]) ** 2
         ).sum()
         if better < 0.5 * misfit:
-            affine, bend = homography, bend_h
+            affine, bend, misfit = homography, bend_h, better
+    spread = max(((uv_px - uv_px.mean(0)) ** 2).sum(), 1e-12)
     # the target point imaged to the image centre: there the off-axis terms vanish
     at = np.linalg.solve(affine[:2].T, -affine[2]) if np.any(bend) else np.zeros(2)
     depth = 1 + at @ bend
     value = (affine[:2].T @ at + affine[2]) / depth
     jacobian = (affine[:2].T - np.outer(value, bend)) / depth / size
     offset = value - jacobian @ (middle + at * size)
-    return ImageMap(jacobian, offset, bend / depth / size)
+    return ImageMap(jacobian, offset, bend / depth / size, float(np.sqrt(misfit / spread)))
 
 
 def _homography(design: Array, uv_px: Array, affine: Array) -> tuple[Array, Array]:
@@ -225,15 +228,23 @@ def _assemble(
 def perspective_from_maps(
     maps: dict[tuple[int, int], ImageMap], state: State, camera: int
 ) -> float:
-    """kappa of one camera (1/mm) from how the scale changes over each tilted view."""
+    """kappa of one camera (1/mm) from how the scale changes over each tilted view.
+
+    The weighted median over the views, so that one with wrong dots does not decide.
+    """
     turn = state.rig_from_camera[camera, :3, :3].T
-    top = bottom = 0.0
+    kappas, weights = [], []
     for (v, c), m in maps.items():
         if c == camera:
             depth_slope = (turn @ state.rig_from_target[v, :3, :3])[2, :2]
-            top += float(m.perspective @ depth_slope)
-            bottom += float(depth_slope @ depth_slope)
-    return top / bottom if bottom > 0 else 0.0
+            steepness = float(depth_slope @ depth_slope)
+            kappas.append(float(m.perspective @ depth_slope) / max(steepness, 1e-12))
+            weights.append(steepness)
+    if not weights or sum(weights) == 0:
+        return 0.0
+    order = np.argsort(kappas)
+    share = np.cumsum(np.array(weights)[order]) / sum(weights)
+    return float(kappas[order[int(np.searchsorted(share, 0.5))]])
 
 
 def _place_views(

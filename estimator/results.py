@@ -12,7 +12,7 @@ from telerig.estimator import checks
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import JointCovariance, aligned_covariance
 from telerig.estimator.problem import Problem
-from telerig.estimator.robust import LIMIT, pixel_residuals, squared_distance
+from telerig.estimator.robust import LIMIT, lost_views, pixel_residuals, squared_distance
 from telerig.factors.projection import State
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotvec_from_rotation
@@ -106,11 +106,30 @@ def residual_table(problem: Problem, state: State) -> pd.DataFrame:
     table = dot_table(problem)
     table["du_px"], table["dv_px"] = residual[:, 0], residual[:, 1]
     table["weight"] = problem.weight
+    lost = np.isin(problem.view, lost_views(problem, problem.weight))
     table["reason"] = [
-        "" if w >= 1 else f"{d:.1f} standard deviations from the model (limit {LIMIT})"
-        for w, d in zip(problem.weight, distance)
+        "" if w >= 1 else _reason(d, bool(alone))
+        for w, d, alone in zip(problem.weight, distance, lost)
     ]
     return table
+
+
+def _reason(distance: float, lost_view: bool) -> str:
+    if lost_view:
+        return "too few dots of this view agree with the model to place the target"
+    return f"{distance:.1f} standard deviations from the model (limit {LIMIT})"
+
+
+def odd_views(problem: Problem) -> list[str]:
+    """Views of which most dots were left out: wrongly numbered, or of a target that moved."""
+    measured = np.bincount(problem.view, minlength=len(problem.views))
+    kept = np.bincount(problem.view[problem.weight > 0.5], minlength=len(problem.views))
+    return [
+        f"view {name!r}: only {k} of {n} dots agree with the others; is it numbered wrongly, or "
+        "did the target move between the cameras' images?"
+        for name, k, n in zip(problem.views, kept, measured)
+        if k < 0.5 * n
+    ]
 
 
 def _statistics(fit: Fit, joint: JointCovariance, residuals: pd.DataFrame) -> dict[str, Any]:
@@ -275,6 +294,7 @@ def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
         reasons.append(f"chi-square per degree of freedom is {chi2:.2f}, not 1")
     if len(fit.notes):
         reasons += [n for n in fit.notes if "weak" in n or "only" in n]
+    reasons += odd_views(fit.robust.problem)
     status = "USABLE, with warnings" if reasons else "GOOD"
     return {"status": status, "reasons": reasons}
 

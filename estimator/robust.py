@@ -19,9 +19,12 @@ from telerig.estimator.problem import Problem
 from telerig.factors.projection import State, pixels
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 LIMIT = 4.5
 """A dot further than this many standard deviations is left out: 4e-5 of sound dots."""
+LEAST_DOTS = 4
+"""Sound dots below which a view is left out: they would not fix the target's pose."""
 _MEDIAN = 2 * np.log(2)  # of chi-square with two degrees of freedom
 
 
@@ -81,7 +84,8 @@ def robust_solve(
     limit, floor = np.inf, 0.0
     for _ in range(rounds):
         residual = pixel_residuals(problem, solution.state)
-        floor = noise_floor_px(residual, base, free_share(problem))
+        sound = problem.weight > 0
+        floor = noise_floor_px(residual[sound], base[sound], free_share(problem))
         covariance = base + floor**2 * np.eye(2)
         distance = np.sqrt(squared_distance(residual, covariance))
         worst = float(distance.max())
@@ -90,7 +94,7 @@ def robust_solve(
         if limit > LIMIT:
             weight = (limit**2 / (limit**2 + distance**2)) ** 2
         else:
-            weight = _truncated(distance, problem.weight)
+            weight = _without_lost_views(problem, _truncated(distance, problem.weight))
         problem = replace(problem, weight=weight, covariance_px2=covariance)
         settled = np.array_equal(weight, previous.weight) and np.allclose(
             covariance, previous.covariance_px2, rtol=1e-3
@@ -106,3 +110,15 @@ def _truncated(distance: Array, before: Array) -> Array:
     """0 or 1; a dot that was out comes back only well inside, so that none flickers."""
     bar = np.where(before < 0.01, 0.9 * LIMIT, LIMIT)
     return (distance <= bar).astype(float)
+
+
+def _without_lost_views(problem: Problem, weight: Array) -> Array:
+    """No weight for views with too few sound dots to place the target; see `lost_views`."""
+    lost = lost_views(problem, weight)
+    return np.where(np.isin(problem.view, lost), 0.0, weight)
+
+
+def lost_views(problem: Problem, weight: Array) -> Ints:
+    """Views of which fewer than `LEAST_DOTS` measurements are kept."""
+    kept = np.bincount(problem.view[weight > 0], minlength=len(problem.views))
+    return np.flatnonzero(kept < LEAST_DOTS)

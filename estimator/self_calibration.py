@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.errors import CalibrationError
+from telerig.errors import CalibrationError, InputError
 from telerig.estimator import checks, initial, model_choice, numbering, twins
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import joint_covariance
@@ -70,6 +70,8 @@ def self_calibrate(
 
     Raises CalibrationError when the views cannot determine a calibration, with the remedy.
     """
+    if len(cameras) not in (1, 2):
+        raise InputError(f"{len(cameras)} cameras", todo="a rig has one camera or two")
     if model != "auto" and model not in MODELS:
         raise CalibrationError(f"unknown model {model!r}", todo=f"known: auto, {', '.join(MODELS)}")
     nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)

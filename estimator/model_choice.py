@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.graph import solve
 from telerig.estimator.problem import Problem, held_at_nominal
-from telerig.factors.projection import Observations, State, whitened_error, whitened_residuals
+from telerig.factors.projection import State, pixels, whitened_error, whitened_residuals
 from telerig.rig.pose import rotation_from_rotvec
 
 Array = NDArray[np.float64]
@@ -18,6 +18,7 @@ LADDER = (
     "none", "radial", "tangential", "kappa", "kappa+radial", "kappa+tangential", "kappa+brown",
 )  # fmt: skip
 FOLDS = 4
+HOPELESS = 10.0
 
 
 @dataclass(frozen=True)
@@ -85,26 +86,33 @@ def held_out_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
 
 
 def climb(problem: Problem, start: State, models: tuple[str, ...] = LADDER) -> list[Rung]:
-    """Fit every model of the ladder from one start and score it on held-out views."""
-    rungs = []
+    """Fit every model of the ladder from one start; score those that fit on held-out views.
+
+    A model whose own fit is `HOPELESS` times worse than the best is not asked to predict: its
+    ``held_out`` is infinite.
+    """
+    fits = []
     for model in models:
         candidate = problem.with_model(model)
         begin = held_at_nominal(candidate, start)
         solution = solve(candidate, begin, max_iterations=40, relative=1e-7)
-        obs = candidate.observations()
-        rungs.append(_rung(model, candidate, solution.state, solution.cost, obs))
-    return rungs
+        fits.append((model, candidate, solution.state, solution.cost))
+    best = min(cost for *_, cost in fits)
+    return [_rung(*fit, predict=fit[3] < HOPELESS * best) for fit in fits]
 
 
-def _rung(model: str, problem: Problem, state: State, cost: float, obs: Observations) -> Rung:
-    per_view = held_out_chi2(problem, state)
+def _rung(model: str, problem: Problem, state: State, cost: float, *, predict: bool) -> Rung:
+    obs = problem.observations()
+    views = len(problem.views)
+    per_view = held_out_chi2(problem, state) if predict else np.full(views, np.inf)
     count = sum(len(f) for f in problem.free)
-    error = whitened_error(state, obs, problem.rho_mm)
-    sigma = np.sqrt(np.trace(problem.covariance_px2, axis1=-2, axis2=-1).mean() / 2)
-    rows = error.size
+    rows = 2 * len(obs)
+    residual = pixels(state, obs, problem.rho_mm) - obs.uv_px
+    finite = per_view[~np.isnan(per_view)]
     return Rung(
         model, count, 2 * cost / rows, float(2 * cost + count * np.log(rows)),
-        float(np.sqrt((error**2).mean()) * sigma), float(np.nanmean(per_view)), per_view, state,
+        float(np.sqrt((residual**2).mean())), float(finite.mean()) if len(finite) else np.inf,
+        per_view, state,
     )  # fmt: skip
 
 
@@ -121,6 +129,8 @@ def choose(rungs: list[Rung]) -> tuple[Rung, str]:
 
 
 def _predicts_as_well(rung: Rung, best: Rung) -> bool:
+    if not np.isfinite(rung.held_out):
+        return False
     loss = rung.per_view - best.per_view
     loss = loss[np.isfinite(loss)]
     error = loss.std(ddof=1) / np.sqrt(len(loss)) if len(loss) > 1 else np.inf
@@ -128,11 +138,20 @@ def _predicts_as_well(rung: Rung, best: Rung) -> bool:
 
 
 def _words(chosen: Rung, rungs: list[Rung]) -> str:
-    others = [r for r in rungs if r.parameters < chosen.parameters]
-    if not others:
-        return f"{chosen.model}: no richer model predicts left-out views better"
-    nearest = min(others, key=lambda r: r.held_out)
-    return (
-        f"{chosen.model}: left-out views are predicted {nearest.held_out / chosen.held_out:.3g} "
-        f"times better (mean square) than by {nearest.model}"
-    )
+    simpler = [r for r in rungs if r.parameters < chosen.parameters and np.isfinite(r.held_out)]
+    words = f"{chosen.model}: no richer model predicts left-out views better"
+    if simpler:
+        nearest = min(simpler, key=lambda r: r.held_out)
+        words = (
+            f"{chosen.model}: left-out views are predicted "
+            f"{nearest.held_out / chosen.held_out:.3g} times better (mean square) than by "
+            f"{nearest.model}"
+        )
+    without = [r for r in rungs if "kappa" not in r.model]
+    if "kappa" in chosen.model and without:
+        nearest = min(without, key=lambda r: r.rms_px)
+        words += (
+            f"; kappa = 0 is rejected: the scale changes with depth, and the best model without "
+            f"it ({nearest.model}) leaves {nearest.rms_px:.3g} px RMS against {chosen.rms_px:.3g}"
+        )
+    return words

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from telerig.errors import InputError, TelerigError
 
 EXIT_REJECTED = 1
 EXIT_BAD_INPUT = 2
+EXIT_FAULT = 3
 EXIT_INTERRUPTED = 130
 
 
@@ -35,12 +37,23 @@ def checked_source(source: str | None) -> Literal["images", "dots"] | None:
 
 @contextmanager
 def errors_in_words() -> Iterator[None]:
-    """Turn telerig's errors and Ctrl-C into a message and an exit code."""
+    """Turn telerig's errors, Ctrl-C and our own faults into a message and an exit code."""
     try:
         yield
     except TelerigError as error:
         typer.echo(f"telerig: {error}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
+    except typer.Exit:
+        raise
+    except Exception as error:
+        if os.environ.get("TELERIG_DEBUG"):
+            raise
+        typer.echo(
+            f"telerig: this is a fault of telerig, not of your data: {error!r:.500}\n"
+            "  -> run again with TELERIG_DEBUG=1 and report what it prints",
+            err=True,
+        )
+        raise typer.Exit(EXIT_FAULT) from error
     except KeyboardInterrupt:
         typer.echo("telerig: interrupted; nothing was half-written", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None

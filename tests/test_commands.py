@@ -20,6 +20,11 @@ from telerig.scripts.main import app
 runner = CliRunner()
 
 
+@pytest.fixture(autouse=True)
+def tracebacks_of_our_own_faults(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TELERIG_DEBUG", "1")
+
+
 def run(*arguments: str | Path, code: int = 0) -> str:
     result = runner.invoke(app, [str(a) for a in arguments])
     if result.exception and not isinstance(result.exception, SystemExit):
@@ -27,6 +32,15 @@ def run(*arguments: str | Path, code: int = 0) -> str:
     text = result.output + result.stderr
     assert result.exit_code == code, text
     return text
+
+
+@pytest.fixture
+def small_copy(paper_copy: Path) -> Path:
+    """Seven of its views."""
+    for camera in ("left", "right"):
+        for path in images(paper_copy, camera)[7:]:
+            path.unlink()
+    return paper_copy
 
 
 def images(folder: Path, camera: str) -> list[Path]:
@@ -63,9 +77,10 @@ def test_calibrate_writes_every_file_of_the_contract(calibrated):
     assert data["pixel_origin"] == "centre" and data["gauge"]
     assert "GOOD" in text
     record = json.loads((out / "run.json").read_text())
-    assert set(record["inputs_sha256"]) >= {"rig.toml", "calibration/left/01.tif"} or len(
-        record["inputs_sha256"]
-    ) == 25
+    assert (
+        set(record["inputs_sha256"]) >= {"rig.toml", "calibration/left/01.tif"}
+        or len(record["inputs_sha256"]) == 25
+    )
 
 
 def test_residuals_are_measured_minus_predicted(calibrated, paper_images):
@@ -107,111 +122,109 @@ def test_detect_says_what_it_found_and_draws_it(paper_images, tmp_path):
     assert len(list((tmp_path / "found" / "overlays").glob("*/*.jpg"))) == 24
 
 
-def test_mirrored_camera_is_named(paper_copy):
-    for path in images(paper_copy, "right"):
+def test_mirrored_camera_is_named(small_copy):
+    for path in images(small_copy, "right"):
         spoil(path, np.fliplr)
-    text = run("calibrate", paper_copy, "--quiet", code=2)
+    text = run("calibrate", small_copy, "--quiet", code=2)
     assert "camera 'right' is mirrored against camera 'left'" in text
     assert "two_sided" in text
-    assert not (paper_copy / "results").exists()
+    assert not (small_copy / "results").exists()
 
 
-def test_one_mirrored_image_is_named(paper_copy):
-    spoil(images(paper_copy, "left")[4], np.flipud)
-    text = run("calibrate", paper_copy, "--quiet", code=2)
-    name = images(paper_copy, "left")[4].stem
+def test_one_mirrored_image_is_named(small_copy):
+    spoil(images(small_copy, "left")[4], np.flipud)
+    text = run("calibrate", small_copy, "--quiet", code=2)
+    name = images(small_copy, "left")[4].stem
     assert f"camera 'left' view '{name}'" in text and "mirrored image" in text
 
 
-def test_view_of_one_camera_only_is_used_and_said(paper_copy):
-    gone = images(paper_copy, "right")[0]
+def test_view_of_one_camera_only_is_used_and_said(small_copy):
+    gone = images(small_copy, "right")[0]
     gone.unlink()
-    text = run("calibrate", paper_copy, "--quiet")
+    text = run("calibrate", small_copy, "--quiet")
     assert re.search(rf"view '?{gone.stem}'?.*(only|alone|one camera)", text), text
 
 
-def test_image_without_dots_is_left_out_with_the_reason(paper_copy):
-    path = images(paper_copy, "left")[2]
+def test_image_without_dots_is_left_out_with_the_reason(small_copy):
+    path = images(small_copy, "left")[2]
     spoil(path, lambda image: np.full_like(image, 40))
-    text = run("calibrate", paper_copy, "--quiet")
+    text = run("calibrate", small_copy, "--quiet")
     assert f"view {path.stem}, camera left left out: no dots found" in text
 
 
-def test_dots_merged_by_glare_are_rejected_and_the_rest_used(paper_copy):
-    path = images(paper_copy, "left")[3]
-    before = telerig.detect_target(tifffile.imread(path), telerig.load_dataset(paper_copy).target)
+def test_dots_merged_by_glare_are_rejected_and_the_rest_used(small_copy):
+    path = images(small_copy, "left")[3]
+    before = telerig.detect_target(tifffile.imread(path), telerig.load_dataset(small_copy).target)
     pair = before[before["dot"].isin([0, 1])][["u_px", "v_px"]].to_numpy()
 
     def glare(image):
         out = image.copy()
-        ends = [tuple(int(round(x)) for x in p) for p in pair]
+        ends = [tuple(round(x) for x in p) for p in pair]
         cv2.line(out, ends[0], ends[1], int(image.max()), 9)
         return out
 
     spoil(path, glare)
-    text = run("calibrate", paper_copy, "--quiet")
-    rejected = pd.read_csv(paper_copy / "results/calibration/rejected.csv", dtype={"view": str})
-    dots = pd.read_csv(paper_copy / "results/calibration/dots.csv", dtype={"view": str})
+    text = run("calibrate", small_copy, "--quiet")
+    rejected = pd.read_csv(small_copy / "results/calibration/rejected.csv", dtype={"view": str})
+    dots = pd.read_csv(small_copy / "results/calibration/dots.csv", dtype={"view": str})
     mine = dots[(dots["view"] == path.stem) & (dots["camera"] == "left")]
     assert len(mine) == 13 and not set(mine["dot"]) & {0, 1}
     assert len(rejected[(rejected["view"] == path.stem) & (rejected["camera"] == "left")]) >= 1
     assert "GOOD" in text or "USABLE" in text
 
 
-def test_twelve_bits_in_sixteen(paper_copy, tmp_path):
+def test_twelve_bits_in_sixteen(small_copy, tmp_path):
     for camera in ("left", "right"):
-        for path in images(paper_copy, camera):
+        for path in images(small_copy, camera):
             spoil(path, lambda image: image.astype(np.uint16) * 16)
-    text = run("calibrate", paper_copy, "--quiet", "--no-report")
-    assert "360 of 360 dots" in text
+    text = run("calibrate", small_copy, "--quiet", "--no-report")
+    assert "210 of 210 dots" in text
 
 
-def test_colour_image_is_refused(paper_copy):
-    path = images(paper_copy, "left")[0]
+def test_colour_image_is_refused(small_copy):
+    path = images(small_copy, "left")[0]
     image = tifffile.imread(path)
     cv2.imwrite(str(path.with_suffix(".png")), np.dstack([image, image // 2, image]))
     path.unlink()
-    text = run("calibrate", paper_copy, "--quiet", code=2)
+    text = run("calibrate", small_copy, "--quiet", code=2)
     assert path.with_suffix(".png").name in text and "colour" in text
 
 
-def test_truncated_image_is_refused_and_nothing_is_written(paper_copy):
-    path = images(paper_copy, "right")[5]
+def test_truncated_image_is_refused_and_nothing_is_written(small_copy):
+    path = images(small_copy, "right")[5]
     path.write_bytes(path.read_bytes()[:3000])
-    text = run("calibrate", paper_copy, "--quiet", code=2)
+    text = run("calibrate", small_copy, "--quiet", code=2)
     assert path.name in text
-    assert not (paper_copy / "results").exists()
+    assert not (small_copy / "results").exists()
 
 
-def test_wrong_size_names_both(paper_copy):
-    spoil(images(paper_copy, "right")[1], lambda image: image[:500])
-    text = run("calibrate", paper_copy, "--quiet", code=2)
+def test_wrong_size_names_both(small_copy):
+    spoil(images(small_copy, "right")[1], lambda image: image[:500])
+    text = run("calibrate", small_copy, "--quiet", code=2)
     assert "512" in text and "500" in text
 
 
-def test_nominal_rotation_on_the_wrong_side_shows_both_twins(paper_copy):
-    rig = paper_copy / "rig.toml"
+def test_nominal_rotation_on_the_wrong_side_shows_both_twins(small_copy):
+    rig = small_copy / "rig.toml"
     text = rig.read_text()
     turned = re.sub(r"(right_from_left_rotvec_deg = \[).*\]", r"\g<1>0.0, -90.0, 0.0]", text)
     assert turned != text
     rig.write_text(turned)
-    said = run("calibrate", paper_copy, "--quiet", "--no-report")
+    said = run("calibrate", small_copy, "--quiet", "--no-report")
     assert "mirror twin: cost" in said
-    calibration = telerig.load_calibration(paper_copy / "results/calibration")
+    calibration = telerig.load_calibration(small_copy / "results/calibration")
     assert calibration.statistics["inter_camera_rotvec_deg"][1] < -80
-    np.testing.assert_allclose(
-        calibration.twin["cost"], calibration.twin["other_cost"], rtol=1e-9
-    )
+    np.testing.assert_allclose(calibration.twin["cost"], calibration.twin["other_cost"], rtol=1e-9)
 
 
-def test_existing_results_survive_a_failure(paper_copy):
-    results = paper_copy / "results" / "calibration"
+def test_existing_results_survive_a_failure(small_copy):
+    results = small_copy / "results" / "calibration"
     results.mkdir(parents=True)
     (results / "calibration.json").write_text("old")
-    shutil.rmtree(paper_copy / "calibration" / "right")
-    for path in images(paper_copy, "left")[1:]:
+    shutil.rmtree(small_copy / "calibration" / "right")
+    for path in images(small_copy, "left")[1:]:
         path.unlink()
-    run("calibrate", paper_copy, "--quiet", code=2)
+    run("calibrate", small_copy, "--quiet", code=2)
     assert (results / "calibration.json").read_text() == "old"
 
 

@@ -1,0 +1,360 @@
+"""The calibration report: from files to one page, and the figures' numbers against authorities."""
+
+from __future__ import annotations
+
+import base64
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.errors import InputError
+from telerig.io.report import contact_sheet as sheets
+from telerig.io.report.calibration_report import write_calibration_report
+from telerig.io.report.calibration_results import read_results
+from telerig.io.report.calibration_tables import parameter_rows, pose_rows, worst_rows
+from telerig.io.report.figures_residuals import residual_field
+from telerig.io.report.words import with_sd
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.projection import PARAMETERS
+
+SIGMA_PX, BUMP_MM = 0.01, 0.05
+SECTIONS = [
+    *("verdict", "key", "parameters", "pose", "model", "residuals", "coverage", "worst", "target"),
+    *("overlays", "dot", "rig", "twin", "weak", "more", "origin"),
+]
+OPTIONAL = ("dots.csv", "covariance.npz", "run.json", "dot_example.npz", "overlays")
+
+
+def _cameras(count: int) -> tuple[Camera, ...]:
+    turned = Pose.from_rotvec([0.0, np.pi / 2, 0.0], [0.0, 0.3, 0.0])
+    left = Camera.create("left", (512, 400), 10.0, k1=0.002)
+    return (left, Camera.create("right", (512, 512), 10.3, camera_from_rig=turned))[:count]
+
+
+def _pose_json(pose: Pose) -> dict[str, Any]:
+    return {"rotation": pose.rotation.tolist(), "translation_mm": pose.translation_mm.tolist()}
+
+
+def _points() -> np.ndarray:
+    row, column = np.divmod(np.arange(15), 5)
+    points = np.stack([7.0 * column, 7.0 * row, 0.0 * row], -1)
+    points[7, 2] += BUMP_MM
+    return points
+
+
+def _views(rng: np.random.Generator) -> dict[str, Pose]:
+    facing = rotation_from_rotvec([0.0, -np.pi / 4, 0.0])
+    turns = [facing @ rotation_from_rotvec(0.3 * rng.standard_normal(3)) for _ in range(6)]
+    return {f"view{i:02}": Pose(r, -r @ _points().mean(axis=0)) for i, r in enumerate(turns)}
+
+
+def _camera_json(camera: Camera) -> dict[str, Any]:
+    return {
+        "image_size_px": list(camera.image_size_px),
+        "rho_mm": camera.rho_mm,
+        "parameters": {p: camera[p] for p in PARAMETERS},
+        "free": ["scale_px_per_mm", "k1"],
+        "standard_deviations": {"scale_px_per_mm": 3.4e-4, "k1": 4.8e-5},
+        "camera_from_rig": _pose_json(camera.camera_from_rig),
+    }
+
+
+def _content(cameras: tuple[Camera, ...], views: dict[str, Pose]) -> dict[str, Any]:
+    tangent = [f"right.{n}" for n in ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")]
+    rung = {"model": "none", "parameters": 2, "chi2_dof": 5.3, "bic": 3855.0, "rms_px": 0.0115,
+            "held_out": None}  # fmt: skip
+    return {
+        "schema": 1,
+        "kind": "telerig calibration",
+        "name": "tank <2>",
+        "gauge": "the gauge in words",
+        "verdict": {"status": "USABLE, with warnings", "reasons": ["only 6 views & <few> dots"]},
+        "cameras": {c.name: _camera_json(c) for c in cameras},
+        "target": {"dots": list(range(15)), "points_mm": _points().tolist()},
+        "views": {name: _pose_json(pose) for name, pose in views.items()},
+        "covariance": {"names": tangent, "matrix": np.diag(np.arange(1.0, 7.0) ** 2).tolist()},
+        "model": {"name": "none", "words": "none was enough", "ladder": [rung]},
+        "twin": {"cost": 12.5, "other_cost": 99.25, "decided_by": "nominal rotation", "words": "w"},
+        "statistics": {"rms_px": 0.01, "chi2_dof": 1.01, "dots_kept": 178, "dots_measured": 180,
+                       "degrees_of_freedom": 301.0, "axes_angle_deg": 90.0,
+                       "axes_angle_sd_deg": 6.9e-4, "space_sd_um": 0.51, "noise_floor_px": 0.0},
+        "diagnostics": {"weak": ["depth scale of the right camera is weak"]},
+        "notes": ["a note"],
+        "stage": {"scale_ppm": 52.0},
+    }  # fmt: skip
+
+
+def _tables(
+    cameras: tuple[Camera, ...], views: dict[str, Pose], rng: np.random.Generator
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    rows = []
+    covariance = SIGMA_PX**2 * np.array([[1.0, 0.6], [0.6, 1.0]])
+    for view, pose in views.items():
+        for camera in cameras:
+            uv = camera.project(pose.apply(_points()))
+            noise = rng.multivariate_normal([0, 0], covariance, len(uv))
+            for dot, (u, v), (du, dv) in zip(range(15), uv + noise, noise):
+                rows.append([view, camera.name, dot, dot // 5, dot % 5, u, v, du, dv, 1.0, ""])
+    columns = ["view", "camera", "dot", "row", "column", "u_px", "v_px"]
+    columns += ["du_px", "dv_px", "weight", "reason"]
+    residuals = pd.DataFrame(rows, columns=columns)
+    residuals.loc[3, ["du_px", "weight", "reason"]] = [0.9, 0.0, "90 deviations"]
+    dots = residuals[columns[:7]].assign(suu_px2=1e-4, suv_px2=6e-5, svv_px2=1e-4)
+    return residuals, dots
+
+
+def _dot_example() -> dict[str, Any]:
+    v, u = np.mgrid[0:31, 0:41].astype(float)
+    model = 20 + 200 / (1 + np.exp(2 * (np.hypot(u - 20, v - 15) - 8)))
+    numbers = {"u0": 100.0, "v0": 50.0, "u_px": 120.0, "v_px": 65.0, "noise": 1.0}
+    return {
+        "patch": model + 1,
+        "model": model,
+        "a_px": 8.0,
+        "b_px": 8.0,
+        "angle_rad": 0.3,
+    } | numbers
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return _write_folder(tmp_path / "results", cameras=2)
+
+
+def _write_folder(folder: Path, cameras: int) -> Path:
+    rng = np.random.default_rng(11)
+    rig, views = _cameras(cameras), _views(rng)
+    folder.mkdir()
+    (folder / "calibration.json").write_text(json.dumps(_content(rig, views)))
+    residuals, dots = _tables(rig, views, rng)
+    residuals.to_csv(folder / "residuals.csv", index=False)
+    dots.to_csv(folder / "dots.csv", index=False)
+    names = [f"dot {i}.{axis}_mm" for i in range(15) for axis in "xyz"]
+    root = 1e-3 * rng.standard_normal((45, 45))
+    np.savez(folder / "covariance.npz", names=np.array(names), covariance=root @ root.T)
+    np.savez(folder / "dot_example.npz", **_dot_example())
+    (folder / "run.json").write_text(json.dumps({"packages": {"numpy": "9.9"}, "seed": 3}))
+    for camera in rig:
+        (folder / "overlays" / camera.name).mkdir(parents=True)
+        cv2.imwrite(str(folder / "overlays" / camera.name / "view01.jpg"), _noise_image(rng))
+    return folder
+
+
+def _noise_image(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 255, (500, 600, 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a whole folder, which no test changes."""
+    return write_calibration_report(_write_folder(tmp_path_factory.mktemp("once") / "r", cameras=2))
+
+
+def _edit(folder: Path, **changes: Any) -> Path:
+    file = folder / "calibration.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    return folder
+
+
+class _Page(HTMLParser):
+    """Text, section ids, what the page loads; fails on tags that do not close."""
+
+    EMPTY = ("meta", "link", "img", "input", "br")
+    LOADS = ("src", "href", "srcset", "data", "poster", "action", "background")
+
+    def __init__(self, file: Path) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.loads: list[str] = []
+        self.text = ""
+        self.feed(file.read_text(encoding="utf-8"))
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+        self.ids += [value or "" for name, value in attrs if name == "id" and tag == "section"]
+        self.loads += [value or "" for name, value in attrs if name in self.LOADS]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] not in ("script", "style"):
+            self.text += data
+
+
+def test_page_is_whole_small_and_loads_nothing(report: Path) -> None:
+    page = _Page(report)
+    assert report.name == "report.html" and report.stat().st_size < 8e6
+    assert page.ids == SECTIONS
+    inside = [load for load in page.loads if load.startswith("data:") or load.startswith("#")]
+    assert sorted(set(page.loads) - set(inside)) == []
+    css = report.read_text(encoding="utf-8").split("<style>")[1].split("</style>")[0]
+    assert "url(" not in css and "@import" not in css
+    assert not list(report.parent.glob(".report*"))
+
+
+def test_page_says_verdict_parameters_and_everything_else(report: Path) -> None:
+    text = _Page(report).text
+    assert text.index("USABLE, with warnings") < text.index("only 6 views & <few> dots")
+    assert text.index("only 6 views & <few> dots") < text.index("Cameras")
+    for name in PARAMETERS:
+        assert f"({name})" in text
+    for words in (
+        "10.00000 ±\u00a00.00034", "0.002000 ±\u00a00.000048", "90.00000 ±\u00a00.00069", "98.9 %",
+        "178 of 180", "0.510 µm", "none was enough", "99.25", "nominal rotation", "90 deviations",
+        "depth scale of the right camera is weak", "a note", "the gauge in words", "packages.numpy",
+        "9.9", "stage.scale_ppm",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+def test_pictures_are_sound_and_captioned(report: Path) -> None:
+    pictures = [load for load in _Page(report).loads if load.startswith("data:image")]
+    drawn = [p for p in pictures if p.startswith("data:image/svg+xml")]
+    for picture in drawn:
+        ET.fromstring(base64.b64decode(picture.split(",")[1]))
+    kinds = [p.split(";")[0] for p in pictures]
+    assert len(drawn) == 2 + 1 + 3 + 2 + 2 + 1
+    assert kinds.count("data:image/png") == 1 and kinds.count("data:image/jpeg") == 2
+    html = report.read_text(encoding="utf-8")
+    assert html.count("<figcaption>") == len(drawn) + 2
+    assert html.count("no picture") == 2 * 5
+
+
+@pytest.mark.parametrize(("status", "colour"), [("GOOD", "good"), ("REJECTED", "rejected")])
+def test_verdict_has_its_colour(folder: Path, status: str, colour: str) -> None:
+    page = write_calibration_report(_edit(folder, verdict={"status": status, "reasons": []}))
+    assert f'class="verdict {colour}"' in page.read_text(encoding="utf-8")
+
+
+def test_one_camera_and_nothing_optional(tmp_path: Path) -> None:
+    folder = _write_folder(tmp_path / "mono", cameras=1)
+    _edit(folder, model={}, twin={}, covariance={}, statistics={"rms_px": None})
+    for name in OPTIONAL:
+        (folder / name).rename(tmp_path / f"away {name}")
+    text = _Page(write_calibration_report(folder)).text
+    for words in (
+        "one camera never sees the depth", "No other model was tried", "No pictures in this folder",
+        "No example of a dot", "There is no run.json", "residuals are shown in px only",
+        "not available px",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+def test_hostile_names_stay_text(folder: Path) -> None:
+    evil = "</script><b>x"
+    views = json.loads((folder / "calibration.json").read_text())["views"]
+    _edit(folder, name=evil, views=views | {evil: views["view00"]})
+    html = write_calibration_report(folder).read_text(encoding="utf-8")
+    assert evil not in html and "&lt;/script&gt;&lt;b&gt;x" in html
+
+
+def test_importing_the_report_draws_in_no_plotting_library() -> None:
+    code = "import sys, telerig.io.report.calibration_report; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"matplotlib", "plotly", "cv2", "jinja2"} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("calibration.json", None, "no calibration here"),
+        ("calibration.json", "{", "JSON"),
+        ("calibration.json", '{"kind": "soup"}', "not a calibration"),
+        ("calibration.json", '{"kind": "telerig calibration", "schema": 9}', "newer"),
+        ("residuals.csv", None, "residuals are missing"),
+        ("residuals.csv", "view,camera\n1,2\n", "dot"),
+        ("covariance.npz", "rubbish", "cannot be read"),
+        ("dot_example.npz", "", "cannot be read"),
+        ("run.json", "[1]", "not an object"),
+    ],
+)
+def test_bad_files_are_named_and_the_old_report_stays(
+    folder: Path, file: str, content: str | None, words: str
+) -> None:
+    (folder / "report.html").write_text("old")
+    (folder / file).unlink()
+    if content is not None:
+        (folder / file).write_text(content)
+    with pytest.raises(InputError, match=words) as caught:
+        write_calibration_report(folder)
+    assert file in str(caught.value) and "->" in str(caught.value)
+    assert (folder / "report.html").read_text() == "old"
+
+
+def test_files_that_do_not_fit_together_are_refused(folder: Path) -> None:
+    file = folder / "residuals.csv"
+    file.write_text(file.read_text().replace("view05,right,14,", "view05,middle,14,"))
+    with pytest.raises(InputError, match=r"row 181: calibration.json has no camera 'middle'"):
+        read_results(folder)
+    with pytest.raises(InputError, match="lacks or garbles 'views'"):
+        content = json.loads((folder / "calibration.json").read_text())
+        del content["views"]
+        (folder / "calibration.json").write_text(json.dumps(content))
+        read_results(folder)
+
+
+def test_whitened_residuals_are_unit_normal(folder: Path) -> None:
+    table = read_results(folder).residuals
+    white = table.loc[table["kept"], ["whitened_u", "whitened_v"]].to_numpy()
+    raw = table.loc[table["kept"], ["du_px", "dv_px"]].to_numpy()
+    inverse = np.linalg.inv(SIGMA_PX**2 * np.array([[1.0, 0.6], [0.6, 1.0]]))
+    np.testing.assert_allclose((white**2).sum(1), np.einsum("ni,ij,nj->n", raw, inverse, raw))
+    assert abs(np.corrcoef(white.T)[0, 1]) < 0.2
+
+
+def test_gap_between_axes_and_its_deviation(folder: Path) -> None:
+    rows = dict(row.cells for row in pose_rows(read_results(folder)))
+    assert rows["distance between the axes (mm)"] == with_sd(0.3, 5.0)
+
+
+def test_parameter_rows_tell_held_from_free_and_distortion_in_px(folder: Path) -> None:
+    rows = {row.cells[0]: row for row in parameter_rows(read_results(folder))}
+    assert rows["skew (skew)"].faint and rows["skew (skew)"].cells[1] == "0 (held)"
+    moved = float(rows["largest distortion in the image"].cells[1].removesuffix(" px"))
+    half_diagonal_px = np.hypot(512, 400) / 2
+    assert moved == pytest.approx(0.002 * half_diagonal_px, rel=0.02)
+
+
+def test_worst_dots_begin_with_those_left_out(folder: Path) -> None:
+    rows = worst_rows(read_results(folder))
+    assert rows[0].strong and rows[0].cells[2] == "3" and rows[0].cells[-1] == "90 deviations"
+    assert not any(row.strong for row in rows[1:])
+
+
+def test_many_residuals_become_means_of_cells(folder: Path) -> None:
+    file = folder / "residuals.csv"
+    table = pd.read_csv(file)
+    many = pd.concat([table] * 20).assign(dot=lambda t: np.arange(len(t)))
+    many.to_csv(file, index=False)
+    assert "mean of a cell" in residual_field(read_results(folder), 0).caption
+
+
+def test_pictures_beyond_the_budget_shrink_then_become_links(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = read_results(folder)
+    whole = sheets.contact_sheet(results)
+    assert not whole.shrunk and whole.linked == 0
+    size = sum(file.stat().st_size for file in results.overlays.values())
+    monkeypatch.setattr(sheets, "BUDGET_BYTES", size - 1)
+    assert sheets.contact_sheet(results).shrunk and sheets.contact_sheet(results).linked == 0
+    monkeypatch.setattr(sheets, "BUDGET_BYTES", 10)
+    assert sheets.contact_sheet(results).linked == 2
+    assert 'href="overlays/left/view01.jpg"' in write_calibration_report(folder).read_text()
+    results.overlays["left", "view01"].write_bytes(b"rubbish" * 9)
+    with pytest.raises(InputError, match=r"view01.jpg: is no JPEG"):
+        sheets.contact_sheet(results)

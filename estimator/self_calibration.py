@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator import checks, initial, model_choice, numbering, twins
+from telerig.estimator import checks, initial, model_choice, numbering, tilt_signs, twins
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import joint_covariance
 from telerig.estimator.eccentricity import eccentricity_px
@@ -89,6 +89,7 @@ def self_calibrate(
     by, words_twin = "mono", "one camera: its mirror twin has the same pixels and is not decided"
     if len(cameras) == 2:
         start, by, words_twin = twins.choose_twin(start, problem, nominal)
+    start = tilt_signs.settle(problem, start)
     fit = _fit(problem, start, model, progress)
     state, by, words_twin = _settled_twin(fit, nominal, by, words_twin)
     twin_cost = _twin_cost(fit, state)

@@ -167,6 +167,17 @@ def test_overlay_marks_what_was_found(kind: type) -> None:
     assert (picture[400:].min(axis=2) < 100).any(), "the legend has letters"
 
 
+def test_overlay_keeps_the_index_of_a_dot_inside_a_rejected_outline() -> None:
+    accepted, rejected = _overlay_tables()
+    around = rejected.assign(u_px=100.0, v_px=90.0, a_px=150.0, b_px=70.0)[:1]
+    image = np.zeros((400, 400), np.uint8)
+    alone = draw_overlay(image, accepted, rejected[:0], max_width_px=400)
+    both = draw_overlay(image, accepted, around, max_width_px=400)
+    np.testing.assert_array_equal(both[75:106, 65:136], alone[75:106, 65:136])
+    number = both[80:101, 235:265].astype(int)
+    assert ((number[..., 0] - number[..., 1] > 80).sum(axis=0) > 1).sum() >= 2
+
+
 def test_overlay_shrinks_with_its_marks() -> None:
     picture = draw_overlay(np.zeros((400, 400), np.uint8), *_overlay_tables(), max_width_px=200)
     assert picture.shape[1] == 200

@@ -45,8 +45,10 @@ def draw_overlay(
     picture = _grey_picture(image, factor)
     numbers = {r: i + 1 for i, r in enumerate(rejected["reason"].value_counts().index)}
     taken = np.zeros(picture.shape[:2], bool)
-    _draw(picture, rejected, [str(numbers[r]) for r in rejected["reason"]], factor, RED, taken)
-    _draw(picture, accepted, _labels(accepted), factor, GREEN, taken)
+    _ellipses(picture, rejected, factor, RED)
+    _ellipses(picture, accepted, factor, GREEN)
+    _write(picture, accepted, _labels(accepted), factor, GREEN, taken)
+    _write(picture, rejected, [str(numbers[r]) for r in rejected["reason"]], factor, RED, taken)
     counts = rejected["reason"].value_counts()
     lines = [f"{len(accepted)} dots accepted, {len(rejected)} rejected"]
     lines += [f"{n}: {reason} ({counts[reason]})" for reason, n in numbers.items()]
@@ -87,15 +89,9 @@ def _labels(accepted: pd.DataFrame) -> list[str]:
     return [str(dot) for dot in accepted["dot"]]
 
 
-def _draw(
-    picture: Picture,
-    table: pd.DataFrame,
-    labels: Iterable[str],
-    factor: float,
-    colour: tuple[int, int, int],
-    taken: NDArray[np.bool_],
+def _ellipses(
+    picture: Picture, table: pd.DataFrame, factor: float, colour: tuple[int, int, int]
 ) -> None:
-    """Ellipses and labels; ``taken`` marks the pixels under labels that are already there."""
     import cv2
 
     ellipses = table[_ELLIPSE].to_numpy(float)
@@ -106,9 +102,26 @@ def _draw(
             picture, _fixed(centre), _fixed(axes), float(np.degrees(angle)), 0, 360, colour, 1,
             cv2.LINE_AA, _FRACTION_BITS,
         )  # fmt: skip
-    for (u, v, a, _, _), label in zip(ellipses, labels):
-        if np.isfinite([u, v, a]).all():
-            _label(picture, label, ((u + 0.5) * factor, (v + 0.5) * factor), colour, taken)
+
+
+def _write(
+    picture: Picture,
+    table: pd.DataFrame,
+    labels: Iterable[str],
+    factor: float,
+    colour: tuple[int, int, int],
+    taken: NDArray[np.bool_],
+) -> None:
+    """Each label in the middle of its ellipse, else at an end of the long axis, if there is room.
+
+    ``taken`` marks the pixels under labels that are already there.
+    """
+    for (u, v, a, _, angle), label in zip(table[_ELLIPSE].to_numpy(float), labels):
+        if not np.isfinite([u, v, a, angle]).all():
+            continue
+        along = a * np.array([np.cos(angle), np.sin(angle)])
+        places = [(np.array([u, v]) + step * along + 0.5) * factor for step in (0, 1, -1)]
+        any(_label(picture, label, place, colour, taken) for place in places)
 
 
 def _fixed(point: Array) -> tuple[int, int]:
@@ -119,11 +132,11 @@ def _fixed(point: Array) -> tuple[int, int]:
 def _label(
     picture: Picture,
     label: str,
-    centre: tuple[float, float],
+    centre: Array,
     colour: tuple[int, int, int],
     taken: NDArray[np.bool_],
-) -> None:
-    """Text in the middle of a dot, with a dark rim, if no other text is there."""
+) -> bool:
+    """Write text round a point, with a dark rim, unless other text is there; whether it was."""
     import cv2
 
     (width, height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, 1)
@@ -131,12 +144,13 @@ def _label(
     y = int(np.clip(round(centre[1] + height / 2), height, max(picture.shape[0] - 1, height)))
     place = (slice(max(y - height - 1, 0), y + 2), slice(max(x - 1, 0), x + width + 2))
     if taken[place].any():
-        return
+        return False
     taken[place] = True
-    for shade, thickness in ((INK, 3), (colour, 1)):
+    for shade, thickness in ((INK, 2), (colour, 1)):
         cv2.putText(
             picture, label, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _SCALE, shade, thickness, cv2.LINE_AA
         )
+    return True
 
 
 def _legend(lines: list[str], width_px: int) -> Picture:

@@ -37,6 +37,7 @@ _PIECE_LEVELS = (0.15, 0.3, 0.45, 0.6, 0.75)
 _PIECE_SHARE = 0.6
 _PIECE_SEMI_AXIS_PX = 4.0
 _PIECE_GROWTH_PX = 0.5
+_LARGE_PIECE = 1.5
 _MIN_PIECE_PIXELS = 4
 
 
@@ -150,21 +151,44 @@ def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) 
     """Every blob of one polarity, with the reason why it cannot be a dot if there is one."""
     sign = 1.0 if polarity == "white_on_black" else -1.0
     labels = np.zeros(edges.smooth.shape, np.int32)
-    blobs: list[Candidate] = []
     if not edges.has_edges:
         return Candidates(polarity, (), labels)
     above: Grey = (edges.smooth - edges.threshold) * np.float32(sign)
-    for outline, holes in _outlines(above > 0):
-        blob = _first_look(outline, holes, labels.shape, min_diameter_px)
-        pieces = _pieces(above, blob) if blob is not None and blob.reason else []
-        looks = [_first_look(piece, (), labels.shape, min_diameter_px) for piece in pieces]
-        parts = [(piece, look) for piece, look in zip(pieces, looks) if look is not None]
-        for shown, part in parts or [(outline, blob)]:
-            if part is not None:
-                grown = part.shape_px + (_PIECE_GROWTH_PX if parts else 0.0) * np.array([1, 0, 1])
-                blobs.append(replace(part, label=len(blobs) + 1, shape_px=grown))
-                _fill(labels, shown, len(blobs))
+    shown = [
+        (outline, _first_look(outline, holes, labels.shape, min_diameter_px))
+        for outline, holes in _outlines(above > 0)
+    ]
+    for _ in range(2):
+        shown = _with_pieces(shown, above, min_diameter_px)
+    blobs: list[Candidate] = []
+    for outline, look in shown:
+        if look is not None:
+            blobs.append(replace(look, label=len(blobs) + 1))
+            _fill(labels, outline, len(blobs))
     return Candidates(polarity, tuple(blobs), labels)
+
+
+_Look = tuple[NDArray[np.int32], Candidate | None]
+
+
+def _with_pieces(shown: list[_Look], above: Grey, min_diameter_px: float) -> list[_Look]:
+    """The outlines with those replaced by their pieces that come apart (see :func:`_pieces`)."""
+    good = [look.area_px2 for _, look in shown if look is not None and not look.reason]
+    large = _LARGE_PIECE * float(np.median(good)) if good else 0.0
+    result: list[_Look] = []
+    for outline, look in shown:
+        pieces: list[NDArray[np.int32]] = []
+        if look is not None and look.reason != TOO_SMALL and (look.reason or look.area_px2 > large):
+            pieces = _pieces(above, outline)
+        for piece in pieces:
+            smallest = min_diameter_px - 2.0 * _PIECE_GROWTH_PX
+            part = _first_look(piece, (), above.shape, smallest)
+            if part is not None:
+                grown = part.shape_px + _PIECE_GROWTH_PX * np.array([1.0, 0.0, 1.0])
+                result.append((piece, replace(part, shape_px=grown)))
+        if not pieces:
+            result.append((outline, look))
+    return result
 
 
 def _fill(canvas: NDArray[np.generic], outline: NDArray[np.int32], value: int) -> None:
@@ -190,21 +214,28 @@ def _outlines(
     return [(outlines[k], tuple(holes.get(int(k), ()))) for k in np.flatnonzero(parents < 0)]
 
 
-def _pieces(above: Grey, blob: Candidate) -> list[NDArray[np.int32]]:
+def _pieces(above: Grey, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
     """Outlines of small dots whose blur runs together, told apart by a higher threshold.
 
-    Only dots of the blur's own size are: larger ones that touch do so in the world.
+    Only dots of the blur's own size are, in blobs that are nowhere thicker: larger ones that
+    touch do so in the world.
     """
-    u, v, width, height = blob.box
-    crop = above[v : v + height, u : u + width]
-    if blob.reason == TOO_SMALL or crop.size < 2 * _MIN_PIECE_PIXELS:
+    import cv2
+
+    low, high = outline.min(axis=0), outline.max(axis=0) + 1
+    filled = np.zeros((high - low)[::-1] + 2, np.uint8)
+    _fill(filled, outline - low + 1, 1)
+    if cv2.distanceTransform(filled, cv2.DIST_L2, 3).max() > _PIECE_SEMI_AXIS_PX + 1.0:
+        return []
+    filled = filled[1:-1, 1:-1]
+    crop = np.where(filled > 0, above[low[1] : high[1], low[0] : high[0]], 0.0)
+    if np.count_nonzero(crop > 0) < 2 * _MIN_PIECE_PIXELS:
         return []
     peak = float(np.quantile(crop[crop > 0], 0.95))
     best: list[NDArray[np.int32]] = []
     for level in _PIECE_LEVELS:
         inside = crop > level * peak
-        pieces = [piece + (u, v) for piece, _ in _outlines(inside)]
-        small = [piece for piece in pieces if _is_small_dot(piece, above.shape)]
+        small = [p + low for p, _ in _outlines(inside) if _is_small_dot(p + low, above.shape)]
         covered = sum(_filled_moments(piece)[0] for piece in small)
         if len(small) > max(1, len(best)) and covered > _PIECE_SHARE * np.count_nonzero(inside):
             best = small

@@ -29,6 +29,8 @@ from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
 
+PLATE = "refraction in the plate"
+"""What decides the mirror twin of a two-sided target when no nominal rotation is given."""
 RICH = "kappa+tangential"
 """The model that finds outliers and the noise floor before a model is chosen."""
 
@@ -88,14 +90,14 @@ def self_calibrate(
     start = best_start(problem, start_dots)
     by, words_twin = "mono", "one camera: its mirror twin has the same pixels and is not decided"
     if len(cameras) == 2:
-        start, by, words_twin = twins.choose_twin(start, problem, nominal)
+        start, by, words_twin = _side(problem, start, nominal)
     start = tilt_signs.settle(problem, start)
     fit = _fit(problem, start, model, progress)
-    state, by, words_twin = _settled_twin(fit, nominal, by, words_twin)
-    twin_cost = _twin_cost(fit, state)
-    robust = replace(fit.robust, solution=replace(fit.robust.solution, state=state))
+    if len(cameras) == 2 and by != PLATE:
+        fit, by, words_twin = _settled_twin(fit, nominal)
+    twin_cost = _twin_cost(fit)
     done = replace(
-        fit, robust=robust, twin_cost=twin_cost, twin_by=by, twin_words=words_twin, pre=pre,
+        fit, twin_cost=twin_cost, twin_by=by, twin_words=words_twin, pre=pre,
         notes=tuple(said),
     )  # fmt: skip
     joint = joint_covariance(done.robust.problem, done.robust.solution)
@@ -197,16 +199,40 @@ def _with_centre(model: str) -> tuple[str, str]:
     )
 
 
-def _settled_twin(fit: Fit, nominal: Array | None, by: str, words: str) -> tuple[State, str, str]:
+def _side(problem: Problem, start: State, nominal: Array | None) -> tuple[State, str, str]:
+    """The twin to go on with: by the plate's refraction where nothing else can tell."""
+    if nominal is not None or not np.any(problem.plate_shift):
+        return twins.choose_twin(start, problem, nominal)
+    both = (start, twins.twin_state(start))
+    costs = [solve(problem, s, max_iterations=20).cost for s in both]
+    words = "the plate's refraction, which has another sign in the mirror twin"
+    return both[int(np.argmin(costs))], PLATE, words
+
+
+def _settled_twin(fit: Fit, nominal: Array | None) -> tuple[Fit, str, str]:
     """The final fit may know the sign of kappa that the start did not."""
-    state, problem = fit.robust.solution.state, fit.robust.problem
+    robust = fit.robust
+    state, by, words = twins.choose_twin(robust.solution.state, robust.problem, nominal)
+    if state is not robust.solution.state:
+        fit = replace(fit, robust=replace(robust, solution=solve(robust.problem, state)))
+    return fit, by, words
+
+
+def _twin_cost(fit: Fit) -> float:
+    """The cost of the twin that was not kept.
+
+    Raises CalibrationError when it is far lower: the plate's refraction decides against the side
+    that the nominal rotation names.
+    """
+    problem, solution = fit.robust.problem, fit.robust.solution
     if len(problem.cameras) == 1:
-        return state, by, words
-    return twins.choose_twin(state, problem, nominal)
-
-
-def _twin_cost(fit: Fit, state: State) -> float:
-    if len(fit.robust.problem.cameras) == 1:
-        return fit.robust.solution.cost
-    other = solve(fit.robust.problem, twins.twin_state(state), max_iterations=20)
-    return other.cost
+        return solution.cost
+    other = solve(problem, twins.twin_state(solution.state), max_iterations=20).cost
+    if np.any(problem.plate_shift) and other < 0.5 * solution.cost - 10:
+        raise CalibrationError(
+            "the nominal rotation puts the second camera on one side, the refraction in the "
+            f"two-sided plate on the other (cost {solution.cost:.4g} against {other:.4g})",
+            where="rig.toml [stereo]",
+            todo="check the sign of the nominal rotation, and the plate's thickness and index",
+        )
+    return other

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.graph import solve
-from telerig.estimator.problem import Problem, held_at_nominal
+from telerig.estimator.model_start import model_start
+from telerig.estimator.problem import Problem
 from telerig.factors.projection import State, pixels, whitened_error, whitened_residuals
 from telerig.rig.pose import rotation_from_rotvec
 
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 
 LADDER = (
     "none", "radial", "tangential", "kappa", "kappa+radial", "kappa+tangential", "kappa+brown",
+    "affine+radial", "tilt+radial",
 )  # fmt: skip
 FOLDS = 4
 HOPELESS = 10.0
@@ -94,7 +96,7 @@ def climb(problem: Problem, start: State, models: tuple[str, ...] = LADDER) -> l
     fits = []
     for model in models:
         candidate = problem.with_model(model)
-        begin = held_at_nominal(candidate, start)
+        begin = model_start(candidate, start)
         solution = solve(candidate, begin, max_iterations=40, relative=1e-7)
         fits.append((model, candidate, solution.state, solution.cost))
     best = min(cost for *_, cost in fits)
@@ -120,8 +122,11 @@ def choose(rungs: list[Rung]) -> tuple[Rung, str]:
     """The lowest information criterion among the models that predict left-out views well.
 
     Well: not worse than the best predictor by more than two standard errors of the difference,
-    paired by view, nor by more than 5 %.
+    paired by view, nor by more than 5 %. With too few views to leave any out, the criterion alone.
     """
+    if not np.isfinite([r.held_out for r in rungs]).any():
+        chosen = min(rungs, key=lambda r: r.bic)
+        return chosen, f"{chosen.model}: lowest information criterion; too few views to leave out"
     best = min(rungs, key=lambda r: r.held_out)
     good = [r for r in rungs if r is best or _predicts_as_well(r, best)]
     chosen = min(good, key=lambda r: r.bic)

@@ -19,6 +19,7 @@ from telerig.estimator.graph import Progress, Solution, solve
 from telerig.estimator.initial_unknown import dots_from_images
 from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.model_choice import Rung
+from telerig.estimator.model_start import model_start
 from telerig.estimator.problem import MODELS, Problem, held_at_nominal
 from telerig.estimator.results import calibration_from_fit
 from telerig.estimator.robust import RobustFit, robust_solve
@@ -166,7 +167,7 @@ def _fit(problem: Problem, start: State, model: str, progress: Progress | None) 
     if model == "auto":
         rich = "tangential" if mono else RICH
         first = robust_solve(problem.with_model(rich), start, progress=progress)
-        ladder = model_choice.LADDER if not mono else ("none", "radial", "tangential")
+        ladder = tuple(m for m in model_choice.LADDER if not (mono and "kappa" in m))
         rungs = model_choice.climb(first.problem, first.solution.state, ladder)
         chosen, words = model_choice.choose(rungs)
         model, start = chosen.model, chosen.state
@@ -176,7 +177,7 @@ def _fit(problem: Problem, start: State, model: str, progress: Progress | None) 
     else:
         words = f"{model}: as asked"
     final = problem.with_model(model)
-    start = held_at_nominal(final, start)
+    start = held_at_nominal(final, start) if rungs else model_start(final, start)
     begin = solve(final, start, max_iterations=15, relative=1e-5).state if rungs else start
     if not rungs:
         begin = robust_solve(final, start).solution.state

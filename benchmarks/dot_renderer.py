@@ -107,7 +107,9 @@ def centre_bound_px(scene: Scene, noise_sigma: float) -> Array:
     changes: list[Array] = []
     for i in range(2):
         shift = np.eye(2)[i] * h
-        changes.append(_difference(base, centres_px=(base.centres_px - shift, base.centres_px + shift)))
+        changes.append(
+            _difference(base, centres_px=(base.centres_px - shift, base.centres_px + shift))
+        )
     for stretch in ([[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]):
         step = np.array(stretch) * h
         pair = (base.image_from_disc - step, base.image_from_disc + step)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
+
 from telerig.estimator.frontend.blurred_ellipse import (
     approximate_distance_px,
     axes_from_shape,
@@ -112,7 +113,7 @@ def test_leading_batch_axes(batch: tuple[int, ...]) -> None:
     for index in np.ndindex(*batch):
         one, its = coverage_on_grid(u, v, centre[index], shape[index], sigma[index])
         np.testing.assert_allclose(coverage[index], one, atol=1e-5)
-        np.testing.assert_allclose(gradient[index], its, atol=5e-5)
+        np.testing.assert_allclose(gradient[index], its, atol=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from telerig.estimator.frontend.noise import (
     clipped_sigma,
     estimate_noise,
     grey_step,
+    high_pass,
 )
 
 Array = NDArray[np.float64]
@@ -140,12 +141,17 @@ def test_misfit_widens_the_covariance() -> None:
     np.testing.assert_array_equal(honest.inflated_covariance_px2, honest.covariance_px2)
 
 
+def noise_in(image: Array, flat: NDArray[np.bool_], step: float) -> NoiseModel:
+    grey = image.astype(np.float32)
+    return estimate_noise(grey, high_pass(grey), flat, step=step)
+
+
 @pytest.mark.parametrize("sigma", [0.4, 0.8, 3.0])
 def test_noise_of_rounded_grey_levels(sigma: float) -> None:
     rng = np.random.default_rng(6)
     u, v = np.meshgrid(np.arange(300.0), np.arange(200.0))
     image = np.rint(80 + 0.07 * u + 0.05 * v + sigma * rng.standard_normal(u.shape))
-    model = estimate_noise(image.astype(np.float32), np.ones(u.shape, dtype=bool), step=1.0)
+    model = noise_in(image, np.ones(u.shape, dtype=bool), step=1.0)
     assert model.sigma_at(90.0) == pytest.approx(np.hypot(sigma, np.sqrt(1 / 12)), rel=0.03)
 
 
@@ -156,7 +162,7 @@ def test_noise_that_grows_with_the_light() -> None:
     image = level + np.sqrt(variance) * rng.standard_normal(level.shape)
     flat = np.ones(level.shape, dtype=bool)
     flat[58:62] = flat[118:122] = flat[178:182] = False
-    model = estimate_noise(image.astype(np.float32), flat, step=0.0)
+    model = noise_in(image, flat, step=0.0)
     assert model.beta == pytest.approx(0.5, rel=0.1)
     np.testing.assert_allclose(model.variance(level[::60, 0]), variance[::60, 0], rtol=0.15)
 

@@ -70,7 +70,8 @@ def _quadratic(position: Array, value: Array, own: Array, slope: float) -> tuple
     scatter, weight = 0.05, np.ones(len(value))
     for _ in range(8):
         precision = weight / (own**2 + scatter**2)
-        covariance: Array = np.linalg.inv(design.T @ (precision[:, None] * design) + prior)
+        information = design.T @ (precision[:, None] * design) + prior
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         coefficients = covariance @ (design.T @ (precision * value))
         residual = value - design @ coefficients
         excess = float(np.sum(np.maximum(weight * (residual**2 - own**2), 0.0)))

@@ -86,7 +86,8 @@ def edge_map(image: Grey, sigma: float) -> EdgeMap:
 
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     rows, columns = image.shape
-    padded = np.pad(smooth, ((0, -rows % _BLOCK), (0, -columns % _BLOCK)), mode="edge")
+    missing = (-rows % _BLOCK, -columns % _BLOCK)
+    padded = cv2.copyMakeBorder(smooth, 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE)
     square = np.ones((_BLOCK, _BLOCK), np.uint8)
     anchor = (0, 0)
     fine_high = cv2.dilate(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
@@ -114,10 +115,10 @@ def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
     grey = bright.astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
-    flat = crossing == 0
+    flat: NDArray[np.bool_] = crossing == 0
     for distance in _FLAT_DISTANCES_PX:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * distance + 1, 2 * distance + 1))
-        flat = cv2.dilate(crossing, disc) == 0
+        flat = np.asarray(cv2.dilate(crossing, disc) == 0)
         flat[[0, -1]] = flat[:, [0, -1]] = False
         if np.count_nonzero(flat) > _FLAT_SHARE * flat.size:
             break

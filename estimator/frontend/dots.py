@@ -43,6 +43,7 @@ from telerig.estimator.frontend.noise import (
     estimate_noise,
     grey_step,
     high_pass,
+    rough_sigma,
 )
 
 if TYPE_CHECKING:
@@ -54,7 +55,6 @@ _FIRST_SIGMA_PX = 1.0
 _FEWEST_PIXELS = 25
 """A first fit that ran out of the image leaves no window for a second one."""
 _ROUNDS = 2
-_ROUGH_PIXELS = 500_000
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ def measure_dots(
 ) -> DotMeasurement:
     """Like :func:`locate_dots`, with the rejected candidates and the noise model."""
     grey = _checked(image, polarity, min_diameter_px)
-    rough_sigma = _rough_noise(grey)
-    edges = edge_map(grey, rough_sigma)
-    noise = estimate_noise(grey, edges.flat, step=grey_step(np.asarray(image)))
+    response = high_pass(grey)
+    edges = edge_map(grey, rough_sigma(response))
+    noise = estimate_noise(grey, response, edges.flat, step=grey_step(np.asarray(image)))
     wanted: tuple[Polarity, ...] = (
         ("white_on_black", "black_on_white") if polarity == "auto" else (polarity,)
     )
@@ -138,17 +138,6 @@ def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> NDAr
             "has pixels that are not finite", where="image", todo="replace NaN and infinity"
         )
     return grey
-
-
-def _rough_noise(grey: NDArray[np.float32]) -> float:
-    """A first guess of the noise: the quietest fifth of the image's 8 x 8 tiles."""
-    response = high_pass(grey)
-    rows, columns = (n // 8 * 8 for n in response.shape)
-    tiles = response[:rows, :columns].reshape(rows // 8, 8, columns // 8, 8)
-    tiles = tiles[:: max(1, response.size // _ROUGH_PIXELS)]
-    spread = np.sqrt(np.mean(tiles**2, axis=(1, 3)))
-    quiet = spread[spread <= np.quantile(spread, 0.2)]
-    return float(np.mean(quiet))
 
 
 @dataclass(frozen=True)

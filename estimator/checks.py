@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from telerig.errors import CalibrationError
 from telerig.estimator.covariance import JointCovariance
 from telerig.estimator.frontend.ordering import check_handedness
-from telerig.estimator.initial import ImageMap, image_maps, rotation_from_jacobian
+from telerig.estimator.initial import ImageMap, image_maps
 from telerig.estimator.problem import Problem, prior_sigma
 from telerig.factors.projection import State
 from telerig.rig.projection import INDEX
@@ -47,8 +47,7 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     _refuse_too_few(problem, usable, stereo=stereo, unknown_dots=unknown_dots)
     mirrored = _mirrored_note(problem, maps)
     tilts = {k: _tilt_deg(m.jacobian) for k, m in maps.items()}
-    if not unknown_dots:
-        _refuse_parallel(problem, maps, usable)
+    _refuse_parallel(problem, maps, usable)
     notes = mirrored
     if len(usable) < RECOMMENDED_VIEWS:
         notes.append(
@@ -140,33 +139,25 @@ def _tilt_deg(jacobian: Array) -> float:
 def _refuse_parallel(
     problem: Problem, maps: dict[tuple[int, int], ImageMap], usable: list[int]
 ) -> None:
-    """Views are parallel when every camera sees them all under one foreshortening."""
-    if len(usable) < 2:
-        return
+    """Views are parallel when each camera sees them foreshortened alike along the same dots.
+
+    A roll of the plate in its own plane is enough to tell them apart: see docs/theory.md.
+    """
     spread = 0.0
     for c in range(len(problem.cameras)):
-        normals = [
-            rotation_from_jacobian(m.jacobian)[0][:, 2]
-            for (v, k), m in maps.items()
-            if k == c and v in usable
-        ]
-        if len(normals) > 1:
-            axes = np.array([_unit_outer(n[:2]) for n in normals])
-            tilt = np.degrees(np.arccos(np.clip(np.abs([n[2] for n in normals]), 0, 1)))
-            sine = np.sin(np.radians(tilt))[:, None, None]
-            vectors = axes * sine
-            spread = max(spread, float(np.ptp(tilt)), float(np.degrees(np.ptp(vectors, 0).max())))
-    if spread < PARALLEL_DEG:
+        mine = [m.jacobian for (v, k), m in maps.items() if k == c and v in usable]
+        if len(mine) > 1:
+            _, singular, axes = np.linalg.svd(np.array(mine))
+            sine = np.sqrt(np.clip(1 - (singular[:, 1] / singular[:, 0]) ** 2, 0, 1))
+            along = axes[:, 1]
+            vectors = sine[:, None, None] * along[:, :, None] * along[:, None, :]
+            spread = max(spread, float(np.degrees(np.ptp(vectors, 0).max())))
+    if len(usable) > 1 and spread < PARALLEL_DEG:
         raise CalibrationError(
             f"all views are parallel: the target's tilt differs by {spread:.1f} degrees at most, "
-            "so depth can be stretched against the tilt (a bas-relief) without any pixel moving",
+            "so depth can be stretched against the tilt (a bas-relief) and hardly a pixel moves",
             todo="tilt the target differently in every view, by 20-40 degrees about several axes",
         )
-
-
-def _unit_outer(v: Array) -> Array:
-    """(2, 2) projector onto a direction: the axis of a tilt without its sign."""
-    return np.asarray(np.outer(v, v) / max(float(v @ v), 1e-9))
 
 
 def _coverage_note(problem: Problem, c: int) -> list[str]:

@@ -30,6 +30,8 @@ GAUGE = (
 )
 BAD_SCATTER_PX = 0.5
 BAD_KEPT = 0.9
+BAD_FLOOR = 5.0
+"""Noise floor over image noise beyond which the model is doubted aloud."""
 
 
 def calibration_from_fit(
@@ -292,6 +294,12 @@ def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
     spread = 5 * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
     if abs(chi2 - 1) > max(0.15, spread):
         reasons.append(f"chi-square per degree of freedom is {chi2:.2f}, not 1")
+    if statistics["noise_floor_px"] > BAD_FLOOR * statistics["image_noise_px"]:
+        reasons.append(
+            f"the dots scatter by {statistics['scatter_px']:.2g} px round the model {fit.model!r}, "
+            f"their own image noise is {statistics['image_noise_px']:.2g} px: what is left is "
+            "systematic, and errors in space may exceed their stated standard deviations"
+        )
     if len(fit.notes):
         reasons += [n for n in fit.notes if "weak" in n or "only" in n]
     reasons += odd_views(fit.robust.problem)

@@ -21,6 +21,16 @@ from telerig.io.simulation_scene import View, hand_held_views, true_cameras, tru
 from telerig.rig.camera import Camera
 from telerig.rig.target import Target
 
+HALF_VOLUME_MM = 15.0
+
+
+def rigidly_aligned(points: Any, onto: Any) -> Any:
+    """Points moved by the rotation and shift that fit best (Kabsch)."""
+    a, b = points - points.mean(0), onto - onto.mean(0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
+    return a @ u @ flip @ vt + onto.mean(0)
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -44,6 +54,26 @@ class Scene:
         """`self_calibrate` on this scene."""
         given = {"nominal_rotvec_deg": self.nominal_rotvec_deg, "model": model} | options
         return self_calibrate(self.dots, self.cameras, self.target, **given)
+
+    def changed(self, change: Callable[[pd.DataFrame], pd.DataFrame]) -> Scene:
+        """The scene with its table of measured dots changed."""
+        return replace(self, dots=change(self.dots.copy()))
+
+    def weights(self, calibration: Calibration) -> Any:
+        """(M,) final weights in the order of the scene's table."""
+        keys = ["view", "camera", "dot"]
+        final = calibration.residuals[[*keys, "weight"]]
+        return self.dots[keys].merge(final, on=keys, how="left")["weight"].to_numpy()
+
+    def space_rms_um(self, calibration: Calibration) -> float:
+        """RMS error per axis of points of the working volume, triangulated from true pixels.
+
+        After the rotation and shift that fit best: the rig's frame is a matter of gauge.
+        """
+        truth = np.random.default_rng(0).uniform(-HALF_VOLUME_MM, HALF_VOLUME_MM, (200, 3))
+        pixels = [self.true_cameras[c.name].project(truth) for c in calibration.cameras]
+        found = calibration.triangulate(*pixels, sigma_px=0.01).points_mm
+        return float(1e3 * np.sqrt(((rigidly_aligned(found, truth) - truth) ** 2).mean()))
 
     def with_dots(self, dots: pd.DataFrame) -> Scene:
         """The same scene with another table of measured dots."""

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import sys
+import threading
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -25,7 +30,7 @@ from telerig.rig.target import Target
 Progress = Callable[[int, int], None]
 
 MEGAPIXELS_FOR_WORKERS = 40
-"""Below this, starting worker processes costs more than it saves."""
+"""Below this, starting fresh worker processes costs more than it saves."""
 
 
 NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
@@ -62,7 +67,7 @@ def detect_dataset(
 ) -> DatasetDots:
     """Detect the target in every calibration image.
 
-    workers : processes; None takes one per core for large images, none for small ones.
+    workers : processes; None takes one per core where that pays.
 
     Raises InputError for images that cannot be read, DetectionError when no image shows the
     target or when images contradict each other's handedness.
@@ -102,21 +107,42 @@ def _joined(images: list[ImageDots], name: str) -> pd.DataFrame:
     return pd.concat(kept, ignore_index=True)
 
 
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _workers(dataset: Dataset, images: int) -> int:
-    pixels = sum(np.prod(c.image_size_px) for c in dataset.rig.cameras.values())
-    total = pixels * images / max(len(dataset.rig.cameras), 1) / 1e6
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return min(cores or 1, images) if total > MEGAPIXELS_FOR_WORKERS else 1
+    pixels = [int(np.prod(c.image_size_px)) for c in dataset.rig.cameras.values()]
+    large = sum(pixels) / len(pixels) * images / 1e6 > MEGAPIXELS_FOR_WORKERS
+    return min(_cores(), images) if large or _can_fork() else 1
+
+
+def _can_fork() -> bool:
+    """Copies of this process start at once, but are safe only while it has a single thread."""
+    return sys.platform == "linux" and threading.active_count() == 1
 
 
 def _run(dataset: Dataset, tasks: list[tuple[View, str]], workers: int) -> Iterator[ImageDots]:
     if workers <= 1:
         yield from (_one(dataset, view, camera) for view, camera in tasks)
-        return
-    from joblib import Parallel, delayed
+    elif _can_fork():
+        with warnings.catch_warnings():
+            # numerical libraries' own idle threads: they restart in the copy
+            warnings.simplefilter("ignore", DeprecationWarning)
+            pool = multiprocessing.get_context("fork").Pool(workers)
+        with pool:
+            yield from pool.imap(partial(_one_of, dataset), tasks)
+    else:
+        from joblib import Parallel, delayed
 
-    pool = Parallel(n_jobs=workers, return_as="generator")
-    yield from pool(delayed(_one)(dataset, view, camera) for view, camera in tasks)
+        jobs = Parallel(n_jobs=workers, return_as="generator")
+        yield from jobs(delayed(_one)(dataset, view, camera) for view, camera in tasks)
+
+
+def _one_of(dataset: Dataset, task: tuple[View, str]) -> ImageDots:
+    return _one(dataset, *task)
 
 
 def _one(dataset: Dataset, view: View, camera: str) -> ImageDots:

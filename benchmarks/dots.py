@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """One kind of picture; ``light`` is the relative change across 512 px, ``noise`` of contrast."""
+    """One kind of picture; ``light``: relative change across 512 px, ``noise``: of contrast."""
 
     radius_px: float
     noise: float = 0.02

@@ -91,7 +91,7 @@ def reason_against_fit(
     fit: DotFit, grey: Grey, polarity: Polarity, usual_contrast: float, saturation: float
 ) -> str:
     """Reason to leave a fitted dot out, or an empty string."""
-    half, size = extent_px(fit.shape_px), np.array(grey.shape[::-1])
+    half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(grey.shape[::-1])
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
         return TOUCHES_BORDER
     lopsided = _one_sided_saturation(

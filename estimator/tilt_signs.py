@@ -122,4 +122,4 @@ def _view_costs(problem: Problem, state: State) -> Array:
     """(V,) sum of squared residuals over each view."""
     obs = problem.observations()
     squares = (whitened_error(state, obs, problem.rho_mm) ** 2).sum(-1)
-    return np.bincount(obs.view, squares, minlength=len(problem.views))
+    return np.asarray(np.bincount(obs.view, squares, minlength=len(problem.views)), float)

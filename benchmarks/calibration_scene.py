@@ -1,0 +1,97 @@
+"""Simulated calibrations in memory, shared by the benchmarks of the self-calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.estimator.calibrate import nominal_cameras
+from telerig.estimator.measurements import problem_from_dots
+from telerig.estimator.problem import Problem, nominal_state
+from telerig.factors.projection import State
+from telerig.io.simulation import exact_dots, rig_description
+from telerig.io.simulation_presets import SimulationConfig
+from telerig.io.simulation_scene import (
+    TrueTarget,
+    View,
+    hand_held_views,
+    true_cameras,
+    true_target,
+)
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
+from telerig.rig.target import Target
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One simulated calibration: truth, what is known, and what is measured."""
+
+    cameras: Mapping[str, Camera]
+    true_target: TrueTarget
+    views: list[View]
+    nominal: tuple[Camera, ...]
+    target: Target
+    nominal_rotvec_deg: tuple[float, float, float] | None
+    dots: pd.DataFrame
+
+    def problem(self) -> Problem:
+        return problem_from_dots(self.dots, self.nominal, self.target)
+
+    def true_state(self, problem: Problem) -> State:
+        """The truth as a start: centres stay where the problem holds them."""
+        start = nominal_state(problem)
+        intrinsics = start.intrinsics.copy()
+        for k, camera in zip(intrinsics, self.cameras.values()):
+            centre = k[3:5].copy()
+            k[:] = camera.intrinsics
+            k[3:5] = centre
+        cameras = np.array([_matrix(c.rig_from_camera) for c in self.cameras.values()])
+        poses = {v.name: _matrix(v.rig_from_target) for v in self.views}
+        at = dict(zip(self.true_target.ids.tolist(), self.true_target.points_mm))
+        dots = np.array([at[int(d)] for d in problem.dot_ids])
+        return State(intrinsics, cameras, np.array([poses[v] for v in problem.views]), dots)
+
+
+def _matrix(pose: Pose) -> Array:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = pose.rotation, pose.translation_mm
+    return out
+
+
+def make_scene(
+    config: SimulationConfig,
+    rng: np.random.Generator,
+    *,
+    views: list[View] | None = None,
+) -> Scene:
+    """A scene; with ``views`` given, only the target and the noise are drawn.
+
+    Raises InputError when no pose meets the configuration's demands.
+    """
+    cameras = true_cameras(config)
+    target = true_target(config, rng)
+    poses = hand_held_views(config, cameras, target, rng) if views is None else views
+    exact = exact_dots(config, cameras, target, poses)
+    dots = exact[exact["inside"] == 1].reset_index(drop=True)
+    noise = config.sigma_px * rng.standard_normal((len(dots), 2))
+    dots[["u_px", "v_px"]] = dots[["u_px", "v_px"]].to_numpy() + noise
+    variance: Any = config.sigma_px**2
+    dots = dots.assign(suu_px2=variance, suv_px2=0.0, svv_px2=variance)
+    rig = rig_description(config, target)
+    return Scene(
+        cameras,
+        target,
+        poses,
+        nominal_cameras(rig),
+        rig.target,
+        rig.second_from_first_rotvec_deg,
+        dots,
+    )

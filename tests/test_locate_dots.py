@@ -124,6 +124,17 @@ def test_any_depth_gives_the_same_dots(kind: str) -> None:
     assert matched.chi2_dof.mean() == pytest.approx(1.0, abs=0.06)
 
 
+@pytest.mark.parametrize("radius", [4.0, 10.0])
+def test_photon_noise_keeps_the_covariance_honest(radius: float) -> None:
+    truth = scene(radius, size=int(np.interp(radius, [4, 10], [200, 420])))
+    clean = renderer.render(truth)
+    rng = np.random.default_rng(12)
+    image = np.rint(clean + np.sqrt(0.04 * clean) * rng.standard_normal(clean.shape))
+    gap, table = errors(locate_dots(image.astype(np.uint16)), truth.centres_px)
+    assert table.chi2_dof.mean() == pytest.approx(1.0, abs=0.05)
+    assert normalised(gap, table) == pytest.approx(1.0, abs=0.13)
+
+
 def test_a_slope_of_light_does_not_move_the_dots() -> None:
     slope = 0.002
     truth = scene(5.0, size=220, light_per_px=(slope, 0.0))

@@ -11,7 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from telerig.estimator.frontend import luminance
 from telerig.estimator.frontend.blurred_ellipse import coverage_on_grid, shape_from_axes
-from telerig.estimator.frontend.luminance import DotFit, Prior, Start, Window, fit_dot
+from telerig.estimator.frontend.dot_types import DotFit, Prior, Start, Window
+from telerig.estimator.frontend.luminance import fit_dot
 from telerig.estimator.frontend.noise import (
     NoiseModel,
     agreed_factor,
@@ -19,6 +20,7 @@ from telerig.estimator.frontend.noise import (
     estimate_noise,
     grey_step,
     high_pass,
+    with_inner_level,
 )
 
 Array = NDArray[np.float64]
@@ -90,7 +92,7 @@ def test_jacobian_of_the_model() -> None:
     window = Window(picture(shape), 0, 0, np.ones((SIZE, SIZE), dtype=bool))
     problem = luminance._problem(window, Start(CENTRE, shape, 1.0), noise_of(1.0), HELD)
     parameters = np.array([0.2, -0.1, *shape, 0.9, 40.0, 3.0, -2.0, 150.0, 0.5, -0.4])
-    _, jacobian = luminance._model(problem, parameters[:6], parameters[6:])
+    _, jacobian, _ = luminance._model(problem, parameters[:6], parameters[6:])
     for i in range(12):
         step = 1e-5 * np.eye(12)[i]
         high, low = parameters + step, parameters - step
@@ -165,6 +167,15 @@ def test_noise_that_grows_with_the_light() -> None:
     model = noise_in(image, flat, step=0.0)
     assert model.beta == pytest.approx(0.5, rel=0.1)
     np.testing.assert_allclose(model.variance(level[::60, 0]), variance[::60, 0], rtol=0.15)
+
+
+def test_noise_inside_the_dots_comes_from_residuals_only_where_no_flat_shows_it() -> None:
+    seen = NoiseModel(4.0, 0.0, 0.0, 0.02, lowest=40.0, highest=50.0)
+    told = with_inner_level(seen, 190.0, 40.0, 2.5, 5000)
+    np.testing.assert_allclose(told.variance(np.array([40.0, 190.0])), [4.0, 10.0])
+    assert with_inner_level(seen, 190.0, 40.0, 1.02, 5000) == seen
+    everywhere = replace(seen, highest=195.0)
+    assert with_inner_level(everywhere, 190.0, 40.0, 2.5, 5000) == everywhere
 
 
 def test_residuals_settle_an_uncertain_noise_but_not_a_misfit() -> None:

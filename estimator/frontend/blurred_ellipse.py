@@ -58,19 +58,23 @@ def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Arra
     return distance
 
 
-def _kernel(z: Array, sigma: Array) -> tuple[Array, Array, Array, Array]:
-    """One-dimensional point spread at ``sigma z``: integral, density, first, second derivative."""
+def _column_kernel(z: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    """One-dimensional point spread at ``sigma z``: its integral, itself, its derivative."""
     k = _FOURTH / sigma**4
     z2 = z * z
-    g = np.exp(-0.5 * z2) / (_ROOT_2PI * sigma)
-    he3, he4 = z * (z2 - 3.0), z2 * (z2 - 6.0) + 3.0
-    he5, he6 = z * (z2 * (z2 - 10.0) + 15.0), z2 * (z2 * (z2 - 15.0) + 45.0) - 15.0
-    return (
-        ndtr(z) - k * he3 * g * sigma,
-        g * (1.0 + k * he4),
-        -g / sigma * (z + k * he5),
-        g / sigma**2 * (z2 - 1.0 + k * he6),
-    )
+    g = np.exp(-0.5 * z2) * (1.0 / (_ROOT_2PI * sigma))
+    integral = ndtr(z) - (k * sigma) * (z * (z2 - 3.0)) * g
+    derivative = (g * (-1.0 / sigma)) * z * (1.0 + k * (z2 * (z2 - 10.0) + 15.0))
+    return integral, g * (1.0 + k * (z2 * (z2 - 6.0) + 3.0)), derivative
+
+
+def _row_kernel(z: Array, sigma: Array) -> tuple[Array, Array]:
+    """One-dimensional point spread at ``sigma z`` and its second derivative."""
+    k = _FOURTH / sigma**4
+    z2 = z * z
+    g = np.exp(-0.5 * z2) * (1.0 / (_ROOT_2PI * sigma))
+    bent = z2 - 1.0 + k * (z2 * (z2 * (z2 - 15.0) + 45.0) - 15.0)
+    return g * (1.0 + k * (z2 * (z2 - 6.0) + 3.0)), (g / sigma**2) * bent
 
 
 def quadrature_nodes(a_px: float, sigma_px: float) -> int:
@@ -103,8 +107,10 @@ def coverage_on_grid(
     sigma3 = sigma[..., None, None]
     x = centre[..., 0, None] + m11 * c + m12 * s
     y = centre[..., 1, None] + m12 * c + m22 * s
-    column_p, column_d, column_d1, _ = _kernel((x[..., None, :] - u_px[:, None]) / sigma3, sigma3)
-    _, row_d, _, row_d2 = _kernel((y[..., None, :] - v_px[:, None]) / sigma3, sigma3)
+    column_p, column_d, column_d1 = _column_kernel(
+        (x[..., None, :] - u_px[:, None]) / sigma3, sigma3
+    )
+    row_d, row_d2 = _row_kernel((y[..., None, :] - v_px[:, None]) / sigma3, sigma3)
 
     motions = (normal_u, normal_v, normal_u * c, normal_u * s + normal_v * c, normal_v * s)
     weights = np.stack(motions, axis=-2)

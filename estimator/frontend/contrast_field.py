@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.frontend.luminance import DotFit, Prior
+from telerig.estimator.frontend.dot_types import DotFit, Prior
 
 Array = NDArray[np.float64]
 

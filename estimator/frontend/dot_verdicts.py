@@ -14,7 +14,7 @@ from telerig.estimator.frontend.dot_candidates import (
     Candidates,
     Polarity,
 )
-from telerig.estimator.frontend.luminance import DotFit
+from telerig.estimator.frontend.dot_types import DotFit
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.float32]

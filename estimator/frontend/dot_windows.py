@@ -12,7 +12,7 @@ from telerig.estimator.frontend.blurred_ellipse import (
     extent_px,
 )
 from telerig.estimator.frontend.dot_candidates import Candidate
-from telerig.estimator.frontend.luminance import DotFit, Start, Window
+from telerig.estimator.frontend.dot_types import DotFit, Start, Window
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

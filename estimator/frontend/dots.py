@@ -24,6 +24,7 @@ from telerig.estimator.frontend.dot_candidates import (
     edge_map,
     find_candidates,
 )
+from telerig.estimator.frontend.dot_types import DotFit, Prior, Start
 from telerig.estimator.frontend.dot_verdicts import (
     is_ring,
     reason_against_blob,
@@ -36,7 +37,7 @@ from telerig.estimator.frontend.dot_windows import (
     dot_window,
     without_neighbours,
 )
-from telerig.estimator.frontend.luminance import DotFit, Prior, Start, fit_dot
+from telerig.estimator.frontend.luminance import fit_dot
 from telerig.estimator.frontend.noise import (
     NoiseModel,
     agreed_factor,
@@ -44,6 +45,7 @@ from telerig.estimator.frontend.noise import (
     grey_step,
     high_pass,
     rough_sigma,
+    with_inner_level,
 )
 
 if TYPE_CHECKING:
@@ -159,6 +161,7 @@ def _measure(grey: NDArray[np.float32], found: Candidates, noise: NoiseModel) ->
         else:
             blobs.append(blob)
     fits = _first_pass(grey, found, blobs, noise)
+    noise = _noise_with_inner_level(noise, fits)
     fits = _second_pass(grey, found, blobs, fits, noise)
     factor = agreed_factor(
         noise, np.array([fit.chi2_dof for fit in fits]), np.array([fit.dof for fit in fits])
@@ -189,6 +192,17 @@ def _first_pass(
         fits.append(fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1))
         sigma = float(np.median([fit.sigma_px for fit in fits[-9:]]))
     return fits
+
+
+def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel:
+    seen = [fit for fit in fits if fit.inner_pixels > 0]
+    if not seen:
+        return noise
+    inner = float(np.median([fit.background + fit.contrast for fit in seen]))
+    outer = float(np.median([fit.background for fit in seen]))
+    ratio = float(np.median([fit.inner_chi2 for fit in seen]))
+    pixels = sum(fit.inner_pixels for fit in seen)
+    return with_inner_level(noise, inner, outer, ratio, pixels)
 
 
 def _second_pass(

@@ -20,6 +20,7 @@ from telerig.estimator.frontend.blurred_ellipse import (
     largest_curvature,
     semi_axes,
 )
+from telerig.estimator.frontend.dot_types import PARAMETERS, DotFit, Prior, Start, Window
 from telerig.estimator.frontend.noise import NoiseModel
 
 Array = NDArray[np.float64]
@@ -28,108 +29,9 @@ Mask = NDArray[np.bool_]
 EDGE_EXPANSION_LIMIT = 0.08
 _MIN_SIGMA_PX = 0.3
 _MIN_SEMI_AXIS_PX = 0.6
-_PARAMETERS = 10  # the contrast gradient's two are held by their prior
+_INSIDE = 0.9
 _OUTLIER_SIGMA = 5.0
 _MAX_OUTLIER_SHARE = 0.15
-
-
-@dataclass(frozen=True)
-class Prior:
-    """What the image's other dots tell about one dot.
-
-    Relative contrast gradient (dC/du)/C, (dC/dv)/C [1/px] and its sigma; with
-    ``tie_to_background`` instead the background's own relative gradient (light falls on both) up
-    to ``sigma_per_px``. The edge's sigma ``edge_px`` up to ``edge_spread_px`` (infinite: unknown).
-    """
-
-    u_per_px: float = 0.0
-    v_per_px: float = 0.0
-    sigma_per_px: float = 3e-4
-    tie_to_background: bool = False
-    edge_px: float = 1.0
-    edge_spread_px: float = np.inf
-
-
-@dataclass(frozen=True)
-class Window:
-    """Pixels that a fit looks at: grey levels (V, U) of a crop, its first pixel, a mask (V, U)."""
-
-    grey: Array
-    first_u: int
-    first_v: int
-    mask: Mask
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where a fit begins: centre (2,) and shape (3,) in image px, edge sigma [px].
-
-    ``previous`` is an earlier fit of the same dot: its levels are then the start too.
-    """
-
-    centre_px: Array
-    shape_px: Array
-    sigma_px: float
-    previous: DotFit | None = None
-
-
-@dataclass(frozen=True)
-class DotFit:
-    """One fitted dot.
-
-    ``centre_px`` (2,), ``shape_px`` (3,) (see ``blurred_ellipse``), ``sigma_px`` of the edge,
-    ``levels`` (6,): B0, B1, B2, C, C1, C2 about the window's middle ``origin_px`` (2,) in units of
-    ``radius_px``; ``covariance_px2`` (2, 2) of the centre, ``contrast_sigma`` of C; ``dropped``
-    pixels were outliers; ``edge_residual`` is the residual's RMS over C in the edge's band.
-    """
-
-    centre_px: Array
-    shape_px: Array
-    sigma_px: float
-    levels: Array
-    origin_px: Array
-    radius_px: float
-    covariance_px2: Array
-    contrast_sigma: float
-    chi2_dof: float
-    pixels: int
-    dropped: int
-    edge_residual: float
-    converged: bool
-
-    @property
-    def dof(self) -> int:
-        return max(self.pixels - self.dropped - _PARAMETERS, 1)
-
-    @property
-    def inflated_covariance_px2(self) -> Array:
-        """The centre's covariance (2, 2), times chi2_dof where that is significantly above 1."""
-        significant = self.chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / self.dof)
-        return self.covariance_px2 * (self.chi2_dof if significant else 1.0)
-
-    def under_noise(self, factor: float) -> DotFit:
-        """The same fit judged by a noise variance ``factor`` times as large."""
-        return replace(
-            self,
-            covariance_px2=self.covariance_px2 * factor,
-            contrast_sigma=self.contrast_sigma * np.sqrt(factor),
-            chi2_dof=self.chi2_dof / factor,
-        )
-
-    @property
-    def contrast(self) -> float:
-        """Contrast [grey] at the dot's centre (negative for a dark dot)."""
-        return float(self.levels[3:] @ self._position)
-
-    @property
-    def background(self) -> float:
-        """Background [grey] carried on under the dot's centre."""
-        return float(self.levels[:3] @ self._position)
-
-    @property
-    def _position(self) -> Array:
-        x, y = (self.centre_px - self.origin_px) / self.radius_px
-        return np.array([1.0, x, y])
 
 
 @dataclass(frozen=True)
@@ -177,8 +79,10 @@ def _coverage(problem: _Problem, theta: Array) -> tuple[Array, Array]:
     return value[problem.mask], gradient[:, problem.mask]
 
 
-def _model(problem: _Problem, theta: Array, levels: Array) -> tuple[Array, Array]:
-    """Grey levels (P,) and their derivatives (12, P) by theta and levels.
+def _model(problem: _Problem, theta: Array, levels: Array | None) -> tuple[Array, Array, Array]:
+    """Grey levels (P,), their derivatives (12, P) by theta and levels, and the levels.
+
+    Without ``levels``, those that fit best.
 
     The light's slope acts before the blur: the Gaussian of x F_sharp is x F + sigma^2 dF/dx.
     Left out, this shifts a centre by sigma^2 times the relative slope. (How that small term
@@ -192,10 +96,12 @@ def _model(problem: _Problem, theta: Array, levels: Array) -> tuple[Array, Array
     jacobian[9] = coverage
     jacobian[10] = coverage * x - spread * gradient[0]
     jacobian[11] = coverage * y - spread * gradient[1]
+    if levels is None:
+        levels = _first_levels(problem, coverage)
     grey: Array = levels @ jacobian[6:]
     contrast = levels[3] + levels[4] * x + levels[5] * y
     np.multiply(gradient, contrast, out=jacobian[:6])
-    return grey, jacobian
+    return grey, jacobian, levels
 
 
 def _prior_rows(prior: Prior, parameters: Array, radius: float) -> tuple[Array, Array]:
@@ -216,12 +122,11 @@ def _prior_rows(prior: Prior, parameters: Array, radius: float) -> tuple[Array, 
     return rows, gap
 
 
-def _first_levels(problem: _Problem, theta: Array) -> Array:
-    coverage, _ = _coverage(problem, theta)
+def _first_levels(problem: _Problem, coverage: Array) -> Array:
     design = np.stack(
         [np.ones_like(coverage), problem.x / problem.radius, problem.y / problem.radius, coverage]
     )
-    b0, b1, b2, c = np.linalg.lstsq(design.T, problem.grey, rcond=None)[0]
+    b0, b1, b2, c = np.linalg.solve(design @ design.T, design @ problem.grey)
     return np.array([b0, b1, b2, c, 0.0, 0.0])
 
 
@@ -244,12 +149,11 @@ class _State:
     chi2: float
 
 
-def _state(problem: _Problem, parameters: Array, weight: Array | None) -> _State:
-    model, jacobian = _model(problem, parameters[:6], parameters[6:])
-    residual = problem.grey - model
-    if weight is None:
-        weight = 1.0 / problem.noise.variance(model)
-    return _State(parameters, model, jacobian, residual, weight, 0.0)
+def _state(problem: _Problem, theta: Array, levels: Array | None) -> _State:
+    model, jacobian, levels = _model(problem, theta, levels)
+    parameters = np.concatenate([theta, levels])
+    weight = 1.0 / problem.noise.variance(model)
+    return _State(parameters, model, jacobian, problem.grey - model, weight, 0.0)
 
 
 def _weighted(problem: _Problem, state: _State, weight: Array) -> _State:
@@ -296,7 +200,7 @@ def _descend(
             return replace(state, parameters=moved, residual=residual), True
         trial = None
         if _admissible(moved[:6], problem.radius):
-            trial = _weighted(problem, _state(problem, moved, state.weight), state.weight)
+            trial = _weighted(problem, _state(problem, moved[:6], moved[6:]), state.weight)
         if trial is not None and trial.chi2 <= state.chi2 * (1.0 + 1e-12):
             damping, state = max(damping / 10.0, 1e-9), trial
         else:
@@ -323,8 +227,7 @@ def fit_dot(
     """
     problem = _problem(window, start, noise, prior)
     theta = np.concatenate([start.centre_px - problem.origin, start.shape_px, [start.sigma_px]])
-    levels = _first_levels(problem, theta) if start.previous is None else start.previous.levels
-    state = _state(problem, np.concatenate([theta, levels]), None)
+    state = _state(problem, theta, None if start.previous is None else start.previous.levels)
     state = _weighted(problem, state, state.weight)
     state, converged = _descend(problem, state, iterations=iterations, tolerance=tolerance)
     for _ in range(outlier_rounds):
@@ -348,7 +251,7 @@ def _result(problem: _Problem, state: _State, converged: bool) -> DotFit:
     information, _ = _normal_equations(problem, state)
     used = state.weight > 0.0
     dropped = int(problem.grey.size - np.count_nonzero(used))
-    dof = max(int(np.count_nonzero(used)) - _PARAMETERS, 1)
+    dof = max(int(np.count_nonzero(used)) - PARAMETERS, 1)
     chi2_dof = float(np.sum(state.weight * state.residual**2)) / dof
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
@@ -356,6 +259,8 @@ def _result(problem: _Problem, state: _State, converged: bool) -> DotFit:
     theta, contrast = state.parameters[:6], abs(float(state.parameters[9]))
     distance = approximate_distance_px(theta[2:5], problem.x - theta[0], problem.y - theta[1])
     band = state.residual[(np.abs(distance) < 2.0 * theta[5]) & used]
+    inside = used & (state.jacobian[9] > _INSIDE)
+    inner = state.weight[inside] * state.residual[inside] ** 2
     edge = float(np.sqrt(np.mean(band**2))) / max(contrast, 1e-12) if band.size else np.inf
     return DotFit(
         theta[:2] + problem.origin,
@@ -370,5 +275,7 @@ def _result(problem: _Problem, state: _State, converged: bool) -> DotFit:
         int(problem.grey.size),
         dropped,
         edge,
+        float(np.mean(inner)) if inner.size else 1.0,
+        int(inner.size),
         converged,
     )

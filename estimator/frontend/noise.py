@@ -15,19 +15,24 @@ _CLIP = 3.0
 _CLIPPED_VARIANCE = 0.973337  # variance of a unit normal cut at +-3 sigma
 _CORRELATED = 3.8  # sum of the filter's squared autocorrelation: neighbours share pixels
 _MAX_SAMPLES = 400_000
+_ENOUGH_PIXELS = 100
+_UNSEEN_SHARE = 0.2
 
 
 @dataclass(frozen=True)
 class NoiseModel:
     """Variance of a pixel's grey level: ``alpha + beta * level``, at least that of rounding.
 
-    ``step`` between grey levels; ``relative_error`` of the variance.
+    ``step`` between grey levels; ``relative_error`` of the variance; the range of grey levels
+    ``lowest .. highest`` at which it was seen.
     """
 
     alpha: float
     beta: float
     step: float
     relative_error: float
+    lowest: float = -np.inf
+    highest: float = np.inf
 
     def variance(self, level: Array) -> Array:
         """Variance [grey^2] at the given grey levels."""
@@ -41,6 +46,24 @@ class NoiseModel:
     def scaled(self, factor: float) -> NoiseModel:
         """The same model with every variance times ``factor``."""
         return replace(self, alpha=self.alpha * factor, beta=self.beta * factor)
+
+
+def with_inner_level(
+    noise: NoiseModel, inner_level: float, outer_level: float, ratio: float, pixels: int
+) -> NoiseModel:
+    """The noise with the dots' own level, at which the image may have no flat place.
+
+    ``ratio`` is the mean whitened square of ``pixels`` residuals at ``inner_level``: the slope
+    between both levels follows from it where it differs from 1 by more than 4 sigma.
+    """
+    unseen = max(noise.lowest - inner_level, inner_level - noise.highest)
+    if unseen < _UNSEEN_SHARE * abs(inner_level - outer_level):
+        return noise
+    if pixels < _ENOUGH_PIXELS or abs(ratio - 1.0) < 4.0 * np.sqrt(2.0 / pixels) + 0.05:
+        return noise
+    inner, outer = (noise.sigma_at(level) ** 2 for level in (inner_level, outer_level))
+    beta = (ratio * inner - outer) / (inner_level - outer_level)
+    return replace(noise, alpha=outer - beta * outer_level, beta=beta)
 
 
 def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
@@ -142,8 +165,9 @@ def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float
     relative = np.sqrt(2.0 * _CORRELATED / counts)
     total = float(np.sqrt(2.0 * _CORRELATED / np.sum(counts)))
     mean = float(np.average(variances, weights=counts))
-    level_free = NoiseModel(mean, 0.0, step, total)
-    if levels.size < 3 or float(np.ptp(levels)) <= 4.0 * np.sqrt(mean):
+    seen = (float(levels.min()), float(levels.max()))
+    level_free = NoiseModel(mean, 0.0, step, total, *seen)
+    if levels.size < 2 or float(np.ptp(levels)) <= 4.0 * np.sqrt(mean):
         return level_free
     precision = 1.0 / ((relative + 0.01) * np.maximum(variances, 0.05 * mean))
     design = np.stack([np.ones_like(levels), levels], axis=1) * precision[:, None]
@@ -151,4 +175,4 @@ def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float
     alpha, beta = covariance @ (design.T @ (variances * precision))
     if beta <= 4.0 * np.sqrt(covariance[1, 1]) or alpha + beta * levels.min() <= 0.0:
         return level_free
-    return NoiseModel(float(alpha), float(beta), step, total)
+    return NoiseModel(float(alpha), float(beta), step, total, *seen)

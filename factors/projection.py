@@ -179,7 +179,8 @@ class ImageFactors:
     GTSAM asks for one image at a time, NumPy is fast only for all at once. The first image asked
     at a new point evaluates every image; the others find their own variables unchanged and take
     their rows. An image whose variables differ from the shared point evaluates again, so what is
-    returned is always that of the values given.
+    returned is always that of the values given. Derivatives are always evaluated too: a point
+    whose cost is asked is nearly always linearised next.
     """
 
     def __init__(
@@ -187,24 +188,21 @@ class ImageFactors:
     ) -> None:
         self.obs, self.keys, self.rho_mm = obs, keys, tuple(rho_mm)
         self._start = start
-        self._images = sorted(set(zip(obs.view.tolist(), obs.camera.tolist())))
-        self._shared: dict[tuple[int, int], bytes] = {}
-        self._at: State | None = None
-        self._value: Array | None = None
+        self._shared: dict[int, bytes] = {}
         self._full: Residuals | None = None
+        self._by_free: list[Array] = []
 
     def graph_factors(self) -> list[Any]:
         """One `gtsam.CustomFactor` for each image that has dots."""
         import gtsam
 
         image = self.obs.view * len(self.rho_mm) + self.obs.camera
-        starts = np.r_[0, np.flatnonzero(np.diff(image)) + 1, len(image)]
+        edges = np.r_[0, np.flatnonzero(np.diff(image)) + 1, len(image)].tolist()
         out = []
-        for first, last in pairwise(starts):
+        for first, last in pairwise(edges):
             view, camera = int(self.obs.view[first]), int(self.obs.camera[first])
-            rows = slice(int(first), int(last))
-            noise = gtsam.noiseModel.Unit.Create(2 * int(last - first))
-            callback = self._callback(rows, view, camera)
+            noise = gtsam.noiseModel.Unit.Create(2 * (last - first))
+            callback = self._callback(slice(first, last), view, camera)
             out.append(gtsam.CustomFactor(noise, self._image_keys(view, camera), callback))
         return out
 
@@ -217,61 +215,55 @@ class ImageFactors:
         return keys
 
     def _callback(self, rows: slice, view: int, camera: int) -> Any:
-        me, free, unit = self, self.keys.free[camera], self.keys.unit[camera]
-        size = 2 * (rows.stop - rows.start)
+        me, has_free = self, len(self.keys.free[camera]) > 0
+        size, width = 2 * (rows.stop - rows.start), self._start.dots_mm.size
+        of_dots = np.arange(size)[:, None] * width + np.repeat(3 * self.obs.dot[rows], 2)[:, None]
+        of_dots = (of_dots + np.arange(3)).ravel()
 
         def error(_this: Any, values: Any, jacobians: list[Array] | None) -> Array:
-            me._move_to(values, view, camera)
+            full = me._move_to(values, view, camera)
             if jacobians is None:
-                return me._values()[rows].ravel()
-            full = me._residuals()
-            blocks = [full.by_view[rows].reshape(size, 6), me._dot_block(full, rows, size)]
-            if len(free):
-                blocks.append((full.by_intrinsics[rows][..., free] * unit).reshape(size, -1))
+                return full.value[rows].ravel()
+            by_dots = np.zeros(size * width)
+            by_dots[of_dots] = full.by_dot[rows].ravel()
+            jacobians[0] = full.by_view[rows].reshape(size, 6)
+            jacobians[1] = by_dots.reshape(size, width)
+            if has_free:
+                jacobians[2] = me._by_free[camera][rows].reshape(size, -1)
             if camera:
-                blocks.append(full.by_camera[rows].reshape(size, 6))
-            for i, block in enumerate(blocks):
-                jacobians[i] = np.asfortranarray(block)
+                jacobians[-1] = full.by_camera[rows].reshape(size, 6)
             return full.value[rows].ravel()
 
         return error
 
-    def _dot_block(self, full: Residuals, rows: slice, size: int) -> Array:
-        dots = self.obs.dot[rows]
-        block = np.zeros((len(dots), 2, len(self._start.dots_mm), 3))
-        block[np.arange(len(dots)), :, dots] = full.by_dot[rows]
-        return block.reshape(size, -1)
-
-    def _move_to(self, values: Any, view: int, camera: int) -> None:
-        asked = self._variables(values, view, camera)
-        if self._shared.get((view, camera)) == asked:
-            return
-        self._at = state_from_values(values, self.keys, self._start)
-        self._value = self._full = None
-        self._shared = {image: self._variables(values, *image) for image in self._images}
-
-    def _variables(self, values: Any, view: int, camera: int) -> bytes:
-        """What one image depends on, as bytes: equality is exact and cheap to test."""
-        keys = self.keys
-        parts = [values.atVector(keys.dots).tobytes(), values.atPose3(keys.view[view]).matrix()]
-        if len(keys.free[camera]):
-            parts.append(values.atVector(keys.intrinsics[camera]))
-        if camera:
-            parts.append(values.atPose3(keys.camera[camera]).matrix())
-        return b"".join(p if isinstance(p, bytes) else p.tobytes() for p in parts)
-
-    def _values(self) -> Array:
-        if self._value is None:
-            assert self._at is not None
-            self._value = whitened_error(self._at, self.obs, self.rho_mm)
-        return self._value
-
-    def _residuals(self) -> Residuals:
-        if self._full is None:
-            assert self._at is not None
-            self._full = whitened_residuals(self._at, self.obs, self.rho_mm)
-            self._value = self._full.value
+    def _move_to(self, values: Any, view: int, camera: int) -> Residuals:
+        """The shared evaluation, renewed unless it is of this image's variables in ``values``."""
+        if self._full is None or not self._unchanged(values, view, camera):
+            state = state_from_values(values, self.keys, self._start)
+            self._shared = _as_bytes(values, self.keys)
+            self._full = whitened_residuals(state, self.obs, self.rho_mm)
+            free = zip(self.keys.free, self.keys.unit)
+            self._by_free = [self._full.by_intrinsics[..., f] * unit for f, unit in free]
         return self._full
+
+    def _unchanged(self, values: Any, view: int, camera: int) -> bool:
+        keys, shared = self.keys, self._shared
+        poses = [keys.view[view], keys.camera[camera]] if camera else [keys.view[view]]
+        vectors = [keys.dots]
+        if len(keys.free[camera]):
+            vectors.append(keys.intrinsics[camera])
+        return all(shared[k] == values.atPose3(k).matrix().tobytes() for k in poses) and all(
+            shared[k] == values.atVector(k).tobytes() for k in vectors
+        )
+
+
+def _as_bytes(values: Any, keys: ImageKeys) -> dict[int, bytes]:
+    """Every variable of the images: equality of bytes is exact and cheap to test."""
+    poses = (*keys.view, *keys.camera[1:])
+    vectors = (keys.dots, *(k for k, free in zip(keys.intrinsics, keys.free) if len(free)))
+    return {k: values.atPose3(k).matrix().tobytes() for k in poses} | {
+        k: values.atVector(k).tobytes() for k in vectors
+    }
 
 
 def intrinsics_from_values(values: Any, keys: ImageKeys, start: State, camera: int) -> Array:

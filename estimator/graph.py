@@ -30,6 +30,8 @@ from telerig.factors.priors import (
 from telerig.factors.projection import ImageFactors, ImageKeys, State, state_from_values
 
 Array = NDArray[np.float64]
+NEARLY_UNDAMPED = 1e-6
+"""Marquardt damping below which a step promises what Gauss-Newton could still gain."""
 Progress = Callable[[int, float], None]
 
 
@@ -149,9 +151,9 @@ def solve(
     relative: float = 1e-11,
     progress: Progress | None = None,
 ) -> Solution:
-    """Levenberg-Marquardt with Marquardt's scaling, to a relative decrease of ``relative``.
+    """Levenberg-Marquardt with Marquardt's scaling, until no more than ``relative`` can be gained.
 
-    Raises CalibrationError when the start is not finite or no step is ever accepted.
+    Raises CalibrationError when the cost is not finite at the start.
     """
     graph, values, keys = build(problem, start)
     ordering = _ordering(problem, keys)
@@ -162,6 +164,8 @@ def solve(
     information, gradient = graph.linearize(values).hessian(ordering)
     for iteration in range(1, max_iterations + 1):
         step, promised = _damped_step(information, gradient, damping)
+        if promised <= relative * cost and damping <= NEARLY_UNDAMPED:
+            break
         trial = values.retract(_vector_values(step, keys, problem))
         trial_cost = graph.error(trial)
         gained = cost - trial_cost

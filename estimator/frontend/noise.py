@@ -14,7 +14,7 @@ _PLANE_KILLER = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
 _CLIP = 3.0
 _CLIPPED_VARIANCE = 0.973337  # variance of a unit normal cut at +-3 sigma
 _CORRELATED = 3.8  # sum of the filter's squared autocorrelation: neighbours share pixels
-_MAX_SAMPLES = 400_000
+_MAX_SAMPLES = 100_000
 _ENOUGH_PIXELS = 100
 _UNSEEN_SHARE = 0.2
 

@@ -33,8 +33,10 @@ def main() -> None:
     rows = []
     for seed in range(options.first, options.first + options.seeds):
         rows.append(one(options.preset, seed))
-        print({k: v if isinstance(v, str) else round(float(v), 4) for k, v in rows[-1].items()},
-              flush=True)
+        print(
+            {k: v if isinstance(v, str) else round(float(v), 4) for k, v in rows[-1].items()},
+            flush=True,
+        )
     text = report(options.preset, pd.DataFrame(rows))
     print(text)
     if options.out is not None:
@@ -107,8 +109,8 @@ def report(preset: str, table: pd.DataFrame) -> str:
         f"{table['rms_um'].median():.3f}, bound {table['bound_um'].median():.3f}; ratio median "
         f"{ratio.median():.3f}, root mean square {np.sqrt((ratio**2).mean()):.3f}, worst "
         f"{ratio.max():.3f}",
-        f"- dots held at nominal instead (print errors of 20 um): {table['held_rms_um'].median():.2f}"
-        f" um, {gain.median():.1f} times worse",
+        f"- dots held at nominal instead (print errors of 20 um): "
+        f"{table['held_rms_um'].median():.2f} um, {gain.median():.1f} times worse",
         f"- models chosen: {table['model'].value_counts().to_dict()}",
         f"- seconds per calibration: median {table['seconds'].median():.2f}",
         "",

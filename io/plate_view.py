@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -14,11 +14,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
+
+from telerig.errors import InputError
 from telerig.io.plate_view import Plate, pixel_from_plate, plate_from_pixel
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-
-from telerig.errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from telerig.errors import InputError
 from telerig.io.atomic import atomic_folder, write_json_atomic
 from telerig.io.dataset import Dataset, load_dataset
 from telerig.io.plate_view import pixel_from_plate
@@ -30,8 +32,6 @@ from telerig.io.tables import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
-
-from telerig.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd

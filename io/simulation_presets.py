@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from telerig.rig.target import Target
-
 from telerig.errors import InputError
+from telerig.rig.target import Target
 
 Range = tuple[float, float]
 Vector = tuple[float, float, float]

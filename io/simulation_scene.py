@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from telerig.errors import InputError
 from telerig.io.plate_view import Plate, pixel_from_plate
 from telerig.io.simulation_presets import CameraConfig, SimulationConfig
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
-
-from telerig.errors import InputError
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -4,6 +4,8 @@ import time
 
 import numpy as np
 import pytest
+
+from telerig.errors import InputError
 from telerig.io.plate_view import Plate, pixel_from_plate, plate_from_pixel
 from telerig.io.render import (
     Light,
@@ -14,8 +16,6 @@ from telerig.io.render import (
 )
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-
-from telerig.errors import InputError
 
 SIZE = (120, 110)
 POSES = {

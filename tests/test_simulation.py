@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+
+from telerig.errors import InputError
 from telerig.io.plate_view import pixel_from_plate
 from telerig.io.simulation import exact_dots, simulate, view_image
 from telerig.io.simulation_presets import PRESETS, CameraConfig, preset
@@ -19,8 +21,6 @@ from telerig.io.simulation_scene import (
 )
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-
-from telerig.errors import InputError
 
 
 @cache

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from telerig.errors import DetectionError, InputError
 from telerig.estimator.frontend.lattice import Lattice
 from telerig.estimator.frontend.marks import MarkEvidence
 from telerig.rig.target import Target
-
-from telerig.errors import DetectionError, InputError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

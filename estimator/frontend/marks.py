@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from telerig.estimator.frontend.lattice import Lattice
 from telerig.rig.target import Target
 

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
+
+from telerig.errors import DetectionError
 from telerig.estimator.frontend.lattice import MIN_DOTS, circle_from_ellipses
 from telerig.estimator.frontend.local_fit import (
     apply_homography,
@@ -21,8 +23,6 @@ from telerig.estimator.frontend.local_fit import (
     fit_homography,
     nearest,
 )
-
-from telerig.errors import DetectionError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

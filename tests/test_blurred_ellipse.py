@@ -134,6 +134,14 @@ def test_edge_expansion_agrees_with_the_exact_sum(
     assert np.max(np.abs(gradient - slopes[:, band])) < 0.01 * np.max(np.abs(slopes))
 
 
+def test_the_middle_of_a_dot_is_simply_inside() -> None:
+    shape = shape_from_axes(9.0, 8.0, 0.4)
+    offsets = np.array([0.0, 0.0, 1.0, -2.0])
+    coverage, gradient = coverage_near_edge(offsets, np.array([0.0, 1.0, 0.0, 1.0]), shape, 0.8)
+    np.testing.assert_allclose(coverage, 1.0)
+    np.testing.assert_allclose(gradient, 0.0)
+
+
 def test_foot_points_are_the_nearest_points() -> None:
     rng = np.random.default_rng(3)
     shape = shape_from_axes(30.0, 18.0, 0.8)

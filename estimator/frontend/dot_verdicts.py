@@ -25,6 +25,7 @@ FAINT = "much fainter than the other dots"
 DARK_SPECK = "does not look like a dot (contrast has the wrong sign)"
 
 _MAX_EDGE_RESIDUAL = 0.12
+_MISFIT_CHI2 = 2.0
 _MIN_RELATIVE_RADIUS = 0.28
 _MIN_RELATIVE_CONTRAST = 0.2
 _MIN_HOLE_SHARE = 0.02
@@ -91,6 +92,8 @@ def reason_against_fit(
     fit: DotFit, grey: Grey, polarity: Polarity, usual_contrast: float, saturation: float
 ) -> str:
     """Reason to leave a fitted dot out, or an empty string."""
+    if not np.all(np.isfinite(fit.covariance_px2)) or axes_from_shape(fit.shape_px)[1] <= 0.0:
+        return "does not look like a dot (fit failed)"
     half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(grey.shape[::-1])
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
         return TOUCHES_BORDER
@@ -99,12 +102,10 @@ def reason_against_fit(
     )
     if lopsided > _MAX_ONE_SIDED_SATURATION:
         return GLARE
-    if fit.edge_residual > _MAX_EDGE_RESIDUAL:
+    if fit.edge_residual > _MAX_EDGE_RESIDUAL and fit.chi2_dof > _MISFIT_CHI2:
         return f"does not look like a dot (residual {np.sqrt(fit.chi2_dof):.0f} x noise)"
     if (fit.contrast > 0.0) != (polarity == "white_on_black"):
         return DARK_SPECK
     if abs(fit.contrast) < _MIN_RELATIVE_CONTRAST * usual_contrast:
         return FAINT
-    if not np.all(np.isfinite(fit.covariance_px2)) or axes_from_shape(fit.shape_px)[1] <= 0.0:
-        return "does not look like a dot (fit failed)"
     return ""

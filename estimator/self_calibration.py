@@ -136,9 +136,8 @@ def with_plate(problem: Problem) -> Problem:
     options = [replace(problem, plate_shift=np.where(hands == h, -hands, 0.0)) for h in (1, -1)]
     costs = []
     for option in options:
-        state = best_start(option, option.nominal_mm)
-        both = (state, twins.twin_state(state))
-        costs.append(min(solve(option, s, max_iterations=20).cost for s in both))
+        start = best_start(option, option.nominal_mm)
+        costs.append(solve(option, start, max_iterations=20).cost)
     return options[int(np.argmin(costs))]
 
 
@@ -152,6 +151,8 @@ def best_start(problem: Problem, dots_mm: Array) -> State:
     if len(problem.cameras) == 1:
         return initial.mono_state(problem, dots_mm)
     starts = initial.stereo_states(problem, dots_mm)
+    if np.any(problem.plate_shift):  # refraction tells the mirror twins apart
+        starts += [twins.twin_state(start) for start in starts]
     fits: list[Solution] = []
     for start in starts:
         perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)

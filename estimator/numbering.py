@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
 from telerig.estimator import initial
-from telerig.estimator.graph import solve
 from telerig.estimator.problem import Problem
+from telerig.estimator.robust import robust_solve
 from telerig.factors.projection import State, whitened_residuals
 from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
 from telerig.rig.target import Target
@@ -38,19 +38,40 @@ def settle(problem: Problem, nominal_rotvec_deg: Array | None) -> tuple[Problem,
     Raises CalibrationError when two numberings explain the two cameras alike.
     """
     labels = turns(problem.target)
-    problem = _agree_between_cameras(problem, labels, nominal_rotvec_deg)
+    if len(problem.cameras) == 2:
+        problem = _agree_between_cameras(problem, labels, nominal_rotvec_deg)
     problem, contrast = _agree_between_views(problem, labels)
+    problem, about_scale = _scale_of_any_turn(problem, labels)
     many = f"{len(labels)}-fold symmetric target without marks"
     if contrast > 3:
         return problem, [
             f"{many}: numbered so that both cameras and all views agree; the dots' print errors "
-            f"tell the turns apart ({contrast:.0f} standard deviations in the least certain view)"
+            f"tell the turns apart ({contrast:.0f} standard deviations in the least certain view)",
+            *about_scale,
         ]
     return problem, [
         f"{many}: both cameras agree within each view; between views the print errors are too "
         f"small to tell the turns apart ({contrast:.1f} standard deviations in the least certain "
-        "view), so the dots' estimated positions may be averages over turns"
+        "view), so the dots' estimated positions may be averages over turns",
+        *about_scale,
     ]
+
+
+def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, list[str]]:
+    """The known distance, less certain where a turn puts other dots in the place of its two."""
+    if problem.scale is None:
+        return problem, []
+    pair, distance, sigma = problem.scale
+    ends = problem.dot_ids[list(pair)]
+    if all(set(label[ends]) == set(ends) for label in labels):
+        return problem, []
+    either = float(np.hypot(sigma, np.sqrt(2) * problem.target.print_sigma_mm))
+    words = (
+        f"the distance of dots {tuple(int(e) for e in ends)} may be that of another pair, which a "
+        f"turn puts in their place, so it is taken as good to {1e3 * either:.0f} um; choose two "
+        "dots that are opposite each other, or put marks on the target"
+    )
+    return replace(problem, scale=(pair, distance, either)), [words]
 
 
 def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:
@@ -88,8 +109,8 @@ def _agree_between_cameras(
             f"{problem.views[both[int(close[0])]]!r}",
             todo="put marks on the target, or leave this view out",
         )
-    # image k of the second camera was turned by spin: its ids follow the inverse relabelling
-    choice = {(v, 1): labels[int(k)] for v, k in zip(both, angles.argmin(1))}
+    # image v of the second camera agrees once turned by spin k: its ids follow the turn back
+    choice = {(v, 1): labels[-int(k)] for v, k in zip(both, angles.argmin(1))}
     return _relabel(problem, choice)
 
 
@@ -125,20 +146,14 @@ def _to_nominal_deg(rotation: Array, nominal_rotvec_deg: Array | None) -> float:
 def _agree_between_views(problem: Problem, labels: list[Ints]) -> tuple[Problem, float]:
     """Turn whole views until their print errors look like those of the others."""
     held = replace(problem, dot_sigma_mm=np.full_like(problem.dot_sigma_mm, 1e-6))
-    start = initial.stereo_states(held, held.nominal_mm, count=1)[0]
-    state = solve(held.with_model("tangential"), start, max_iterations=30, relative=1e-6).state
-    marks = _print_errors(problem, state)
+    if len(problem.cameras) == 2:
+        start = initial.stereo_states(held, held.nominal_mm, count=1)[0]
+    else:
+        start = initial.mono_state(held, held.nominal_mm)
+    rough = robust_solve(held.with_model("tangential"), start)
+    marks = _print_errors(rough.problem, rough.solution.state)
     turned = np.array([_turned(marks, label, k, len(labels)) for k, label in enumerate(labels)])
-    choice = np.zeros(len(problem.views), int)
-    for _ in range(10):
-        chosen = turned[choice, np.arange(len(choice))]
-        before = choice.copy()
-        for v in range(len(choice)):
-            others = np.nanmean(np.delete(chosen, v, 0), 0)
-            choice[v] = int(np.argmin(np.nansum((turned[:, v] - others) ** 2, (1, 2))))
-            chosen[v] = turned[choice[v], v]
-        if np.array_equal(before, choice):
-            break
+    choice = _alike(turned)
     contrast = _contrast(turned, choice)
     picks = {
         (v, c): labels[k] for v, k in enumerate(choice) for c in range(len(problem.cameras)) if k
@@ -146,17 +161,46 @@ def _agree_between_views(problem: Problem, labels: list[Ints]) -> tuple[Problem,
     return _relabel(problem, picks), contrast
 
 
+def _alike(turned: Array) -> Ints:
+    """(V,) turns that make the views' print errors most alike: to one view, then to the mean."""
+    views = np.arange(turned.shape[1])
+    starts = [_misfits(turned, turned[0, v][None]).argmin(0) for v in views]
+    choice = min(starts, key=lambda c: _scatter(turned[c, views]))
+    for _ in range(10):
+        chosen = turned[choice, views]
+        others = np.array([np.nanmean(np.delete(chosen, v, 0), 0) for v in views])
+        before, choice = choice, _misfits(turned, others).argmin(0)
+        if np.array_equal(before, choice):
+            break
+    return choice
+
+
+def _misfits(turned: Array, others: Array) -> Array:
+    """(T, V) mean square difference of each turn of each view from (V or 1, N, 2) print errors."""
+    return np.asarray(np.nanmean((turned - others) ** 2, (2, 3)))
+
+
+def _scatter(marks: Array) -> float:
+    return float(np.nansum((marks - np.nanmean(marks, 0)) ** 2))
+
+
 def _print_errors(problem: Problem, state: State) -> Array:
-    """(V, N, 2) where each view sees the dots, minus nominal, in the target's plane (mm)."""
-    obs = problem.unweighted()
+    """(V, N, 2) where each view sees the dots, minus nominal, in the target's plane (mm).
+
+    NaN for dots that it does not see.
+    """
+    obs = problem.observations()
     jac = whitened_residuals(state, obs, problem.rho_mm)
-    normal = np.tile(1e-6 * np.eye(2), (len(problem.views), len(problem.dot_ids), 1, 1))
+    normal = np.zeros((len(problem.views), len(problem.dot_ids), 2, 2))
     right = np.zeros((*normal.shape[:2], 2))
     plane = jac.by_dot[..., :2]
     np.add.at(normal, (obs.view, obs.dot), np.swapaxes(plane, -1, -2) @ plane)
     np.add.at(right, (obs.view, obs.dot), -np.einsum("mij,mi->mj", plane, jac.value))
+    unseen = np.linalg.det(normal) <= 0
+    normal[unseen] = np.eye(2)
     errors = np.linalg.solve(normal, right[..., None])[..., 0]
-    return np.asarray(errors - errors.mean(1, keepdims=True))
+    errors[unseen] = np.nan
+    return np.asarray(errors - np.nanmean(errors, 1, keepdims=True))
 
 
 def _turned(marks: Array, label: Ints, k: int, order: int) -> Array:

@@ -83,7 +83,7 @@ def self_calibrate(
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
     said = [*notes, *pre.notes]
-    if target.symmetry_order() > 1 and len(cameras) == 2:
+    if target.symmetry_order() > 1:
         problem, words = numbering.settle(problem, nominal)
         said += words
         start_dots = problem.nominal_mm

@@ -172,7 +172,7 @@ def _alike(turned: Array) -> Ints:
         before, choice = choice, _misfits(turned, others).argmin(0)
         if np.array_equal(before, choice):
             break
-    return choice
+    return np.asarray(choice, np.int64)
 
 
 def _misfits(turned: Array, others: Array) -> Array:

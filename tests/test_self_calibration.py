@@ -264,7 +264,7 @@ def test_strong_perspective_decides_and_contradicts(scene: Any) -> None:
     assert calibration.twin["decided_by"] == "perspective"
     assert calibration.twin["other_cost"] == pytest.approx(calibration.twin["cost"], rel=0.05)
     truth = {c.name: c for c in cameras}
-    assert replace(lens, true_cameras=truth).space_rms_um(calibration) < 50
+    assert replace(lens, true_cameras=truth).space_rms_um(calibration) < 1.5
     with pytest.raises(CalibrationError, match="perspective of the lenses"):
         lens.calibrate("auto", nominal_rotvec_deg=(0, -90, 0))
     telecentric = lens.calibrate("radial")

@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 CLEAR_SIGMA = 3.5
 _MAX_MARGIN_PX = 12.0
-_THIN_ABOVE_PIXELS = 3000
+_THIN_ABOVE_PIXELS, _COARSE_ABOVE_PIXELS = 3000, 800
 _EDGE_SIGMA = 2.7
 
 
@@ -54,7 +54,7 @@ def dot_window(
         mask &= (gap > clear) | (distance < gap)
     if blob.holes:
         mask &= _distance_to(_holes(blob, low, mask.shape)) > clear + 0.5
-    if np.count_nonzero(mask) > _THIN_ABOVE_PIXELS:
+    if np.count_nonzero(mask) > (_COARSE_ABOVE_PIXELS if coarse else _THIN_ABOVE_PIXELS):
         thin = np.abs(distance) > (0.0 if coarse else _EDGE_SIGMA * start.sigma_px)
         thin[::2, ::2] = False
         mask &= ~thin

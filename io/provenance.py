@@ -10,8 +10,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from telerig import __version__
-
 PACKAGES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "scikit-image", "pandas")
 
 
@@ -31,7 +29,7 @@ def run_record(
     """The content of run.json. inputs : hashed, named relative to the dataset."""
     return {
         "command": command,
-        "telerig": __version__,
+        "telerig": _version("telerig"),
         "python": platform.python_version(),
         "platform": platform.platform(terse=True),
         "packages": {name: _version(name) for name in PACKAGES},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.estimator.calibrate import nominal_cameras
+from telerig.estimator.eccentricity import eccentricity_px
 from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.problem import Problem, nominal_state
 from telerig.factors.projection import State
@@ -45,14 +46,11 @@ class Scene:
     def problem(self) -> Problem:
         return problem_from_dots(self.dots, self.nominal, self.target)
 
-    def true_state(self, problem: Problem) -> State:
-        """The truth as a start: centres stay where the problem holds them."""
-        start = nominal_state(problem)
-        intrinsics = start.intrinsics.copy()
-        for k, camera in zip(intrinsics, self.cameras.values()):
-            centre = k[3:5].copy()
-            k[:] = camera.intrinsics
-            k[3:5] = centre
+    def true_state(self, problem: Problem, *, held_centres: bool = True) -> State:
+        """The truth; as a start, with the centres where the problem holds them."""
+        intrinsics = np.array([c.intrinsics for c in self.cameras.values()])
+        if held_centres:
+            intrinsics[:, 3:5] = nominal_state(problem).intrinsics[:, 3:5]
         cameras = np.array([_matrix(c.rig_from_camera) for c in self.cameras.values()])
         poses = {v.name: _matrix(v.rig_from_target) for v in self.views}
         at = dict(zip(self.true_target.ids.tolist(), self.true_target.points_mm))
@@ -74,6 +72,8 @@ def make_scene(
 ) -> Scene:
     """A scene; with ``views`` given, only the target and the noise are drawn.
 
+    What is measured are the centres of the projected discs.
+
     Raises InputError when no pose meets the configuration's demands.
     """
     cameras = true_cameras(config)
@@ -81,17 +81,19 @@ def make_scene(
     poses = hand_held_views(config, cameras, target, rng) if views is None else views
     exact = exact_dots(config, cameras, target, poses)
     dots = exact[exact["inside"] == 1].reset_index(drop=True)
-    noise = config.sigma_px * rng.standard_normal((len(dots), 2))
-    dots[["u_px", "v_px"]] = dots[["u_px", "v_px"]].to_numpy() + noise
     variance: Any = config.sigma_px**2
     dots = dots.assign(suu_px2=variance, suv_px2=0.0, svv_px2=variance)
     rig = rig_description(config, target)
-    return Scene(
-        cameras,
-        target,
-        poses,
-        nominal_cameras(rig),
-        rig.target,
-        rig.second_from_first_rotvec_deg,
-        dots,
-    )
+    nominal = nominal_cameras(rig)
+    side = rig.second_from_first_rotvec_deg
+    scene = Scene(cameras, target, poses, nominal, rig.target, side, dots)
+    problem = scene.problem()
+    if not np.array_equal(problem.uv_px, dots[["u_px", "v_px"]].to_numpy()):
+        raise RuntimeError("the table is not in the problem's order")
+    discs = eccentricity_px(problem, scene.true_state(problem, held_centres=False))
+    noise = config.sigma_px * rng.standard_normal((len(dots), 2))
+    return replace(scene, dots=dots.assign(**_pixels(problem.uv_px + discs + noise)))
+
+
+def _pixels(uv_px: Array) -> dict[str, Array]:
+    return {"u_px": uv_px[:, 0], "v_px": uv_px[:, 1]}

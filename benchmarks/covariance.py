@@ -183,7 +183,7 @@ def bound_um(case: Case, scene: Scene) -> float:
     """Cramer-Rao bound on the 3-D RMS per axis: the covariance at the truth, without noise."""
     exact = exact_dots(case.config, scene.cameras, scene.true_target, scene.views)
     dots = exact[exact["inside"] == 1].reset_index(drop=True)
-    dots = dots.assign(**{k: scene.dots[k] for k in ("suu_px2", "suv_px2", "svv_px2")})
+    dots = scene.dots.assign(u_px=dots["u_px"], v_px=dots["v_px"])
     problem = replace(scene, dots=dots).problem().with_model(case.model)
     solution = solve(problem, held_at_nominal(problem, scene.true_state(problem)))
     names, covariance = joint_covariance(problem, solution).rig_block()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from telerig.errors import CalibrationError
+from telerig.estimator.normal_equations import ArraySystem
 from telerig.estimator.problem import (
     GAUGE_SIGMA_MM,
     Problem,
@@ -30,6 +31,7 @@ from telerig.factors.priors import (
 from telerig.factors.projection import ImageFactors, ImageKeys, State, state_from_values
 
 Array = NDArray[np.float64]
+MANY_DOTS, MANY_VIEWS = 50, 100
 NEARLY_UNDAMPED = 1e-6
 """Marquardt damping below which a step promises what Gauss-Newton could still gain."""
 Progress = Callable[[int, float], None]
@@ -143,6 +145,50 @@ def _ordering(problem: Problem, keys: ImageKeys) -> Any:
     return ordering
 
 
+@dataclass(frozen=True)
+class DenseEquations:
+    """J^T J and -J^T r of the whole graph."""
+
+    matrix: Array
+    gradient: Array
+
+    def information(self) -> Array:
+        return self.matrix
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """Damped step, and the decrease of the cost that it promises."""
+        return _damped_step(self.matrix, self.gradient, damping)
+
+
+class GraphSystem:
+    """A problem as GTSAM's graph; points are `gtsam.Values`."""
+
+    def __init__(self, problem: Problem, start: State) -> None:
+        self.problem, self.start = problem, start
+        self.graph, self.values, self.keys = build(problem, start)
+        self.ordering = _ordering(problem, self.keys)
+
+    def first(self) -> Any:
+        return self.values
+
+    def cost(self, values: Any) -> float:
+        return float(self.graph.error(values))
+
+    def linearised(self, values: Any) -> DenseEquations:
+        return DenseEquations(*self.graph.linearize(values).hessian(self.ordering))
+
+    def moved(self, values: Any, step: Array) -> Any:
+        return values.retract(_vector_values(step, self.keys, self.problem))
+
+    def state(self, values: Any) -> State:
+        return state_from_values(values, self.keys, self.start)
+
+
+def is_large(problem: Problem) -> bool:
+    """Whether the graph's dense Hessian would be what costs; see docs/decisions/002."""
+    return len(problem.dot_ids) > MANY_DOTS or len(problem.views) > MANY_VIEWS
+
+
 def solve(
     problem: Problem,
     start: State,
@@ -153,26 +199,30 @@ def solve(
 ) -> Solution:
     """Levenberg-Marquardt with Marquardt's scaling, until no more than ``relative`` can be gained.
 
+    On GTSAM's graph, or for large problems (``problem.solver`` "auto") on the same normal
+    equations with the dots eliminated.
+
     Raises CalibrationError when the cost is not finite at the start.
     """
-    graph, values, keys = build(problem, start)
-    ordering = _ordering(problem, keys)
-    cost = graph.error(values)
+    schur = problem.solver == "schur" or (problem.solver == "auto" and is_large(problem))
+    system: Any = ArraySystem(problem, start) if schur else GraphSystem(problem, start)
+    point = system.first()
+    cost = system.cost(point)
     if not np.isfinite(cost):
         raise CalibrationError("the starting point has no finite cost", todo="check rig.toml")
     damping, iteration = 1e-4, 0
-    information, gradient = graph.linearize(values).hessian(ordering)
+    equations = system.linearised(point)
     for iteration in range(1, max_iterations + 1):
-        step, promised = _damped_step(information, gradient, damping)
+        step, promised = equations.step(damping)
         if promised <= relative * cost and damping <= NEARLY_UNDAMPED:
             break
-        trial = values.retract(_vector_values(step, keys, problem))
-        trial_cost = graph.error(trial)
+        trial = system.moved(point, step)
+        trial_cost = system.cost(trial)
         gained = cost - trial_cost
         if np.isfinite(trial_cost) and gained >= -1e-13 * cost:
             done = promised <= relative * cost and gained <= relative * cost
-            values, cost, damping = trial, trial_cost, max(damping / 10, 1e-12)
-            information, gradient = graph.linearize(values).hessian(ordering)
+            point, cost, damping = trial, trial_cost, max(damping / 10, 1e-12)
+            equations = system.linearised(point)
             if progress is not None:
                 progress(iteration, cost)
             if done:
@@ -181,8 +231,8 @@ def solve(
             damping *= 10
             if damping > 1e12:
                 break
-    state = state_from_values(values, keys, start)
-    return Solution(state, float(cost), iteration, information, slots(problem))
+    information = equations.information()
+    return Solution(system.state(point), float(cost), iteration, information, slots(problem))
 
 
 def _damped_step(information: Array, gradient: Array, damping: float) -> tuple[Array, float]:

@@ -52,6 +52,8 @@ tangential terms to first order and otherwise a gauge freedom, so it is held at 
 image and p1, p2 carry a decentred lens (docs/decisions/003).
 """
 
+SOLVERS = ("auto", "gtsam", "schur")
+
 PRIOR_SIGMA = {
     "scale_px_per_mm": 0.5,  # relative
     "aspect": 0.1, "skew": 0.1, "kappa_per_mm": 0.5,  # kappa: per rho
@@ -73,6 +75,7 @@ class Problem:
     weight : (M,) in [0, 1].
     free : per camera, names of the free intrinsics.
     scale : ((index, index), distance_mm, sigma_mm) or None.
+    solver : "gtsam", "schur", or "auto" for the one that suits the size.
     """
 
     cameras: tuple[Camera, ...]
@@ -90,6 +93,7 @@ class Problem:
     free: tuple[tuple[str, ...], ...]
     scale: tuple[tuple[int, int], float, float] | None
     plate_shift: Array
+    solver: str = "auto"
 
     @property
     def rho_mm(self) -> tuple[float, ...]:

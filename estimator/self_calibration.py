@@ -20,7 +20,7 @@ from telerig.estimator.initial_unknown import dots_from_images
 from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.model_choice import Rung
 from telerig.estimator.model_start import model_start
-from telerig.estimator.problem import MODELS, Problem, held_at_nominal
+from telerig.estimator.problem import MODELS, SOLVERS, Problem, held_at_nominal
 from telerig.estimator.results import calibration_from_fit
 from telerig.estimator.robust import RobustFit, robust_solve
 from telerig.factors.projection import State
@@ -59,6 +59,7 @@ def self_calibrate(
     nominal_rotvec_deg: Sequence[float] | None = None,
     model: str = "auto",
     dots_free: str = "3d",
+    solver: str = "auto",
     progress: Progress | None = None,
     notes: Sequence[str] = (),
     name: str = "",
@@ -70,6 +71,7 @@ def self_calibrate(
     nominal_rotvec_deg : of second_from_first; decides the mirror twin.
     model : a name of `telerig.estimator.problem.MODELS`, or "auto".
     dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
+    solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
 
     Raises CalibrationError when the views cannot determine a calibration, with the remedy.
     """
@@ -77,8 +79,11 @@ def self_calibrate(
         raise InputError(f"{len(cameras)} cameras", todo="a rig has one camera or two")
     if model != "auto" and model not in MODELS:
         raise CalibrationError(f"unknown model {model!r}", todo=f"known: auto, {', '.join(MODELS)}")
+    if solver not in SOLVERS:
+        raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
+    problem = replace(problem, solver=solver)
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)

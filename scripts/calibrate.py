@@ -19,7 +19,7 @@ def calibrate(
     model: Annotated[
         str, typer.Option(help="auto, or a lens model: none, radial, tangential, kappa, ...")
     ] = "auto",
-    solver: Annotated[str, typer.Option(help="auto or gtsam.")] = "auto",
+    solver: Annotated[str, typer.Option(help="auto, gtsam or schur.")] = "auto",
     dots: Annotated[
         str, typer.Option(help="What dots may do: 3d, plane (stay in the plane), nominal (held).")
     ] = "3d",

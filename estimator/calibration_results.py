@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from telerig.estimator.calibrate import CalibrationRun
 from telerig.io.atomic import atomic_folder, write_json_atomic
+from telerig.io.parallel import ordered_map, quick_workers
 from telerig.io.provenance import run_record
 from telerig.io.tables import write_table
 
@@ -62,16 +64,17 @@ def write_results(
 def write_detections(dataset: Dataset, detected: DatasetDots, folder: Path) -> None:
     """rejected.csv and overlays/<camera>/<view>.jpg."""
     write_table(detected.rejected, folder / "rejected.csv")
-    paths = {view.name: view for view in dataset.views}
-    for image in detected.images:
-        _write_overlay(dataset, paths[image.view], image, folder / "overlays")
+    write = partial(_write_overlay, dataset, folder / "overlays")
+    for _ in ordered_map(write, detected.images, quick_workers(len(detected.images))):
+        pass
 
 
-def _write_overlay(dataset: Dataset, view: Any, image: ImageDots, folder: Path) -> None:
+def _write_overlay(dataset: Dataset, folder: Path, image: ImageDots) -> None:
     import cv2
 
     from telerig.io.report.overlay import draw_overlay
 
+    view = next(v for v in dataset.views if v.name == image.view)
     picture = draw_overlay(
         dataset.image(view, image.camera), image.dots, image.rejected, max_width_px=OVERLAY_WIDTH_PX
     )

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import sys
-import threading
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -25,6 +20,7 @@ from telerig.estimator.frontend.target_detection import (
     rejected_table,
 )
 from telerig.io.dataset import Dataset, View
+from telerig.io.parallel import cores, ordered_map, quick_workers
 from telerig.rig.target import Target
 
 Progress = Callable[[int, int], None]
@@ -75,7 +71,7 @@ def detect_dataset(
     tasks = [(view, camera) for view in dataset.views for camera in view.image_paths]
     count = _workers(dataset, len(tasks)) if workers is None else workers
     found: list[ImageDots] = []
-    for done, image in enumerate(_run(dataset, tasks, count), 1):
+    for done, image in enumerate(ordered_map(partial(_one_of, dataset), tasks, count), 1):
         found.append(image)
         if progress is not None:
             progress(done, len(tasks))
@@ -107,38 +103,10 @@ def _joined(images: list[ImageDots], name: str) -> pd.DataFrame:
     return pd.concat(kept, ignore_index=True)
 
 
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def _workers(dataset: Dataset, images: int) -> int:
     pixels = [int(np.prod(c.image_size_px)) for c in dataset.rig.cameras.values()]
     large = sum(pixels) / len(pixels) * images / 1e6 > MEGAPIXELS_FOR_WORKERS
-    return min(_cores(), images) if large or _can_fork() else 1
-
-
-def _can_fork() -> bool:
-    """Copies of this process start at once, but are safe only while it has a single thread."""
-    return sys.platform == "linux" and threading.active_count() == 1
-
-
-def _run(dataset: Dataset, tasks: list[tuple[View, str]], workers: int) -> Iterator[ImageDots]:
-    if workers <= 1:
-        yield from (_one(dataset, view, camera) for view, camera in tasks)
-    elif _can_fork():
-        with warnings.catch_warnings():
-            # numerical libraries' own idle threads: they restart in the copy
-            warnings.simplefilter("ignore", DeprecationWarning)
-            pool = multiprocessing.get_context("fork").Pool(workers)
-        with pool:
-            yield from pool.imap(partial(_one_of, dataset), tasks)
-    else:
-        from joblib import Parallel, delayed
-
-        jobs = Parallel(n_jobs=workers, return_as="generator")
-        yield from jobs(delayed(_one)(dataset, view, camera) for view, camera in tasks)
+    return min(cores(), images) if large else quick_workers(images)
 
 
 def _one_of(dataset: Dataset, task: tuple[View, str]) -> ImageDots:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from telerig.io.atomic import write_text_atomic
+from telerig.io.parallel import ordered_map, quick_workers
 from telerig.io.report import calibration_tables as tables
 from telerig.io.report.calibration_results import CalibrationResults, read_results
 from telerig.io.report.contact_sheet import contact_sheet
+from telerig.io.report.figures_common import prepare_drawing
 from telerig.io.report.figures_coverage import coverage, tilts
 from telerig.io.report.figures_dot import dot_pictures
 from telerig.io.report.figures_residuals import residual_field, residual_histogram
@@ -95,12 +99,26 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
 
 def _pictures(results: CalibrationResults) -> dict[str, Any]:
     every = range(len(results.cameras))
-    return {
-        "fields": [residual_field(results, i) for i in every],
-        "spread": [residual_histogram(results)],
-        "covered": [*(coverage(results, i) for i in every), tilts(results)],
-        "target": target_pictures(results),
-        "dot": dot_pictures(results.dot_example),
-        "plan": rig_plan(results),
-        "sheet": contact_sheet(results),
-    }
+    drawings: list[tuple[str, Callable[[], Any]]] = [
+        ("sheet", partial(contact_sheet, results)),
+        *(("fields", partial(residual_field, results, i)) for i in every),
+        ("dot", partial(dot_pictures, results.dot_example)),
+        ("target", partial(target_pictures, results)),
+        *(("covered", partial(coverage, results, i)) for i in every),
+        ("covered", partial(tilts, results)),
+        ("spread", partial(residual_histogram, results)),
+        ("plan", partial(rig_plan, results)),
+    ]
+    prepare_drawing()
+    drawn = ordered_map(_call, [d for _, d in drawings], quick_workers(len(drawings)))
+    pictures: dict[str, Any] = {"fields": [], "covered": [], "spread": []}
+    for (place, _), picture in zip(drawings, drawn):
+        if place in ("fields", "covered", "spread"):
+            pictures[place].append(picture)
+        else:
+            pictures[place] = picture
+    return pictures
+
+
+def _call(drawing: Callable[[], Any]) -> Any:
+    return drawing()

@@ -39,6 +39,13 @@ class Picture:
     caption: str
 
 
+def prepare_drawing() -> None:
+    """Import what every figure needs, so that processes started afterwards share it."""
+    import matplotlib.backends.backend_agg
+    import matplotlib.backends.backend_svg
+    import matplotlib.figure  # noqa: F401
+
+
 @contextmanager
 def drawing(height_in: float) -> Iterator[tuple[Any, Any]]:
     """A figure and its axes in the report's style, `WIDTH_IN` wide."""

@@ -1,0 +1,55 @@
+"""Work spread over the cores of this machine, results in order."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def can_fork() -> bool:
+    """Copies of this process start at once, but are safe only while it has a single thread."""
+    return sys.platform == "linux" and threading.active_count() == 1
+
+
+def ordered_map(
+    function: Callable[[Task], Result], tasks: Sequence[Task], workers: int
+) -> Iterator[Result]:
+    """``function`` of each task, in the order of the tasks, by ``workers`` processes.
+
+    function : a module's function or a `functools.partial` of one. An error raised in a process
+        is raised here.
+    """
+    if workers <= 1:
+        yield from map(function, tasks)
+    elif can_fork():
+        with warnings.catch_warnings():
+            # numerical libraries' own idle threads: they restart in the copy
+            warnings.simplefilter("ignore", DeprecationWarning)
+            pool = multiprocessing.get_context("fork").Pool(workers)
+        with pool:
+            yield from pool.imap(function, tasks)
+    else:
+        from joblib import Parallel, delayed
+
+        jobs = Parallel(n_jobs=workers, return_as="generator")
+        yield from jobs(delayed(function)(task) for task in tasks)
+
+
+def quick_workers(tasks: int) -> int:
+    """How many processes pay for short work: one per core where they start at once, else 1."""
+    return min(cores(), tasks) if can_fork() else 1

@@ -1,0 +1,308 @@
+"""Motions of a run: bubbles, stage, servo and shaking rig, all discretised exactly.
+
+Linear processes x' = F x + L w are stepped with Van Loan's matrix exponential (IEEE Trans. Autom.
+Control 23:395, 1978), so that any sampling rate has the right spectra and covariances. Vectors
+lead with the path: (paths, steps, states). Heights are along the stage's axis, upwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+
+Array = NDArray[np.float64]
+
+GRAVITY_M_S2 = 9.81
+MICRO_G_M_S2 = 9.81e-6
+
+
+@dataclass(frozen=True)
+class LinearProcess:
+    """x' = drift x + input * w, w white noise of unit two-sided density.
+
+    drift : (n, n) 1/s; noise_input : (n,).
+    """
+
+    drift: Array
+    noise_input: Array
+
+    def stationary_covariance(self) -> Array:
+        """(n, n). Raises InputError for a process that does not settle."""
+        from scipy.linalg import solve_continuous_lyapunov
+
+        if np.max(np.linalg.eigvals(self.drift).real) >= 0:
+            raise InputError("a motion without damping has no stationary state", todo="damp it")
+        noise = np.outer(self.noise_input, self.noise_input)
+        return np.asarray(solve_continuous_lyapunov(self.drift, -noise))
+
+    def discretised(self, step_s: float) -> tuple[Array, Array]:
+        """Transition (n, n) and a square root (n, n) of the step's noise covariance.
+
+        Integrals of white noise of different orders differ by powers of the step; they are
+        scaled before Van Loan's exponential, else the smallest drown in rounding.
+        """
+        from scipy.linalg import expm
+
+        scale = step_s ** self._orders()
+        drift = self.drift * step_s / scale[:, None] * scale
+        noise = self.noise_input * np.sqrt(step_s) / scale
+        n = len(noise)
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n], block[:n, n:], block[n:, n:] = -drift, np.outer(noise, noise), drift.T
+        exponential = expm(block)
+        transition = exponential[n:, n:].T
+        covariance = transition @ exponential[:n, n:]
+        root = square_root((covariance + covariance.T) / 2)
+        return transition * scale[:, None] / scale, scale[:, None] * root
+
+    def _orders(self) -> Array:
+        """(n,) how many integrations lie between the white noise and each state."""
+        orders = np.full(len(self.noise_input), np.nan)
+        reached = self.noise_input
+        for order in range(len(orders)):
+            orders[np.isnan(orders) & (reached != 0)] = order
+            reached = np.abs(self.drift) @ np.abs(reached)
+        return np.nan_to_num(orders, nan=0.0)
+
+    def paths(
+        self,
+        step_s: float,
+        steps: int,
+        rng: Generator,
+        *,
+        paths: int = 1,
+        start_covariance: Array | None = None,
+    ) -> Array:
+        """(paths, steps, n) samples every step_s from a random start.
+
+        start_covariance : (n, n) of the start; None for the stationary one.
+        """
+        start = self.stationary_covariance() if start_covariance is None else start_covariance
+        transition, root = self.discretised(step_s)
+        n = len(self.noise_input)
+        out = np.empty((steps, paths, n))
+        out[0] = rng.standard_normal((paths, n)) @ square_root(start).T
+        kicks = rng.standard_normal((steps, paths, n)) @ root.T
+        for i in range(1, steps):
+            out[i] = out[i - 1] @ transition.T + kicks[i]
+        return out.transpose(1, 0, 2)
+
+
+def square_root(covariance: Array) -> Array:
+    """(n, n) S with S S^T = covariance, which may be singular."""
+    sigma = np.sqrt(np.diag(covariance))
+    unit = np.where(sigma > 0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
+    return np.asarray(unit[:, None] * vectors * np.sqrt(np.clip(values, 0, None)))
+
+
+def ornstein_uhlenbeck(sigma: float, tau_s: float) -> LinearProcess:
+    """States (integral, value): a velocity of RMS sigma that forgets within tau_s.
+
+    The integral, a displacement, does not settle: start it at 0.
+    """
+    return LinearProcess(
+        np.array([[0.0, 1.0], [0.0, -1 / tau_s]]), np.array([0.0, sigma * np.sqrt(2 / tau_s)])
+    )
+
+
+def oscillator(rms: float, frequency_hz: float, damping: float) -> LinearProcess:
+    """States (displacement, velocity) of a resonator driven by white noise, of the given RMS."""
+    w = 2 * np.pi * frequency_hz
+    drift = np.array([[0.0, 1.0], [-(w**2), -2 * damping * w]])
+    return LinearProcess(drift, np.array([0.0, 2 * rms * np.sqrt(damping * w**3)]))
+
+
+def rig_mode(rms: float, frequency_hz: float, damping: float, force_hz: float) -> LinearProcess:
+    """States (displacement, velocity, force, force's slope) of a structure's mode.
+
+    The force is white noise through two critically damped poles at force_hz; rms is that of the
+    displacement. The acceleration follows from the states, see `mode_acceleration`.
+    """
+    w, f = 2 * np.pi * frequency_hz, 2 * np.pi * force_hz
+    drift = np.array(
+        [
+            [0.0, 1.0, 0.0, 0.0],
+            [-(w**2), -2 * damping * w, 1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            [0.0, 0.0, -(f**2), -2 * f],
+        ]
+    )
+    unit = LinearProcess(drift, np.array([0.0, 0.0, 0.0, f**2]))
+    gain = rms / np.sqrt(unit.stationary_covariance()[0, 0])
+    return LinearProcess(drift, unit.noise_input * gain)
+
+
+def mode_acceleration(states: Array, process: LinearProcess) -> Array:
+    """(..., 4) states of a `rig_mode` -> (...) its acceleration."""
+    return np.asarray(states @ process.drift[1])
+
+
+@dataclass(frozen=True)
+class Path:
+    """height_mm : along the stage's axis; lateral_mm : (..., 2) across it; with velocities."""
+
+    height_mm: Array
+    lateral_mm: Array
+    height_mm_s: Array
+    lateral_mm_s: Array
+
+
+def constant_speed_path(
+    t_s: ArrayLike,
+    speed_mm_s: float,
+    frequency_hz: float,
+    amplitudes_mm: tuple[float, float],
+    *,
+    azimuth_rad: float = 0.0,
+    phase_rad: float = 0.0,
+) -> Path:
+    """Zigzag (second amplitude 0), helix (equal ones) or between, with |velocity| constant.
+
+    The lateral path is an ellipse; the height is an elliptic integral of the second kind.
+    Raises InputError when the lateral motion alone is faster than the speed.
+    """
+    from scipy.special import ellipeinc
+
+    large, small = sorted((abs(a) for a in amplitudes_mm), reverse=True)
+    w = 2 * np.pi * frequency_hz
+    if w * large >= speed_mm_s:
+        raise InputError(
+            f"an amplitude of {large:g} mm at {frequency_hz:g} Hz needs {w * large:.0f} mm/s",
+            todo=f"stay below the bubble's speed of {speed_mm_s:g} mm/s",
+        )
+    theta = w * np.asarray(t_s, float) + phase_rad
+    upright = np.sqrt(speed_mm_s**2 - (w * small) ** 2)
+    m = (large**2 - small**2) * (w / upright) ** 2
+    rise = ellipeinc(theta - np.pi / 2, m) - ellipeinc(phase_rad - np.pi / 2, m)
+    turn = np.array(
+        [[np.cos(azimuth_rad), np.sin(azimuth_rad)], [-np.sin(azimuth_rad), np.cos(azimuth_rad)]]
+    )
+    place = np.stack([large * np.sin(theta), -small * np.cos(theta)], -1) @ turn
+    speed = w * np.stack([large * np.cos(theta), small * np.sin(theta)], -1) @ turn
+    climb = upright * np.sqrt(1 - m * np.cos(theta) ** 2)
+    return Path(upright / w * rise, place, climb, speed)
+
+
+def constant_speed_rise_mm_s(
+    speed_mm_s: float, frequency_hz: float, amplitudes_mm: tuple[float, float]
+) -> float:
+    """Mean vertical velocity of `constant_speed_path`."""
+    whole = constant_speed_path([1 / frequency_hz], speed_mm_s, frequency_hz, amplitudes_mm)
+    return float(whole.height_mm[0] * frequency_hz)
+
+
+def stochastic_path(
+    step_s: float,
+    steps: int,
+    rng: Generator,
+    *,
+    rise_mm_s: float,
+    wander_mm_s: float,
+    wander_tau_s: float,
+    height_oscillation: tuple[float, float, float],
+    lateral_oscillation: tuple[float, float, float],
+) -> Path:
+    """A bubble's path: steady rise, Ornstein-Uhlenbeck velocity and a stochastic oscillation.
+
+    The oscillations are (RMS mm, frequency Hz, damping), one vertical, one on each lateral axis.
+    """
+    wander = ornstein_uhlenbeck(wander_mm_s, wander_tau_s).paths(
+        step_s, steps, rng, paths=3, start_covariance=np.diag([0.0, wander_mm_s**2])
+    )
+    height = oscillator(*height_oscillation).paths(step_s, steps, rng)
+    lateral = oscillator(*lateral_oscillation).paths(step_s, steps, rng, paths=2)
+    across = (wander[1:] + lateral).transpose(1, 0, 2)
+    up = wander[0] + height[0]
+    t = step_s * np.arange(steps)
+    return Path(rise_mm_s * t + up[:, 0], across[..., 0], rise_mm_s + up[:, 1], across[..., 1])
+
+
+def stage_trajectory(
+    t_s: ArrayLike, speed_mm_s: float, ramp_s: float
+) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration (each as t_s) of a start from rest at t = 0.
+
+    The velocity rises like half a cosine within ramp_s, so the acceleration has no step.
+    """
+    t = np.asarray(t_s, float)
+    if ramp_s == 0:
+        return speed_mm_s * t, np.full_like(t, speed_mm_s), np.zeros_like(t)
+    phase = np.pi * np.clip(t / ramp_s, 0, 1)
+    ramp = speed_mm_s * ramp_s / 2 / np.pi * (phase - np.sin(phase))
+    place = ramp + speed_mm_s * np.maximum(t - ramp_s, 0)
+    velocity = speed_mm_s * (1 - np.cos(phase)) / 2
+    return place, velocity, speed_mm_s * np.pi / 2 / ramp_s * np.sin(phase)
+
+
+@dataclass(frozen=True)
+class Shake:
+    """Offsets of the cameras from the carriage, and the second derivatives.
+
+    offset_mm, acceleration_mm_s2 : (cameras, steps, axes).
+    """
+
+    offset_mm: Array
+    acceleration_mm_s2: Array
+
+
+def rig_shake(
+    step_s: float,
+    steps: int,
+    rng: Generator,
+    *,
+    cameras: int,
+    rms_mm: ArrayLike,
+    frequency_hz: float,
+    common_share: float = 0.75,
+    arm_ratio: float = 1.6,
+    damping: float = 0.03,
+    force_hz: float = 60.0,
+) -> Shake:
+    """One common mode and one mode of each camera's arm, on each axis.
+
+    rms_mm : (axes,) total of each camera; common_share : of the variance, at frequency_hz;
+    the arms' modes lie at arm_ratio times that.
+    """
+    rms = np.asarray(rms_mm, float)
+    offset = np.zeros((cameras, steps, len(rms)))
+    acceleration = np.zeros_like(offset)
+    parts = ((common_share, 1.0, 1), (1 - common_share, arm_ratio, cameras))
+    for axis, total in enumerate(rms):
+        for share, ratio, copies in parts:
+            if total * share == 0:
+                continue
+            mode = rig_mode(total * np.sqrt(share), ratio * frequency_hz, damping, force_hz)
+            states = mode.paths(step_s, steps, rng, paths=copies)
+            offset[..., axis] += states[..., 0]
+            acceleration[..., axis] += mode_acceleration(states, mode)
+    return Shake(offset, acceleration)
+
+
+def accelerometer_readings(
+    acceleration_mm_s2: ArrayLike,
+    up: ArrayLike,
+    axes: ArrayLike,
+    rng: Generator,
+    *,
+    rate_hz: float,
+    density_ug_sqrt_hz: float,
+    bias_m_s2: ArrayLike,
+) -> Array:
+    """(N, 3) accelerations in the rig frame -> (N, 3) readings in m/s^2: axes . (a - g) + bias.
+
+    up : (3,) away from gravity; axes : (3, 3) rows are the sensor's axes in rig coordinates.
+    Noise per sample: density * sqrt(rate / 2).
+    """
+    force = np.asarray(acceleration_mm_s2, float) / 1000 + GRAVITY_M_S2 * np.asarray(up, float)
+    sigma = density_ug_sqrt_hz * MICRO_G_M_S2 * np.sqrt(rate_hz / 2)
+    noise = sigma * rng.standard_normal(force.shape)
+    return np.asarray(force @ np.asarray(axes, float).T + np.asarray(bias_m_s2) + noise)

@@ -1,0 +1,181 @@
+"""Which detection of the second camera shows the same bubble as which of the first.
+
+Every combination gets log odds: how much better "one bubble seen twice" explains the two
+detections than "two detections without a partner". Cues are the gap along the shared axis, the
+height along it, the width, the contrast, and the predicted tracks. (Blur is no cue: views at an
+angle are out of focus at different depths.) One assignment is then the best as a whole, with the
+option to leave detections out, and each of its pairs has a posterior probability.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.estimator.frontend.bubble_types import Prediction
+from telerig.estimator.frontend.pair_geometry import (
+    PairGeometry,
+    pair_geometry,
+    shared_axis,
+    view_of,
+)
+from telerig.estimator.frontend.pair_history import history_log_odds
+from telerig.estimator.frontend.pair_marginals import best_assignment, marginals
+from telerig.estimator.frontend.pair_types import Alternative, Cue, Matches, PairModel
+from telerig.rig.camera import Camera
+
+Array = NDArray[np.float64]
+
+SAFE_NATS = 3.0
+_TAIL, _TAIL_WIDTH = 0.02, 3.0
+_WRONG_SIZE, _WRONG_SIZE_FLAGGED = 1e-4, 0.02
+_SHIFT_PASSES = 4
+
+
+def match_pairs(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    cameras: tuple[Camera, Camera],
+    model: PairModel,
+    *,
+    predicted: Prediction | None = None,
+) -> Matches:
+    """Pairs of the detections of one frame.
+
+    first, second : tables of `detect_bubbles`, in pixels of ``cameras``; other row labels than
+    0..N-1 do not matter, results are positions. model : `estimate_pair_model` or `default_model`.
+
+    Raises InputError for tables without centres or covariances and for parallel cameras.
+    """
+    axis = shared_axis(cameras)
+    views = (view_of(first, cameras[0], axis), view_of(second, cameras[1], axis))
+    if not len(first) or not len(second):
+        return _no_pairs(len(first), len(second))
+    geometry = pair_geometry(*views)
+    history, track = history_log_odds(geometry, model, predicted)
+    gap, variance, odds, shift = common_shift(geometry, model, history)
+    return _matches(odds, gap, variance, geometry, track, shift)
+
+
+def common_shift(
+    geometry: PairGeometry, model: PairModel, history: Array | float = 0.0
+) -> tuple[Array, Array, Array, float]:
+    """Gaps (bias and the frame's shift removed), their variances, log odds, and the shift.
+
+    The shift starts as unknown within ``model.frame_px`` and is then the mean over the pairs
+    by their probabilities, with that scatter as its prior.
+    """
+    bias, bias_variance = model.bias(geometry.points_mm)
+    raw = geometry.gap_px - bias
+    own = geometry.variance_px2 + bias_variance + (model.scatter_px * geometry.doubt) ** 2
+    appearance = appearance_log_odds(geometry, model) + history
+    shift, uncertainty = 0.0, model.frame_px**2
+    odds = appearance + _gap_log_odds(raw, own + uncertainty, model)
+    for _ in range(_SHIFT_PASSES if model.frame_px > 0 else 0):
+        weight = marginals(odds) / own
+        weight = weight / (1 + (raw - shift) ** 2 / (4 * (own + uncertainty)))
+        precision = weight.sum() + model.frame_px**-2
+        shift, uncertainty = float((weight * raw).sum() / precision), float(1 / precision)
+        odds = appearance + _gap_log_odds(raw - shift, own + uncertainty, model)
+    return raw - shift, own + uncertainty, odds, shift
+
+
+def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
+    """(N1, N2) log odds by height, shape, contrast and the number of detections; not the gap."""
+    first, second = geometry.views
+    odds = np.full(geometry.gap_px.shape, _prior_log_odds(len(first), len(second), model.lonely))
+    wrong = np.where(geometry.doubt > 1, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
+    odds += _cue(model.height, geometry.height, first.log_height, second.log_height, wrong)
+    odds += _cue(model.shape, geometry.shape, first.log_shape, second.log_shape, wrong)
+    tolerant = np.full_like(wrong, _WRONG_SIZE_FLAGGED)
+    odds += _cue(
+        model.contrast, geometry.contrast, first.log_contrast, second.log_contrast, tolerant
+    )
+    return odds
+
+
+def _prior_log_odds(n1: int, n2: int, lonely: tuple[float, float]) -> float:
+    """Expected pairs over the product of expected lonely detections."""
+    alone = (max(n1 * lonely[0], 1e-3), max(n2 * lonely[1], 1e-3))
+    pairs = max(np.sqrt(n1 * (1 - lonely[0]) * n2 * (1 - lonely[1])), 1e-3)
+    return float(np.log(pairs / (alone[0] * alone[1])))
+
+
+def _gap_log_odds(gap: Array, variance: Array, model: PairModel) -> Array:
+    """A normal core with wide tails, against any place along the span."""
+    core = np.exp(-0.5 * gap**2 / variance)
+    tail = np.exp(-0.5 * gap**2 / (variance * _TAIL_WIDTH**2)) / _TAIL_WIDTH
+    density = ((1 - _TAIL) * core + _TAIL * tail) / np.sqrt(2 * np.pi * variance)
+    return np.log(np.maximum(density * model.span_px, 1e-300))
+
+
+def _cue(cue: Cue, ratio: Array, first: Array, second: Array, wrong: Array) -> Array:
+    """Log odds of one property: alike within its scatter, or two draws of the population.
+
+    wrong : chance that one of the two measurements says nothing about the bubble.
+    """
+    rarity = [
+        _log_population(np.nan_to_num(values, nan=cue.means[c]), cue.means[c], cue.sds[c])
+        for c, values in enumerate((first, second))
+    ]
+    drawn = 0.5 * (rarity[0][:, None] + rarity[1])
+    alike = _log_normal(np.nan_to_num(ratio) - cue.difference, cue.sd)
+    log_odds = np.logaddexp(np.log1p(-wrong) + alike - drawn, np.log(wrong))
+    return np.where(np.isfinite(ratio), log_odds, 0.0)
+
+
+def _log_population(values: Array, mean: float, sd: float) -> Array:
+    core, wide = _log_normal(values - mean, sd), _log_normal(values - mean, 3 * sd)
+    return np.logaddexp(np.log(0.9) + core, np.log(0.1) + wide)
+
+
+def _log_normal(deviation: Array, sd: float) -> Array:
+    return -0.5 * (deviation / sd) ** 2 - np.log(sd * np.sqrt(2 * np.pi))
+
+
+def _matches(
+    odds: Array,
+    gap: Array,
+    variance: Array,
+    geometry: PairGeometry,
+    track: NDArray[np.int64],
+    shift: float,
+) -> Matches:
+    rows, columns = best_assignment(odds)
+    probability = marginals(odds)
+    confidence = probability[rows, columns]
+    return Matches(
+        rows, columns, confidence, gap[rows, columns],
+        gap[rows, columns] / np.sqrt(variance[rows, columns]),
+        np.exp(geometry.height[rows, columns]),
+        np.log(confidence) - np.log(np.maximum(1 - confidence, 1e-300)) < SAFE_NATS,
+        tuple(_alternatives(int(i), int(j), probability) for i, j in zip(rows, columns)),
+        track[rows, columns],
+        np.setdiff1d(np.arange(odds.shape[0]), rows),
+        np.setdiff1d(np.arange(odds.shape[1]), columns),
+        shift, probability,
+    )  # fmt: skip
+
+
+def _alternatives(i: int, j: int, probability: Array) -> tuple[Alternative, ...]:
+    """Other pairs of these two detections, or none for them, within reach of this pair."""
+    least = probability[i, j] * np.exp(-SAFE_NATS)
+    others = [Alternative(i, int(k), float(probability[i, k])) for k in range(probability.shape[1])]
+    others += [Alternative(int(k), j, float(probability[k, j])) for k in range(len(probability))]
+    others = [a for a in others if (a.first, a.second) != (i, j)]
+    others.append(Alternative(i, -1, max(0.0, 1 - float(probability[i].sum()))))
+    others.append(Alternative(-1, j, max(0.0, 1 - float(probability[:, j].sum()))))
+    return tuple(sorted((a for a in others if a.probability >= least), key=_rank))
+
+
+def _rank(alternative: Alternative) -> float:
+    return -alternative.probability
+
+
+def _no_pairs(n1: int, n2: int) -> Matches:
+    none, empty = np.zeros(0, np.int64), np.zeros(0)
+    return Matches(
+        none, none, empty, empty, empty, empty, np.zeros(0, bool), (), none,
+        np.arange(n1), np.arange(n2), 0.0, np.zeros((n1, n2)),
+    )  # fmt: skip

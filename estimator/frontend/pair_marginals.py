@@ -1,0 +1,108 @@
+"""One-to-one assignment with the option to leave out: the best one, and each pair's probability.
+
+An assignment's probability is proportional to the product of exp(log odds) of its pairs.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+NEGLIGIBLE = -9.0
+"""Log odds below which a pair is never considered: its probability stays under exp(-9)."""
+
+_EXACT_SIDE = 11
+_PASSES = 500
+
+
+def best_assignment(log_odds: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the assignment of highest probability; what is left out is not named."""
+    from scipy.optimize import linear_sum_assignment
+
+    gain = np.where(log_odds > 0, log_odds, 0.0)
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    kept = gain[rows, columns] > 0
+    return rows[kept].astype(np.int64), columns[kept].astype(np.int64)
+
+
+def marginals(log_odds: Array) -> Array:
+    """(N1, N2) log odds -> (N1, N2) posterior probability of each pair.
+
+    Exact per connected component with up to 11 detections on its smaller side (sum over all
+    assignments by dynamic programming over subsets); above that loopy belief propagation
+    (Williams and Lau, IEEE Trans. AES 50:2942, 2014), which always converges.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    out = np.zeros(log_odds.shape)
+    n1, n2 = log_odds.shape
+    rows, columns = np.nonzero(log_odds > NEGLIGIBLE)
+    if not len(rows):
+        return out
+    graph = coo_array((np.ones(len(rows)), (rows, n1 + columns)), shape=(n1 + n2, n1 + n2))
+    _, label = connected_components(graph, directed=False)
+    for component in np.unique(label[rows]):
+        i = np.flatnonzero(label[:n1] == component)
+        j = np.flatnonzero(label[n1:] == component)
+        part = log_odds[np.ix_(i, j)]
+        part = np.where(part > NEGLIGIBLE, part, -np.inf)
+        if len(i) == len(j) == 1:
+            probability = 1 / (1 + np.exp(-part))
+        elif min(len(i), len(j)) > _EXACT_SIDE:
+            probability = _belief_propagation(part)
+        elif len(j) <= len(i):
+            probability = _exact(part)
+        else:
+            probability = _exact(part.T).T
+        out[np.ix_(i, j)] = probability
+    return out
+
+
+@lru_cache(maxsize=16)
+def _without(columns: int) -> tuple[NDArray[np.int64], ...]:
+    """For each column the subsets that do not hold it."""
+    subsets = np.arange(1 << columns)
+    return tuple(subsets[(subsets >> j) & 1 == 0] for j in range(columns))
+
+
+def _exact(log_odds: Array) -> Array:
+    n, m = log_odds.shape
+    peak = np.maximum(log_odds.max(axis=1, initial=0.0), 0.0)
+    weight = np.exp(log_odds - peak[:, None])
+    alone = np.exp(-peak)
+    free = _without(m)
+    forward, backward = np.zeros((n + 1, 1 << m)), np.zeros((n + 1, 1 << m))
+    forward[0, 0], backward[n] = 1.0, 1.0
+    for i in range(n):
+        forward[i + 1] = alone[i] * forward[i]
+        for j in np.flatnonzero(weight[i]):
+            forward[i + 1, free[j] | (1 << j)] += weight[i, j] * forward[i, free[j]]
+    for i in reversed(range(n)):
+        backward[i] = alone[i] * backward[i + 1]
+        for j in np.flatnonzero(weight[i]):
+            backward[i, free[j]] += weight[i, j] * backward[i + 1, free[j] | (1 << j)]
+    out = np.zeros((n, m))
+    for i in range(n):
+        for j in np.flatnonzero(weight[i]):
+            out[i, j] = weight[i, j] * (forward[i, free[j]] @ backward[i + 1, free[j] | (1 << j)])
+    return out / backward[0, 0]
+
+
+def _belief_propagation(log_odds: Array) -> Array:
+    weight = np.exp(np.minimum(log_odds, 50.0))
+    back = np.ones_like(weight)
+    for _ in range(_PASSES):
+        incoming = weight * back
+        forth = weight / (1 + incoming.sum(1, keepdims=True) - incoming)
+        new = 1 / (1 + forth.sum(0) - forth)
+        change = np.abs(new - back).max()
+        back = new
+        if change < 1e-9:
+            break
+    incoming = weight * back
+    return np.asarray(incoming / (1 + incoming.sum(1, keepdims=True)))

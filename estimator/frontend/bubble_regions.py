@@ -1,0 +1,194 @@
+"""Dark blobs in front of a lit screen: background, noise, threshold, outlines to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.frontend.noise import clipped_sigma
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.float32]
+
+_SHRINK = 8
+_SCREEN_PASSES = 3
+_NOISE_ROWS = 96
+_FAINT_SHARE = 0.5
+_LOW_SIGMA = 6.0
+_DARKEST = 0.05
+
+
+@dataclass(frozen=True)
+class Blob:
+    """One dark region: its outline ``contour_px`` (n, 2; closed, to about 0.1 px) at half depth,
+    the ``inner`` level (background is 1), the edge's ``blur_px``, ``area_px2``, and the
+    ``box`` (u, v, width, height) of the region it came from."""
+
+    contour_px: Array
+    inner: float
+    blur_px: float
+    area_px2: float
+    box: tuple[int, int, int, int]
+    touches_border: bool
+
+
+@dataclass(frozen=True)
+class Speck:
+    """A dark region that is no bubble, and why."""
+
+    u_px: float
+    v_px: float
+    radius_px: float
+    reason: str
+
+
+def screen_level(image: Grey) -> Grey:
+    """Level of the lit screen (rows, columns), from an image with bubbles in front of it.
+
+    Bright closing over a quarter of the image at an eighth of its size, then a broad mean over
+    what is not darker than that; robust while the screen shows within a quarter of the image.
+    """
+    import cv2
+
+    rows, columns = image.shape
+    small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))
+    small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
+    reach = max(3, min(small_size) // 4 | 1)
+    kernel = np.ones((reach, reach), np.uint8)
+    level = cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REFLECT)
+    width = (2 * (reach // 3) + 1,) * 2
+    for _ in range(_SCREEN_PASSES):
+        lit = (small > 0.93 * level).astype(np.float32)
+        lit = cv2.erode(lit, np.ones((3, 3), np.uint8))
+        weight = cv2.GaussianBlur(lit, width, 0) + 1e-3 * cv2.GaussianBlur(lit, (0, 0), reach)
+        total = cv2.GaussianBlur(lit * small, width, 0)
+        total += 1e-3 * cv2.GaussianBlur(lit * small, (0, 0), reach)
+        level = np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), level).astype(np.float32)
+    screen: Grey = cv2.resize(level, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return screen
+
+
+def noise_share(ratio: Grey) -> float:
+    """Noise of the normalised image where the screen is free, as a share of the background.
+
+    From second differences along both axes (blind to any plane) on some rows.
+    """
+    step = max(1, (ratio.shape[0] - 2) // _NOISE_ROWS)
+    middle = np.arange(1, ratio.shape[0] - 1, step)
+    vertical = ratio[middle - 1] - 2.0 * ratio[middle] + ratio[middle + 1]
+    response = (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
+    lit = ratio[middle, 1:-1] > 0.85
+    values = response[lit] if np.count_nonzero(lit) > 200 else response.ravel()
+    return clipped_sigma(values[:: max(1, values.size // 40_000)].astype(np.float64), rounds=6)
+
+
+def find_blobs(
+    ratio: Grey, *, sigma: float, min_contrast: float, min_diameter_px: float
+) -> tuple[list[Blob], list[Speck]]:
+    """Dark regions of the normalised image that may be bubbles, and those too small or faint.
+
+    Hysteresis: a region is what is darker than a faint shadow, and counts when it holds pixels
+    darker than ``1 - min_contrast``. Its outline is traced at half of its own depth.
+    """
+    import cv2
+
+    low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
+    mask = cv2.compare(ratio, low, cv2.CMP_LT)
+    count, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    sizes = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
+    big = np.flatnonzero((sizes >= min_diameter_px) & (np.arange(count) > 0))
+    blobs: list[Blob] = []
+    specks = _small_ones(stats, centres, min_diameter_px)
+    for label in big.tolist():
+        found, reason = _trace(ratio, labels, stats[label], label, min_contrast, min_diameter_px)
+        blobs += found
+        if reason:
+            radius = float(np.sqrt(stats[label, cv2.CC_STAT_AREA] / np.pi))
+            specks.append(Speck(*centres[label].tolist(), radius, reason))
+    return blobs, specks
+
+
+def _small_ones(stats: NDArray[np.int32], centres: Array, min_diameter_px: float) -> list[Speck]:
+    import cv2
+
+    area = stats[:, cv2.CC_STAT_AREA]
+    sizes = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
+    small = np.flatnonzero((sizes < min_diameter_px) & (area >= 4))
+    reason = f"smaller than {min_diameter_px:g} px"
+    return [
+        Speck(float(centres[i, 0]), float(centres[i, 1]), float(np.sqrt(area[i] / np.pi)), reason)
+        for i in small.tolist()
+        if i > 0
+    ]
+
+
+def _trace(
+    ratio: Grey,
+    labels: NDArray[np.int32],
+    stat: NDArray[np.int32],
+    label: int,
+    min_contrast: float,
+    min_diameter_px: float,
+) -> tuple[list[Blob], str]:
+    """Outlines at half depth within one region, or the reason why there is none."""
+    import cv2
+
+    x, y, width, height = (int(value) for value in stat[:4])
+    rows, columns = ratio.shape
+    left, top = max(x - 1, 0), max(y - 1, 0)
+    crop = np.s_[top : min(y + height + 1, rows), left : min(x + width + 1, columns)]
+    part, own = ratio[crop], labels[crop] == label
+    values = part[own]
+    place = int(_DARKEST * values.size)
+    inner = float(np.partition(values, place)[place])
+    if inner > 1.0 - min_contrast:
+        return [], f"contrast {1.0 - inner:.2f} is below {min_contrast:g}"
+    half = 0.5 * (1.0 + inner)
+    dark = (own & (part < half)).astype(np.uint8)
+    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    blobs, reason = [], f"smaller than {min_diameter_px:g} px"
+    for outline in outlines:
+        points = outline.reshape(-1, 2)
+        if len(points) < 8:
+            continue
+        area = float(cv2.contourArea(outline)) + 0.5 * len(points) + 1.0
+        if max(np.ptp(points[:, 0]), np.ptp(points[:, 1])) + 1 < min_diameter_px:
+            continue
+        points = points + np.array([left, top])
+        refined, blur = refined_contour(ratio, points, half, 1.0 - inner)
+        edge = (points[:, 0] <= 0) | (points[:, 1] <= 0)
+        edge |= (points[:, 0] >= columns - 1) | (points[:, 1] >= rows - 1)
+        refined[edge] = np.nan
+        box = (x, y, width, height)
+        blobs.append(Blob(refined, inner, blur, area, box, bool(np.any(edge))))
+        reason = ""
+    return blobs, reason
+
+
+def refined_contour(
+    ratio: Grey, points: NDArray[np.int_], half: float, contrast: float
+) -> tuple[Array, float]:
+    """Outline points (n, 2) moved along the gradient to the half level, and the edge's blur."""
+    rows, columns = ratio.shape
+    u, v = points[:, 0].astype(np.intp), points[:, 1].astype(np.intp)
+    u0, u1 = np.maximum(u - 1, 0), np.minimum(u + 1, columns - 1)
+    v0, v1 = np.maximum(v - 1, 0), np.minimum(v + 1, rows - 1)
+    slope_u = (
+        2.0 * (ratio[v, u1] - ratio[v, u0])
+        + (ratio[v0, u1] - ratio[v0, u0])
+        + (ratio[v1, u1] - ratio[v1, u0])
+    ) / 8.0
+    slope_v = (
+        2.0 * (ratio[v1, u] - ratio[v0, u])
+        + (ratio[v1, u0] - ratio[v0, u0])
+        + (ratio[v1, u1] - ratio[v0, u1])
+    ) / 8.0
+    square = np.maximum(slope_u**2 + slope_v**2, (0.02 * contrast) ** 2)
+    shift = (half - ratio[v, u]) / square
+    shift = shift * np.minimum(1.0, 1.2 / np.maximum(np.abs(shift) * np.sqrt(square), 1e-9))
+    refined = np.stack([u + shift * slope_u, v + shift * slope_v], axis=1).astype(np.float64)
+    steepest = float(np.quantile(np.sqrt(square), 0.6))
+    blur = contrast / (np.sqrt(2.0 * np.pi) * max(steepest, 1e-6))
+    return refined, float(np.sqrt(max(blur**2 - 0.6, 0.15)))

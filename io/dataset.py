@@ -20,6 +20,8 @@ from telerig.rig.target import Target
 if TYPE_CHECKING:
     import pandas as pd
 
+    from telerig.io.run import RunData
+
 Source = Literal["images", "dots"]
 
 _FOLDERS = ["calibration", "stage_axis", "runs", "truth", "results"]
@@ -40,6 +42,12 @@ class Run:
 
     name: str
     path: Path
+
+    def load(self, **options: Any) -> RunData:
+        """Its tables and frames; options as for `telerig.io.run.load_run`."""
+        from telerig.io.run import load_run
+
+        return load_run(self.path, **options)
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,18 @@ def read_image(
     """
     file = Path(path)
     data = _bytes(file)
-    pixels = _native(_grey(_decoder(data, file)(data, file), file), file)
+    image = image_from_pixels(_decoder(data, file)(data, file), file)
     if expected_size_px is not None:
-        _check_size(pixels, expected_size_px, file)
-    return pixels
+        check_size(image, expected_size_px, str(file))
+    return image
+
+
+def image_from_pixels(pixels: NDArray[Any], file: Path) -> Image:
+    """What `read_image` makes of decoded pixels, with the same checks; for pages and videos.
+
+    file : for errors.
+    """
+    return _native(_grey(pixels, file), file)
 
 
 def list_images(folder: str | PathLike[str]) -> list[Path]:
@@ -271,14 +279,15 @@ def _finite(pixels: NDArray[Any], file: Path) -> NDArray[np.float32]:
     return np.ascontiguousarray(pixels, dtype=np.float32)
 
 
-def _check_size(pixels: Image, expected: tuple[int, int], file: Path) -> None:
+def check_size(pixels: Image, expected: tuple[int, int], where: str) -> None:
+    """Raise InputError unless the image is ``expected`` = (width, height) px."""
     height, width = pixels.shape
     if (width, height) == tuple(expected):
         return
     swapped = " (width and height swapped?)" if (height, width) == tuple(expected) else ""
     raise InputError(
         f"is {width} x {height} px, expected {expected[0]} x {expected[1]}{swapped}",
-        where=str(file),
+        where=where,
         todo="correct image_size_px = [width, height] of that "
         "camera in rig.toml, or put the right image there",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,14 +41,14 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
     """
     file = Path(path)
     table = read_table(file, _columns(rig.target))
-    _check_cameras(table, rig, file)
-    _check_pixels(table, rig, file)
+    check_cameras(table, list(rig.cameras), file)
+    check_pixels(table, {name: c.image_size_px for name, c in rig.cameras.items()}, file)
     if rig.target.bounded:
         _check_dots(table, rig.target, file)
     else:
         _number_unbounded(table, rig.target, file)
     _check_repeats(table, rig.target, file)
-    known = _fill_covariance(table, file)
+    known = fill_covariance(table, file, DEFAULT_SIGMA_PX, of="the dot's centre")
     columns = DOTS_COLUMNS + [name for name in ("chi2_dof",) if name in table]
     dots = table[columns].reset_index(drop=True)
     dots.attrs["sigma_known"] = known
@@ -70,16 +71,17 @@ def _columns(target: Target) -> list[Column]:
     ]
 
 
-def _check_cameras(table: pd.DataFrame, rig: RigDescription, file: Path) -> None:
-    unknown = ~table["camera"].isin(list(rig.cameras)).to_numpy()
+def check_cameras(table: pd.DataFrame, names: list[str], file: Path) -> None:
+    """Raise InputError for the first row whose camera is not one of ``names``."""
+    unknown = ~table["camera"].isin(names).to_numpy()
     name = str(table["camera"][unknown].iloc[0]) if unknown.any() else ""
     what = f"there is no camera {name!r} in rig.toml"
-    todo = suggestion(name, list(rig.cameras))
-    fail_rows(unknown, table, (file, "camera"), lambda i: what, todo)
+    fail_rows(unknown, table, (file, "camera"), lambda i: what, suggestion(name, names))
 
 
-def _check_pixels(table: pd.DataFrame, rig: RigDescription, file: Path) -> None:
-    sizes = np.array([rig.cameras[name].image_size_px for name in table["camera"]], float)
+def check_pixels(table: pd.DataFrame, sizes_px: Mapping[str, tuple[int, int]], file: Path) -> None:
+    """Raise InputError for the first row whose pixel lies outside its camera's image."""
+    sizes = np.array([sizes_px[name] for name in table["camera"]], float).reshape(-1, 2)
     for column, size in zip(("u_px", "v_px"), sizes.T):
         _check_inside(table, column, size, file)
 
@@ -148,8 +150,12 @@ def _check_repeats(table: pd.DataFrame, target: Target, file: Path) -> None:
     fail_rows(again, table, (file, "dot"), lambda i: what, "keep one of the two rows")
 
 
-def _fill_covariance(table: pd.DataFrame, file: Path) -> bool:
-    """Set the covariance columns; whether the file stated the noise."""
+def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *, of: str) -> bool:
+    """Set the covariance columns from what the file has; whether it stated the noise.
+
+    of : what the standard deviation belongs to, for errors. Raises InputError for what is no
+    covariance.
+    """
     given = [name for name in _COVARIANCE if name in table]
     if 0 < len(given) < 3:
         missing = ", ".join(name for name in _COVARIANCE if name not in table)
@@ -162,8 +168,8 @@ def _fill_covariance(table: pd.DataFrame, file: Path) -> bool:
         _check_covariance(table, file)
         return True
     known = "sigma_px" in table
-    sigma = table["sigma_px"].to_numpy() if known else np.full(len(table), DEFAULT_SIGMA_PX)
-    todo = "give the standard deviation of the dot's centre, or leave the column out"
+    sigma = table["sigma_px"].to_numpy() if known else np.full(len(table), default_sigma_px)
+    todo = f"give the standard deviation of {of}, or leave the column out"
     fail_rows(
         sigma <= 0, table, (file, "sigma_px"), lambda i: f"is {sigma[i]:g}, not positive", todo
     )

@@ -245,12 +245,10 @@ def stage_trajectory(
 
 @dataclass(frozen=True)
 class Shake:
-    """Offsets of the cameras from the carriage, and the second derivatives.
-
-    offset_mm, acceleration_mm_s2 : (cameras, steps, axes).
-    """
+    """Offsets of the cameras from the carriage with their derivatives: (cameras, steps, axes)."""
 
     offset_mm: Array
+    velocity_mm_s: Array
     acceleration_mm_s2: Array
 
 
@@ -274,7 +272,7 @@ def rig_shake(
     """
     rms = np.asarray(rms_mm, float)
     offset = np.zeros((cameras, steps, len(rms)))
-    acceleration = np.zeros_like(offset)
+    velocity, acceleration = np.zeros_like(offset), np.zeros_like(offset)
     parts = ((common_share, 1.0, 1), (1 - common_share, arm_ratio, cameras))
     for axis, total in enumerate(rms):
         for share, ratio, copies in parts:
@@ -283,8 +281,9 @@ def rig_shake(
             mode = rig_mode(total * np.sqrt(share), ratio * frequency_hz, damping, force_hz)
             states = mode.paths(step_s, steps, rng, paths=copies)
             offset[..., axis] += states[..., 0]
+            velocity[..., axis] += states[..., 1]
             acceleration[..., axis] += mode_acceleration(states, mode)
-    return Shake(offset, acceleration)
+    return Shake(offset, velocity, acceleration)
 
 
 def accelerometer_readings(

@@ -1,9 +1,9 @@
-"""Simulated calibration datasets with their truth beside them."""
+"""Simulated datasets with their truth beside them: calibrations, and runs that come with one."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -19,7 +19,8 @@ from telerig.io.plate_view import pixel_from_plate
 from telerig.io.render import Light, digitise, render
 from telerig.io.rig_description import CameraDescription, RigDescription
 from telerig.io.rigfile import write_rig_toml
-from telerig.io.simulation_presets import SimulationConfig, preset
+from telerig.io.run_presets import RunConfig, any_preset
+from telerig.io.simulation_presets import SimulationConfig
 from telerig.io.simulation_scene import (
     TrueTarget,
     View,
@@ -45,41 +46,64 @@ LEAST_SIGMA_PX = 1e-4
 
 
 def simulate(
-    config: str | SimulationConfig,
+    config: str | SimulationConfig | RunConfig,
     *,
     rng: np.random.Generator,
     out: str | PathLike[str] | None = None,
     images: bool = True,
 ) -> Dataset:
-    """Write a calibration dataset with known truth and load it.
+    """Write a dataset with known truth and load it: a calibration, or a run with its calibration.
 
-    config : the name of a preset, or a configuration (`telerig.io.simulation_presets.preset`).
-    rng : the only source of chance; the same seed gives the same bytes, and the same rig, target
-        and poses with images or without.
+    config : the name of a preset, or a configuration (`telerig.io.simulation_presets.preset`,
+        `telerig.io.run_presets.run_preset`).
+    rng : the only source of chance; the same seed gives the same bytes, and the same rig, target,
+        poses and bubbles with images or without.
     out : a new or empty folder; None makes a temporary one, which the caller may delete.
-    images : render TIFF images; False writes `calibration/dots.csv` with noisy true centres.
+    images : render TIFF images; False writes `calibration/dots.csv` with noisy true centres, and
+        the run's `detections.csv`.
 
     Raises InputError for an unknown preset, demands that no pose meets, or a folder in use.
     """
-    settings = preset(config) if isinstance(config, str) else config
-    seed = _seed(rng)
+    settings = any_preset(config) if isinstance(config, str) else config
+    final = _new_folder(out)
+    with atomic_folder(final) as folder:
+        if isinstance(settings, RunConfig):
+            from telerig.io.simulation_runs import write_run_dataset
+
+            write_run_dataset(settings, folder, rng, images=images)
+        else:
+            write_calibration(settings, folder, rng, images=images)
+    return load_dataset(final)
+
+
+def write_calibration(
+    settings: SimulationConfig,
+    folder: Path,
+    rng: np.random.Generator,
+    *,
+    images: bool,
+    complete: Callable[[RigDescription], RigDescription] = lambda rig: rig,
+) -> Mapping[str, Camera]:
+    """Write `rig.toml`, `calibration/` and `truth/`; the true cameras by name.
+
+    complete : adds to the rig file what only runs need.
+    """
+    seed = seed_of(rng)
     scene_rng, dots_rng, image_rng = rng.spawn(3)
     cameras = true_cameras(settings)
     target = true_target(settings, scene_rng)
     views = hand_held_views(settings, cameras, target, scene_rng)
     exact = exact_dots(settings, cameras, target, views)
-    final = _new_folder(out)
-    with atomic_folder(final) as folder:
-        write_rig_toml(rig_description(settings, target), folder / "rig.toml")
-        truth = _truth(settings, seed, cameras, target, views)
-        write_json_atomic(folder / "truth" / "truth.json", truth)
-        write_table(exact, folder / "truth" / "dots.csv")
-        if images:
-            _write_images(settings, cameras, target, views, folder / "calibration", image_rng)
-        else:
-            measured = _measured_dots(settings, exact, cameras, dots_rng)
-            write_table(measured, folder / "calibration" / "dots.csv")
-    return load_dataset(final)
+    write_rig_toml(complete(rig_description(settings, target)), folder / "rig.toml")
+    truth = _truth(settings, seed, cameras, target, views)
+    write_json_atomic(folder / "truth" / "truth.json", truth)
+    write_table(exact, folder / "truth" / "dots.csv")
+    if images:
+        _write_images(settings, cameras, target, views, folder / "calibration", image_rng)
+    else:
+        measured = _measured_dots(settings, exact, cameras, dots_rng)
+        write_table(measured, folder / "calibration" / "dots.csv")
+    return cameras
 
 
 def rig_description(config: SimulationConfig, target: TrueTarget) -> RigDescription:
@@ -250,7 +274,8 @@ def _pose_truth(pose: Pose) -> dict[str, Any]:
     }
 
 
-def _seed(rng: np.random.Generator) -> dict[str, Any]:
+def seed_of(rng: np.random.Generator) -> dict[str, Any]:
+    """What it takes to make the same generator again."""
     sequence = rng.bit_generator.seed_seq
     entropy = getattr(sequence, "entropy", None)
     key = getattr(sequence, "spawn_key", ())

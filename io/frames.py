@@ -155,11 +155,13 @@ class _Stack:
 
 
 def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
-    page, described = tiff.pages[0], tiff.series[0] if tiff.series else None
-    if pages > 1 or described is None or page.samplesperpixel != 1 or page.compression != 1:
+    """When the description speaks of more frames than there are page headers."""
+    page = tiff.pages[0]
+    if page.samplesperpixel != 1 or page.photometric == 0:
         return None
-    count = int(np.prod(described.shape)) // max(page.size, 1)
-    if count < 2 or page.photometric == 0:
+    count = int(np.prod(tiff.series[0].shape)) // max(page.size, 1)
+    count = max(count, int((tiff.imagej_metadata or {}).get("images", 0)))
+    if count <= pages or not page.is_contiguous:
         return None
     dtype = np.dtype(tiff.byteorder + np.dtype(page.dtype).char)
     return _Stack(int(page.dataoffsets[0]), count, (page.imagelength, page.imagewidth), dtype)

@@ -1,0 +1,287 @@
+"""The centre of a bubble's volume from its two outlines.
+
+An outline's centre is not the volume's: a third-degree shape mode of 5 % moves it by up to 4 % of
+the radius. The outline's own third harmonics tell part of that, see `body_modes` and
+docs/decisions/007-volume-centroid.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.frontend import body_modes
+from telerig.estimator.frontend.body_modes import Views
+from telerig.estimator.frontend.body_outlines import Outlines, outlines_from_table
+from telerig.estimator.frontend.body_shapes import BodyShapes, body_shapes
+from telerig.rig import silhouette
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import stacked_jacobian, triangulate
+
+Array = NDArray[np.float64]
+
+DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
+_ZONAL_SHARE = 0.5
+_RUN_WEIGHT = 4.0
+_MODEL_ERROR = 0.02
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """M bubbles, rig frame.
+
+    points_mm, covariance_mm2 : (M, 3), (M, 3, 3) centre of volume, with the share of the shape that
+        two outlines leave open.
+    silhouette_points_mm, silhouette_covariance_mm2 : maximum-likelihood point of the two outlines'
+        centres, with the covariance of the outlines' noise alone.
+    used : (M,) "volume": points_mm is corrected for the shape; "silhouettes": points_mm is
+        silhouette_points_mm (harmonics unknown in a view, an outline that is hidden in part or
+        leaves the image, or nothing to gain), covariance_mm2 with the shape's share; "none": a
+        centre or its covariance is missing, the row is NaN.
+    du_px, dv_px : (M, 2) first and second camera: added to the outlines' centres they make them
+        measurements of the projected centre of volume; 0 unless used is "volume".
+    d_eq_mm, d_eq_sd_mm : (M,) diameter of the sphere of equal volume; semi_axes_mm : (M, 3),
+        descending, of the ellipsoid.  ray_miss_mm : (M,) of the outlines' centres.
+    zonal_probability : (M,) that the shape is axisymmetric (about any axis) in its third degree.
+    """
+
+    points_mm: Array
+    covariance_mm2: Array
+    silhouette_points_mm: Array
+    silhouette_covariance_mm2: Array
+    used: NDArray[np.str_]
+    du_px: Array
+    dv_px: Array
+    d_eq_mm: Array
+    d_eq_sd_mm: Array
+    semi_axes_mm: Array
+    ray_miss_mm: Array
+    zonal_probability: Array
+
+
+def fit_bodies(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    cameras: tuple[Camera, Camera],
+    *,
+    shape_sigma: ArrayLike | None = None,
+) -> Bodies:
+    """Centres of volume of M pairs of outlines, row i of one table matching row i of the other.
+
+    shape_sigma : standard deviations of the shape's coefficients (harmonics of unit mean square,
+    relative to the radius) of degree 3 and 4, one number for both; by default
+    `estimate_shape_sigma` of these pairs.
+
+    Raises InputError for tables of unequal length or a shape_sigma that is not positive.
+    """
+    outlines = _paired(first, second)
+    sigma = _learned_sigma(outlines) if shape_sigma is None else _checked_sigma(shape_sigma)
+    located = outlines[0].located & outlines[1].located
+    shaped = located & outlines[0].shaped & outlines[1].shaped
+    whole = shaped & outlines[0].whole & outlines[1].whole
+    bodies = _empty(len(located))
+    _fill_points(bodies, outlines, cameras, located)
+    for rows, complete in ((np.flatnonzero(shaped), False), (np.flatnonzero(whole), True)):
+        if len(rows):
+            pair = (outlines[0].rows(rows), outlines[1].rows(rows))
+            pixels, jacobian, _ = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
+            if complete:
+                _correct(bodies, pair, pixels, jacobian, rows, sigma)
+            else:
+                _fill_shapes(bodies, pair, jacobian, rows, sigma)
+    return bodies
+
+
+def estimate_shape_sigma(first: pd.DataFrame, second: pd.DataFrame) -> Array:
+    """(2,) standard deviations of the shape's coefficients of degree 3 and 4, learned from a run.
+
+    Empirical Bayes: the mean square of the outlines' third and fourth harmonics, less their noise,
+    with `DEFAULT_SHAPE_SIGMA` as one more bubble. Raises InputError for tables of unequal length.
+    """
+    return _learned_sigma(_paired(first, second))
+
+
+def _paired(first: pd.DataFrame, second: pd.DataFrame) -> tuple[Outlines, Outlines]:
+    if len(first) != len(second):
+        raise InputError(
+            f"{len(first)} outlines in the first camera and {len(second)} in the second",
+            todo="row i of one table must be the same bubble as row i of the other",
+        )
+    return outlines_from_table(first), outlines_from_table(second)
+
+
+def _checked_sigma(shape_sigma: ArrayLike) -> Array:
+    sigma = np.asarray(shape_sigma, float)
+    if sigma.shape not in ((), (2,)) or not np.all(np.isfinite(sigma) & (sigma > 0)):
+        raise InputError(
+            f"shape_sigma {shape_sigma!r}: one positive number, or one each for degree 3 and 4",
+            todo="give the shape's rms relative to the radius divided by 2.6, for instance 0.005",
+        )
+    return np.broadcast_to(sigma, (2,))
+
+
+def _learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
+    whole = np.flatnonzero(outlines[0].whole & outlines[1].whole)
+    out = []
+    for degree, part, default in zip((3, 4), (slice(2, 4), slice(4, 6)), DEFAULT_SHAPE_SIGMA):
+        variance = np.mean([_variance(o.rows(whole), degree, part) for o in outlines], 0)
+        out.append(np.sqrt((max(variance.sum(), 0.0) + default**2) / (len(variance) + 1)))
+    return np.array(out)
+
+
+def _variance(outlines: Outlines, degree: int, part: slice) -> Array:
+    """(M,) unbiased estimates of one degree's sigma^2 from one outline each."""
+    noise = np.einsum("mii->m", outlines.trace_covariance[:, part, part])
+    power = (outlines.trace[:, part] ** 2).sum(-1) - noise
+    return np.asarray(power / (2 * silhouette.TRACE_VARIANCE[degree, degree]))
+
+
+def _empty(count: int) -> Bodies:
+    def nan(*shape: int) -> Array:
+        return np.full((count, *shape), np.nan)
+
+    return Bodies(
+        nan(3), nan(3, 3), nan(3), nan(3, 3), np.full(count, "none", "<U11"),
+        np.zeros((count, 2)), np.zeros((count, 2)), nan(), nan(), nan(3), nan(), nan(),
+    )  # fmt: skip
+
+
+def _fill_points(
+    bodies: Bodies,
+    outlines: tuple[Outlines, Outlines],
+    cameras: tuple[Camera, Camera],
+    rows: NDArray[np.bool_],
+) -> None:
+    """The outlines' centres triangulated."""
+    pair = [o.rows(rows) for o in outlines]
+    found = triangulate(
+        cameras, (pair[0].uv_px, pair[1].uv_px), (pair[0].covariance_px2, pair[1].covariance_px2)
+    )
+    for points in (bodies.points_mm, bodies.silhouette_points_mm):
+        points[rows] = found.points_mm
+    for covariance in (bodies.covariance_mm2, bodies.silhouette_covariance_mm2):
+        covariance[rows] = found.covariance_mm2
+    bodies.ray_miss_mm[rows] = found.ray_miss_mm
+    bodies.used[rows] = "silhouettes"
+
+
+def _fill_shapes(
+    bodies: Bodies,
+    pair: tuple[Outlines, Outlines],
+    jacobian: Array,
+    rows: NDArray[np.int64],
+    sigma: Array,
+) -> None:
+    """Sizes, and what the shape may add to the error of the outlines' centres."""
+    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), (pair[0].axes_px, pair[1].axes_px))
+    axes = np.sqrt(np.linalg.eigvalsh(shapes.moments_mm2))
+    bodies.semi_axes_mm[rows] = axes[:, ::-1]
+    bodies.d_eq_mm[rows], bodies.d_eq_sd_mm[rows] = _diameter(shapes, pair, sigma)
+    views = Views(
+        np.zeros((len(rows), 8)),
+        _pixel_noise(pair),
+        jacobian,
+        shapes.axes_px,
+        np.full(len(rows), sigma[0]),
+    )
+    frames = shapes.pair.frames(shapes.coupling)
+    bodies.covariance_mm2[rows] = body_modes.uncorrected_covariance(views, frames)
+
+
+def _correct(
+    bodies: Bodies,
+    pair: tuple[Outlines, Outlines],
+    pixels: Array,
+    jacobian: Array,
+    rows: NDArray[np.int64],
+    sigma: Array,
+) -> None:
+    """Centres of volume: every account of the shape, weighted by its evidence."""
+    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), (pair[0].axes_px, pair[1].axes_px))
+    measured, noise, conversion = _measured(pair, pixels)
+    slope = np.concatenate([jacobian, np.zeros_like(jacobian)], 1)
+    views = Views(measured, noise, slope, shapes.axes_px, _own_sigma(pair, sigma[0]))
+    accounts, prior = [], []
+    for coupling, share in shapes.couplings():
+        accounts.append(body_modes.isotropic(views, shapes.pair.frames(coupling)))
+        prior.append((1 - _ZONAL_SHARE) * share)
+    for spheroid in shapes.spheroids:
+        axis_sigma = _axis_sigma(spheroid.moments_mm2, pair, sigma[1])
+        accounts.append(body_modes.zonal(views, spheroid.projections, axis_sigma))
+        prior.append(_ZONAL_SHARE / len(shapes.spheroids))
+    answer, weight = body_modes.combine(accounts, np.array(prior)[:, None])
+    correction = conversion - answer.shift_px
+    bodies.points_mm[rows] = bodies.silhouette_points_mm[rows] + answer.step_mm
+    bodies.covariance_mm2[rows] = answer.covariance_mm2
+    bodies.du_px[rows], bodies.dv_px[rows] = correction[:, 0::2], correction[:, 1::2]
+    bodies.used[rows] = "volume"
+    bodies.zonal_probability[rows] = weight[-len(shapes.spheroids) :].sum(0)
+
+
+def _measured(pair: tuple[Outlines, Outlines], pixels: Array) -> tuple[Array, Array, Array]:
+    """`Views.measured`, `Views.noise`, and (M, 4) what was added to the ellipses' centres."""
+    count = len(pixels)
+    measured, noise = np.zeros((count, 8)), np.zeros((count, 8, 8))
+    conversion = np.zeros((count, 4))
+    power = np.mean([(o.trace[:, 2:4] ** 2).mean(-1) for o in pair], 0)
+    for c, outlines in enumerate(pair):
+        pixel, third = slice(2 * c, 2 * c + 2), slice(4 + 2 * c, 6 + 2 * c)
+        mix = np.zeros((count, 4, 4))
+        mix[:, :2, :2], mix[:, 2:, 2:] = outlines.axes_px, np.eye(2)
+        error = outlines.trace_covariance[:, :4, :4]
+        error = error + _MODEL_ERROR**2 * power[:, None, None] * np.eye(4)
+        error = mix @ error @ np.swapaxes(mix, -1, -2)
+        error[:, :2, :2] += outlines.covariance_px2
+        conversion[:, pixel] = np.einsum("mij,mj->mi", outlines.axes_px, outlines.trace[:, :2])
+        measured[:, pixel] = outlines.uv_px + conversion[:, pixel] - pixels[:, pixel]
+        measured[:, third] = outlines.trace[:, 2:4]
+        noise[:, pixel, pixel], noise[:, third, third] = error[:, :2, :2], error[:, 2:, 2:]
+        noise[:, pixel, third], noise[:, third, pixel] = error[:, :2, 2:], error[:, 2:, :2]
+    return measured, noise, conversion
+
+
+def _pixel_noise(pair: tuple[Outlines, Outlines]) -> Array:
+    noise = np.zeros((len(pair[0].uv_px), 4, 4))
+    noise[:, :2, :2], noise[:, 2:, 2:] = pair[0].covariance_px2, pair[1].covariance_px2
+    return noise
+
+
+def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
+    """(M,) each bubble's sigma of degree 3: the run's, as `_RUN_WEIGHT` harmonics, and its own."""
+    own = np.sum([2 * _variance(o, 3, slice(2, 4)) for o in pair], 0)
+    return np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 4))
+
+
+def _diameter(
+    shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: Array
+) -> tuple[Array, Array]:
+    """(M,) volume's diameter and its standard deviation.
+
+    Three things are open: the coupling of the viewing directions (the mean of the most spherical
+    ellipsoid and the oblate spheroid is taken), the fourth degree's share of the ellipses, and the
+    outlines' noise.
+    """
+    logs = [
+        np.linalg.slogdet(m)[1] / 6 for m in (shapes.moments_mm2, shapes.spheroids[0].moments_mm2)
+    ]
+    unseen = np.hypot((logs[1] - logs[0]) / 2, shapes.coupling_sigma**2 / np.sqrt(18))
+    diameter = 2 * np.exp((logs[0] + logs[1]) / 2)
+    relative2 = unseen**2 + 0.8 * sigma[1] ** 2 + _relative_noise2(pair) / 8
+    return diameter, diameter * np.sqrt(relative2)
+
+
+def _axis_sigma(moments_mm2: Array, pair: tuple[Outlines, Outlines], sigma: float) -> Array:
+    """(M,) how well a spheroid's axis is known: errors of the ellipses over its flatness."""
+    squares = np.linalg.eigvalsh(moments_mm2)
+    flatness = 1 - squares[:, 0] / squares[:, 2]
+    error = np.sqrt(_relative_noise2(pair) + (3.4 * sigma) ** 2)
+    return np.asarray(np.clip(error / (flatness + 1e-6), 0.01, 0.7))
+
+
+def _relative_noise2(pair: tuple[Outlines, Outlines]) -> Array:
+    noise2 = [np.trace(o.covariance_px2, axis1=1, axis2=2) / np.linalg.det(o.axes_px) for o in pair]
+    return np.asarray(np.abs(np.sum(noise2, 0)))

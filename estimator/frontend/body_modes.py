@@ -1,0 +1,137 @@
+"""Where the volume's centre lies, given the outlines of two views: two accounts of the shape.
+
+Both take the third-degree part of the body (even degrees leave the outlines' centres where the
+volume's is). `isotropic`: seven independent Gaussian coefficients; two views then tell all of the
+shift along the coordinate they share and nothing of the others. `zonal`: one mode, axisymmetric
+about the axis of a spheroid; all is told by its one amplitude.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.rig import silhouette
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Views:
+    """What M pairs of outlines say, about a point near the body.
+
+    measured : (M, 8): pixel residuals of the first and the second view (2 + 2) and the coefficients
+    of cos 3 phi, sin 3 phi in both (2 + 2); noise : (M, 8, 8).  jacobian : (M, 8, 3) by the point
+    (zero for the coefficients).  axes_px : two (M, 2, 2) semi-axes.  sigma : (M,) prior standard
+    deviation of each coefficient of degree 3 (of unit mean square).
+    """
+
+    measured: Array
+    noise: Array
+    jacobian: Array
+    axes_px: tuple[Array, Array]
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class Account:
+    """One account's answer.
+
+    step_mm : (M, 3) from the point to the centre of volume; covariance_mm2 : (M, 3, 3);
+    shift_px : (M, 4) expected displacement of the outlines' centres from the projected centre of
+    volume; log_evidence : (M,), comparable between accounts of the same `Views`.
+    """
+
+    step_mm: Array
+    covariance_mm2: Array
+    shift_px: Array
+    log_evidence: Array
+
+
+def isotropic(views: Views, frames: tuple[Array, Array]) -> Account:
+    """frames : two (M, 3, 2), `EllipsePair.frames` of an ellipsoid that fits the outlines."""
+    effect = third_degree_effect(views.axes_px, frames)
+    return _account(views, views.sigma[:, None, None] ** 2 * effect @ _t(effect))
+
+
+def zonal(views: Views, projections: tuple[Array, Array], axis_sigma: Array) -> Account:
+    """The amplitude has the prior of `isotropic`'s root mean square: 7 sigma.
+
+    projections : two (M, 2), where the pole appears in the outlines' unit circles.
+    axis_sigma : (M,) their uncertainty.
+    """
+    effect = _zonal_effect(views.axes_px, projections)[..., None]
+    prior = effect @ _t(effect)
+    for view in range(2):
+        for direction in np.eye(2):
+            moved = list(projections)
+            moved[view] = projections[view] + axis_sigma[:, None] * direction
+            change = _zonal_effect(views.axes_px, (moved[0], moved[1]))[..., None] - effect
+            prior = prior + change @ _t(change)
+    return _account(views, (7 * views.sigma[:, None, None]) ** 2 * prior)
+
+
+def uncorrected_covariance(views: Views, frames: tuple[Array, Array]) -> Array:
+    """(M, 3, 3) of the outlines' centres taken for the volume's, the shape's share included.
+
+    Of views, noise (M, 4, 4) and jacobian (M, 4, 3) are the pixels' alone.
+    """
+    noise, jacobian = views.noise, views.jacobian
+    weighted = _t(jacobian) @ np.linalg.inv(noise)
+    gain = np.linalg.solve(weighted @ jacobian, weighted)
+    effect = third_degree_effect(views.axes_px, frames)[:, :4]
+    by_shape = views.sigma[:, None, None] * gain @ effect
+    return np.asarray(gain @ noise @ _t(gain) + by_shape @ _t(by_shape))
+
+
+def combine(accounts: list[Account], prior: Array) -> tuple[Account, Array]:
+    """Mean over accounts with their posterior probabilities (K, M), also returned; prior (K, M)."""
+    log_weight = np.stack([a.log_evidence for a in accounts]) + np.log(prior)
+    top = log_weight.max(0)
+    weight = np.exp(log_weight - top)
+    total = weight.sum(0)
+    weight /= total
+    steps = np.stack([a.step_mm for a in accounts])
+    step = (weight[..., None] * steps).sum(0)
+    apart = steps - step
+    second = np.stack([a.covariance_mm2 for a in accounts]) + apart[..., None] * apart[..., None, :]
+    covariance = (weight[..., None, None] * second).sum(0)
+    shift = (weight[..., None] * np.stack([a.shift_px for a in accounts])).sum(0)
+    return Account(step, covariance, shift, top + np.log(total)), weight
+
+
+def third_degree_effect(axes_px: tuple[Array, Array], frames: tuple[Array, Array]) -> Array:
+    """(M, 8, 7): what is measured, by the coefficients of degree 3."""
+    traces = [silhouette.third_degree_traces(f) for f in frames]
+    pixels = [axes @ first for axes, (first, _) in zip(axes_px, traces)]
+    return np.concatenate([*pixels, traces[0][1], traces[1][1]], -2)
+
+
+def _zonal_effect(axes_px: tuple[Array, Array], projections: tuple[Array, Array]) -> Array:
+    """(M, 8): what is measured, by the zonal amplitude."""
+    traces = [silhouette.zonal_traces(q) for q in projections]
+    pixels = [(axes @ first[..., None])[..., 0] for axes, (first, _) in zip(axes_px, traces)]
+    return np.concatenate([*pixels, traces[0][1], traces[1][1]], -1)
+
+
+def _account(views: Views, prior: Array) -> Account:
+    """Generalised least squares for the point, the shape being noise of covariance prior."""
+    inverse = np.linalg.inv(views.noise + prior)
+    weighted = _t(views.jacobian) @ inverse
+    normal = weighted @ views.jacobian
+    covariance = np.linalg.inv(normal)
+    step = _mv(covariance @ weighted, views.measured)
+    misfit = _mv(inverse, views.measured) - _mv(_t(weighted), step)
+    log_det = np.linalg.slogdet(inverse)[1] - np.linalg.slogdet(normal)[1]
+    log_evidence = 0.5 * (log_det - (views.measured * misfit).sum(-1))
+    return Account(step, covariance, _mv(prior, misfit)[:, :4], log_evidence)
+
+
+def _t(matrix: Array) -> Array:
+    return np.swapaxes(matrix, -1, -2)
+
+
+def _mv(matrix: Array, vector: Array) -> Array:
+    return np.asarray((matrix @ vector[..., None])[..., 0])

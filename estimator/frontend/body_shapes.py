@@ -1,0 +1,71 @@
+"""The ellipsoids that two outlines allow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.rig import silhouette
+from telerig.rig.silhouette import EllipsePair
+
+Array = NDArray[np.float64]
+
+_NODES = ((-np.sqrt(3), 1 / 12), (0.0, 1 / 3), (np.sqrt(3), 1 / 12))
+_OBLATE_SHARE = 0.5
+_LEAST_COUPLING = 0.01
+_LARGEST_COUPLING = 0.9
+
+
+@dataclass(frozen=True)
+class BodyShapes:
+    """What M pairs of outlines allow.
+
+    pair : their ellipses in mm.  moments_mm2 : (M, 3, 3) A A^T of the most spherical ellipsoid,
+    coupling : (M,) its coupling (`EllipsePair`), coupling_sigma : (M,) how far that may be off.
+    oblate_mm2 : (M, 3, 3) A A^T of the nearest oblate spheroid, poles : two (M, 2), where its pole
+    appears in the outlines' unit circles.
+    """
+
+    pair: EllipsePair
+    moments_mm2: Array
+    coupling: Array
+    coupling_sigma: Array
+    oblate_mm2: Array
+    poles: tuple[Array, Array]
+
+    def couplings(self) -> Iterator[tuple[Array, float]]:
+        """(M,) possible couplings and their probabilities.
+
+        Half goes to the oblate spheroid, half to a normal distribution (three Gauss-Hermite nodes)
+        about the most spherical ellipsoid.
+        """
+        for node, share in _NODES:
+            yield _possible(self.coupling + node * self.coupling_sigma), share
+        yield _possible(self.pair.coupling_of(self.oblate_mm2)), _OBLATE_SHARE
+
+
+def body_shapes(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> BodyShapes:
+    """jacobians : two (M, 2, 3), px per mm.  axes_px : two (M, 2, 2), columns are semi-axes."""
+    pair = silhouette.ellipse_pair(jacobians, axes_px)
+    moments = silhouette.most_spherical(pair)
+    pole, oblate = silhouette.oblate_spheroid(pair)
+    first, second = (
+        np.linalg.solve(a, j @ pole[..., None])[..., 0] for a, j in zip(axes_px, jacobians)
+    )
+    spread = _coupling_sigma(moments)
+    coupling = _possible(pair.coupling_of(moments))
+    return BodyShapes(pair, moments, coupling, spread, oblate, (first, second))
+
+
+def _coupling_sigma(moments_mm2: Array) -> Array:
+    """(M,) the coupling is as large as the four like numbers of the anisotropy that are seen."""
+    logs = np.log(np.linalg.eigvalsh(moments_mm2))
+    seen = ((logs - logs.mean(-1, keepdims=True)) ** 2).sum(-1)
+    return np.asarray(np.sqrt(seen / 8 + _LEAST_COUPLING**2))
+
+
+def _possible(coupling: Array) -> Array:
+    return np.clip(coupling, -_LARGEST_COUPLING, _LARGEST_COUPLING)

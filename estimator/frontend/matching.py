@@ -29,7 +29,8 @@ Array = NDArray[np.float64]
 
 SAFE_NATS = 3.0
 _TAIL, _TAIL_WIDTH = 0.02, 3.0
-_WRONG_SIZE, _WRONG_SIZE_FLAGGED = 1e-4, 0.02
+_WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-4, 0.02, 0.05
+_RARE, _FREEDOM = 2.5, 6.0
 _SHIFT_PASSES = 4
 
 
@@ -86,12 +87,9 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
     first, second = geometry.views
     odds = np.full(geometry.gap_px.shape, _prior_log_odds(len(first), len(second), model.lonely))
     wrong = np.where(geometry.doubt > 1, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
-    odds += _cue(model.height, geometry.height, first.log_height, second.log_height, wrong)
-    odds += _cue(model.shape, geometry.shape, first.log_shape, second.log_shape, wrong)
-    tolerant = np.full_like(wrong, _WRONG_SIZE_FLAGGED)
-    odds += _cue(
-        model.contrast, geometry.contrast, first.log_contrast, second.log_contrast, tolerant
-    )
+    odds += _cue(model.size, geometry.size, first.log_size, second.log_size, wrong)
+    contrasts = (first.log_contrast, second.log_contrast)
+    odds += _cue(model.contrast, geometry.contrast, *contrasts, _WRONG_CONTRAST)
     return odds
 
 
@@ -110,28 +108,27 @@ def _gap_log_odds(gap: Array, variance: Array, model: PairModel) -> Array:
     return np.log(np.maximum(density * model.span_px, 1e-300))
 
 
-def _cue(cue: Cue, ratio: Array, first: Array, second: Array, wrong: Array) -> Array:
-    """Log odds of one property: alike within its scatter, or two draws of the population.
+def _cue(cue: Cue, ratio: Array, first: Array, second: Array, wrong: Array | float) -> Array:
+    """Log odds of properties: two noisy images of one bubble, or of two from the population.
 
-    wrong : chance that one of the two measurements says nothing about the bubble.
+    In the axes in which scatter and population are both uncorrelated (generalised eigenvectors),
+    two images of one bubble have correlation 1 - scatter / 2; the log odds are those of the two
+    normal distributions. How rare a bubble is counts to ``_RARE`` standard deviations.
+    wrong : chance that one of the measurements says nothing about the bubble.
     """
-    rarity = [
-        _log_population(np.nan_to_num(values, nan=cue.means[c]), cue.means[c], cue.sds[c])
-        for c, values in enumerate((first, second))
-    ]
-    drawn = 0.5 * (rarity[0][:, None] + rarity[1])
-    alike = _log_normal(np.nan_to_num(ratio) - cue.difference, cue.sd)
-    log_odds = np.logaddexp(np.log1p(-wrong) + alike - drawn, np.log(wrong))
-    return np.where(np.isfinite(ratio), log_odds, 0.0)
+    from scipy.linalg import eigh
 
-
-def _log_population(values: Array, mean: float, sd: float) -> Array:
-    core, wide = _log_normal(values - mean, sd), _log_normal(values - mean, 3 * sd)
-    return np.logaddexp(np.log(0.9) + core, np.log(0.1) + wide)
-
-
-def _log_normal(deviation: Array, sd: float) -> Array:
-    return -0.5 * (deviation / sd) ** 2 - np.log(sd * np.sqrt(2 * np.pi))
+    relative, axes = eigh(cue.scatter, cue.spread)
+    alike = np.clip(1 - relative / 2, 0.0, 1 - 1e-6)
+    apart = np.nan_to_num(ratio - cue.difference) @ axes
+    own = [np.nan_to_num(v - cue.means[c]) @ axes for c, v in enumerate((first, second))]
+    rare = np.clip(0.5 * (own[0][:, None] + own[1]), -_RARE, _RARE)
+    odds = rare**2 @ (alike / (1 + alike)) + (apart**2).sum(-1) / 4
+    tails = np.log1p(apart**2 @ (0.5 / (1 - alike)) / _FREEDOM)
+    odds -= 0.5 * (_FREEDOM + len(alike)) * tails
+    odds -= 0.5 * np.log1p(-(alike**2)).sum()
+    odds = np.logaddexp(np.log1p(-wrong) + odds, np.log(wrong))
+    return np.where(np.isfinite(ratio).all(-1), odds, 0.0)
 
 
 def _matches(
@@ -148,7 +145,7 @@ def _matches(
     return Matches(
         rows, columns, confidence, gap[rows, columns],
         gap[rows, columns] / np.sqrt(variance[rows, columns]),
-        np.exp(geometry.height[rows, columns]),
+        np.exp(geometry.size[rows, columns, 0]),
         np.log(confidence) - np.log(np.maximum(1 - confidence, 1e-300)) < SAFE_NATS,
         tuple(_alternatives(int(i), int(j), probability) for i, j in zip(rows, columns)),
         track[rows, columns],

@@ -33,8 +33,8 @@ class View:
 
     uv_px : (N, 2).  origin_mm, direction : (N, 3) rays.  mm_by_px : (N, 2, 2) camera-plane mm by pixel at depth 0.
     covariance_px2 : (N, 2, 2).  middle_mm : (N,) middle of top and bottom less the centre, along
-    the shared axis.  log_height, log_shape, log_contrast : (N,) logarithms of half the height
-    (mm), of width over height, of the contrast; NaN where unknown.  doubt : (N,) factor for the
+    the shared axis.  log_size : (N, 2) logarithms of half the height and half the width (mm), along
+    and across the shared axis.  log_contrast : (N, 1).  NaN where unknown.  doubt : (N,) factor for the
     scatter of flagged detections.
     """
 
@@ -45,8 +45,7 @@ class View:
     mm_by_px: Array
     covariance_px2: Array
     middle_mm: Array
-    log_height: Array
-    log_shape: Array
+    log_size: Array
     log_contrast: Array
     doubt: Array
 
@@ -61,7 +60,7 @@ class PairGeometry:
     gap_px : (N1, N2) first less second along the shared axis, in px of the first image, bias
     included; positive along that image's +u or +v, whichever is nearer the axis.
     variance_px2 : its variance by the detections' covariances.  points_mm : (N1, N2, 3) mid-points.
-    height, shape, contrast : (N1, N2) logarithms of the ratios first / second.
+    size, contrast : (N1, N2, 2), (N1, N2, 1) logarithms of the ratios first / second.
     mm_per_px : (N1, N2) length of a pixel of the gap.  doubt : (N1, N2).
     """
 
@@ -69,8 +68,7 @@ class PairGeometry:
     gap_px: Array
     variance_px2: Array
     points_mm: Array
-    height: Array
-    shape: Array
+    size: Array
     contrast: Array
     mm_per_px: Array
     doubt: Array
@@ -123,11 +121,11 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     area_mm2 = area * np.abs(np.linalg.det(mm_by_px))
     with np.errstate(divide="ignore", invalid="ignore"):
         log_height = np.where(known & (height > 0), np.log(height), np.nan)
-        log_shape = np.log(area_mm2 / np.pi) - 2 * log_height
+        log_width = np.log(area_mm2 / np.pi) - log_height
         contrast = np.log(_column(table, "contrast"))
     return View(
         camera, uv, origin, direction, mm_by_px, covariance.reshape(-1, 2, 2), middle,
-        _finite(log_height), _finite(log_shape), _finite(contrast),
+        _finite(np.stack([log_height, log_width], -1)), _finite(contrast[:, None]),
         np.array([max([_DOUBTFUL.get(w, 1.0) for w in f], default=1.0) for f in flags]),
     )  # fmt: skip
 
@@ -157,8 +155,7 @@ def pair_geometry(first: View, second: View) -> PairGeometry:
         lengths.append(np.linalg.norm(across, axis=-1))
     return PairGeometry(
         views, gap / lengths[0], variance / lengths[0] ** 2, points,
-        first.log_height[:, None] - second.log_height + stretch[0] - stretch[1],
-        first.log_shape[:, None] - second.log_shape,
+        first.log_size[:, None] - second.log_size + (stretch[0] - stretch[1])[..., None],
         first.log_contrast[:, None] - second.log_contrast,
         lengths[0], np.maximum(first.doubt[:, None], second.doubt),
     )  # fmt: skip

@@ -58,11 +58,11 @@ def _track_density(geometry: PairGeometry, model: PairModel, predicted: Predicti
     distance = (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(-1)
     density = np.exp(-0.5 * np.minimum(distance, 2 * _NEAR))
     density /= np.sqrt(np.linalg.det(2 * np.pi * covariance))
-    size = 0.5 * (first.log_height[:, None] + second.log_height)[..., None]
+    size = 0.25 * (first.log_size.sum(-1)[:, None] + second.log_size.sum(-1))[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
         log_ratio = size - np.log(np.asarray(predicted.d_eq_mm) / 2)
-    sd = np.hypot(_SIZE_SD, model.shape.sd / 2)
-    population = np.maximum(0.5 * (model.height.sds[0] + model.height.sds[1]), sd)
+    population = float(np.sqrt(model.size.spread.mean()))
+    sd = min(_SIZE_SD, population)
     of_size = np.exp(-0.5 * (log_ratio / sd) ** 2) * population / sd
     of_size = np.where(np.isfinite(log_ratio), of_size, 1.0)
     return np.asarray(density * of_size * _volume_mm3(geometry, model))

@@ -40,22 +40,23 @@ _CONSTANT_PASSES = 6
 _LEAST_LONELY, _MOST_LONELY = 0.05, 0.9
 _PRIOR_PAIRS = 3.0
 _PRIOR_SCATTER_PX = 0.3
-_SMALLEST = {"height": 0.005, "shape": 0.01, "contrast": 0.03}
-_PRIOR_SD = {"height": 0.03, "shape": 0.08, "contrast": 0.2}
-_USUAL_SPREAD = {"height": 0.4, "shape": 0.15, "contrast": 0.3}
+_SMALLEST = {"size": np.diag([0.005, 0.005]) ** 2, "contrast": np.diag([0.02]) ** 2}
+_PRIOR = {"size": np.diag([0.03, 0.06]) ** 2, "contrast": np.diag([0.2]) ** 2}
+_USUAL = {"size": np.array([[0.17, 0.15], [0.15, 0.17]]), "contrast": np.array([[0.1]])}
+_USUAL_WEIGHT = 4.0
 
 
 def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
     """A model for a calibration that is believed, before any detection was seen."""
     axis = shared_axis(cameras)
-    cues = {
-        name: Cue(0.0, _PRIOR_SD[name], (0.0, 0.0), (3.0 * spread, 3.0 * spread))
-        for name, spread in _USUAL_SPREAD.items()
-    }
+    size, contrast = (
+        Cue(np.zeros(len(usual)), _PRIOR[name], np.zeros((2, len(usual))), 9.0 * usual)
+        for name, usual in _USUAL.items()
+    )
     reach = np.full(3, max(c.image_size_px[0] / c["scale_px_per_mm"] / 2 for c in cameras))
     return PairModel(
         np.zeros(1), np.zeros((1, 1)), np.zeros(3), reach, _PRIOR_SCATTER_PX, 0.0,
-        cues["height"], cues["shape"], cues["contrast"], (0.1, 0.1), _span_px(cameras, axis),
+        size, contrast, (0.1, 0.1), _span_px(cameras, axis),
     )  # fmt: skip
 
 
@@ -115,8 +116,7 @@ def _improved(model: PairModel, geometries: list[PairGeometry], *, smooth: bool)
     return replace(
         model,
         frame_px=_frame_scatter(model, shifts, total) if len(geometries) > 1 else 0.0,
-        height=_learnt(model.height, "height", flat.height, weight / flat.doubt**2),
-        shape=_learnt(model.shape, "shape", flat.shape, weight / flat.doubt**2),
+        size=_learnt(model.size, "size", flat.size, weight / flat.doubt**2),
         contrast=_learnt(model.contrast, "contrast", flat.contrast, weight),
         lonely=(float(first), float(second)),
         pairs=float(total.sum()),
@@ -130,12 +130,12 @@ class _Flat:
         self, geometries: list[PairGeometry], shifts: list[float], use: NDArray[np.bool_]
     ) -> None:
         def flat(name: str) -> Array:
-            return np.concatenate([getattr(g, name).ravel() for g in geometries])[use]
+            arrays: list[Array] = [getattr(g, name) for g in geometries]
+            return np.concatenate([a.reshape(-1, *a.shape[2:]) for a in arrays])[use]
 
         self.raw_px, self.variance_px2 = flat("gap_px"), flat("variance_px2")
-        self.height, self.shape, self.contrast = flat("height"), flat("shape"), flat("contrast")
-        self.doubt = flat("doubt")
-        self.points_mm = np.concatenate([g.points_mm.reshape(-1, 3) for g in geometries])[use]
+        self.size, self.contrast = flat("size"), flat("contrast")
+        self.doubt, self.points_mm = flat("doubt"), flat("points_mm")
         sizes = [g.gap_px.size for g in geometries]
         self.shift_px = np.repeat(shifts, sizes)[use]
 
@@ -151,41 +151,38 @@ def _frame_scatter(model: PairModel, shifts: Array, total: Array) -> float:
 
 
 def _learnt(cue: Cue, name: str, ratio: Array, weight: Array) -> Cue:
-    known = np.isfinite(ratio)
-    if weight[known].sum() < 0.5:
-        return cue
+    """Mean and covariance of the ratios over likely pairs, tails tempered (Student's t, 4)."""
+    known = np.isfinite(ratio).all(-1)
     ratio, weight = ratio[known], weight[known]
-    tail = 5 / (4 + ((ratio - cue.difference) / cue.sd) ** 2)
-    mean = float((weight * tail * ratio).sum() / ((weight * tail).sum() + 0.1))
-    prior = _PRIOR_PAIRS * _PRIOR_SD[name] ** 2
-    squares = (weight * tail * (ratio - mean) ** 2).sum() + prior
-    sd = float(np.sqrt(squares / (weight.sum() + _PRIOR_PAIRS)))
-    sd = max(sd, _SMALLEST[name])
-    sds = (max(cue.sds[0], sd), max(cue.sds[1], sd))
-    return replace(cue, difference=mean, sd=sd, sds=sds)
+    if weight.sum() < 0.5:
+        return cue
+    off = ratio - cue.difference
+    far = (off * np.linalg.solve(cue.scatter, off.T).T).sum(-1)
+    tempered = weight * (4 + ratio.shape[1]) / (4 + far)
+    mean = tempered @ ratio / (tempered.sum() + 0.1)
+    off = ratio - mean
+    squares = (off.T * tempered) @ off + _PRIOR_PAIRS * _PRIOR[name]
+    scatter = squares / (weight.sum() + _PRIOR_PAIRS) + _SMALLEST[name]
+    return replace(cue, difference=mean, scatter=scatter)
 
 
 def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
-    """Means and spreads of all detections, by median and quartiles, drawn to the usual if few."""
+    """Means and spreads of all detections; outliers count as three sd, few draw to the usual."""
     cues = {}
-    for name in _USUAL_SPREAD:
-        values = [
-            np.concatenate([getattr(pair[c], f"log_{name}") for pair in views]) for c in range(2)
-        ]
-        stats = [_centre_and_spread(v[np.isfinite(v)], _USUAL_SPREAD[name]) for v in values]
+    for name, usual in _USUAL.items():
+        means, squares, count = [], _USUAL_WEIGHT * usual, _USUAL_WEIGHT
+        for c in range(2):
+            values: Array = np.concatenate([getattr(pair[c], f"log_{name}") for pair in views])
+            values = values[np.isfinite(values).all(-1)]
+            middle = np.median(values, axis=0) if len(values) else np.zeros(len(usual))
+            off = values - middle
+            limit = 3 * 1.4826 * np.median(np.abs(off), axis=0) if len(values) else 0.0
+            off = np.clip(off, -limit, limit)
+            means.append(middle)
+            squares, count = squares + off.T @ off, count + len(off)
         old: Cue = getattr(model, name)
-        cues[name] = replace(
-            old, means=(stats[0][0], stats[1][0]), sds=(stats[0][1], stats[1][1])
-        )
+        cues[name] = replace(old, means=np.array(means), spread=squares / count)
     return replace(model, **cues)
-
-
-def _centre_and_spread(values: Array, usual: float) -> tuple[float, float]:
-    if not len(values):
-        return 0.0, usual
-    low, middle, high = np.percentile(values, [25, 50, 75])
-    n, robust = len(values), (high - low) / 1.349
-    return float(middle), float(np.sqrt((n * robust**2 + 4 * usual**2) / (n + 4)))
 
 
 def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, float]:

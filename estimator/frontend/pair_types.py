@@ -13,16 +13,22 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Cue:
-    """How the logarithm of one property compares between the two views.
+    """How the logarithms of K properties compare between the two images of one bubble.
 
-    difference, sd : mean and scatter of (first - second) for the two images of one bubble.
-    means, sds : of the property over all bubbles, in the first and in the second view.
+    difference, scatter : (K,), (K, K) mean and covariance of first - second over true pairs.
+    means : (2, K) over all bubbles, in the first and in the second view.
+    spread : (K, K) covariance over all bubbles of a view.
     """
 
-    difference: float
-    sd: float
-    means: tuple[float, float]
-    sds: tuple[float, float]
+    difference: Array
+    scatter: Array
+    means: Array
+    spread: Array
+
+    @property
+    def sd(self) -> Array:
+        """(K,) scatter of each property."""
+        return np.sqrt(np.diag(self.scatter))
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class PairModel:
         over ``reach_mm``.
     scatter_px : of single gaps beyond the detections' own covariance.
     frame_px : of a shift common to all gaps of a frame (the cameras shake).
-    height, shape, contrast : see `Cue`; heights in mm, shape = width / height.
+    size : of (height, width) in mm, along and across the shared axis.  contrast : see `Cue`.
     lonely : share of the detections of each view without a partner.
     span_px : length of the shared coordinate that both images cover, in px of the first.
     pairs : number of pairs it rests on (a sum of probabilities); 0 for a model not learnt.
@@ -50,8 +56,7 @@ class PairModel:
     reach_mm: Array
     scatter_px: float
     frame_px: float
-    height: Cue
-    shape: Cue
+    size: Cue
     contrast: Cue
     lonely: tuple[float, float]
     span_px: float

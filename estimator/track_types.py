@@ -1,0 +1,194 @@
+"""What goes into the tracker, what comes out, and its settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+NO_PARTICLE = -1
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Defaults suit bubbles of 5 mm that rise at 280 mm/s, seen at 100 to 1000 Hz.
+
+    rise_mm_s, birth_speed_sd_mm_s : velocity of a new track along the travel axis and its sd on
+        each axis; without an encoder the mean is 0 and the sd birth_speed_sd_no_encoder_mm_s.
+    lateral_acceleration_mm_s2, rise_acceleration_mm_s2 : RMS across and along the travel axis.
+    acceleration_time_s : how long an acceleration lasts. With `acceleration_state` it is a state
+        (Singer's model), else white noise of the same spectral density at 0 Hz.
+    velocity_time_s : relaxation of the velocity towards the rise; inf: none.
+    shake_sd_mm, shake_time_s : offset common to all bubbles in a frame, sd and correlation time.
+    stage_acceleration_mm_s2 : of the stage, where the encoder does not tell its position.
+    size_scatter : relative sd of d_eq_mm from frame to frame; size_cap_nats bounds what one
+        wrong size can say.
+    detection_probability, new_per_mm3, new_per_px2 : of a bubble in a frame; density of what is
+        no continuation (clutter, new bubbles) in space and in one image.
+    gate_probability : of a true continuation to lie inside its gate.
+    margin_nats : a continuation this close to the runner-up is not safe when the window ends;
+        prune_nats : a hypothesis this far behind is dropped at once.
+    window_frames : how long a conflict may stay open. max_hypotheses : per conflict.
+    confirm_hits, confirm_frames : a new track needs hits in so many of its first frames.
+    gap_s, gap_frames : a track unseen for longer than both ends.
+    balance_tolerance : of the volume, to call a birth a split or an end a merger.
+    """
+
+    rise_mm_s: float = 280.0
+    birth_speed_sd_mm_s: float = 120.0
+    birth_speed_sd_no_encoder_mm_s: float = 300.0
+    lateral_acceleration_mm_s2: float = 3000.0
+    rise_acceleration_mm_s2: float = 1000.0
+    acceleration_time_s: float = 0.02
+    acceleration_state: bool = False
+    velocity_time_s: float = float("inf")
+    shake_sd_mm: float = 0.3
+    shake_time_s: float = 0.01
+    stage_acceleration_mm_s2: float = 3000.0
+    size_scatter: float = 0.05
+    size_cap_nats: float = 4.5
+    detection_probability: float = 0.95
+    new_per_mm3: float = 1e-5
+    new_per_px2: float = 1e-5
+    gate_probability: float = 0.9999
+    margin_nats: float = 4.6
+    prune_nats: float = 9.0
+    window_frames: int = 10
+    max_hypotheses: int = 30
+    confirm_hits: int = 3
+    confirm_frames: int = 4
+    gap_s: float = 0.05
+    gap_frames: int = 3
+    balance_tolerance: float = 0.25
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not value >= 0:
+                raise InputError(f"{item.name} = {value}", todo="give a number of at least 0")
+        for name in ("detection_probability", "gate_probability"):
+            if not 0 < getattr(self, name) < 1:
+                raise InputError(f"{name} = {getattr(self, name)}", todo="give it between 0 and 1")
+        for name in ("acceleration_time_s", "velocity_time_s", "shake_time_s", "size_scatter"):
+            if getattr(self, name) == 0:
+                raise InputError(f"{name} = 0", todo="give a positive number")
+        if not 1 <= self.confirm_hits <= self.confirm_frames:
+            raise InputError(
+                f"{self.confirm_hits} hits of {self.confirm_frames} frames",
+                todo="confirm_hits from 1 to confirm_frames",
+            )
+
+
+def _empty(*shape: int) -> Array:
+    return np.zeros(shape)
+
+
+@dataclass(frozen=True)
+class SingleMeasurements:
+    """Bubbles that one camera saw without a partner.
+
+    camera : (L,) index; uv_px : (L, 2); covariance_px2 : (L, 2, 2).
+    """
+
+    camera: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    uv_px: Array = field(default_factory=lambda: _empty(0, 2))
+    covariance_px2: Array = field(default_factory=lambda: _empty(0, 2, 2))
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+
+@dataclass(frozen=True)
+class FrameMeasurements:
+    """One frame's bubbles, in the rig frame.
+
+    points_mm : (M, 3); covariance_mm2 : (M, 3, 3); d_eq_mm : (M,), NaN where unknown;
+    confidence : (M,) in (0, 1]; particle : (M,) given ids, -1 where there is none.
+    """
+
+    points_mm: Array
+    covariance_mm2: Array
+    d_eq_mm: Array
+    confidence: Array
+    particle: Ids
+    singles: SingleMeasurements
+
+    @staticmethod
+    def create(
+        points_mm: ArrayLike,
+        covariance_mm2: ArrayLike,
+        *,
+        d_eq_mm: ArrayLike | None = None,
+        confidence: ArrayLike | None = None,
+        particle: ArrayLike | None = None,
+        singles: SingleMeasurements | None = None,
+    ) -> FrameMeasurements:
+        """Checked: raises InputError for shapes that do not fit, or values that are not finite."""
+        points = np.asarray(points_mm, float).reshape(-1, 3)
+        m = len(points)
+        covariance = np.broadcast_to(np.asarray(covariance_mm2, float), (m, 3, 3))
+        size = np.full(m, np.nan) if d_eq_mm is None else np.asarray(d_eq_mm, float)
+        sure = np.ones(m) if confidence is None else np.asarray(confidence, float)
+        ids = np.full(m, NO_PARTICLE) if particle is None else np.asarray(particle)
+        for name, values in (("d_eq_mm", size), ("confidence", sure), ("particle", ids)):
+            if values.shape != (m,):
+                raise InputError(
+                    f"{name} of shape {values.shape} for {m} points", todo="one value per point"
+                )
+        if not (np.isfinite(points).all() and np.isfinite(covariance).all()):
+            raise InputError(
+                "points or covariances that are not finite",
+                todo="leave out bubbles that could not be triangulated",
+            )
+        given = ids[ids != NO_PARTICLE]
+        if len(np.unique(given)) < len(given):
+            raise InputError("a particle id occurs twice in one frame", todo="give each id once")
+        alone = SingleMeasurements() if singles is None else singles
+        return FrameMeasurements(points, covariance, size, sure, ids.astype(np.int64), alone)
+
+    def __len__(self) -> int:
+        return len(self.points_mm)
+
+
+@dataclass(frozen=True)
+class TrackEvent:
+    """kind : birth, death, gap, break, resolved, split or merge.
+
+    particles : the tracks it is about, the older first; frame, t_s : when; reason : in words.
+    """
+
+    kind: str
+    frame: int
+    t_s: float
+    particles: tuple[int, ...]
+    reason: str
+
+
+@dataclass(frozen=True)
+class FrameIds:
+    """Final: particle : (M,) and single : (L,) ids of a frame's measurements, -1 for none."""
+
+    frame: int
+    particle: Ids
+    single: Ids
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """particle, single : ids as of now, the best guess where a conflict or a birth is still open.
+
+    settled : the earlier frames (and this one, if nothing is open) whose ids are final now, in
+        order; write these to the tables. events : what became known in this frame.
+    """
+
+    frame: int
+    particle: Ids
+    single: Ids
+    events: tuple[TrackEvent, ...]
+    settled: tuple[FrameIds, ...]

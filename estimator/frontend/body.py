@@ -28,6 +28,7 @@ DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
 _ZONAL_SHARE = 0.5
 _RUN_WEIGHT = 4.0
 _MODEL_ERROR = 0.02
+_KNOWN_AXIS = 0.2
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,8 @@ def _fill_shapes(
     sigma: Array,
 ) -> None:
     """Sizes, and what the shape may add to the error of the outlines' centres."""
-    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), (pair[0].axes_px, pair[1].axes_px))
+    axes_px = (pair[0].axes_px, pair[1].axes_px)
+    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), axes_px)
     axes = np.sqrt(np.linalg.eigvalsh(shapes.moments_mm2))
     bodies.semi_axes_mm[rows] = axes[:, ::-1]
     bodies.d_eq_mm[rows], bodies.d_eq_sd_mm[rows] = _diameter(shapes, pair, sigma)
@@ -185,7 +187,7 @@ def _fill_shapes(
         np.zeros((len(rows), 8)),
         _pixel_noise(pair),
         jacobian,
-        shapes.axes_px,
+        axes_px,
         np.full(len(rows), sigma[0]),
     )
     frames = shapes.pair.frames(shapes.coupling)
@@ -201,25 +203,26 @@ def _correct(
     sigma: Array,
 ) -> None:
     """Centres of volume: every account of the shape, weighted by its evidence."""
-    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), (pair[0].axes_px, pair[1].axes_px))
+    axes_px = (pair[0].axes_px, pair[1].axes_px)
+    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), axes_px)
     measured, noise, conversion = _measured(pair, pixels)
     slope = np.concatenate([jacobian, np.zeros_like(jacobian)], 1)
-    views = Views(measured, noise, slope, shapes.axes_px, _own_sigma(pair, sigma[0]))
-    accounts, prior = [], []
+    views = Views(measured, noise, slope, axes_px, _own_sigma(pair, sigma[0]))
+    accounts, shares = [], []
     for coupling, share in shapes.couplings():
         accounts.append(body_modes.isotropic(views, shapes.pair.frames(coupling)))
-        prior.append((1 - _ZONAL_SHARE) * share)
-    for spheroid in shapes.spheroids:
-        axis_sigma = _axis_sigma(spheroid.moments_mm2, pair, sigma[1])
-        accounts.append(body_modes.zonal(views, spheroid.projections, axis_sigma))
-        prior.append(_ZONAL_SHARE / len(shapes.spheroids))
-    answer, weight = body_modes.combine(accounts, np.array(prior)[:, None])
+        shares.append(share)
+    axis_sigma = _axis_sigma(shapes, pair, sigma[1])
+    accounts.append(body_modes.zonal(views, shapes.poles, axis_sigma))
+    share = np.where(axis_sigma < _KNOWN_AXIS, _ZONAL_SHARE, 1e-9)
+    prior = np.stack([*((1 - share) * p for p in shares), share])
+    answer, weight = body_modes.combine(accounts, prior)
     correction = conversion - answer.shift_px
     bodies.points_mm[rows] = bodies.silhouette_points_mm[rows] + answer.step_mm
     bodies.covariance_mm2[rows] = answer.covariance_mm2
     bodies.du_px[rows], bodies.dv_px[rows] = correction[:, 0::2], correction[:, 1::2]
     bodies.used[rows] = "volume"
-    bodies.zonal_probability[rows] = weight[-len(shapes.spheroids) :].sum(0)
+    bodies.zonal_probability[rows] = weight[-1]
 
 
 def _measured(pair: tuple[Outlines, Outlines], pixels: Array) -> tuple[Array, Array, Array]:
@@ -265,18 +268,16 @@ def _diameter(
     ellipsoid and the oblate spheroid is taken), the fourth degree's share of the ellipses, and the
     outlines' noise.
     """
-    logs = [
-        np.linalg.slogdet(m)[1] / 6 for m in (shapes.moments_mm2, shapes.spheroids[0].moments_mm2)
-    ]
+    logs = [np.linalg.slogdet(m)[1] / 6 for m in (shapes.moments_mm2, shapes.oblate_mm2)]
     unseen = np.hypot((logs[1] - logs[0]) / 2, shapes.coupling_sigma**2 / np.sqrt(18))
     diameter = 2 * np.exp((logs[0] + logs[1]) / 2)
     relative2 = unseen**2 + 0.8 * sigma[1] ** 2 + _relative_noise2(pair) / 8
     return diameter, diameter * np.sqrt(relative2)
 
 
-def _axis_sigma(moments_mm2: Array, pair: tuple[Outlines, Outlines], sigma: float) -> Array:
+def _axis_sigma(shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: float) -> Array:
     """(M,) how well a spheroid's axis is known: errors of the ellipses over its flatness."""
-    squares = np.linalg.eigvalsh(moments_mm2)
+    squares = np.linalg.eigvalsh(shapes.oblate_mm2)
     flatness = 1 - squares[:, 0] / squares[:, 2]
     error = np.sqrt(_relative_noise2(pair) + (3.4 * sigma) ** 2)
     return np.asarray(np.clip(error / (flatness + 1e-6), 0.01, 0.7))

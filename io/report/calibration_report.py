@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from telerig.io.atomic import write_text_atomic
-from telerig.io.parallel import ordered_map, quick_workers
 from telerig.io.report import calibration_tables as tables
 from telerig.io.report.calibration_results import CalibrationResults, read_results
 from telerig.io.report.contact_sheet import contact_sheet
-from telerig.io.report.figures_common import prepare_drawing
 from telerig.io.report.figures_coverage import coverage, tilts
 from telerig.io.report.figures_dot import dot_pictures
 from telerig.io.report.figures_residuals import residual_field, residual_histogram
 from telerig.io.report.figures_rig import rig_plan
 from telerig.io.report.figures_target import target_pictures
-from telerig.io.report.scene import dots_are_drawn, plotly_javascript, scene_json
+from telerig.io.report.page import drawn_over_cores, render_page
+from telerig.io.report.scene import dots_are_drawn, scene_json
 from telerig.io.report.words import ABSENT, flat_rows, is_number
 
 _COLOURS = {"GOOD": "good", "USABLE": "usable", "REJECTED": "rejected"}
@@ -45,17 +43,8 @@ def write_calibration_report(results_folder: Path) -> Path:
 
 def render(results: CalibrationResults) -> str:
     """The page as text."""
-    from jinja2 import Environment
-    from markupsafe import Markup
-
-    files = resources.files("telerig.io.report")
-    template = (files / "template_calibration.html").read_text(encoding="utf-8")
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     context = _words(results) | _tables(results) | _pictures(results)
-    context["css"] = Markup((files / "report.css").read_text(encoding="utf-8"))
-    context["scene"] = Markup(scene_json(results))
-    context["plotly"] = Markup(plotly_javascript())
-    return environment.from_string(template).render(context)
+    return render_page("template_calibration.html", context, scene_json(results))
 
 
 def _words(results: CalibrationResults) -> dict[str, Any]:
@@ -109,8 +98,7 @@ def _pictures(results: CalibrationResults) -> dict[str, Any]:
         ("spread", partial(residual_histogram, results)),
         ("plan", partial(rig_plan, results)),
     ]
-    prepare_drawing()
-    drawn = ordered_map(_call, [d for _, d in drawings], quick_workers(len(drawings)))
+    drawn = drawn_over_cores([d for _, d in drawings])
     pictures: dict[str, Any] = {"fields": [], "covered": [], "spread": []}
     for (place, _), picture in zip(drawings, drawn):
         if place in ("fields", "covered", "spread"):
@@ -118,7 +106,3 @@ def _pictures(results: CalibrationResults) -> dict[str, Any]:
         else:
             pictures[place] = picture
     return pictures
-
-
-def _call(drawing: Callable[[], Any]) -> Any:
-    return drawing()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.csv_table import Column, read_table
+from telerig.io.report.results_files import check_kind, read_object
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
@@ -87,7 +87,7 @@ def read_results(folder: Path) -> CalibrationResults:
     residuals = _residuals(folder, cameras, views, content)
     component, joint = _covariance(folder / "covariance.npz")
     example = _dot_example(folder / "dot_example.npz")
-    run = _json(folder / "run.json") if (folder / "run.json").is_file() else {}
+    run = read_object(folder / "run.json", _AGAIN) if (folder / "run.json").is_file() else {}
     overlays = _overlays(folder / "overlays", cameras, views)
     absent = _absent(residuals, joint, run, overlays, example)
     rows = _row_column(residuals, dot_ids)
@@ -101,31 +101,13 @@ def _broken(file: Path, what: str) -> InputError:
     return InputError(what, where=str(file), todo=_AGAIN)
 
 
-def _json(file: Path) -> Mapping[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise _broken(file, f"cannot be read as JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise _broken(file, "is JSON, but not an object")
-    return content
-
-
 def _content(file: Path) -> Mapping[str, Any]:
     if not file.is_file():
         raise InputError(
             "no calibration here", where=str(file), todo="run `telerig calibrate DATASET` first"
         )
-    content = _json(file)
-    if content.get("kind") != "telerig calibration":
-        raise _broken(file, "is not a calibration that telerig wrote")
-    schema = content.get("schema")
-    if not isinstance(schema, int) or schema > SCHEMA:
-        raise InputError(
-            f"schema {schema} is newer than this version reads ({SCHEMA})",
-            where=str(file),
-            todo="update telerig",
-        )
+    content = read_object(file, _AGAIN)
+    check_kind(content, file, "calibration", SCHEMA, _AGAIN)
     if not isinstance(content.get("verdict"), dict) or "status" not in content["verdict"]:
         raise _broken(file, "has no verdict")
     return content

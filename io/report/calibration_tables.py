@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import GeometryError
 from telerig.io.report.calibration_results import CalibrationResults
+from telerig.io.report.page import Figure, Row
 from telerig.io.report.words import ABSENT, is_number, number, share, with_sd
 from telerig.rig import projection
 from telerig.rig.camera import Camera
@@ -40,24 +40,6 @@ _WORDS = {
     "tilt_y": "sensor tilt about u, tangent",
     "image_convergence_per_mm": "image-side convergence, 1/mm",
 }
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A key number: its name, the number with its unit, and what to compare it with."""
-
-    name: str
-    value: str
-    remark: str
-
-
-@dataclass(frozen=True)
-class Row:
-    """A table row: the cells as text; ``strong`` is set off, ``faint`` set back."""
-
-    cells: tuple[str, ...]
-    strong: bool = False
-    faint: bool = False
 
 
 def key_numbers(results: CalibrationResults) -> list[Figure]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import numpy as np
 from telerig.errors import InputError
 from telerig.io.report.calibration_results import CalibrationResults
 from telerig.io.report.figures_common import data_uri
+from telerig.io.report.results_files import read_picture
 
 BUDGET_BYTES = 1_500_000
 """Of JPEG: with the page's other parts a report stays below 8 MB."""
 
 SMALL_WIDTH_PX = 420
 _SMALL_QUALITY = 70
+_PNG = b"\x89PNG"
 
 
 @dataclass(frozen=True)
@@ -41,45 +44,55 @@ class ContactSheet:
 
 
 def contact_sheet(results: CalibrationResults) -> ContactSheet:
-    """As they are if they fit; else smaller; else those of the last views linked only.
+    """The overlays of a calibration. Raises InputError for a picture that cannot be read."""
+    views = list(results.views) if results.overlays else []
+    return picture_sheet(views, results.camera_names, results.overlays)
 
+
+def picture_sheet(
+    rows: Sequence[str],
+    columns: Sequence[str],
+    files: Mapping[tuple[str, str], Path],
+    *,
+    small_width_px: int = SMALL_WIDTH_PX,
+) -> ContactSheet:
+    """As they are if they fit; else smaller; else those of the last rows linked only.
+
+    files : (column, row) -> JPEG or PNG, <results>/<kind>/<folder>/<name>.
     Raises InputError for a picture that cannot be read.
     """
-    pictures = {key: _read(file) for key, file in results.overlays.items()}
+    pictures = {key: read_picture(file) for key, file in files.items()}
     shrunk = sum(map(len, pictures.values())) > BUDGET_BYTES
     if shrunk:
-        pictures = {key: _smaller(p, results.overlays[key]) for key, p in pictures.items()}
+        pictures = {key: _smaller(p, files[key], small_width_px) for key, p in pictures.items()}
     left = BUDGET_BYTES
     views = []
-    for view in results.views if pictures else ():
+    for row in rows:
         cells = []
-        for camera in results.camera_names:
-            picture = pictures.get((camera, view), b"")
+        for column in columns:
+            picture = pictures.get((column, row), b"")
             left -= len(picture)
-            source = data_uri("image/jpeg", picture) if picture and left >= 0 else ""
-            link = f"overlays/{camera}/{view}.jpg" if picture else ""
-            cells.append(Cell(camera, source, link))
-        views.append((view, tuple(cells)))
+            kind = "image/png" if picture.startswith(_PNG) else "image/jpeg"
+            source = data_uri(kind, picture) if picture and left >= 0 else ""
+            link = "/".join(files[column, row].parts[-3:]) if picture else ""
+            cells.append(Cell(column, source, link))
+        views.append((row, tuple(cells)))
     return ContactSheet(tuple(views), shrunk)
 
 
-def _read(file: Path) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(file)) from error
-
-
-def _smaller(picture: bytes, file: Path) -> bytes:
+def _smaller(picture: bytes, file: Path, width_px: int) -> bytes:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_ANYCOLOR)
     if image is None:
         raise InputError(
-            "is no JPEG picture", where=str(file), todo="calibrate again, or remove this file"
+            "is no JPEG or PNG picture", where=str(file), todo="remove this file, or make it again"
         )
-    factor = SMALL_WIDTH_PX / image.shape[1]
+    factor = width_px / image.shape[1]
     if factor < 1:
         image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    _, small = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY])
+    if picture.startswith(_PNG):
+        _, small = cv2.imencode(".png", image)
+    else:
+        _, small = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY])
     return min(small.tobytes(), picture, key=len)

@@ -42,7 +42,7 @@ def draw_overlay(
     _check(image, accepted, ["dot", "row", "column"], "accepted")
     _check(image, rejected, ["reason"], "rejected")
     factor = min(1.0, max_width_px / image.shape[1])
-    picture = _grey_picture(image, factor)
+    picture = grey_picture(image, factor)
     numbers = {r: i + 1 for i, r in enumerate(rejected["reason"].value_counts().index)}
     taken = np.zeros(picture.shape[:2], bool)
     _ellipses(picture, rejected, factor, RED)
@@ -52,7 +52,7 @@ def draw_overlay(
     counts = rejected["reason"].value_counts()
     lines = [f"{len(accepted)} dots accepted, {len(rejected)} rejected"]
     lines += [f"{n}: {reason} ({counts[reason]})" for reason, n in numbers.items()]
-    return np.concatenate([picture, _legend(lines, picture.shape[1])])
+    return np.concatenate([picture, legend(lines, picture.shape[1])])
 
 
 def _check(image: NDArray[Any], table: pd.DataFrame, extra: list[str], name: str) -> None:
@@ -69,7 +69,7 @@ def _check(image: NDArray[Any], table: pd.DataFrame, extra: list[str], name: str
         )
 
 
-def _grey_picture(image: NDArray[Any], factor: float) -> Picture:
+def grey_picture(image: NDArray[Any], factor: float) -> Picture:
     """8-bit RGB; the darkest and brightest thousandth of the pixels become black and white."""
     import cv2
 
@@ -99,7 +99,7 @@ def _ellipses(
         centre = (np.array([u, v]) + 0.5) * factor - 0.5
         axes = np.maximum(np.array([a, b]) * factor, 1.5)
         cv2.ellipse(
-            picture, _fixed(centre), _fixed(axes), float(np.degrees(angle)), 0, 360, colour, 1,
+            picture, fixed(centre), fixed(axes), float(np.degrees(angle)), 0, 360, colour, 1,
             cv2.LINE_AA, _FRACTION_BITS,
         )  # fmt: skip
 
@@ -121,15 +121,15 @@ def _write(
             continue
         along = a * np.array([np.cos(angle), np.sin(angle)])
         places = [(np.array([u, v]) + step * along + 0.5) * factor for step in (0, 1, -1)]
-        any(_label(picture, label, place, colour, taken) for place in places)
+        any(write_label(picture, label, place, colour, taken) for place in places)
 
 
-def _fixed(point: Array) -> tuple[int, int]:
+def fixed(point: Array) -> tuple[int, int]:
     x, y = np.rint(point * 2**_FRACTION_BITS).astype(int)
     return int(x), int(y)
 
 
-def _label(
+def write_label(
     picture: Picture,
     label: str,
     centre: Array,
@@ -153,7 +153,7 @@ def _label(
     return True
 
 
-def _legend(lines: list[str], width_px: int) -> Picture:
+def legend(lines: list[str], width_px: int) -> Picture:
     """The lines in dark ink on white, wrapped to the width."""
     import textwrap
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -25,18 +24,17 @@ _BOX_FACES = [[0, 0, 4, 4, 0, 0, 1, 1, 2, 2, 3, 3], [1, 2, 6, 7, 1, 5, 2, 6, 3, 
               [2, 3, 5, 6, 5, 4, 6, 5, 7, 6, 4, 7]]  # fmt: skip
 
 
-def plotly_javascript() -> str:
-    """The library's own JavaScript, from the installed package. Reading it imports no plotly."""
-    file = resources.files("plotly") / "package_data" / "plotly.min.js"
-    return file.read_text(encoding="utf-8")
-
-
 def scene_json(results: CalibrationResults) -> str:
     """Traces and layout for ``Plotly.newPlot``, safe inside a script element."""
     outline = rig_outline(results)
     traces = [t for i, c in enumerate(outline.cameras) for t in _camera_traces(c, i)]
     traces += _target_traces(outline)
-    text = json.dumps({"data": traces, "layout": _layout()}, allow_nan=False)
+    return scene_text(traces)
+
+
+def scene_text(traces: list[Trace], up: tuple[float, float, float] = (0.0, -1.0, 0.0)) -> str:
+    """Traces with a layout for them, safe inside a script element; ``up`` is up on the screen."""
+    text = json.dumps({"data": traces, "layout": _layout(up)}, allow_nan=False)
     return text.replace("</", "<\\/")
 
 
@@ -50,10 +48,10 @@ def _camera_traces(camera: CameraOutline, index: int) -> list[Trace]:
     shared = {"legendgroup": camera.name, "hoverinfo": "name", "name": f"camera {camera.name}"}
     i, j, k = _BOX_FACES
     return [
-        _xyz("mesh3d", body) | shared
+        xyz("mesh3d", body) | shared
         | {"i": i, "j": j, "k": k, "color": colour, "opacity": 0.55, "flatshading": True},
-        _lines(field[_BOX], colour, 1.5) | shared | {"showlegend": True, "opacity": 0.5},
-        _lines(camera.axis_mm, colour, 5) | shared | {"showlegend": False},
+        lines(field[_BOX], colour, 1.5) | shared | {"showlegend": True, "opacity": 0.5},
+        lines(camera.axis_mm, colour, 5) | shared | {"showlegend": False},
     ]  # fmt: skip
 
 
@@ -64,43 +62,43 @@ def _target_traces(outline: RigOutline) -> list[Trace]:
     loops[:, :5] = outline.plates_mm[:, [0, 1, 2, 3, 0]]
     names = [name for name in outline.view_names for _ in range(6)]
     traces = [
-        _lines(loops.reshape(-1, 3), MUTED, 2)
+        lines(loops.reshape(-1, 3), MUTED, 2)
         | {"name": "target, every view", "text": names, "hoverinfo": "text", "showlegend": True},
-        _xyz("scatter3d", outline.plates_mm[:, 0])
+        xyz("scatter3d", outline.plates_mm[:, 0])
         | {"mode": "text", "text": short_names(outline.view_names), "hoverinfo": "skip",
            "textfont": {"size": 10, "color": "#444444"}, "name": "names of the views"},
     ]  # fmt: skip
     corners = outline.plates_mm.reshape(-1, 3)
     if np.linalg.matrix_rank(corners - corners.mean(axis=0), tol=0.1) == 3:
         traces.append(
-            _xyz("mesh3d", corners)
+            xyz("mesh3d", corners)
             | {"alphahull": 0, "color": "#3aa0a0", "opacity": 0.08, "hoverinfo": "skip",
                "name": "calibrated volume", "showlegend": True}
         )  # fmt: skip
     if outline.dots_mm[..., 0].size <= MOST_DOTS:
         marker = {"size": 2, "color": "#333333"}
         traces.append(
-            _xyz("scatter3d", outline.dots_mm.reshape(-1, 3))
+            xyz("scatter3d", outline.dots_mm.reshape(-1, 3))
             | {"mode": "markers", "marker": marker, "name": "dots", "hoverinfo": "x+y+z"}
         )
     return traces
 
 
-def _xyz(kind: str, points_mm: Array) -> Trace:
+def xyz(kind: str, points_mm: Array) -> Trace:
     """Micrometre digits; NaN, which interrupts a line, is null in JSON."""
     columns = [[None if np.isnan(c) else round(float(c), 3) for c in axis] for axis in points_mm.T]
     return {"type": kind, **dict(zip("xyz", columns))}
 
 
-def _lines(points_mm: Array, colour: str, width: float) -> Trace:
-    return _xyz("scatter3d", points_mm) | {
+def lines(points_mm: Array, colour: str, width: float) -> Trace:
+    return xyz("scatter3d", points_mm) | {
         "mode": "lines", "line": {"color": colour, "width": width}, "connectgaps": False,
     }  # fmt: skip
 
 
-def _layout() -> dict[str, Any]:
+def _layout(up: tuple[float, float, float]) -> dict[str, Any]:
     axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
-    view = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.85, "y": -0.8, "z": -1.0}}
+    view = {"up": dict(zip("xyz", up)), "eye": {"x": 0.85, "y": -0.8, "z": -1.0}}
     return {
         "scene": axes | {"aspectmode": "data", "camera": view},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},

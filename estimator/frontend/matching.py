@@ -158,11 +158,14 @@ def _matches(
 def _alternatives(i: int, j: int, probability: Array) -> tuple[Alternative, ...]:
     """Other pairs of these two detections, or none for them, within reach of this pair."""
     least = probability[i, j] * np.exp(-SAFE_NATS)
-    others = [Alternative(i, int(k), float(probability[i, k])) for k in range(probability.shape[1])]
-    others += [Alternative(int(k), j, float(probability[k, j])) for k in range(len(probability))]
+    in_row, in_column = probability[i], probability[:, j]
+    others = [Alternative(i, int(k), float(in_row[k])) for k in np.flatnonzero(in_row >= least)]
+    others += [
+        Alternative(int(k), j, float(in_column[k])) for k in np.flatnonzero(in_column >= least)
+    ]
     others = [a for a in others if (a.first, a.second) != (i, j)]
-    others.append(Alternative(i, -1, max(0.0, 1 - float(probability[i].sum()))))
-    others.append(Alternative(-1, j, max(0.0, 1 - float(probability[:, j].sum()))))
+    others.append(Alternative(i, -1, max(0.0, 1 - float(in_row.sum()))))
+    others.append(Alternative(-1, j, max(0.0, 1 - float(in_column.sum()))))
     return tuple(sorted((a for a in others if a.probability >= least), key=_rank))
 
 

@@ -99,8 +99,10 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
             f"the detections of camera {camera.name!r} lack {', '.join(sorted(missing))}",
             todo="give the table that detect_bubbles returns",
         )
-    uv = table[["u_px", "v_px"]].to_numpy(float)
-    covariance = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
+    uv = np.stack([_column(table, c) for c in ("u_px", "v_px")], -1)
+    covariance = np.stack(
+        [_column(table, c) for c in ("suu_px2", "suv_px2", "suv_px2", "svv_px2")], -1
+    )
     bad = ~(np.isfinite(uv).all(1) & np.isfinite(covariance).all(1))
     if bad.any():
         raise InputError(
@@ -112,12 +114,10 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     mm_by_px = _mm_by_px(camera, uv)
     across = np.einsum("i,nij->nj", (camera.camera_from_rig.rotation @ axis)[:2], mm_by_px)
     middle, height = outline_extent(table, across)
-    flags = _flags(table)
-    known = np.array([not any(w in f for w in NO_SIZE_FLAGS) for f in flags], bool)
-    area = np.pi * (table["a_px"] * table["b_px"]).to_numpy(float)
-    if "area_px2" in table:
-        measured = table["area_px2"].to_numpy(float)
-        area = np.where(measured > 0, measured, area)
+    known, doubt = _trust(table)
+    area = np.pi * _column(table, "a_px") * _column(table, "b_px")
+    measured = _column(table, "area_px2")
+    area = np.where(measured > 0, measured, area)
     area_mm2 = area * np.abs(np.linalg.det(mm_by_px))
     with np.errstate(divide="ignore", invalid="ignore"):
         log_height = np.where(known & (height > 0), np.log(height), np.nan)
@@ -126,7 +126,7 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     return View(
         camera, uv, origin, direction, mm_by_px, covariance.reshape(-1, 2, 2), middle,
         _finite(np.stack([log_height, log_width], -1)), _finite(contrast[:, None]),
-        np.array([max([_DOUBTFUL.get(w, 1.0) for w in f], default=1.0) for f in flags]),
+        doubt,
     )  # fmt: skip
 
 
@@ -166,23 +166,22 @@ def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
 
     The middle is relative to (u_px, v_px). Harmonics are used where they were fitted.
     """
-    a, b = table["a_px"].to_numpy(float), table["b_px"].to_numpy(float)
+    a, b = _column(table, "a_px"), _column(table, "b_px")
     angle = np.nan_to_num(_column(table, "angle_rad"))
     turn = np.stack([np.cos(angle), np.sin(angle)], -1)
     along = (across * turn).sum(-1)
     beside = across[:, 1] * turn[:, 0] - across[:, 0] * turn[:, 1]
     half = np.hypot(a * along, b * beside)
     middle = np.zeros(len(table))
-    shaped = np.zeros(len(table), bool)
-    if set(HARMONIC_COLUMNS) <= set(table.columns):
-        shaped = np.isfinite(table[HARMONIC_COLUMNS].to_numpy(float)).all(1)
+    harmonics = np.stack([_column(table, c) for c in HARMONIC_COLUMNS], -1)
+    shaped = np.isfinite(harmonics).all(1)
     if shaped.any():
         phi = 2 * np.pi * np.arange(_OUTLINE_SAMPLES) / _OUTLINE_SAMPLES
         cosine, sine = np.cos(phi), np.sin(phi)
         a, b, along, beside = (v[shaped, None] for v in (a, b, along, beside))
         normal = (b * cosine * along + a * sine * beside) / np.hypot(b * cosine, a * sine)
         waves = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)])
-        displaced = table.loc[shaped, HARMONIC_COLUMNS].to_numpy(float) @ waves
+        displaced = harmonics[shaped] @ waves
         profile = a * cosine * along + b * sine * beside + normal * displaced
         top, bottom = _peak(profile), -_peak(-profile)
         middle[shaped], half[shaped] = (top + bottom) / 2, (top - bottom) / 2
@@ -206,16 +205,25 @@ def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
     return np.asarray(np.linalg.inv(by_point[..., :2]))
 
 
-def _flags(table: pd.DataFrame) -> list[list[str]]:
-    if "flags" not in table:
-        return [[] for _ in range(len(table))]
-    return [text.split("|") if isinstance(text, str) else [] for text in table["flags"]]
+def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array]:
+    """Whether the size means anything, and the factor for the scatter, by the flags."""
+    known, doubt = np.ones(len(table), bool), np.ones(len(table))
+    if "flags" in table:
+        for i, text in enumerate(table["flags"].tolist()):
+            for word in text.split("|") if isinstance(text, str) and text else ():
+                known[i] &= word not in NO_SIZE_FLAGS
+                doubt[i] = max(doubt[i], _DOUBTFUL.get(word, 1.0))
+    return known, doubt
 
 
 def _column(table: pd.DataFrame, name: str) -> Array:
+    """A column as numbers; NaN where there is none."""
     if name not in table:
         return np.full(len(table), np.nan)
-    return np.asarray(pd.to_numeric(table[name], errors="coerce").to_numpy(float))
+    values = table[name].to_numpy()
+    if values.dtype.kind not in "fiu":
+        values = pd.to_numeric(table[name], errors="coerce").to_numpy()
+    return values.astype(np.float64)
 
 
 def _finite(values: Array) -> Array:

@@ -36,30 +36,40 @@ def marginals(log_odds: Array) -> Array:
     assignments by dynamic programming over subsets); above that loopy belief propagation
     (Williams and Lau, IEEE Trans. AES 50:2942, 2014), which always converges.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     out = np.zeros(log_odds.shape)
-    n1, n2 = log_odds.shape
-    rows, columns = np.nonzero(log_odds > NEGLIGIBLE)
-    if not len(rows):
-        return out
-    graph = coo_array((np.ones(len(rows)), (rows, n1 + columns)), shape=(n1 + n2, n1 + n2))
-    _, label = connected_components(graph, directed=False)
-    for component in np.unique(label[rows]):
-        i = np.flatnonzero(label[:n1] == component)
-        j = np.flatnonzero(label[n1:] == component)
-        part = log_odds[np.ix_(i, j)]
-        part = np.where(part > NEGLIGIBLE, part, -np.inf)
-        if len(i) == len(j) == 1:
-            probability = 1 / (1 + np.exp(-part))
-        elif min(len(i), len(j)) > _EXACT_SIDE:
-            probability = _belief_propagation(part)
+    possible = log_odds > NEGLIGIBLE
+    lone = possible & (possible.sum(1) == 1)[:, None] & (possible.sum(0) == 1)
+    out[lone] = 1 / (1 + np.exp(-log_odds[lone]))
+    for i, j in _components(possible & ~lone):
+        block = np.ix_(i, j)
+        part = np.where(possible[block], log_odds[block], -np.inf)
+        if min(len(i), len(j)) > _EXACT_SIDE:
+            out[block] = _belief_propagation(part)
         elif len(j) <= len(i):
-            probability = _exact(part)
+            out[block] = _exact(part)
         else:
-            probability = _exact(part.T).T
-        out[np.ix_(i, j)] = probability
+            out[block] = _exact(part.T).T
+    return out
+
+
+def _components(possible: NDArray[np.bool_]) -> list[tuple[list[int], list[int]]]:
+    """Rows and columns that hang together."""
+    rows = {int(i): np.flatnonzero(possible[i]).tolist() for i in np.flatnonzero(possible.any(1))}
+    columns = {int(j): np.flatnonzero(possible[:, j]).tolist() for row in rows.values() for j in row}
+    out = []
+    while rows:
+        mine: tuple[list[int], list[int]] = ([], [])
+        todo = [next(iter(rows))]
+        while todo:
+            i = todo.pop()
+            if i not in rows:
+                continue
+            mine[0].append(i)
+            for j in rows.pop(i):
+                if j in columns:
+                    mine[1].append(j)
+                    todo += columns.pop(j)
+        out.append((sorted(mine[0]), sorted(mine[1])))
     return out
 
 

@@ -9,11 +9,12 @@ from telerig.scripts.calibrate import calibrate
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
 from telerig.scripts.simulate import simulate
+from telerig.scripts.track import track
 
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Telecentric stereo self-calibration, with a covariance that is true.",
+    help="Telecentric stereo: self-calibration with a true covariance, bubbles tracked in space.",
 )
 
 
@@ -29,10 +30,10 @@ def _main(
         False, "--version", help="Print the version.", callback=_version, is_eager=True
     ),
 ) -> None:
-    """Calibrate a telecentric stereo rig from hand-held views of a target of dots."""
+    """Calibrate a telecentric stereo rig from hand-held views of dots, and track bubbles with it."""
 
 
-for command in (demo, simulate, detect, calibrate):
+for command in (demo, simulate, detect, calibrate, track):
     app.command()(command)
 
 

@@ -15,10 +15,15 @@ if TYPE_CHECKING:
     from telerig.estimator.calibrate import calibrate as calibrate
     from telerig.estimator.calibration import Calibration as Calibration
     from telerig.estimator.calibration import load_calibration as load_calibration
+    from telerig.estimator.frontend.bubbles import detect_bubbles as detect_bubbles
     from telerig.estimator.frontend.dots import locate_dots as locate_dots
     from telerig.estimator.frontend.target_detection import detect_target as detect_target
+    from telerig.estimator.track_run import track as track
+    from telerig.estimator.tracks import Tracks as Tracks
+    from telerig.estimator.tracks import load_tracks as load_tracks
     from telerig.io.dataset import Dataset as Dataset
     from telerig.io.dataset import load_dataset as load_dataset
+    from telerig.io.run import load_run as load_run
     from telerig.io.simulation import simulate as simulate
     from telerig.io.simulation_presets import SimulationConfig as SimulationConfig
     from telerig.rig.triangulation import Triangulation as Triangulation
@@ -30,11 +35,16 @@ _WHERE = {
     "TelerigError": "telerig.errors",
     "Triangulation": "telerig.rig.triangulation",
     "calibrate": "telerig.estimator.calibrate",
+    "Tracks": "telerig.estimator.tracks",
+    "detect_bubbles": "telerig.estimator.frontend.bubbles",
     "detect_target": "telerig.estimator.frontend.target_detection",
     "load_calibration": "telerig.estimator.calibration",
     "load_dataset": "telerig.io.dataset",
+    "load_run": "telerig.io.run",
+    "load_tracks": "telerig.estimator.tracks",
     "locate_dots": "telerig.estimator.frontend.dots",
     "simulate": "telerig.io.simulation",
+    "track": "telerig.estimator.track_run",
 }
 __all__ = ["__version__", *_WHERE]
 

@@ -1,0 +1,264 @@
+"""Detections to tracks, frame by frame: pairs across the views, ids in time, points in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.estimator.frontend.body import fit_bodies
+from telerig.estimator.frontend.bubble_types import Prediction
+from telerig.estimator.frontend.matching import match_pairs
+from telerig.estimator.frontend.pair_types import PairModel
+from telerig.estimator.track_types import (
+    NO_PARTICLE,
+    FrameIds,
+    FrameMeasurements,
+    FrameResult,
+    SingleMeasurements,
+    TrackEvent,
+)
+from telerig.estimator.tracker import Tracker
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import stacked_jacobian, triangulate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
+_UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+_PER_CAMERA = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
+_PAIRS_AT_ONCE = 2048
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Rows of the two tables that show the same bubble.
+
+    particle : (M,) ids given by the user, -1 where the pair was found here.
+    """
+
+    first: Index
+    second: Index
+    confidence: Array
+    ambiguous: NDArray[np.bool_]
+    particle: Index
+
+
+@dataclass(frozen=True)
+class Linked:
+    """Finished rows of `tracks.csv` and `detections.csv`."""
+
+    tracks: pd.DataFrame
+    detections: pd.DataFrame
+
+
+@dataclass
+class _Frame:
+    """One frame whose ids are not final yet."""
+
+    number: int
+    t_s: float
+    tables: tuple[pd.DataFrame, pd.DataFrame]
+    pairs: Pairs
+    singles: tuple[Index, Index]
+    ids: FrameIds | None = None
+
+
+@dataclass
+class Linker:
+    """Turns frames of detections into finished rows; holds no more than the frames still open."""
+
+    cameras: tuple[Camera, Camera]
+    model: PairModel
+    tracker: Tracker
+    shape_sigma: Array | None
+    events: list[TrackEvent] = field(default_factory=list)
+    _open: dict[int, _Frame] = field(default_factory=dict)
+    _closed: list[_Frame] = field(default_factory=list)
+    _waiting: int = 0
+
+    def add(
+        self,
+        number: int,
+        t_s: float,
+        position_mm: float | None,
+        tables: tuple[pd.DataFrame, pd.DataFrame],
+    ) -> Linked | None:
+        """One frame; returns rows when enough of them are final."""
+        predicted = self.tracker.predict(t_s, position_mm)
+        pairs = pair_frame(tables, self.cameras, self.model, predicted)
+        lonely = _unpaired(tables, pairs)
+        result = self.tracker.update(number, t_s, _measured(self.cameras, tables, pairs, lonely))
+        self._open[number] = _Frame(number, t_s, tables, pairs, lonely)
+        self._settle(result)
+        return self._flush() if self._waiting >= _PAIRS_AT_ONCE else None
+
+    def finish(self) -> Linked | None:
+        """The rows still open at the end of the run."""
+        result = self.tracker.finish()
+        if result is not None:
+            self._settle(result)
+        return self._flush() if self._closed else None
+
+    def _settle(self, result: FrameResult) -> None:
+        self.events.extend(result.events)
+        for ids in result.settled:
+            frame = self._open.pop(ids.frame)
+            frame.ids = ids
+            self._closed.append(frame)
+            self._waiting += 1 + len(frame.pairs.first)
+
+    def _flush(self) -> Linked:
+        frames, self._closed, self._waiting = self._closed, [], 0
+        return Linked(self._tracks(frames), _detections(frames))
+
+    def _tracks(self, frames: Sequence[_Frame]) -> pd.DataFrame:
+        parts = [
+            [f.tables[c].iloc[(f.pairs.first, f.pairs.second)[c]] for f in frames] for c in (0, 1)
+        ]
+        first, second = (pd.concat(part, ignore_index=True) for part in parts)
+        bodies = fit_bodies(first, second, self.cameras, shape_sigma=self.shape_sigma)
+        many = [len(f.pairs.first) for f in frames]
+        table = pd.DataFrame(
+            {
+                "frame": np.repeat([f.number for f in frames], many),
+                "particle": np.concatenate([f.ids.particle for f in frames if f.ids is not None]),
+                "t_s": np.repeat([f.t_s for f in frames], many),
+            }
+        )
+        table[["x_mm", "y_mm", "z_mm"]] = bodies.points_mm
+        table[COVARIANCE_MM2] = bodies.covariance_mm2[:, _UPPER[0], _UPPER[1]]
+        corrections = (bodies.du_px, bodies.dv_px)
+        for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
+            table[[f"{camera.name}_{name}" for name in _PER_CAMERA]] = rows[_PER_CAMERA].to_numpy()
+            table[[f"{camera.name}_du_px", f"{camera.name}_dv_px"]] = corrections[c]
+        table["ray_miss_mm"] = bodies.ray_miss_mm
+        table["d_eq_mm"], table["sd_eq_mm"] = bodies.d_eq_mm, bodies.d_eq_sd_mm
+        table["confidence"] = np.concatenate([f.pairs.confidence for f in frames])
+        table["centre"] = bodies.used
+        table[[f"silhouettes_{x}_mm" for x in "xyz"]] = bodies.silhouette_points_mm
+        ambiguous = np.concatenate([f.pairs.ambiguous for f in frames])
+        table["flags"] = _joined_flags(first["flags"], second["flags"], ambiguous)
+        return table[table["particle"] != NO_PARTICLE].reset_index(drop=True)
+
+
+def pair_frame(
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+    cameras: tuple[Camera, Camera],
+    model: PairModel,
+    predicted: Prediction | None,
+) -> Pairs:
+    """Given ids pair up as they are; the rest is matched."""
+    ids = [_given(table) for table in tables]
+    common = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1])
+    rows = [np.array([np.flatnonzero(i == p)[0] for p in common], np.int64) for i in ids]
+    free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
+    found = match_pairs(
+        tables[0].iloc[free[0]], tables[1].iloc[free[1]], cameras, model, predicted=predicted
+    )
+    none = np.full(len(found), NO_PARTICLE)
+    return Pairs(
+        np.concatenate([rows[0], free[0][found.first]]),
+        np.concatenate([rows[1], free[1][found.second]]),
+        np.concatenate([np.ones(len(common)), found.confidence]),
+        np.concatenate([np.zeros(len(common), bool), found.ambiguous]),
+        np.concatenate([common, none]).astype(np.int64),
+    )
+
+
+def _given(table: pd.DataFrame) -> Index:
+    if "particle" not in table:
+        return np.full(len(table), NO_PARTICLE)
+    return table["particle"].fillna(NO_PARTICLE).to_numpy(np.int64)
+
+
+def _unpaired(tables: tuple[pd.DataFrame, pd.DataFrame], pairs: Pairs) -> tuple[Index, Index]:
+    first, second = (
+        np.setdiff1d(np.arange(len(table)), taken)
+        for table, taken in zip(tables, (pairs.first, pairs.second))
+    )
+    return first, second
+
+
+def _pixels(table: pd.DataFrame) -> tuple[Array, Array]:
+    """(N, 2) centres and (N, 2, 2) covariances."""
+    covariance = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
+    return table[["u_px", "v_px"]].to_numpy(float), covariance.reshape(-1, 2, 2)
+
+
+def _measured(
+    cameras: tuple[Camera, Camera],
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+    pairs: Pairs,
+    lonely: tuple[Index, Index],
+) -> FrameMeasurements:
+    (uv_a, cov_a), (uv_b, cov_b) = (_pixels(table) for table in tables)
+    found = triangulate(
+        cameras, (uv_a[pairs.first], uv_b[pairs.second]), (cov_a[pairs.first], cov_b[pairs.second])
+    )
+    singles = SingleMeasurements(
+        np.repeat([0, 1], [len(i) for i in lonely]).astype(np.int64),
+        np.concatenate([uv_a[lonely[0]], uv_b[lonely[1]]]),
+        np.concatenate([cov_a[lonely[0]], cov_b[lonely[1]]]),
+    )
+    return FrameMeasurements.create(
+        found.points_mm,
+        found.covariance_mm2,
+        d_eq_mm=_diameter_mm(cameras, tables, pairs, found.points_mm),
+        confidence=pairs.confidence,
+        particle=pairs.particle,
+        singles=singles,
+    )
+
+
+def _diameter_mm(
+    cameras: tuple[Camera, Camera],
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+    pairs: Pairs,
+    points_mm: Array,
+) -> Array:
+    """(M,) geometric mean of the two views' equivalent diameters, NaN where unknown."""
+    if not len(points_mm) or not all("d_eq_px" in table for table in tables):
+        return np.full(len(points_mm), np.nan)
+    _, jacobian, _ = stacked_jacobian(cameras, points_mm)
+    product = np.ones(len(points_mm))
+    for c, rows in enumerate((pairs.first, pairs.second)):
+        view = jacobian[:, 2 * c : 2 * c + 2]
+        px_per_mm = np.linalg.det(view @ np.swapaxes(view, -1, -2)) ** 0.25
+        product *= tables[c]["d_eq_px"].to_numpy(float)[rows] / px_per_mm
+    return np.sqrt(product)
+
+
+def _detections(frames: Sequence[_Frame]) -> pd.DataFrame:
+    """Every detection with the id of its track, blank where it has none."""
+    tables = []
+    for frame in frames:
+        assert frame.ids is not None
+        first = len(frame.singles[0])
+        singles = (frame.ids.single[:first], frame.ids.single[first:])
+        for c, rows in enumerate((frame.pairs.first, frame.pairs.second)):
+            particle = np.full(len(frame.tables[c]), NO_PARTICLE)
+            particle[rows] = frame.ids.particle
+            particle[frame.singles[c]] = singles[c]
+            given = _given(frame.tables[c])
+            particle = np.where(given != NO_PARTICLE, given, particle)
+            known = pd.array(particle, dtype="Int64")
+            known[particle == NO_PARTICLE] = pd.NA
+            tables.append(frame.tables[c].assign(particle=known))
+    joined = pd.concat(tables, ignore_index=True)
+    leading = ["frame", "camera", "particle"]
+    return joined[leading + [name for name in joined if name not in leading]]
+
+
+def _joined_flags(
+    first: pd.Series[str], second: pd.Series[str], ambiguous: NDArray[np.bool_]
+) -> list[str]:
+    """The flags of both views, each word once."""
+    return [
+        "|".join(sorted({*filter(None, (a or "").split("|") + (b or "").split("|"))} | extra))
+        for a, b, extra in zip(first, second, ({"ambiguous"} if x else set() for x in ambiguous))
+    ]

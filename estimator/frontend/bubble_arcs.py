@@ -174,17 +174,22 @@ def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
     Short arcs lean towards circles: a - b and the shear carry a prior of 12 % of the radius.
     """
     sizes = np.array([len(arc) for arc in arcs])
-    first, owner = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(arcs)), sizes)
-    u, v = np.concatenate(arcs).T
+    first = np.cumsum(sizes) - sizes
+    points = np.concatenate(arcs)
+    origin = np.mean(points, axis=0)
+    u, v = (points - origin).astype(np.float32).T
     ellipse = _circles(arcs)
+    ellipse[:, :2] -= origin
     radius = ellipse[:, 2].copy()
+    basis = np.empty((ELLIPSE_PARAMETERS, u.size), dtype=np.float32)
     for _ in range(_ROUNDS):
-        foot = foot_points(ellipse, owner, u, v, rounds=2)
-        basis = ellipse_basis(ellipse, owner, foot)
+        foot = foot_points(ellipse, sizes, u, v)
+        ellipse_basis(foot, basis)
         weight = 1.0 / (_POINT_SIGMA_PX**2 * (1.0 + (foot.distance / 0.6) ** 2))
         products = np.add.reduceat(basis[:, None] * basis[None] * weight, first, axis=2)
         pull = np.add.reduceat(basis * (weight * foot.distance), first, axis=1).T
-        information = np.moveaxis(products, 2, 0)
+        information = np.moveaxis(products, 2, 0).astype(np.float64)
+        pull = pull.astype(np.float64)
         _add_roundness(information, pull, ellipse, _ROUND_SHARE * radius)
         step = np.linalg.solve(information, pull[..., None])[..., 0]
         reach = np.max(np.abs(step), axis=1)
@@ -192,7 +197,8 @@ def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
         ellipse, _ = moved(ellipse, step)
         if np.max(reach) < 0.01:
             break
-    gap = foot_points(ellipse, owner, u, v, rounds=2).distance
+    gap = foot_points(ellipse, sizes, u, v).distance
+    ellipse[:, :2] += origin
     return ellipse, np.sqrt(np.add.reduceat(gap**2, first) / sizes)
 
 

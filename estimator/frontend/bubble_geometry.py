@@ -7,6 +7,7 @@ outlines of different length need no padding.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from telerig.estimator.frontend.bubble_types import HARMONICS
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Index = NDArray[np.intp]
 
 ELLIPSE_PARAMETERS = 5
@@ -23,16 +25,23 @@ ELLIPSE_PARAMETERS = 5
 @dataclass(frozen=True)
 class Foot:
     """Nearest point of each point's ellipse: eccentric anomaly as (cos, sin), ``distance``
-    outside the ellipse, ``speed`` |dp/dphi| and ``curvature`` there."""
+    outside the ellipse, ``speed`` |dp/dphi|, ``curvature`` and outward ``normal`` (2, N) there,
+    the latter along the ellipse's axes."""
 
-    cos: Array
-    sin: Array
-    distance: Array
-    speed: Array
-    curvature: Array
+    cos: Floats
+    sin: Floats
+    distance: Floats
+    speed: Floats
+    curvature: Floats
+    normal: Floats
 
 
-def rough_distance(ellipse: Array, u: Array, v: Array) -> Array:
+def spread(values: Array, counts: Index) -> NDArray[np.float32]:
+    """Values (..., B) repeated for the points of each of B owners: (..., N), single precision."""
+    return np.repeat(np.asarray(values, dtype=np.float32), counts, axis=-1)
+
+
+def rough_distance(ellipse: Array, u: Floats, v: Floats) -> Array:
     """Distance of points outside ellipses (..., 5) by (g - 1) / |grad g|; broadcasts."""
     cos, sin = np.cos(ellipse[..., 4]), np.sin(ellipse[..., 4])
     a, b = ellipse[..., 2], ellipse[..., 3]
@@ -44,50 +53,54 @@ def rough_distance(ellipse: Array, u: Array, v: Array) -> Array:
     return distance
 
 
-def foot_points(ellipse: Array, owner: Index, u: Array, v: Array, *, rounds: int = 3) -> Foot:
-    """Nearest points on the ellipses ``ellipse[owner]`` (N, 5) to points (u, v).
+def foot_points(ellipse: Array, counts: Index, u: Floats, v: Floats, *, rounds: int = 2) -> Foot:
+    """Nearest points on ellipses (B, 5) to points (u, v) (N,), ``counts`` (B,) for each in turn.
 
-    Iteration by the evolute's centre of curvature: no trigonometry, three rounds are exact to
-    1e-6 px near the outline of an ellipse of axis ratio 2.
+    Iteration by the evolute's centre of curvature: no trigonometry, two rounds are exact to
+    1e-4 px near the outline of an ellipse of axis ratio 2. In the precision of ``u``; the caller
+    keeps coordinates near zero.
     """
-    per = np.stack(
-        [ellipse[:, 0], ellipse[:, 1], ellipse[:, 2], ellipse[:, 3]]
-        + [np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])]
-    )
-    u0, v0, a, b, turn_cos, turn_sin = per.take(owner, axis=1)
-    du, dv = u - u0, v - v0
-    x, y = du * turn_cos + dv * turn_sin, dv * turn_cos - du * turn_sin
-    cos, sin = x / a, y / b
-    norm = 1.0 / np.sqrt(cos * cos + sin * sin + 1e-18)
-    cos, sin = cos * norm, sin * norm
-    focal_a, focal_b = (a * a - b * b) / a, (a * a - b * b) / b
+    a, b = ellipse[:, 2], ellipse[:, 3]
+    cos, sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
+    along = -(ellipse[:, 0] * cos + ellipse[:, 1] * sin)
+    across = ellipse[:, 0] * sin - ellipse[:, 1] * cos
+    focal = (a * a - b * b) / np.stack([a * a, b * b])
+    per = np.stack([cos, sin, along, across, a, b, 1.0 / a, 1.0 / b, *focal])
+    cos, sin, along, across, a, b, per_a, per_b, focal_a, focal_b = spread(per, counts)
+    x = u * cos + v * sin + along
+    y = v * cos - u * sin + across
+    x_unit, y_unit = x * per_a, y * per_b
+    scale = 1.0 / np.sqrt(x_unit * x_unit + y_unit * y_unit + 1e-12)
+    cos, sin = x_unit * scale, y_unit * scale
     for _ in range(rounds):
-        evolute_x, evolute_y = focal_a * cos**3, -focal_b * sin**3
-        radius = np.hypot(a * cos - evolute_x, b * sin - evolute_y)
-        away_x, away_y = x - evolute_x, y - evolute_y
-        scale = radius / (np.sqrt(away_x * away_x + away_y * away_y) + 1e-12)
-        cos, sin = (away_x * scale + evolute_x) / a, (away_y * scale + evolute_y) / b
-        norm = 1.0 / np.sqrt(cos * cos + sin * sin + 1e-18)
-        cos, sin = cos * norm, sin * norm
-    speed = np.sqrt((a * sin) ** 2 + (b * cos) ** 2)
-    distance = ((x - a * cos) * b * cos + (y - b * sin) * a * sin) / speed
-    return Foot(cos, sin, distance, speed, a * b / speed**3)
+        # In units of a along x and of b along y.
+        evolute_x, evolute_y = focal_a * cos * cos * cos, -focal_b * sin * sin * sin
+        ahead = np.square((cos - evolute_x) * a) + np.square((sin - evolute_y) * b)
+        away_x, away_y = x_unit - evolute_x, y_unit - evolute_y
+        scale = np.sqrt(ahead / (np.square(away_x * a) + np.square(away_y * b) + 1e-12))
+        cos, sin = away_x * scale + evolute_x, away_y * scale + evolute_y
+        scale = 1.0 / np.sqrt(cos * cos + sin * sin + 1e-12)
+        cos, sin = cos * scale, sin * scale
+    normal = np.stack([b * cos, a * sin])
+    inverse_speed = 1.0 / np.sqrt(normal[0] * normal[0] + normal[1] * normal[1])
+    normal *= inverse_speed
+    distance = (x - a * cos) * normal[0] + (y - b * sin) * normal[1]
+    curvature = a * b * inverse_speed * inverse_speed * inverse_speed
+    return Foot(cos, sin, distance, 1.0 / inverse_speed, curvature, normal)
 
 
-def ellipse_basis(ellipse: Array, owner: Index, foot: Foot) -> Array:
+def ellipse_basis(foot: Foot, out: Floats) -> None:
     """Outward displacement (5, N) of the outline by centre (along a, along b), a, b and shear."""
-    a, b = ellipse[:, 2].take(owner), ellipse[:, 3].take(owner)
-    normal_x, normal_y = b * foot.cos / foot.speed, a * foot.sin / foot.speed
-    basis = np.empty((ELLIPSE_PARAMETERS, owner.size))
-    basis[0], basis[1] = normal_x, normal_y
-    basis[2], basis[3] = normal_x * foot.cos, normal_y * foot.sin
-    basis[4] = normal_x * foot.sin + normal_y * foot.cos
-    return basis
+    out[:2] = foot.normal
+    np.multiply(foot.normal[0], foot.cos, out=out[2])
+    np.multiply(foot.normal[1], foot.sin, out=out[3])
+    np.multiply(foot.normal[0], foot.sin, out=out[4])
+    out[4] += foot.normal[1] * foot.cos
 
 
-def harmonic_basis(cos: Array, sin: Array) -> Array:
+def harmonic_basis(cos: Floats, sin: Floats) -> Floats:
     """(8, N): cos k phi, sin k phi for the orders in HARMONICS, from cos phi and sin phi."""
-    basis = np.empty((2 * len(HARMONICS), cos.size))
+    basis = np.empty((2 * len(HARMONICS), cos.size), dtype=cos.dtype)
     real, imaginary = cos, sin
     for order in range(2, HARMONICS[-1] + 1):
         real, imaginary = real * cos - imaginary * sin, real * sin + imaginary * cos

@@ -4,51 +4,59 @@ The model of a pixel is ``outer + (inner - outer) F``, with F the profile of a b
 (:mod:`bubble_profile`) at the pixel's distance from the outline and the ellipse's curvature there;
 the outline is an ellipse with normal displacements of orders 3 to 6 in the eccentric anomaly. In
 that parametrisation the centre is orthogonal to the harmonics (b cos phi / h times cos k phi,
-integrated along the arc h dphi, is zero), so fitting them costs a whole outline nothing.
+integrated along the arc h dphi, is zero), so fitting them costs a whole outline nothing. Where a
+part is hidden it does, and the shapes of the frame's whole outlines serve as prior.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.frontend.bubble_geometry import (
-    ELLIPSE_PARAMETERS,
-    Foot,
-    ellipse_basis,
-    foot_points,
-    harmonic_basis,
-    moved,
-    turned_harmonics,
-)
+from telerig.estimator.frontend.bubble_geometry import Index, moved, spread, turned_harmonics
 from telerig.estimator.frontend.bubble_pixels import Pixels, rim_pixels, unlike_rim
-from telerig.estimator.frontend.bubble_profile import rim_profile
-from telerig.estimator.frontend.bubble_types import HARMONICS
+from telerig.estimator.frontend.bubble_prior import (
+    ShapePrior,
+    learnt_prior,
+    prior_equations,
+    weak_prior,
+)
+from telerig.estimator.frontend.bubble_rim_model import (
+    BLUR,
+    FIRST_HARMONIC,
+    INNER,
+    OUTER,
+    PARAMETERS,
+    Linear,
+    RimState,
+    linearised,
+    normal_equations,
+    rim_model,
+)
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 PIXEL_VARIANCE_PX2 = 1.0 / 12.0
-_BLUR, _OUTER, _INNER, _FIRST_HARMONIC = 5, 6, 7, 8
-_PARAMETERS = _FIRST_HARMONIC + 2 * len(HARMONICS)
 _MIN_SIGMA_PX = 0.3
-_INNER_SPREAD = 0.3
-_OUTER_SPREAD = 0.3
-_WHOLE_HARMONIC, _PARTIAL_HARMONIC = 0.25, 0.02
-_RESOLVED = 3.0
 _OUTLIER_SIGMA = 4.5
-_FULL_COVERAGE = 0.9
+_WHOLE = 0.9
 _BINS = 32
+_STEPS = 3
+_FAR_SHIFT_PX, _CONVERGED_PX = 0.25, 0.02
+_HIDING_SIGMA = 3.0
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where the fits begin: ``ellipse`` (B, 5), ``blur_px`` and ``inner`` level (B,), noise
-    ``sigma_outer`` and ``sigma_inner`` (B,) as shares of the background's level."""
+    """Where the fits begin: ``ellipse`` (B, 5), ``harmonics`` (B, 8), ``blur_px`` and ``inner``
+    level (B,), noise ``sigma_outer`` and ``sigma_inner`` (B,) as shares of the background."""
 
     ellipse: Array
+    harmonics: Array
     blur_px: Array
     inner: Array
     sigma_outer: Array
@@ -57,151 +65,234 @@ class Start:
     def __len__(self) -> int:
         return int(self.ellipse.shape[0])
 
+    def __getitem__(self, index: Index) -> Start:
+        return Start(*(getattr(self, field.name)[index] for field in fields(self)))
+
 
 @dataclass(frozen=True)
 class Outlines:
     """Fitted outlines of B bubbles.
 
-    ``ellipse`` (B, 5), ``harmonics`` (B, 8; NaN where not fitted), ``blur_px`` without the pixel,
-    ``outer`` and ``inner`` levels, ``centre_covariance_px2`` (B, 2, 2), ``sigma_outline_px``,
-    ``chi2_dof``, ``coverage`` (share of the outline that was seen), ``misfit_px`` (spread of the
-    edge about the outline), ``converged``; ``inner_ratio``, the variance of what is left inside
-    relative to that outside.
+    ``ellipse`` (B, 5), ``harmonics`` (B, 8; 0 where ``resolved`` is False), ``sigma_px`` blur of
+    optics and pixel, ``outer`` and ``inner`` levels, ``centre_covariance_px2`` (B, 2, 2),
+    ``sigma_outline_px`` of a harmonic's coefficient, ``chi2_dof``, ``coverage`` (share of the
+    outline that was seen), ``shift_px`` (largest displacement since the linearisation) and
+    ``step_px`` (the last one).
     """
 
     ellipse: Array
     harmonics: Array
-    blur_px: Array
+    resolved: Mask
+    sigma_px: Array
     outer: Array
     inner: Array
     centre_covariance_px2: Array
     sigma_outline_px: Array
     chi2_dof: Array
     coverage: Array
-    misfit_px: Array
-    converged: Mask
+    shift_px: Array
+    step_px: Array
+
+    @property
+    def blur_px(self) -> Array:
+        """Blur (B,) of the optics alone."""
+        blur: Array = np.sqrt(np.maximum(self.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0))
+        return blur
+
+    def state(self, index: Index) -> RimState:
+        """The outlines ``index`` as a point to go on from."""
+        every = (self.ellipse, self.harmonics, self.sigma_px, self.outer, self.inner)
+        return RimState(*(values[index] for values in every))
+
+    def updated(self, index: Index, other: Outlines) -> Outlines:
+        """These outlines with those at ``index`` replaced by ``other``."""
+        changed = {}
+        for field in fields(self):
+            changed[field.name] = getattr(self, field.name).copy()
+            changed[field.name][index] = getattr(other, field.name)
+        return Outlines(**changed)
 
 
-@dataclass(frozen=True)
-class _State:
-    ellipse: Array
-    harmonics: Array
-    sigma: Array
-    outer: Array
-    inner: Array
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """Everything about one linearisation point that stays while the outline moves a little."""
-
-    foot: Foot
-    shape: Array
-    curvature: Array
-
-
-def fit_outlines(ratio: NDArray[np.float32], start: Start, *, rounds: int = 3) -> Outlines:
+def fit_outlines(ratio: NDArray[np.float32], start: Start) -> Outlines:
     """Fit B outlines to the normalised image ``ratio`` (grey over background).
 
     Pixels inside or near another bubble of ``start`` are left out, and so are hearts, dirt and
-    whatever else is unlike a rim.
+    whatever else is unlike a rim. A first look at some of the pixels brings blur and levels; the
+    fit to all is repeated for outlines that moved far or are partly hidden.
     """
-    sigma = np.sqrt(start.blur_px**2 + PIXEL_VARIANCE_PX2)
-    state = _State(
+    everyone = np.arange(len(start))
+    state = RimState(
         start.ellipse,
-        np.zeros((len(start), 2 * len(HARMONICS))),
-        sigma,
+        start.harmonics,
+        np.sqrt(start.blur_px**2 + PIXEL_VARIANCE_PX2),
         np.ones(len(start)),
         start.inner,
     )
-    pixels = rim_pixels(ratio, start.ellipse, 1.2 * sigma)
-    for index in range(rounds):
-        last = index == rounds - 1
-        linear = _linearised(state, pixels)
-        used = _window(state, pixels, linear, start, first=index == 0)
-        state, step = _descend(
-            state, pixels, linear, used, start, harmonics=index > 0, steps=1 if last else 2
+    state = _first_look(ratio, state, start)
+    fit = _refined(ratio, state, start, state, everyone, weak_prior(len(start)))
+    partial = fit.coverage < _WHOLE
+    again = np.flatnonzero(partial | (fit.shift_px > _FAR_SHIFT_PX))
+    for _ in range(2):
+        if again.size == 0:
+            break
+        prior = learnt_prior(fit.ellipse, fit.harmonics, fit.resolved & ~partial, partial)
+        near = _refined(
+            ratio, fit.state(again), start[again], fit.state(everyone), again, prior[again]
         )
-    return _result(state, step, pixels, linear, used, start)
+        fit = fit.updated(again, near)
+        again = again[near.shift_px > _FAR_SHIFT_PX]
+    return fit
 
 
-def _linearised(state: _State, pixels: Pixels) -> _Linear:
-    foot = foot_points(state.ellipse, pixels.owner, pixels.u, pixels.v)
-    order = np.repeat(np.array(HARMONICS, dtype=np.float64), 2)
-    radius = np.sqrt(state.ellipse[:, 2] * state.ellipse[:, 3])
-    gain = np.exp(-(order**2 - 1.0) * ((state.sigma / radius) ** 2)[:, None] / 2.0)
-    shape = np.empty((ELLIPSE_PARAMETERS + order.size, pixels.owner.size))
-    shape[:ELLIPSE_PARAMETERS] = ellipse_basis(state.ellipse, pixels.owner, foot)
-    shape[ELLIPSE_PARAMETERS:] = harmonic_basis(foot.cos, foot.sin)
-    shape[ELLIPSE_PARAMETERS:] *= gain.T.take(pixels.owner, axis=1)
-    return _Linear(foot, shape, foot.curvature)
+def _first_look(ratio: NDArray[np.float32], state: RimState, start: Start) -> RimState:
+    """Ellipse, blur and levels from a share of the pixels within a narrow band."""
+    pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state), thin=True)
+    linear = linearised(state, pixels)
+    distance, sigma = _distance(state, pixels, linear), spread(state.sigma, pixels.counts)
+    depth = np.minimum(2.0 * state.sigma + 0.5, 0.45 * state.ellipse[:, 3])
+    used = (distance > -spread(depth, pixels.counts)) & (distance < 2.5 * sigma + 1.0)
+    everyone = np.arange(len(start))
+    used &= ~pixels.hidden(state.ellipse, state.ellipse, _HIDING_SIGMA * state.sigma, everyone)
+    weight = used * spread(1.0 / start.sigma_outer**2, pixels.counts)
+    prior = weak_prior(len(start), held=True)
+    descent = _descend(state, pixels, linear, weight, start, prior, steps=2)
+    return _moved(descent.state, descent.shifts)
 
 
-def _model(
-    state: _State, pixels: Pixels, linear: _Linear, moved_by: Array
-) -> tuple[Array, Array, Array]:
-    """Grey (N,), its Jacobian (16, N) and the share of light lost F (N,).
+def _bulge(state: RimState) -> Array:
+    bulge: Array = np.sum(np.abs(state.harmonics), axis=1)
+    return bulge
 
-    ``moved_by`` (B, 13): outline displacements since the linearisation.
-    """
-    owner = pixels.owner
-    shift = np.einsum("kn,kn->n", linear.shape, moved_by.T.take(owner, axis=1))
-    per = np.stack([1.0 / state.sigma, state.inner - state.outer, state.outer])
-    inverse_sigma, contrast, outer = per.take(owner, axis=1)
-    distance = (linear.foot.distance - shift) * inverse_sigma
-    curvature = linear.curvature / inverse_sigma
-    profile = rim_profile(distance, curvature)
-    jacobian = np.empty((_PARAMETERS, owner.size))
-    slope = contrast * profile.by_distance * inverse_sigma
-    np.multiply(linear.shape[:ELLIPSE_PARAMETERS], -slope, out=jacobian[:ELLIPSE_PARAMETERS])
-    np.multiply(linear.shape[ELLIPSE_PARAMETERS:], -slope, out=jacobian[_FIRST_HARMONIC:])
-    jacobian[_BLUR] = contrast * inverse_sigma * (
-        profile.by_curvature * curvature - profile.by_distance * distance
-    )
-    jacobian[_OUTER] = 1.0 - profile.value
-    jacobian[_INNER] = profile.value
-    return outer + contrast * profile.value, jacobian, profile.value
+
+def _distance(state: RimState, pixels: Pixels, linear: Linear) -> Single:
+    bump = linear.displacements(pixels, _shifts(state))
+    return np.asarray(linear.foot.distance - bump, dtype=np.float32)
+
+
+def _shifts(state: RimState) -> Array:
+    return np.concatenate([np.zeros_like(state.ellipse), state.harmonics], axis=1)
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where Gauss-Newton stands: ``shifts`` (B, 13) since the linearisation, covariance
+    (B, 16, 16) and what is left of the grey levels (N,)."""
+
+    state: RimState
+    shifts: Array
+    covariance: Array
+    residual: Single
+    step_px: Array
+
+
+def _refined(
+    ratio: NDArray[np.float32],
+    state: RimState,
+    start: Start,
+    everyone: RimState,
+    own: Index,
+    prior: ShapePrior,
+) -> Outlines:
+    """One linearisation: pixels, window, steps, results of the bubbles ``own`` of everyone."""
+    pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state))
+    linear = linearised(state, pixels)
+    hidden = pixels.hidden(state.ellipse, everyone.ellipse, _HIDING_SIGMA * everyone.sigma, own)
+    weight = _window(state, pixels, linear, start, hidden)
+    prior = prior.held_where(~linear.resolved)
+    descent = _descend(state, pixels, linear, weight, start, prior, steps=_STEPS)
+    return _result(descent, pixels, linear, weight)
 
 
 def _window(
-    state: _State, pixels: Pixels, linear: _Linear, start: Start, *, first: bool
-) -> Array:
+    state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Mask
+) -> Single:
     """Weights (N,): inverse variances, 0 for what must not be looked at."""
-    owner = pixels.owner
-    none = np.zeros((len(start), linear.shape.shape[0]))
-    none[:, ELLIPSE_PARAMETERS:] = state.harmonics
-    grey, _, inside = _model(state, pixels, linear, none)
-    variance_out, variance_in = start.sigma_outer**2, start.sigma_inner**2
-    variance = variance_out[owner] + (variance_in - variance_out)[owner] * inside
-    sigma, minor = state.sigma[owner], state.ellipse[:, 3].take(owner)
-    distance = linear.foot.distance
-    if first:
-        depth = np.minimum(2.0 * sigma + 0.5, 0.45 * minor)
-        kept = (distance > -depth) & (distance < 2.5 * sigma + 1.0)
-    else:
-        kept = (distance > -(3.0 * sigma + 0.5)) & (distance < 3.0 * sigma + 0.5)
-    residual = (pixels.value - grey) / np.sqrt(variance)
-    kept &= ~pixels.hidden(state.ellipse, 3.0 * state.sigma)
-    if not first:
-        contrast = (state.outer - state.inner) / np.sqrt(variance_out)
-        kept &= ~unlike_rim(pixels, linear.foot, residual, state.sigma, contrast)
-        spread = _per_bubble_spread(residual, pixels, kept)
-        kept &= np.abs(residual) < _OUTLIER_SIGMA * np.maximum(spread, 1.0)[owner]
-    return np.where(kept, 1.0 / variance, 0.0)
+    counts = pixels.counts
+    grey, _, inside = rim_model(state, pixels, linear, _shifts(state))
+    outside, change = start.sigma_outer**2, start.sigma_inner**2 - start.sigma_outer**2
+    inverse = 1.0 / (spread(outside, counts) + spread(change, counts) * inside)
+    distance, sigma = _distance(state, pixels, linear), spread(state.sigma, counts)
+    kept = (np.abs(distance) < 3.0 * sigma + 0.5) & ~hidden
+    residual = (pixels.value - grey) * np.sqrt(inverse)
+    contrast = (state.outer - state.inner) / start.sigma_outer
+    kept &= ~unlike_rim(pixels, linear.foot, distance, residual, state.sigma, contrast)
+    limit = _OUTLIER_SIGMA * np.maximum(_typical_residual(residual, pixels, kept), 1.0)
+    kept &= np.abs(residual) < spread(limit, counts)
+    weight: Single = inverse * kept
+    return weight
 
 
-def _per_bubble_spread(residual: Array, pixels: Pixels, kept: Mask) -> Array:
-    spread = np.ones(pixels.bubbles)
+def _typical_residual(residual: Single, pixels: Pixels, kept: Mask) -> Array:
+    typical = np.ones(pixels.bubbles)
     for index, part in enumerate(pixels.parts()):
         own = np.abs(residual[part][kept[part]])
         if own.size > 8:
-            spread[index] = 1.4826 * np.partition(own, own.size // 2)[own.size // 2]
-    return spread
+            typical[index] = 1.4826 * np.partition(own, own.size // 2)[own.size // 2]
+    return typical
 
 
-def _coverage(pixels: Pixels, linear: _Linear, used: Array, sigma: Array) -> Array:
+def _descend(
+    state: RimState,
+    pixels: Pixels,
+    linear: Linear,
+    weight: Single,
+    start: Start,
+    prior: ShapePrior,
+    *,
+    steps: int,
+) -> _Descent:
+    """Gauss-Newton at fixed feet."""
+    shifts = _shifts(state)
+    for index in range(steps):
+        grey, jacobian, _ = rim_model(state, pixels, linear, shifts)
+        residual = pixels.value - grey
+        information, pull = normal_equations(jacobian, residual, weight, pixels)
+        prior_equations(information, pull, state, shifts, start.inner, prior)
+        step, covariance = _solved(information, pull)
+        step = _limited(step, state)
+        shifts = shifts + np.delete(step, (BLUR, OUTER, INNER), axis=1)
+        state = replace(
+            state,
+            sigma=np.maximum(state.sigma + step[:, BLUR], _MIN_SIGMA_PX),
+            outer=state.outer + step[:, OUTER],
+            inner=state.inner + step[:, INNER],
+        )
+        reach = np.max(np.abs(step[:, :BLUR]), axis=1)
+        if index + 1 == steps or float(np.max(reach)) < _CONVERGED_PX:
+            break
+    for part, own in zip(pixels.parts(), step.astype(np.float32), strict=True):
+        residual[part] -= own @ jacobian[:, part]
+    return _Descent(state, shifts, covariance, residual, reach)
+
+
+def _solved(information: Array, pull: Array) -> tuple[Array, Array]:
+    """Steps (B, 16) and covariances (B, 16, 16)."""
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", information), 1e-12))
+    equilibrated = information * scale[:, :, None] * scale[:, None, :]
+    diagonal = np.arange(PARAMETERS)
+    equilibrated[:, diagonal, diagonal] += 1e-7
+    covariance = np.linalg.inv(equilibrated) * scale[:, :, None] * scale[:, None, :]
+    step: Array = (covariance @ pull[..., None])[..., 0]
+    return step, covariance
+
+
+def _limited(step: Array, state: RimState) -> Array:
+    """Steps that keep within the range where the linearisation holds."""
+    reach = np.max(np.abs(step[:, :BLUR]), axis=1)
+    share = np.minimum(1.0, np.minimum(1.5, 0.3 * state.ellipse[:, 3]) / (reach + 1e-12))
+    share = np.minimum(share, 0.4 * state.sigma / (np.abs(step[:, BLUR]) + 1e-12))
+    return step * share[:, None]
+
+
+def _moved(state: RimState, shifts: Array) -> RimState:
+    ellipse, turn = moved(state.ellipse, shifts[:, :BLUR])
+    return replace(state, ellipse=ellipse, harmonics=turned_harmonics(shifts[:, BLUR:], turn))
+
+
+def _coverage(pixels: Pixels, linear: Linear, weight: Single, sigma: Array) -> Array:
     """Share of the outline (B,) at which pixels at the edge were looked at."""
-    near = (used > 0.0) & (np.abs(linear.foot.distance) < 1.2 * sigma[pixels.owner] + 0.3)
+    near = np.abs(linear.foot.distance) < spread(1.2 * sigma + 0.3, pixels.counts)
+    near = np.flatnonzero(near & (weight > 0.0))
     angle = np.arctan2(linear.foot.sin[near], linear.foot.cos[near])
     slot = ((angle + np.pi) * (_BINS / (2.0 * np.pi))).astype(np.intp) % _BINS
     seen = np.bincount(pixels.owner[near] * _BINS + slot, minlength=pixels.bubbles * _BINS)
@@ -209,146 +300,28 @@ def _coverage(pixels: Pixels, linear: _Linear, used: Array, sigma: Array) -> Arr
     return share
 
 
-def _prior(state: _State, start: Start, coverage: Array, *, harmonics: bool) -> Array:
-    """Information (B, 16) of the weak priors; infinite stands for a parameter held at zero."""
-    information = np.zeros((len(start), _PARAMETERS))
-    information[:, _OUTER] = 1.0 / _OUTER_SPREAD**2
-    information[:, _INNER] = 1.0 / _INNER_SPREAD**2
-    radius = np.sqrt(state.ellipse[:, 2] * state.ellipse[:, 3])
-    share = np.where(coverage >= _FULL_COVERAGE, _WHOLE_HARMONIC, _PARTIAL_HARMONIC)
-    information[:, _FIRST_HARMONIC:] = (1.0 / (share * radius) ** 2)[:, None]
-    if not harmonics:
-        information[:, _FIRST_HARMONIC:] = 1e12
-    information[~_resolved(state), _FIRST_HARMONIC:] = 1e12
-    return information
-
-
-def _resolved(state: _State) -> Mask:
-    resolved: Mask = state.ellipse[:, 3] > _RESOLVED * state.sigma
-    return resolved
-
-
-def _normal_equations(
-    jacobian: Array, residual: Array, weight: Array, pixels: Pixels
-) -> tuple[Array, Array]:
-    information = np.empty((pixels.bubbles, _PARAMETERS, _PARAMETERS))
-    pull = np.empty((pixels.bubbles, _PARAMETERS))
-    weighted = jacobian * weight
-    for index, part in enumerate(pixels.parts()):
-        information[index] = weighted[:, part] @ jacobian[:, part].T
-        pull[index] = weighted[:, part] @ residual[part]
-    return information, pull
-
-
-def _descend(
-    state: _State,
-    pixels: Pixels,
-    linear: _Linear,
-    used: Array,
-    start: Start,
-    *,
-    harmonics: bool,
-    steps: int,
-) -> tuple[_State, Array]:
-    """Gauss-Newton at fixed feet, then the outline moved; also the size of the last step (B,)."""
-    shifts = np.zeros((len(start), linear.shape.shape[0]))
-    shifts[:, ELLIPSE_PARAMETERS:] = state.harmonics
-    prior = _prior(
-        state, start, _coverage(pixels, linear, used, state.sigma), harmonics=harmonics
-    )
-    for _ in range(steps):
-        grey, jacobian, _ = _model(state, pixels, linear, shifts)
-        information, pull = _normal_equations(jacobian, pixels.value - grey, used, pixels)
-        pull[:, _OUTER] -= prior[:, _OUTER] * (state.outer - 1.0)
-        pull[:, _INNER] -= prior[:, _INNER] * (state.inner - start.inner)
-        pull[:, _FIRST_HARMONIC:] -= prior[:, _FIRST_HARMONIC:] * shifts[:, ELLIPSE_PARAMETERS:]
-        step = _limited(_solved(information, prior, pull), state)
-        shifts[:, :ELLIPSE_PARAMETERS] += step[:, :ELLIPSE_PARAMETERS]
-        shifts[:, ELLIPSE_PARAMETERS:] += step[:, _FIRST_HARMONIC:]
-        state = replace(
-            state,
-            sigma=np.maximum(state.sigma + step[:, _BLUR], _MIN_SIGMA_PX),
-            outer=state.outer + step[:, _OUTER],
-            inner=state.inner + step[:, _INNER],
-        )
-    ellipse, turn = moved(state.ellipse, shifts[:, :ELLIPSE_PARAMETERS])
-    turned = turned_harmonics(shifts[:, ELLIPSE_PARAMETERS:], turn)
-    size = np.max(np.abs(step[:, :ELLIPSE_PARAMETERS]), axis=1)
-    return replace(state, ellipse=ellipse, harmonics=turned), size
-
-
-def _solved(information: Array, prior: Array, pull: Array) -> Array:
-    diagonal = np.arange(_PARAMETERS)
-    information = information.copy()
-    information[:, diagonal, diagonal] += prior + 1e-6 * (
-        information[:, diagonal, diagonal] + 1.0
-    )
-    scale = 1.0 / np.sqrt(information[:, diagonal, diagonal])
-    equilibrated = information * scale[:, :, None] * scale[:, None, :]
-    solution: Array = np.linalg.solve(equilibrated, (pull * scale)[..., None])[..., 0] * scale
-    return solution
-
-
-def _limited(step: Array, state: _State) -> Array:
-    """Steps that keep within the range where the linearisation holds."""
-    reach = np.max(np.abs(step[:, :ELLIPSE_PARAMETERS]), axis=1)
-    share = np.minimum(1.0, np.minimum(1.5, 0.3 * state.ellipse[:, 3]) / (reach + 1e-12))
-    share = np.minimum(share, 0.4 * state.sigma / (np.abs(step[:, _BLUR]) + 1e-12))
-    return step * share[:, None]
-
-
-def _result(
-    state: _State, step: Array, pixels: Pixels, linear: _Linear, used: Array, start: Start
-) -> Outlines:
-    """Covariances and residuals at the last linearisation (the last step is small)."""
-    shifts = np.zeros((len(start), linear.shape.shape[0]))
-    ellipse = state.ellipse
-    linear = _linearised(state, pixels)
-    shifts[:, ELLIPSE_PARAMETERS:] = state.harmonics
-    grey, jacobian, _ = _model(state, pixels, linear, shifts)
-    residual = pixels.value - grey
-    information, _ = _normal_equations(jacobian, residual, used, pixels)
-    coverage = _coverage(pixels, linear, used, state.sigma)
-    prior = _prior(state, start, coverage, harmonics=True)
-    diagonal = np.arange(_PARAMETERS)
-    information[:, diagonal, diagonal] += prior + 1e-12
-    scale = 1.0 / np.sqrt(information[:, diagonal, diagonal])
-    covariance = np.linalg.inv(information * scale[:, :, None] * scale[:, None, :])
-    covariance *= scale[:, :, None] * scale[:, None, :]
-    resolved = _resolved(state)
-    fitted = np.where(resolved, _PARAMETERS, _FIRST_HARMONIC)
-    count = pixels.sums((used > 0.0).astype(np.float64))
-    chi2_dof = pixels.sums(used * residual**2) / np.maximum(count - fitted, 1.0)
-    covariance *= np.maximum(chi2_dof, 1.0)[:, None, None]
-    turn_cos, turn_sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
-    turn = np.stack([turn_cos, -turn_sin, turn_sin, turn_cos], axis=1).reshape(-1, 2, 2)
-    variances = covariance[:, diagonal, diagonal][:, _FIRST_HARMONIC:]
+def _result(descent: _Descent, pixels: Pixels, linear: Linear, weight: Single) -> Outlines:
+    """Covariances are widened by chi2_dof where that exceeds 1."""
+    state = _moved(descent.state, descent.shifts)
+    fitted = np.where(linear.resolved, PARAMETERS, FIRST_HARMONIC)
+    dof = np.maximum(pixels.sums((weight > 0.0).astype(np.float32)) - fitted, 1.0)
+    chi2_dof = pixels.sums(weight * descent.residual**2) / dof
+    covariance = descent.covariance * np.maximum(chi2_dof, 1.0)[:, None, None]
+    angle = descent.state.ellipse[:, 4]
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+    variances = np.einsum("bii->bi", covariance)[:, FIRST_HARMONIC:]
     return Outlines(
-        ellipse,
-        np.where(resolved[:, None], state.harmonics, np.nan),
-        np.sqrt(np.maximum(state.sigma**2 - PIXEL_VARIANCE_PX2, 0.0)),
+        state.ellipse,
+        np.where(linear.resolved[:, None], state.harmonics, 0.0),
+        linear.resolved,
+        state.sigma,
         state.outer,
         state.inner,
         turn @ covariance[:, :2, :2] @ np.swapaxes(turn, 1, 2),
-        np.where(resolved, np.sqrt(np.mean(variances, axis=1)), np.nan),
+        np.sqrt(np.mean(variances, axis=1)),
         chi2_dof,
-        coverage,
-        _misfit(residual, jacobian, used, pixels, state),
-        (step < 0.05) & (count > 2 * _PARAMETERS),
+        _coverage(pixels, linear, weight, state.sigma),
+        np.max(np.abs(descent.shifts[:, :BLUR]), axis=1),
+        descent.step_px,
     )
-
-
-def _misfit(
-    residual: Array, jacobian: Array, used: Array, pixels: Pixels, state: _State
-) -> Array:
-    """Spread of the edge about the fitted outline (B,), in px.
-
-    The residual grey over the edge's slope, where it is steep, with the part that the noise
-    explains taken away.
-    """
-    slope = np.abs(jacobian[_FIRST_HARMONIC] / 1.0) + np.abs(jacobian[_FIRST_HARMONIC + 1])
-    steep = (used > 0.0) & (slope > 0.0)
-    weight = np.where(steep, slope**2, 0.0)
-    noise = np.where(used > 0.0, 1.0 / np.maximum(used, 1e-300), 0.0)
-    excess = pixels.sums(np.where(steep, residual**2 - noise, 0.0))
-    return np.sqrt(np.maximum(excess, 0.0) / np.maximum(pixels.sums(weight), 1e-12))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 _DISTANCE_LIMIT, _DISTANCE_STEP = 5.5, 0.05
 _CURVATURE_LIMIT, _CURVATURE_STEP = 1.4, 0.02
@@ -25,9 +26,9 @@ class Profile:
     """Share of the disc's light ``value`` at each place, with derivatives by distance and by
     curvature (both in units of the blur)."""
 
-    value: Array
-    by_distance: Array
-    by_curvature: Array
+    value: Single
+    by_distance: Single
+    by_curvature: Single
 
 
 def blurred_disc(distance: Array, radius: Array) -> Array:
@@ -52,37 +53,43 @@ def blurred_disc(distance: Array, radius: Array) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _table() -> tuple[Array, int]:
+def _table() -> tuple[Single, int]:
     from scipy.special import ndtr
 
     t = np.arange(-_DISTANCE_LIMIT, _DISTANCE_LIMIT + _DISTANCE_STEP / 2, _DISTANCE_STEP)
     q = np.arange(_CURVATURE_STEP, _CURVATURE_LIMIT + _CURVATURE_STEP / 2, _CURVATURE_STEP)
     rows = [ndtr(-t), *(blurred_disc(t, np.full(1, 1.0 / value)) for value in q)]
-    return np.ascontiguousarray(np.stack(rows)).ravel(), t.size
+    return np.stack(rows).astype(np.float32).ravel(), t.size
 
 
-def rim_profile(distance: Array, curvature: Array) -> Profile:
+def rim_profile(distance: Single, curvature: Single) -> Profile:
     """Profile at signed ``distance`` outside a rim of ``curvature``, both (N,) in units of blur.
 
     Bilinear in the table: good to 1e-4 of the contrast.
     """
     table, columns = _table()
-    x = (np.clip(distance, -_DISTANCE_LIMIT, _DISTANCE_LIMIT - 1e-9) + _DISTANCE_LIMIT) * (
-        1.0 / _DISTANCE_STEP
-    )
-    y = np.clip(curvature, 0.0, _CURVATURE_LIMIT - 1e-9) * (1.0 / _CURVATURE_STEP)
+    x = np.clip(distance, -_DISTANCE_LIMIT, _DISTANCE_LIMIT - 1e-3)
+    x += _DISTANCE_LIMIT
+    x *= 1.0 / _DISTANCE_STEP
+    y = np.clip(curvature, 0.0, _CURVATURE_LIMIT - 1e-3)
+    y *= 1.0 / _CURVATURE_STEP
     column, row = x.astype(np.intp), y.astype(np.intp)
-    x -= column
-    y -= row
-    index = row * columns + column
-    low_low, low_high = table.take(index), table.take(index + 1)
-    index += columns
-    high_low, high_high = table.take(index), table.take(index + 1)
-    low_slope, high_slope = low_high - low_low, high_high - high_low
-    low, high = low_low + x * low_slope, high_low + x * high_slope
-    by_curvature = high - low
-    return Profile(
-        low + y * by_curvature,
-        (low_slope + y * (high_slope - low_slope)) * (1.0 / _DISTANCE_STEP),
-        by_curvature * (1.0 / _CURVATURE_STEP),
-    )
+    x -= column.astype(np.float32)
+    y -= row.astype(np.float32)
+    row *= columns
+    row += column
+    low_low, low_slope = table.take(row), table.take(row + 1)
+    row += columns
+    high_low, high_slope = table.take(row), table.take(row + 1)
+    low_slope -= low_low
+    high_slope -= high_low
+    low_low += x * low_slope
+    high_low += x * high_slope
+    high_low -= low_low
+    high_slope -= low_slope
+    high_slope *= y
+    low_slope += high_slope
+    low_slope *= 1.0 / _DISTANCE_STEP
+    low_low += y * high_low
+    high_low *= 1.0 / _CURVATURE_STEP
+    return Profile(low_low, low_slope, high_low)

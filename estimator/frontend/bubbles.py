@@ -220,6 +220,7 @@ def _start(parts: list[Part], blobs: list[Blob], sigma: float) -> Start:
     noise = np.full(len(parts), sigma)
     return Start(
         np.stack([part.ellipse for part in parts]),
+        np.zeros((len(parts), len(HARMONIC_COLUMNS))),
         np.array([blob.blur_px for blob in own]),
         np.array([blob.inner for blob in own]),
         noise,
@@ -231,7 +232,7 @@ def _columns(
     outlines: Outlines, parts: list[Part], shape: tuple[int, ...], clipped: bool
 ) -> dict[str, Any]:
     ellipse, covariance = outlines.ellipse, outlines.centre_covariance_px2
-    area, _ = outline_moments(ellipse, np.nan_to_num(outlines.harmonics))
+    area, _ = outline_moments(ellipse, outlines.harmonics)
     columns: dict[str, Any] = {
         "u_px": ellipse[:, 0],
         "v_px": ellipse[:, 1],
@@ -246,14 +247,15 @@ def _columns(
         "contrast": (outlines.outer - outlines.inner) / outlines.outer,
         "edge_px": outlines.blur_px,
         "chi2_dof": outlines.chi2_dof,
-        "sigma_outline_px": outlines.sigma_outline_px,
+        "sigma_outline_px": np.where(outlines.resolved, outlines.sigma_outline_px, np.nan),
         "flags": _flags(outlines, parts, shape, clipped),
     }
     # A half turn of the axes changes the sign of the odd orders.
     turned = np.cos(ellipse[:, 4] - columns["angle_rad"]) < 0.0
+    harmonics = np.where(outlines.resolved[:, None], outlines.harmonics, np.nan)
     for index, name in enumerate(HARMONIC_COLUMNS):
         odd = name[1] in "35"
-        columns[name] = outlines.harmonics[:, index] * np.where(turned & odd, -1.0, 1.0)
+        columns[name] = harmonics[:, index] * np.where(turned & odd, -1.0, 1.0)
     return columns
 
 
@@ -262,14 +264,15 @@ def _flags(
 ) -> NDArray[np.object_]:
     ellipse = outlines.ellipse
     rim = points_on(
-        ellipse, np.nan_to_num(outlines.harmonics), np.linspace(0.0, 2.0 * np.pi, 32, False)
+        ellipse, outlines.harmonics, np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
     )
     reach = outlines.blur_px[:, None]
     beyond = (rim[..., 0] < reach - 0.5) | (rim[..., 0] > shape[1] - 0.5 - reach)
     beyond |= (rim[..., 1] < reach - 0.5) | (rim[..., 1] > shape[0] - 0.5 - reach)
     border = np.any(beyond, axis=1)
     hidden = np.zeros(len(parts), dtype=np.bool_)
-    for index, other in close_pairs(ellipse, outlines.blur_px):
+    blur, own = outlines.blur_px, np.arange(len(parts))
+    for index, other in close_pairs(ellipse, ellipse, blur, blur, own):
         gap = rough_distance(ellipse[other], rim[index, :, 0], rim[index, :, 1])
         hidden[index] |= bool(np.any(gap < 0.0))
     words = {

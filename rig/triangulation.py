@@ -8,12 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import GeometryError, InputError
-from telerig.rig import projection
+from telerig.rig import distortion, projection
 from telerig.rig.camera import Camera
+from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
 
 _STEPS = 20
+_BLOCK = 4096
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_ROWS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
@@ -134,18 +138,86 @@ def _maximum_likelihood(
     covariances: list[Array],
     points: Array,
 ) -> tuple[Array, Array]:
-    measured = np.concatenate(uv_px, -1)
-    weight = _information(covariances)
-    normal = np.zeros((*points.shape, 3))
+    """Gauss-Newton in blocks that fit the processor's cache; (..., 3), (..., 3, 3)."""
+    flat = points.reshape(-1, 3).T
+    measured = np.concatenate([uv.reshape(-1, 2) for uv in uv_px], -1).T
+    weights = np.array([_weights(covariance) for covariance in covariances])
+    out, covariance = np.empty_like(flat, order="C"), np.empty((flat.shape[1], 3, 3))
+    for start in range(0, flat.shape[1], _BLOCK):
+        block = slice(start, start + _BLOCK)
+        out[:, block], covariance[block] = _gauss_newton(
+            cameras, measured[:, block], weights[..., block], flat[:, block]
+        )
+    shape = points.shape
+    return np.ascontiguousarray(out.T).reshape(shape), covariance.reshape(*shape, 3)
+
+
+def _weights(covariance: Array) -> Array:
+    """(..., 2, 2) -> (3, N) inverse covariances: uu, uv, vv."""
+    a, b, c = (covariance[..., i, j].ravel() for i, j in ((0, 0), (0, 1), (1, 1)))
+    determinant = a * c - b * b
+    return np.array([c / determinant, -b / determinant, a / determinant])
+
+
+def _gauss_newton(
+    cameras: tuple[Camera, Camera], measured: Array, weights: Array, points: Array
+) -> tuple[Array, Array]:
+    """measured (4, N), weights (2, 3, N), points (3, N) -> points (3, N), covariance (N, 3, 3)."""
+    points = np.ascontiguousarray(points)
+    inverse = np.empty((6, points.shape[1]))
     for _ in range(_STEPS):
-        predicted, jacobian, _ = stacked_jacobian(cameras, points)
-        weighted = np.swapaxes(jacobian, -1, -2) @ weight
-        normal = weighted @ jacobian
-        step = np.linalg.solve(normal, weighted @ (measured - predicted)[..., None])[..., 0]
+        normal, right = np.zeros((6, points.shape[1])), np.zeros((3, points.shape[1]))
+        for c, camera in enumerate(cameras):
+            predicted, jacobian = _point_jacobian(camera, points)
+            off = measured[2 * c : 2 * c + 2] - predicted
+            uu, uv, vv = weights[c]
+            left = (uu * jacobian[0] + uv * jacobian[1], uv * jacobian[0] + vv * jacobian[1])
+            for i, (j, k) in enumerate(_UPPER):
+                normal[i] += left[0][j] * jacobian[0, k] + left[1][j] * jacobian[1, k]
+            right += left[0] * off[0] + left[1] * off[1]
+        inverse = _symmetric_inverse(normal)
+        step = np.array([(inverse[row] * right).sum(0) for row in _ROWS])
         points = points + step
         if np.max(np.abs(step), initial=0.0) < 1e-9:
             break
-    return points, np.linalg.inv(normal)
+    return points, np.ascontiguousarray(inverse[_ROWS].transpose(2, 0, 1))
+
+
+def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
+    """(3, N) rig points -> (2, N) pixels, (2, 3, N) by the rig point; quick for untilted lenses."""
+    pose = camera.camera_from_rig
+    x, y, z = pose.rotation @ points + pose.translation_mm[:, None]
+    if np.any(camera.intrinsics[INDEX["tilt_x"] :]):
+        uv, by_tilted, _ = projection.pixel_jacobians(
+            np.stack([x, y, z], -1), camera.intrinsics, camera.rho_mm
+        )
+        return uv.T, np.moveaxis(by_tilted @ pose.rotation, 0, -1)
+    kappa = camera["kappa_per_mm"]
+    shrink = 1 / (1 + kappa * z)
+    x, y = x * shrink, y * shrink
+    across, down, depth = pose.rotation[:, :, None]
+    by_x, by_y = (across - kappa * x * depth) * shrink, (down - kappa * y * depth) * shrink
+    coefficients = camera.intrinsics[INDEX["k1"] : INDEX["tilt_x"]]
+    if np.any(coefficients):
+        normal = np.stack([x, y], -1) / camera.rho_mm
+        x, y = distortion.distort(normal, coefficients).T * camera.rho_mm
+        (xx, xy), (yx, yy) = np.moveaxis(
+            distortion.distortion_jacobian(normal, coefficients), 0, -1
+        )
+        by_x, by_y = xx * by_x + xy * by_y, yx * by_x + yy * by_y
+    scale, skew, aspect = camera["scale_px_per_mm"], camera["skew"], camera["aspect"]
+    pixel = [scale * (x + skew * y), scale * aspect * y]
+    by_point = np.array([scale * (by_x + skew * by_y), scale * aspect * by_y])
+    return np.array([pixel[0] + camera["centre_u_px"], pixel[1] + camera["centre_v_px"]]), by_point
+
+
+def _symmetric_inverse(matrix: Array) -> Array:
+    """(6, N) -> (6, N): inverses of symmetric 3x3 matrices, entries in the order of `_UPPER`."""
+    a, b, c, d, e, f = matrix
+    cofactors = np.array(
+        [d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b]
+    )
+    return cofactors / (a * cofactors[0] + b * cofactors[1] + c * cofactors[2])
 
 
 def _midpoint_covariance(

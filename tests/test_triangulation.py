@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,7 @@ from scipy.optimize import least_squares, minimize
 from telerig.errors import GeometryError, InputError
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-from telerig.rig.triangulation import midpoint, triangulate
+from telerig.rig.triangulation import midpoint, stacked_jacobian, triangulate
 
 LENSES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "ideal": ({}, {}),
@@ -194,10 +195,32 @@ def test_two_points_are_not_taken_for_a_covariance() -> None:
     np.testing.assert_allclose(found.covariance_mm2.reshape(4, 3, 3), one_by_one.covariance_mm2)
 
 
-def test_many_points_at_once() -> None:
-    cameras, truth = rig("distorted"), points(100_000)
-    found = triangulate(cameras, tuple(c.project(truth) for c in cameras), 0.02)
+@pytest.mark.parametrize("kind", ["ideal", "distorted", "perspective"])
+def test_many_points_at_once(kind: str) -> None:
+    cameras, truth = rig(kind), points(100_000)
+    pixels = tuple(c.project(truth) for c in cameras)
+    start = time.process_time()
+    found = triangulate(cameras, pixels, 0.02)
+    assert time.process_time() - start < 2.0
     assert np.abs(found.points_mm - truth).max() < 1e-8
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_blocks_give_what_dense_normal_equations_give(kind: str) -> None:
+    cameras, count = rig(kind), 5000
+    pixels = noisy(cameras, count)
+    found = triangulate(cameras, tuple(pixels), sigmas(count))
+    weight = np.zeros((4, 4))
+    weight[:2, :2], weight[2:, 2:] = np.linalg.inv(SIGMA)
+    at = found.points_mm
+    for _ in range(3):
+        predicted, jacobian, _ = stacked_jacobian(cameras, at)
+        weighted = np.swapaxes(jacobian, 1, 2) @ weight
+        off = (np.concatenate(pixels, 1) - predicted)[..., None]
+        at = at + np.linalg.solve(weighted @ jacobian, weighted @ off)[..., 0]
+    np.testing.assert_allclose(found.points_mm, at, atol=1e-12)
+    dense = np.linalg.inv(weighted @ jacobian)
+    np.testing.assert_allclose(found.covariance_mm2, dense, rtol=0, atol=1e-12 * dense.max())
 
 
 def test_bad_input() -> None:

@@ -1,0 +1,103 @@
+"""What the tables of a tracked run add up to."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.report.track_results import TrackResults
+
+Array = NDArray[np.float64]
+
+_MOST_ROWS = 20_000
+_LEAST_SPREAD_MM = 0.1
+_LEAST_ROWS = 12
+_NORMAL_MEDIAN = 0.6745
+
+
+def ray_miss_sd_mm(results: TrackResults) -> Array | None:
+    """(N,) sd of ``ray_miss_mm`` that the outlines' covariances predict; None if it is not known.
+
+    The cameras are not in the folder, but the points and their pixels are: an affine camera
+    fitted to them gives the rays' directions and what a pixel is worth along the common
+    perpendicular, to the lens's residual perspective. It takes points that fill some space.
+    """
+    if len(results.cameras) != 2:
+        return None
+    maps = [_affine(results, camera) for camera in results.cameras]
+    if maps[0] is None or maps[1] is None:
+        return None
+    across = np.cross(*(np.cross(m[0], m[1]) for m in maps if m is not None))
+    length = np.linalg.norm(across)
+    if length < 1e-9:
+        return None
+    variance = np.zeros(len(results.tracks))
+    for camera, affine in zip(results.cameras, maps):
+        assert affine is not None
+        per_px = np.linalg.lstsq(affine.T, across / length, rcond=None)[0]
+        columns = [f"{camera}_{name}" for name in ("suu_px2", "suv_px2", "svv_px2")]
+        uu, uv, vv = results.tracks[columns].to_numpy(float).T
+        variance += per_px[0] ** 2 * uu + 2 * per_px[0] * per_px[1] * uv + per_px[1] ** 2 * vv
+    return np.sqrt(np.where(variance > 0, variance, np.nan))
+
+
+def _affine(results: TrackResults, camera: str) -> Array | None:
+    """(2, 3) px per mm, or None where the points do not tell."""
+    uv = results.tracks[[f"{camera}_u_px", f"{camera}_v_px"]].to_numpy(float)
+    both = np.c_[results.points_mm, uv]
+    both = both[np.isfinite(both).all(axis=1)]
+    both = both[:: len(both) // _MOST_ROWS + 1]
+    if len(both) < _LEAST_ROWS:
+        return None
+    points, pixels = both[:, :3] - both[:, :3].mean(axis=0), both[:, 3:] - both[:, 3:].mean(axis=0)
+    if np.linalg.svd(points, compute_uv=False)[2] < _LEAST_SPREAD_MM * np.sqrt(len(both)):
+        return None
+    return np.asarray(np.linalg.lstsq(points, pixels, rcond=None)[0].T)
+
+
+def ray_miss_ratio(results: TrackResults, predicted_mm: Array | None) -> float | None:
+    """Typical ray miss over its predicted sd: 1 when the covariances tell the whole story.
+
+    From the medians, so that a few wrong pairs do not count.
+    """
+    if predicted_mm is None:
+        return None
+    units = np.abs(results.tracks["ray_miss_mm"].to_numpy(float)) / predicted_mm
+    units = units[np.isfinite(units)]
+    return float(np.median(units)) / _NORMAL_MEDIAN if len(units) else None
+
+
+def median(values: Array) -> float | None:
+    """None where no value is finite."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def rms(values: Array) -> float | None:
+    """None where no value is finite."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
+
+
+def frame_count(results: TrackResults) -> int:
+    """Of the run, else up to the last frame with a bubble."""
+    given = results.content.get("frames")
+    tables = (results.tracks, results.detections)
+    seen = max((int(t["frame"].max()) + 1 for t in tables if len(t)), default=0)
+    return max(int(given), seen) if isinstance(given, int) else seen
+
+
+def per_frame(results: TrackResults) -> dict[str, NDArray[np.int64]]:
+    """Bubbles in each frame (F,): by camera, and "both" for those with a place in space."""
+    frames = frame_count(results)
+    found = results.detections
+    counts = {
+        camera: np.bincount(found["frame"][found["camera"] == camera], minlength=frames)
+        for camera in results.cameras
+    }
+    return counts | {"both": np.bincount(results.tracks["frame"], minlength=frames)}
+
+
+def track_lengths(results: TrackResults) -> NDArray[np.int64]:
+    """(K,) points of each track."""
+    return np.asarray(results.tracks["particle"].value_counts().to_numpy(np.int64))

@@ -1,0 +1,95 @@
+"""The report of a tracked run: one page that needs no network, made from a results folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from telerig.io.atomic import write_text_atomic
+from telerig.io.report import track_tables as tables
+from telerig.io.report.contact_sheet import picture_sheet
+from telerig.io.report.page import drawn_over_cores, render_page
+from telerig.io.report.track_figures import (
+    bubbles_in_time,
+    confidence,
+    predicted_sd,
+    sizes,
+    time_series,
+)
+from telerig.io.report.track_figures_rays import (
+    ray_miss_histogram,
+    ray_miss_in_space,
+    seen_where,
+    shared_pictures,
+)
+from telerig.io.report.track_results import TrackResults, binary_column, read_track_results
+from telerig.io.report.track_scene import track_plans, track_scene_json
+from telerig.io.report.words import flat_rows
+
+_SMALL_WIDTH_PX = 560
+_SHOWN = {"schema", "kind", "run", "notes", "worst_frames", "pairs", "covariance", "events"}
+
+
+def write_track_report(results_folder: Path) -> Path:
+    """Write report.html into a tracked run's results folder and return its path.
+
+    It reads nothing but that folder: tracking.json and tracks.csv, and if they are there
+    detections.csv, events.csv, run.json, overlays/<camera>/<frame>.jpg and
+    binary/<camera>/<frame>.png. The page is written whole or not at all. Raises InputError for a
+    folder that holds no tracks, or files that cannot be read or do not fit together.
+    """
+    folder = Path(results_folder)
+    page = render(read_track_results(folder))
+    write_text_atomic(folder / "report.html", page)
+    return folder / "report.html"
+
+
+def render(results: TrackResults) -> str:
+    """The page as text."""
+    context = _words(results) | _pictures(results)
+    return render_page("template_track.html", context, track_scene_json(results))
+
+
+def _words(results: TrackResults) -> dict[str, Any]:
+    content = results.content
+    return {
+        "name": str(content.get("run") or "run"),
+        "verdict": tables.verdict(results),
+        "figures": tables.key_numbers(results),
+        "cameras": list(results.cameras),
+        "pairs_rows": tables.pair_rows(results),
+        "pair_words": [str(word) for word in results.pairs.get("words") or []],
+        "flags": tables.flag_rows(results),
+        "events": tables.event_rows(results),
+        "event_words": tables.event_words(results),
+        "notes": [str(note) for note in content.get("notes") or []],
+        "covariance": content.get("covariance") or "",
+        "extra": list(flat_rows({k: v for k, v in content.items() if k not in _SHOWN})),
+        "run": list(flat_rows(results.run)),
+        "absent": results.absent,
+        "worst": tables.worst_words(results),
+    }
+
+
+def _pictures(results: TrackResults) -> dict[str, Any]:
+    every = range(len(results.cameras))
+    drawings: list[tuple[str, Callable[[], Any]]] = [
+        *(("seen", partial(seen_where, results, i)) for i in every),
+        *(("series", partial(time_series, results, axis)) for axis in range(3)),
+        ("rays", partial(ray_miss_histogram, results)),
+        *(("rays", partial(ray_miss_in_space, results, *how)) for how in shared_pictures(results)),
+        ("counts", partial(bubbles_in_time, results)),
+        ("quality", partial(predicted_sd, results)),
+        ("quality", partial(sizes, results)),
+        ("quality", partial(confidence, results)),
+        ("plans", partial(track_plans, results)),
+    ]
+    pictures: dict[str, Any] = {place: [] for place, _ in drawings}
+    for (place, _), picture in zip(drawings, drawn_over_cores([d for _, d in drawings])):
+        pictures[place] += picture if isinstance(picture, list) else [picture]
+    columns = [column for c in results.cameras for column in (c, binary_column(c))]
+    rows = list(tables.worst_words(results)) if results.pictures else []
+    sheet = picture_sheet(rows, columns, results.pictures, small_width_px=_SMALL_WIDTH_PX)
+    return pictures | {"sheet": sheet}

@@ -217,7 +217,7 @@ def _symmetric_inverse(matrix: Array) -> Array:
     cofactors = np.array(
         [d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b]
     )
-    return cofactors / (a * cofactors[0] + b * cofactors[1] + c * cofactors[2])
+    return np.asarray(cofactors / (a * cofactors[0] + b * cofactors[1] + c * cofactors[2]))
 
 
 def _midpoint_covariance(

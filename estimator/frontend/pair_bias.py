@@ -45,7 +45,8 @@ def fit_bias(
         if trial.rms_px[3] < _BETTER * best.rms_px[3]:
             best = trial
     raw, middle = constant.rms_px[0], constant.rms_px[2]
-    return replace(best, rms_px=(raw, middle, best.rms_px[2], best.rms_px[3]))
+    mean = (float(constant.bias_px[0]), float(np.sqrt(constant.bias_covariance_px2[0, 0])))
+    return replace(best, mean_gap_px=mean, rms_px=(raw, middle, best.rms_px[2], best.rms_px[3]))
 
 
 def _fit(
@@ -58,13 +59,15 @@ def _fit(
     terms: int,
 ) -> PairModel:
     basis = model.basis(points_mm, terms)
-    prior = np.array([_PRIOR_SD_PX[0]] + [_PRIOR_SD_PX[1]] * 3 + [_PRIOR_SD_PX[2]] * 6)[:terms] ** -2
+    prior = (
+        np.array([_PRIOR_SD_PX[0]] + [_PRIOR_SD_PX[1]] * 3 + [_PRIOR_SD_PX[2]] * 6)[:terms] ** -2
+    )
     scatter = model.scatter_px
     bias = np.zeros(terms)
     bias[0] = model.bias_px[0]
     residual = gap_px - basis @ bias
-    covariance = np.zeros((terms, terms))
-    total = influence = weight
+    covariance: Array = np.zeros((terms, terms))
+    tempered = influence = weight
     for _ in range(8):
         own = variance_px2 + (scatter * doubt) ** 2
         tempered = weight * 5 / (4 + residual**2 / own)
@@ -73,17 +76,16 @@ def _fit(
         bias = covariance @ (basis.T @ (influence * gap_px))
         residual = gap_px - basis @ bias
         lost = np.einsum("ni,ij,nj->n", basis, covariance, basis)
-        total = tempered
-        excess = (total * (residual**2 + lost - variance_px2) / doubt**2).sum()
+        excess = (tempered * (residual**2 + lost - variance_px2) / doubt**2).sum()
         prior_squares = _PRIOR_PAIRS * _PRIOR_SCATTER_PX**2
         free = weight.sum() + _PRIOR_PAIRS
         scatter = float(np.sqrt(max((excess + prior_squares) / free, _SMALLEST_PX**2)))
     leverage = np.minimum(influence * np.einsum("ni,ij,nj->n", basis, covariance, basis), 0.95)
     rms = [
-        float(np.sqrt(np.average(r**2, weights=total)))
-        for r in (gap_px, gap_px, residual, residual / (1 - leverage))
+        float(np.sqrt(np.average(r**2, weights=tempered)))
+        for r in (gap_px, residual, residual / (1 - leverage))
     ]
     return replace(
         model, bias_px=bias, bias_covariance_px2=covariance, scatter_px=scatter,
-        rms_px=(rms[0], rms[1], rms[2], rms[3]),
+        rms_px=(rms[0], rms[1], rms[1], rms[2]),
     )  # fmt: skip

@@ -31,11 +31,13 @@ _OUTLINE_SAMPLES = 96
 class View:
     """One camera's detections, seen along the shared axis; N rows.
 
-    uv_px : (N, 2).  origin_mm, direction : (N, 3) rays.  mm_by_px : (N, 2, 2) camera-plane mm by pixel at depth 0.
-    covariance_px2 : (N, 2, 2).  middle_mm : (N,) middle of top and bottom less the centre, along
-    the shared axis.  log_size : (N, 2) logarithms of half the height and half the width (mm), along
-    and across the shared axis.  log_contrast : (N, 1).  NaN where unknown.  doubt : (N,) factor for the
-    scatter of flagged detections.
+    uv_px : (N, 2).  origin_mm, direction : (N, 3) rays.
+    mm_by_px : (N, 2, 2) camera-plane mm by pixel, at depth 0.
+    covariance_px2 : (N, 2, 2).
+    middle_mm : (N,) middle of top and bottom less the centre, along the shared axis.
+    log_size : (N, 2) logarithms of half the height and half the width (mm), along and across the
+        shared axis; NaN where unknown.  log_contrast : (N, 1), likewise.
+    doubt : (N,) factor for the scatter of flagged detections.
     """
 
     camera: Camera

@@ -55,7 +55,9 @@ def marginals(log_odds: Array) -> Array:
 def _components(possible: NDArray[np.bool_]) -> list[tuple[list[int], list[int]]]:
     """Rows and columns that hang together."""
     rows = {int(i): np.flatnonzero(possible[i]).tolist() for i in np.flatnonzero(possible.any(1))}
-    columns = {int(j): np.flatnonzero(possible[:, j]).tolist() for row in rows.values() for j in row}
+    columns = {
+        int(j): np.flatnonzero(possible[:, j]).tolist() for row in rows.values() for j in row
+    }
     out = []
     while rows:
         mine: tuple[list[int], list[int]] = ([], [])
@@ -100,7 +102,7 @@ def _exact(log_odds: Array) -> Array:
     for i in range(n):
         for j in np.flatnonzero(weight[i]):
             out[i, j] = weight[i, j] * (forward[i, free[j]] @ backward[i + 1, free[j] | (1 << j)])
-    return out / backward[0, 0]
+    return np.asarray(out / backward[0, 0])
 
 
 def _belief_propagation(log_odds: Array) -> Array:

@@ -168,7 +168,7 @@ def _learnt(cue: Cue, name: str, ratio: Array, weight: Array) -> Cue:
 
 def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
     """Means and spreads of all detections; outliers count as three sd, few draw to the usual."""
-    cues = {}
+    cues: dict[str, Cue] = {}
     for name, usual in _USUAL.items():
         means, squares, count = [], _USUAL_WEIGHT * usual, _USUAL_WEIGHT
         for c in range(2):
@@ -182,7 +182,7 @@ def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
             squares, count = squares + off.T @ off, count + len(off)
         old: Cue = getattr(model, name)
         cues[name] = replace(old, means=np.array(means), spread=squares / count)
-    return replace(model, **cues)
+    return replace(model, size=cues["size"], contrast=cues["contrast"])
 
 
 def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, float]:
@@ -216,4 +216,4 @@ def _span_px(cameras: tuple[Camera, Camera], axis: Array) -> float:
             "the two cameras see no common range along their shared axis",
             todo="check that the calibration belongs to these cameras",
         )
-    return (high - low) * cameras[0]["scale_px_per_mm"]
+    return float(high - low) * cameras[0]["scale_px_per_mm"]

@@ -44,6 +44,7 @@ class PairModel:
     lonely : share of the detections of each view without a partner.
     span_px : length of the shared coordinate that both images cover, in px of the first.
     pairs : number of pairs it rests on (a sum of probabilities); 0 for a model not learnt.
+    mean_gap_px : mean of the pairs' gaps (the best constant) and its standard error.
     rms_px : root mean square of the gaps as they are, after the constant, after the whole bias,
         and with every pair left out of its own bias.
     calibration_problem : the gaps' systematic part is beyond chance and beyond half a pixel.
@@ -61,6 +62,7 @@ class PairModel:
     lonely: tuple[float, float]
     span_px: float
     pairs: float = 0.0
+    mean_gap_px: tuple[float, float] = (0.0, 0.0)
     rms_px: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     calibration_problem: bool = False
     words: tuple[str, ...] = ()

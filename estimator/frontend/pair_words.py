@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from telerig.estimator.frontend.pair_types import PairModel
 
 LEAST_PROBLEM_PX = 0.5
@@ -16,8 +14,7 @@ _CLEAR_VOTE = 3.0
 
 def describe(model: PairModel, votes: float) -> PairModel:
     """The model with its words; votes : how far the bias stood out in the first vote."""
-    constant = float(model.bias_px[0])
-    error = float(np.sqrt(model.bias_covariance_px2[0, 0]))
+    constant, error = model.mean_gap_px
     raw, after_constant, after_all, left_out = model.rms_px
     problem = abs(constant) > max(LEAST_PROBLEM_PX, _SIGNIFICANT * error)
     uneven = len(model.bias_px) > 1 and after_constant > max(LEAST_PROBLEM_PX, 1.5 * after_all)

@@ -56,7 +56,7 @@ class Screen:
         field = _single(by_row).T @ _single(by_column)
         dark_u = self.vignetting * ((np.arange(width) - (width - 1) / 2) / half) ** 2
         dark_v = 1 - self.vignetting * ((np.arange(height) - (height - 1) / 2) / half) ** 2
-        return field * (self.level * (dark_v[:, None] - dark_u)).astype(np.float32)
+        return np.asarray(field * (self.level * (dark_v[:, None] - dark_u)).astype(np.float32))
 
 
 def random_screen(
@@ -70,7 +70,7 @@ def random_screen(
 ) -> Screen:
     """A screen of random directions; texture : RMS relative to the level."""
     angle = rng.uniform(0, 2 * np.pi, _WAVES)
-    length = np.exp(rng.uniform(*np.log(wavelength_px), _WAVES))
+    length = _log_uniform(rng, wavelength_px, _WAVES)
     waves = 2 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     amplitude = np.abs(rng.standard_normal(_WAVES)) * length
     amplitude *= texture * np.sqrt(2) / np.linalg.norm(amplitude)
@@ -115,8 +115,13 @@ def random_specks(
 ) -> Specks:
     """``count`` specks spread evenly over the rectangle low_px..high_px."""
     places = rng.uniform(low_px, high_px, (count, 2))
-    sigma = np.exp(rng.uniform(*np.log(sigma_px), count))
+    sigma = _log_uniform(rng, sigma_px, count)
     return Specks(places, sigma, rng.uniform(*depth, count))
+
+
+def _log_uniform(rng: Generator, low_high: tuple[float, float], count: int) -> Array:
+    low, high = low_high
+    return np.asarray(low * (high / low) ** rng.random(count))
 
 
 def _single(rows: list[Array]) -> Float32:

@@ -101,7 +101,8 @@ def d_eq_mm(bodies: Bodies) -> Array:
 def volume_centre_mm(bodies: Bodies) -> Array:
     """(..., 3) exact centre of volume."""
     offset = bodies.semi_axes_mm * _sphere_moments(bodies.modes)[1]
-    return bodies.origin_mm + np.einsum("...ij,...j->...i", bodies.rotation, offset)
+    turned = np.einsum("...ij,...j->...i", bodies.rotation, offset)
+    return np.asarray(bodies.origin_mm + turned)
 
 
 def surface_mm(bodies: Bodies, directions: ArrayLike) -> Array:
@@ -109,7 +110,8 @@ def surface_mm(bodies: Bodies, directions: ArrayLike) -> Array:
     s = np.asarray(directions, float)
     radius = 1 + np.einsum("...k,...k->...", surface_modes(s), bodies.modes)
     local = bodies.semi_axes_mm * s * radius[..., None]
-    return bodies.origin_mm + np.einsum("...ij,...j->...i", bodies.rotation, local)
+    turned = np.einsum("...ij,...j->...i", bodies.rotation, local)
+    return np.asarray(bodies.origin_mm + turned)
 
 
 def surface_modes(directions: Array) -> Array:
@@ -159,7 +161,8 @@ def rim_mm(bodies: Bodies, direction: ArrayLike, count: int = 128) -> Array:
         across = across * np.cos(turn) + away * np.sin(turn)
     radius = 1 + np.einsum("...nk,...k->...n", surface_modes(across), bodies.modes)
     local = bodies.semi_axes_mm[..., None, :] * across * radius[..., None]
-    return bodies.origin_mm[..., None, :] + local @ np.swapaxes(bodies.rotation, -1, -2)
+    turned = local @ np.swapaxes(bodies.rotation, -1, -2)
+    return np.asarray(bodies.origin_mm[..., None, :] + turned)
 
 
 def outline_moments(outline_px: ArrayLike) -> tuple[Array, Array, Array]:

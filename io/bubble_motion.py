@@ -46,22 +46,47 @@ class LinearProcess:
     def discretised(self, step_s: float) -> tuple[Array, Array]:
         """Transition (n, n) and a square root (n, n) of the step's noise covariance.
 
+        Van Loan's exponential holds e^(-F t), which is huge for fast states: it is taken for a
+        fraction of the step, and doubled.
+        """
+        doublings = max(
+            0, int(np.ceil(np.log2(np.linalg.norm(self._rates(), 2) * step_s + 1e-300)))
+        )
+        transition, covariance = self._van_loan(step_s / 2**doublings)
+        for _ in range(doublings):
+            covariance = covariance + transition @ covariance @ transition.T
+            transition = transition @ transition
+        return transition, square_root(covariance)
+
+    def _van_loan(self, step_s: float) -> tuple[Array, Array]:
+        """Transition and noise covariance (n, n) of a short step.
+
         Integrals of white noise of different orders differ by powers of the step; they are
-        scaled before Van Loan's exponential, else the smallest drown in rounding.
+        scaled before the exponential, else the smallest drown in rounding.
         """
         from scipy.linalg import expm
 
         scale = step_s ** self._orders()
         drift = self.drift * step_s / scale[:, None] * scale
         noise = self.noise_input * np.sqrt(step_s) / scale
-        n = len(noise)
+        strength = float(np.linalg.norm(noise)) or 1.0
+        noise, n = noise / strength, len(noise)
         block = np.zeros((2 * n, 2 * n))
         block[:n, :n], block[:n, n:], block[n:, n:] = -drift, np.outer(noise, noise), drift.T
         exponential = expm(block)
         transition = exponential[n:, n:].T
         covariance = transition @ exponential[:n, n:]
-        root = square_root((covariance + covariance.T) / 2)
-        return transition * scale[:, None] / scale, scale[:, None] * root
+        symmetric = (covariance + covariance.T) / 2
+        return (
+            np.asarray(transition * scale[:, None] / scale),
+            np.asarray(symmetric * strength**2 * scale[:, None] * scale),
+        )
+
+    def _rates(self) -> Array:
+        """(n, n) the drift with states scaled to one unit, so that its norm is a rate."""
+        off = np.abs(np.linalg.eigvals(self.drift)).max()
+        scale = off ** -self._orders()
+        return np.asarray(self.drift / scale[:, None] * scale)
 
     def _orders(self) -> Array:
         """(n,) how many integrations lie between the white noise and each state."""
@@ -70,7 +95,7 @@ class LinearProcess:
         for order in range(len(orders)):
             orders[np.isnan(orders) & (reached != 0)] = order
             reached = np.abs(self.drift) @ np.abs(reached)
-        return np.nan_to_num(orders, nan=0.0)
+        return np.asarray(np.nan_to_num(orders, nan=0.0))
 
     def paths(
         self,

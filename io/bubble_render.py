@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.errors import InputError
 from telerig.io.backlight import Screen, Specks
 from telerig.io.bubble_bodies import outline_moments
 from telerig.io.outline_raster import cell_coverage, pixel_weights, refined
-from telerig.io.render import digitise
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -26,7 +26,8 @@ CELLS = 4
 """Fine cells per pixel and direction."""
 
 _REACH = 4.5
-_HEART_REACH = 4.0
+_HEART_REACH = 3.2
+_RING_REACH = 4.0
 _STILL_PX = 0.02
 
 
@@ -65,8 +66,11 @@ class Look:
             fall = np.exp(-np.log(2.0) * square[inner] ** (self.heart_sharpness / 2))
             out[inner] += (self.heart - self.rim) * fall
         if self.ring > 0:
-            rho = np.sqrt(_square(du, dv, metric))
-            out += self.ring * np.exp(-(((rho - self.ring_radius) / self.ring_width) ** 2) / 2)
+            square = _square(du, dv, metric)
+            low, high = self.ring_radius + _RING_REACH * self.ring_width * np.array([-1, 1])
+            near = (square > max(low, 0.0) ** 2) & (square < high**2)
+            off = (np.sqrt(square[near]) - self.ring_radius) / self.ring_width
+            out[near] += self.ring * np.exp(-(off**2) / 2)
         return out
 
 
@@ -96,7 +100,7 @@ class Patch:
 
     row: int
     column: int
-    absorption: Array
+    absorption: Float32
 
 
 def absorption_patch(bubble: Silhouette) -> Patch:
@@ -104,22 +108,22 @@ def absorption_patch(bubble: Silhouette) -> Patch:
     outline = bubble.outline_px
     first = np.floor(outline.min(0) + 0.5).astype(int)
     count = np.floor(outline.max(0) + 0.5).astype(int) - first + 1
-    edges = max(256, 16 * int(count.max()))
+    edges = max(512, 16 * int(count.max()))
     fine_outline = (refined(outline, edges) - first + 0.5) * CELLS
     fine_outline = np.clip(fine_outline, 0.0, count * CELLS)
-    fine = cell_coverage(fine_outline, (int(count[1]) * CELLS, int(count[0]) * CELLS))
-    fine *= 1 - _inside(bubble, first, count)
+    covered = cell_coverage(fine_outline, (int(count[1]) * CELLS, int(count[0]) * CELLS))
+    fine = covered.astype(np.float32) * (1 - _inside(bubble, first, count))
     smear = np.asarray(bubble.smear_px, float)
     length = float(np.linalg.norm(smear))
     pad = int(np.ceil(_REACH * bubble.blur_px + length / 2)) + 1
     nodes, weights = _exposure(length, bubble.blur_px)
-    total = np.zeros(count[::-1] + 2 * pad)
+    total = np.zeros(count[::-1] + 2 * pad, np.float32)
     for node, weight in zip(nodes, weights):
         by_u, by_v = (
             pixel_weights(int(n) * CELLS, CELLS, pad, bubble.blur_px, float(node * shift))
             for n, shift in zip(count, smear)
         )
-        total += weight * (by_v @ fine @ by_u.T)
+        total += np.float32(weight) * (by_v @ fine @ by_u.T)
     return Patch(int(first[1]) - pad, int(first[0]) - pad, total)
 
 
@@ -136,7 +140,7 @@ def _exposure(length_px: float, blur_px: float) -> tuple[Array, Array]:
     """Gauss-Legendre moments of the exposure (-1/2..1/2), closer than the blur, and weights."""
     if length_px < _STILL_PX:
         return np.zeros(1), np.ones(1)
-    nodes, weights = np.polynomial.legendre.leggauss(3 + int(length_px / max(blur_px, 0.3)))
+    nodes, weights = np.polynomial.legendre.leggauss(2 + int(2 * length_px / max(blur_px, 0.3)))
     return nodes / 2, weights / 2
 
 
@@ -162,7 +166,7 @@ def _multiply(out: Float32, patch: Patch) -> None:
         taken = patch.absorption[
             top - patch.row : bottom - patch.row, left - patch.column : right - patch.column
         ]
-        out[top:bottom, left:right] *= (1 - taken).astype(np.float32)
+        out[top:bottom, left:right] *= 1 - taken
 
 
 def render_bubbles(
@@ -200,17 +204,22 @@ def exposed(
     bit_depth: int,
     left_aligned: bool = False,
 ) -> Image:
-    """Noisy integers as a camera delivers them, see `telerig.io.render.digitise`.
+    """Noisy integers as a camera delivers them, clipped at full scale; grey in fractions of it.
 
+    read_noise : standard deviation; shot_noise : standard deviation at full scale.
     left_aligned : data of fewer than 16 bits stand in the high bits of 16, as many cameras write.
+    Raises InputError for a bit depth outside 8..16.
     """
-    levels = digitise(
-        np.asarray(grey, float),
-        rng,
-        read_noise=read_noise,
-        shot_noise=shot_noise,
-        bit_depth=bit_depth,
-    )
-    if left_aligned and 8 < bit_depth < 16:
-        return np.asarray(levels << (16 - bit_depth), dtype=np.uint16)
-    return levels
+    if not 8 <= bit_depth <= 16:
+        raise InputError(f"a bit depth of {bit_depth}", todo="choose 8 to 16 bits")
+    full = np.float32(2**bit_depth - 1)
+    levels = rng.standard_normal(grey.shape, dtype=np.float32)
+    bright = np.clip(grey, 0, 1).astype(np.float32, copy=False)
+    levels *= np.sqrt(np.float32(read_noise**2) + np.float32(shot_noise**2) * bright)
+    levels += grey
+    levels *= full
+    np.clip(np.rint(levels, out=levels), 0, full, out=levels)
+    if bit_depth == 8:
+        return levels.astype(np.uint8)
+    aligned = levels.astype(np.uint16) << (16 - bit_depth if left_aligned else 0)
+    return aligned.astype(np.uint16, copy=False)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 Array = NDArray[np.float64]
+Float32 = NDArray[np.float32]
 Index = NDArray[np.int64]
 
 
@@ -62,7 +63,9 @@ def _crossings(start: Array, step: Array) -> tuple[Index, Array]:
     return edge, np.clip(cut, 0.0, 1.0)
 
 
-def pixel_weights(cells: int, per_pixel: int, pad: int, sigma_px: float, shift_px: float) -> Array:
+def pixel_weights(
+    cells: int, per_pixel: int, pad: int, sigma_px: float, shift_px: float
+) -> Float32:
     """(pixels + 2 pad, cells): Gaussian blur and integration over pixels, of a row of fine cells.
 
     The row starts at the left edge of its first pixel and is displaced by shift_px. Averaging
@@ -72,7 +75,8 @@ def pixel_weights(cells: int, per_pixel: int, pad: int, sigma_px: float, shift_p
     centre = (np.arange(cells) + 0.5) / per_pixel + shift_px
     border = np.arange(-pad, pixels + pad + 1)[:, None]
     sigma = np.sqrt(max(sigma_px**2 - 1 / (12 * per_pixel**2), (0.1 / per_pixel) ** 2))
-    return np.asarray(np.diff(ndtr((border - centre) / sigma), axis=0) / per_pixel)
+    share = ndtr(((border - centre) / sigma).astype(np.float32))
+    return np.asarray((share[1:] - share[:-1]) / np.float32(per_pixel))
 
 
 def refined(outline: Array, count: int) -> Array:

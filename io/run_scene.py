@@ -176,7 +176,7 @@ def _carriage(config: RunConfig, cameras: int, speed_mm_s: float, rng: Generator
     stride = max(1, int(np.ceil(rate / config.frame_rate_hz - 1e-9)))
     step = 1 / (config.frame_rate_hz * stride)
     steps = (config.frames - 1) * stride + 1
-    t = step * np.arange(steps)
+    t = np.asarray(step * np.arange(steps), float)
     position, velocity, acceleration = stage_trajectory(t, speed_mm_s, stage.ramp_s)
     servo_rng, shake_rng = rng.spawn(2)
     if stage.servo_rms_mm > 0:
@@ -216,7 +216,7 @@ def _bubble_count(config: RunConfig, position_mm: Array, size_mm: Array) -> int:
     """Bubbles that exist, so that ``config.bubbles`` are in view at a time."""
     if not _passing(config):
         return config.bubbles
-    height = size_mm[1]
+    height = float(size_mm[1])
     reach = height + abs(_drift(config, position_mm)) + config.bubble.d_eq_mm[1]
     pairs = 2 if config.motion.pairs else 1
     return pairs * round(config.bubbles * reach / height / pairs)

@@ -60,8 +60,8 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     )
     scene = run_scene(config, cameras, scene_rng)
     run = folder / "runs" / config.name
-    _write_clocks_and_sensors(scene, run, sensor_rng)
     lost = _lost_frames(scene, image_rng)
+    _write_clocks_and_sensors(scene, run, lost, sensor_rng)
     truth: list[dict[str, Any]] = []
     detections: list[dict[str, Any]] = []
     with ExitStack() as stack:
@@ -104,12 +104,17 @@ def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
     return replace(rig, stage=stage, accelerometers=sensors, references=marks)
 
 
-def _write_clocks_and_sensors(scene: RunScene, run: Path, rng: Generator) -> None:
+def _write_clocks_and_sensors(
+    scene: RunScene, run: Path, lost: NDArray[np.bool_], rng: Generator
+) -> None:
     import pandas as pd
 
     encoder_rng, accelerometer_rng, mark_rng = rng.spawn(3)
     run.mkdir(parents=True, exist_ok=True)
     frames = pd.DataFrame({"frame": np.arange(scene.config.frames), "t_s": scene.t_s})
+    if lost.any():
+        names = np.array(list(scene.cameras))
+        frames["missing"] = ["|".join(names[gone]) for gone in lost.T]
     write_table(frames, run / "frames.csv")
     write_table(stage_table(scene, encoder_rng), run / "stage.csv")
     if scene.config.stage.accelerometers:

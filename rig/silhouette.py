@@ -115,7 +115,8 @@ def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -
     side = [np.cross(shared, d) for d in view]
     rims, moments = [], []
     for jacobian, axes, alpha in zip(jacobians, axes_px, side):
-        extents = np.stack([shared, alpha], -2) @ np.linalg.pinv(jacobian) @ axes
+        back = _t(jacobian) @ np.linalg.inv(jacobian @ _t(jacobian))
+        extents = np.stack([shared, alpha], -2) @ back @ axes
         rims.append(_rim(extents))
         moments.append(extents @ _t(extents))
     return EllipsePair(shared, (side[0], side[1]), (moments[0], moments[1]), (rims[0], rims[1]))

@@ -28,6 +28,7 @@ DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
 _ZONAL_SHARE = 0.5
 _RUN_WEIGHT = 4.0
 _MODEL_ERROR = 0.02
+_CROSS_TERM = 8.0
 _KNOWN_AXIS = 0.2
 
 
@@ -86,14 +87,10 @@ def fit_bodies(
     whole = shaped & outlines[0].whole & outlines[1].whole
     bodies = _empty(len(located))
     _fill_points(bodies, outlines, cameras, located)
-    for rows, complete in ((np.flatnonzero(shaped), False), (np.flatnonzero(whole), True)):
-        if len(rows):
+    for rows, correct in ((whole, True), (shaped & ~whole, False)):
+        if np.any(rows):
             pair = (outlines[0].rows(rows), outlines[1].rows(rows))
-            pixels, jacobian, _ = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
-            if complete:
-                _correct(bodies, pair, pixels, jacobian, rows, sigma)
-            else:
-                _fill_shapes(bodies, pair, jacobian, rows, sigma)
+            _fill_shapes(bodies, pair, cameras, np.flatnonzero(rows), sigma, correct=correct)
     return bodies
 
 
@@ -173,46 +170,54 @@ def _fill_points(
 def _fill_shapes(
     bodies: Bodies,
     pair: tuple[Outlines, Outlines],
-    jacobian: Array,
+    cameras: tuple[Camera, Camera],
     rows: NDArray[np.int64],
     sigma: Array,
+    *,
+    correct: bool,
 ) -> None:
-    """Sizes, and what the shape may add to the error of the outlines' centres."""
+    """Sizes; the centres of volume, or else what the shape adds to the outlines' centres' error."""
+    pixels, jacobian, _ = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
     axes_px = (pair[0].axes_px, pair[1].axes_px)
     shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), axes_px)
-    axes = np.sqrt(np.linalg.eigvalsh(shapes.moments_mm2))
-    bodies.semi_axes_mm[rows] = axes[:, ::-1]
+    squares = np.linalg.eigvalsh(shapes.moments_mm2)
+    bodies.semi_axes_mm[rows] = np.sqrt(squares[:, ::-1])
     bodies.d_eq_mm[rows], bodies.d_eq_sd_mm[rows] = _diameter(shapes, pair, sigma)
-    views = Views(
-        np.zeros((len(rows), 8)),
-        _pixel_noise(pair),
-        jacobian,
-        axes_px,
-        np.full(len(rows), sigma[0]),
-    )
-    frames = shapes.pair.frames(shapes.coupling)
-    bodies.covariance_mm2[rows] = body_modes.uncorrected_covariance(views, frames)
+    if correct:
+        _correct(bodies, pair, shapes, pixels, jacobian, rows, sigma)
+    else:
+        bodies.covariance_mm2[rows] = body_modes.uncorrected_covariance(
+            _pixel_noise(pair), jacobian, axes_px, shapes.pair.frames(shapes.coupling), sigma[0]
+        )
 
 
 def _correct(
     bodies: Bodies,
     pair: tuple[Outlines, Outlines],
+    shapes: BodyShapes,
     pixels: Array,
     jacobian: Array,
     rows: NDArray[np.int64],
     sigma: Array,
 ) -> None:
     """Centres of volume: every account of the shape, weighted by its evidence."""
-    axes_px = (pair[0].axes_px, pair[1].axes_px)
-    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), axes_px)
     measured, noise, conversion = _measured(pair, pixels)
     slope = np.concatenate([jacobian, np.zeros_like(jacobian)], 1)
-    views = Views(measured, noise, slope, axes_px, _own_sigma(pair, sigma[0]))
+    views = Views(
+        measured,
+        noise,
+        slope,
+        (pair[0].axes_px, pair[1].axes_px),
+        _own_sigma(pair, sigma[0]),
+        conversion,
+        _images(jacobian, shapes.pair.sides),
+        _images(jacobian, (shapes.pair.shared, shapes.pair.shared)),
+    )
     accounts, shares = [], []
     for coupling, share in shapes.couplings():
         accounts.append(body_modes.isotropic(views, shapes.pair.frames(coupling)))
         shares.append(share)
-    axis_sigma = _axis_sigma(shapes, pair, sigma[1])
+    axis_sigma = _axis_sigma(shapes, pair, sigma)
     accounts.append(body_modes.zonal(views, shapes.poles, axis_sigma))
     share = np.where(axis_sigma < _KNOWN_AXIS, _ZONAL_SHARE, 1e-9)
     prior = np.stack([*((1 - share) * p for p in shares), share])
@@ -225,18 +230,28 @@ def _correct(
     bodies.zonal_probability[rows] = weight[-1]
 
 
+def _images(jacobian: Array, directions: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Two (M, 2): the first direction in the first view, the second in the second."""
+    left, right = (
+        (jacobian[:, 2 * c : 2 * c + 2] @ d[..., None])[..., 0] for c, d in enumerate(directions)
+    )
+    return left, right
+
+
 def _measured(pair: tuple[Outlines, Outlines], pixels: Array) -> tuple[Array, Array, Array]:
     """`Views.measured`, `Views.noise`, and (M, 4) what was added to the ellipses' centres."""
     count = len(pixels)
     measured, noise = np.zeros((count, 8)), np.zeros((count, 8, 8))
     conversion = np.zeros((count, 4))
-    power = np.mean([(o.trace[:, 2:4] ** 2).mean(-1) for o in pair], 0)
+    third2 = np.mean([(o.trace[:, 2:4] ** 2).mean(-1) for o in pair], 0)
+    fourth2 = np.mean([(o.trace[:, 4:] ** 2).mean(-1) for o in pair], 0)
+    second_order2 = third2 * (_MODEL_ERROR**2 + _CROSS_TERM**2 * fourth2)
     for c, outlines in enumerate(pair):
         pixel, third = slice(2 * c, 2 * c + 2), slice(4 + 2 * c, 6 + 2 * c)
         mix = np.zeros((count, 4, 4))
         mix[:, :2, :2], mix[:, 2:, 2:] = outlines.axes_px, np.eye(2)
         error = outlines.trace_covariance[:, :4, :4]
-        error = error + _MODEL_ERROR**2 * power[:, None, None] * np.eye(4)
+        error = error + second_order2[:, None, None] * np.eye(4)
         error = mix @ error @ np.swapaxes(mix, -1, -2)
         error[:, :2, :2] += outlines.covariance_px2
         conversion[:, pixel] = np.einsum("mij,mj->mi", outlines.axes_px, outlines.trace[:, :2])
@@ -254,9 +269,12 @@ def _pixel_noise(pair: tuple[Outlines, Outlines]) -> Array:
 
 
 def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
-    """(M,) each bubble's sigma of degree 3: the run's, as `_RUN_WEIGHT` harmonics, and its own."""
+    """(M,) each bubble's sigma of degree 3: the run's, as `_RUN_WEIGHT` harmonics, and its own.
+
+    Mean of an inverse gamma distribution, so that the blind components are covered.
+    """
     own = np.sum([2 * _variance(o, 3, slice(2, 4)) for o in pair], 0)
-    return np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 4))
+    return np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 2))
 
 
 def _diameter(
@@ -268,19 +286,21 @@ def _diameter(
     ellipsoid and the oblate spheroid is taken), the fourth degree's share of the ellipses, and the
     outlines' noise.
     """
-    logs = [np.linalg.slogdet(m)[1] / 6 for m in (shapes.moments_mm2, shapes.oblate_mm2)]
+    logs = [np.log(np.linalg.det(m)) / 6 for m in (shapes.moments_mm2, shapes.oblate_mm2)]
     unseen = np.hypot((logs[1] - logs[0]) / 2, shapes.coupling_sigma**2 / np.sqrt(18))
     diameter = 2 * np.exp((logs[0] + logs[1]) / 2)
-    relative2 = unseen**2 + 0.8 * sigma[1] ** 2 + _relative_noise2(pair) / 8
+    relative2 = (
+        unseen**2 + 0.8 * sigma[1] ** 2 + (30 * sigma[0] ** 2) ** 2 + _relative_noise2(pair) / 8
+    )
     return diameter, diameter * np.sqrt(relative2)
 
 
-def _axis_sigma(shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: float) -> Array:
+def _axis_sigma(shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
     """(M,) how well a spheroid's axis is known: errors of the ellipses over its flatness."""
     squares = np.linalg.eigvalsh(shapes.oblate_mm2)
     flatness = 1 - squares[:, 0] / squares[:, 2]
-    error = np.sqrt(_relative_noise2(pair) + (3.4 * sigma) ** 2)
-    return np.asarray(np.clip(error / (flatness + 1e-6), 0.01, 0.7))
+    error2 = 4 * _relative_noise2(pair) + (6.7 * sigma[1]) ** 2 + (80 * sigma[0] ** 2) ** 2
+    return np.asarray(np.clip(np.sqrt(error2) / (flatness + 1e-6), 0.01, 0.7))
 
 
 def _relative_noise2(pair: tuple[Outlines, Outlines]) -> Array:

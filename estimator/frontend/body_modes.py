@@ -8,7 +8,7 @@ about the axis of a spheroid; all is told by its one amplitude.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,9 @@ class Views:
     measured : (M, 8): pixel residuals of the first and the second view (2 + 2) and the coefficients
     of cos 3 phi, sin 3 phi in both (2 + 2); noise : (M, 8, 8).  jacobian : (M, 8, 3) by the point
     (zero for the coefficients).  axes_px : two (M, 2, 2) semi-axes.  sigma : (M,) prior standard
-    deviation of each coefficient of degree 3 (of unit mean square).
+    deviation of each coefficient of degree 3 (of unit mean square).  conversion_px : (M, 4) what
+    the pixel residuals hold beside the ellipses' centres; across_px : two (M, 2), the images of
+    motions across the shared coordinate, shared_px : two (M, 2), along it.
     """
 
     measured: Array
@@ -33,6 +35,18 @@ class Views:
     jacobian: Array
     axes_px: tuple[Array, Array]
     sigma: Array
+    conversion_px: Array
+    across_px: tuple[Array, Array]
+    shared_px: tuple[Array, Array]
+
+    def blind_px(self) -> Array:
+        """(M, 4): the conversion's part that leaves the shared coordinate as it is."""
+        parts = []
+        for c, (across, shared) in enumerate(zip(self.across_px, self.shared_px)):
+            basis = np.stack([across, shared], -1)
+            share = np.linalg.solve(basis, self.conversion_px[:, 2 * c : 2 * c + 2, None])
+            parts.append(share[:, 0] * across)
+        return np.concatenate(parts, -1)
 
 
 @dataclass(frozen=True)
@@ -51,9 +65,16 @@ class Account:
 
 
 def isotropic(views: Views, frames: tuple[Array, Array]) -> Account:
-    """frames : two (M, 3, 2), `EllipsePair.frames` of an ellipsoid that fits the outlines."""
+    """frames : two (M, 3, 2), `EllipsePair.frames` of an ellipsoid that fits the outlines.
+
+    Across the shared coordinate, where this account knows nothing, the ellipses' centres are kept
+    as they are: to re-express them gains 1 % on average and loses 40 % for some modes.
+    """
     effect = third_degree_effect(views.axes_px, frames)
-    return _account(views, views.sigma[:, None, None] ** 2 * effect @ _t(effect))
+    answer = _account(views, views.sigma[:, None, None] ** 2 * effect @ _t(effect))
+    blind, jacobian = views.blind_px(), views.jacobian[:, :4]
+    back = np.linalg.solve(_t(jacobian) @ jacobian, _t(jacobian) @ blind[..., None])[..., 0]
+    return replace(answer, step_mm=answer.step_mm - back, shift_px=answer.shift_px + blind)
 
 
 def zonal(views: Views, projections: tuple[Array, Array], axis_sigma: Array) -> Account:
@@ -73,16 +94,20 @@ def zonal(views: Views, projections: tuple[Array, Array], axis_sigma: Array) -> 
     return _account(views, (7 * views.sigma[:, None, None]) ** 2 * prior)
 
 
-def uncorrected_covariance(views: Views, frames: tuple[Array, Array]) -> Array:
+def uncorrected_covariance(
+    noise: Array,
+    jacobian: Array,
+    axes_px: tuple[Array, Array],
+    frames: tuple[Array, Array],
+    sigma: float,
+) -> Array:
     """(M, 3, 3) of the outlines' centres taken for the volume's, the shape's share included.
 
-    Of views, noise (M, 4, 4) and jacobian (M, 4, 3) are the pixels' alone.
+    noise : (M, 4, 4) and jacobian : (M, 4, 3) of the pixels.
     """
-    noise, jacobian = views.noise, views.jacobian
     weighted = _t(jacobian) @ np.linalg.inv(noise)
     gain = np.linalg.solve(weighted @ jacobian, weighted)
-    effect = third_degree_effect(views.axes_px, frames)[:, :4]
-    by_shape = views.sigma[:, None, None] * gain @ effect
+    by_shape = sigma * gain @ third_degree_effect(axes_px, frames)[:, :4]
     return np.asarray(gain @ noise @ _t(gain) + by_shape @ _t(by_shape))
 
 
@@ -118,13 +143,14 @@ def _zonal_effect(axes_px: tuple[Array, Array], projections: tuple[Array, Array]
 
 def _account(views: Views, prior: Array) -> Account:
     """Generalised least squares for the point, the shape being noise of covariance prior."""
-    inverse = np.linalg.inv(views.noise + prior)
+    total = views.noise + prior
+    inverse = np.linalg.inv(total)
     weighted = _t(views.jacobian) @ inverse
     normal = weighted @ views.jacobian
     covariance = np.linalg.inv(normal)
     step = _mv(covariance @ weighted, views.measured)
     misfit = _mv(inverse, views.measured) - _mv(_t(weighted), step)
-    log_det = np.linalg.slogdet(inverse)[1] - np.linalg.slogdet(normal)[1]
+    log_det = -np.linalg.slogdet(total)[1] - np.log(np.linalg.det(normal))
     log_evidence = 0.5 * (log_det - (views.measured * misfit).sum(-1))
     return Account(step, covariance, _mv(prior, misfit)[:, :4], log_evidence)
 

@@ -43,7 +43,7 @@ class Outlines:
         """(M, 2, 2) R diag(a^2, b^2) R^T."""
         return self.axes_px @ np.swapaxes(self.axes_px, -1, -2)
 
-    def rows(self, keep: NDArray[np.int64]) -> Outlines:
+    def rows(self, keep: Mask) -> Outlines:
         """Some of the rows."""
         return Outlines(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 

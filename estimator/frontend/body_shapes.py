@@ -13,8 +13,6 @@ from telerig.rig.silhouette import EllipsePair
 
 Array = NDArray[np.float64]
 
-_NODES = ((-np.sqrt(3), 1 / 12), (0.0, 1 / 3), (np.sqrt(3), 1 / 12))
-_OBLATE_SHARE = 0.5
 _LEAST_COUPLING = 0.01
 _LARGEST_COUPLING = 0.9
 
@@ -39,12 +37,10 @@ class BodyShapes:
     def couplings(self) -> Iterator[tuple[Array, float]]:
         """(M,) possible couplings and their probabilities.
 
-        Half goes to the oblate spheroid, half to a normal distribution (three Gauss-Hermite nodes)
-        about the most spherical ellipsoid.
+        Half goes to the most spherical ellipsoid, half to the oblate spheroid.
         """
-        for node, share in _NODES:
-            yield _possible(self.coupling + node * self.coupling_sigma), share
-        yield _possible(self.pair.coupling_of(self.oblate_mm2)), _OBLATE_SHARE
+        yield self.coupling, 0.5
+        yield _possible(self.pair.coupling_of(self.oblate_mm2)), 0.5
 
 
 def body_shapes(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> BodyShapes:

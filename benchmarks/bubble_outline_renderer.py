@@ -48,9 +48,7 @@ def _inside(bubble: Drawn, u: Array, v: Array) -> Array:
 
     phi = np.linspace(0.0, 2.0 * np.pi, 2048, endpoint=False)
     speed = np.sqrt((a * np.sin(phi)) ** 2 + (b * np.cos(phi)) ** 2)
-    bump = sum(
-        c * np.cos(k * phi) + s * np.sin(k * phi) for k, (c, s) in bubble.harmonics.items()
-    )
+    bump = sum(c * np.cos(k * phi) + s * np.sin(k * phi) for k, (c, s) in bubble.harmonics.items())
     outline = np.stack(
         [
             a * np.cos(phi) + bump * b * np.cos(phi) / speed,
@@ -84,7 +82,9 @@ def draw(
     return image
 
 
-def centre_bound_px(bubble: Drawn, shape: tuple[int, int], *, blur_px: float, sigma: float) -> Array:
+def centre_bound_px(
+    bubble: Drawn, shape: tuple[int, int], *, blur_px: float, sigma: float
+) -> Array:
     """Cramer-Rao bound (2, 2) of the ellipse's centre for white noise ``sigma``.
 
     Unknown besides: both axes, angle, blur, both levels; the heart and what lies deeper than
@@ -98,7 +98,9 @@ def centre_bound_px(bubble: Drawn, shape: tuple[int, int], *, blur_px: float, si
         change = np.zeros(5)
         change[index] = step
         plus, minus = (
-            draw([Drawn(tuple(ellipse + sign * change), level=bubble.level)], shape, blur_px=blur_px)
+            draw(
+                [Drawn(tuple(ellipse + sign * change), level=bubble.level)], shape, blur_px=blur_px
+            )
             for sign in (1.0, -1.0)
         )
         rows.append((plus - minus) / (2.0 * step))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +17,7 @@ from telerig.estimator.frontend.bubble_geometry import (
 
 Array = NDArray[np.float64]
 
-_TURN_RAD = -0.2
+_TURN_RAD = -0.1
 _POINT_SIGMA_PX = 0.2
 _ROUND_SHARE = 0.12
 _SHORTEST_ARC = 5
@@ -149,7 +151,7 @@ def _cut_open(contour: Array) -> list[Array]:
 
 def _trimmed(points: Array, bounds: list[int]) -> list[Array]:
     """Arcs between bounds, without the points that the notch's blur has moved."""
-    arcs = [points[low + 2 : high - 1] for low, high in zip(bounds[:-1], bounds[1:], strict=True)]
+    arcs = [points[low + 2 : high - 1] for low, high in itertools.pairwise(bounds)]
     return [arc for arc in arcs if len(arc) >= _SHORTEST_ARC]
 
 

@@ -48,6 +48,8 @@ _BINS = 32
 _STEPS = 3
 _FAR_SHIFT_PX, _CONVERGED_PX = 0.25, 0.02
 _HIDING_SIGMA = 3.0
+_MEAN_SLOPE = 0.35
+"""RMS of the unit normal density within one sigma."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ class Outlines:
     ``ellipse`` (B, 5), ``harmonics`` (B, 8; 0 where ``resolved`` is False), ``sigma_px`` blur of
     optics and pixel, ``outer`` and ``inner`` levels, ``centre_covariance_px2`` (B, 2, 2),
     ``sigma_outline_px`` of a harmonic's coefficient, ``chi2_dof``, ``coverage`` (share of the
-    outline that was seen), ``shift_px`` (largest displacement since the linearisation) and
+    outline that was seen), ``misfit_px`` (how far the rim strays from the outline, beyond noise),
+    ``shift_px`` (largest displacement since the linearisation) and
     ``step_px`` (the last one).
     """
 
@@ -90,6 +93,7 @@ class Outlines:
     sigma_outline_px: Array
     chi2_dof: Array
     coverage: Array
+    misfit_px: Array
     shift_px: Array
     step_px: Array
 
@@ -182,6 +186,7 @@ class _Descent:
     shifts: Array
     covariance: Array
     residual: Single
+    shift_px: Array
     step_px: Array
 
 
@@ -200,12 +205,10 @@ def _refined(
     weight = _window(state, pixels, linear, start, hidden)
     prior = prior.held_where(~linear.resolved)
     descent = _descend(state, pixels, linear, weight, start, prior, steps=_STEPS)
-    return _result(descent, pixels, linear, weight)
+    return _result(descent, pixels, linear, weight, hidden, start)
 
 
-def _window(
-    state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Mask
-) -> Single:
+def _window(state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Mask) -> Single:
     """Weights (N,): inverse variances, 0 for what must not be looked at."""
     counts = pixels.counts
     grey, _, inside = rim_model(state, pixels, linear, _shifts(state))
@@ -242,7 +245,7 @@ def _descend(
     steps: int,
 ) -> _Descent:
     """Gauss-Newton at fixed feet."""
-    shifts = _shifts(state)
+    first, shifts = state, _shifts(state)
     for index in range(steps):
         grey, jacobian, _ = rim_model(state, pixels, linear, shifts)
         residual = pixels.value - grey
@@ -262,7 +265,8 @@ def _descend(
             break
     for part, own in zip(pixels.parts(), step.astype(np.float32), strict=True):
         residual[part] -= own @ jacobian[:, part]
-    return _Descent(state, shifts, covariance, residual, reach)
+    since = np.max(np.abs(shifts - _shifts(first)), axis=1)
+    return _Descent(state, shifts, covariance, residual, since, reach)
 
 
 def _solved(information: Array, pull: Array) -> tuple[Array, Array]:
@@ -300,13 +304,38 @@ def _coverage(pixels: Pixels, linear: Linear, weight: Single, sigma: Array) -> A
     return share
 
 
-def _result(descent: _Descent, pixels: Pixels, linear: Linear, weight: Single) -> Outlines:
-    """Covariances are widened by chi2_dof where that exceeds 1."""
+def _misfit(
+    state: RimState, pixels: Pixels, linear: Linear, residual: Single, hidden: Mask, start: Start
+) -> Array:
+    """RMS distance (B,) between rim and outline: grey residuals over the edge's slope.
+
+    At the edge's steepest, outliers included, with the noise's share taken away.
+    """
+    counts = pixels.counts
+    near = np.abs(_distance(state, pixels, linear)) < spread(state.sigma, counts)
+    near &= ~hidden
+    count = np.maximum(pixels.sums(near.astype(np.float32)), 1.0)
+    excess = pixels.sums(near * residual**2) / count - start.sigma_outer**2
+    slope = _MEAN_SLOPE * (state.outer - state.inner) / state.sigma
+    misfit: Array = np.sqrt(np.maximum(excess, 0.0)) / np.maximum(slope, 1e-9)
+    return misfit
+
+
+def _result(
+    descent: _Descent,
+    pixels: Pixels,
+    linear: Linear,
+    weight: Single,
+    hidden: Mask,
+    start: Start,
+) -> Outlines:
+    """Covariances are widened by chi2_dof where that exceeds 1 by 3 sigma."""
     state = _moved(descent.state, descent.shifts)
     fitted = np.where(linear.resolved, PARAMETERS, FIRST_HARMONIC)
     dof = np.maximum(pixels.sums((weight > 0.0).astype(np.float32)) - fitted, 1.0)
     chi2_dof = pixels.sums(weight * descent.residual**2) / dof
-    covariance = descent.covariance * np.maximum(chi2_dof, 1.0)[:, None, None]
+    misfit = np.where(chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / dof), chi2_dof, 1.0)
+    covariance = descent.covariance * misfit[:, None, None]
     angle = descent.state.ellipse[:, 4]
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
@@ -319,9 +348,10 @@ def _result(descent: _Descent, pixels: Pixels, linear: Linear, weight: Single) -
         state.outer,
         state.inner,
         turn @ covariance[:, :2, :2] @ np.swapaxes(turn, 1, 2),
-        np.sqrt(np.mean(variances, axis=1)),
+        np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0)),
         chi2_dof,
         _coverage(pixels, linear, weight, state.sigma),
-        np.max(np.abs(descent.shifts[:, :BLUR]), axis=1),
+        _misfit(state, pixels, linear, descent.residual, hidden, start),
+        descent.shift_px,
         descent.step_px,
     )

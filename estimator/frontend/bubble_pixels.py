@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -43,7 +44,7 @@ class Pixels:
     def parts(self) -> Iterator[slice]:
         """The slice of each bubble."""
         edges = np.concatenate([[0], np.cumsum(self.counts)]).tolist()
-        return (slice(low, high) for low, high in zip(edges[:-1], edges[1:], strict=True))
+        return (slice(low, high) for low, high in itertools.pairwise(edges))
 
     def sums(self, values: Single) -> Array:
         """Sum (B,) of values (N,) over each bubble."""

@@ -18,6 +18,7 @@ _NOISE_ROWS = 96
 _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
 _DARKEST = 0.05
+_MAX_CUT_HEART_SHARE = 0.6
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,9 @@ def _trace(
         return [], f"contrast {1.0 - inner:.2f} is below {min_contrast:g}"
     half = 0.5 * (1.0 + inner)
     dark = (own & (part < half)).astype(np.uint8)
+    lit_sides = (top == 0, left == 0, top + part.shape[0] == rows, left + part.shape[1] == columns)
+    if any(lit_sides):
+        _close_at_border(dark, lit_sides)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     blobs, reason = [], f"smaller than {min_diameter_px:g} px"
     for outline in outlines:
@@ -165,6 +169,18 @@ def _trace(
         blobs.append(Blob(refined, inner, blur, area, box, bool(np.any(edge))))
         reason = ""
     return blobs, reason
+
+
+def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
+    """Join what is dark along the image's edges, so that a heart cut by the edge is a hole."""
+    lines = (dark[0], dark[:, 0], dark[-1], dark[:, -1])
+    for line, at_border in zip(lines, sides, strict=True):
+        if not at_border:
+            continue
+        places = np.flatnonzero(line)
+        for low, high in zip(places[:-1].tolist(), places[1:].tolist(), strict=True):
+            if 1 < high - low <= _MAX_CUT_HEART_SHARE * line.size:
+                line[low:high] = 1
 
 
 def refined_contour(

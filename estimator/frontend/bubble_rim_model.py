@@ -27,6 +27,7 @@ BLUR, OUTER, INNER, FIRST_HARMONIC = 5, 6, 7, 8
 """Places in the parameter vector; before BLUR the five displacements of the ellipse."""
 PARAMETERS = FIRST_HARMONIC + 2 * len(HARMONICS)
 _RESOLVED_BLURS = 3.0
+_BENDING_FROM, _MAX_RETREAT = 0.2, 0.3
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,13 @@ class RimState:
 class Linear:
     """What stays while outlines move a little: the pixels' feet, and the outward displacement
     ``shape`` (13, N) there by each parameter of the outline. Harmonics of bubbles that are not
-    ``resolved`` (B,), too small against their blur, are not to be fitted."""
+    ``resolved`` (B,), too small against their blur, are not to be fitted. ``bending`` (N,) is the
+    curvature's second derivative along the arc over 8, where the blur makes it matter."""
 
     foot: Foot
     shape: Single
     resolved: Mask
+    bending: Single | None
 
     def displacements(self, pixels: Pixels, shifts: Array) -> Single:
         """Outward displacement (N,) of the outline at each pixel's foot for shifts (B, 13)."""
@@ -74,7 +77,28 @@ def linearised(state: RimState, pixels: Pixels) -> Linear:
     shape[ELLIPSE_PARAMETERS:] = harmonic_basis(foot.cos, foot.sin)
     for index, part in enumerate(pixels.parts()):
         shape[ELLIPSE_PARAMETERS:, part] *= gain[:, index : index + 1].astype(np.float32)
-    return Linear(foot, shape, state.ellipse[:, 3] > _RESOLVED_BLURS * state.sigma)
+    sharpest = state.ellipse[:, 2] / state.ellipse[:, 3] ** 2
+    bent = bool(np.any(sharpest * state.sigma > _BENDING_FROM))
+    resolved = state.ellipse[:, 3] > _RESOLVED_BLURS * state.sigma
+    return Linear(foot, shape, resolved, _bending(state, pixels, foot) if bent else None)
+
+
+def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Single:
+    """Second derivative of the curvature by the arc's length, over 8.
+
+    Across the blur an arc runs at -(K y^2 / 2 + (K'' + 3 K^3) y^4 / 24) from its tangent, a circle
+    of the same curvature at K'' = 0; the mean of y^4 is 3 sigma^4, so the blurred edge retreats
+    by K'' sigma^4 / 8.
+    """
+    a, b = state.ellipse[:, 2], state.ellipse[:, 3]
+    product, gap = spread(np.stack([a * b, a * a - b * b]), pixels.counts)
+    square = foot.speed * foot.speed
+    turn = gap * (foot.cos * foot.cos - foot.sin * foot.sin)
+    slope = gap * foot.sin * foot.cos
+    bending: Single = (
+        -0.375 * product * (turn - 6.0 * slope * slope / square) / (square**3 * foot.speed)
+    )
+    return bending
 
 
 def rim_model(
@@ -89,6 +113,10 @@ def rim_model(
         np.stack([1.0 / state.sigma, state.inner - state.outer, state.outer]), counts
     )
     distance = linear.foot.distance - linear.displacements(pixels, shifts)
+    if linear.bending is not None:
+        limit = spread(_MAX_RETREAT * state.sigma, counts)
+        retreat = linear.bending * spread(state.sigma**4, counts)
+        distance += np.clip(retreat, -limit, limit)
     distance *= inverse_sigma
     curvature = linear.foot.curvature / inverse_sigma
     profile = rim_profile(distance, curvature)

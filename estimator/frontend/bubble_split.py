@@ -29,6 +29,7 @@ _FIT_PX, _FIT_SHARE = 0.3, 0.03
 _MIN_ARC_RAD = 1.0
 _MIN_EXPLAINED, _MIN_COVERED = 0.75, 0.88
 _MAX_ARCS = 24
+_SPIRAL, _LEAST_IN_IMAGE = 200, 0.08
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class Part:
     merged: bool = False
 
 
-def split_blobs(blobs: list[Blob], *, min_diameter_px: float) -> list[Part]:
-    """The bubbles in every blob; at least one part for each."""
+def split_blobs(blobs: list[Blob], shape: tuple[int, ...], *, min_diameter_px: float) -> list[Part]:
+    """The bubbles in every blob of an image of ``shape``; at least one part for each."""
     if not blobs:
         return []
     whole, rms, largest = contour_moments([blob.contour_px for blob in blobs])
@@ -55,7 +56,7 @@ def split_blobs(blobs: list[Blob], *, min_diameter_px: float) -> list[Part]:
         if clean and not blob.touches_border:
             parts.append(Part(whole[index], index))
         else:
-            parts += _split(blob, index, whole[index], min_diameter_px)
+            parts += _split(blob, index, whole[index], shape, min_diameter_px)
     return parts
 
 
@@ -64,27 +65,29 @@ def _tolerance(ellipse: Array) -> Array:
     return tolerance
 
 
-def _split(blob: Blob, index: int, whole: Array, min_diameter_px: float) -> list[Part]:
+def _split(
+    blob: Blob, index: int, whole: Array, shape: tuple[int, ...], min_diameter_px: float
+) -> list[Part]:
     arcs = notch_arcs(blob.contour_px)
-    if len(arcs) > _MAX_ARCS:
-        return [Part(whole, index, merged=True)]
-    if not arcs:
-        return [Part(whole, index, merged=True)]
+    unsplit = [Part(whole, index, merged=True)]
+    if not arcs or len(arcs) > _MAX_ARCS:
+        return unsplit
+    contour = blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
     if len(arcs) == 1:
         fitted, rms = fit_ellipses(arcs)
-        sound = rms[0] < 2.5 * float(_tolerance(fitted[0]))
-        return [Part(fitted[0] if sound else whole, index, merged=not sound)]
+        sound = rms[0] < 2.5 * _tolerance(fitted[0]) and _dark(fitted[0], contour, shape)
+        return [Part(fitted[0], index)] if sound else unsplit
     groups = _grouped(arcs, blob)
     fitted, rms = fit_ellipses(groups)
-    contour = blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
     good = [
-        (ellipse, group)
+        ellipse
         for ellipse, group, error in zip(fitted, groups, rms, strict=True)
         if _sound(ellipse, group, float(error), contour, min_diameter_px)
+        and _dark(ellipse, contour, shape)
     ]
-    if not _explains([ellipse for ellipse, _ in good], contour, blob):
-        return [Part(whole, index, merged=True)]
-    return [Part(ellipse, index, shared=len(good) > 1) for ellipse, _ in good]
+    if not _explains(good, contour):
+        return unsplit
+    return [Part(ellipse, index, shared=len(good) > 1) for ellipse in good]
 
 
 def _sound(
@@ -144,7 +147,7 @@ def _grouped(arcs: list[Array], blob: Blob) -> list[Array]:
     return groups
 
 
-def _explains(ellipses: list[Array], contour: Array, blob: Blob) -> bool:
+def _explains(ellipses: list[Array], contour: Array) -> bool:
     """Whether the ellipses' rims carry the blob's outline and their discs fill its area."""
     if not ellipses:
         return False
@@ -153,16 +156,42 @@ def _explains(ellipses: list[Array], contour: Array, blob: Blob) -> bool:
     nearest = np.min(np.abs(gap), axis=0)
     if np.mean(nearest < 1.0 + 2.0 * np.min(_tolerance(stack))) < _MIN_EXPLAINED:
         return False
-    return _covered(stack, contour, blob) > _MIN_COVERED
+    return _covered(stack, contour) > _MIN_COVERED
 
 
-def _covered(ellipses: Array, contour: Array, blob: Blob) -> float:
+def _filled(contour: Array) -> tuple[NDArray[np.uint8], NDArray[np.int_]]:
+    """The outline filled on a canvas, and the canvas's first pixel (u, v)."""
     import cv2
 
     low = np.floor(np.min(contour, axis=0)).astype(int)
     size = np.ceil(np.max(contour, axis=0)).astype(int) - low + 1
     canvas = np.zeros((size[1], size[0]), np.uint8)
     cv2.fillPoly(canvas, [np.round(contour - low).astype(np.int32).reshape(-1, 1, 2)], 1)
+    return canvas, low
+
+
+def _dark(ellipse: Array, contour: Array, shape: tuple[int, ...]) -> bool:
+    """Whether what the image shows of the ellipse's disc lies within the blob."""
+    share = (np.arange(_SPIRAL) + 0.5) / _SPIRAL
+    turn = np.arange(_SPIRAL) * np.pi * (3.0 - np.sqrt(5.0))
+    x = ellipse[2] * np.sqrt(share) * np.cos(turn)
+    y = ellipse[3] * np.sqrt(share) * np.sin(turn)
+    cos, sin = np.cos(ellipse[4]), np.sin(ellipse[4])
+    u = np.round(ellipse[0] + cos * x - sin * y).astype(int)
+    v = np.round(ellipse[1] + sin * x + cos * y).astype(int)
+    seen = (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
+    if np.mean(seen) < _LEAST_IN_IMAGE:
+        return False
+    canvas, low = _filled(contour)
+    u, v = u[seen] - low[0], v[seen] - low[1]
+    inside = (u >= 0) & (v >= 0) & (u < canvas.shape[1]) & (v < canvas.shape[0])
+    dark = np.zeros(u.size, dtype=np.bool_)
+    dark[inside] = canvas[v[inside], u[inside]] > 0
+    return bool(np.mean(dark) > _MIN_COVERED)
+
+
+def _covered(ellipses: Array, contour: Array) -> float:
+    canvas, low = _filled(contour)
     v, u = np.nonzero(canvas)
     gap = rough_distance(ellipses[:, None, :], (u + low[0])[None, :], (v + low[1])[None, :])
     return float(np.mean(np.any(gap < 0.7, axis=0)))

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 TERMS = (1, 4, 10)
 PAIRS_PER_TERM = 3.0
-_BETTER = 0.9
+_BETTER = 0.95
 _PRIOR_SD_PX = (10.0, 2.0, 1.0)
 _PRIOR_SCATTER_PX, _PRIOR_PAIRS, _SMALLEST_PX = 0.3, 2.0, 0.02
 
@@ -72,7 +72,7 @@ def _fit(
         own = variance_px2 + (scatter * doubt) ** 2
         tempered = weight * 5 / (4 + residual**2 / own)
         influence = tempered / own
-        covariance = np.linalg.inv((basis.T * influence) @ basis + np.diag(prior))
+        covariance = np.asarray(np.linalg.inv((basis.T * influence) @ basis + np.diag(prior)))
         bias = covariance @ (basis.T @ (influence * gap_px))
         residual = gap_px - basis @ bias
         lost = np.einsum("ni,ij,nj->n", basis, covariance, basis)

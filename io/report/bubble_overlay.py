@@ -17,6 +17,10 @@ Colour = tuple[int, int, int]
 Rejected = tuple[float, float, float, str]
 
 _FRACTION_BITS = 4
+_LEAST_CONTRAST = 0.6
+_ROOM_PX = 9
+"""An outline wider than twice this has its label inside."""
+
 _FINEST_PX = 2.0
 """A circle round what was rejected is at least so large, to be seen."""
 
@@ -42,7 +46,7 @@ def draw_bubble_overlay(
     """
     shades = _checked(image, outlines, labels, colours)
     factor = min(1.0, max_width_px / image.shape[1])
-    picture = grey_picture(image, factor)
+    picture = grey_picture(image, factor, _LEAST_CONTRAST)
     reasons = Counter(reason for *_, reason in rejected)
     numbers = {reason: i + 1 for i, (reason, _) in enumerate(reasons.most_common())}
     circles = [_circle(u, v, radius, factor) for u, v, radius, _ in rejected]
@@ -139,6 +143,9 @@ def _write(
     if not label or not len(points):
         return
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, reach = (low + high) / 2, (high - low) / 2 + 8
-    places = [middle + reach * step for step in ((0, 0), (1, 0), (-1, 0), (0, -1), (0, 1))]
+    middle, reach = (low + high) / 2, (high - low) / 2
+    steps = [(1, 0), (-1, 0), (0, -1), (0, 1)]
+    if reach.min() > _ROOM_PX:
+        steps = [(0, 0), *steps]
+    places = [middle + (reach + _ROOM_PX) * step for step in steps]
     any(write_label(picture, label, place, colour, taken) for place in places)

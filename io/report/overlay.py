@@ -69,8 +69,12 @@ def _check(image: NDArray[Any], table: pd.DataFrame, extra: list[str], name: str
         )
 
 
-def grey_picture(image: NDArray[Any], factor: float) -> Picture:
-    """8-bit RGB; the darkest and brightest thousandth of the pixels become black and white."""
+def grey_picture(image: NDArray[Any], factor: float, least_contrast: float = 0.0) -> Picture:
+    """8-bit RGB; the darkest and brightest thousandth of the pixels become black and white.
+
+    What is brighter than 1 - least_contrast of the brightest never becomes black, so that an
+    empty image does not look like snow.
+    """
     import cv2
 
     height, width = image.shape
@@ -79,6 +83,7 @@ def grey_picture(image: NDArray[Any], factor: float) -> Picture:
     if factor < 1:
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     low, high = np.percentile(grey, [0.1, 99.9])
+    low = min(low, (1 - least_contrast) * high) if least_contrast > 0 else low
     stretched = np.clip((grey - low) / max(high - low, 1e-9), 0, 1) * 255
     return np.repeat(stretched.astype(np.uint8)[..., None], 3, axis=2)
 

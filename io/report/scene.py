@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,15 @@ def scene_json(results: CalibrationResults) -> str:
     return scene_text(traces)
 
 
-def scene_text(traces: list[Trace], up: tuple[float, float, float] = (0.0, -1.0, 0.0)) -> str:
-    """Traces with a layout for them, safe inside a script element; ``up`` is up on the screen."""
-    text = json.dumps({"data": traces, "layout": _layout(up)}, allow_nan=False)
+def scene_text(
+    traces: list[Trace], up: Sequence[float] = (0.0, -1.0, 0.0), distance: float = 1.0
+) -> str:
+    """Traces with a layout for them, safe inside a script element.
+
+    up : (3,) unit vector, up on the screen. distance : of the eye; from afar it looks a little
+    lower, where tilted boxes reach farthest.
+    """
+    text = json.dumps({"data": traces, "layout": _layout(up, distance)}, allow_nan=False)
     return text.replace("</", "<\\/")
 
 
@@ -96,9 +103,22 @@ def lines(points_mm: Array, colour: str, width: float) -> Trace:
     }  # fmt: skip
 
 
-def _layout(up: tuple[float, float, float]) -> dict[str, Any]:
+def _eye(up: Sequence[float], distance: float) -> list[float]:
+    """From above, off the two horizontal axes."""
+    axis = int(np.argmax(np.abs(up)))
+    eye = 0.8 * np.array(up, float)
+    eye[[i for i in range(3) if i != axis]] += (0.85, -1.0)
+    return [float(part) for part in distance * eye]
+
+
+def _layout(up: Sequence[float], distance: float) -> dict[str, Any]:
     axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
-    view = {"up": dict(zip("xyz", up)), "eye": {"x": 0.85, "y": -0.8, "z": -1.0}}
+    lower = [0.3 * (1 - distance) * float(part) for part in up]
+    view = {
+        "up": dict(zip("xyz", up)),
+        "center": dict(zip("xyz", lower)),
+        "eye": dict(zip("xyz", _eye(up, distance))),
+    }
     return {
         "scene": axes | {"aspectmode": "data", "camera": view},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},

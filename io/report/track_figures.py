@@ -98,7 +98,9 @@ def sizes(results: TrackResults) -> Picture:
         beside.set_ylabel("tracks", color=camera_colour(0))
         beside.spines["right"].set(visible=True, color=camera_colour(0))
         beside.yaxis.get_major_locator().set_params(integer=True)
-        figure.subplots_adjust(right=0.87)
+        box = axes.get_position()
+        for each_axes in (axes, beside):
+            each_axes.set_position((box.x0, box.y0, box.width - 0.09, box.height))
         _room_above(axes, beside)
         source = svg(figure)
     scatter = _scatter_in_tracks(results)
@@ -129,7 +131,8 @@ def predicted_sd(results: TrackResults) -> Picture:
             label = f"{name}: {number(median(sd[:, i]), 2)} µm"
             _bars(axes, sd[:, i], edges, camera_colour(i), label, fill=False)
         axes.set(xlabel="sd of the position / µm", ylabel="points")
-        axes.legend(loc="upper right")
+        axes.set_ylim(0, 1.25 * max(axes.get_ylim()[1], 1.0))
+        axes.legend(loc="upper left", ncols=3, columnspacing=1.2, handlelength=1.4)
         source = svg(figure)
     beyond = int(np.sum((sd > edges[-1]).any(axis=1)))
     caption = (

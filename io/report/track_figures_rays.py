@@ -145,14 +145,19 @@ def seen_where(results: TrackResults, index: int) -> Picture:
     cells = [max(2, round(_CELLS * n / max(size))) for n in size]
     edges = [np.linspace(-0.5, n - 0.5, k + 1) for n, k in zip(size, cells)]
     count, _ = np.histogramdd(uv, bins=edges)
-    with drawing(image_height_in(size) + 0.75) as (figure, axes):
+    below = 0.75
+    height = image_height_in(size) + below
+    with drawing(height) as (figure, axes):
+        box, room = axes.get_position(), below / height
+        axes.set_position((box.x0, box.y0 + room, box.width, box.height - room))
+        bar = figure.add_axes((box.x0, 0.42 / height, box.width, 0.1 / height))
         image_axes(axes, size)
         mesh = axes.pcolormesh(*edges, np.where(count.T > 0, count.T, np.nan), cmap="Blues",
                                vmin=0, vmax=max(float(count.max()), 1.0))  # fmt: skip
         step = len(alone) // _MOST_MARKS + 1
-        axes.plot(*alone[::step].T, ".", color=LEFT_OUT, markersize=2.5, markeredgewidth=0,
+        axes.plot(*alone[::step].T, ".", color=LEFT_OUT, markersize=4, markeredgewidth=0,
                   alpha=0.7)  # fmt: skip
-        figure.colorbar(mesh, ax=axes, orientation="horizontal", fraction=0.06, pad=0.2,
+        figure.colorbar(mesh, cax=bar, orientation="horizontal",
                         label="bubbles in a cell, all frames")  # fmt: skip
         source = png(figure) if len(alone) > 500 else svg(figure)
     empty = int(np.sum(count == 0))

@@ -55,14 +55,17 @@ def _affine(results: TrackResults, camera: str) -> Array | None:
     return np.asarray(np.linalg.lstsq(points, pixels, rcond=None)[0].T)
 
 
-def ray_miss_ratio(results: TrackResults, predicted_mm: Array | None) -> float | None:
+def ray_miss_ratio(
+    results: TrackResults, predicted_mm: Array | None, *, centred: bool = False
+) -> float | None:
     """Typical ray miss over its predicted sd: 1 when the covariances tell the whole story.
 
-    From the medians, so that a few wrong pairs do not count.
+    From the medians, so that a few wrong pairs do not count. centred : about the median miss.
     """
     if predicted_mm is None:
         return None
-    units = np.abs(results.tracks["ray_miss_mm"].to_numpy(float)) / predicted_mm
+    miss = results.tracks["ray_miss_mm"].to_numpy(float)
+    units = np.abs(miss - (median(miss) or 0.0 if centred else 0.0)) / predicted_mm
     units = units[np.isfinite(units)]
     return float(np.median(units)) / _NORMAL_MEDIAN if len(units) else None
 

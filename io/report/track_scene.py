@@ -25,6 +25,7 @@ MANY_POINTS = 3_000
 """More of them in a figure are stored as pixels."""
 
 _NAMED = len(TRACK_COLOURS)
+_EYE = 1.5
 
 
 def track_colour(particle: int) -> str:
@@ -65,7 +66,7 @@ def track_scene_json(results: TrackResults) -> str:
     traces = [
         _group(table[group == k], TRACK_COLOURS[k], named=bool(few)) for k in np.unique(group)
     ]
-    return scene_text(traces, tuple(float(part) + 0.0 for part in results.up))  # type: ignore[arg-type]
+    return scene_text(traces, [float(part) + 0.0 for part in results.up], _EYE)
 
 
 def _group(table: pd.DataFrame, colour: str, *, named: bool) -> Trace:

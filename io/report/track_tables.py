@@ -99,10 +99,11 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
         words += [w for w in told if "calibration" in w.lower()] or [
             "The cameras disagree along their shared axis: this is a calibration problem."
         ]
-    ratio = ray_miss_ratio(results, ray_miss_sd_mm(results))
+    ratio = ray_miss_ratio(results, ray_miss_sd_mm(results), centred=bool(words))
     if ratio is not None and ratio > _MISS_TOO_LARGE:
+        scatter = "Even without their common offset, rays" if words else "Rays"
         words.append(
-            f"Rays miss by {number(ratio, 2)} times what the outlines' noise predicts: the "
+            f"{scatter} miss by {number(ratio, 2)} times what the outlines' noise predicts: the "
             "calibration, the pairs or the shapes of the bubbles are worse than the covariances "
             "in tracks.csv say."
         )
@@ -127,7 +128,7 @@ def key_numbers(results: TrackResults) -> list[Figure]:
     each = len(tracks) / frames if frames else None
     return [
         Figure("Tracks", number(len(lengths)),
-               f"median length {number(median(lengths.astype(float)), 4)} points, longest "
+               f"median length {number(round(median(lengths.astype(float)) or 0))} points, longest "
                f"{number(int(lengths.max())) if len(lengths) else ABSENT}"),
         Figure("Bubbles in a frame", number(each, 3), f"in space, mean of {number(frames)} frames"),
         Figure("Matched", share(*matched),
@@ -215,7 +216,7 @@ def event_words(results: TrackResults) -> str:
     """How many of each kind there were."""
     given = results.content.get("events") or {}
     counts = given or results.events["kind"].value_counts().to_dict()
-    told = [f"{number(n)} {kind}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])]
+    told = [f"{kind}: {number(n)}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])]
     rest = len(results.events) - MOST_EVENTS
     text = ", ".join(told) + "." if told else "Nothing is known of any event."
     if rest > 0:

@@ -25,11 +25,11 @@ from telerig.rig.triangulation import stacked_jacobian, triangulate
 Array = NDArray[np.float64]
 
 DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
-_ZONAL_SHARE = 0.5
-_RUN_WEIGHT = 4.0
-_MODEL_ERROR = 0.02
-_CROSS_TERM = 8.0
-_KNOWN_AXIS = 0.2
+_ZONAL_SHARE = 0.5  # prior probability of a shape that is axisymmetric about the spheroid's axis
+_KNOWN_AXIS = 0.2  # rad: beyond this uncertainty of the axis that account is left out
+_RUN_WEIGHT = 4.0  # harmonics' worth of the run's shape_sigma against a bubble's own four
+_LARGEST_SIGMA = 0.03  # one bubble's share in what a run learns
+_MODEL_ERROR, _CROSS_TERM = 0.02, 8.0  # second order: of the third harmonic, times the fourth
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def fit_bodies(
 
     Raises InputError for tables of unequal length or a shape_sigma that is not positive.
     """
-    outlines = _paired(first, second)
+    outlines = _paired(first, second, cameras)
     sigma = _learned_sigma(outlines) if shape_sigma is None else _checked_sigma(shape_sigma)
     located = outlines[0].located & outlines[1].located
     shaped = located & outlines[0].shaped & outlines[1].shaped
@@ -94,22 +94,30 @@ def fit_bodies(
     return bodies
 
 
-def estimate_shape_sigma(first: pd.DataFrame, second: pd.DataFrame) -> Array:
+def estimate_shape_sigma(
+    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
+) -> Array:
     """(2,) standard deviations of the shape's coefficients of degree 3 and 4, learned from a run.
 
     Empirical Bayes: the mean square of the outlines' third and fourth harmonics, less their noise,
     with `DEFAULT_SHAPE_SIGMA` as one more bubble. Raises InputError for tables of unequal length.
     """
-    return _learned_sigma(_paired(first, second))
+    return _learned_sigma(_paired(first, second, cameras))
 
 
-def _paired(first: pd.DataFrame, second: pd.DataFrame) -> tuple[Outlines, Outlines]:
+def _paired(
+    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
+) -> tuple[Outlines, Outlines]:
     if len(first) != len(second):
         raise InputError(
             f"{len(first)} outlines in the first camera and {len(second)} in the second",
             todo="row i of one table must be the same bubble as row i of the other",
         )
-    return outlines_from_table(first), outlines_from_table(second)
+    left, right = (
+        outlines_from_table(table, camera.image_size_px)
+        for table, camera in zip((first, second), cameras)
+    )
+    return left, right
 
 
 def _checked_sigma(shape_sigma: ArrayLike) -> Array:
@@ -123,10 +131,11 @@ def _checked_sigma(shape_sigma: ArrayLike) -> Array:
 
 
 def _learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
-    whole = np.flatnonzero(outlines[0].whole & outlines[1].whole)
+    whole = outlines[0].whole & outlines[1].whole
     out = []
     for degree, part, default in zip((3, 4), (slice(2, 4), slice(4, 6)), DEFAULT_SHAPE_SIGMA):
         variance = np.mean([_variance(o.rows(whole), degree, part) for o in outlines], 0)
+        variance = np.minimum(variance, _LARGEST_SIGMA**2)
         out.append(np.sqrt((max(variance.sum(), 0.0) + default**2) / (len(variance) + 1)))
     return np.array(out)
 
@@ -219,8 +228,8 @@ def _correct(
         shares.append(share)
     axis_sigma = _axis_sigma(shapes, pair, sigma)
     accounts.append(body_modes.zonal(views, shapes.poles, axis_sigma))
-    share = np.where(axis_sigma < _KNOWN_AXIS, _ZONAL_SHARE, 1e-9)
-    prior = np.stack([*((1 - share) * p for p in shares), share])
+    zonal_share = np.where(axis_sigma < _KNOWN_AXIS, _ZONAL_SHARE, 1e-9)
+    prior = np.stack([*((1 - zonal_share) * p for p in shares), zonal_share])
     answer, weight = body_modes.combine(accounts, prior)
     correction = conversion - answer.shift_px
     bodies.points_mm[rows] = bodies.silhouette_points_mm[rows] + answer.step_mm
@@ -274,7 +283,7 @@ def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
     Mean of an inverse gamma distribution, so that the blind components are covered.
     """
     own = np.sum([2 * _variance(o, 3, slice(2, 4)) for o in pair], 0)
-    return np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 2))
+    return np.asarray(np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 2)))
 
 
 def _diameter(

@@ -9,6 +9,7 @@ about the axis of a spheroid; all is told by its one amplitude.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,8 +107,8 @@ def uncorrected_covariance(
     noise : (M, 4, 4) and jacobian : (M, 4, 3) of the pixels.
     """
     weighted = _t(jacobian) @ np.linalg.inv(noise)
-    gain = np.linalg.solve(weighted @ jacobian, weighted)
-    by_shape = sigma * gain @ third_degree_effect(axes_px, frames)[:, :4]
+    gain = np.asarray(np.linalg.solve(weighted @ jacobian, weighted))
+    by_shape = np.asarray(gain @ (sigma * third_degree_effect(axes_px, frames)[:, :4]))
     return np.asarray(gain @ noise @ _t(gain) + by_shape @ _t(by_shape))
 
 
@@ -147,7 +148,7 @@ def _account(views: Views, prior: Array) -> Account:
     inverse = np.linalg.inv(total)
     weighted = _t(views.jacobian) @ inverse
     normal = weighted @ views.jacobian
-    covariance = np.linalg.inv(normal)
+    covariance = np.asarray(np.linalg.inv(normal))
     step = _mv(covariance @ weighted, views.measured)
     misfit = _mv(inverse, views.measured) - _mv(_t(weighted), step)
     log_det = -np.linalg.slogdet(total)[1] - np.log(np.linalg.det(normal))
@@ -155,9 +156,9 @@ def _account(views: Views, prior: Array) -> Account:
     return Account(step, covariance, _mv(prior, misfit)[:, :4], log_evidence)
 
 
-def _t(matrix: Array) -> Array:
+def _t(matrix: NDArray[Any]) -> Array:
     return np.swapaxes(matrix, -1, -2)
 
 
-def _mv(matrix: Array, vector: Array) -> Array:
+def _mv(matrix: NDArray[Any], vector: Array) -> Array:
     return np.asarray((matrix @ vector[..., None])[..., 0])

@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SAMPLES = 32
+_LEAST_PX2 = 1e-12
 _BLOCKING = ("border", "overlap", "merged")
 _TRACE_ORDERS = (1, 3, 4)
 
@@ -48,8 +49,12 @@ class Outlines:
         return Outlines(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
 
-def outlines_from_table(table: pd.DataFrame) -> Outlines:
-    """A detection table's rows; missing columns and words that are no numbers count as unknown."""
+def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> Outlines:
+    """A detection table's rows; missing columns and words that are no numbers count as unknown.
+
+    So do centres farther out than the image is large, axes of a ratio above 20, and harmonics
+    above 30 % of the smaller axis.
+    """
     numbers = {
         name: pd.to_numeric(table[name], errors="coerce").to_numpy(float)
         if name in table
@@ -59,14 +64,18 @@ def outlines_from_table(table: pd.DataFrame) -> Outlines:
     uv = np.stack([numbers["u_px"], numbers["v_px"]], -1)
     suu, suv, svv = (numbers[f"s{n}_px2"] for n in ("uu", "uv", "vv"))
     covariance = np.stack([suu, suv, suv, svv], -1).reshape(-1, 2, 2)
-    located = np.isfinite(uv).all(-1) & (suu > 0) & (suu * svv > suv**2)
+    size = np.asarray(image_size_px, float)
+    located = (np.abs(uv - size / 2) < 1.5 * size).all(-1)
+    located &= np.isfinite(suu) & np.isfinite(svv) & (suu > _LEAST_PX2) & (svv > _LEAST_PX2)
+    located &= suu * svv - suv**2 > 1e-6 * suu * svv
     a, b, angle = numbers["a_px"], numbers["b_px"], numbers["angle_rad"]
-    shaped = located & np.isfinite(angle) & np.isfinite(a) & (b > 0) & (a >= b)
+    shaped = located & np.isfinite(angle) & np.isfinite(a) & (b > 0.05 * a) & (a >= b)
     rotation = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1)
     axes = rotation.reshape(-1, 2, 2) * np.stack([a, b], -1)[:, None, :]
     displacement = np.stack([numbers[name] for name in HARMONIC_COLUMNS], -1)
     sigma = numbers["sigma_outline_px"]
-    known = np.isfinite(displacement).all(-1) & (sigma > 0) & np.isfinite(sigma)
+    known = (np.abs(displacement) < 0.3 * b[:, None]).all(-1)
+    known &= (sigma**2 > _LEAST_PX2) & (sigma < b)
     gain = _trace_from_displacement(a, b)
     return Outlines(
         uv,
@@ -92,7 +101,7 @@ def _trace_from_displacement(a_px: Array, b_px: Array) -> Array:
     weights = (2 / _SAMPLES * outward[:, None] * inward[None]).reshape(-1, _SAMPLES)
     speed = np.hypot(np.outer(b_px, np.cos(phi)), np.outer(a_px, np.sin(phi)))
     factor = speed / (a_px * b_px)[:, None]
-    return (factor @ weights.T).reshape(-1, len(outward), len(inward))
+    return np.asarray((factor @ weights.T).reshape(-1, len(outward), len(inward)))
 
 
 def _blocked(table: pd.DataFrame) -> Mask:

@@ -49,7 +49,8 @@ def body_shapes(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) ->
     moments = silhouette.most_spherical(pair)
     pole, oblate = silhouette.oblate_spheroid(pair)
     first, second = (
-        np.linalg.solve(a, j @ pole[..., None])[..., 0] for a, j in zip(axes_px, jacobians)
+        np.asarray(np.linalg.solve(a, j @ pole[..., None])[..., 0])
+        for a, j in zip(axes_px, jacobians)
     )
     spread = _coupling_sigma(moments)
     coupling = _possible(pair.coupling_of(moments))

@@ -55,17 +55,19 @@ def picture_sheet(
     files: Mapping[tuple[str, str], Path],
     *,
     small_width_px: int = SMALL_WIDTH_PX,
+    budget_bytes: int | None = None,
 ) -> ContactSheet:
     """As they are if they fit; else smaller; else those of the last rows linked only.
 
-    files : (column, row) -> JPEG or PNG, <results>/<kind>/<folder>/<name>.
+    files : (column, row) -> JPEG or PNG, <results>/<kind>/<folder>/<name>. budget_bytes : of all
+    pictures, `BUDGET_BYTES` unless told.
     Raises InputError for a picture that cannot be read.
     """
     pictures = {key: read_picture(file) for key, file in files.items()}
-    shrunk = sum(map(len, pictures.values())) > BUDGET_BYTES
+    left = BUDGET_BYTES if budget_bytes is None else budget_bytes
+    shrunk = sum(map(len, pictures.values())) > left
     if shrunk:
         pictures = {key: _smaller(p, files[key], small_width_px) for key, p in pictures.items()}
-    left = BUDGET_BYTES
     views = []
     for row in rows:
         cells = []

@@ -19,7 +19,7 @@ from telerig.io.report.figures_common import (
 )
 from telerig.io.report.track_numbers import median, per_frame
 from telerig.io.report.track_results import TrackResults
-from telerig.io.report.track_scene import MANY_POINTS, draw_tracks, thinned
+from telerig.io.report.track_scene import MANY_POINTS, SHADES, draw_tracks, thinned
 from telerig.io.report.words import number, share
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ def time_series(results: TrackResults, axis: int) -> Picture:
         if upwards < -0.5:
             axes.invert_yaxis()
         axes.grid(True)
-        source = png(figure) if len(table) > MANY_POINTS else svg(figure)
+        source = png(figure, colours=SHADES) if len(table) > MANY_POINTS else svg(figure)
     span = 1e-9 + results.tracks["t_s"].max() - results.tracks["t_s"].min() if len(table) else 0
     caption = f"{number(float(span))} s, a colour per track; a line breaks where a bubble was lost."
     if upwards < -0.5:

@@ -21,6 +21,7 @@ from telerig.io.report.figures_common import (
 )
 from telerig.io.report.track_numbers import median, ray_miss_sd_mm
 from telerig.io.report.track_results import TrackResults
+from telerig.io.report.track_scene import SHADES
 from telerig.io.report.words import number, share
 
 Array = NDArray[np.float64]
@@ -108,7 +109,7 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
                       label="median of a step")  # fmt: skip
         axes.set(xlabel=f"{name} / mm", ylabel="ray miss / µm", ylim=(-reach, 1.2 * reach))
         axes.legend(loc="upper right")
-        source = png(figure) if len(miss) > 1000 else svg(figure)
+        source = png(figure, colours=SHADES) if len(miss) > 1000 else svg(figure)
     caption = (
         "The red line should lie on zero. A constant offset, a slope or a bow along it is the "
         f"calibration's fault, not the bubbles'. {_worst_step(medians, doubt)}"
@@ -159,7 +160,7 @@ def seen_where(results: TrackResults, index: int) -> Picture:
                   alpha=0.7)  # fmt: skip
         figure.colorbar(mesh, cax=bar, orientation="horizontal",
                         label="bubbles in a cell, all frames")  # fmt: skip
-        source = png(figure) if len(alone) > 500 else svg(figure)
+        source = png(figure, colours=SHADES) if len(alone) > 500 else svg(figure)
     empty = int(np.sum(count == 0))
     caption = _where_caption(len(uv), len(alone), empty, count.size, stated)
     return Picture(f"Bubbles in the image, camera {camera}", source, caption)

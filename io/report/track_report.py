@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from telerig.io.atomic import write_text_atomic
 from telerig.io.report import track_tables as tables
-from telerig.io.report.contact_sheet import picture_sheet
-from telerig.io.report.page import drawn_over_cores, render_page
+from telerig.io.report.contact_sheet import BUDGET_BYTES, ContactSheet, picture_sheet
+from telerig.io.report.page import drawn_over_cores, plotly_javascript, render_page
 from telerig.io.report.track_figures import (
     bubbles_in_time,
     confidence,
@@ -28,7 +28,12 @@ from telerig.io.report.track_results import TrackResults, binary_column, read_tr
 from telerig.io.report.track_scene import track_plans, track_scene_json
 from telerig.io.report.words import flat_rows
 
+PAGE_BYTES = 7_600_000
+"""Of all that is large; words and tables come on top."""
+
 _SMALL_WIDTH_PX = 560
+_BASE64 = 1.34
+_MOST_ROWS = 150
 _SHOWN = {"schema", "kind", "run", "notes", "worst_frames", "pairs", "covariance", "events"}
 
 
@@ -48,8 +53,25 @@ def write_track_report(results_folder: Path) -> Path:
 
 def render(results: TrackResults) -> str:
     """The page as text."""
+    scene = track_scene_json(results)
     context = _words(results) | _pictures(results)
-    return render_page("template_track.html", context, track_scene_json(results))
+    drawn = [p.source for group in context.values() for p in _list(group) if hasattr(p, "source")]
+    left = PAGE_BYTES - len(plotly_javascript()) - len(scene) - sum(map(len, drawn))
+    context["sheet"] = _sheet(results, max(0, int(left / _BASE64)))
+    return render_page("template_track.html", context, scene)
+
+
+def _list(group: Any) -> list[Any]:
+    return group if isinstance(group, list) else []
+
+
+def _sheet(results: TrackResults, budget_bytes: int) -> ContactSheet:
+    columns = [column for c in results.cameras for column in (c, binary_column(c))]
+    rows = list(tables.worst_words(results)) if results.pictures else []
+    return picture_sheet(
+        rows, columns, results.pictures, small_width_px=_SMALL_WIDTH_PX,
+        budget_bytes=min(BUDGET_BYTES, budget_bytes),
+    )  # fmt: skip
 
 
 def _words(results: TrackResults) -> dict[str, Any]:
@@ -66,11 +88,18 @@ def _words(results: TrackResults) -> dict[str, Any]:
         "event_words": tables.event_words(results),
         "notes": [str(note) for note in content.get("notes") or []],
         "covariance": content.get("covariance") or "",
-        "extra": list(flat_rows({k: v for k, v in content.items() if k not in _SHOWN})),
-        "run": list(flat_rows(results.run)),
+        "extra": _rows({k: v for k, v in content.items() if k not in _SHOWN}, "tracking.json"),
+        "run": _rows(results.run, "run.json"),
         "absent": results.absent,
         "worst": tables.worst_words(results),
     }
+
+
+def _rows(content: Mapping[str, Any], file: str) -> list[tuple[str, str]]:
+    """A run of many images has a hash for each of them."""
+    rows = list(flat_rows(content))
+    more = len(rows) - _MOST_ROWS
+    return rows if more <= 0 else [*rows[:_MOST_ROWS], ("and", f"{more} more in {file}")]
 
 
 def _pictures(results: TrackResults) -> dict[str, Any]:
@@ -89,7 +118,4 @@ def _pictures(results: TrackResults) -> dict[str, Any]:
     pictures: dict[str, Any] = {place: [] for place, _ in drawings}
     for (place, _), picture in zip(drawings, drawn_over_cores([d for _, d in drawings])):
         pictures[place] += picture if isinstance(picture, list) else [picture]
-    columns = [column for c in results.cameras for column in (c, binary_column(c))]
-    rows = list(tables.worst_words(results)) if results.pictures else []
-    sheet = picture_sheet(rows, columns, results.pictures, small_width_px=_SMALL_WIDTH_PX)
-    return pictures | {"sheet": sheet}
+    return pictures

@@ -20,10 +20,11 @@ TRACK_COLOURS = (
     "#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0", "#a8324a", "#0f8a8a", "#8a6d00", "#5b4a42",
     "#d05fa0", "#4f6bd8",
 )  # fmt: skip
-MOST_POINTS = 12_000
+MOST_POINTS = 8_000
 MANY_POINTS = 3_000
 """More of them in a figure are stored as pixels."""
 
+SHADES = 64
 _NAMED = len(TRACK_COLOURS)
 _EYE = 1.5
 
@@ -98,7 +99,7 @@ def _plan(results: TrackResults, across: int) -> Picture:
         draw_tracks(axes, points[:, across], points @ results.up, table)
         axes.set(xlabel=f"{'xyz'[across]} / mm", ylabel="height / mm")
         axes.set_aspect("equal", adjustable="datalim")
-        source = png(figure) if len(points) > MANY_POINTS else svg(figure)
+        source = png(figure, colours=SHADES) if len(points) > MANY_POINTS else svg(figure)
     caption = "Every track has its colour; the scene in a browser can be turned."
     return Picture(f"Tracks, height against {'xyz'[across]}", source, caption)
 

@@ -120,11 +120,11 @@ class DetectionStore:
 
 
 def read_batch(path: Path) -> pd.DataFrame:
-    """A table that `write_table` wrote: floats bit for bit, empty flags as ""."""
+    """A table that `write_table` wrote; empty texts are ""."""
     import pandas as pd
 
     kinds = {"camera": str, "flags": str, "reason": str}
-    table = pd.read_csv(path, float_precision="round_trip", dtype=kinds)
+    table = pd.read_csv(path, dtype=kinds)
     texts = [name for name in kinds if name in table]
     table[texts] = table[texts].fillna("")
     return table

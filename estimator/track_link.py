@@ -173,7 +173,7 @@ def pair_frame(
 def _given(table: pd.DataFrame) -> Index:
     if "particle" not in table:
         return np.full(len(table), NO_PARTICLE)
-    return table["particle"].fillna(NO_PARTICLE).to_numpy(np.int64)
+    return table["particle"].to_numpy(np.int64)
 
 
 def _unpaired(tables: tuple[pd.DataFrame, pd.DataFrame], pairs: Pairs) -> tuple[Index, Index]:

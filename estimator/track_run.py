@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ from telerig.estimator.track_detect import (
     make_scene,
 )
 from telerig.estimator.track_link import Linked, Linker
-from telerig.estimator.track_types import TrackerSettings
+from telerig.estimator.track_types import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracker import Tracker
 from telerig.estimator.tracks import Tracks, events_table
 from telerig.io.parallel import cores
@@ -101,10 +102,12 @@ def tracking_stream(
     chosen = options or TrackOptions()
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
+    first_id, labels = 0, None
+    batches: Callable[[], Iterator[pd.DataFrame]]
     if run.detections is not None:
-
-        def batches() -> Iterator[pd.DataFrame]:
-            return iter([_complete(run.detections)])
+        table, labels = numbered_particles(_complete(run.detections))
+        first_id = int(table["particle"].max()) + 1
+        batches = partial(_once, table)
     else:
         mark = fingerprint(run, {"options": repr(chosen), "cameras": repr(cameras)})
         store = DetectionStore(work, mark, run.frame_count, cores())
@@ -116,8 +119,11 @@ def tracking_stream(
     sample = _sample(run, cameras, batches())
     model = estimate_pair_model(sample, cameras)
     sigma = _shape_sigma(sample, cameras, model)
-    linker = Linker(cameras, model, Tracker(cameras, axis, chosen.tracker), sigma)
+    tracker = Tracker(cameras, axis, chosen.tracker, first_id=first_id)
+    linker = Linker(cameras, model, tracker, sigma)
     rows = _linked(run, cameras, batches(), linker, without, stage)
+    if labels is not None:
+        rows = (_labelled(part, labels) for part in rows)
     return TrackingStream(rows, linker.events, model, sigma, without)
 
 
@@ -162,6 +168,35 @@ def _complete(detections: pd.DataFrame) -> pd.DataFrame:
     return detections.assign(**blank)
 
 
+def _once(table: pd.DataFrame) -> Iterator[pd.DataFrame]:
+    yield table
+
+
+def numbered_particles(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str] | None]:
+    """Given ids as numbers, -1 where blank; and their texts, None when all are whole numbers."""
+    texts = table["particle"].astype(str) if "particle" in table else pd.Series("", table.index)
+    given = sorted(set(texts) - {""})
+    if all(text.isascii() and text.isdecimal() and str(int(text)) == text for text in given):
+        numbers = {text: int(text) for text in given}
+        labels = None
+    else:
+        numbers = {text: i for i, text in enumerate(given)}
+        labels = {i: text for text, i in numbers.items()}
+    return table.assign(particle=texts.map(numbers | {"": NO_PARTICLE}).astype(np.int64)), labels
+
+
+def _labelled(part: Linked, labels: dict[int, str]) -> Linked:
+    """Given ids that are no numbers reach the output as they were."""
+
+    def named(particle: pd.Series[Any]) -> list[str]:
+        return ["" if pd.isna(p) else labels.get(int(p), str(p)) for p in particle]
+
+    return Linked(
+        part.tracks.assign(particle=named(part.tracks["particle"])),
+        part.detections.assign(particle=named(part.detections["particle"])),
+    )
+
+
 def _split(table: pd.DataFrame, cameras: tuple[Camera, Camera]) -> dict[int, Tables]:
     """By frame, the two cameras' bubbles; rows that only say why there is none are left out."""
     kept = table[np.isfinite(table["u_px"].to_numpy(float))]
@@ -198,7 +233,7 @@ def _shape_sigma(
     if not sum(map(len, firsts)):
         return None
     return estimate_shape_sigma(
-        pd.concat(firsts, ignore_index=True), pd.concat(seconds, ignore_index=True)
+        pd.concat(firsts, ignore_index=True), pd.concat(seconds, ignore_index=True), cameras
     )
 
 

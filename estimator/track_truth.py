@@ -1,0 +1,112 @@
+"""Tracks of a simulated run beside the truth. For the demo and the benchmarks, never estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.estimator.tracks import Tracks
+
+Array = NDArray[np.float64]
+
+NEAR_PX = 3.0
+"""A point is a bubble's when both its pixels are this near to the bubble's true ones."""
+
+
+@dataclass(frozen=True)
+class TrackScore:
+    """How tracks agree with the truth; bubbles that an image cuts are neither right nor wrong.
+
+    in_view : (bubble, frame) pairs that both images show whole; right : of these, with a point;
+    wrong : points that are no bubble; swaps : changes of the true bubble along a track.
+    centre_px, corrected_px : RMS per coordinate of the outlines' centres against the projected
+    centre of volume, as measured and with the shape's correction; silhouette_px : against the
+    centroid of the true silhouette.
+    """
+
+    in_view: int
+    right: int
+    wrong: int
+    tracks: int
+    swaps: int
+    breaks: int
+    centre_px: float
+    corrected_px: float
+    silhouette_px: float
+
+    @property
+    def recall(self) -> float:
+        return self.right / max(self.in_view, 1)
+
+    @property
+    def precision(self) -> float:
+        return self.right / max(self.right + self.wrong, 1)
+
+
+def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) -> TrackScore:
+    """Compare with the simulator's `truth/runs/<run>/bubbles.csv`."""
+    bubble = _true_bubbles(tracks.table, truth, cameras)
+    found = bubble["row"].notna().to_numpy()
+    whole = _whole(truth, cameras)
+    right = found & bubble["whole"].fillna(False).to_numpy(bool)
+    measured, shift, volume, silhouette = (
+        _columns(table[right], cameras, name)
+        for table, name in (
+            (tracks.table, "{c}_{x}_px"),
+            (tracks.table, "{c}_d{x}_px"),
+            (bubble, "{c}_{x}_px"),
+            (bubble, "{c}_silhouette_{x}_px"),
+        )
+    )
+    return TrackScore(
+        int(whole.sum()),
+        int(right.sum()),
+        int((~found).sum()),
+        len(tracks),
+        _swaps(tracks.table["particle"].to_numpy()[found], bubble["particle"].to_numpy()[found]),
+        int((tracks.events["kind"] == "break").sum()),
+        _rms(measured - volume),
+        _rms(measured + shift - volume),
+        _rms(measured - silhouette),
+    )
+
+
+def _true_bubbles(table: pd.DataFrame, truth: pd.DataFrame, cameras: Sequence[str]) -> pd.DataFrame:
+    """For each row of ``table`` the row of ``truth`` it shows; blank where there is none."""
+    by_frame = {
+        f: rows.to_numpy() for f, rows in pd.Series(range(len(truth))).groupby(truth["frame"])
+    }
+    at, true = (_columns(t, cameras, "{c}_{x}_px").reshape(len(t), -1, 2) for t in (table, truth))
+    chosen = np.full(len(table), np.nan)
+    for i, frame in enumerate(table["frame"]):
+        rows = by_frame.get(frame, np.zeros(0, int))
+        off = np.linalg.norm(true[rows] - at[i], axis=-1).max(axis=1)
+        if len(rows) and off.min() < NEAR_PX:
+            chosen[i] = rows[off.argmin()]
+    known = truth.assign(row=np.arange(len(truth)), whole=_whole(truth, cameras))
+    return known.reindex(chosen).reset_index(drop=True)
+
+
+def _whole(truth: pd.DataFrame, cameras: Sequence[str]) -> pd.Series[bool]:
+    return (truth[[f"{c}_whole" for c in cameras]] == 1).all(axis=1)
+
+
+def _columns(table: pd.DataFrame, cameras: Sequence[str], name: str) -> Array:
+    return table[[name.format(c=c, x=x) for c in cameras for x in "uv"]].to_numpy(float)
+
+
+def _swaps(particle: NDArray[np.int64], true: Array) -> int:
+    last: dict[int, float] = {}
+    swaps = 0
+    for mine, theirs in zip(particle.tolist(), true.tolist()):
+        swaps += last.get(mine, theirs) != theirs
+        last[mine] = theirs
+    return swaps
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt(np.mean(error**2))) if error.size else float("nan")

@@ -40,7 +40,8 @@ _MAX_AXIS_RATIO = 3.5
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
 _SMALL_EDGES = 3.0
-_WAIST, _SHARPEST_ORDER, _WHOLE = 0.3, 35.0, 0.9
+_WAIST, _SLIGHT_WAIST, _POOR_FIT = 0.3, 0.03, 2.5
+_SHARPEST_ORDER, _WHOLE = 35.0, 0.9
 
 
 @dataclass(frozen=True)
@@ -221,11 +222,15 @@ def _flags(
 
 
 def _dented(outlines: Outlines) -> Mask:
-    """Outlines with a waist, which no single bubble has; hidden ones are not judged."""
+    """Outlines with a waist, which no single bubble has; hidden ones are not judged.
+
+    A slight waist counts where the outline's orders do not describe the rim either.
+    """
     dent = deepest_dent(outlines.ellipse, outlines.harmonics)
-    error = _SHARPEST_ORDER * outlines.sigma_outline_px / np.sqrt(outlines.ellipse[:, 2])
-    error = error / np.sqrt(outlines.ellipse[:, 3])
-    dented: Mask = (dent > _WAIST) & (dent > 3.0 * error) & (outlines.coverage > _WHOLE)
+    radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
+    sure = dent > 3.0 * _SHARPEST_ORDER * outlines.sigma_outline_px / radius
+    waist = (dent > _WAIST) | ((dent > _SLIGHT_WAIST) & (outlines.chi2_dof > _POOR_FIT))
+    dented: Mask = waist & sure & (outlines.coverage > _WHOLE)
     return dented
 
 

@@ -173,7 +173,7 @@ def mode_acceleration(states: Array, process: LinearProcess) -> Array:
 
 @dataclass(frozen=True)
 class Path:
-    """height_mm : along the stage's axis; lateral_mm : (..., 2) across it; with velocities."""
+    """height_mm : (...) along the stage's axis; lateral_mm : (..., 2) across; with velocities."""
 
     height_mm: Array
     lateral_mm: Array
@@ -225,30 +225,36 @@ def constant_speed_rise_mm_s(
     return float(whole.height_mm[0] * frequency_hz)
 
 
-def stochastic_path(
+def stochastic_paths(
     step_s: float,
     steps: int,
     rng: Generator,
     *,
-    rise_mm_s: float,
+    rise_mm_s: ArrayLike,
     wander_mm_s: float,
     wander_tau_s: float,
     height_oscillation: tuple[float, float, float],
     lateral_oscillation: tuple[float, float, float],
 ) -> Path:
-    """A bubble's path: steady rise, Ornstein-Uhlenbeck velocity and a stochastic oscillation.
+    """Bubbles' paths: steady rise, Ornstein-Uhlenbeck velocity and a stochastic oscillation.
 
-    The oscillations are (RMS mm, frequency Hz, damping), one vertical, one on each lateral axis.
+    rise_mm_s : (B,); the path's fields have the shape (B, steps) and (B, steps, 2). The
+    oscillations are (RMS mm, frequency Hz, damping), one vertical, one on each lateral axis.
     """
+    rise = np.asarray(rise_mm_s, float)
+    count = len(rise)
     wander = ornstein_uhlenbeck(wander_mm_s, wander_tau_s).paths(
-        step_s, steps, rng, paths=3, start_covariance=np.diag([0.0, wander_mm_s**2])
+        step_s, steps, rng, paths=3 * count, start_covariance=np.diag([0.0, wander_mm_s**2])
     )
-    height = oscillator(*height_oscillation).paths(step_s, steps, rng)
-    lateral = oscillator(*lateral_oscillation).paths(step_s, steps, rng, paths=2)
-    across = (wander[1:] + lateral).transpose(1, 0, 2)
-    up = wander[0] + height[0]
+    up = wander[:count] + oscillator(*height_oscillation).paths(step_s, steps, rng, paths=count)
+    across = wander[count:] + oscillator(*lateral_oscillation).paths(
+        step_s, steps, rng, paths=2 * count
+    )
+    across = across.reshape(2, count, steps, 2).transpose(1, 2, 3, 0)
     t = step_s * np.arange(steps)
-    return Path(rise_mm_s * t + up[:, 0], across[..., 0], rise_mm_s + up[:, 1], across[..., 1])
+    return Path(
+        rise[:, None] * t + up[..., 0], across[:, :, 0], rise[:, None] + up[..., 1], across[:, :, 1]
+    )
 
 
 def stage_trajectory(

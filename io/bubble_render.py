@@ -39,7 +39,8 @@ class Look:
     heart_radius : where the heart is half as bright, over the silhouette's radius.
     heart_sharpness : exponent of the heart's fall; 2.5 as in real images, 20 and more a disc.
     heart_offset : (2,) of the heart's middle from the silhouette's, over the radius.
-    ring : transmission of a faint ring at ring_radius, ring_width wide (over the radius).
+    ring : transmission of a faint ring at ring_radius, ring_width wide (over the radius), up to
+    twice as bright below and fading above.
     """
 
     rim: float = 0.1
@@ -70,7 +71,8 @@ class Look:
             low, high = self.ring_radius + _RING_REACH * self.ring_width * np.array([-1, 1])
             near = (square > max(low, 0.0) ** 2) & (square < high**2)
             off = (np.sqrt(square[near]) - self.ring_radius) / self.ring_width
-            out[near] += self.ring * np.exp(-(off**2) / 2)
+            below = np.broadcast_to(dv[:, None], near.shape)[near] / np.hypot(*np.diag(axes))
+            out[near] += self.ring * (1 + np.tanh(3 * below)) * np.exp(-(off**2) / 2)
         return out
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 from telerig.errors import InputError
@@ -35,8 +36,8 @@ class BubbleConfig:
     tone: float = 1.0
     spin_hz: Range = (-3.0, 3.0)
     rim: Range = (0.09, 0.12)
-    heart: Range = (0.8, 0.95)
-    heart_radius: Range = (0.3, 0.36)
+    heart: Range = (0.84, 0.97)
+    heart_radius: Range = (0.32, 0.38)
     heart_sharpness: float = 2.5
     heart_offset: float = 0.04
     ring: float = 0.04
@@ -339,14 +340,10 @@ _SCENARIOS = {
 """Frame rate, shake frequency, shake amplitude (mm), noise (px) of the smoother's benchmarks."""
 
 
-def _maker(name: str) -> Callable[[], RunConfig]:
-    return lambda: _scenario(name, *_SCENARIOS[name])
-
-
 RUN_PRESETS: Mapping[str, Callable[[], RunConfig]] = {
     "rise": _rise,
     "swarm": _swarm,
     "crossing": _crossing,
-    **{name: _maker(name) for name in _SCENARIOS},
+    **{name: partial(_scenario, name, *numbers) for name, numbers in _SCENARIOS.items()},
 }
 """Named runs; `run_preset` makes one."""

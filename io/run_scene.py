@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.bubble_bodies import MODES, Bodies, bodies_about
+from telerig.io.bubble_bodies import Bodies, bodies_about
 from telerig.io.bubble_motion import (
     Path,
     Shake,
@@ -20,10 +20,10 @@ from telerig.io.bubble_motion import (
     rig_mode,
     rig_shake,
     stage_trajectory,
-    stochastic_path,
+    stochastic_paths,
 )
-from telerig.io.bubble_render import Look
-from telerig.io.run_presets import BubbleConfig, MotionConfig, Range, RunConfig
+from telerig.io.run_fleet import Fleet, random_fleet
+from telerig.io.run_presets import MotionConfig, RunConfig
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -34,8 +34,6 @@ Array = NDArray[np.float64]
 AXIS_RIG = np.array([0.0, -1.0, 0.0])
 """True travel of the stage in rig axes: upwards."""
 _ACROSS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_SURFACE_TENSION_N_M = 0.072
-_DENSITY_KG_M3 = 998.0
 _TRIES = 400
 _CLEARANCE = 1.1
 
@@ -53,26 +51,6 @@ class Carriage:
     velocity_mm_s: Array
     acceleration_mm_s2: Array
     shake: Shake
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """What stays the same of each of B bubbles.
-
-    d_eq_mm : (B,); semi_axes_mm : (B, 3), proportions, the third along the path.
-    modes_static, modes_swing : (B, 21) relative; swing_hz, swing_rad : (B, 21).
-    spin_hz, spin_rad : (B,).
-    """
-
-    d_eq_mm: Array
-    semi_axes_mm: Array
-    modes_static: Array
-    modes_swing: Array
-    swing_hz: Array
-    swing_rad: Array
-    spin_hz: Array
-    spin_rad: Array
-    looks: tuple[Look, ...]
 
 
 @dataclass(frozen=True)
@@ -140,19 +118,11 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     position = carriage.position_mm[:: carriage.stride]
     size_mm = _view_mm(config)
     count = _bubble_count(config, position, size_mm)
-    fleet = _fleet(config.bubble, count, shape_rng)
+    fleet = random_fleet(config.bubble, count, shape_rng)
     paths = _paths(config, count, path_rng)
     lab, velocity, closest = _lab_paths(config, paths, path_rng)
     start = _starts(config, lab, position, fleet.d_eq_mm, size_mm, place_rng)
     return RunScene(config, cameras, carriage, fleet, lab + start[:, None], velocity, closest)
-
-
-def lamb_frequency_hz(degree: int, d_eq_mm: float) -> float:
-    """Frequency at which surface tension swings a bubble's mode in water (Lamb, sec. 275)."""
-    radius = d_eq_mm / 2000
-    n = degree
-    square = (n - 1) * (n + 1) * (n + 2) * _SURFACE_TENSION_N_M / (_DENSITY_KG_M3 * radius**3)
-    return float(np.sqrt(square) / (2 * np.pi))
 
 
 def _view_mm(config: RunConfig) -> Array:
@@ -222,69 +192,33 @@ def _bubble_count(config: RunConfig, position_mm: Array, size_mm: Array) -> int:
     return pairs * round(config.bubbles * reach / height / pairs)
 
 
-def _fleet(config: BubbleConfig, count: int, rng: Generator) -> Fleet:
-    d_eq = rng.uniform(*config.d_eq_mm, count)
-    aspect = rng.uniform(*config.aspect, count)
-    uneven = rng.uniform(-config.triaxial, config.triaxial, count)
-    axes = np.stack([1 + uneven / 2, 1 - uneven / 2, 1 / aspect], -1)
-    degrees = np.array([degree for degree, _ in MODES])
-    static = rng.uniform(-1, 1, (count, len(MODES)))
-    swing = rng.uniform(-1, 1, (count, len(MODES)))
-    for modes, amplitude in (
-        (static, config.modes_static),
-        (swing, config.modes_oscillating),
-    ):
-        modes *= np.array([amplitude.get(int(degree), 0.0) for degree in degrees])
-    hertz = [[config.tone * lamb_frequency_hz(int(n), d) for n in degrees] for d in d_eq]
-    phase = rng.uniform(0, 2 * np.pi, (count, len(MODES)))
-    spin = rng.uniform(*config.spin_hz, count)
-    turn = rng.uniform(0, 2 * np.pi, count)
-    looks = tuple(_look(config, rng) for _ in range(count))
-    swing_hz = np.reshape(hertz, (count, len(MODES)))
-    return Fleet(d_eq, axes, static, swing, swing_hz, phase, spin, turn, looks)
-
-
-def _look(config: BubbleConfig, rng: Generator) -> Look:
-    def drawn(low_high: Range) -> float:
-        return float(rng.uniform(*low_high))
-
-    offset = config.heart_offset * rng.standard_normal(2)
-    return Look(
-        rim=drawn(config.rim),
-        heart=drawn(config.heart),
-        heart_radius=drawn(config.heart_radius),
-        heart_sharpness=config.heart_sharpness,
-        heart_offset=(float(offset[0]), float(offset[1])),
-        ring=config.ring * float(rng.uniform(0.4, 1.4)),
-    )
-
-
-def _paths(config: RunConfig, count: int, rng: Generator) -> list[Path]:
+def _paths(config: RunConfig, count: int, rng: Generator) -> Path:
     """One path for each bubble, or for each pair."""
     motion = config.motion
-    step = 1 / config.frame_rate_hz
-    paths = []
-    for _ in range(count // 2 if motion.pairs else count):
-        rise = float(rng.uniform(*motion.rise_mm_s))
-        swing = (0.0, 1.0, 1.0)
-        if motion.path == "stochastic":
-            regular, steady = None, rise
-            height, lateral = motion.height_oscillation, motion.lateral_oscillation
-        else:
-            regular, steady = _regular_path(config, rise, rng), 0.0
-            height = lateral = swing
-        random = stochastic_path(
-            step,
-            config.frames,
-            rng,
-            rise_mm_s=steady,
-            wander_mm_s=motion.wander_mm_s,
-            wander_tau_s=motion.wander_tau_s,
-            height_oscillation=height,
-            lateral_oscillation=lateral,
-        )
-        paths.append(random if regular is None else _sum(regular, random))
-    return paths
+    paths = count // 2 if motion.pairs else count
+    random_rng, regular_rng = rng.spawn(2)
+    rise = regular_rng.uniform(*motion.rise_mm_s, paths)
+    regular = motion.path != "stochastic"
+    still = (0.0, 1.0, 1.0)
+    random = stochastic_paths(
+        1 / config.frame_rate_hz,
+        config.frames,
+        random_rng,
+        rise_mm_s=0 * rise if regular else rise,
+        wander_mm_s=motion.wander_mm_s,
+        wander_tau_s=motion.wander_tau_s,
+        height_oscillation=still if regular else motion.height_oscillation,
+        lateral_oscillation=still if regular else motion.lateral_oscillation,
+    )
+    if not regular or paths == 0:
+        return random
+    each = [_regular_path(config, float(speed), regular_rng) for speed in rise]
+    return Path(
+        random.height_mm + np.stack([p.height_mm for p in each]),
+        random.lateral_mm + np.stack([p.lateral_mm for p in each]),
+        random.height_mm_s + np.stack([p.height_mm_s for p in each]),
+        random.lateral_mm_s + np.stack([p.lateral_mm_s for p in each]),
+    )
 
 
 def _regular_path(config: RunConfig, speed_mm_s: float, rng: Generator) -> Path:
@@ -306,22 +240,10 @@ def _regular_path(config: RunConfig, speed_mm_s: float, rng: Generator) -> Path:
     )
 
 
-def _sum(one: Path, other: Path) -> Path:
-    return Path(
-        one.height_mm + other.height_mm,
-        one.lateral_mm + other.lateral_mm,
-        one.height_mm_s + other.height_mm_s,
-        one.lateral_mm_s + other.lateral_mm_s,
-    )
-
-
-def _lab_paths(config: RunConfig, paths: list[Path], rng: Generator) -> tuple[Array, Array, Array]:
+def _lab_paths(config: RunConfig, paths: Path, rng: Generator) -> tuple[Array, Array, Array]:
     """(B, F, 3) places from each start and velocities, and when each pair passes."""
-    frames = config.frames
-    if not paths:
-        return np.zeros((0, frames, 3)), np.zeros((0, frames, 3)), np.zeros(0)
-    place = np.stack([p.height_mm[:, None] * AXIS_RIG + p.lateral_mm @ _ACROSS for p in paths])
-    speed = np.stack([p.height_mm_s[:, None] * AXIS_RIG + p.lateral_mm_s @ _ACROSS for p in paths])
+    place = paths.height_mm[..., None] * AXIS_RIG + paths.lateral_mm @ _ACROSS
+    speed = paths.height_mm_s[..., None] * AXIS_RIG + paths.lateral_mm_s @ _ACROSS
     if not config.motion.pairs:
         return place, speed, np.zeros(0)
     return _pair_paths(config, place, speed, rng)

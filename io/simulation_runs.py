@@ -42,6 +42,9 @@ Views = dict[str, CameraView]
 
 RUN_TRUTH_SCHEMA = 1
 
+LEAST_ACCELEROMETER_SIGMA = 1e-4
+"""What the rig file states of a perfect accelerometer, as it must state a positive number."""
+
 
 def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images: bool) -> None:
     """Write a whole dataset into an empty folder: the calibration and `runs/<preset>/`.
@@ -97,8 +100,8 @@ def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
             name,
             mount,
             unit,
-            config.stage.accelerometer_density_ug,
-            config.stage.accelerometer_bias_m_s2,
+            max(config.stage.accelerometer_density_ug, LEAST_ACCELEROMETER_SIGMA),
+            max(config.stage.accelerometer_bias_m_s2, LEAST_ACCELEROMETER_SIGMA),
         )
     marks = ReferencesDescription() if config.table.references else None
     return replace(rig, stage=stage, accelerometers=sensors, references=marks)

@@ -19,7 +19,7 @@ from telerig.io.bubble_motion import (
     rig_shake,
     square_root,
     stage_trajectory,
-    stochastic_path,
+    stochastic_paths,
 )
 
 
@@ -150,8 +150,8 @@ def test_impossible_zigzag_is_refused():
 
 def test_stochastic_path_velocities_are_the_derivatives():
     """But for the Brownian bridge between samples, of variance step * kick^2 / 12."""
-    path = stochastic_path(
-        1e-4, 4000, rng(), rise_mm_s=280.0, wander_mm_s=10.0, wander_tau_s=0.3,
+    path = stochastic_paths(
+        1e-4, 4000, rng(), rise_mm_s=[280.0, 100.0], wander_mm_s=10.0, wander_tau_s=0.3,
         height_oscillation=(0.177, 12.0, 0.03), lateral_oscillation=(2.0, 6.0, 0.03),
     )  # fmt: skip
     wander = 10.0 * np.sqrt(2 / 0.3)
@@ -159,11 +159,13 @@ def test_stochastic_path_velocities_are_the_derivatives():
         (path.height_mm, path.height_mm_s, 0.177, 12.0),
         (path.lateral_mm, path.lateral_mm_s, 2.0, 6.0),
     ):
-        gap = np.diff(place, axis=0) / 1e-4 - (speed[1:] + speed[:-1]) / 2
+        gap = np.diff(place, axis=1) / 1e-4 - (speed[:, 1:] + speed[:, :-1]) / 2
         kick = np.hypot(wander, 2 * rms * np.sqrt(0.03 * (2 * np.pi * hertz) ** 3))
         assert gap.std() == pytest.approx(kick * np.sqrt(1e-4 / 12), rel=0.05)
-        assert np.all(np.abs(gap.mean(0)) < 4 * gap.std() / np.sqrt(4000))
-    assert path.height_mm_s.mean() == pytest.approx(280, abs=30)
+        assert np.all(np.abs(gap.mean(1)) < 4 * gap.std() / np.sqrt(4000))
+    assert np.allclose(path.height_mm_s.mean(1), [280, 100], atol=30)
+    gap = path.lateral_mm_s[0] - path.lateral_mm_s[1]
+    assert gap.std() > 0.5 * path.lateral_mm_s.std()
 
 
 def test_stage_starts_from_rest_and_goes_on_steadily():

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from telerig.errors import InputError
 from telerig.io.bubble_bodies import volume_centre_mm
 from telerig.io.run import load_run
+from telerig.io.run_fleet import lamb_frequency_hz
 from telerig.io.run_presets import (
     RUN_PRESETS,
     BubbleConfig,
@@ -21,7 +22,7 @@ from telerig.io.run_presets import (
     any_preset,
     run_preset,
 )
-from telerig.io.run_scene import AXIS_RIG, lamb_frequency_hz, run_scene
+from telerig.io.run_scene import AXIS_RIG, run_scene
 from telerig.io.run_views import camera_view
 from telerig.io.simulation import simulate
 from telerig.io.simulation_presets import SimulationConfig
@@ -292,51 +293,6 @@ def test_multi_page_files():
     pixels = run.image("right", 2)
     assert run.frame_count == 3 and pixels.dtype == np.uint16 and np.all(pixels % 16 == 0)
     assert pixels.max() > 20_000
-
-
-def test_stage_and_accelerometers_agree_with_the_truth():
-    data = dataset("S2", images=False, frames=60)
-    _, cameras, _ = truth_of(data, "S2")
-    folder = data.runs["S2"].path
-    stage = pd.read_csv(folder / "stage.csv")
-    at_frames = np.interp(cameras["t_s"], stage["t_s"], stage["position_mm"])
-    assert np.std(at_frames - cameras["position_mm"]) == pytest.approx(0.001, rel=0.35)
-    assert data.rig.stage.axis == (0.0, -1.0, 0.0)
-    assert set(data.rig.accelerometers) == {"arm_left", "arm_right"}
-    readings = pd.read_csv(folder / "accelerometer.csv")
-    run = scene_of(data)
-    for j, camera in enumerate(("left", "right")):
-        one = readings[readings["sensor"] == f"arm_{camera}"]
-        assert np.allclose(np.diff(one["t_s"]), 1 / 2000)
-        path = AXIS_RIG * run.carriage.position_mm[:, None] + run.carriage.shake.offset_mm[j]
-        bend = np.diff(path, 2, axis=0) * 2000.0**2 / 1000
-        force = one[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy()[1:-1] - bend
-        bias = force.mean(0) - 9.81 * AXIS_RIG
-        assert np.abs(bias).max() < 1.0
-        assert np.abs(force - force.mean(0)).max() < 0.15
-
-
-def scene_of(data):
-    config = few_views("S2", frames=60)
-    _, scene_rng, *_ = np.random.default_rng(7).spawn(5)
-    return run_scene(config, true_cameras(config.calibration), scene_rng)
-
-
-def test_reference_marks_are_fixed_to_the_tank():
-    data = dataset("S2", images=False, frames=60)
-    marks = pd.read_csv(data.runs["S2"].path / "references.csv")
-    _, cameras, _ = truth_of(data, "S2")
-    per_image = marks.groupby(["frame", "camera"]).size()
-    assert per_image.min() >= 3 and per_image.max() <= 6
-    models = dict(cameras_from_truth(data))
-    for mark, rows in marks.groupby("mark"):
-        camera = rows["camera"].iloc[0]
-        assert str(mark).startswith(camera) and set(rows["camera"]) == {camera}
-        at = cameras.set_index("frame").loc[rows["frame"]]
-        origin, _ = models[camera].unproject(rows[["u_px", "v_px"]].to_numpy())
-        height = origin @ AXIS_RIG + at["position_mm"].to_numpy()
-        height -= at[f"{camera}_shake_y_mm"].to_numpy()
-        assert height.std() < 0.03
 
 
 def test_presets_are_found_and_refused_by_name():

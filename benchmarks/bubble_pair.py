@@ -35,8 +35,6 @@ from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 
 sys.path.insert(0, str(Path(__file__).parent))
-import itertools
-
 from pair_scene import CAMERAS, PairScene, random_frame
 
 Array = NDArray[np.float64]
@@ -221,7 +219,7 @@ def _right(first: pd.DataFrame, second: pd.DataFrame, pairs: Matches) -> NDArray
 def calibration(confidence: Array, right: Array) -> list[str]:
     lines = ["All scenes together:", "", "| stated | pairs | mean stated | right |",
              "|---|---|---|---|"]  # fmt: skip
-    for low, high in itertools.pairwise(EDGES):
+    for low, high in pairwise(EDGES):
         use = (confidence >= low) & (confidence < high)
         if use.any():
             lines.append(

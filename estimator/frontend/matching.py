@@ -28,10 +28,12 @@ from telerig.rig.camera import Camera
 Array = NDArray[np.float64]
 
 SAFE_NATS = 3.0
-_TAIL, _TAIL_WIDTH = 0.02, 3.0
-_WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-4, 0.02, 0.05
+_TAIL, _TAIL_WIDTH, _GATE_SIGMA = 0.01, 2.0, 6.0
+_WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-6, 0.02, 0.05
+_IMPOSSIBLE, _IMPOSSIBLE_SIGMA = 0.15, 10.0
 _RARE, _FREEDOM = 2.5, 6.0
 _SHIFT_PASSES = 4
+_NEVER = -1e6
 
 
 def match_pairs(
@@ -83,11 +85,17 @@ def common_shift(
 
 
 def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
-    """(N1, N2) log odds by height, shape, contrast and the number of detections; not the gap."""
+    """(N1, N2) log odds by height, width, contrast and the number of detections; not the gap.
+
+    Heights that differ beyond all measurement exclude a pair, unless one of the two is flagged.
+    """
     first, second = geometry.views
     odds = np.full(geometry.gap_px.shape, _prior_log_odds(len(first), len(second), model.lonely))
     wrong = np.where(geometry.doubt > 1, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
     odds += _cue(model.size, geometry.size, first.log_size, second.log_size, wrong)
+    apart = np.abs(np.nan_to_num(geometry.size[..., 0] - model.size.difference[0]))
+    impossible = apart > max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
+    odds[impossible & (geometry.doubt == 1)] = _NEVER
     contrasts = (first.log_contrast, second.log_contrast)
     odds += _cue(model.contrast, geometry.contrast, *contrasts, _WRONG_CONTRAST)
     return odds
@@ -101,11 +109,12 @@ def _prior_log_odds(n1: int, n2: int, lonely: tuple[float, float]) -> float:
 
 
 def _gap_log_odds(gap: Array, variance: Array, model: PairModel) -> Array:
-    """A normal core with wide tails, against any place along the span."""
+    """A normal core with wider tails, cut off, against any place along the span."""
     core = np.exp(-0.5 * gap**2 / variance)
     tail = np.exp(-0.5 * gap**2 / (variance * _TAIL_WIDTH**2)) / _TAIL_WIDTH
     density = ((1 - _TAIL) * core + _TAIL * tail) / np.sqrt(2 * np.pi * variance)
-    return np.log(np.maximum(density * model.span_px, 1e-300))
+    near = gap**2 < _GATE_SIGMA**2 * variance
+    return np.where(near, np.log(np.maximum(density * model.span_px, 1e-300)), _NEVER)
 
 
 def _cue(cue: Cue, ratio: Array, first: Array, second: Array, wrong: Array | float) -> Array:

@@ -195,7 +195,7 @@ def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, floa
     for g in geometries:
         near = np.abs(g.gap_px) < MOST_BIAS_PX + 5
         odds = appearance_log_odds(g, model)
-        share = 1 / (1 + np.exp(-np.minimum(odds + np.log(model.span_px / 4), 30.0)))
+        share = 1 / (1 + np.exp(-np.clip(odds + np.log(model.span_px / 4), -30.0, 30.0)))
         kernel = np.exp(-0.5 * (g.gap_px[near][:, None] - grid) ** 2)
         density += np.sum(share[near][:, None] * kernel, axis=0)
     peak = int(np.argmax(density * np.exp(-0.5 * (grid / MOST_BIAS_PX) ** 2)))

@@ -32,7 +32,7 @@ Mode = Callable[[Array], Array]
 SCALE_PX_PER_MM = 10.0
 NOISE_PX = 0.05
 EPSILON = 0.05
-RIM_POINTS = 128
+RIM_POINTS = 96
 VERTICAL_FROM_Z = Rotation.from_rotvec([np.pi / 2, 0, 0])
 MODES = [(2, 0), (2, 1), (2, 2), (3, 0), (3, 1), (3, 2), (3, 3), *((4, m) for m in range(5))]
 
@@ -132,9 +132,9 @@ def _sphere(count: int) -> Array:
 def rim_mm(body: Body, outward: Array) -> Array:
     """(N, 3) surface points that reach farthest in the directions outward (N, 3).
 
-    The best of 4000 points, then three Newton steps on the sphere with differences.
+    The best of 1500 points, then three Newton steps on the sphere with differences.
     """
-    start = _sphere(4000)
+    start = _sphere(1500)
     best = start[np.argmax(body.surface_mm(start) @ outward.T, axis=0)]
     step = 0.01
     for _ in range(3):
@@ -214,10 +214,12 @@ def outlines(
 ) -> list[dict[str, float]]:
     """The rows of both cameras."""
     angle = 2 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
+    circle = np.stack([np.cos(angle), np.sin(angle)], -1)
+    outward = np.concatenate([circle @ camera.camera_from_rig.rotation[:2] for camera in cameras])
+    rims = np.split(rim_mm(body, outward), 2)
     rows = []
-    for camera in cameras:
-        outward = np.stack([np.cos(angle), np.sin(angle)], -1) @ camera.camera_from_rig.rotation[:2]
-        pixels = camera.project(rim_mm(body, outward))
+    for camera, rim in zip(cameras, rims):
+        pixels = camera.project(rim)
         arc = np.linalg.norm(np.roll(pixels, -1, 0) - np.roll(pixels, 1, 0), axis=-1) / 2
         rows.append(outline_row(pixels, NOISE_PX / np.sqrt(arc), rng))
     return rows

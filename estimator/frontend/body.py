@@ -28,6 +28,7 @@ DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
 _ZONAL_SHARE = 0.5  # prior probability of a shape that is axisymmetric about the spheroid's axis
 _KNOWN_AXIS = 0.2  # rad: beyond this uncertainty of the axis that account is left out
 _RUN_WEIGHT = 4.0  # harmonics' worth of the run's shape_sigma against a bubble's own four
+_DEFAULT_WEIGHT = 0.05  # in bubbles, of DEFAULT_SHAPE_SIGMA in what a run learns
 _LARGEST_SIGMA = 0.03  # one bubble's share in what a run learns
 _MODEL_ERROR, _CROSS_TERM = 0.02, 8.0  # second order: of the third harmonic, times the fourth
 
@@ -47,8 +48,9 @@ class Bodies:
     du_px, dv_px : (M, 2) first and second camera: added to the outlines' centres they make them
         measurements of the projected centre of volume; 0 unless used is "volume".
     d_eq_mm, d_eq_sd_mm : (M,) diameter of the sphere of equal volume; semi_axes_mm : (M, 3),
-        descending, of the ellipsoid.  ray_miss_mm : (M,) of the outlines' centres.
-    zonal_probability : (M,) that the shape is axisymmetric (about any axis) in its third degree.
+        descending, of the most spherical ellipsoid with these outlines.  ray_miss_mm : (M,) of the
+        outlines' centres.
+    zonal_probability : (M,) that the third degree is axisymmetric about an oblate body's axis.
     """
 
     points_mm: Array
@@ -100,7 +102,7 @@ def estimate_shape_sigma(
     """(2,) standard deviations of the shape's coefficients of degree 3 and 4, learned from a run.
 
     Empirical Bayes: the mean square of the outlines' third and fourth harmonics, less their noise,
-    with `DEFAULT_SHAPE_SIGMA` as one more bubble. Raises InputError for tables of unequal length.
+    with a little of `DEFAULT_SHAPE_SIGMA`. Raises InputError for tables of unequal length.
     """
     return _learned_sigma(_paired(first, second, cameras))
 
@@ -136,14 +138,19 @@ def _learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
     for degree, part, default in zip((3, 4), (slice(2, 4), slice(4, 6)), DEFAULT_SHAPE_SIGMA):
         variance = np.mean([_variance(o.rows(whole), degree, part) for o in outlines], 0)
         variance = np.minimum(variance, _LARGEST_SIGMA**2)
-        out.append(np.sqrt((max(variance.sum(), 0.0) + default**2) / (len(variance) + 1)))
+        out.append(
+            np.sqrt(
+                (max(variance.sum(), 0.0) + _DEFAULT_WEIGHT * default**2)
+                / (len(variance) + _DEFAULT_WEIGHT)
+            )
+        )
     return np.array(out)
 
 
-def _variance(outlines: Outlines, degree: int, part: slice) -> Array:
-    """(M,) unbiased estimates of one degree's sigma^2 from one outline each."""
+def _variance(outlines: Outlines, degree: int, part: slice, less: float = 1.0) -> Array:
+    """(M,) one degree's sigma^2 from one outline each, unbiased with once the noise taken off."""
     noise = np.einsum("mii->m", outlines.trace_covariance[:, part, part])
-    power = (outlines.trace[:, part] ** 2).sum(-1) - noise
+    power = (outlines.trace[:, part] ** 2).sum(-1) - less * noise
     return np.asarray(power / (2 * silhouette.TRACE_VARIANCE[degree, degree]))
 
 
@@ -280,9 +287,10 @@ def _pixel_noise(pair: tuple[Outlines, Outlines]) -> Array:
 def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
     """(M,) each bubble's sigma of degree 3: the run's, as `_RUN_WEIGHT` harmonics, and its own.
 
-    Mean of an inverse gamma distribution, so that the blind components are covered.
+    Mean of an inverse gamma distribution, so that the blind components are covered; less twice the
+    noise, so that a bubble without shape is left alone.
     """
-    own = np.sum([2 * _variance(o, 3, slice(2, 4)) for o in pair], 0)
+    own = np.sum([2 * _variance(o, 3, slice(2, 4), 2.0) for o in pair], 0)
     return np.asarray(np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 2)))
 
 

@@ -76,7 +76,7 @@ def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> 
     sigma = numbers["sigma_outline_px"]
     known = (np.abs(displacement) < 0.3 * b[:, None]).all(-1)
     known &= (sigma**2 > _LEAST_PX2) & (sigma < b)
-    gain = _trace_from_displacement(a, b)
+    gain = _trace_from_displacement(*(np.where(shaped, axis, np.nan) for axis in (a, b)))
     return Outlines(
         uv,
         covariance,

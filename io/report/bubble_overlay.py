@@ -113,7 +113,7 @@ def _checked(
 
 def _finite(outline: Array) -> Array:
     points = np.asarray(outline, float).reshape(-1, 2)
-    return points[np.isfinite(points).all(axis=1)]
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 def _circle(u: float, v: float, radius: float, factor: float) -> Array:

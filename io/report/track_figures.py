@@ -34,7 +34,8 @@ def time_series(results: TrackResults, axis: int) -> Picture:
     table = thinned(results.tracks, _MOST_POINTS)
     name, upwards = "xyz"[axis], float(results.up[axis])
     with drawing(2.6) as (figure, axes):
-        draw_tracks(axes, *table[["t_s", f"{name}_mm"]].to_numpy(float).T, table)
+        place = table[f"{name}_mm"].to_numpy(float)
+        draw_tracks(axes, table["t_s"].to_numpy(float), place, table)
         axes.set(xlabel="t / s", ylabel=f"{name} / mm")
         if upwards < -0.5:
             axes.invert_yaxis()

@@ -25,15 +25,16 @@ def ray_miss_sd_mm(results: TrackResults) -> Array | None:
     if len(results.cameras) != 2:
         return None
     maps = [_affine(results, camera) for camera in results.cameras]
-    if maps[0] is None or maps[1] is None:
+    known = [m for m in maps if m is not None]
+    if len(known) < 2:
         return None
-    across = np.cross(*(np.cross(m[0], m[1]) for m in maps if m is not None))
+    first, second = (np.cross(m[0], m[1]) for m in known)
+    across = np.cross(first, second)
     length = np.linalg.norm(across)
     if length < 1e-9:
         return None
     variance = np.zeros(len(results.tracks))
-    for camera, affine in zip(results.cameras, maps):
-        assert affine is not None
+    for camera, affine in zip(results.cameras, known):
         per_px = np.linalg.lstsq(affine.T, across / length, rcond=None)[0]
         columns = [f"{camera}_{name}" for name in ("suu_px2", "suv_px2", "svv_px2")]
         uu, uv, vv = results.tracks[columns].to_numpy(float).T

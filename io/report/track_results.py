@@ -182,7 +182,7 @@ _EVENTS = [
 
 
 def _detections(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
-    table = _optional(file, _DETECTIONS)
+    table: pd.DataFrame = _optional(file, _DETECTIONS)
     strange = ~table["camera"].isin(cameras).to_numpy(bool)
     if strange.any():
         row = int(np.flatnonzero(strange)[0])
@@ -191,7 +191,8 @@ def _detections(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
             where=f"{file} row {row + 2}",
             todo="the files are of two runs; " + _AGAIN,
         )
-    return table[np.isfinite(table["u_px"].to_numpy(float))].reset_index(drop=True)
+    found: pd.DataFrame = table.loc[np.isfinite(table["u_px"].to_numpy(float))]
+    return found.reset_index(drop=True)
 
 
 def _optional(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
@@ -199,7 +200,8 @@ def _optional(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
         return _table(file, columns)
     import pandas as pd
 
-    return _typed(pd.DataFrame({c.name: [] for c in columns if c.required}), columns)
+    always = [c.name for c in columns if c.required or c.kind == "text"]
+    return _typed(pd.DataFrame({name: [] for name in always}), columns)
 
 
 def _table(file: Path, columns: Sequence[Column]) -> pd.DataFrame:

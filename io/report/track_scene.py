@@ -26,7 +26,7 @@ MANY_POINTS = 3_000
 
 SHADES = 64
 _NAMED = len(TRACK_COLOURS)
-_EYE = 1.5
+_EYE = 1.35
 
 
 def track_colour(particle: int) -> str:
@@ -38,23 +38,25 @@ def thinned(tracks: pd.DataFrame, most: int) -> pd.DataFrame:
     """At most about ``most`` rows, sorted by bubble and frame; the ends of each track stay.
 
     Of more tracks than ``most`` / 4 the longest stay. ``new`` marks rows before which a line
-    must not be drawn: a track's first, and the first after a gap.
+    must not be drawn: a track's first, and the first after a gap longer than the thinning.
     """
-    table = tracks[np.isfinite(tracks[["x_mm", "y_mm", "z_mm"]]).all(axis=1)]
+    table: pd.DataFrame = tracks.loc[
+        np.isfinite(tracks[["x_mm", "y_mm", "z_mm"]].to_numpy()).all(1)
+    ]
     length = table["particle"].value_counts()
     if len(length) > most // 4:
         table = table[table["particle"].isin(length.index[: most // 4])]
-    table = table.sort_values(["particle", "frame"])
+    table = table.sort_values(by=["particle", "frame"])
     particle, frame = table["particle"].to_numpy(), table["frame"].to_numpy()
     first = np.append(True, particle[1:] != particle[:-1])[: len(table)]
-    gap = np.append(False, np.diff(frame) > 1)[: len(table)]
     step = max(1, int(np.ceil(len(table) / most)))
+    gap = np.append(False, np.diff(frame) > step)[: len(table)]
     within = np.arange(len(table)) - np.maximum.accumulate(
         np.where(first, np.arange(len(table)), 0)
     )
     keep = (within % step == 0) | first | np.append(first[1:], True)[: len(table)]
     run = np.cumsum(first | gap)
-    kept = table.assign(run=run)[keep]
+    kept: pd.DataFrame = table.assign(run=run).loc[keep]
     new = np.append(True, np.diff(kept["run"]) != 0)[: len(kept)]
     return kept.assign(new=new)
 
@@ -67,7 +69,17 @@ def track_scene_json(results: TrackResults) -> str:
     traces = [
         _group(table[group == k], TRACK_COLOURS[k], named=bool(few)) for k in np.unique(group)
     ]
-    return scene_text(traces, [float(part) + 0.0 for part in results.up], _EYE)
+    up = [float(part) + 0.0 for part in results.up]
+    return scene_text(traces, up, _EYE * _slenderness(table[["x_mm", "y_mm", "z_mm"]].to_numpy()))
+
+
+def _slenderness(points_mm: Array) -> float:
+    """Diagonal of the points' box over that of a cube of its volume; the eye steps back for it."""
+    if not len(points_mm):
+        return 1.0
+    sides = np.ptp(points_mm, axis=0) + 1e-9
+    sides = np.maximum(sides, 0.05 * sides.max())
+    return float(np.linalg.norm(sides) / np.sqrt(3) / np.prod(sides) ** (1 / 3))
 
 
 def _group(table: pd.DataFrame, colour: str, *, named: bool) -> Trace:

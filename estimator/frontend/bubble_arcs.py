@@ -72,15 +72,16 @@ def notch_arcs(contour: Array) -> list[Array]:
     inside = np.isfinite(contour[:, 0])
     if not np.any(inside):
         return []
+    sense = _sense(contour[inside])
     if np.all(inside):
-        return _cut_closed(contour)
+        return _cut_closed(contour, sense)
     turn = int(np.argmin(inside))
     contour, inside = np.roll(contour, -turn, axis=0), np.roll(inside, -turn)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
     return [
         arc
         for low, high in zip(edges[::2], edges[1::2], strict=True)
-        for arc in _cut_open(contour[low:high])
+        for arc in _cut_open(contour[low:high], sense)
     ]
 
 
@@ -101,14 +102,18 @@ def _arm(points: Array) -> int:
     return int(np.clip(round(0.1 * size), 3, 8))
 
 
+def _sense(points: Array) -> float:
+    """1 for outlines that run from +u to +v, -1 for the others."""
+    x, y = (points - points[0]).T
+    return float(np.sign(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)))
+
+
 def _turning(points: Array, arm: int) -> Array:
-    """Turn (n,) of the outline over ``arm`` points before and after, positive where convex."""
+    """Turn (n,) of the outline over ``arm`` points before and after, towards +v from +u."""
     back = points - np.roll(points, arm, axis=0)
     ahead = np.roll(points, -arm, axis=0) - points
     cross = back[:, 0] * ahead[:, 1] - back[:, 1] * ahead[:, 0]
-    x, y = points.T
-    sense = np.sign(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
-    turn: Array = sense * np.arctan2(cross, np.sum(back * ahead, axis=1))
+    turn: Array = np.arctan2(cross, np.sum(back * ahead, axis=1))
     return turn
 
 
@@ -124,12 +129,12 @@ def _notches(turn: Array, arm: int) -> list[int]:
     return sorted(found)
 
 
-def _cut_closed(contour: Array) -> list[Array]:
+def _cut_closed(contour: Array, sense: float) -> list[Array]:
     points = _spaced(contour, closed=True)
     arm = _arm(points)
     if len(points) < 4 * arm:
         return [points]
-    notches = _notches(_turning(points, arm), arm)
+    notches = _notches(sense * _turning(points, arm), arm)
     if not notches:
         return [points]
     points = np.roll(points, -notches[0], axis=0)
@@ -137,14 +142,14 @@ def _cut_closed(contour: Array) -> list[Array]:
     return _trimmed(points, bounds)
 
 
-def _cut_open(contour: Array) -> list[Array]:
+def _cut_open(contour: Array, sense: float) -> list[Array]:
     if len(contour) < _SHORTEST_ARC:
         return []
     points = _spaced(contour, closed=False)
     arm = _arm(points)
     if len(points) < 4 * arm:
         return [points]
-    turn = _turning(np.concatenate([points, points[::-1]]), arm)[: len(points)]
+    turn = sense * _turning(points, arm)
     turn[:arm] = turn[-arm:] = 0.0
     return _trimmed(points, [0, *_notches(turn, arm), len(points)])
 

@@ -18,6 +18,7 @@ _NOISE_ROWS = 96
 _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
 _DARKEST = 0.05
+_LIT = 0.85
 _MAX_CUT_HEART_SHARE = 0.6
 
 
@@ -78,10 +79,16 @@ def noise_share(ratio: Grey) -> float:
     """
     step = max(1, (ratio.shape[0] - 2) // _NOISE_ROWS)
     middle = np.arange(1, ratio.shape[0] - 1, step)
-    vertical = ratio[middle - 1] - 2.0 * ratio[middle] + ratio[middle + 1]
+    above, here, below = ratio[middle - 1], ratio[middle], ratio[middle + 1]
+    vertical = above - 2.0 * here + below
     response = (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
-    lit = ratio[middle, 1:-1] > 0.85
-    values = response[lit] if np.count_nonzero(lit) > 200 else response.ravel()
+    lit = np.minimum(np.minimum(above, here), below) > _LIT
+    far = lit.copy()
+    for shift in (1, 2, 3):
+        far[:, shift:] &= lit[:, :-shift]
+        far[:, :-shift] &= lit[:, shift:]
+    far = far[:, 1:-1]
+    values = response[far] if np.count_nonzero(far) > 200 else response.ravel()
     return clipped_sigma(values[:: max(1, values.size // 40_000)].astype(np.float64), rounds=6)
 
 

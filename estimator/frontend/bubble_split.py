@@ -30,6 +30,8 @@ _MIN_ARC_RAD = 1.0
 _MIN_EXPLAINED, _MIN_COVERED = 0.75, 0.88
 _MAX_ARCS = 24
 _SPIRAL, _LEAST_IN_IMAGE = 200, 0.08
+_CANVAS_MARGIN_PX = 2
+"""Outline points on the image's edge are left out, which narrows the blob by this much."""
 
 
 @dataclass(frozen=True)
@@ -184,9 +186,9 @@ def _dark(ellipse: Array, contour: Array, shape: tuple[int, ...]) -> bool:
         return False
     canvas, low = _filled(contour)
     u, v = u[seen] - low[0], v[seen] - low[1]
-    inside = (u >= 0) & (v >= 0) & (u < canvas.shape[1]) & (v < canvas.shape[0])
-    dark = np.zeros(u.size, dtype=np.bool_)
-    dark[inside] = canvas[v[inside], u[inside]] > 0
+    near_u, near_v = np.clip(u, 0, canvas.shape[1] - 1), np.clip(v, 0, canvas.shape[0] - 1)
+    inside = np.maximum(np.abs(near_u - u), np.abs(near_v - v)) <= _CANVAS_MARGIN_PX
+    dark = inside & (canvas[near_v, near_u] > 0)
     return bool(np.mean(dark) > _MIN_COVERED)
 
 

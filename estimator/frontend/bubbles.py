@@ -42,6 +42,7 @@ _DEFOCUS_FLOOR_PX = 1.5
 _SMALL_EDGES = 3.0
 _WAIST, _SLIGHT_WAIST, _POOR_FIT = 0.3, 0.03, 2.5
 _SHARPEST_ORDER, _WHOLE = 35.0, 0.9
+_SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
 
 
 @dataclass(frozen=True)
@@ -249,6 +250,7 @@ def _reasons(
 ) -> list[str]:
     """Why each fitted outline is no bubble; empty where it is one."""
     reasons = []
+    typical = float(np.median(columns["contrast"]))
     for i in range(outlines.ellipse.shape[0]):
         _u, _v, a, b, _ = outlines.ellipse[i]
         jump = float(np.hypot(*(outlines.ellipse[i, :2] - start.ellipse[i, :2])))
@@ -260,6 +262,8 @@ def _reasons(
             reasons.append(f"contrast {columns['contrast'][i]:.2f} is below {min_contrast:g}")
         elif a > _MAX_AXIS_RATIO * b:
             reasons.append(f"{a / b:.1f} times as long as wide")
+        elif outlines.blur_px[i] > _SMUDGE_BLUR * b and columns["contrast"][i] < _SMUDGE * typical:
+            reasons.append("a smudge: blurred beyond its size, fainter than the bubbles")
         elif jump > 0.3 * a + 2.0 or outlines.coverage[i] < 0.12:
             reasons.append("too little of its outline can be seen")
         else:

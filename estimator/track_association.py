@@ -97,9 +97,18 @@ def _constant(
     base = np.log(seen / (1 - seen) / settings.new_per_mm3)
     sure = np.log(np.clip(measured.confidence[column], 1e-3, 1.0))
     expected = np.array([t.d_eq_mm for t in tracks])[row]
+    alive = alive_score(np.array([t.misses for t in tracks]), settings)[row]
     return np.asarray(
-        base + density + sure + size_score(expected, measured.d_eq_mm[column], settings)
+        base + density + sure + alive + size_score(expected, measured.d_eq_mm[column], settings)
     )
+
+
+def alive_score(misses: Ids, settings: TrackerSettings) -> Array:
+    """(K,) log probability that a track not seen for so many frames is only missed, not gone."""
+    missed = (1 - settings.detection_probability) * settings.missed_again_probability ** (
+        np.maximum(misses, 1) - 1.0
+    )
+    return -np.log1p(misses * settings.end_probability / missed)
 
 
 def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:

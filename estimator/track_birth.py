@@ -24,6 +24,8 @@ def extend(
 
     Where no confirmed track told the common shift (mean_gain None), they tell it themselves.
     """
+    if not tentative:
+        return [], common, mean_gain
     pairs = gated_pairs(tentative, scan.measured, scan.columns, common, scan.settings)
     if mean_gain is None:
         everyone = np.ones(len(tentative), bool)

@@ -28,9 +28,10 @@ class Track:
     """A bubble under way.
 
     filter : filterpy KalmanFilter, state as in `track_motion`; d_eq_mm : running mean, NaN if
-    unknown; d_last_mm : the last measured. seen : frame and time of the last measurement.
-    history : (frame, point) of a track that is not confirmed yet. parent, near : the track beside
-    it when it was born, and when it was missed first, with that one's size before.
+    unknown; d_last_mm : the last measured, d_before_mm : the mean before that. seen : frame and
+    time of the last measurement; misses : frames since. history : (frame, point) of a track that
+    is not confirmed yet. parent, near : the track beside it when it was born, and when it was
+    missed first, with that one's size before.
     """
 
     filter: Any
@@ -41,6 +42,7 @@ class Track:
     born_frame: int = 0
     seen_frame: int = 0
     seen_t_s: float = 0.0
+    misses: int = 0
     history: list[tuple[int, int]] = field(default_factory=list)
     parent: tuple[int, float] | None = None
     near: tuple[int, float] | None = None
@@ -50,6 +52,7 @@ class Track:
         return replace(self, filter=copy(self.filter), history=list(self.history))
 
     def missed(self, shift: Array, mean_gain: Array, common_mm2: Array) -> None:
+        self.misses += 1
         self.filter.x = self.filter.x + shift
         self.filter.P = self.filter.P + mean_gain @ common_mm2 @ mean_gain.T
 
@@ -61,7 +64,7 @@ class Track:
         self.filter.P = self.filter.P + unequal @ common_mm2 @ unequal.T
 
     def saw(self, frame: int, t_s: float, d_eq_mm: float) -> None:
-        self.seen_frame, self.seen_t_s, self.near = frame, t_s, None
+        self.seen_frame, self.seen_t_s, self.misses, self.near = frame, t_s, 0, None
         if np.isfinite(d_eq_mm):
             self.d_last_mm, self.d_before_mm = d_eq_mm, self.d_eq_mm
             first = not np.isfinite(self.d_eq_mm)

@@ -17,7 +17,16 @@ if TYPE_CHECKING:
     from telerig.estimator.tracker import Tracker
 
 _SCHEMA = 1
-_PLAIN = ("particle", "d_eq_mm", "d_last_mm", "d_before_mm", "born_frame", "seen_frame", "seen_t_s")
+_PLAIN = (
+    "particle",
+    "d_eq_mm",
+    "d_last_mm",
+    "d_before_mm",
+    "born_frame",
+    "seen_frame",
+    "seen_t_s",
+    "misses",
+)
 
 
 def to_dict(tracker: Tracker) -> dict[str, Any]:

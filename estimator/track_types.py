@@ -29,8 +29,11 @@ class TrackerSettings:
     stage_acceleration_mm_s2 : of the stage, where the encoder does not tell its position.
     size_scatter : relative sd of d_eq_mm from frame to frame; size_cap_nats bounds what one
         wrong size can say.
-    detection_probability, new_per_mm3, new_per_px2 : of a bubble in a frame; density of what is
-        no continuation (clutter, new bubbles) in space and in one image.
+    detection_probability, missed_again_probability : of a bubble in a frame; of one that was
+        missed in the frame before to be missed again. end_probability : to leave for good in a
+        frame; so a track that was missed for long hardly claims a measurement.
+    new_per_mm3, new_per_px2 : density of what is no continuation (clutter, new bubbles) in space
+        and in one image.
     gate_probability : of a true continuation to lie inside its gate.
     margin_nats : a continuation this close to the runner-up is not safe when the window ends;
         prune_nats : a hypothesis this far behind is dropped at once.
@@ -46,7 +49,7 @@ class TrackerSettings:
     lateral_acceleration_mm_s2: float = 3000.0
     rise_acceleration_mm_s2: float = 1000.0
     acceleration_time_s: float = 0.02
-    acceleration_state: bool = False
+    acceleration_state: bool = True
     velocity_time_s: float = float("inf")
     shake_sd_mm: float = 0.3
     shake_time_s: float = 0.01
@@ -54,12 +57,14 @@ class TrackerSettings:
     size_scatter: float = 0.05
     size_cap_nats: float = 4.5
     detection_probability: float = 0.95
+    missed_again_probability: float = 0.5
+    end_probability: float = 0.002
     new_per_mm3: float = 1e-5
     new_per_px2: float = 1e-5
     gate_probability: float = 0.9999
     margin_nats: float = 4.6
     prune_nats: float = 9.0
-    window_frames: int = 10
+    window_frames: int = 25
     max_hypotheses: int = 30
     confirm_hits: int = 3
     confirm_frames: int = 4
@@ -72,7 +77,8 @@ class TrackerSettings:
             value = getattr(self, item.name)
             if not value >= 0:
                 raise InputError(f"{item.name} = {value}", todo="give a number of at least 0")
-        for name in ("detection_probability", "gate_probability"):
+        probabilities = ("detection_probability", "missed_again_probability", "gate_probability")
+        for name in probabilities:
             if not 0 < getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)}", todo="give it between 0 and 1")
         for name in ("acceleration_time_s", "velocity_time_s", "shake_time_s", "size_scatter"):

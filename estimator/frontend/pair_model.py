@@ -104,18 +104,22 @@ def _improved(model: PairModel, geometries: list[PairGeometry], *, smooth: bool)
     probability = [marginals(odds) for _, _, odds, _ in found]
     weight = np.concatenate([p.ravel() for p in probability])
     use = weight > 0.01
-    flat = _Flat(geometries, [shift for *_, shift in found], use)
+    shifts = np.array([shift for *_, shift in found])
+    total = np.array([p.sum() for p in probability])
+    counts = np.array([p.shape for p in probability])
+    centred = shifts - np.average(shifts, weights=total + 1e-9)
+    flat = _Flat(geometries, centred, use)
     weight = weight[use]
     model = fit_bias(model, flat.points_mm, flat.raw_px - flat.shift_px, flat.variance_px2,
                      flat.doubt, weight, smooth=smooth)  # fmt: skip
-    total = np.array([p.sum() for p in probability])
-    counts = np.array([p.shape for p in probability])
     lonely = 1 - (total.sum() + 0.5) / (counts.sum(0) + 1.0)
     first, second = np.clip(lonely, _LEAST_LONELY, _MOST_LONELY)
-    shifts = np.array([shift for *_, shift in found])
+    mean, error = model.mean_gap_px
+    frame_px = _frame_scatter(model, centred, total) if len(geometries) > 1 else 0.0
     return replace(
         model,
-        frame_px=_frame_scatter(model, shifts, total) if len(geometries) > 1 else 0.0,
+        mean_gap_px=(mean, float(np.hypot(error, frame_px / np.sqrt(len(geometries))))),
+        frame_px=frame_px,
         size=_learnt(model.size, "size", flat.size, weight / flat.doubt**2),
         contrast=_learnt(model.contrast, "contrast", flat.contrast, weight),
         lonely=(float(first), float(second)),
@@ -127,7 +131,7 @@ class _Flat:
     """Likely pairs of all frames, one row each."""
 
     def __init__(
-        self, geometries: list[PairGeometry], shifts: list[float], use: NDArray[np.bool_]
+        self, geometries: list[PairGeometry], shifts: Array, use: NDArray[np.bool_]
     ) -> None:
         def flat(name: str) -> Array:
             arrays: list[Array] = [getattr(g, name) for g in geometries]

@@ -46,7 +46,7 @@ def _inside(bubble: Drawn, u: Array, v: Array) -> Array:
         return np.clip(0.5 - (level - 1.0) / slope * FINE, 0.0, 1.0)
     import matplotlib.path
 
-    phi = np.linspace(0.0, 2.0 * np.pi, 2048, endpoint=False)
+    phi = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
     speed = np.sqrt((a * np.sin(phi)) ** 2 + (b * np.cos(phi)) ** 2)
     bump = sum(c * np.cos(k * phi) + s * np.sin(k * phi) for k, (c, s) in bubble.harmonics.items())
     outline = np.stack(
@@ -67,18 +67,19 @@ def draw(
     v, u = fine_grid(shape)
     fine = np.ones((v.size, u.size))
     for bubble in bubbles:
-        inside = _inside(bubble, u, v)
-        own = np.full(fine.shape, bubble.level)
+        u0, v0, a, b, _ = bubble.ellipse
+        reach = 1.3 * a + 1.0
+        rows = slice(*np.searchsorted(v[:, 0], [v0 - reach, v0 + reach]))
+        columns = slice(*np.searchsorted(u[0], [u0 - reach, u0 + reach]))
+        own_v, own_u = v[rows], u[:, columns]
+        own: Array | float = bubble.level
         if bubble.heart:
-            u0, v0, _, b, _ = bubble.ellipse
-            radius = np.hypot(u - u0, v - v0)
-            soft = heart_blur * b
-            light = 0.5 * (1.0 - np.tanh((radius - bubble.heart * b) / soft))
-            own = own + (bubble.heart_level - bubble.level) * light
-        fine *= 1.0 - inside * (1.0 - own)
+            radius = np.hypot(own_u - u0, own_v - v0)
+            light = 0.5 * (1.0 - np.tanh((radius - bubble.heart * b) / (heart_blur * b)))
+            own = bubble.level + (bubble.heart_level - bubble.level) * light
+        fine[rows, columns] *= 1.0 - _inside(bubble, own_u, own_v) * (1.0 - own)
     blurred = gaussian_filter(fine, blur_px * FINE, mode="nearest", truncate=5.0)
-    rows, columns = shape
-    image: Array = blurred.reshape(rows, FINE, columns, FINE).mean(axis=(1, 3))
+    image: Array = blurred.reshape(shape[0], FINE, shape[1], FINE).mean(axis=(1, 3))
     return image
 
 

@@ -138,10 +138,10 @@ def test_types_of_image(dtype: type) -> None:
 
 def test_uneven_screen_is_estimated_from_the_image() -> None:
     rng = np.random.default_rng(5)
-    v, u = np.mgrid[:400, :500]
-    screen = 1.0 - 0.3 * ((u - 220) / 500) ** 2 - 0.25 * ((v - 260) / 400) ** 2
-    truth = [(80.0, 90.0), (250.4, 210.7), (410.2, 330.5), (300.6, 60.1)]
-    bubbles = [Drawn((*at, 20.0, 18.0, rng.uniform(0, 3)), heart=0.4) for at in truth]
+    v, u = np.mgrid[:240, :300]
+    screen = 1.0 - 0.3 * ((u - 130) / 300) ** 2 - 0.25 * ((v - 160) / 240) ** 2
+    truth = [(50.0, 60.0), (150.4, 130.7), (240.2, 190.5), (200.6, 50.1)]
+    bubbles = [Drawn((*at, 14.0, 13.0, rng.uniform(0, 3)), heart=0.4) for at in truth]
     image = digitised(draw(bubbles, screen.shape, blur_px=1.0) * screen, noise=0.01)
     table = detect_bubbles(image)
     assert len(table) == 4

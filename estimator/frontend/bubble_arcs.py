@@ -198,7 +198,7 @@ def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
         information = np.moveaxis(products, 2, 0).astype(np.float64)
         pull = pull.astype(np.float64)
         _add_roundness(information, pull, ellipse, _ROUND_SHARE * radius)
-        step = np.linalg.solve(information, pull[..., None])[..., 0]
+        step: Array = np.linalg.solve(information, pull[..., None])[..., 0]
         reach = np.max(np.abs(step), axis=1)
         step *= np.minimum(1.0, 0.4 * ellipse[:, 3] / (reach + 1e-12))[:, None]
         ellipse, _ = moved(ellipse, step)

@@ -157,7 +157,7 @@ def _first_look(ratio: NDArray[np.float32], state: RimState, start: Start) -> Ri
     used = (distance > -spread(depth, pixels.counts)) & (distance < 2.5 * sigma + 1.0)
     everyone = np.arange(len(start))
     used &= ~pixels.hidden(state.ellipse, state.ellipse, _HIDING_SIGMA * state.sigma, everyone)
-    weight = used * spread(1.0 / start.sigma_outer**2, pixels.counts)
+    weight = spread(1.0 / start.sigma_outer**2, pixels.counts) * used.astype(np.float32)
     prior = weak_prior(len(start), held=True)
     descent = _descend(state, pixels, linear, weight, start, prior, steps=2)
     return _moved(descent.state, descent.shifts)
@@ -221,7 +221,7 @@ def _window(state: RimState, pixels: Pixels, linear: Linear, start: Start, hidde
     kept &= ~unlike_rim(pixels, linear.foot, distance, residual, state.sigma, contrast)
     limit = _OUTLIER_SIGMA * np.maximum(_typical_residual(residual, pixels, kept), 1.0)
     kept &= np.abs(residual) < spread(limit, counts)
-    weight: Single = inverse * kept
+    weight: Single = (inverse * kept).astype(np.float32)
     return weight
 
 
@@ -285,7 +285,8 @@ def _limited(step: Array, state: RimState) -> Array:
     reach = np.max(np.abs(step[:, :BLUR]), axis=1)
     share = np.minimum(1.0, np.minimum(1.5, 0.3 * state.ellipse[:, 3]) / (reach + 1e-12))
     share = np.minimum(share, 0.4 * state.sigma / (np.abs(step[:, BLUR]) + 1e-12))
-    return step * share[:, None]
+    limited: Array = step * share[:, None]
+    return limited
 
 
 def _moved(state: RimState, shifts: Array) -> RimState:
@@ -295,8 +296,8 @@ def _moved(state: RimState, shifts: Array) -> RimState:
 
 def _coverage(pixels: Pixels, linear: Linear, weight: Single, sigma: Array) -> Array:
     """Share of the outline (B,) at which pixels at the edge were looked at."""
-    near = np.abs(linear.foot.distance) < spread(1.2 * sigma + 0.3, pixels.counts)
-    near = np.flatnonzero(near & (weight > 0.0))
+    close = np.abs(linear.foot.distance) < spread(1.2 * sigma + 0.3, pixels.counts)
+    near = np.flatnonzero(close & (weight > 0.0))
     angle = np.arctan2(linear.foot.sin[near], linear.foot.cos[near])
     slot = ((angle + np.pi) * (_BINS / (2.0 * np.pi))).astype(np.intp) % _BINS
     seen = np.bincount(pixels.owner[near] * _BINS + slot, minlength=pixels.bubbles * _BINS)

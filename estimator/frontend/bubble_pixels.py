@@ -48,7 +48,8 @@ class Pixels:
 
     def sums(self, values: Single) -> Array:
         """Sum (B,) of values (N,) over each bubble."""
-        return np.bincount(self.owner, weights=values, minlength=self.bubbles)
+        sums: Array = np.bincount(self.owner, weights=values, minlength=self.bubbles)
+        return sums
 
     def local(self, ellipse: Array) -> Array:
         """Ellipses (B, 5) with their centres counted from ``origin``."""

@@ -14,7 +14,8 @@ Grey = NDArray[np.float32]
 
 _SHRINK = 8
 _SCREEN_PASSES = 3
-_NOISE_ROWS = 96
+_NOISE_ROWS, _NOISE_SAMPLES = 96, 40_000
+_DARK_SHARE, _ENOUGH_DARK = 0.12, 120
 _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
 _DARKEST = 0.05
@@ -89,7 +90,34 @@ def noise_share(ratio: Grey) -> float:
         far[:, :-shift] &= lit[:, shift:]
     far = far[:, 1:-1]
     values = response[far] if np.count_nonzero(far) > 200 else response.ravel()
-    return clipped_sigma(values[:: max(1, values.size // 40_000)].astype(np.float64), rounds=6)
+    return clipped_sigma(
+        values[:: max(1, values.size // _NOISE_SAMPLES)].astype(np.float64), rounds=6
+    )
+
+
+def dark_noise_share(ratio: Grey, blobs: list[Blob], sigma: float) -> float:
+    """Noise within the dark rims, at most ``sigma``, that of the screen: photons are fewer there.
+
+    From second differences along both axes where three by three pixels are dark alike. What
+    structure the rims have makes it too large rather than too small.
+    """
+    import cv2
+
+    found = []
+    for blob in blobs:
+        x, y, width, height = blob.box
+        crop = ratio[y : y + height, x : x + width]
+        if min(crop.shape) < 5:
+            continue
+        even = (crop < blob.inner + _DARK_SHARE * (1.0 - blob.inner)).astype(np.uint8)
+        even = cv2.erode(even, np.ones((5, 5), np.uint8), borderValue=0)[1:-1, 1:-1] > 0
+        vertical = crop[:-2] - 2.0 * crop[1:-1] + crop[2:]
+        response = (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
+        found.append(response[even])
+    values = np.concatenate(found) if found else np.empty(0, np.float32)
+    if values.size < _ENOUGH_DARK:
+        return sigma
+    return min(sigma, clipped_sigma(values[: 10 * _NOISE_SAMPLES].astype(np.float64), rounds=6))
 
 
 def find_blobs(
@@ -114,7 +142,8 @@ def find_blobs(
         blobs += found
         if reason:
             radius = float(np.sqrt(stats[label, cv2.CC_STAT_AREA] / np.pi))
-            specks.append(Speck(*centres[label].tolist(), radius, reason))
+            u, v = centres[label].tolist()
+            specks.append(Speck(u, v, radius, reason))
     return blobs, specks
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 _SAMPLES = 64
 _ELLIPSE_COLUMNS = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
@@ -28,7 +29,7 @@ def outline_points(row: pd.Series[Any] | dict[str, Any], n: int = 64) -> Array:
     return points
 
 
-def _sampled(ellipse: Array, harmonics: Array) -> tuple[Array, Array, Array]:
+def _sampled(ellipse: Array, harmonics: Array) -> tuple[Complex, Complex, Complex]:
     """Outlines about their ellipses' centres as complex numbers (B, 64), and their first and
     second derivatives by the anomaly, spectral and so exact to rounding."""
     phi = np.linspace(0.0, 2.0 * np.pi, _SAMPLES, endpoint=False)

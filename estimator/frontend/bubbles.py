@@ -15,6 +15,7 @@ from telerig.estimator.frontend.bubble_pixels import close_pairs
 from telerig.estimator.frontend.bubble_regions import (
     Blob,
     Speck,
+    dark_noise_share,
     find_blobs,
     noise_share,
 )
@@ -41,6 +42,7 @@ _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
 _SMALL_EDGES = 3.0
 _WAIST, _SLIGHT_WAIST, _POOR_FIT = 0.3, 0.03, 2.5
+_ASTRAY_PX, _ASTRAY_SHARE = 0.3, 0.01
 _SHARPEST_ORDER, _WHOLE = 35.0, 0.9
 _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
 
@@ -105,7 +107,7 @@ def find_bubbles(
     specks += slender
     if not parts:
         return _bubbles(_empty_columns(), specks, sigma, "no shadow dark and large enough")
-    start = _start(parts, blobs, sigma)
+    start = _start(parts, blobs, sigma, max(dark_noise_share(ratio, blobs, sigma), 1e-4))
     outlines = fit_outlines(ratio, start)
     columns = _columns(outlines, parts, image.shape, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
@@ -152,16 +154,15 @@ def _empty_columns() -> dict[str, Any]:
     return columns
 
 
-def _start(parts: list[Part], blobs: list[Blob], sigma: float) -> Start:
+def _start(parts: list[Part], blobs: list[Blob], sigma: float, dark_sigma: float) -> Start:
     own = [blobs[part.blob] for part in parts]
-    noise = np.full(len(parts), sigma)
     return Start(
         np.stack([part.ellipse for part in parts]),
         np.zeros((len(parts), len(HARMONIC_COLUMNS))),
         np.array([blob.blur_px for blob in own]),
         np.array([blob.inner for blob in own]),
-        noise,
-        noise,
+        np.full(len(parts), sigma),
+        np.full(len(parts), dark_sigma),
     )
 
 
@@ -214,7 +215,7 @@ def _flags(
         "border": border,
         "defocus": _defocused(outlines),
         "overlap": hidden,
-        "merged": np.array([part.merged for part in parts]) | _dented(outlines),
+        "merged": _merged(outlines, parts),
         "small": ellipse[:, 3] < _SMALL_EDGES * np.hypot(outlines.blur_px, 0.29),
         "saturated": np.full(len(parts), clipped),
     }
@@ -222,17 +223,26 @@ def _flags(
     return np.array(flags, dtype=object)
 
 
-def _dented(outlines: Outlines) -> Mask:
-    """Outlines with a waist, which no single bubble has; hidden ones are not judged.
+def _merged(outlines: Outlines, parts: list[Part]) -> Mask:
+    """What could not be split, and all of a blob when one of its parts turns out unsound."""
+    merged = np.array([part.merged for part in parts]) | _dented(outlines)
+    unsound = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
+    return np.array([part.blob in unsound for part in parts])
 
-    A slight waist counts where the outline's orders do not describe the rim either.
+
+def _dented(outlines: Outlines) -> Mask:
+    """Outlines from which the rim strays, or with a waist, which no single bubble has.
+
+    A slight waist counts where the outline's orders do not describe the rim either; whether a
+    partly hidden outline has one cannot be told.
     """
     dent = deepest_dent(outlines.ellipse, outlines.harmonics)
     radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
     sure = dent > 3.0 * _SHARPEST_ORDER * outlines.sigma_outline_px / radius
     waist = (dent > _WAIST) | ((dent > _SLIGHT_WAIST) & (outlines.chi2_dof > _POOR_FIT))
-    dented: Mask = waist & sure & (outlines.coverage > _WHOLE)
-    return dented
+    waist &= sure & (outlines.coverage > _WHOLE)
+    astray: Mask = outlines.misfit_px > _ASTRAY_PX + _ASTRAY_SHARE * radius
+    return waist | astray
 
 
 def _defocused(outlines: Outlines) -> Mask:

@@ -139,7 +139,13 @@ def _any_inside(points: Array, outline: Array, centre: Array) -> bool:
 
 
 def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dict[str, Any]:
-    """Columns of `truth/runs/<run>/bubbles.csv` for one frame: bubbles that any camera sees."""
+    """Columns of `truth/runs/<run>/bubbles.csv` for one frame: bubbles that any camera sees.
+
+    Lab place and velocity of the centre of volume; its rig place is that in the carriage's frame,
+    without any camera's shake. Per camera: pixels of the projected centre of volume and of the
+    silhouette's centroid (both with that camera's shake), area, blur, and the flags of
+    `CameraView`; blank where the bubble is far from the image.
+    """
     seen = np.zeros(len(scene.fleet.d_eq_mm), bool)
     for view in views.values():
         seen[view.particle[view.visible]] = True

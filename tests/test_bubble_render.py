@@ -129,8 +129,7 @@ def test_no_surface_point_lies_outside_the_outline_and_some_reach_it(seed, param
         period=2 * np.pi,
     )
     beyond = np.linalg.norm(cloud, axis=1) - radius
-    tolerance = 2e-2 if "kappa_per_mm" in parameters else 2e-3
-    assert beyond.max() < tolerance
+    assert beyond.max() < 2e-3
     sector = np.floor(np.arctan2(cloud[:, 1], cloud[:, 0]) / (2 * np.pi / 60)).astype(int)
     nearest = [beyond[sector == k].max() for k in np.unique(sector)]
     assert min(nearest) > -0.3

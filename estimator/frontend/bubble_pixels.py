@@ -145,8 +145,8 @@ def _ring(
     # |g - 1| g / |grad| < reach, with square = g^2 and x = |grad|^2 / 4
     level = np.sqrt(square)
     near = np.flatnonzero((np.abs(level - 1.0) * level) < np.float32(reach) * np.sqrt(x))
-    row, column = np.divmod(near, max(u.size, 1))
-    return u.take(column), v.take(row)
+    row = near // max(u.size, 1)
+    return u.take(near - row * u.size), v.take(row)
 
 
 def unlike_rim(

@@ -20,19 +20,19 @@ _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
 _DARKEST = 0.05
 _LIT = 0.85
+_LEAST_OUTLINE, _STEEP_SHARE = 5, 0.6
 _MAX_CUT_HEART_SHARE = 0.6
 
 
 @dataclass(frozen=True)
 class Blob:
     """One dark region: its outline ``contour_px`` (n, 2; closed, to about 0.1 px) at half depth,
-    the ``inner`` level (background is 1), the edge's ``blur_px``, ``area_px2``, and the
-    ``box`` (u, v, width, height) of the region it came from."""
+    the ``inner`` level (background is 1), the edge's ``blur_px``, and the ``box`` (u, v, width,
+    height) of the region it came from."""
 
     contour_px: Array
     inner: float
     blur_px: float
-    area_px2: float
     box: tuple[int, int, int, int]
     touches_border: bool
 
@@ -132,79 +132,66 @@ def find_blobs(
 
     low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
     mask = cv2.compare(ratio, low, cv2.CMP_LT)
-    count, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    sizes = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
-    big = np.flatnonzero((sizes >= min_diameter_px) & (np.arange(count) > 0))
+    regions, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     blobs: list[Blob] = []
-    specks = _small_ones(stats, centres, min_diameter_px)
-    for label in big.tolist():
-        found, reason = _trace(ratio, labels, stats[label], label, min_contrast, min_diameter_px)
+    specks: list[Speck] = []
+    too_small = f"smaller than {min_diameter_px:g} px"
+    for region in regions:
+        if len(region) < _LEAST_OUTLINE:
+            continue
+        x, y, width, height = cv2.boundingRect(region)
+        found, reason = [], too_small
+        if max(width, height) >= min_diameter_px:
+            box = (x, y, width, height)
+            found, reason = _trace(ratio, region, box, low, min_contrast, min_diameter_px)
         blobs += found
-        if reason:
-            radius = float(np.sqrt(stats[label, cv2.CC_STAT_AREA] / np.pi))
-            u, v = centres[label].tolist()
-            specks.append(Speck(u, v, radius, reason))
+        if not found:
+            radius = 0.5 * float(np.sqrt(width * height))
+            specks.append(Speck(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
     return blobs, specks
-
-
-def _small_ones(stats: NDArray[np.int32], centres: Array, min_diameter_px: float) -> list[Speck]:
-    import cv2
-
-    area = stats[:, cv2.CC_STAT_AREA]
-    sizes = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
-    small = np.flatnonzero((sizes < min_diameter_px) & (area >= 4))
-    reason = f"smaller than {min_diameter_px:g} px"
-    return [
-        Speck(float(centres[i, 0]), float(centres[i, 1]), float(np.sqrt(area[i] / np.pi)), reason)
-        for i in small.tolist()
-        if i > 0
-    ]
 
 
 def _trace(
     ratio: Grey,
-    labels: NDArray[np.int32],
-    stat: NDArray[np.int32],
-    label: int,
+    region: NDArray[np.int32],
+    box: tuple[int, int, int, int],
+    low: float,
     min_contrast: float,
     min_diameter_px: float,
 ) -> tuple[list[Blob], str]:
     """Outlines at half depth within one region, or the reason why there is none."""
     import cv2
 
-    x, y, width, height = (int(value) for value in stat[:4])
+    x, y, width, height = box
     rows, columns = ratio.shape
     left, top = max(x - 1, 0), max(y - 1, 0)
-    crop = np.s_[top : min(y + height + 1, rows), left : min(x + width + 1, columns)]
-    part, own = ratio[crop], labels[crop] == label
-    values = part[own]
+    part = ratio[top : min(y + height + 1, rows), left : min(x + width + 1, columns)]
+    own = np.zeros(part.shape, np.uint8)
+    cv2.drawContours(own, [region], -1, 1, cv2.FILLED, offset=(-left, -top))
+    values = part[(own > 0) & (part < low)]
     place = int(_DARKEST * values.size)
     inner = float(np.partition(values, place)[place])
     if inner > 1.0 - min_contrast:
         return [], f"contrast {1.0 - inner:.2f} is below {min_contrast:g}"
     half = 0.5 * (1.0 + inner)
-    dark = (own & (part < half)).astype(np.uint8)
-    lit_sides = (top == 0, left == 0, top + part.shape[0] == rows, left + part.shape[1] == columns)
-    if any(lit_sides):
-        _close_at_border(dark, lit_sides)
+    dark = own & (part < half)
+    at_border = (top == 0, left == 0, top + part.shape[0] == rows, left + part.shape[1] == columns)
+    if any(at_border):
+        _close_at_border(dark, at_border)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    blobs, reason = [], f"smaller than {min_diameter_px:g} px"
+    blobs = []
     for outline in outlines:
         points = outline.reshape(-1, 2)
-        if len(points) < 8:
-            continue
-        area = float(cv2.contourArea(outline)) + 0.5 * len(points) + 1.0
-        if max(np.ptp(points[:, 0]), np.ptp(points[:, 1])) + 1 < min_diameter_px:
+        size = int(np.max(np.max(points, axis=0) - np.min(points, axis=0))) + 1
+        if len(points) < _LEAST_OUTLINE or size < min_diameter_px:
             continue
         points = points + np.array([left, top])
         refined, blur = refined_contour(ratio, points, half, 1.0 - inner)
         edge = (points[:, 0] <= 0) | (points[:, 1] <= 0)
         edge |= (points[:, 0] >= columns - 1) | (points[:, 1] >= rows - 1)
         refined[edge] = np.nan
-        box = (x, y, width, height)
-        blobs.append(Blob(refined, inner, blur, area, box, bool(np.any(edge))))
-        reason = ""
-    return blobs, reason
+        blobs.append(Blob(refined, inner, blur, box, bool(np.any(edge))))
+    return blobs, "" if blobs else f"smaller than {min_diameter_px:g} px"
 
 
 def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
@@ -241,6 +228,7 @@ def refined_contour(
     shift = (half - ratio[v, u]) / square
     shift = shift * np.minimum(1.0, 1.2 / np.maximum(np.abs(shift) * np.sqrt(square), 1e-9))
     refined = np.stack([u + shift * slope_u, v + shift * slope_v], axis=1).astype(np.float64)
-    steepest = float(np.quantile(np.sqrt(square), 0.6))
+    place = int(_STEEP_SHARE * square.size)
+    steepest = float(np.sqrt(np.partition(square, place)[place]))
     blur = contrast / (np.sqrt(2.0 * np.pi) * max(steepest, 1e-6))
     return refined, float(np.sqrt(max(blur**2 - 0.6, 0.15)))

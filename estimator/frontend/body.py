@@ -25,8 +25,8 @@ from telerig.rig.triangulation import stacked_jacobian, triangulate
 Array = NDArray[np.float64]
 
 DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
-_ZONAL_SHARE = 0.5  # prior probability of a shape that is axisymmetric about the spheroid's axis
-_KNOWN_AXIS = 0.2  # rad: beyond this uncertainty of the axis that account is left out
+_ZONAL_SHARE = 0.2  # prior probability of a shape that is axisymmetric about the spheroid's axis
+_KNOWN_AXIS = 0.15  # rad: beyond this uncertainty of the axis that account is left out
 _RUN_WEIGHT = 4.0  # harmonics' worth of the run's shape_sigma against a bubble's own four
 _DEFAULT_WEIGHT = 0.05  # in bubbles, of DEFAULT_SHAPE_SIGMA in what a run learns
 _LARGEST_SIGMA = 0.03  # one bubble's share in what a run learns

@@ -28,7 +28,7 @@ from telerig.rig.camera import Camera
 Array = NDArray[np.float64]
 
 SAFE_NATS = 3.0
-_TAIL, _TAIL_WIDTH, _GATE_SIGMA = 0.01, 2.0, 6.0
+_TAIL, _TAIL_WIDTH, _TAIL_PX, _GATE_SIGMA = 0.02, 2.0, 0.5, 5.0
 _WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-6, 0.02, 0.05
 _IMPOSSIBLE, _IMPOSSIBLE_SIGMA = 0.15, 10.0
 _RARE, _FREEDOM = 2.5, 6.0
@@ -87,15 +87,15 @@ def common_shift(
 def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
     """(N1, N2) log odds by height, width, contrast and the number of detections; not the gap.
 
-    Heights that differ beyond all measurement exclude a pair, unless one of the two is flagged.
+    Heights that differ beyond all measurement exclude a pair; flagged ones may differ twice that.
     """
     first, second = geometry.views
     odds = np.full(geometry.gap_px.shape, _prior_log_odds(len(first), len(second), model.lonely))
     wrong = np.where(geometry.doubt > 1, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
     odds += _cue(model.size, geometry.size, first.log_size, second.log_size, wrong)
     apart = np.abs(np.nan_to_num(geometry.size[..., 0] - model.size.difference[0]))
-    impossible = apart > max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
-    odds[impossible & (geometry.doubt == 1)] = _NEVER
+    limit = max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
+    odds[apart > np.where(geometry.doubt > 1, 2 * limit, limit)] = _NEVER
     contrasts = (first.log_contrast, second.log_contrast)
     odds += _cue(model.contrast, geometry.contrast, *contrasts, _WRONG_CONTRAST)
     return odds
@@ -109,11 +109,12 @@ def _prior_log_odds(n1: int, n2: int, lonely: tuple[float, float]) -> float:
 
 
 def _gap_log_odds(gap: Array, variance: Array, model: PairModel) -> Array:
-    """A normal core with wider tails, cut off, against any place along the span."""
+    """A normal core with wider tails (upset outlines), cut off, against any place in the span."""
     core = np.exp(-0.5 * gap**2 / variance)
-    tail = np.exp(-0.5 * gap**2 / (variance * _TAIL_WIDTH**2)) / _TAIL_WIDTH
+    wide = variance * _TAIL_WIDTH**2 + _TAIL_PX**2
+    tail = np.exp(-0.5 * gap**2 / wide) * np.sqrt(variance / wide)
     density = ((1 - _TAIL) * core + _TAIL * tail) / np.sqrt(2 * np.pi * variance)
-    near = gap**2 < _GATE_SIGMA**2 * variance
+    near = gap**2 < _GATE_SIGMA**2 * wide
     return np.where(near, np.log(np.maximum(density * model.span_px, 1e-300)), _NEVER)
 
 

@@ -13,7 +13,8 @@ Array = NDArray[np.float64]
 
 TERMS = (1, 4, 10)
 PAIRS_PER_TERM = 3.0
-_BETTER = 0.95
+BETTER = 0.95
+AS_MANY = 0.95
 _PRIOR_SD_PX = (10.0, 2.0, 1.0)
 _PRIOR_SCATTER_PX, _PRIOR_PAIRS, _SMALLEST_PX = 0.3, 2.0, 0.02
 
@@ -25,28 +26,29 @@ def fit_bias(
     variance_px2: Array,
     doubt: Array,
     weight: Array,
-    *,
-    smooth: bool,
+    terms: int,
 ) -> PairModel:
     """Bias, its covariance and the scatter from likely pairs; all arrays have one row per pair.
 
-    weight : probability of the pair. Tails are tempered as of Student's t with 4 degrees.
+    terms : 1, 4 or 10, see `PairModel`.  weight : probability of the pair. Tails are tempered as of Student's t with 8 degrees.
     """
     if weight.sum() < 0.5:
         return model
     reach = np.maximum(3 * np.sqrt(np.average((points_mm - model.origin_mm) ** 2, 0, weight)), 1e-3)
     model = replace(model, reach_mm=np.maximum(reach / 1.5, 0.1 * reach.max()))
-    best = _fit(model, points_mm, gap_px, variance_px2, doubt, weight, 1)
-    constant = best
-    for terms in TERMS[1:] if smooth else ():
-        if weight.sum() < PAIRS_PER_TERM * terms:
-            break
-        trial = _fit(model, points_mm, gap_px, variance_px2, doubt, weight, terms)
-        if trial.rms_px[3] < _BETTER * best.rms_px[3]:
-            best = trial
+    constant = _fit(model, points_mm, gap_px, variance_px2, doubt, weight, 1)
+    best = constant
+    if terms > 1:
+        best = _fit(model, points_mm, gap_px, variance_px2, doubt, weight, terms)
     raw, middle = constant.rms_px[0], constant.rms_px[2]
     mean = (float(constant.bias_px[0]), float(np.sqrt(constant.bias_covariance_px2[0, 0])))
     return replace(best, mean_gap_px=mean, rms_px=(raw, middle, best.rms_px[2], best.rms_px[3]))
+
+
+def better(trial: PairModel, best: PairModel) -> bool:
+    """Whether a richer bias predicts pairs left out of it better, with no fewer pairs."""
+    fewer = trial.pairs < AS_MANY * best.pairs
+    return not fewer and trial.rms_px[3] < BETTER * best.rms_px[3]
 
 
 def _fit(
@@ -70,7 +72,7 @@ def _fit(
     tempered = influence = weight
     for _ in range(8):
         own = variance_px2 + (scatter * doubt) ** 2
-        tempered = weight * 5 / (4 + residual**2 / own)
+        tempered = weight * 9 / (8 + residual**2 / own)
         influence = tempered / own
         covariance = np.asarray(np.linalg.inv((basis.T * influence) @ basis + np.diag(prior)))
         bias = covariance @ (basis.T @ (influence * gap_px))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.frontend.matching import appearance_log_odds, common_shift
-from telerig.estimator.frontend.pair_bias import fit_bias
+from telerig.estimator.frontend.pair_bias import PAIRS_PER_TERM, TERMS, better, fit_bias
 from telerig.estimator.frontend.pair_geometry import (
     PairGeometry,
     View,
@@ -35,8 +35,7 @@ Array = NDArray[np.float64]
 MOST_FRAMES = 60
 MOST_BIAS_PX = 20.0
 _START_SCATTER_PX = 1.5
-_PASSES = 12
-_CONSTANT_PASSES = 6
+_PASSES = 6
 _LEAST_LONELY, _MOST_LONELY = 0.05, 0.9
 _PRIOR_PAIRS = 3.0
 _PRIOR_SCATTER_PX = 0.3
@@ -93,12 +92,19 @@ def estimate_pair_model(
         frame_px=_START_SCATTER_PX if len(used) > 1 else 0.0,
         origin_mm=np.median(points, axis=0),
     )
-    for i in range(_PASSES):
-        model = _improved(model, geometries, smooth=i >= _CONSTANT_PASSES)
-    return describe(model, votes)
+    for _ in range(_PASSES):
+        model = _improved(model, geometries, 1)
+    best = model
+    for terms in TERMS[1:]:
+        if model.pairs >= PAIRS_PER_TERM * terms:
+            trial = model
+            for _ in range(_PASSES):
+                trial = _improved(trial, geometries, terms)
+            best = trial if better(trial, best) else best
+    return describe(best, votes)
 
 
-def _improved(model: PairModel, geometries: list[PairGeometry], *, smooth: bool) -> PairModel:
+def _improved(model: PairModel, geometries: list[PairGeometry], terms: int) -> PairModel:
     """One pass: probabilities of all pairs, then everything that follows from them."""
     found = [common_shift(g, model) for g in geometries]
     probability = [marginals(odds) for _, _, odds, _ in found]
@@ -111,7 +117,7 @@ def _improved(model: PairModel, geometries: list[PairGeometry], *, smooth: bool)
     flat = _Flat(geometries, centred, use)
     weight = weight[use]
     model = fit_bias(model, flat.points_mm, flat.raw_px - flat.shift_px, flat.variance_px2,
-                     flat.doubt, weight, smooth=smooth)  # fmt: skip
+                     flat.doubt, weight, terms)  # fmt: skip
     lonely = 1 - (total.sum() + 0.5) / (counts.sum(0) + 1.0)
     first, second = np.clip(lonely, _LEAST_LONELY, _MOST_LONELY)
     mean, error = model.mean_gap_px
@@ -155,14 +161,14 @@ def _frame_scatter(model: PairModel, shifts: Array, total: Array) -> float:
 
 
 def _learnt(cue: Cue, name: str, ratio: Array, weight: Array) -> Cue:
-    """Mean and covariance of the ratios over likely pairs, tails tempered (Student's t, 4)."""
+    """Mean and covariance of the ratios over likely pairs, tails tempered (Student's t, 8)."""
     known = np.isfinite(ratio).all(-1)
     ratio, weight = ratio[known], weight[known]
     if weight.sum() < 0.5:
         return cue
     off = ratio - cue.difference
     far = (off * np.linalg.solve(cue.scatter, off.T).T).sum(-1)
-    tempered = weight * (4 + ratio.shape[1]) / (4 + far)
+    tempered = weight * (8 + ratio.shape[1]) / (8 + far)
     mean = tempered @ ratio / (tempered.sum() + 0.1)
     off = ratio - mean
     squares = (off.T * tempered) @ off + _PRIOR_PAIRS * _PRIOR[name]

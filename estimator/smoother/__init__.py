@@ -1,0 +1,1 @@
+"""The smoothing graph: bubbles, carriage and camera offsets from all that was measured."""

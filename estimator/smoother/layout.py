@@ -1,0 +1,280 @@
+"""How states are laid out: which component sits where in a node's vector, and when nodes are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoother.model import (
+    CARRIAGE,
+    BubbleModel,
+    ShakeModel,
+    SmoothingProblem,
+)
+from telerig.factors.state_space import (
+    Component,
+    broad_band,
+    driven_mode,
+    independent,
+    oscillator,
+    ou_velocity,
+    slow_ou,
+    wander,
+    white_jerk,
+)
+from telerig.rig.camera import Camera
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_MERGE = 0.02
+_READING_SIGMA_MM = 10.0
+_ALIGNED = 1 - 1e-9
+
+
+@dataclass(frozen=True)
+class ShakeLayout:
+    """The vector of carriage and camera offsets at a node.
+
+    components : independent, one after the other.
+    position, velocity, acceleration, jerk : (D,) of the carriage along the axis.
+    offset, offset_velocity, offset_acceleration, offset_jerk : (C + 1, 3, D) of each camera in
+        rig axes; the last is what all share, which a sensor on the carriage feels.
+    pitch : (C, D).  seen : per camera (k, 3), the directions in which its own arm is modelled.
+    unseen_variance_mm2 : (C, 3, 3) of the arm's own shake along the camera's depth.
+    """
+
+    components: tuple[Component, ...]
+    labels: tuple[str, ...]
+    position: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    offset: Array
+    offset_velocity: Array
+    offset_acceleration: Array
+    offset_jerk: Array
+    pitch: Array
+    seen: tuple[Array, ...]
+    unseen_variance_mm2: Array
+
+    @property
+    def size(self) -> int:
+        return len(self.position)
+
+
+@dataclass(frozen=True)
+class BubbleLayout:
+    """The vector of a bubble at a frame.
+
+    position, velocity : (3, D) lab, rig axes.  wander : (C, 2, D) px.
+    """
+
+    components: tuple[Component, ...]
+    position: Array
+    velocity: Array
+    wander: Array
+
+    @property
+    def size(self) -> int:
+        return self.position.shape[1]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """When the carriage's and the cameras' states are: frames and sensor samples together.
+
+    t_s : (N,).  of_frame : (F,).  of_encoder, of_accelerometers : node of each reading, and by
+    how much later than the node the reading is (encoder_late_s, accelerometer_late_s).
+    """
+
+    t_s: Array
+    of_frame: Ints
+    of_encoder: Ints
+    encoder_late_s: Array
+    of_accelerometers: tuple[Ints, ...]
+    accelerometer_late_s: tuple[Array, ...]
+
+
+def seen_directions(camera: Camera) -> Array:
+    """(2, 3) unit vectors in rig axes across the camera's line of sight; rig axes where they fit."""
+    rotation = camera.camera_from_rig.rotation
+    along = int(np.argmax(np.abs(rotation[2])))
+    if abs(rotation[2, along]) > _ALIGNED:
+        return np.delete(np.eye(3), along, 0)
+    return np.asarray(rotation[:2])
+
+
+@dataclass(frozen=True)
+class _Placed:
+    component: Component
+    label: str
+    direction: Array
+    camera: int
+    kind: str = "offset"
+
+
+def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
+    """All components of carriage and cameras."""
+    placed = _carriage(problem, model) + _offsets(problem.cameras, model)
+    parts = [p.component for p in placed]
+    size, cameras = sum(c.size for c in parts), len(problem.cameras)
+    carriage = np.zeros((4, size))
+    offset, pitch = np.zeros((4, cameras + 1, 3, size)), np.zeros((cameras, size))
+    at = 0
+    for p in placed:
+        c, columns = p.component, slice(at, at + p.component.size)
+        rows = (c.position, c.velocity, c.acceleration, c.jerk)
+        if p.kind == "carriage":
+            carriage[:, columns] = rows
+        elif p.kind == "pitch":
+            pitch[p.camera, columns] = c.position
+        else:
+            block = np.einsum("rn,i->rin", np.array(rows), p.direction)
+            if p.camera == CARRIAGE:
+                offset[..., columns] += block[:, None]
+            else:
+                offset[:, p.camera, :, columns] += block
+        at += c.size
+    return ShakeLayout(
+        tuple(parts), tuple(p.label for p in placed), *carriage, *offset, pitch,
+        tuple(seen_directions(c) for c in problem.cameras), _unseen(problem.cameras, model),
+    )  # fmt: skip
+
+
+def _carriage(problem: SmoothingProblem, model: ShakeModel) -> list[_Placed]:
+    if problem.stage is None:
+        return []
+    if model.carriage.kind == "jerk":
+        part = white_jerk(
+            model.carriage.jerk_density, start_sigma_mm_s=1000.0, start_sigma_mm_s2=5000.0
+        )
+    else:
+        part = independent(_READING_SIGMA_MM)
+    placed = [_Placed(part, "carriage", problem.axis, CARRIAGE, "carriage")]
+    if model.carriage.servo is not None:
+        rms, frequency, damping = model.carriage.servo
+        servo = driven_mode(rms, frequency, damping)
+        placed.append(_Placed(servo, "servo", problem.axis, CARRIAGE, "carriage"))
+    return placed
+
+
+def _offsets(cameras: Sequence[Camera], model: ShakeModel) -> list[_Placed]:
+    placed: list[_Placed] = []
+    for mode in model.modes:
+        for direction, rms in _directed(mode.rms_mm, mode.camera, cameras):
+            where, label = mode.camera, f"mode {mode.frequency_hz:.4g} Hz"
+            if mode.force_hz is None:
+                part = oscillator(rms, mode.frequency_hz, mode.damping)
+            else:
+                part = driven_mode(rms, mode.frequency_hz, mode.damping, force_hz=mode.force_hz)
+            placed.append(_Placed(part, label, direction, where))
+    for band in model.broad_bands:
+        for direction, rms in _directed(band.rms_mm, band.camera, cameras):
+            part = broad_band(rms, low_hz=band.low_hz, high_hz=band.high_hz)
+            placed.append(_Placed(part, "broad band", direction, band.camera))
+            if band.slow_rms_mm > 0:
+                slow = slow_ou(band.slow_rms_mm, band.slow_tau_s)
+                placed.append(_Placed(slow, "slow", direction, band.camera))
+    for p in model.pitches:
+        part = driven_mode(p.rms_rad, p.frequency_hz, p.damping, force_hz=p.force_hz)
+        placed.append(_Placed(part, "pitch", np.zeros(3), p.camera, "pitch"))
+    return placed
+
+
+def _directed(
+    rms_mm: Sequence[float], camera: int, cameras: Sequence[Camera]
+) -> list[tuple[Array, float]]:
+    """Directions that some camera sees, with the RMS along them; none where the RMS is 0."""
+    directions = np.eye(3) if camera == CARRIAGE else seen_directions(cameras[camera])
+    rms = np.sqrt((directions * np.asarray(rms_mm)) ** 2 @ np.ones(3))
+    return [(d, float(r)) for d, r in zip(directions, rms) if r > 0]
+
+
+def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
+    out = np.zeros((len(cameras), 3, 3))
+    for own in (*model.modes, *model.broad_bands):
+        if own.camera != CARRIAGE:
+            depth = cameras[own.camera].camera_from_rig.rotation[2]
+            variance = float(((depth * np.asarray(own.rms_mm)) ** 2).sum())
+            out[own.camera] += variance * np.outer(depth, depth)
+    return out
+
+
+def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
+    """The same for all bubbles."""
+    parts: list[tuple[Component, int]] = [
+        (
+            ou_velocity(
+                model.velocity_sigma_mm_s,
+                model.velocity_tau_s,
+                start_sigma_mm=model.start_sigma_mm,
+            ),
+            axis,
+        )
+        for axis in range(3)
+    ]
+    parts += [
+        (oscillator(rms, z.frequency_hz, z.damping), axis)
+        for z in model.zigzags
+        for axis, rms in enumerate(z.rms_mm)
+        if rms > 0
+    ]
+    motion = sum(c.size for c, _ in parts)
+    extra: list[Component] = []
+    if model.wander_px > 0:
+        extra = [wander(model.wander_px, model.wander_tau_s)] * (2 * cameras)
+    size = motion + len(extra)
+    position, velocity = np.zeros((3, size)), np.zeros((3, size))
+    at = 0
+    for part, axis in parts:
+        position[axis, at : at + part.size] = part.position
+        velocity[axis, at : at + part.size] = part.velocity
+        at += part.size
+    shifts = np.zeros((cameras, 2, size))
+    for i in range(len(extra)):
+        shifts[i // 2, i % 2, motion + i] = 1.0
+    components = tuple(c for c, _ in parts) + tuple(extra)
+    return BubbleLayout(components, position, velocity, shifts)
+
+
+def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[float]) -> Nodes:
+    """Frames, and the sensors' samples at stamp - delay; nearly equal times share a node.
+
+    A reading that is not exactly at its node is carried there by the derivatives of the state, so
+    that no step is so short that its noise drowns in rounding.
+    """
+    with_encoder = problem.stage is not None and model.carriage.kind == "jerk"
+    encoder = problem.stage.t_s if problem.stage is not None and with_encoder else np.zeros(0)
+    sensors = [a.t_s - d for a, d in zip(problem.accelerometers, delays_s)]
+    sources = [problem.t_s, encoder, *sensors]
+    times = np.concatenate(sources)
+    is_frame = np.arange(len(times)) < len(problem.t_s)
+    tolerance = _MERGE * min(float(np.median(np.diff(s))) for s in sources if len(s) > 1)
+    order = np.lexsort((~is_frame, times))
+    node = np.empty(len(times), np.int64)
+    node[order], leaders = _clusters(times[order], is_frame[order], tolerance)
+    node_t = times[order][leaders]
+    edges = np.cumsum([len(s) for s in sources])[:-1]
+    split, late = np.split(node, edges), np.split(times - node_t[node], edges)
+    return Nodes(node_t, split[0], split[1], late[1], tuple(split[2:]), tuple(late[2:]))
+
+
+def _clusters(times: Array, is_frame: NDArray[np.bool_], tolerance: float) -> tuple[Ints, Ints]:
+    """Cluster of each of the sorted times, and the one that leads each cluster (a frame, if any)."""
+    if tolerance <= 0:
+        tolerance = 0.0
+    cluster, leaders = np.empty(len(times), np.int64), []
+    begin = -np.inf
+    led = False
+    for i, (t, frame) in enumerate(zip(times.tolist(), is_frame.tolist())):
+        if t - begin > tolerance or (frame and led):
+            leaders.append(i)
+            begin, led = t, frame
+        elif frame:
+            leaders[-1], led = i, True
+        cluster[i] = len(leaders) - 1
+    return cluster, np.array(leaders, np.int64)

@@ -1,0 +1,367 @@
+"""The linear factors of one Gauss-Newton pass, as arrays: motion, images, sensors, priors.
+
+Every factor is whitened and stated for increments: |sum_k A_k d_k - b|^2, where the increments of
+shake and bubble states are in their whitening basis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.estimator.covariance import rig_jacobian
+from telerig.estimator.smoother.model import CARRIAGE, Observations
+from telerig.estimator.smoother.state import Frame, State
+from telerig.factors import measurements
+from telerig.factors.measurements import whitener_of
+from telerig.factors.motion import start
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """M factors of one shape.
+
+    keys : one (M,) each.  blocks : (M, rows, columns) each.  rhs : (M, rows).
+    log_det : (M,) of the whiteners.  weight : (M,) 0..1 of a robust fit, already in the rest.
+    """
+
+    keys: tuple[ArrayLike, ...]
+    blocks: tuple[Array, ...]
+    rhs: Array
+    log_det: Array
+    weight: Array | None = None
+
+    def log_norm(self) -> float:
+        """log of the factors' normalisation, residuals apart."""
+        share = np.ones(len(self.rhs)) if self.weight is None else self.weight
+        each = self.log_det - self.rhs.shape[1] * 0.5 * np.log(2 * np.pi)
+        return float((share * each).sum())
+
+
+def priors_and_motion(frame: Frame, state: State) -> list[Linear]:
+    """Everything but the measurements."""
+    out = _shake_motion(frame, state) + _bubble_motion(frame, state)
+    return out + _constant_priors(frame, state)
+
+
+def _shake_motion(frame: Frame, state: State) -> list[Linear]:
+    layout = frame.shake
+    if not layout.size:
+        return []
+    keys = np.arange(len(frame.nodes.t_s))
+    deviation = state.shake.copy()
+    at = 0
+    for i, component in enumerate(layout.components):
+        if component.memoryless:
+            deviation[:, at] -= frame.nominal_mm
+        elif i == 0 and frame.problem.stage is not None:
+            deviation[:, at] -= frame.nominal_mm[0]
+        at += component.size
+    steps, basis = frame.shake_motion, frame.shake_basis(keys)
+    residual = steps.residual(deviation[:-1], deviation[1:], np.zeros(0))
+    i = steps.index
+    blocks = (steps.by_last[i] @ basis[:-1], steps.by_next[i] @ basis[1:])
+    between = Linear((keys[:-1], keys[1:]), blocks, -residual, steps.log_det[i])
+    covariance, _ = start(layout.components)
+    whitener = whitener_of(covariance)
+    first = Linear(
+        (keys[:1],),
+        ((whitener @ basis[0])[None],),
+        -(whitener @ deviation[0])[None],
+        _log_det(whitener)[None],
+    )
+    return [first, between]
+
+
+def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
+    problem, layout = frame.problem, frame.bubble
+    if not problem.bubbles:
+        return []
+    base = frame.base()
+    firsts, rows = frame.first_row[:-1], frame.moving_rows
+    covariance, by_input = start(layout.components)
+    whitener = whitener_of(covariance)
+    places = np.array([b.start_mm for b in problem.bubbles])
+    means = state.means[:, :3]
+    off = state.bubbles[firsts] - places @ layout.position - means @ by_input.T
+    numbers = np.arange(len(firsts))
+    wide = _with_columns(-whitener @ by_input, frame.mean_size)
+    begin = Linear(
+        (base[1] + firsts, base[2] + numbers),
+        (whitener @ frame.bubble_basis(firsts), _all(wide, len(firsts))),
+        -off @ whitener.T,
+        np.full(len(firsts), _log_det(whitener)),
+    )
+    if not len(rows):
+        return [begin]
+    steps, owner = frame.bubble_motion, frame.bubble_of_row[rows]
+    residual = steps.residual(state.bubbles[rows], state.bubbles[rows + 1], means[owner])
+    i = steps.index
+    blocks = (
+        steps.by_last[i] @ frame.bubble_basis(rows),
+        steps.by_next[i] @ frame.bubble_basis(rows + 1),
+        _with_columns(steps.by_input, frame.mean_size)[i],
+    )
+    keys = (base[1] + rows, base[1] + rows + 1, base[2] + owner)
+    return [begin, Linear(keys, blocks, -residual, steps.log_det[i])]
+
+
+def _constant_priors(frame: Frame, state: State) -> list[Linear]:
+    model, problem, base = frame.model, frame.problem, frame.base()
+    scale, delay = frame.sensor_flags
+    out = [_prior(base[2], state.means[:, :3], model.bubble.mean_sigma_mm_s, frame.mean_size)]
+    if frame.mean_size == 4:
+        value = np.concatenate([state.means[:, :3], state.means[:, 3:]], 1)
+        sigma = np.full(4, model.bubble.mean_sigma_mm_s)
+        out = [_prior(base[2], value, sigma)]
+    if problem.accelerometers:
+        given = np.array([a.delay_s for a in problem.accelerometers])
+        value = state.sensors.copy()
+        if delay:
+            value[:, -1] += frame.delays_s - given
+        extra = [model.accelerometer_scale_sigma] * scale
+        extra += [model.accelerometer_delay_sigma_s] * delay
+        sigma = np.array([[a.bias_sigma_mm_s2] * 3 + extra for a in problem.accelerometers])
+        out.append(_prior(base[3], value, sigma))
+    if problem.stage is not None:
+        sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
+        out.append(_prior(base[4], state.encoder[None], sigmas[np.array(frame.encoder_flags)]))
+    out.append(_prior(base[5], state.calibration[None], 1.0))
+    if problem.marks:
+        guess = np.array([m.guess_mm for m in problem.marks])
+        sigma = np.array([[m.sigma_mm] for m in problem.marks])
+        out.append(_prior(base[6], state.marks - guess, sigma))
+    return [p for p in out if p.rhs.size]
+
+
+def _prior(base: int, value: Array, sigma: ArrayLike, size: int | None = None) -> Linear:
+    count, width = value.shape
+    scale = np.broadcast_to(1 / np.asarray(sigma, float), (count, width))
+    block = scale[:, :, None] * np.eye(width)
+    keys = base + np.arange(count)
+    return Linear((keys,), (block,), -value * scale, np.log(scale).sum(-1))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Predictions of images: whitened residuals (M, 2), for the robust weights."""
+
+    linear: list[Linear]
+    residual: Array
+
+
+def images(frame: Frame, state: State, weight: Array) -> Seen:
+    """Pixels of the bubbles; weight (M,)."""
+    problem, layout = frame.problem, frame.bubble
+    obs = problem.observations
+    rows = frame.row(obs.item, obs.frame)
+    states = state.bubbles[rows]
+    points = states @ layout.position.T
+    basis = frame.bubble_basis(rows)
+    by_point = layout.position @ basis
+    shift = np.einsum("mid,md->mi", layout.wander[obs.camera], states)
+    extra = layout.wander[obs.camera] @ basis
+    keys = frame.base()[1] + rows
+    return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
+
+
+def references(frame: Frame, state: State, weight: Array) -> Seen:
+    """Pixels of the marks fixed to the tank; weight (R,)."""
+    obs = frame.problem.references
+    points = state.marks[obs.item]
+    keys = frame.base()[6] + obs.item
+    extra, shift = np.zeros((len(obs), 2, 3)), np.zeros((len(obs), 2))
+    by_point = _all(np.eye(3), len(obs))
+    return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
+
+
+def _seen(
+    frame: Frame,
+    state: State,
+    obs: Observations,
+    weight: Array,
+    points: Array,
+    by_state: Array,
+    keys: Ints,
+    shift: Array,
+    extra: Array,
+) -> Seen:
+    """``points`` (M, 3) of keys whose states move them by ``by_state``, their images ``extra``."""
+    problem, layout, base = frame.problem, frame.shake, frame.base()
+    inflation = frame.model.pixel_inflation
+    whitener = whitener_of(obs.covariance_px2) / inflation
+    out, residual = [], np.zeros((len(obs), 2))
+    for c, camera in enumerate(problem.cameras):
+        mine = np.flatnonzero(obs.camera == c)
+        if not len(mine):
+            continue
+        node = frame.nodes.of_frame[obs.frame[mine]]
+        shake = state.shake[node]
+        seen = measurements.image_of_point(
+            camera, points[mine], shake @ layout.position, problem.axis,
+            shake @ layout.offset[c].T, shake @ layout.pitch[c],
+        )  # fmt: skip
+        by_shake = (
+            seen.by_offset @ layout.offset[c]
+            + seen.by_position[..., None] * layout.position
+            + seen.by_pitch[..., None] * layout.pitch[c]
+        )
+        off = seen.uv_px + shift[mine] - obs.uv_px[mine]
+        by_rig = np.zeros((len(mine), 2, 0))
+        if problem.calibration is not None and len(state.calibration):
+            by_rig = _by_calibration(frame, c, points[mine], shake)
+            off += by_rig @ state.calibration
+        w = whitener[mine]
+        residual[mine] = np.einsum("mij,mj->mi", w, off)
+        root = np.sqrt(weight[mine])
+        w = w * root[:, None, None]
+        blocks = (
+            w @ (seen.by_point @ by_state[mine] + extra[mine]),
+            w @ (by_shake @ frame.shake_basis(node)),
+            w @ by_rig,
+        )
+        rhs = -residual[mine] * root[:, None]
+        log_det = _log_det(whitener[mine])
+        linear = Linear((keys[mine], node, base[5]), blocks, rhs, log_det, weight[mine])
+        out.append(linear)
+    return Seen(out, residual)
+
+
+def _by_calibration(frame: Frame, camera: int, points: Array, shake: Array) -> Array:
+    """(M, 2, r) pixels by the unit directions of the calibration's uncertainty."""
+    problem, share = frame.problem, frame.problem.calibration
+    assert share is not None
+    position = shake @ frame.shake.position
+    rig = points - position[:, None] * problem.axis - shake @ frame.shake.offset[camera].T
+    rows = rig_jacobian(problem.cameras, share.free, rig)[..., 2 * camera : 2 * camera + 2, :]
+    return np.asarray(rows @ share.root)
+
+
+def encoder(frame: Frame, state: State) -> list[Linear]:
+    """Readings of the stage's position: at their own times, or interpolated at the frames."""
+    problem, model, layout = frame.problem, frame.model, frame.shake
+    stage, nodes = problem.stage, frame.nodes
+    if stage is None:
+        return []
+    if model.carriage.kind == "jerk":
+        node, late, reading = nodes.of_encoder, nodes.encoder_late_s, stage.position_mm
+        rows = layout.position + late[:, None] * layout.velocity
+        speed = state.shake[node] @ layout.velocity
+    else:
+        t = problem.t_s
+        inside = (t >= stage.t_s[0] - 1e-9) & (t <= stage.t_s[-1] + 1e-9)
+        node = nodes.of_frame[inside]
+        reading = frame.nominal_mm[node]
+        rows = np.broadcast_to(layout.position, (len(node), layout.size))
+        speed = np.gradient(frame.nominal_mm, nodes.t_s)[node]
+    scale, delay = _encoder_constants(frame, state)
+    position = (state.shake[node] * rows).sum(-1) - delay * speed
+    read = measurements.encoder_reading(position, speed, scale)
+    columns = np.stack([read.by_scale, read.by_delay], -1)[:, np.array(frame.encoder_flags)]
+    sigma = model.encoder_sigma_mm
+    by_shake = (read.by_position[:, None] * rows)[:, None] @ frame.shake_basis(node)
+    blocks = (by_shake, columns[:, None])
+    rhs = (reading - read.reading_mm)[:, None] / sigma
+    log_det = np.full(len(rhs), -np.log(sigma))
+    return [Linear((node, frame.base()[4]), tuple(b / sigma for b in blocks), rhs, log_det)]
+
+
+def _encoder_constants(frame: Frame, state: State) -> tuple[float, float]:
+    values = iter(state.encoder.tolist())
+    scale, delay = (next(values) if flag else 0.0 for flag in frame.encoder_flags)
+    return scale, delay
+
+
+def accelerometers(frame: Frame, state: State) -> list[Linear]:
+    """Samples of all sensors, along the directions in which their mount's motion is modelled."""
+    return [_accelerometer(frame, state, i) for i in range(len(frame.problem.accelerometers))]
+
+
+def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
+    problem, layout = frame.problem, frame.shake
+    sensor = problem.accelerometers[index]
+    node, late = frame.nodes.of_accelerometers[index], frame.nodes.accelerometer_late_s[index]
+    jerk_rows = np.multiply.outer(problem.axis, layout.jerk) + layout.offset_jerk[sensor.camera]
+    rows = (
+        np.multiply.outer(problem.axis, layout.acceleration)
+        + layout.offset_acceleration[sensor.camera]
+    )
+    bias = state.sensors[index, :3]
+    rest = iter(state.sensors[index, 3:].tolist())
+    scale, delay = (next(rest) if flag else 0.0 for flag in frame.sensor_flags)
+    states = state.shake[node]
+    after = late - delay
+    acceleration = states @ rows.T + after[:, None] * (states @ jerk_rows.T)
+    read = measurements.accelerometer_reading(
+        acceleration, states @ jerk_rows.T, problem.up, sensor.axes, bias, np.asarray(scale)
+    )
+    project, white = _felt(frame, index)
+    by_shake = (project @ read.by_acceleration[0]) @ (
+        (rows + after[:, None, None] * jerk_rows) @ frame.shake_basis(node)
+    )
+    columns = np.stack([read.by_scale, read.by_delay], -1)[..., np.array(frame.sensor_flags)]
+    by_sensor = np.concatenate([_all(np.eye(3), len(node)), columns], -1)
+    rhs = (sensor.reading_mm_s2 - read.reading_mm_s2) @ project.T
+    log_det = np.full(len(node), white)
+    keys = (node, frame.base()[3] + index)
+    return Linear(keys, (by_shake, project @ by_sensor), rhs, log_det)
+
+
+def _felt(frame: Frame, index: int) -> tuple[Array, float]:
+    """(k, 3) whitened rows that take a reading to the directions of modelled motion; log det."""
+    sensor = frame.problem.accelerometers[index]
+    directions = np.eye(3) if sensor.camera == CARRIAGE else frame.shake.seen[sensor.camera]
+    rows = directions @ np.linalg.inv(sensor.axes)
+    whitener = whitener_of(rows @ rows.T * sensor.sigma_mm_s2**2)
+    return np.asarray(whitener @ rows), float(_log_det(whitener))
+
+
+def speeds(frame: Frame, state: State) -> list[Linear]:
+    """How constant the bubbles' speed is, if that is part of the model."""
+    sigma = frame.model.bubble.speed_sigma_mm_s
+    if sigma is None or not frame.rows:
+        return []
+    layout, base = frame.bubble, frame.base()
+    owner = frame.bubble_of_row
+    velocity = state.bubbles @ layout.velocity.T
+    value, by_velocity, by_speed = measurements.speed_residual(
+        velocity, state.means[owner, 3], frame.problem.up
+    )
+    by_mean = np.zeros((len(owner), 1, 4))
+    by_mean[:, 0, 3] = by_speed / sigma
+    every = frame.bubble_basis(np.arange(frame.rows))
+    by_state = (by_velocity @ layout.velocity)[:, None] @ every / sigma
+    keys = (base[1] + np.arange(frame.rows), base[2] + owner)
+    log_det = np.full(len(owner), -np.log(sigma))
+    return [Linear(keys, (by_state, by_mean), -value[:, None] / sigma, log_det)]
+
+
+def all_factors(
+    frame: Frame, state: State, weights: Sequence[Array]
+) -> tuple[list[Linear], Array, Array]:
+    """Every factor of the graph, and the whitened residuals of bubbles' and marks' pixels."""
+    bubbles = images(frame, state, weights[0])
+    marks = references(frame, state, weights[1])
+    out = priors_and_motion(frame, state) + bubbles.linear + marks.linear
+    out += encoder(frame, state) + accelerometers(frame, state) + speeds(frame, state)
+    return out, bubbles.residual, marks.residual
+
+
+def _log_det(whitener: Array) -> Array:
+    return np.asarray(np.log(np.abs(np.diagonal(whitener, axis1=-2, axis2=-1))).sum(-1))
+
+
+def _all(block: Array, count: int) -> Array:
+    return np.broadcast_to(block, (count, *block.shape))
+
+
+def _with_columns(block: Array, columns: int) -> Array:
+    """Zero columns added on the right."""
+    missing = columns - block.shape[-1]
+    return np.concatenate([block, np.zeros((*block.shape[:-1], missing))], -1)

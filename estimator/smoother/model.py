@@ -1,0 +1,257 @@
+"""What a smoothing problem is: measurements, geometry and the priors of bubbles and rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.rig.camera import Camera
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Triple = tuple[float, float, float]
+
+CARRIAGE = -1
+"""Where a sensor sits, or a mode shakes, that moves all cameras alike."""
+
+
+@dataclass(frozen=True)
+class Zigzag:
+    """A stochastic oscillation of the bubbles' paths; RMS along the rig's x, y, z, 0 for none."""
+
+    frequency_hz: float
+    damping: float
+    rms_mm: Triple
+
+
+@dataclass(frozen=True)
+class BubbleModel:
+    """Priors of every bubble.
+
+    velocity_sigma_mm_s, velocity_tau_s : Ornstein-Uhlenbeck velocity about a constant mean.
+    start_sigma_mm, mean_sigma_mm_s : of the first position and the mean velocity, each axis.
+    zigzags : oscillations besides.  wander_px, wander_tau_s : of the centroid in each image,
+        0 for none.  speed_sigma_mm_s : how constant the speed is, None to leave it free.
+    """
+
+    velocity_sigma_mm_s: float = 10.0
+    velocity_tau_s: float = 0.3
+    start_sigma_mm: float = 100.0
+    mean_sigma_mm_s: float = 300.0
+    zigzags: tuple[Zigzag, ...] = ()
+    wander_px: float = 0.0
+    wander_tau_s: float = 0.1
+    speed_sigma_mm_s: float | None = None
+
+
+@dataclass(frozen=True)
+class RigMode:
+    """One vibration of the rig, alike on the axes where its RMS is not 0 but independent there.
+
+    camera : index of the camera whose arm shakes, or CARRIAGE for all cameras.
+    force_hz : corner of the force's two poles; None: white force, only for images without sensors.
+    """
+
+    frequency_hz: float
+    damping: float
+    rms_mm: Triple
+    camera: int = CARRIAGE
+    force_hz: float | None = 60.0
+
+
+@dataclass(frozen=True)
+class BroadBand:
+    """Shake without modal knowledge, of each camera or (CARRIAGE) of all alike."""
+
+    rms_mm: Triple
+    camera: int = CARRIAGE
+    low_hz: float = 8.0
+    high_hz: float = 60.0
+    slow_rms_mm: float = 0.0
+    slow_tau_s: float = 0.3
+
+
+@dataclass(frozen=True)
+class PitchMode:
+    """Rotation of a camera about its own x axis, which shifts its image with depth."""
+
+    frequency_hz: float
+    damping: float
+    rms_rad: float
+    camera: int
+    force_hz: float = 60.0
+
+
+@dataclass(frozen=True)
+class CarriageModel:
+    """How the carriage moves along the axis.
+
+    kind : "readings" (no dynamics: the position at a frame is what the encoder reads there) or
+        "jerk" (white jerk; what accelerometers and slow encoders need).
+    jerk_density : mm s^-3 / sqrt Hz.  servo : (RMS mm, Hz, damping) of a following error besides.
+    """
+
+    kind: str = "readings"
+    jerk_density: float = 1e4
+    servo: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class ShakeModel:
+    """Every hyper-parameter of the smoother; each can be given.
+
+    encoder_sigma_mm : of one reading.  encoder_scale_sigma, encoder_delay_sigma_s,
+    accelerometer_scale_sigma, accelerometer_delay_sigma_s : priors of constants, 0 to hold them.
+    pixel_inflation : factor on the stated pixel noise.  name : where the values come from.
+    learned : sd of log-parameters, by name, of a model that was learned.
+    """
+
+    bubble: BubbleModel = BubbleModel()
+    modes: tuple[RigMode, ...] = ()
+    broad_bands: tuple[BroadBand, ...] = ()
+    pitches: tuple[PitchMode, ...] = ()
+    carriage: CarriageModel = CarriageModel()
+    encoder_sigma_mm: float = 0.005
+    encoder_scale_sigma: float = 0.0
+    encoder_delay_sigma_s: float = 0.0
+    accelerometer_scale_sigma: float = 0.0
+    accelerometer_delay_sigma_s: float = 0.0
+    pixel_inflation: float = 1.0
+    name: str = "given"
+    learned: Mapping[str, float] = field(default_factory=dict)
+
+    def without_shake(self) -> ShakeModel:
+        """The oracle's model: the cameras stand still on the carriage."""
+        return replace(self, modes=(), broad_bands=(), pitches=())
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Pixels of one kind: frame, camera (M,), uv_px (M, 2), covariance_px2 (M, 2, 2).
+
+    item : (M,) index of the bubble or mark.
+    """
+
+    item: Ints
+    frame: Ints
+    camera: Ints
+    uv_px: Array
+    covariance_px2: Array
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def of(self, keep: NDArray[Any]) -> Observations:
+        parts = (self.item, self.frame, self.camera, self.uv_px, self.covariance_px2)
+        return Observations(*(p[keep] for p in parts))
+
+    @staticmethod
+    def none() -> Observations:
+        ints = np.zeros(0, np.int64)
+        return Observations(ints, ints, ints, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+
+@dataclass(frozen=True)
+class Bubble:
+    """particle : its id.  first, last : frames.  start_mm : (3,) lab, the prior's mean.
+
+    guess_mm : (last - first + 1, 3) lab positions where the projection is linearised first.
+    """
+
+    particle: int
+    first: int
+    last: int
+    start_mm: Array
+    guess_mm: Array
+
+    def __len__(self) -> int:
+        return self.last - self.first + 1
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A feature fixed to the tank. guess_mm : (3,) lab; the prior is that, within sigma_mm."""
+
+    name: str
+    guess_mm: Array
+    sigma_mm: float = 30.0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The encoder's record: t_s, position_mm (E,)."""
+
+    t_s: Array
+    position_mm: Array
+
+
+@dataclass(frozen=True)
+class Accelerometer:
+    """One sensor. camera : index, or CARRIAGE.  t_s (N,), reading_mm_s2 (N, 3).
+
+    axes : (3, 3) rows are its axes in rig coordinates.  sigma_mm_s2 : of one sample, each axis.
+    delay_s : a reading stamped t describes t - delay.
+    """
+
+    name: str
+    camera: int
+    t_s: Array
+    reading_mm_s2: Array
+    axes: Array
+    sigma_mm_s2: float
+    bias_sigma_mm_s2: float = 200.0
+    delay_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class CalibrationShare:
+    """What of the calibration's uncertainty reaches the pixels: unit-variance directions.
+
+    root : (P, r), covariance = root root^T up to what no pixel feels.
+    free : per camera, names of the free intrinsics (the order of P, see `Calibration`).
+    """
+
+    root: Array
+    free: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class SmoothingProblem:
+    """Everything that was measured in one run, and the geometry it is seen through.
+
+    t_s : (F,) frame times.  axis, up : (3,) unit vectors in rig axes.
+    observations, references : pixels of ``bubbles`` and of ``marks``.
+    """
+
+    cameras: tuple[Camera, ...]
+    t_s: Array
+    axis: Array
+    up: Array
+    bubbles: tuple[Bubble, ...] = ()
+    observations: Observations = field(default_factory=Observations.none)
+    stage: Stage | None = None
+    accelerometers: tuple[Accelerometer, ...] = ()
+    marks: tuple[Mark, ...] = ()
+    references: Observations = field(default_factory=Observations.none)
+    calibration: CalibrationShare | None = None
+
+    def __post_init__(self) -> None:
+        """Raises InputError for times that do not increase or a run of fewer than two frames."""
+        if len(self.t_s) < 2:
+            raise InputError(
+                f"a run of {len(self.t_s)} frame(s) has no motion to smooth",
+                todo="give at least two frames",
+            )
+        for name, times in (("frames", self.t_s), ("stage", self.stage and self.stage.t_s)):
+            if times is not None and np.any(~(np.diff(times) > 0)):
+                row = int(np.flatnonzero(~(np.diff(times) > 0))[0]) + 1
+                raise InputError(
+                    f"times do not increase at row {row}",
+                    where=name,
+                    todo="sort the rows and remove duplicates",
+                )

@@ -1,0 +1,368 @@
+"""Solve the smoothing graph: Gauss-Newton passes, robust weights, covariances, evidence."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator.smoother.linear import Linear, all_factors
+from telerig.estimator.smoother.marginals import marginal_covariances
+from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
+from telerig.estimator.smoother.state import Frame, State, first_guess, frame_of
+from telerig.factors.motion import add_linear_factors
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+T = TypeVar("T")
+
+STACK_BYTES = 512 << 20
+OUTLIER_SIGMAS = 4.0
+_SUSPICIOUS_SIGMAS = 5.0
+_DELAY_STEP_S = 2e-5
+
+
+@dataclass(frozen=True)
+class Options:
+    """passes : relinearisations at most.  robust : down-weight pixels that do not fit.
+
+    covariances : of states ("frames"), or none (False) when only the evidence is asked.
+    tolerance_px : passes end when no predicted pixel moves more.
+    """
+
+    passes: int = 6
+    robust: bool = True
+    covariances: bool = True
+    tolerance_px: float = 1e-4
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """shake : (F, Ds, Ds) at the frames.  bubbles : (rows, Db, Db).  Constants one each."""
+
+    shake: Array
+    bubbles: Array
+    means: Array
+    sensors: Array
+    encoder: Array
+    calibration: Array
+    marks: Array
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The posterior.
+
+    weights : of the bubbles' pixels (M,) and of the marks' (R,), 0 for outliers.
+    residuals : whitened, (M, 2) and (R, 2).  log_evidence : exact for linear cameras, else at the
+    last linearisation.  delays_s : (A,) the accelerometers'.
+    """
+
+    frame: Frame
+    state: State
+    covariances: Covariances | None
+    weights: tuple[Array, Array]
+    residuals: tuple[Array, Array]
+    log_evidence: float
+    passes: int
+
+    @property
+    def delays_s(self) -> Array:
+        delays = self.frame.delays_s
+        if self.frame.sensor_flags[1] and len(delays):
+            return np.asarray(delays + self.state.sensors[:, -1])
+        return delays
+
+
+def solve(
+    problem: SmoothingProblem,
+    model: ShakeModel,
+    options: Options = Options(),
+    progress: Progress | None = None,
+) -> Solution:
+    """Smooth. Raises CalibrationError when the measurements leave something undetermined."""
+    return in_large_stack(lambda: _solve(problem, model, options, progress or _silent))
+
+
+def _silent(_what: str, _share: float) -> None:
+    return None
+
+
+def _solve(
+    problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress
+) -> Solution:
+    delays = np.array([a.delay_s for a in problem.accelerometers])
+    frame = frame_of(problem, model, delays)
+    state = first_guess(frame)
+    weights = (np.ones(len(problem.observations)), np.ones(len(problem.references)))
+    robust = _Truncation(options.robust)
+    done = 0
+    while True:
+        progress("smoothing", done / (options.passes + 1))
+        pass_ = _linear_solve(frame, state, weights)
+        state = moved(frame, state, pass_.step)
+        done += 1
+        factors, *residuals = all_factors(frame, state, weights)
+        weights, changed = robust.update(weights, (residuals[0], residuals[1]))
+        still = pass_.largest_px < options.tolerance_px and not changed
+        frame, state, restamped = _restamped(frame, state)
+        if done >= options.passes or (still and not restamped):
+            break
+        if done == 1 and _is_linear(problem, model) and not changed:
+            break
+    return _finish(frame, state, weights, options, done, progress)
+
+
+def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
+    """Whether one pass is exact: affine cameras, no bilinear constants."""
+    flat = all(not np.any(c.intrinsics[4:]) for c in problem.cameras)
+    held = (
+        model.encoder_scale_sigma,
+        model.encoder_delay_sigma_s,
+        model.accelerometer_scale_sigma,
+        model.accelerometer_delay_sigma_s,
+    )
+    return flat and not any(held) and model.bubble.speed_sigma_mm_s is None and not model.pitches
+
+
+@dataclass(frozen=True)
+class _Pass:
+    net: Any
+    step: Array
+    largest_px: float
+    log_norm: float
+    squared: float
+
+
+def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _Pass:
+    import gtsam
+
+    factors, *_ = all_factors(frame, state, weights)
+    graph = gtsam.GaussianFactorGraph()
+    for linear in factors:
+        add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
+    net, solution = _eliminated(graph, _ordering(frame))
+    vector = solution.vector()
+    if not np.all(np.isfinite(vector)):
+        raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
+    largest = _largest_shift_px(factors, frame, vector)
+    return _Pass(net, vector, largest, _log_norm(frame, factors), 2 * graph.error(solution))
+
+
+def _eliminated(graph: Any, ordering: Any) -> tuple[Any, Any]:
+    """Bayes net and solution: by Cholesky, and by QR, four times slower, where that gives up.
+
+    Cholesky refuses a pivot that is 2^-12 of its variable's information, which irregular times
+    or the end of a run can bring about.
+    """
+    import gtsam
+
+    try:
+        net = graph.eliminateSequential(ordering)
+        return net, net.optimize()
+    except RuntimeError:
+        pass
+    try:
+        net = graph.eliminateSequential(ordering, gtsam.EliminateQR)
+        return net, net.optimize()
+    except RuntimeError as error:
+        raise CalibrationError(
+            f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
+            todo="check the priors: every component needs a positive intensity",
+        ) from error
+
+
+def _log_norm(frame: Frame, factors: list[Linear]) -> float:
+    """log of the joint density's normalisation, the change to whitening bases included."""
+    nodes, rows = np.arange(len(frame.nodes.t_s)), np.arange(frame.rows)
+    bases = [np.linalg.slogdet(b)[1] for b in (frame.shake_basis(nodes), frame.bubble_basis(rows))]
+    return float(bases[0].sum() + bases[1].sum()) + sum(f.log_norm() for f in factors)
+
+
+def _ordering(frame: Frame) -> Any:
+    """Time order; what ends (a bubble's mean, a mark) right after it was last seen; rest last."""
+    import gtsam
+
+    base, problem = frame.base(), frame.problem
+    nodes = np.arange(len(frame.nodes.t_s)) if frame.shake.size else np.zeros(0, np.int64)
+    rows = np.arange(frame.rows)
+    last_row = frame.node_of_row[frame.first_row[1:] - 1] if len(problem.bubbles) else []
+    last_mark = np.zeros(len(problem.marks))
+    seen = frame.nodes.of_frame[problem.references.frame]
+    np.maximum.at(last_mark, problem.references.item, seen)
+    keys = [nodes, base[1] + rows, base[2] + np.arange(len(problem.bubbles))]
+    when = [nodes, frame.node_of_row, np.asarray(last_row)]
+    keys.append(base[6] + np.arange(len(problem.marks)))
+    when.append(last_mark)
+    rank = np.repeat(np.arange(4), [len(k) for k in keys])
+    joined = np.concatenate(keys).astype(np.int64)
+    order = np.lexsort((joined, rank, np.concatenate(when)))
+    out = gtsam.Ordering()
+    for key in joined[order].tolist():
+        out.push_back(key)
+    counts = frame.counts()
+    for family in (3, 4, 5):
+        number, size = counts[family]
+        for key in range(base[family], base[family] + number * (size > 0)):
+            out.push_back(key)
+    return out
+
+
+def moved(frame: Frame, state: State, step: Array) -> State:
+    """The state after an increment, keys in their order."""
+    counts = [n * d for n, d in frame.counts()]
+    parts = np.split(step, np.cumsum(counts)[:-1])
+    shaped = [p.reshape(n, d) for p, (n, d) in zip(parts, frame.counts())]
+    return State(
+        state.shake + _times(frame.shake_basis(np.arange(len(shaped[0]))), shaped[0]),
+        state.bubbles + _times(frame.bubble_basis(np.arange(len(shaped[1]))), shaped[1]),
+        state.means + shaped[2],
+        state.sensors + shaped[3],
+        state.encoder + shaped[4][0],
+        state.calibration + shaped[5][0],
+        state.marks + shaped[6],
+    )
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _largest_shift_px(factors: list[Linear], frame: Frame, vector: Array) -> float:
+    """How far bubbles moved in this pass, in pixels of the finest camera."""
+    layout, (nodes, size) = frame.bubble, frame.counts()[0]
+    start = nodes * size
+    states = vector[start : start + frame.rows * layout.size].reshape(-1, layout.size)
+    moves = _times(frame.bubble_basis(np.arange(frame.rows)), states) @ layout.position.T
+    scale = max(c["scale_px_per_mm"] for c in frame.problem.cameras)
+    return float(np.max(np.abs(moves), initial=0.0) * scale)
+
+
+class _Truncation:
+    """Truncated least squares by graduated non-convexity (Yang et al., RA-L 5:1127, 2020).
+
+    Nothing is touched as long as no residual is suspicious.
+    """
+
+    def __init__(self, wanted: bool) -> None:
+        self.wanted, self.control = wanted, 0.0
+
+    def update(
+        self, weights: tuple[Array, Array], residuals: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array], bool]:
+        """New weights, and whether they have changed."""
+        squares = [(r**2).sum(-1) for r in residuals]
+        largest = max((float(s.max(initial=0.0)) for s in squares), default=0.0)
+        bound = OUTLIER_SIGMAS**2
+        if not self.wanted or (self.control == 0 and largest < _SUSPICIOUS_SIGMAS**2):
+            return weights, False
+        if self.control == 0:
+            self.control = bound / max(2 * largest - bound, bound)
+        else:
+            self.control *= 4
+        fresh = tuple(_truncated(s, bound, self.control) for s in squares)
+        change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fresh, weights))
+        return (fresh[0], fresh[1]), change > 1e-3
+
+
+def _truncated(squares: Array, bound: float, control: float) -> Array:
+    """(M,) weights; control grows from near 0 (convex) to infinity (truncated)."""
+    low, high = control / (control + 1) * bound, (control + 1) / control * bound
+    if control > 1e3:
+        return (squares <= bound).astype(float)
+    between = np.sqrt(bound * control * (control + 1) / np.maximum(squares, 1e-12)) - control
+    return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, np.clip(between, 0, 1)))
+
+
+def _restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
+    """Move the nodes of sensors whose estimated delay has moved."""
+    if not (frame.sensor_flags[1] and frame.problem.accelerometers):
+        return frame, state, False
+    found = state.sensors[:, -1]
+    if np.max(np.abs(found)) < _DELAY_STEP_S:
+        return frame, state, False
+    fresh = frame_of(frame.problem, frame.model, frame.delays_s + found)
+    sensors = state.sensors.copy()
+    sensors[:, -1] = 0.0
+    shake = np.stack(
+        [np.interp(fresh.nodes.t_s, frame.nodes.t_s, column) for column in state.shake.T], -1
+    )
+    moved_state = State(
+        shake, state.bubbles, state.means, sensors, state.encoder, state.calibration, state.marks
+    )
+    return fresh, moved_state, True
+
+
+def _finish(
+    frame: Frame,
+    state: State,
+    weights: tuple[Array, Array],
+    options: Options,
+    done: int,
+    progress: Progress,
+) -> Solution:
+    """One more pass at the solution: it polishes the means, and gives covariances and evidence."""
+    weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
+    last = _linear_solve(frame, state, weights)
+    state = moved(frame, state, last.step)
+    _, *residuals = all_factors(frame, state, weights)
+    dimension = sum(n * d for n, d in frame.counts())
+    evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
+    evidence -= last.net.logDeterminant()
+    found = _covariances(frame, last.net, progress) if options.covariances else None
+    progress("smoothing", 1.0)
+    return Solution(
+        frame, state, found, weights, (residuals[0], residuals[1]), float(evidence), done + 1
+    )
+
+
+def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
+    base, counts = frame.base(), frame.counts()
+    progress("covariances", 0.0)
+    families = [range(base[i], base[i] + n * (d > 0)) for i, (n, d) in enumerate(counts)]
+    at_frames = frame.nodes.of_frame.tolist() if counts[0][1] else []
+    wanted = set(at_frames).union(*families[1:])
+    sizes = [d for n, d in counts for _ in range(n)]
+    found = marginal_covariances(net, sizes, wanted)
+
+    def of(keys: Sequence[int], i: int) -> Array:
+        number, size = len(problem_frames) if i == 0 else counts[i][0], counts[i][1]
+        return np.array([found[key] for key in keys]).reshape(number, size, size)
+
+    problem_frames = frame.nodes.of_frame
+    blocks = [of(keys, i) for i, keys in enumerate([at_frames, *families[1:]])]
+    shake_basis = frame.shake_basis(problem_frames)
+    bubble_basis = frame.bubble_basis(np.arange(frame.rows))
+    shake = shake_basis @ blocks[0] @ np.swapaxes(shake_basis, -1, -2)
+    bubbles = bubble_basis @ blocks[1] @ np.swapaxes(bubble_basis, -1, -2)
+    return Covariances(
+        shake, bubbles, blocks[2], blocks[3], blocks[4][0], blocks[5][0], blocks[6]
+    )
+
+
+def in_large_stack(task: Callable[[], T]) -> T:
+    """Run in a thread with a large stack: GTSAM's recursion is as deep as the run is long."""
+    result: list[T] = []
+    fault: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            result.append(task())
+        except BaseException as error:
+            fault.append(error)
+
+    before = threading.stack_size(STACK_BYTES)
+    try:
+        thread = threading.Thread(target=run, name="telerig-smoother")
+        thread.start()
+    finally:
+        threading.stack_size(before)
+    thread.join()
+    if fault:
+        raise fault[0]
+    return result[0]

@@ -1,0 +1,180 @@
+"""Values of everything in the graph, and the keys under which GTSAM knows them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.estimator.smoother.layout import (
+    BubbleLayout,
+    Nodes,
+    ShakeLayout,
+    bubble_layout,
+    nodes_of,
+    shake_layout,
+)
+from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
+from telerig.factors.motion import Motion, motion
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class State:
+    """shake : (N, Ds).  bubbles : (sum of lengths, Db), one bubble after the other.
+
+    means : (K, 3), or (K, 4) with the constant speed.  sensors : (A, 3 + scale + delay), bias
+    first.  encoder : (0..2,) scale, delay.  calibration : (r,).  marks : (Q, 3).
+    """
+
+    shake: Array
+    bubbles: Array
+    means: Array
+    sensors: Array
+    encoder: Array
+    calibration: Array
+    marks: Array
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The fixed part of one linearisation: layouts, nodes and the keys' order.
+
+    nominal_mm : (N,) the carriage's prior mean.  delays_s : (A,) at which the nodes are placed.
+    first_row : (K + 1,) where each bubble's rows begin.  sizes : dimension of each family of keys.
+    """
+
+    problem: SmoothingProblem
+    model: ShakeModel
+    shake: ShakeLayout
+    bubble: BubbleLayout
+    nodes: Nodes
+    delays_s: Array
+    nominal_mm: Array
+    first_row: Ints
+    node_of_row: Ints
+    bubble_of_row: Ints
+    frame_of_row: Ints
+    shake_motion: Motion
+    bubble_motion: Motion
+    moving_rows: Ints
+
+    def shake_basis(self, node: ArrayLike) -> Array:
+        """(..., D, D) basis of the increments at nodes (...)."""
+        return np.asarray(self.shake_motion.basis[_basis_index(self.shake_motion.index, node)])
+
+    @cached_property
+    def _row_index(self) -> Ints:
+        out = np.full(self.rows, len(self.bubble_motion.basis) - 1)
+        out[self.moving_rows] = self.bubble_motion.index
+        return out
+
+    def bubble_basis(self, row: ArrayLike) -> Array:
+        """(..., D, D) basis of the increments of bubble rows (...)."""
+        return np.asarray(self.bubble_motion.basis[self._row_index[row]])
+
+    @property
+    def rows(self) -> int:
+        return int(self.first_row[-1])
+
+    def row(self, bubble: Ints, frame: Ints) -> Ints:
+        first = np.array([b.first for b in self.problem.bubbles], np.int64)
+        return np.asarray(self.first_row[bubble] + frame - first[bubble])
+
+    @property
+    def mean_size(self) -> int:
+        return 3 if self.model.bubble.speed_sigma_mm_s is None else 4
+
+    @property
+    def sensor_flags(self) -> tuple[bool, bool]:
+        model = self.model
+        return model.accelerometer_scale_sigma > 0, model.accelerometer_delay_sigma_s > 0
+
+    @property
+    def encoder_flags(self) -> tuple[bool, bool]:
+        return self.model.encoder_scale_sigma > 0, self.model.encoder_delay_sigma_s > 0
+
+    def counts(self) -> list[tuple[int, int]]:
+        """(number, dimension) of the keys of each family, in the order of `State`."""
+        problem = self.problem
+        share = 0 if problem.calibration is None else problem.calibration.root.shape[1]
+        encoder = sum(self.encoder_flags) if problem.stage is not None else 0
+        return [
+            (len(self.nodes.t_s), self.shake.size),
+            (self.rows, self.bubble.size),
+            (len(problem.bubbles), self.mean_size),
+            (len(problem.accelerometers), 3 + sum(self.sensor_flags)),
+            (1, encoder),
+            (1, share),
+            (len(problem.marks), 3),
+        ]
+
+    def base(self) -> list[int]:
+        """The first key of each family."""
+        return np.r_[0, np.cumsum([n for n, _ in self.counts()])].tolist()
+
+
+def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> Frame:
+    """Lay everything out for given delays of the accelerometers."""
+    nodes = nodes_of(problem, model, delays_s.tolist())
+    stage = problem.stage
+    nominal = np.zeros(len(nodes.t_s))
+    if stage is not None:
+        nominal = np.interp(nodes.t_s, stage.t_s, stage.position_mm)
+    lengths = np.array([len(b) for b in problem.bubbles], np.int64)
+    first_row = np.r_[0, np.cumsum(lengths)].astype(np.int64)
+    frames = [np.arange(b.first, b.last + 1) for b in problem.bubbles]
+    frame_of_row = np.concatenate([*frames, np.zeros(0, np.int64)]).astype(np.int64)
+    shake = shake_layout(problem, model)
+    bubble = bubble_layout(model.bubble, len(problem.cameras))
+    moving = np.setdiff1d(np.arange(len(frame_of_row)), first_row[1:] - 1)
+    t = problem.t_s[frame_of_row]
+    return Frame(
+        problem, model, shake, bubble, nodes, delays_s, nominal, first_row,
+        nodes.of_frame[frame_of_row],
+        np.repeat(np.arange(len(lengths)), lengths),
+        frame_of_row,
+        motion(shake.components, np.diff(nodes.t_s)),
+        motion(bubble.components, t[moving + 1] - t[moving]),
+        moving,
+    )  # fmt: skip
+
+
+def _basis_index(index: Ints, node: ArrayLike) -> Ints:
+    return np.asarray(np.append(index, -1)[node])
+
+
+def first_guess(frame: Frame) -> State:
+    """Bubbles where the cameras first saw them, the carriage where the encoder was, no shake."""
+    problem = frame.problem
+    shapes = frame.counts()
+    values = [np.zeros(shape) for shape in shapes]
+    shake, bubbles, means = values[0], values[1], values[2]
+    if problem.stage is not None:
+        _guess_carriage(frame, shake)
+    for k, bubble in enumerate(problem.bubbles):
+        rows = slice(frame.first_row[k], frame.first_row[k + 1])
+        t = problem.t_s[bubble.first : bubble.last + 1]
+        slope = np.zeros(3)
+        if len(bubble) > 1:
+            slope = np.polyfit(t - t.mean(), bubble.guess_mm, 1)[0]
+        for axis in range(3):
+            bubbles[rows, 2 * axis] = bubble.guess_mm[:, axis]
+            bubbles[rows, 2 * axis + 1] = slope[axis]
+        means[k, :3] = slope
+        means[k, 3:] = max(float(np.linalg.norm(slope)), 1.0)
+    if len(problem.marks):
+        values[6][:] = [m.guess_mm for m in problem.marks]
+    return State(shake, bubbles, means, values[3], values[4][0], values[5][0], values[6])
+
+
+def _guess_carriage(frame: Frame, shake: Array) -> None:
+    t, s = frame.nodes.t_s, frame.nominal_mm
+    derivatives = [s, np.gradient(s, t), np.zeros_like(s)]
+    size = frame.shake.components[0].size
+    for i in range(size):
+        shake[:, i] = derivatives[i]

@@ -1,0 +1,101 @@
+"""Motion priors as whitened linear factors, and linear factors as GTSAM takes them.
+
+A factor is |sum_k A_k x_k - b|^2 with unit noise. Arrays of factors of one shape are made in NumPy
+and handed over one by one: GTSAM's `JacobianFactor` takes up to three keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.factors.state_space import (
+    Component,
+    block_diagonal,
+    discretise,
+    elimination_basis,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Steps of several components side by side, whitened: W (x' - Phi x - G c) has unit noise.
+
+    by_next, by_last : (U, n, n) W and -W Phi.  by_input : (U, n, K) -W G.  log_det : (U,) of W.
+    basis : (U + 1, n, n), see `elimination_basis`.
+    index : (M,) which of the U distinct steps each step is.
+    """
+
+    by_last: Array
+    by_next: Array
+    by_input: Array
+    log_det: Array
+    basis: Array
+    index: NDArray[np.int64]
+
+    def residual(self, last: Array, following: Array, inputs: ArrayLike) -> Array:
+        """(M, n) whitened residuals of states (M, n), (M, n) and inputs (M, K) or (K,)."""
+        i = self.index
+        constant = np.broadcast_to(np.asarray(inputs, float), (len(i), self.by_input.shape[-1]))
+        terms = ((self.by_next, following), (self.by_last, last), (self.by_input, constant))
+        return np.asarray(sum(np.einsum("mij,mj->mi", a[i], x) for a, x in terms))
+
+
+def motion(components: Sequence[Component], dt_s: ArrayLike) -> Motion:
+    """The steps (M,) of independent components, states and inputs one after the other."""
+    if not components:
+        steps = len(np.atleast_1d(np.asarray(dt_s, float)))
+        none = np.zeros((1, 0, 0))
+        zero = np.zeros((2, 0, 0)), np.zeros(steps, np.int64)
+        return Motion(none, none, none, np.zeros(1), *zero)
+    all_steps = [discretise(c, dt_s) for c in components]
+    index = all_steps[0].index
+    return Motion(
+        block_diagonal([-s.whitener @ s.transition for s in all_steps]),
+        block_diagonal([s.whitener for s in all_steps]),
+        block_diagonal([-s.whitener @ s.input for s in all_steps]),
+        np.sum([s.log_det for s in all_steps], 0),
+        block_diagonal([elimination_basis(c, s) for c, s in zip(components, all_steps)]),
+        index,
+    )
+
+
+def start(components: Sequence[Component]) -> tuple[Array, Array]:
+    """(n, n) covariance of the states at the start, and (n, K) their mean for given inputs."""
+    covariance = block_diagonal([c.start_covariance for c in components])
+    return covariance, block_diagonal([c.start_from_input for c in components])
+
+
+@lru_cache(maxsize=64)
+def _unit_noise(rows: int) -> Any:
+    import gtsam
+
+    return gtsam.noiseModel.Unit.Create(rows)
+
+
+def add_linear_factors(
+    graph: Any, keys: Sequence[ArrayLike], blocks: Sequence[Array], rhs: Array
+) -> None:
+    """Add M factors |sum_k blocks[k] x_keys[k] - rhs|^2 of unit noise to a GaussianFactorGraph.
+
+    keys : up to three of (M,) or one number.  blocks : (M, rows, columns) or (rows, columns) each.
+    rhs : (M, rows). Blocks without columns are left out.
+    """
+    import gtsam
+
+    count, rows = rhs.shape
+    kept = [(k, b) for k, b in zip(keys, blocks) if b.shape[-1]]
+    noise, factor = _unit_noise(rows), gtsam.JacobianFactor
+    columns: list[Any] = []
+    for key, block in kept:
+        columns.append(np.broadcast_to(np.asarray(key), (count,)).tolist())
+        columns.append(np.broadcast_to(block, (count, *block.shape[-2:])))
+    for parts in zip(*columns, rhs):
+        graph.push_back(factor(*parts, noise))

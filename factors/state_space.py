@@ -1,0 +1,319 @@
+"""Linear stochastic processes of bubbles and rig, and their exact discretisation.
+
+Every process is x' = F x + B c + L w, with w white noise of unit two-sided density and c constants
+(a bubble's mean velocity). A step of any length is exact: Van Loan's matrix exponential (IEEE
+Trans. Autom. Control 23:395, 1978) over a short step, doubled as often as the step needs, so that
+neither a long gap nor the tiny variance of an often integrated noise loses digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+
+Array = NDArray[np.float64]
+
+_TERMS = 26
+_SHORT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """One process. Lengths in mm (or px, rad: the caller's), time in s.
+
+    drift : (n, n) F.  noise : (n, m) L.  start_covariance : (n, n) at the first node.
+    position, velocity, acceleration : (n,) rows that read these from the state; an acceleration
+        that does not exist (white noise drives the velocity) is 0.
+    input : (n, k) B.  start_from_input : (n, k), the state's mean at the start for constants c.
+    memoryless : the state is drawn anew at every node, from start_covariance.
+    """
+
+    name: str
+    drift: Array
+    noise: Array
+    start_covariance: Array
+    position: Array
+    velocity: Array
+    acceleration: Array
+    input: Array
+    start_from_input: Array
+    memoryless: bool = False
+
+    @property
+    def size(self) -> int:
+        return len(self.drift)
+
+    @property
+    def jerk(self) -> Array:
+        """(n,) the acceleration's rate of change, its white part (if any) left out."""
+        return np.asarray(self.acceleration @ self.drift)
+
+    def renamed(self, name: str) -> Component:
+        return replace(self, name=name)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Transitions over M steps, of which few differ; row i of the steps is row index[i] here.
+
+    transition : (U, n, n).  input : (U, n, k).  covariance : (U, n, n).
+    whitener : (U, n, n) W with W covariance W^T = 1.  log_det : (U,) of W.
+    """
+
+    transition: Array
+    input: Array
+    covariance: Array
+    whitener: Array
+    log_det: Array
+    index: NDArray[np.int64] = field(repr=False)
+
+
+def _component(
+    name: str,
+    drift: ArrayLike,
+    noise: ArrayLike,
+    start: Array | None = None,
+    *,
+    acceleration: ArrayLike | None = None,
+) -> Component:
+    """States (displacement, velocity, ...); start None: stationary."""
+    f = np.atleast_2d(np.asarray(drift, float))
+    n = len(f)
+    gain = np.asarray(noise, float).reshape(n, -1)
+    rows = np.eye(max(n, 2))[:2, :n]
+    covariance = stationary_covariance(f, gain) if start is None else start
+    still = np.zeros(n) if acceleration is None else np.asarray(acceleration, float)
+    nothing = np.zeros((n, 0))
+    return Component(name, f, gain, covariance, rows[0], rows[1], still, nothing, nothing)
+
+
+def stationary_covariance(drift: Array, noise: Array) -> Array:
+    """(n, n) P with F P + P F^T + L L^T = 0. Raises InputError when the process does not settle."""
+    from scipy.linalg import solve_continuous_lyapunov
+
+    if np.max(np.linalg.eigvals(drift).real) >= 0:
+        raise InputError("a motion without damping has no stationary state", todo="damp it")
+    covariance = solve_continuous_lyapunov(drift, -noise @ noise.T)
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value}", todo="give a positive number")
+
+
+def ou_velocity(sigma_mm_s: float, tau_s: float, *, start_sigma_mm: float = 100.0) -> Component:
+    """States (position, velocity): a velocity about a constant mean that forgets within tau.
+
+    v' = (U - v) / tau + noise, v - U of RMS sigma; U is the input. Starts at position 0 within
+    start_sigma, its velocity stationary about U.
+    """
+    _positive(sigma_mm_s=sigma_mm_s, tau_s=tau_s, start_sigma_mm=start_sigma_mm)
+    drift = np.array([[0.0, 1.0], [0.0, -1 / tau_s]])
+    start = np.diag([start_sigma_mm**2, sigma_mm_s**2])
+    plain = _component("ou_velocity", drift, [0.0, sigma_mm_s * np.sqrt(2 / tau_s)], start)
+    return replace(
+        plain, input=np.array([[0.0], [1 / tau_s]]), start_from_input=np.array([[0.0], [1.0]])
+    )
+
+
+def white_jerk(
+    jerk_density: float,
+    *,
+    start_sigma_mm: float = 100.0,
+    start_sigma_mm_s: float = 300.0,
+    start_sigma_mm_s2: float = 1000.0,
+) -> Component:
+    """States (position, velocity, acceleration); the jerk is white, density in mm s^-3 / sqrt Hz."""
+    _positive(jerk_density=jerk_density)
+    start = np.diag(np.square([start_sigma_mm, start_sigma_mm_s, start_sigma_mm_s2]))
+    drift = np.diag([1.0, 1.0], 1)
+    return _component(
+        "white_jerk", drift, [0, 0, jerk_density], start, acceleration=[0.0, 0.0, 1.0]
+    )
+
+
+def oscillator(rms_mm: float, frequency_hz: float, damping: float) -> Component:
+    """States (displacement, velocity) of a resonator driven by white noise: zigzag, rough mode."""
+    _positive(rms_mm=rms_mm, frequency_hz=frequency_hz, damping=damping)
+    w = 2 * np.pi * frequency_hz
+    drift = np.array([[0.0, 1.0], [-(w**2), -2 * damping * w]])
+    start = np.diag([rms_mm**2, (w * rms_mm) ** 2])
+    return _component("oscillator", drift, [0.0, 2 * rms_mm * np.sqrt(damping * w**3)], start)
+
+
+def driven_mode(
+    rms_mm: float, frequency_hz: float, damping: float, *, force_hz: float = 60.0
+) -> Component:
+    """States (displacement, velocity, force, force's slope) of one degree of freedom.
+
+    The force is white noise through two critically damped poles at force_hz.
+    """
+    _positive(rms_mm=rms_mm, frequency_hz=frequency_hz, damping=damping, force_hz=force_hz)
+    w, f = 2 * np.pi * frequency_hz, 2 * np.pi * force_hz
+    drift = np.zeros((4, 4))
+    drift[0, 1] = drift[1, 2] = drift[2, 3] = 1.0
+    drift[1, :2] = -(w**2), -2 * damping * w
+    drift[3, 2:] = -(f**2), -2 * f
+    return _scaled("driven_mode", drift, np.array([1.0, 0, 0, 0]), rms_mm)
+
+
+def broad_band(rms_mm: float, *, low_hz: float = 8.0, high_hz: float = 60.0) -> Component:
+    """Shake of unknown modes: s / ((s + a)^2 (s + b)^3) of white noise, of the given RMS.
+
+    Nothing at zero frequency, a falling density from low_hz, accelerations that are smooth from
+    high_hz on (as a force needs to be to make accelerometers useful). Five states, one for each
+    pole; displacement, velocity and acceleration are combinations of them.
+    """
+    _positive(rms_mm=rms_mm, low_hz=low_hz, high_hz=high_hz)
+    a, b = 2 * np.pi * low_hz, 2 * np.pi * high_hz
+    chain = np.diag([-a, -a, -b, -b, -b]) + np.diag([1.0, 1.0, 1.0, 1.0], 1)
+    return _scaled("broad_band", chain, chain[0], rms_mm)
+
+
+def _scaled(name: str, drift: Array, position: Array, rms: float) -> Component:
+    """A process driven at its last state, its displacement ``position`` scaled to the RMS."""
+    unit = np.zeros((len(drift), 1))
+    unit[-1] = 1.0
+    shape = stationary_covariance(drift, unit)
+    gain = rms / np.sqrt(position @ shape @ position)
+    velocity = position @ drift
+    plain = _component(name, drift, unit * gain, shape * gain**2, acceleration=velocity @ drift)
+    return replace(plain, position=position, velocity=velocity)
+
+
+def slow_ou(rms: float, tau_s: float) -> Component:
+    """One state that forgets within tau: slow drift of an arm, wander of a centroid (in px).
+
+    Too rough to have a velocity; an accelerometer is not told of it.
+    """
+    _positive(rms=rms, tau_s=tau_s)
+    return _component("slow_ou", [[-1 / tau_s]], [rms * np.sqrt(2 / tau_s)])
+
+
+def wander(rms_px: float, tau_s: float) -> Component:
+    """Correlated wander of a bubble's centroid, one image axis."""
+    return slow_ou(rms_px, tau_s).renamed("wander")
+
+
+def independent(sigma: float) -> Component:
+    """One state, drawn anew at every node: a position that only its own reading tells."""
+    _positive(sigma=sigma)
+    plain = _component("independent", [[0.0]], [[0.0]], np.array([[sigma**2]]))
+    return replace(plain, memoryless=True)
+
+
+def discretise(component: Component, dt_s: ArrayLike) -> Steps:
+    """Exact steps of lengths dt_s (M,), positive; each distinct length is worked out once.
+
+    Raises InputError for a length that is not positive.
+    """
+    dt = np.atleast_1d(np.asarray(dt_s, float))
+    if dt.size and not np.min(dt) > 0:
+        raise InputError("a time step is not positive", todo="give strictly increasing times")
+    # clocks printed to a nanosecond jitter in the last digit: not a reason for a new step
+    digits = np.round(dt * 1e11)
+    _, first, index = np.unique(digits, return_index=True, return_inverse=True)
+    if component.memoryless:
+        n = component.size
+        q = np.broadcast_to(component.start_covariance, (len(first), n, n))
+        zero = np.zeros((len(first), n, n))
+        return _steps(zero, np.zeros((len(first), n, component.input.shape[1])), q, index)
+    return _steps(*_exact(component, dt[first]), index)
+
+
+def _steps(transition: Array, gain: Array, q: Array, index: NDArray[np.int64]) -> Steps:
+    whitener = _inverse_root(q)
+    log_det = np.log(np.diagonal(whitener, axis1=-2, axis2=-1)).sum(-1)
+    return Steps(transition, gain, q, whitener, log_det, index.ravel())
+
+
+def _inverse_root(covariance: Array) -> Array:
+    """(..., n, n) lower W with W C W^T = 1, scaled so that small variances keep their digits."""
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    scaled = covariance / sigma[..., :, None] / sigma[..., None, :]
+    root = np.linalg.cholesky(scaled)
+    unit = np.broadcast_to(np.eye(root.shape[-1]), root.shape)
+    return np.asarray(np.tril(np.linalg.solve(root, unit)) / sigma[..., None, :])
+
+
+def elimination_basis(component: Component, steps: Steps) -> Array:
+    """(U + 1, n, n) bases T, x = T y, of a state that a step follows, last one: that none follows.
+
+    Integrated noise has variances many powers of the step apart. In this basis what the next
+    state and the prior together tell of a state, Phi^T Q^-1 Phi + P^-1, is the identity: the
+    pivots of a forward elimination are of order one, as Cholesky in double precision asks for.
+    """
+    prior = np.broadcast_to(
+        _inverse_root(component.start_covariance), (len(steps.whitener) + 1, *component.drift.shape)
+    )
+    ahead = np.zeros_like(prior)
+    ahead[:-1] = steps.whitener @ steps.transition
+    root = np.linalg.qr(np.concatenate([ahead, prior], -2), mode="r")
+    return np.asarray(np.linalg.inv(root))
+
+
+def _exact(component: Component, dt: Array) -> tuple[Array, Array, Array]:
+    """Transitions (U, n, n), inputs (U, n, k), covariances (U, n, n)."""
+    n, k = component.size, component.input.shape[1]
+    drift = np.zeros((n + k, n + k))
+    drift[:n, :n], drift[:n, n:] = component.drift, component.input
+    noise = np.vstack([component.noise, np.zeros((k, component.noise.shape[1]))])
+    rate = np.max(np.abs(np.linalg.eigvals(drift)), initial=0.0)
+    doublings = np.ceil(np.log2(np.maximum(rate * dt / _SHORT, 1.0))).astype(int)
+    transition, q = _short_step(drift, noise, dt / 2.0**doublings)
+    for step in range(int(doublings.max(initial=0))):
+        more = doublings > step
+        phi = transition[more]
+        q[more] += phi @ q[more] @ np.swapaxes(phi, -1, -2)
+        transition[more] = phi @ phi
+    q = (q + np.swapaxes(q, -1, -2)) / 2
+    return transition[:, :n, :n], transition[:, :n, n:], q[:, :n, :n]
+
+
+def _short_step(drift: Array, noise: Array, h: Array) -> tuple[Array, Array]:
+    """Van Loan's exponential by its series, states scaled by the powers of h that they grow with."""
+    n = len(drift)
+    scale = h[:, None] ** _orders(drift, noise)
+    ratio = scale[:, None, :] / scale[:, :, None]
+    f = drift * h[:, None, None] * ratio
+    q = noise @ noise.T * h[:, None, None] / scale[:, :, None] / scale[:, None, :]
+    block = np.zeros((len(h), 2 * n, 2 * n))
+    block[:, :n, :n], block[:, :n, n:], block[:, n:, n:] = -f, q, np.swapaxes(f, -1, -2)
+    total = np.broadcast_to(np.eye(2 * n), block.shape).copy()
+    term = total.copy()
+    for i in range(1, _TERMS):
+        term = term @ block / i
+        total += term
+    phi = np.swapaxes(total[:, n:, n:], -1, -2)
+    covariance = phi @ total[:, :n, n:]
+    return phi / ratio, covariance * scale[:, :, None] * scale[:, None, :]
+
+
+def _orders(drift: Array, noise: Array) -> Array:
+    """(n,) how many integrations lie between the white noise and each state."""
+    orders = np.full(len(drift), np.nan)
+    reached = np.abs(noise).sum(1)
+    for order in range(len(orders)):
+        orders[np.isnan(orders) & (reached > 0)] = order
+        reached = np.abs(drift) @ reached
+    return np.asarray(np.nan_to_num(orders, nan=0.0))
+
+
+def block_diagonal(blocks: Sequence[Array]) -> Array:
+    """Blocks (..., a, b), batch axes alike, into one (..., sum a, sum b)."""
+    rows, columns = (sum(b.shape[axis] for b in blocks) for axis in (-2, -1))
+    batch = np.broadcast_shapes(*(b.shape[:-2] for b in blocks)) if blocks else ()
+    out = np.zeros((*batch, rows, columns))
+    i = j = 0
+    for block in blocks:
+        a, b = block.shape[-2:]
+        out[..., i : i + a, j : j + b] = block
+        i, j = i + a, j + b
+    return out

@@ -27,10 +27,12 @@ UPPER = 0.8
 STEADY = 0.04
 """A pixel whose brighter frames spread less than this shows the screen, or dirt on it."""
 
+_STARTS = 2
 _ROUNDS = 3
 _BLOCK_ROWS = 64
 _LEAST_SEEN = 3
-"""A place of the lab that fewer frames show cannot be told from a bubble."""
+_LEAST_SEEN_LAB = 2
+"""What a single frame shows of the lab cannot be told from a bubble."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,13 @@ class _Model:
     origin_px: tuple[int, int]
     gains: Array
 
-    def lab_in(self, shift_px: Array) -> Log | float:
-        """(H, W) of the lab layer as a frame sees it."""
+    def lab_in(self, shift_px: Array, rows: slice = slice(None)) -> Log | float:
+        """(H, W) of the lab layer as a frame sees it, or some rows of it."""
         if self.lab is None:
             return 0.0
-        shape = (self.rig.shape[0], self.rig.shape[1])
-        return crop_of_lab(self.lab, self.origin_px, (shift_px[0], shift_px[1]), shape, 0.0)
+        first, last, _ = rows.indices(self.rig.shape[0])
+        shape = (last - first, self.rig.shape[1])
+        return crop_of_lab(self.lab, self.origin_px, (shift_px[0], shift_px[1] + first), shape, 0.0)
 
 
 @dataclass(frozen=True)
@@ -82,11 +85,12 @@ def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> Layers:
     shifts = np.zeros((len(stack), 2)) if shifts_px is None else shifts_px
     sample = _Sample(stack, shifts, _log_table(stack.dtype))
     gains = _first_gains(sample)
-    rig, spread = _first_rig(sample, gains)
-    model = _Model(rig, None, (0, 0), gains)
-    if shifts_px is not None:
+    empty = np.zeros(stack.shape[1:], np.float32)
+    model, spread = _first_rig(sample, _Model(empty, None, (0, 0), gains))
+    for _ in range(_STARTS if shifts_px is not None else 0):
         model = _first_lab(sample, model)
-    model, marked, covered = _uncovered(sample, *_marked(sample, model), spread)
+        model, spread = _first_rig(sample, model)
+    model, marked, covered, usable = _uncovered(sample, *_marked(sample, model), spread)
     for turn in range(_ROUNDS):
         if turn:
             model, marked = _marked(sample, model)
@@ -95,6 +99,9 @@ def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> Layers:
             model = _mean_lab(sample, model, marked)
     noise = float(np.median(_noise(sample, model)[1]))
     hidden = covered & (seen < _least_seen(len(stack)))
+    if hidden.any():
+        filled = fill_masked(model.rig, hidden, usable, _along_travel(sample, model))
+        model = replace(model, rig=filled)
     return Layers(model.rig, model.lab, model.origin_px, model.gains, noise, hidden)
 
 
@@ -157,14 +164,16 @@ def _first_gains(sample: _Sample) -> Array:
     return gains
 
 
-def _first_rig(sample: _Sample, gains: Array) -> tuple[Log, Log]:
-    """(H, W) upper quantile of the frames, and how far the brighter frames spread about it."""
+def _first_rig(sample: _Sample, model: _Model) -> tuple[_Model, Log]:
+    """The model with the frames' upper quantile, and how far the brighter frames spread."""
     rig, spread = np.empty((2, *sample.stack.shape[1:]), np.float32)
     for rows in _blocks(rig.shape[0]):
-        log = sample.log(slice(None), rows) - gains[:, None, None].astype(np.float32)
+        log = sample.log(slice(None), rows) - model.gains[:, None, None].astype(np.float32)
+        for k, shift in enumerate(sample.shifts):
+            log[k] -= model.lab_in(shift, rows)
         low, rig[rows], high = _quantiles(log, (UPPER - 0.1, UPPER, UPPER + 0.1))
         spread[rows] = high - low
-    return rig, spread
+    return replace(model, rig=rig), spread
 
 
 def _blocks(height: int) -> Iterator[slice]:
@@ -172,13 +181,13 @@ def _blocks(height: int) -> Iterator[slice]:
 
 
 def _quantiles(values: Log, shares: tuple[float, ...]) -> Log:
-    """(Q, H, W) quantiles over the first axis, NaN left out; NaN where too few frames remain."""
+    """(Q, H, W) quantiles over the first axis, NaN left out; NaN where fewer than two remain."""
     count, height, width = values.shape
     ordered = np.sort(np.ascontiguousarray(values.reshape(count, -1).T), axis=1)
     known = count - np.sum(np.isnan(ordered), axis=1)
     at = np.rint(np.outer(known - 1, shares)).astype(np.int64).clip(0)
     found = np.take_along_axis(ordered, at, axis=1)
-    found[known < _LEAST_SEEN] = np.nan
+    found[known < _LEAST_SEEN_LAB] = np.nan
     return np.ascontiguousarray(found.T).reshape(len(shares), height, width)
 
 
@@ -277,7 +286,9 @@ def _outliers(residual: Log, sigma: Log) -> Mask:
     import cv2
 
     soft = cv2.blur(residual, (5, 5))
-    dark = (residual < -4 * sigma) | (soft < -np.maximum(1.2 * sigma, 0.01))
+    thin = soft[::8, ::8] - np.median(soft[::8, ::8])
+    spread = float(np.median(thin[thin >= 0])) / 0.6745
+    dark = (residual < -4 * sigma) | (soft < -max(5 * spread, 0.01))
     grown = cv2.dilate(dark.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
     outlines, _ = cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(grown, outlines, -1, 1, cv2.FILLED)
@@ -286,8 +297,10 @@ def _outliers(residual: Log, sigma: Log) -> Mask:
 
 def _uncovered(
     sample: _Sample, model: _Model, marked: Mask, spread: Log
-) -> tuple[_Model, Mask, Mask]:
-    """The rig layer filled where a bubble kept it dark all the time; new marks; (H, W) where.
+) -> tuple[_Model, Mask, Mask, Mask]:
+    """The rig layer filled where a bubble kept it dark all the time, and the new marks.
+
+    Then (H, W) where it was filled, and what is clean enough to fill from.
 
     spread : (H, W) of the brighter frames, as `_first_rig` gives it.
 
@@ -307,12 +320,24 @@ def _uncovered(
         if np.mean(share[around] > usual + 0.25) > 0.5:
             covered |= thing
     if not covered.any():
-        return model, marked, covered.astype(bool)
+        return model, marked, covered.astype(bool), covered == 0
     edge = cv2.dilate(covered, np.ones((13, 13), np.uint8)) > covered
     hidden = covered.astype(bool) | (edge & (spread > STEADY))
-    usable = cv2.dilate(dark | covered, np.ones((5, 5), np.uint8)) == 0
-    model = replace(model, rig=fill_masked(model.rig, hidden, usable & ~edge))
-    return *_marked(sample, model), hidden
+    usable = (cv2.dilate(dark | covered, np.ones((5, 5), np.uint8)) == 0) & ~edge
+    filled = fill_masked(model.rig, hidden, usable, _along_travel(sample, model))
+    return *_marked(sample, replace(model, rig=filled)), hidden, usable
+
+
+def _along_travel(sample: _Sample, model: _Model) -> tuple[float, float] | None:
+    """The reach (u, v) px of the fill when the travel follows an image axis.
+
+    A pattern that is constant along the travel looks the same in both layers, and what one has of
+    it the other lacks: such stripes must go on through a hole.
+    """
+    spread_u, spread_v = np.ptp(sample.shifts, axis=0)
+    if model.lab is None or min(spread_u, spread_v) > 0.02 * max(spread_u, spread_v):
+        return None
+    return (1.0, np.inf) if spread_v > spread_u else (np.inf, 1.0)
 
 
 def _least_seen(frames: int) -> int:
@@ -356,5 +381,5 @@ def _mean_lab(sample: _Sample, model: _Model, marked: Mask) -> _Model:
         place = (slice(row, row + height), slice(column, column + width))
         total[place] += free * _shifted(residual, fraction)
         seen[place] += free
-    change = np.where(seen >= _LEAST_SEEN, total / np.maximum(seen, 1), 0)
+    change = np.where(seen >= _LEAST_SEEN_LAB, total / np.maximum(seen, 1), 0)
     return _centred(replace(model, lab=model.lab + change.astype(np.float32)))

@@ -42,18 +42,21 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Level, Mask]:
     return level.astype(np.float32), covered.astype(bool)
 
 
-def fill_masked(log: Level, mask: Mask, usable: Mask) -> Level:
+def fill_masked(
+    log: Level, mask: Mask, usable: Mask, across: tuple[float, float] | None = None
+) -> Level:
     """``log`` with the masked pixels interpolated from the usable ones around them.
 
     A surface of degree 2 through each hole's neighbourhood, and what is left of it around the
-    hole carried over it.
+    hole carried over it, in all directions, or along an image axis only: ``across`` is then the
+    reach (u, v) px of a pixel, small across the axis.
     """
     surface = log.copy()
     for window, hole in _holes(mask):
         known = usable[window] & ~mask[window]
         if known.sum() > 30:
             smooth = _bright_surface(log[window], 2, known)
-            carried = smooth + _carried(log[window] - smooth, known)
+            carried = smooth + _carried(log[window] - smooth, known, across)
             surface[window] = np.where(hole, carried, surface[window])
     return surface
 
@@ -73,7 +76,7 @@ def _holes(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:
         yield window, labels[window] == k
 
 
-def _carried(residual: Level, known: Mask) -> Level:
+def _carried(residual: Level, known: Mask, across: tuple[float, float] | None = None) -> Level:
     """Weighted means of what is known nearby, the finest scale that reaches a pixel first."""
     import cv2
 
@@ -81,8 +84,9 @@ def _carried(residual: Level, known: Mask) -> Level:
     result, left = np.zeros_like(value), np.ones_like(value)
     scale = 2.0
     while scale < max(known.shape) and float(left.max()) > 1e-3:
-        total = cv2.GaussianBlur(weight, (0, 0), scale, borderType=cv2.BORDER_REPLICATE)
-        mean = cv2.GaussianBlur(value, (0, 0), scale, borderType=cv2.BORDER_REPLICATE)
+        reach = (scale, scale) if across is None else tuple(min(scale, most) for most in across)
+        total = cv2.GaussianBlur(weight, (0, 0), *reach, borderType=cv2.BORDER_REPLICATE)
+        mean = cv2.GaussianBlur(value, (0, 0), *reach, borderType=cv2.BORDER_REPLICATE)
         share = left * np.minimum(1.0, 4 * total)
         result += share * mean / np.maximum(total, 1e-6)
         left -= share

@@ -113,7 +113,7 @@ def _eye(up: Sequence[float], distance: float) -> list[float]:
 
 def _layout(up: Sequence[float], distance: float) -> dict[str, Any]:
     axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
-    lower = [0.3 * (1 - distance) * float(part) for part in up]
+    lower = [-min(0.3 * (distance - 1), 0.12) * float(part) for part in up]
     view = {
         "up": dict(zip("xyz", up)),
         "center": dict(zip("xyz", lower)),

@@ -26,7 +26,7 @@ MANY_POINTS = 3_000
 
 SHADES = 64
 _NAMED = len(TRACK_COLOURS)
-_EYE = 1.35
+_EYE = 1.5
 
 
 def track_colour(particle: int) -> str:

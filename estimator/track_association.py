@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,7 @@ class Pairs:
         return self.constant - self.distance2(shift_mm) / 2
 
 
+@lru_cache(maxsize=64)
 def gate2(settings: TrackerSettings, dimensions: int = 3) -> float:
     return float(chdtri(dimensions, 1 - settings.gate_probability))
 
@@ -124,12 +126,11 @@ def best_assignment(rows: int, row: Ids, column: Ids, score: Array) -> Ids:
     out = np.full(rows, -1)
     if not len(row):
         return out
-    used, local = np.unique(column, return_inverse=True)
-    cost = np.zeros((rows, len(used)))
-    np.minimum.at(cost, (row, local), -score)
+    cost = np.zeros((rows, int(column.max()) + 1))
+    cost[row, column] = np.minimum(-score, 0.0)
     at, to = linear_sum_assignment(cost)
     good = cost[at, to] < 0
-    out[at[good]] = used[to[good]]
+    out[at[good]] = to[good]
     return out
 
 

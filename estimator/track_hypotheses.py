@@ -127,7 +127,9 @@ def decide(
 ) -> Decision:
     """What can leave the cluster in this frame; at_once: all of it, as if its window were over."""
     branches = cluster.branches
-    runner_up = -branches[1].weight if cluster.open else np.inf
+    if not cluster.open:
+        return Decision(None, _leave(branches[0], cluster.tracks), [], np.inf)
+    runner_up = -branches[1].weight
     over = frame - cluster.since_frame + 1 >= settings.window_frames
     if not (over or at_once):
         hot = disputed(branches, _MERGE_FRAMES)

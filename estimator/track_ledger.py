@@ -9,6 +9,8 @@ import numpy as np
 
 from telerig.estimator.track_types import NO_PARTICLE, FrameIds, Ids, TrackEvent
 
+_SPARE = 16
+
 
 class Ledger:
     """The frames that are still open, and when each living particle was last seen."""
@@ -43,7 +45,7 @@ class Ledger:
         for frame in [f for f in self._frames if f < before_frame]:
             t_s, particle, single = self._frames.pop(frame)
             out.append(FrameIds(frame, particle, single))
-            for p in np.unique(np.concatenate([particle, single])).tolist():
+            for p in sorted({*particle.tolist(), *single.tolist()}):
                 if p == NO_PARTICLE:
                     continue
                 missed = frame - self._seen.get(p, frame - 1) - 1
@@ -54,8 +56,9 @@ class Ledger:
         return tuple(out), events
 
     def forget(self, alive: set[int]) -> None:
-        """Drop what is kept of dead particles; their open frames must be settled."""
-        self._seen = {p: f for p, f in self._seen.items() if p in alive}
+        """Drop what is kept of dead particles, now and then."""
+        if len(self._seen) > 2 * len(alive) + _SPARE:
+            self._seen = {p: f for p, f in self._seen.items() if p in alive}
 
     def to_dict(self) -> dict[str, Any]:
         frames = [[f, t, p.tolist(), s.tolist()] for f, (t, p, s) in self._frames.items()]

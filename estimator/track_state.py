@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,12 @@ def new_filter(x: Array, p: Array) -> Any:
 
 def predict(track: Track, step: Transition, control: Array) -> None:
     """control : (n,) added to the state, the stage's motion and the mean velocity's drift."""
-    track.filter.predict(u=control, B=np.eye(len(control)), F=step.matrix, Q=step.noise)
+    track.filter.predict(u=control, B=_identity(len(control)), F=step.matrix, Q=step.noise)
+
+
+@lru_cache(maxsize=4)
+def _identity(n: int) -> Array:
+    return np.eye(n)
 
 
 @dataclass(frozen=True)
@@ -123,5 +129,6 @@ class Common:
 
     def applied(self, mean_gain: Array) -> Common:
         """What is left once the tracks have taken the shift and their measurements."""
-        keep = np.eye(len(self.shift)) - np.pad(mean_gain, ((0, 0), (0, len(self.shift) - 3)))
+        keep = np.eye(len(self.shift))
+        keep[:, :3] -= mean_gain
         return Common(np.zeros(len(self.shift)), keep @ self.covariance @ keep.T)

@@ -119,6 +119,7 @@ class Tracker:
         self._deaths(scan, events)
         now = self.ledger.now(frame)
         settled, gaps = self.ledger.settle(self._open_since(frame))
+        self.ledger.forget({t.particle for t in self._confirmed()})
         return FrameResult(frame, *now, (*events, *gaps), settled)
 
     def finish(self) -> FrameResult | None:

@@ -28,9 +28,11 @@ from telerig.rig.camera import Camera
 Array = NDArray[np.float64]
 
 SAFE_NATS = 3.0
-_TAIL, _TAIL_WIDTH, _TAIL_PX, _GATE_SIGMA = 0.02, 2.0, 0.5, 5.0
+_TAIL, _TAIL_PX2, _GATE_SIGMA = 0.02, (0.25, 1.0), 5.0
 _WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-6, 0.02, 0.05
 _IMPOSSIBLE, _IMPOSSIBLE_SIGMA = 0.15, 10.0
+_UNKNOWN_SIZE = 2.0
+"""Nats against a pair with a bubble cut by the border or merged: its partner is often unseen."""
 _RARE, _FREEDOM = 2.5, 6.0
 _SHIFT_PASSES = 4
 _NEVER = -1e6
@@ -93,9 +95,10 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
     odds = np.full(geometry.gap_px.shape, _prior_log_odds(len(first), len(second), model.lonely))
     wrong = np.where(geometry.doubt > 1, _WRONG_SIZE_FLAGGED, _WRONG_SIZE)
     odds += _cue(model.size, geometry.size, first.log_size, second.log_size, wrong)
-    apart = np.abs(np.nan_to_num(geometry.size[..., 0] - model.size.difference[0]))
+    apart = np.abs(geometry.size[..., 0] - model.size.difference[0])
     limit = max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
     odds[apart > np.where(geometry.doubt > 1, 2 * limit, limit)] = _NEVER
+    odds -= np.where(np.isfinite(apart), 0.0, _UNKNOWN_SIZE)
     contrasts = (first.log_contrast, second.log_contrast)
     odds += _cue(model.contrast, geometry.contrast, *contrasts, _WRONG_CONTRAST)
     return odds
@@ -111,7 +114,7 @@ def _prior_log_odds(n1: int, n2: int, lonely: tuple[float, float]) -> float:
 def _gap_log_odds(gap: Array, variance: Array, model: PairModel) -> Array:
     """A normal core with wider tails (upset outlines), cut off, against any place in the span."""
     core = np.exp(-0.5 * gap**2 / variance)
-    wide = variance * _TAIL_WIDTH**2 + _TAIL_PX**2
+    wide = variance + np.clip(3 * variance, *_TAIL_PX2)
     tail = np.exp(-0.5 * gap**2 / wide) * np.sqrt(variance / wide)
     density = ((1 - _TAIL) * core + _TAIL * tail) / np.sqrt(2 * np.pi * variance)
     near = gap**2 < _GATE_SIGMA**2 * wide

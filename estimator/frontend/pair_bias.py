@@ -30,7 +30,8 @@ def fit_bias(
 ) -> PairModel:
     """Bias, its covariance and the scatter from likely pairs; all arrays have one row per pair.
 
-    terms : 1, 4 or 10, see `PairModel`.  weight : probability of the pair. Tails are tempered as of Student's t with 8 degrees.
+    terms : 1, 4 or 10, see `PairModel`.  weight : probability of the pair.
+    Tails are tempered as of Student's t with 8 degrees.
     """
     if weight.sum() < 0.5:
         return model

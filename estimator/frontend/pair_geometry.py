@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 NO_SIZE_FLAGS = ("border", "merged")
 _DOUBTFUL = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
+_UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
+"""What hidden outline may add to a centre's sd, as a share of the larger semi-axis."""
 _OUTLINE_SAMPLES = 96
 
 
@@ -116,7 +118,8 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     mm_by_px = _mm_by_px(camera, uv)
     across = np.einsum("i,nij->nj", (camera.camera_from_rig.rotation @ axis)[:2], mm_by_px)
     middle, height = outline_extent(table, across)
-    known, doubt = _trust(table)
+    known, doubt, unsure = _trust(table)
+    extra = np.square(unsure * _column(table, "a_px"))
     area = np.pi * _column(table, "a_px") * _column(table, "b_px")
     measured = _column(table, "area_px2")
     area = np.where(measured > 0, measured, area)
@@ -126,7 +129,8 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
         log_width = np.log(area_mm2 / np.pi) - log_height
         contrast = np.log(_column(table, "contrast"))
     return View(
-        camera, uv, origin, direction, mm_by_px, covariance.reshape(-1, 2, 2), middle,
+        camera, uv, origin, direction, mm_by_px,
+        covariance.reshape(-1, 2, 2) + extra[:, None, None] * np.eye(2), middle,
         _finite(np.stack([log_height, log_width], -1)), _finite(contrast[:, None]),
         doubt,
     )  # fmt: skip
@@ -207,15 +211,16 @@ def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
     return np.asarray(np.linalg.inv(by_point[..., :2]))
 
 
-def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array]:
-    """Whether the size means anything, and the factor for the scatter, by the flags."""
-    known, doubt = np.ones(len(table), bool), np.ones(len(table))
+def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array, Array]:
+    """By the flags: is the size known, the factor for the scatter, the unsure share of the size."""
+    known, doubt, unsure = np.ones(len(table), bool), np.ones(len(table)), np.zeros(len(table))
     if "flags" in table:
         for i, text in enumerate(table["flags"].tolist()):
             for word in text.split("|") if isinstance(text, str) and text else ():
                 known[i] &= word not in NO_SIZE_FLAGS
                 doubt[i] = max(doubt[i], _DOUBTFUL.get(word, 1.0))
-    return known, doubt
+                unsure[i] = max(unsure[i], _UNSURE_SHARE.get(word, 0.0))
+    return known, doubt, unsure
 
 
 def _column(table: pd.DataFrame, name: str) -> Array:

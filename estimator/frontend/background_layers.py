@@ -128,8 +128,8 @@ def _shifted(image: Log, shift_px: tuple[float, float]) -> Log:
     """image(p + shift) for shifts below 1 px, by Catmull-Rom splines; borders replicated."""
     import cv2
 
-    kernels = [_spline(shift) for shift in shift_px]
-    out = cv2.sepFilter2D(image, cv2.CV_32F, *kernels, borderType=cv2.BORDER_REPLICATE)
+    along_u, along_v = (_spline(shift) for shift in shift_px)
+    out = cv2.sepFilter2D(image, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(out, np.float32)
 
 
@@ -292,7 +292,7 @@ def _outliers(residual: Log, sigma: Log) -> Mask:
     grown = cv2.dilate(dark.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
     outlines, _ = cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(grown, outlines, -1, 1, cv2.FILLED)
-    return grown.astype(bool) | (residual > 5 * sigma)
+    return np.asarray((grown > 0) | (residual > 5 * sigma), bool)
 
 
 def _uncovered(

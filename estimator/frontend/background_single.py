@@ -84,9 +84,11 @@ def _carried(residual: Level, known: Mask, across: tuple[float, float] | None = 
     result, left = np.zeros_like(value), np.ones_like(value)
     scale = 2.0
     while scale < max(known.shape) and float(left.max()) > 1e-3:
-        reach = (scale, scale) if across is None else tuple(min(scale, most) for most in across)
-        total = cv2.GaussianBlur(weight, (0, 0), *reach, borderType=cv2.BORDER_REPLICATE)
-        mean = cv2.GaussianBlur(value, (0, 0), *reach, borderType=cv2.BORDER_REPLICATE)
+        su, sv = (min(scale, most) for most in across or (scale, scale))
+        total, mean = (
+            cv2.GaussianBlur(part, (0, 0), sigmaX=su, sigmaY=sv, borderType=cv2.BORDER_REPLICATE)
+            for part in (weight, value)
+        )
         share = left * np.minimum(1.0, 4 * total)
         result += share * mean / np.maximum(total, 1e-6)
         left -= share
@@ -136,4 +138,4 @@ def _dark_things(log: Level, surface: Level) -> Mask:
         ):
             dark[labels == k] = False
     grown = cv2.dilate(dark.astype(np.uint8), np.ones((5, 5), np.uint8))
-    return grown.astype(bool)
+    return np.asarray(grown, bool)

@@ -40,9 +40,10 @@ _CLEARANCE = 1.1
 
 @dataclass(frozen=True)
 class Carriage:
-    """The stage on a fine time grid of which every ``stride``-th sample is a frame.
+    """The stage on a fine time grid, from the first frame to one frame after the last.
 
     t_s, position_mm, velocity_mm_s, acceleration_mm_s2 : (N,); shake : of each camera, (C, N, 3).
+    stride : fine samples per frame; frames : which of the N samples are frames.
     """
 
     t_s: Array
@@ -51,6 +52,10 @@ class Carriage:
     velocity_mm_s: Array
     acceleration_mm_s2: Array
     shake: Shake
+
+    @property
+    def frames(self) -> slice:
+        return slice(0, len(self.t_s) - 1, self.stride)
 
 
 @dataclass(frozen=True)
@@ -72,23 +77,23 @@ class RunScene:
 
     @property
     def t_s(self) -> Array:
-        return self.carriage.t_s[:: self.carriage.stride]
+        return self.carriage.t_s[self.carriage.frames]
 
     @property
     def position_mm(self) -> Array:
-        return self.carriage.position_mm[:: self.carriage.stride]
+        return self.carriage.position_mm[self.carriage.frames]
 
     @property
     def velocity_mm_s(self) -> Array:
-        return self.carriage.velocity_mm_s[:: self.carriage.stride]
+        return self.carriage.velocity_mm_s[self.carriage.frames]
 
     @property
     def shake_mm(self) -> Array:
-        return self.carriage.shake.offset_mm[:, :: self.carriage.stride]
+        return self.carriage.shake.offset_mm[:, self.carriage.frames]
 
     @property
     def shake_mm_s(self) -> Array:
-        return self.carriage.shake.velocity_mm_s[:, :: self.carriage.stride]
+        return self.carriage.shake.velocity_mm_s[:, self.carriage.frames]
 
     def rig_from_lab_mm(self, camera: int, frame: int) -> Array:
         """(3,) to add to a lab point to have it where a camera sees it, in rig axes."""
@@ -115,7 +120,7 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     stage_rng, path_rng, place_rng, shape_rng = rng.spawn(4)
     speed = config.stage.follow * _mean_rise(config.motion)
     carriage = _carriage(config, len(cameras), speed, stage_rng)
-    position = carriage.position_mm[:: carriage.stride]
+    position = carriage.position_mm[carriage.frames]
     size_mm = _view_mm(config)
     count = _bubble_count(config, position, size_mm)
     fleet = random_fleet(config.bubble, count, shape_rng)
@@ -145,7 +150,7 @@ def _carriage(config: RunConfig, cameras: int, speed_mm_s: float, rng: Generator
     rate = max(stage.encoder_rate_hz, stage.accelerometer_rate_hz if stage.accelerometers else 0)
     stride = max(1, int(np.ceil(rate / config.frame_rate_hz - 1e-9)))
     step = 1 / (config.frame_rate_hz * stride)
-    steps = (config.frames - 1) * stride + 1
+    steps = config.frames * stride + 1
     t = np.asarray(step * np.arange(steps), float)
     position, velocity, acceleration = stage_trajectory(t, speed_mm_s, stage.ramp_s)
     servo_rng, shake_rng = rng.spawn(2)

@@ -1,5 +1,6 @@
 """What stands beside a simulated run's images: encoder, accelerometers, marks, what moves."""
 
+import tempfile
 from dataclasses import replace
 from functools import cache
 
@@ -8,11 +9,19 @@ import pandas as pd
 import pytest
 import tifffile
 
+from telerig.io.run import load_run
 from telerig.io.run_presets import run_preset
 from telerig.io.run_scene import AXIS_RIG, run_scene
 from telerig.io.run_views import linear_projection
 from telerig.io.simulation import simulate
 from telerig.io.simulation_scene import true_cameras
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _datasets_go_where_pytest_cleans_up(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("datasets")))
+        yield
 
 
 def few_views(name, **changes):
@@ -127,3 +136,10 @@ def bilinear(image, u, v):
     y, x = v - i, u - j
     top = image[i, j] * (1 - x) + image[i, j + 1] * x
     return top * (1 - y) + (image[i + 1, j] * (1 - x) + image[i + 1, j + 1] * x) * y
+
+
+def test_a_run_of_one_frame_can_be_read():
+    data = simulate(few_views("rise", frames=1), rng=np.random.default_rng(7), images=False)
+    run = load_run(data.runs["rise"].path)
+    assert run.frame_count == 1 and len(run.stage) > 2
+    assert abs(run.position_mm[0] - cameras_table(data, "rise")["position_mm"][0]) < 0.01

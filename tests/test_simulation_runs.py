@@ -1,6 +1,7 @@
 """Simulated runs: files that can be read, and a truth that agrees with cameras and clocks."""
 
 import json
+import tempfile
 from dataclasses import replace
 from functools import cache
 
@@ -33,6 +34,13 @@ from telerig.scripts.main import app
 
 LAB = ["x_lab_mm", "y_lab_mm", "z_lab_mm"]
 SPEED = ["vx_lab_mm_s", "vy_lab_mm_s", "vz_lab_mm_s"]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _datasets_go_where_pytest_cleans_up(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("datasets")))
+        yield
 
 
 def few_views(name, **changes):

@@ -142,6 +142,15 @@ def _cut_closed(contour: Array, sense: float) -> list[Array]:
     return _trimmed(points, bounds)
 
 
+def arcs_between(contour: Array, cuts: Array) -> list[Array]:
+    """A closed outline (n, 2) cut at its points nearest to ``cuts`` (m, 2)."""
+    points = _spaced(contour, closed=True)
+    gap = np.hypot(*(points[:, None] - cuts[None]).transpose(2, 0, 1))
+    bounds = np.sort(np.argmin(gap, axis=0)).tolist()
+    points = np.roll(points, -bounds[0], axis=0)
+    return _trimmed(points, [k - bounds[0] for k in bounds] + [len(points)])
+
+
 def _cut_open(contour: Array, sense: float) -> list[Array]:
     if len(contour) < _SHORTEST_ARC:
         return []

@@ -21,6 +21,7 @@ Mask = NDArray[np.bool_]
 _LEVEL_SPREAD = 0.3
 _FREE_HARMONIC, _FREE_FLATTENING = 0.25, 1e3
 _UNLEARNT_HARMONIC, _LEAST_HARMONIC, _LEAST_FLATTENING = 0.02, 0.002, 0.01
+_UNLEARNT_FLATTENING = 0.08
 _WIDENED = 1.5
 _ENOUGH_WHOLE = 4
 _HELD = 1e-7
@@ -57,7 +58,10 @@ def weak_prior(count: int, *, held: bool = False) -> ShapePrior:
 
 
 def learnt_prior(ellipse: Array, harmonics: Array, whole: Mask, partial: Mask) -> ShapePrior:
-    """For outlines that are ``partial`` (B,) the shapes of the ``whole`` ones, for others none."""
+    """For outlines that are ``partial`` (B,) the shapes of the ``whole`` ones, for others none.
+
+    With too few whole ones, partial outlines are taken to be round to 8 %.
+    """
     count = len(ellipse)
     prior = weak_prior(count)
     share = _UNLEARNT_HARMONIC
@@ -70,6 +74,8 @@ def learnt_prior(ellipse: Array, harmonics: Array, whole: Mask, partial: Mask) -
         scatter = 1.4826 * float(np.median(np.abs(own - middle)))
         prior.flattening[partial] = middle
         prior.flattening_spread[partial] = max(_WIDENED * scatter, _LEAST_FLATTENING)
+    else:
+        prior.flattening_spread[partial] = _UNLEARNT_FLATTENING
     prior.harmonic_share[partial] = share
     return prior
 

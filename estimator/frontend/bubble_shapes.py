@@ -52,10 +52,16 @@ def outline_moments(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
     return area, ellipse[:, :2] + np.stack([u, v], axis=1)
 
 
+def outline_curvature(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
+    """Points (B, 64, 2) and curvature (B, 64) of outlines, positive where convex."""
+    place, slope, bend = _sampled(ellipse, harmonics)
+    curvature = (np.conj(slope) * bend).imag / np.abs(slope) ** 3
+    return ellipse[:, None, :2] + np.stack([place.real, place.imag], axis=-1), curvature
+
+
 def deepest_dent(ellipse: Array, harmonics: Array) -> Array:
     """Most inward curvature (B,) of outlines in units of 1 / radius, 0 where all is convex."""
-    _, slope, bend = _sampled(ellipse, harmonics)
-    curvature = (np.conj(slope) * bend).imag / np.abs(slope) ** 3
+    _, curvature = outline_curvature(ellipse, harmonics)
     radius = np.sqrt(ellipse[:, 2] * ellipse[:, 3])
     dent: Array = np.maximum(-np.min(curvature, axis=1) * radius, 0.0)
     return dent

@@ -79,7 +79,16 @@ def _split(
         fitted, rms = fit_ellipses(arcs)
         sound = rms[0] < 2.5 * _tolerance(fitted[0]) and _dark(fitted[0], contour, shape)
         return [Part(fitted[0], index)] if sound else unsplit
-    groups = _grouped(arcs, blob)
+    return parts_of_arcs(_grouped(arcs, blob), blob, index, shape, min_diameter_px) or unsplit
+
+
+def parts_of_arcs(
+    groups: list[Array], blob: Blob, index: int, shape: tuple[int, ...], min_diameter_px: float
+) -> list[Part]:
+    """The sound bubbles along groups of arcs of blob ``index``; none if they do not explain it."""
+    if not groups:
+        return []
+    contour = blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
     fitted, rms = fit_ellipses(groups)
     good = [
         ellipse
@@ -88,7 +97,7 @@ def _split(
         and _dark(ellipse, contour, shape)
     ]
     if not _explains(good, contour):
-        return unsplit
+        return []
     return [Part(ellipse, index, shared=len(good) > 1) for ellipse in good]
 
 

@@ -19,8 +19,12 @@ from telerig.estimator.frontend.bubble_regions import (
     find_blobs,
     noise_share,
 )
+from telerig.estimator.frontend.bubble_second_look import (
+    agreed,
+    halves_at_waists,
+    unsound_parts,
+)
 from telerig.estimator.frontend.bubble_shapes import (
-    deepest_dent,
     outline_centroid,
     outline_moments,
     outline_points,
@@ -41,9 +45,7 @@ _MAX_AXIS_RATIO = 3.5
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
 _SMALL_EDGES = 3.0
-_WAIST, _SLIGHT_WAIST, _POOR_FIT = 0.3, 0.03, 2.5
-_ASTRAY_PX, _ASTRAY_SHARE = 0.3, 0.01
-_SHARPEST_ORDER, _WHOLE = 35.0, 0.9
+_MOSTLY_SEEN = 0.6
 _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
 
 
@@ -107,8 +109,19 @@ def find_bubbles(
     specks += slender
     if not parts:
         return _bubbles(_empty_columns(), specks, sigma, "no shadow dark and large enough")
-    start = _start(parts, blobs, sigma, max(dark_noise_share(ratio, blobs, sigma), 1e-4))
+    dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
+    start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
+    halves = halves_at_waists(outlines, parts, blobs, image.shape, min_diameter_px)
+    for _ in range(2 if halves else 0):
+        split = _replaced(parts, halves)
+        start = _start(split, blobs, sigma, dark_sigma)
+        refitted = fit_outlines(ratio, start)
+        sound = agreed(halves, outlines, split, refitted)
+        if len(sound) == len(halves):
+            parts, outlines = split, refitted
+            break
+        halves = sound
     columns = _columns(outlines, parts, image.shape, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])
@@ -133,6 +146,10 @@ def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Speck]]:
         else:
             slender.append(Speck(u, v, (a * b) ** 0.5, f"{a / b:.1f} times as long as wide"))
     return kept, slender
+
+
+def _replaced(parts: list[Part], halves: dict[int, list[Part]]) -> list[Part]:
+    return [new for k, part in enumerate(parts) for new in halves.get(k, [part])]
 
 
 def _bubbles(columns: dict[str, Any], specks: list[Speck], noise: float, reason: str) -> Bubbles:
@@ -224,25 +241,12 @@ def _flags(
 
 
 def _merged(outlines: Outlines, parts: list[Part]) -> Mask:
-    """What could not be split, and all of a blob when one of its parts turns out unsound."""
-    merged = np.array([part.merged for part in parts]) | _dented(outlines)
+    """What could not be split; and where one part of a blob turns out unsound, all those whose
+    own outline is not mostly seen."""
+    merged: Mask = np.array([part.merged for part in parts]) | unsound_parts(outlines, parts)
     unsound = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
-    return np.array([part.blob in unsound for part in parts])
-
-
-def _dented(outlines: Outlines) -> Mask:
-    """Outlines from which the rim strays, or with a waist, which no single bubble has.
-
-    A slight waist counts where the outline's orders do not describe the rim either; whether a
-    partly hidden outline has one cannot be told.
-    """
-    dent = deepest_dent(outlines.ellipse, outlines.harmonics)
-    radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
-    sure = dent > 3.0 * _SHARPEST_ORDER * outlines.sigma_outline_px / radius
-    waist = (dent > _WAIST) | ((dent > _SLIGHT_WAIST) & (outlines.chi2_dof > _POOR_FIT))
-    waist &= sure & (outlines.coverage > _WHOLE)
-    astray: Mask = outlines.misfit_px > _ASTRAY_PX + _ASTRAY_SHARE * radius
-    return waist | astray
+    doubtful = np.array([part.blob in unsound for part in parts])
+    return merged | (doubtful & (outlines.coverage < _MOSTLY_SEEN))
 
 
 def _defocused(outlines: Outlines) -> Mask:

@@ -203,11 +203,10 @@ def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
         ellipse_basis(foot, basis)
         weight = 1.0 / (_POINT_SIGMA_PX**2 * (1.0 + (foot.distance / 0.6) ** 2))
         products = np.add.reduceat(basis[:, None] * basis[None] * weight, first, axis=2)
-        pull = np.add.reduceat(basis * (weight * foot.distance), first, axis=1).T
+        pull = np.add.reduceat(basis * (weight * foot.distance), first, axis=1).T.astype(np.float64)
         information = np.moveaxis(products, 2, 0).astype(np.float64)
-        pull = pull.astype(np.float64)
         _add_roundness(information, pull, ellipse, _ROUND_SHARE * radius)
-        step: Array = np.linalg.solve(information, pull[..., None])[..., 0]
+        step = np.linalg.solve(information, pull[..., None])[..., 0].astype(np.float64)
         reach = np.max(np.abs(step), axis=1)
         step *= np.minimum(1.0, 0.4 * ellipse[:, 3] / (reach + 1e-12))[:, None]
         ellipse, _ = moved(ellipse, step)

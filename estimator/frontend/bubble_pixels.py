@@ -48,8 +48,8 @@ class Pixels:
 
     def sums(self, values: Single) -> Array:
         """Sum (B,) of values (N,) over each bubble."""
-        sums: Array = np.bincount(self.owner, weights=values, minlength=self.bubbles)
-        return sums
+        weights = values.astype(np.float64)
+        return np.bincount(self.owner, weights, self.bubbles).astype(np.float64)
 
     def local(self, ellipse: Array) -> Array:
         """Ellipses (B, 5) with their centres counted from ``origin``."""

@@ -140,7 +140,8 @@ def find_blobs(
         if len(region) < _LEAST_OUTLINE:
             continue
         x, y, width, height = cv2.boundingRect(region)
-        found, reason = [], too_small
+        found: list[Blob] = []
+        reason = too_small
         if max(width, height) >= min_diameter_px:
             box = (x, y, width, height)
             found, reason = _trace(ratio, region, box, low, min_contrast, min_diameter_px)

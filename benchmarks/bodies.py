@@ -324,15 +324,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="write the table there as Markdown")
     options = parser.parse_args()
-    rng = np.random.default_rng(options.seed)
     lines = [HEADER]
     print(HEADER)
     for mode in [*MODES, None]:
-        for axis, ratio in PLACEMENTS:
+        for place, (axis, ratio) in enumerate(PLACEMENTS):
+            rng = np.random.default_rng([options.seed, *(mode or (0, 0)), place])
             case = Case(mode, axis, ratio)
             lines.append(row(case, run_case(case, options.bodies, rng)))
             print(lines[-1], flush=True)
-    notes = [speed(rng), f"{options.bodies} bodies a case, seed {options.seed}"]
+    notes = [
+        speed(np.random.default_rng(options.seed)),
+        f"{options.bodies} bodies a case, seed {options.seed}",
+    ]
     print("\n".join(notes))
     if options.out:
         text = ["# Centre of volume against the mean of the outlines", "", NOTES, "", *lines, ""]

@@ -231,7 +231,7 @@ def test_ten_thousand_pairs_in_a_second(
     first, second = (pd.concat([t] * 834, ignore_index=True)[:10_000] for t in measured[:2])
     begin = time.process_time()
     fit_bodies(first, second, bodies.rig())
-    assert time.process_time() - begin < 1.5
+    assert time.process_time() - begin < 1.0
 
 
 def circle(frame: Array, count: int = 64) -> tuple[Array, Array]:

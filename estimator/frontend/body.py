@@ -43,8 +43,8 @@ class Bodies:
         centres, with the covariance of the outlines' noise alone.
     used : (M,) "volume": points_mm is corrected for the shape; "silhouettes": points_mm is
         silhouette_points_mm (harmonics unknown in a view, an outline that is hidden in part or
-        leaves the image, or nothing to gain), covariance_mm2 with the shape's share; "none": a
-        centre or its covariance is missing, the row is NaN.
+        leaves the image, or rays that pass farther apart than a bubble is large), covariance_mm2
+        with the shape's share; "none": a centre or its covariance is missing, the row is NaN.
     du_px, dv_px : (M, 2) first and second camera: added to the outlines' centres they make them
         measurements of the projected centre of volume; 0 unless used is "volume".
     d_eq_mm, d_eq_sd_mm : (M,) diameter of the sphere of equal volume; semi_axes_mm : (M, 3),
@@ -85,10 +85,12 @@ def fit_bodies(
     outlines = _paired(first, second, cameras)
     sigma = _learned_sigma(outlines) if shape_sigma is None else _checked_sigma(shape_sigma)
     located = outlines[0].located & outlines[1].located
-    shaped = located & outlines[0].shaped & outlines[1].shaped
-    whole = shaped & outlines[0].whole & outlines[1].whole
     bodies = _empty(len(located))
     _fill_points(bodies, outlines, cameras, located)
+    located = np.isfinite(bodies.covariance_mm2).all((1, 2))
+    shaped = located & outlines[0].shaped & outlines[1].shaped
+    shaped[shaped] = _meet(bodies.silhouette_points_mm[shaped], outlines, cameras, shaped)
+    whole = shaped & outlines[0].whole & outlines[1].whole
     for rows, correct in ((whole, True), (shaped & ~whole, False)):
         if np.any(rows):
             pair = (outlines[0].rows(rows), outlines[1].rows(rows))
@@ -180,7 +182,21 @@ def _fill_points(
     for covariance in (bodies.covariance_mm2, bodies.silhouette_covariance_mm2):
         covariance[rows] = found.covariance_mm2
     bodies.ray_miss_mm[rows] = found.ray_miss_mm
-    bodies.used[rows] = "silhouettes"
+    bodies.used[np.isfinite(bodies.covariance_mm2).all((1, 2))] = "silhouettes"
+
+
+def _meet(
+    points_mm: Array,
+    outlines: tuple[Outlines, Outlines],
+    cameras: tuple[Camera, Camera],
+    rows: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """(M,) the triangulated point is seen inside both outlines: they may be one body's."""
+    pixels, _, _ = stacked_jacobian(cameras, points_mm)
+    pair = [o.rows(rows) for o in outlines]
+    gap = np.concatenate([o.uv_px for o in pair], -1) - pixels
+    extent = np.minimum(*(np.linalg.norm(o.axes_px, axis=1).max(-1) for o in pair))
+    return np.asarray((np.abs(gap) < extent[:, None]).all(-1))
 
 
 def _fill_shapes(

@@ -151,7 +151,7 @@ def _account(views: Views, prior: Array) -> Account:
     covariance = np.asarray(np.linalg.inv(normal))
     step = _mv(covariance @ weighted, views.measured)
     misfit = _mv(inverse, views.measured) - _mv(_t(weighted), step)
-    log_det = -np.linalg.slogdet(total)[1] - np.log(np.linalg.det(normal))
+    log_det = -np.linalg.slogdet(total)[1] - np.linalg.slogdet(normal)[1]
     log_evidence = 0.5 * (log_det - (views.measured * misfit).sum(-1))
     return Account(step, covariance, _mv(prior, misfit)[:, :4], log_evidence)
 

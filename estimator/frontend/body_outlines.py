@@ -15,6 +15,7 @@ Mask = NDArray[np.bool_]
 
 _SAMPLES = 32
 _LEAST_PX2 = 1e-12
+_FLOOR_PX2 = 1e-6  # no outline is known better; keeps the algebra regular
 _BLOCKING = ("border", "overlap", "merged")
 _TRACE_ORDERS = (1, 3, 4)
 
@@ -63,7 +64,7 @@ def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> 
     }
     uv = np.stack([numbers["u_px"], numbers["v_px"]], -1)
     suu, suv, svv = (numbers[f"s{n}_px2"] for n in ("uu", "uv", "vv"))
-    covariance = np.stack([suu, suv, suv, svv], -1).reshape(-1, 2, 2)
+    covariance = np.stack([suu, suv, suv, svv], -1).reshape(-1, 2, 2) + _FLOOR_PX2 * np.eye(2)
     size = np.asarray(image_size_px, float)
     located = (np.abs(uv - size / 2) < 1.5 * size).all(-1)
     located &= np.isfinite(suu) & np.isfinite(svv) & (suu > _LEAST_PX2) & (svv > _LEAST_PX2)
@@ -82,7 +83,7 @@ def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> 
         covariance,
         axes,
         np.einsum("mij,mj->mi", gain, displacement),
-        gain @ np.swapaxes(gain, -1, -2) * (sigma**2)[:, None, None],
+        gain @ np.swapaxes(gain, -1, -2) * (sigma**2 + _FLOOR_PX2)[:, None, None],
         located,
         shaped,
         shaped & known & ~_blocked(table),

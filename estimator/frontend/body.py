@@ -87,7 +87,7 @@ def fit_bodies(
     located = outlines[0].located & outlines[1].located
     bodies = _empty(len(located))
     _fill_points(bodies, outlines, cameras, located)
-    located = np.isfinite(bodies.covariance_mm2).all((1, 2))
+    located = bodies.used == "silhouettes"
     shaped = located & outlines[0].shaped & outlines[1].shaped
     shaped[shaped] = _meet(bodies.silhouette_points_mm[shaped], outlines, cameras, shaped)
     whole = shaped & outlines[0].whole & outlines[1].whole

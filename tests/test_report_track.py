@@ -22,7 +22,12 @@ from telerig.io.report import contact_sheet as sheets
 from telerig.io.report.bubble_overlay import draw_binary, draw_bubble_overlay
 from telerig.io.report.track_figures import time_series
 from telerig.io.report.track_figures_rays import ray_miss_in_space, seen_where
-from telerig.io.report.track_numbers import per_frame, ray_miss_ratio, ray_miss_sd_mm
+from telerig.io.report.track_numbers import (
+    learnt_sd_mm,
+    per_frame,
+    ray_miss_ratio,
+    ray_miss_sd_mm,
+)
 from telerig.io.report.track_report import write_track_report
 from telerig.io.report.track_results import TrackResults, read_track_results
 from telerig.io.report.track_scene import thinned, track_scene_json
@@ -319,9 +324,23 @@ def test_a_biased_calibration_is_named_first_and_seen_in_the_rays(tmp_path: Path
     assert off_um == pytest.approx(1e3 * 1.8 / SCALE, rel=0.1)
 
 
+def test_shake_learnt_from_the_run_accounts_for_the_ray_miss(folder: Path) -> None:
+    table = pd.read_csv(folder / "tracks.csv")
+    rng = np.random.default_rng(8)
+    _edit_table(folder, "tracks", ray_miss_mm=0.08 * rng.standard_normal(len(table)))
+    quiet = read_track_results(folder)
+    assert "Rays miss by" in verdict(quiet).warnings[0]
+    pairs = quiet.pairs | {"frame_px": 1.5, "scatter_px": 0.2}
+    results = read_track_results(_edit(folder, pairs=pairs))
+    assert learnt_sd_mm(results) == pytest.approx(np.hypot(1.5, 0.2) / SCALE, rel=2e-3)
+    assert not verdict(results).warnings
+    assert "shake against each other (1.5 px from frame to frame)" in verdict(results).sentences[-1]
+
+
 def test_covariances_too_small_and_few_partners_are_warned_of(folder: Path) -> None:
     table = pd.read_csv(folder / "tracks.csv")
     small = {name: table[name] / 100 for name in table if name.endswith("_px2")}
+    _edit(folder, pairs={"scatter_px": 0.0, "frame_px": 0.0})
     results = read_track_results(_edit_table(folder, "tracks", **small))
     assert "worse than the covariances" in verdict(results).warnings[0]
     table.iloc[: len(table) // 3].to_csv(folder / "tracks.csv", index=False)

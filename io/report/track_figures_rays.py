@@ -19,7 +19,7 @@ from telerig.io.report.figures_common import (
     png,
     svg,
 )
-from telerig.io.report.track_numbers import median, ray_miss_sd_mm
+from telerig.io.report.track_numbers import learnt_sd_mm, median, ray_miss_sd_mm
 from telerig.io.report.track_results import TrackResults
 from telerig.io.report.track_scene import SHADES
 from telerig.io.report.words import number, share
@@ -36,7 +36,7 @@ _CELLS = 16
 def ray_miss_histogram(results: TrackResults) -> Picture:
     """Signed ray miss against the distribution that each pair's own noise predicts."""
     miss = 1e3 * results.tracks["ray_miss_mm"].to_numpy(float)
-    sd = _predicted_um(results)
+    sd, learnt = _predicted_um(results), 1e3 * (learnt_sd_mm(results) or 0.0)
     known = miss[np.isfinite(miss)]
     spread = _reach(known, sd)
     edges = np.linspace(-spread, spread, _BINS + 1)
@@ -44,12 +44,18 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
         count, _ = np.histogram(known, edges)
         share_of = count / max(len(known), 1) / np.diff(edges)
         axes.stairs(share_of, edges, color=camera_colour(0), fill=True, alpha=0.5, label="measured")
+        top = float(share_of.max(initial=0.0))
         if sd is not None:
             curve = _mixture(edges, sd)
-            axes.plot(*curve, color="black", linewidth=1.2, label="predicted")
+            axes.plot(*curve, color="black", linewidth=1.2, label="noise of the outlines")
+            top = max(top, min(2 * top, float(curve[1].max())))
+            if learnt > float(np.median(sd)):
+                curve = _mixture(edges, np.hypot(sd, learnt))
+                axes.plot(*curve, color=MODEL, linewidth=1.2, label="with shake and scatter")
+                top = max(top, float(curve[1].max()))
         axes.axvline(0, color=MUTED, linewidth=0.8)
-        axes.set(xlabel="ray miss / µm", ylabel="density per µm", xlim=(-spread, spread))
-        axes.set_ylim(0, 1.25 * axes.get_ylim()[1])
+        axes.set(xlabel="ray miss / µm", ylabel="density", xlim=(-spread, spread), yticks=[])
+        axes.set_ylim(0, 1.3 * max(top, 1e-9))
         axes.legend(loc="upper left")
         source = svg(figure)
     beyond = int(np.sum(np.abs(known) > spread))
@@ -62,7 +68,7 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
     else:
         caption += (
             f"The outlines' noise predicts the black curve (sd {number(median(sd), 2)} µm): a "
-            "shift against it is a biased calibration, more width is shape or wrong pairs."
+            "shift against it is a biased calibration, more width is shake, shape or wrong pairs."
         )
     caption += f" {number(beyond)} points lie beyond the plot." if beyond else ""
     return Picture("Ray miss", source, caption)
@@ -103,8 +109,8 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
     middles, medians, doubt = _steps(place, miss)
     with drawing(2.9) as (figure, axes):
         axes.axhline(0, color=MUTED, linewidth=0.8)
-        axes.plot(place[::step], miss[::step], ".", color=camera_colour(0), markersize=2.5,
-                  markeredgewidth=0, alpha=0.45)  # fmt: skip
+        axes.plot(place[::step], miss[::step], ".", color=camera_colour(0), alpha=0.5,
+                  markersize=2.5 if len(miss) > 1000 else 5, markeredgewidth=0)  # fmt: skip
         axes.errorbar(middles, medians, doubt, color=MODEL, fmt="o-", markersize=3.5, linewidth=1.2,
                       label="median of a step")  # fmt: skip
         axes.set(xlabel=f"{name} / mm", ylabel="ray miss / µm", ylim=(-reach, 1.2 * reach))

@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.io.report.track_results import TrackResults
+from telerig.io.report.words import is_number
 
 Array = NDArray[np.float64]
 
 _MOST_ROWS = 20_000
 _LEAST_SPREAD_MM = 0.1
 _LEAST_ROWS = 12
-_NORMAL_MEDIAN = 0.6745
+NORMAL_MEDIAN = 0.6745
+"""Of the absolute value, in standard deviations."""
 
 
 def ray_miss_sd_mm(results: TrackResults) -> Array | None:
@@ -22,24 +24,42 @@ def ray_miss_sd_mm(results: TrackResults) -> Array | None:
     fitted to them gives the rays' directions and what a pixel is worth along the common
     perpendicular, to the lens's residual perspective. It takes points that fill some space.
     """
-    if len(results.cameras) != 2:
+    worth = _mm_per_px(results)
+    if worth is None:
         return None
+    variance = np.zeros(len(results.tracks))
+    for camera, per_px in zip(results.cameras, worth):
+        columns = [f"{camera}_{name}" for name in ("suu_px2", "suv_px2", "svv_px2")]
+        uu, uv, vv = results.tracks[columns].to_numpy(float).T
+        variance += per_px[0] ** 2 * uu + 2 * per_px[0] * per_px[1] * uv + per_px[1] ** 2 * vv
+    return np.sqrt(np.where(variance > 0, variance, np.nan))
+
+
+def learnt_sd_mm(results: TrackResults) -> float | None:
+    """What pairs were found to scatter besides: shake of the cameras against each other, shapes.
+
+    From ``frame_px`` and ``scatter_px`` of tracking.json; None where that is not known.
+    """
+    worth = _mm_per_px(results)
+    frame, scatter = (results.pairs.get(name) for name in ("frame_px", "scatter_px"))
+    if worth is None or not (is_number(frame) and is_number(scatter)):
+        return None
+    apart_px = np.linalg.norm(np.array([frame, scatter], float))
+    return float(apart_px * np.linalg.norm(worth, axis=1).mean())
+
+
+def _mm_per_px(results: TrackResults) -> Array | None:
+    """(2, 2) by camera, what one px of u and of v moves a ray along the common perpendicular."""
     maps = [_affine(results, camera) for camera in results.cameras]
     known = [m for m in maps if m is not None]
-    if len(known) < 2:
+    if len(known) != 2:
         return None
     first, second = (np.cross(m[0], m[1]) for m in known)
     across = np.cross(first, second)
     length = np.linalg.norm(across)
     if length < 1e-9:
         return None
-    variance = np.zeros(len(results.tracks))
-    for camera, affine in zip(results.cameras, known):
-        per_px = np.linalg.lstsq(affine.T, across / length, rcond=None)[0]
-        columns = [f"{camera}_{name}" for name in ("suu_px2", "suv_px2", "svv_px2")]
-        uu, uv, vv = results.tracks[columns].to_numpy(float).T
-        variance += per_px[0] ** 2 * uu + 2 * per_px[0] * per_px[1] * uv + per_px[1] ** 2 * vv
-    return np.sqrt(np.where(variance > 0, variance, np.nan))
+    return np.array([np.linalg.lstsq(m.T, across / length, rcond=None)[0] for m in known])
 
 
 def _affine(results: TrackResults, camera: str) -> Array | None:
@@ -68,7 +88,7 @@ def ray_miss_ratio(
     miss = results.tracks["ray_miss_mm"].to_numpy(float)
     units = np.abs(miss - (median(miss) or 0.0 if centred else 0.0)) / predicted_mm
     units = units[np.isfinite(units)]
-    return float(np.median(units)) / _NORMAL_MEDIAN if len(units) else None
+    return float(np.median(units)) / NORMAL_MEDIAN if len(units) else None
 
 
 def median(values: Array) -> float | None:

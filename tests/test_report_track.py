@@ -410,7 +410,7 @@ def test_importing_the_report_draws_in_no_plotting_library() -> None:
     [
         ("tracking.json", None, "no tracks here"),
         ("tracking.json", "{", "JSON"),
-        ("tracking.json", '{"kind": "telerig calibration"}', "is not a tracks"),
+        ("tracking.json", '{"kind": "telerig calibration"}', "is not a tracks file"),
         ("tracking.json", '{"kind": "telerig tracks", "schema": 9}', "newer"),
         ("tracking.json", '{"kind": "telerig tracks", "schema": 1, "pairs": 3}', "garbles 'pairs'"),
         ("tracks.csv", None, "cannot be read"),

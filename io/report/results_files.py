@@ -24,7 +24,7 @@ def read_object(file: Path, todo: str) -> Mapping[str, Any]:
 def check_kind(content: Mapping[str, Any], file: Path, kind: str, schema: int, todo: str) -> None:
     """Raise InputError unless telerig wrote ``content`` as ``kind``, in a schema known here."""
     if content.get("kind") != f"telerig {kind}":
-        raise InputError(f"is not a {kind} that telerig wrote", where=str(file), todo=todo)
+        raise InputError(f"is not a {kind} file that telerig wrote", where=str(file), todo=todo)
     found = content.get("schema")
     if not isinstance(found, int) or found > schema:
         raise InputError(

@@ -47,6 +47,17 @@ class Motion:
         terms = ((self.by_next, following), (self.by_last, last), (self.by_input, constant))
         return np.asarray(sum(np.einsum("mij,mj->mi", a[i], x) for a, x in terms))
 
+    def in_basis(self, following: NDArray[np.int64]) -> tuple[Array, Array]:
+        """(M, n, n) by_last and by_next for increments in the bases of the two states.
+
+        following : (M,) index into ``basis`` of each step's second state.
+        """
+        count = len(self.basis)
+        own, place = np.unique(self.index * count + following % count, return_inverse=True)
+        step, after = np.divmod(own, count)
+        last = self.by_last[step] @ self.basis[step]
+        return last[place], (self.by_next[step] @ self.basis[after])[place]
+
 
 def motion(components: Sequence[Component], dt_s: ArrayLike) -> Motion:
     """The steps (M,) of independent components, states and inputs one after the other."""

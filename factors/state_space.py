@@ -139,6 +139,30 @@ def white_jerk(
     )
 
 
+def forced_mass(
+    acceleration_rms_mm_s2: float,
+    *,
+    corner_hz: float = 60.0,
+    start_sigma_mm: float = 100.0,
+    start_sigma_mm_s: float = 1000.0,
+) -> Component:
+    """A carriage under a smooth force: its acceleration is white noise through three equal poles.
+
+    States (position, velocity, acceleration and two more of the force). Smoother than white jerk
+    on purpose: what a prior holds possible above a sensor's rate folds into the sensor's band and
+    drowns an accelerometer.
+    """
+    _positive(acceleration_rms_mm_s2=acceleration_rms_mm_s2, corner_hz=corner_hz)
+    corner = 2 * np.pi * corner_hz
+    force = np.diag([-corner] * 3) + np.diag([1.0, 1.0], 1)
+    scaled = _scaled("force", force, np.array([1.0, 0.0, 0.0]), acceleration_rms_mm_s2)
+    drift = np.diag([0.0, 0.0, -corner, -corner, -corner]) + np.diag([1.0] * 4, 1)
+    noise = np.vstack([np.zeros((2, 1)), scaled.noise])
+    start = np.diag([start_sigma_mm**2, start_sigma_mm_s**2, 0.0, 0.0, 0.0])
+    start[2:, 2:] = scaled.start_covariance
+    return _component("forced_mass", drift, noise, start, acceleration=[0.0, 0.0, 1.0, 0.0, 0.0])
+
+
 def oscillator(rms_mm: float, frequency_hz: float, damping: float) -> Component:
     """States (displacement, velocity) of a resonator driven by white noise: zigzag, rough mode."""
     _positive(rms_mm=rms_mm, frequency_hz=frequency_hz, damping=damping)

@@ -18,6 +18,7 @@ from telerig.factors.state_space import (
     Component,
     broad_band,
     driven_mode,
+    forced_mass,
     independent,
     oscillator,
     ou_velocity,
@@ -152,6 +153,10 @@ def _carriage(problem: SmoothingProblem, model: ShakeModel) -> list[_Placed]:
         part = white_jerk(
             model.carriage.jerk_density, start_sigma_mm_s=1000.0, start_sigma_mm_s2=5000.0
         )
+    elif model.carriage.kind == "force":
+        part = forced_mass(
+            model.carriage.acceleration_rms_mm_s2, corner_hz=model.carriage.corner_hz
+        )
     else:
         part = independent(_READING_SIGMA_MM)
     placed = [_Placed(part, "carriage", problem.axis, CARRIAGE, "carriage")]
@@ -247,7 +252,7 @@ def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[fl
     A reading that is not exactly at its node is carried there by the derivatives of the state, so
     that no step is so short that its noise drowns in rounding.
     """
-    with_encoder = problem.stage is not None and model.carriage.kind == "jerk"
+    with_encoder = problem.stage is not None and model.carriage.kind != "readings"
     encoder = problem.stage.t_s if problem.stage is not None and with_encoder else np.zeros(0)
     sensors = [a.t_s - d for a, d in zip(problem.accelerometers, delays_s)]
     sources = [problem.t_s, encoder, *sensors]

@@ -6,7 +6,6 @@ shake and bubble states are in their whitening basis.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +54,7 @@ def _shake_motion(frame: Frame, state: State) -> list[Linear]:
     if not layout.size:
         return []
     keys = np.arange(len(frame.nodes.t_s))
+    steps = frame.shake_motion
     deviation = state.shake.copy()
     at = 0
     for i, component in enumerate(layout.components):
@@ -63,16 +63,14 @@ def _shake_motion(frame: Frame, state: State) -> list[Linear]:
         elif i == 0 and frame.problem.stage is not None:
             deviation[:, at] -= frame.nominal_mm[0]
         at += component.size
-    steps, basis = frame.shake_motion, frame.shake_basis(keys)
     residual = steps.residual(deviation[:-1], deviation[1:], np.zeros(0))
-    i = steps.index
-    blocks = (steps.by_last[i] @ basis[:-1], steps.by_next[i] @ basis[1:])
-    between = Linear((keys[:-1], keys[1:]), blocks, -residual, steps.log_det[i])
+    blocks = steps.in_basis(np.append(steps.index[1:], -1))
+    between = Linear((keys[:-1], keys[1:]), blocks, -residual, steps.log_det[steps.index])
     covariance, _ = start(layout.components)
     whitener = whitener_of(covariance)
     first = Linear(
         (keys[:1],),
-        ((whitener @ basis[0])[None],),
+        ((whitener @ frame.shake_basis(0))[None],),
         -(whitener @ deviation[0])[None],
         _log_det(whitener)[None],
     )
@@ -104,8 +102,7 @@ def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
     residual = steps.residual(state.bubbles[rows], state.bubbles[rows + 1], means[owner])
     i = steps.index
     blocks = (
-        steps.by_last[i] @ frame.bubble_basis(rows),
-        steps.by_next[i] @ frame.bubble_basis(rows + 1),
+        *steps.in_basis(frame.row_basis[rows + 1]),
         _with_columns(steps.by_input, frame.mean_size)[i],
     )
     keys = (base[1] + rows, base[1] + rows + 1, base[2] + owner)
@@ -249,7 +246,7 @@ def encoder(frame: Frame, state: State) -> list[Linear]:
     stage, nodes = problem.stage, frame.nodes
     if stage is None:
         return []
-    if model.carriage.kind == "jerk":
+    if model.carriage.kind != "readings":
         node, late, reading = nodes.of_encoder, nodes.encoder_late_s, stage.position_mm
         rows = layout.position + late[:, None] * layout.velocity
         speed = state.shake[node] @ layout.velocity
@@ -342,15 +339,18 @@ def speeds(frame: Frame, state: State) -> list[Linear]:
     return [Linear(keys, (by_state, by_mean), -value[:, None] / sigma, log_det)]
 
 
-def all_factors(
-    frame: Frame, state: State, weights: Sequence[Array]
-) -> tuple[list[Linear], Array, Array]:
-    """Every factor of the graph, and the whitened residuals of bubbles' and marks' pixels."""
-    bubbles = images(frame, state, weights[0])
-    marks = references(frame, state, weights[1])
-    out = priors_and_motion(frame, state) + bubbles.linear + marks.linear
-    out += encoder(frame, state) + accelerometers(frame, state) + speeds(frame, state)
-    return out, bubbles.residual, marks.residual
+def all_factors(frame: Frame, state: State, weights: tuple[Array, Array]) -> list[Linear]:
+    """Every factor of the graph; weights of the bubbles' and of the marks' pixels."""
+    out = priors_and_motion(frame, state)
+    out += images(frame, state, weights[0]).linear + references(frame, state, weights[1]).linear
+    return out + encoder(frame, state) + accelerometers(frame, state) + speeds(frame, state)
+
+
+def pixel_residuals(frame: Frame, state: State) -> tuple[Array, Array]:
+    """Whitened residuals of the bubbles' (M, 2) and of the marks' pixels (R, 2)."""
+    problem = frame.problem
+    ones = np.ones(len(problem.observations)), np.ones(len(problem.references))
+    return images(frame, state, ones[0]).residual, references(frame, state, ones[1]).residual
 
 
 def _log_det(whitener: Array) -> Array:

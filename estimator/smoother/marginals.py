@@ -19,10 +19,13 @@ from scipy.linalg.lapack import dtrtri
 Array = NDArray[np.float64]
 
 
-def marginal_covariances(net: Any, sizes: Sequence[int], wanted: set[int]) -> dict[int, Array]:
+def marginal_covariances(
+    net: Any, sizes: Sequence[int], wanted: set[int], pairs: set[tuple[int, int]]
+) -> tuple[dict[int, Array], dict[tuple[int, int], Array]]:
     """Covariance (d, d) of each wanted key of a `gtsam.GaussianBayesNet` (one key a conditional).
 
-    sizes : dimension of each key, keys counting from 0.
+    sizes : dimension of each key, keys counting from 0.  pairs : (key, later key) of one clique
+    whose cross covariances (d, e) are wanted too.
     """
     count = int(net.size())
     conditionals = [net.at(i) for i in range(count)]
@@ -35,6 +38,10 @@ def marginal_covariances(net: Any, sizes: Sequence[int], wanted: set[int]) -> di
     joint: dict[int, tuple[list[int], Array]] = {}
     patterns: dict[tuple[Any, ...], NDArray[np.int64]] = {}
     out: dict[int, Array] = {}
+    crossed: dict[tuple[int, int], Array] = {}
+    of_first: dict[int, list[int]] = {}
+    for first, second in pairs:
+        of_first.setdefault(first, []).append(second)
     for conditional, clique, parent in zip(conditionals[::-1], keys[::-1], parents[::-1]):
         own, size = clique[0], sizes[clique[0]]
         inverse, _ = dtrtri(conditional.R())
@@ -53,9 +60,12 @@ def marginal_covariances(net: Any, sizes: Sequence[int], wanted: set[int]) -> di
                 del joint[parent]
         if own in wanted:
             out[own] = block[:size, :size].copy()
+        for other in of_first.get(own, ()):
+            at = sum(sizes[k] for k in clique[: clique.index(other)])
+            crossed[own, other] = block[:size, at : at + sizes[other]].copy()
         if children[own]:
             joint[own] = (clique, block)
-    return out
+    return out, crossed
 
 
 def _within(

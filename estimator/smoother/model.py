@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,12 +91,15 @@ class PitchMode:
 class CarriageModel:
     """How the carriage moves along the axis.
 
-    kind : "readings" (no dynamics: the position at a frame is what the encoder reads there) or
-        "jerk" (white jerk; what accelerometers and slow encoders need).
-    jerk_density : mm s^-3 / sqrt Hz.  servo : (RMS mm, Hz, damping) of a following error besides.
+    kind : "readings", no dynamics: its position at a frame is what the encoder reads there;
+        "force", an acceleration of the given RMS through three poles at corner_hz, which
+        accelerometers and slow encoders need; "jerk", white jerk of the given density.
+    servo : (RMS mm, Hz, damping) of a following error besides.
     """
 
-    kind: str = "readings"
+    kind: Literal["readings", "force", "jerk"] = "readings"
+    acceleration_rms_mm_s2: float = 1000.0
+    corner_hz: float = 60.0
     jerk_density: float = 1e4
     servo: tuple[float, float, float] | None = None
 

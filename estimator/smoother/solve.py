@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
-from telerig.estimator.smoother.linear import Linear, all_factors
+from telerig.estimator.smoother.linear import Linear, all_factors, pixel_residuals
 from telerig.estimator.smoother.marginals import marginal_covariances
 from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
 from telerig.estimator.smoother.state import Frame, State, first_guess, frame_of
 from telerig.factors.motion import add_linear_factors
+from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -43,10 +44,14 @@ class Options:
 
 @dataclass(frozen=True)
 class Covariances:
-    """shake : (F, Ds, Ds) at the frames.  bubbles : (rows, Db, Db).  Constants one each."""
+    """shake : (F, Ds, Ds) at the frames.  bubbles : (rows, Db, Db).  Constants one each.
+
+    cross : (rows, Ds, Db) of the shake with each bubble at the same frame.
+    """
 
     shake: Array
     bubbles: Array
+    cross: Array
     means: Array
     sensors: Array
     encoder: Array
@@ -107,8 +112,8 @@ def _solve(
         pass_ = _linear_solve(frame, state, weights)
         state = moved(frame, state, pass_.step)
         done += 1
-        factors, *residuals = all_factors(frame, state, weights)
-        weights, changed = robust.update(weights, (residuals[0], residuals[1]))
+        residuals = pixel_residuals(frame, state)
+        weights, changed = robust.update(weights, residuals)
         still = pass_.largest_px < options.tolerance_px and not changed
         frame, state, restamped = _restamped(frame, state)
         if done >= options.passes or (still and not restamped):
@@ -120,7 +125,7 @@ def _solve(
 
 def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
     """Whether one pass is exact: affine cameras, no bilinear constants."""
-    flat = all(not np.any(c.intrinsics[4:]) for c in problem.cameras)
+    flat = all(not np.any(c.intrinsics[INDEX["kappa_per_mm"] :]) for c in problem.cameras)
     held = (
         model.encoder_scale_sigma,
         model.encoder_delay_sigma_s,
@@ -142,7 +147,7 @@ class _Pass:
 def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _Pass:
     import gtsam
 
-    factors, *_ = all_factors(frame, state, weights)
+    factors = all_factors(frame, state, weights)
     graph = gtsam.GaussianFactorGraph()
     for linear in factors:
         add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
@@ -179,9 +184,10 @@ def _eliminated(graph: Any, ordering: Any) -> tuple[Any, Any]:
 
 def _log_norm(frame: Frame, factors: list[Linear]) -> float:
     """log of the joint density's normalisation, the change to whitening bases included."""
-    nodes, rows = np.arange(len(frame.nodes.t_s)), np.arange(frame.rows)
-    bases = [np.linalg.slogdet(b)[1] for b in (frame.shake_basis(nodes), frame.bubble_basis(rows))]
-    return float(bases[0].sum() + bases[1].sum()) + sum(f.log_norm() for f in factors)
+    shake, bubble = frame.shake_motion, frame.bubble_motion
+    of_nodes = np.linalg.slogdet(shake.basis)[1][np.append(shake.index, -1)]
+    of_rows = np.linalg.slogdet(bubble.basis)[1][frame.row_basis]
+    return float(of_nodes.sum() + of_rows.sum()) + sum(f.log_norm() for f in factors)
 
 
 def _ordering(frame: Frame) -> Any:
@@ -310,15 +316,20 @@ def _finish(
     weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
     last = _linear_solve(frame, state, weights)
     state = moved(frame, state, last.step)
-    _, *residuals = all_factors(frame, state, weights)
     dimension = sum(n * d for n, d in frame.counts())
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
-    evidence -= last.net.logDeterminant()
+    evidence -= _log_det(last.net)
     found = _covariances(frame, last.net, progress) if options.covariances else None
     progress("smoothing", 1.0)
     return Solution(
-        frame, state, found, weights, (residuals[0], residuals[1]), float(evidence), done + 1
+        frame, state, found, weights, pixel_residuals(frame, state), float(evidence), done + 1
     )
+
+
+def _log_det(net: Any) -> float:
+    """log |R|; QR leaves signs on the diagonal."""
+    diagonals = (np.diagonal(net.at(i).R()) for i in range(net.size()))
+    return float(sum(np.log(np.abs(d)).sum() for d in diagonals))
 
 
 def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
@@ -328,7 +339,9 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
     at_frames = frame.nodes.of_frame.tolist() if counts[0][1] else []
     wanted = set(at_frames).union(*families[1:])
     sizes = [d for n, d in counts for _ in range(n)]
-    found = marginal_covariances(net, sizes, wanted)
+    rows = base[1] + np.arange(frame.rows)
+    pairs = list(zip(frame.node_of_row.tolist(), rows.tolist())) if counts[0][1] else []
+    found, crossed = marginal_covariances(net, sizes, wanted, set(pairs))
 
     def of(keys: Sequence[int], i: int) -> Array:
         number, size = len(problem_frames) if i == 0 else counts[i][0], counts[i][1]
@@ -340,8 +353,11 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
     bubble_basis = frame.bubble_basis(np.arange(frame.rows))
     shake = shake_basis @ blocks[0] @ np.swapaxes(shake_basis, -1, -2)
     bubbles = bubble_basis @ blocks[1] @ np.swapaxes(bubble_basis, -1, -2)
+    cross = np.array([crossed[pair] for pair in pairs])
+    cross = cross.reshape(frame.rows, counts[0][1], counts[1][1])
+    cross = frame.shake_basis(frame.node_of_row) @ cross @ np.swapaxes(bubble_basis, -1, -2)
     return Covariances(
-        shake, bubbles, blocks[2], blocks[3], blocks[4][0], blocks[5][0], blocks[6]
+        shake, bubbles, cross, blocks[2], blocks[3], blocks[4][0], blocks[5][0], blocks[6]
     )
 
 

@@ -68,14 +68,15 @@ class Frame:
         return np.asarray(self.shake_motion.basis[_basis_index(self.shake_motion.index, node)])
 
     @cached_property
-    def _row_index(self) -> Ints:
+    def row_basis(self) -> Ints:
+        """(rows,) which basis of the bubbles' motion each row has."""
         out = np.full(self.rows, len(self.bubble_motion.basis) - 1)
         out[self.moving_rows] = self.bubble_motion.index
         return out
 
     def bubble_basis(self, row: ArrayLike) -> Array:
         """(..., D, D) basis of the increments of bubble rows (...)."""
-        return np.asarray(self.bubble_motion.basis[self._row_index[row]])
+        return np.asarray(self.bubble_motion.basis[self.row_basis[row]])
 
     @property
     def rows(self) -> int:
@@ -174,7 +175,6 @@ def first_guess(frame: Frame) -> State:
 
 def _guess_carriage(frame: Frame, shake: Array) -> None:
     t, s = frame.nodes.t_s, frame.nominal_mm
-    derivatives = [s, np.gradient(s, t), np.zeros_like(s)]
-    size = frame.shake.components[0].size
-    for i in range(size):
-        shake[:, i] = derivatives[i]
+    shake[:, 0] = s
+    if not frame.shake.components[0].memoryless:
+        shake[:, 1] = np.gradient(s, t)

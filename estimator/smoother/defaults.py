@@ -1,0 +1,140 @@
+"""Priors for users who have given none, from what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoother.model import (
+    CARRIAGE,
+    BroadBand,
+    BubbleModel,
+    CarriageModel,
+    RigMode,
+    ShakeModel,
+    SmoothingProblem,
+    Stage,
+    Zigzag,
+)
+
+Array = NDArray[np.float64]
+
+SHAKE_RMS_MM = 0.2
+DELAY_SIGMA_S = 0.002
+_ZIGZAG_HZ = (3.0, 12.0)
+_ZIGZAG_RMS_MM = 0.3
+_INTERPOLATION_SHARE = 0.3
+
+
+def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
+    """With marks or arm sensors a broad prior of the shake; else a guess at its modes."""
+    arms = {a.camera for a in problem.accelerometers if a.camera != CARRIAGE}
+    bands: tuple[BroadBand, ...] = ()
+    modes: tuple[RigMode, ...] = ()
+    rms = (SHAKE_RMS_MM,) * 3
+    cameras = range(len(problem.cameras))
+    if len(problem.references) or len(arms) == len(problem.cameras):
+        bands = tuple(_band(j) for j in cameras)
+    elif problem.accelerometers:
+        bands = (_band(CARRIAGE), *(replace(_band(j), rms_mm=(0.07,) * 3) for j in cameras))
+    else:
+        modes = (RigMode(12.0, 0.2, (0.1,) * 3, force_hz=None),)
+        modes += tuple(RigMode(19.0, 0.2, (0.05,) * 3, j, None) for j in cameras)
+    del rms
+    return ShakeModel(
+        bubble=default_bubble(problem),
+        modes=modes,
+        broad_bands=bands,
+        carriage=default_carriage(problem, encoder_sigma_mm),
+        encoder_sigma_mm=encoder_sigma_mm,
+        accelerometer_delay_sigma_s=DELAY_SIGMA_S if problem.accelerometers else 0.0,
+        name="default",
+    )
+
+
+def _band(camera: int) -> BroadBand:
+    return BroadBand(
+        (SHAKE_RMS_MM,) * 3, camera, low_hz=8.0, high_hz=60.0, slow_rms_mm=0.02, slow_tau_s=0.1
+    )
+
+
+def default_bubble(problem: SmoothingProblem) -> BubbleModel:
+    """Zigzag where the tracks show one, with its second harmonic upwards."""
+    found = zigzag(problem)
+    if found is None:
+        return BubbleModel(zigzags=())
+    frequency, rms = found
+    across = 1 - np.abs(problem.up)
+    up = np.abs(problem.up)
+    return BubbleModel(
+        zigzags=(
+            Zigzag(frequency, 0.05, _triple(rms * across)),
+            Zigzag(2 * frequency, 0.05, _triple(0.15 * up)),
+        )
+    )
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(v) if v > 1e-6 else 0.0 for v in values)
+    return x, y, z
+
+
+def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
+    """Frequency (Hz) and RMS (mm) of the bubbles' swing across the vertical; None without one.
+
+    A least-squares sine through each track over a range of frequencies, drift removed.
+    """
+    trials = np.arange(_ZIGZAG_HZ[0], _ZIGZAG_HZ[1], 0.25)
+    power, total, samples = np.zeros(len(trials)), 0.0, 0
+    for bubble in problem.bubbles[:20]:
+        t = problem.t_s[bubble.first : bubble.last + 1]
+        if len(bubble) < 12 or t[-1] - t[0] < 1.5 / _ZIGZAG_HZ[0]:
+            continue
+        across = bubble.guess_mm - (bubble.guess_mm @ problem.up)[:, None] * problem.up
+        x = (t - t.mean()) / (t[-1] - t[0])
+        drift = np.stack([np.ones_like(x), x, x**2], -1)
+        rest = across - drift @ np.linalg.lstsq(drift, across, rcond=None)[0]
+        for i, f in enumerate(trials):
+            wave = np.stack([np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)], -1)
+            fit = wave @ np.linalg.lstsq(wave, rest, rcond=None)[0]
+            power[i] += (fit**2).sum()
+        total, samples = total + (rest**2).sum(), samples + 2 * len(t)
+    if not samples or power.max() < 0.4 * total:
+        return None
+    rms = float(np.sqrt(total / samples))
+    return (float(trials[power.argmax()]), rms) if rms > _ZIGZAG_RMS_MM else None
+
+
+def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> CarriageModel:
+    """Readings as they are, unless sensors or a slow encoder ask how the carriage moves between."""
+    stage = problem.stage
+    if stage is None:
+        return CarriageModel()
+    wanted = bool(problem.accelerometers) or not _dense(stage, problem.t_s, encoder_sigma_mm)
+    if not wanted:
+        return CarriageModel()
+    rms = acceleration_rms(stage)
+    return CarriageModel("force", acceleration_rms_mm_s2=max(1.5 * rms, 100.0))
+
+
+def _dense(stage: Stage, t_s: Array, sigma_mm: float) -> bool:
+    """Whether a straight line between two readings misses less than their noise."""
+    if len(stage.t_s) < 3:
+        return False
+    step = float(np.median(np.diff(stage.t_s)))
+    bend = acceleration_rms(stage) * step**2 / 8
+    return bend < _INTERPOLATION_SHARE * max(sigma_mm, 1e-4)
+
+
+def acceleration_rms(stage: Stage) -> float:
+    """mm/s^2, of parabolas through windows of about 20 ms."""
+    step = float(np.median(np.diff(stage.t_s)))
+    window = int(np.clip(round(0.02 / step) // 2 * 2 + 1, 5, len(stage.t_s) // 2 * 2 - 1))
+    if window < 5:
+        return 1000.0
+    x = (np.arange(window) - window // 2) * step
+    parabola = np.linalg.pinv(np.stack([np.ones(window), x, x**2], -1))[2] * 2
+    bend = np.convolve(stage.position_mm, parabola[::-1], mode="valid")
+    return float(np.sqrt(np.mean(bend**2)))

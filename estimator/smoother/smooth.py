@@ -1,0 +1,224 @@
+"""`telerig.smooth`: the motion of the bubbles and the shake of the rig, told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.smoother.defaults import default_model
+from telerig.estimator.smoother.linear import images
+from telerig.estimator.smoother.model import (
+    CARRIAGE,
+    Observations,
+    ShakeModel,
+    SmoothingProblem,
+)
+from telerig.estimator.smoother.results import Smoothing, summary_of
+from telerig.estimator.smoother.sensors import (
+    accelerometers_of,
+    calibration_share,
+    references_of,
+    stage_of,
+)
+from telerig.estimator.smoother.solve import Options, Progress, Solution, solve
+from telerig.estimator.smoother.tables import shake as shake_table
+from telerig.estimator.smoother.tables import trajectories
+from telerig.estimator.smoother.tracked import Tracked, bubbles_of, read_tracks
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration import Calibration
+
+Array = NDArray[np.float64]
+Learn = Callable[[SmoothingProblem], ShakeModel]
+
+_INFLATE_BEYOND = 0.05
+_ENCODER_SIGMA_MM = 0.005
+_SAMPLED = 500
+
+
+def smooth(
+    tracks: Any,
+    calibration: Calibration,
+    *,
+    stage: Any = None,
+    accelerometers: Any = None,
+    references: Any = None,
+    model: ShakeModel | Learn | str = "auto",
+    rig: Any = None,
+    t_s: ArrayLike | None = None,
+    options: Options = Options(),
+    progress: Progress | None = None,
+) -> Smoothing:
+    """Smooth a run: every bubble in the lab, every camera's shake, with what is known of them.
+
+    tracks : `Tracks`, a table like tracks.csv, or None to estimate offsets alone.
+    stage : a table t_s, position_mm, or the `RunData` that holds all of the run's records, which
+        then are used where nothing else is given.
+    accelerometers : a table t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2, whose sensors ``rig``
+        describes, or a mapping of name to {t_s, a_m_s2 (N, 3), mounted_on, axes,
+        noise_density_ug_sqrt_hz}.
+    references : a table frame, camera, mark, u_px, v_px[, sigma_px].
+    model : "auto" (defaults for the information at hand; learned modes for images alone, where
+        learning is available), "default", a `ShakeModel`, or a function that makes one.
+    rig : the description in rig.toml: travel axis, sensors. t_s : (F,) frame times, else those of
+        the tracks.
+
+    Raises InputError for tables that cannot be used together.
+    """
+    problem, tracked, encoder_sigma = problem_of(
+        tracks, calibration, stage=stage, accelerometers=accelerometers,
+        references=references, rig=rig, t_s=t_s,
+    )  # fmt: skip
+    chosen = choose_model(problem, model, encoder_sigma)
+    solution = solve(problem, chosen, options, progress)
+    if not isinstance(model, ShakeModel):
+        inflation = _inflation(solution)
+        if abs(inflation - 1) > _INFLATE_BEYOND:
+            chosen = replace(chosen, pixel_inflation=chosen.pixel_inflation * inflation)
+            solution = solve(problem, chosen, options, progress)
+    verdict = judge(problem, chosen, solution)
+    return Smoothing(
+        trajectories(solution, None if tracked is None else tracked.table),
+        shake_table(solution),
+        verdict,
+        summary_of(solution),
+        chosen,
+        solution,
+    )
+
+
+def problem_of(
+    tracks: Any,
+    calibration: Calibration,
+    *,
+    stage: Any = None,
+    accelerometers: Any = None,
+    references: Any = None,
+    rig: Any = None,
+    t_s: ArrayLike | None = None,
+) -> tuple[SmoothingProblem, Tracked | None, float]:
+    """The smoothing problem of these tables, the tracks read, and the encoder's sd (mm)."""
+    if hasattr(stage, "frame_count"):
+        run = stage
+        stage, rig, t_s = run.stage, run.rig if rig is None else rig, run.t_s
+        accelerometers = run.accelerometers if accelerometers is None else accelerometers
+        references = run.references if references is None else references
+    cameras = calibration.cameras
+    frame_times = None if t_s is None else np.asarray(t_s, float)
+    tracked = None if tracks is None else read_tracks(tracks, cameras, frame_times)
+    times = frame_times if tracked is None else tracked.t_s
+    if times is None:
+        raise InputError(
+            "without tracks nothing says when the frames are",
+            where="smooth",
+            todo="give t_s, the times at which offsets are wanted",
+        )
+    axis, up, encoder_sigma = _stage_geometry(rig)
+    record = stage_of(stage, times)
+    positions = np.zeros(len(times))
+    if record is not None:
+        positions = np.interp(times, record.t_s, record.position_mm)
+    marks, seen = references_of(references, cameras, times, positions, axis)
+    bubbles = () if tracked is None else bubbles_of(tracked, positions, axis)
+    share = None
+    if tracked is not None:
+        points = tracked.table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+        some = points[np.linspace(0, len(points) - 1, min(len(points), 200)).astype(int)]
+        noise = np.median(np.sqrt(tracked.observations.covariance_px2[:, 0, 0]))
+        share = calibration_share(calibration, some, float(noise))
+    problem = SmoothingProblem(
+        cameras, times, axis, up, bubbles,
+        Observations.none() if tracked is None else tracked.observations,
+        record, accelerometers_of(accelerometers, rig, cameras, times), marks, seen, share,
+    )  # fmt: skip
+    return problem, tracked, encoder_sigma
+
+
+def _stage_geometry(rig: Any) -> tuple[Array, Array, float]:
+    """Travel axis, up, and the encoder's sd; without a description, upwards in the images."""
+    described = None if rig is None else rig.stage
+    if described is None:
+        up = np.array([0.0, -1.0, 0.0])
+        return up, up, _ENCODER_SIGMA_MM
+    axis, up = (np.asarray(v, float) for v in (described.axis, described.up))
+    return (
+        axis / np.linalg.norm(axis),
+        up / np.linalg.norm(up),
+        float(described.position_sigma_mm),
+    )
+
+
+def choose_model(
+    problem: SmoothingProblem, model: ShakeModel | Learn | str, encoder_sigma_mm: float
+) -> ShakeModel:
+    """The hyper-parameters: given, default or learned. Raises InputError for an unknown word."""
+    if isinstance(model, ShakeModel):
+        return model
+    if callable(model):
+        return model(problem)
+    if model not in ("auto", "default"):
+        raise InputError(
+            f"model is {model!r}", where="smooth", todo='give "auto", "default" or a ShakeModel'
+        )
+    default = default_model(problem, encoder_sigma_mm)
+    arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
+    known = len(problem.references) > 0 or len(arms) == len(problem.cameras)
+    learning = "telerig.estimator.shake_learning"
+    if model == "auto" and not known and problem.bubbles and find_spec(learning) is not None:
+        learned: ShakeModel = import_module(learning).learn(problem, default)
+        return learned
+    return default
+
+
+def judge(
+    problem: SmoothingProblem, model: ShakeModel, solution: Solution
+) -> Mapping[str, Any]:
+    """The verdict of the identifiability module, where it is installed."""
+    module = "telerig.estimator.identifiability"
+    if not problem.bubbles or find_spec(module) is None:
+        return {}
+    verdict: Mapping[str, Any] = import_module(module).judge(problem, model, solution)
+    return verdict
+
+
+def _inflation(solution: Solution) -> float:
+    """By how much the pixels' stated noise is too small (above 1) or too large.
+
+    From the median, which outliers do not move; the share of the noise that the fit takes up is
+    given back by counting states as far as the pixels determine them.
+    """
+    kept = solution.weights[0] > 0.5
+    if kept.sum() < 30:
+        return 1.0
+    square = (solution.residuals[0][kept] ** 2).sum(-1)
+    spare = 1 - min(_taken_up(solution), 0.9)
+    return float(np.sqrt(np.median(square) / (2 * np.log(2)) / spare))
+
+
+def _taken_up(solution: Solution) -> float:
+    """Mean leverage of a pixel: var(prediction) / var(noise), from the bubbles' covariances."""
+    frame, found = solution.frame, solution.covariances
+    if found is None or not frame.rows:
+        return 0.0
+    linear = images(frame, solution.state, np.ones(len(frame.problem.observations))).linear
+    total, count = 0.0, 0
+    for part in linear:
+        row, node = np.asarray(part.keys[0]) - frame.base()[1], np.asarray(part.keys[1])
+        some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
+        row, node = row[some], node[some]
+        by_bubble = part.blocks[0][some] @ np.linalg.inv(frame.bubble_basis(row))
+        by_shake = part.blocks[1][some] @ np.linalg.inv(frame.shake_basis(node))
+        at = frame.frame_of_row[row]
+        both = by_shake @ found.cross[row]
+        total += float((by_bubble @ found.bubbles[row] * by_bubble).sum())
+        total += float((by_shake @ found.shake[at] * by_shake).sum())
+        total += float(2 * (both * by_bubble).sum())
+        count += 2 * len(row)
+    return total / count

@@ -14,7 +14,9 @@ from telerig.estimator.frontend.bubble_split import Part, parts_of_arcs
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_WAIST, _SLIGHT_WAIST, _POOR_FIT = 0.3, 0.03, 2.5
+_WAISTS = ((0.03, 2.5), (0.3, 1.3), (1.5, 0.0))
+"""Depth of a dent and the chi2_dof above which it counts: strong shape modes are dented too, but
+then the outline's orders describe them."""
 _ASTRAY_PX, _ASTRAY_SHARE = 0.15, 0.005
 _SWOLLEN, _LONG = 1.6, 2.3
 _SHARPEST_ORDER, _WHOLE = 35.0, 0.9
@@ -25,13 +27,13 @@ _BETTER = 0.6
 def impossible_outlines(outlines: Outlines) -> Mask:
     """Outlines (B,) from which the rim strays, or with a waist, which no single bubble has.
 
-    A slight waist counts where the outline's orders do not describe the rim either; whether a
-    partly hidden outline has one cannot be told.
+    The slighter the waist, the worse the outline's orders must describe the rim; whether a partly
+    hidden outline has one cannot be told.
     """
     dent = deepest_dent(outlines.ellipse, outlines.harmonics)
     radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
     sure = dent > 3.0 * _SHARPEST_ORDER * outlines.sigma_outline_px / radius
-    waist = (dent > _WAIST) | ((dent > _SLIGHT_WAIST) & (outlines.chi2_dof > _POOR_FIT))
+    waist = np.any([(dent > depth) & (outlines.chi2_dof > fit) for depth, fit in _WAISTS], axis=0)
     waist &= sure & (outlines.coverage > _WHOLE)
     astray: Mask = outlines.misfit_px > _ASTRAY_PX + _ASTRAY_SHARE * radius
     return waist | astray

@@ -16,7 +16,8 @@ Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _OCTANTS = 8
-_UNLIKE_SHARE, _UNLIKE_SIGMA = 0.03, 3.0
+_UNLIKE_SHARE, _UNLIKE_SIGMA = 0.015, 3.0
+_MARGIN_SIGMA = 0.9
 _REACH_SIGMA, _REACH_PX = 3.2, 1.2
 _THIN_ABOVE_PX = 10.0
 
@@ -156,7 +157,7 @@ def unlike_rim(
 
     Rings are one pixel wide. Inside, a departure towards bright is a heart; outside, one towards
     dark is dirt or a neighbour. ``residual`` is in units of the noise, ``contrast`` (B,) too. A
-    ring counts when its mean is off by 3 % of the contrast and by 3 sigma of its own error.
+    ring counts when its mean is off by 1.5 % of the contrast and by 3 sigma of its own error.
     """
     depth = np.abs(distance)
     rings = int(np.max(depth, initial=0.0)) + 2
@@ -175,5 +176,5 @@ def unlike_rim(
     off = (mean > limit) & (mean * np.sqrt(count) > _UNLIKE_SIGMA) & (count > 1)
     off &= np.arange(rings) >= first_ring
     cut = np.where(np.any(off, axis=1), np.argmax(off, axis=1), rings).astype(np.float32)
-    unlike: Mask = depth > cut.take(sector) - spread(0.5 * sigma, pixels.counts)
+    unlike: Mask = depth > cut.take(sector) - spread(_MARGIN_SIGMA * sigma, pixels.counts)
     return unlike

@@ -41,7 +41,7 @@ Mask = NDArray[np.bool_]
 __all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
 
 _REJECTED_COLUMNS = ["u_px", "v_px", "radius_px", "reason"]
-_MAX_AXIS_RATIO = 3.5
+_MAX_AXIS_RATIO = 3.0
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
 _SMALL_EDGES = 3.0

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.frontend.background_masks import first_masks
 from telerig.estimator.frontend.background_single import DARK, fill_masked, level_of_image
 
 Array = NDArray[np.float64]
@@ -86,11 +87,12 @@ def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> Layers:
     sample = _Sample(stack, shifts, _log_table(stack.dtype))
     gains = _first_gains(sample)
     empty = np.zeros(stack.shape[1:], np.float32)
-    model, spread = _first_rig(sample, _Model(empty, None, (0, 0), gains))
+    masks = first_masks(stack, shifts_px, gains)
+    model, spread, never = _first_rig(sample, _Model(empty, None, (0, 0), gains), masks)
     for _ in range(_STARTS if shifts_px is not None else 0):
-        model = _first_lab(sample, model)
-        model, spread = _first_rig(sample, model)
-    model, marked, covered, usable = _uncovered(sample, *_marked(sample, model), spread)
+        model = _first_lab(sample, model, masks)
+        model, spread, never = _first_rig(sample, model, masks)
+    model, marked, covered, usable = _uncovered(sample, *_marked(sample, model), spread, never)
     for turn in range(_ROUNDS):
         if turn:
             model, marked = _marked(sample, model)
@@ -164,16 +166,24 @@ def _first_gains(sample: _Sample) -> Array:
     return gains
 
 
-def _first_rig(sample: _Sample, model: _Model) -> tuple[_Model, Log]:
-    """The model with the frames' upper quantile, and how far the brighter frames spread."""
+def _first_rig(sample: _Sample, model: _Model, masks: Mask) -> tuple[_Model, Log, Mask]:
+    """The model with the frames' upper quantile, and how far the brighter frames spread.
+
+    masks : (n, H, W) what is left out. Then (H, W) the pixels that no two frames show, filled.
+    """
     rig, spread = np.empty((2, *sample.stack.shape[1:]), np.float32)
     for rows in _blocks(rig.shape[0]):
         log = sample.log(slice(None), rows) - model.gains[:, None, None].astype(np.float32)
         for k, shift in enumerate(sample.shifts):
             log[k] -= model.lab_in(shift, rows)
+        log[masks[:, rows]] = np.nan
         low, rig[rows], high = _quantiles(log, (UPPER - 0.1, UPPER, UPPER + 0.1))
         spread[rows] = high - low
-    return replace(model, rig=rig), spread
+    never = np.isnan(rig)
+    rig[never] = 0
+    if never.any():
+        rig = fill_masked(rig, never, ~never, _along_travel(sample, model))
+    return replace(model, rig=rig), np.nan_to_num(spread), never
 
 
 def _blocks(height: int) -> Iterator[slice]:
@@ -191,7 +201,7 @@ def _quantiles(values: Log, shares: tuple[float, ...]) -> Log:
     return np.ascontiguousarray(found.T).reshape(len(shares), height, width)
 
 
-def _first_lab(sample: _Sample, model: _Model) -> _Model:
+def _first_lab(sample: _Sample, model: _Model, masks: Mask) -> _Model:
     """The model with the lab layer's quantiles over the frames that saw each place."""
     height, width = model.rig.shape
     low, high = np.floor(sample.shifts.min(0)), np.ceil(sample.shifts.max(0))
@@ -202,7 +212,8 @@ def _first_lab(sample: _Sample, model: _Model) -> _Model:
         seen = [
             found
             for k in range(len(sample.stack))
-            if (found := _lab_rows(sample, model, k, rows, origin, lab.shape[1])) is not None
+            if (found := _lab_rows(sample, model, k, masks[k], rows, origin, lab.shape[1]))
+            is not None
         ]
         if seen:
             lab[rows] = np.nan_to_num(_quantiles(np.stack(seen), (UPPER,))[0], nan=0.0)
@@ -210,7 +221,13 @@ def _first_lab(sample: _Sample, model: _Model) -> _Model:
 
 
 def _lab_rows(
-    sample: _Sample, model: _Model, k: int, rows: slice, origin: tuple[int, int], width: int
+    sample: _Sample,
+    model: _Model,
+    k: int,
+    mask: Mask,
+    rows: slice,
+    origin: tuple[int, int],
+    width: int,
 ) -> Log | None:
     """What frame k shows in these rows of the lab, NaN beside it; None when it shows nothing."""
     left, top = sample.shifts[k] - origin
@@ -221,6 +238,7 @@ def _lab_rows(
         return None
     margin = slice(max(first - 2, 0), min(last + 2, height))
     residual = sample.log(k, margin) - np.float32(model.gains[k]) - model.rig[margin]
+    residual[mask[margin]] = np.nan
     moved = _shifted(residual, (column - left, row - top))
     out = np.full((rows.stop - rows.start, width), np.nan, np.float32)
     place = slice(first + row - rows.start, last + row - rows.start)
@@ -296,13 +314,13 @@ def _outliers(residual: Log, sigma: Log) -> Mask:
 
 
 def _uncovered(
-    sample: _Sample, model: _Model, marked: Mask, spread: Log
+    sample: _Sample, model: _Model, marked: Mask, spread: Log, never: Mask
 ) -> tuple[_Model, Mask, Mask, Mask]:
     """The rig layer filled where a bubble kept it dark all the time, and the new marks.
 
     Then (H, W) where it was filled, and what is clean enough to fill from.
 
-    spread : (H, W) of the brighter frames, as `_first_rig` gives it.
+    spread, never : (H, W), as `_first_rig` gives them.
 
     Dirt and a bubble that the rig follows both look dark in the layer, but a bubble's edge
     moves: just outside it the frames differ.
@@ -313,7 +331,7 @@ def _uncovered(
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     share = marked.mean(0, dtype=np.float32)
     usual = float(np.median(share))
-    covered = np.zeros(dark.shape, np.uint8)
+    covered = never.astype(np.uint8)
     for outline in outlines:
         thing = cv2.drawContours(np.zeros_like(dark), [outline], -1, 1, cv2.FILLED)
         around = cv2.dilate(thing, np.ones((7, 7), np.uint8)) > thing

@@ -32,7 +32,7 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Level, Mask]:
     height, width = image.shape
     size = (max(4, width // CELL_PX), max(4, height // CELL_PX))
     log = np.log(np.maximum(cv2.resize(image.astype(np.float32), size, None, 0, 0, 3), 0.5))
-    surface = _bright_surface(log, 4)
+    surface = bright_surface(log, 4)
     for _ in range(3):
         dark = _dark_things(log, surface)
         filled = np.where(dark, surface + _carried(log - surface, ~dark), log).astype(np.float32)
@@ -55,7 +55,7 @@ def fill_masked(
     for window, hole in _holes(mask):
         known = usable[window] & ~mask[window]
         if known.sum() > 30:
-            smooth = _bright_surface(log[window], 2, known)
+            smooth = bright_surface(log[window], 2, known)
             carried = smooth + _carried(log[window] - smooth, known, across)
             surface[window] = np.where(hole, carried, surface[window])
     return surface
@@ -96,7 +96,7 @@ def _carried(residual: Level, known: Mask, across: tuple[float, float] | None = 
     return result
 
 
-def _bright_surface(log: Level, degree: int, known: Mask | None = None) -> Level:
+def bright_surface(log: Level, degree: int, known: Mask | None = None) -> Level:
     """Least squares over what is known and not much darker than the fit."""
     flat = log.ravel().astype(np.float64)
     usable = np.ones(flat.shape, bool) if known is None else known.ravel()
@@ -127,15 +127,23 @@ def _dark_things(log: Level, surface: Level) -> Mask:
     depth = surface - log
     noise = 1.4826 * float(np.median(np.abs(depth - np.median(depth))))
     dark = depth > max(DARK, 5 * noise)
-    dark = ndimage.binary_fill_holes(dark)
+    dark = without_screen_edge(ndimage.binary_fill_holes(dark))
+    grown = cv2.dilate(dark.astype(np.uint8), np.ones((5, 5), np.uint8))
+    return np.asarray(grown, bool)
+
+
+def without_screen_edge(dark: Mask) -> Mask:
+    """``dark`` less what covers more than a third of a border: the screen's edge, no bubble."""
+    import cv2
+
+    kept = dark.copy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8))
     for k in range(1, count):
         left, top, width, height, _ = stats[k]
-        at_side = left == 0 or left + width == log.shape[1]
-        at_top = top == 0 or top + height == log.shape[0]
-        if (at_side and height > _EDGE_SHARE * log.shape[0]) or (
-            at_top and width > _EDGE_SHARE * log.shape[1]
+        at_side = left == 0 or left + width == dark.shape[1]
+        at_top = top == 0 or top + height == dark.shape[0]
+        if (at_side and height > _EDGE_SHARE * dark.shape[0]) or (
+            at_top and width > _EDGE_SHARE * dark.shape[1]
         ):
-            dark[labels == k] = False
-    grown = cv2.dilate(dark.astype(np.uint8), np.ones((5, 5), np.uint8))
-    return np.asarray(grown, bool)
+            kept[labels == k] = False
+    return kept

@@ -92,7 +92,8 @@ class Linker:
         predicted = self.tracker.predict(t_s, position_mm)
         pairs = pair_frame(tables, self.cameras, self.model, predicted)
         lonely = _unpaired(tables, pairs)
-        result = self.tracker.update(number, t_s, _measured(self.cameras, tables, pairs, lonely))
+        measured = _measured(self.cameras, tables, pairs, lonely)
+        result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = _Frame(number, t_s, tables, pairs, lonely)
         self._settle(result)
         return self._flush() if self._waiting >= _PAIRS_AT_ONCE else None
@@ -132,10 +133,10 @@ class Linker:
         )
         table[["x_mm", "y_mm", "z_mm"]] = bodies.points_mm
         table[COVARIANCE_MM2] = bodies.covariance_mm2[:, _UPPER[0], _UPPER[1]]
-        corrections = (bodies.du_px, bodies.dv_px)
         for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
             table[[f"{camera.name}_{name}" for name in _PER_CAMERA]] = rows[_PER_CAMERA].to_numpy()
-            table[[f"{camera.name}_du_px", f"{camera.name}_dv_px"]] = corrections[c]
+            table[f"{camera.name}_du_px"] = bodies.du_px[:, c]
+            table[f"{camera.name}_dv_px"] = bodies.dv_px[:, c]
         table["ray_miss_mm"] = bodies.ray_miss_mm
         table["d_eq_mm"], table["sd_eq_mm"] = bodies.d_eq_mm, bodies.d_eq_sd_mm
         table["confidence"] = np.concatenate([f.pairs.confidence for f in frames])

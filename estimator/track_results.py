@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 WORST_FRAMES = 8
 _OUTLINE_POINTS = 72
-_GREEN, _ORANGE, _RED = (27, 127, 59), (194, 87, 12), (198, 40, 40)
+_GREEN, _ORANGE = (40, 200, 70), (255, 140, 40)
 
 
 @dataclass
@@ -175,7 +175,7 @@ def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> No
     found, rejected = bubbles.accepted, bubbles.rejected
     outlines = [outline_points(row, _OUTLINE_POINTS) for _, row in found.iterrows()]
     named = [_particle(labels, row) for _, row in found.iterrows()]
-    words = [f"{n} {row.flags}".strip() for n, (_, row) in zip(named, found.iterrows())]
+    words = [f"{n} {row['flags']}".strip() for n, (_, row) in zip(named, found.iterrows())]
     colours = [_GREEN if n else _ORANGE for n in named]
     marks = [(r.u_px, r.v_px, r.radius_px, r.reason) for r in rejected.itertuples()]
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks)

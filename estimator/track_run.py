@@ -304,6 +304,7 @@ def summary_of(run: RunData, stream: TrackingStream, counts: dict[str, Any]) -> 
         "run": run.name,
         "pixel_origin": "centre",
         "frame_of_reference": "rig frame (the first camera's), mm",
+        "image_size_px": dict(run.image_sizes_px),
         "frames": run.frame_count,
         "detections": counts["detections"],
         "points": counts["points"],

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.frontend.bubble_arcs import arcs_between
-from telerig.estimator.frontend.bubble_outline import Outlines
+from telerig.estimator.frontend.bubble_outline_types import Outlines
 from telerig.estimator.frontend.bubble_regions import Blob
 from telerig.estimator.frontend.bubble_shapes import deepest_dent, outline_curvature
 from telerig.estimator.frontend.bubble_split import Part, parts_of_arcs
@@ -36,7 +36,8 @@ def impossible_outlines(outlines: Outlines) -> Mask:
     waist = np.any([(dent > depth) & (outlines.chi2_dof > fit) for depth, fit in _WAISTS], axis=0)
     waist &= sure & (outlines.coverage > _WHOLE)
     astray: Mask = outlines.misfit_px > _ASTRAY_PX + _ASTRAY_SHARE * radius
-    return waist | astray
+    impossible: Mask = waist | astray
+    return impossible
 
 
 def unsound_parts(outlines: Outlines, parts: list[Part]) -> Mask:

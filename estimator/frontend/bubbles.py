@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from telerig.estimator.frontend.bubble_geometry import points_on, rough_distance
 from telerig.estimator.frontend.bubble_input import checked_image, normalised, nothing_to_see
-from telerig.estimator.frontend.bubble_outline import Outlines, Start, fit_outlines
+from telerig.estimator.frontend.bubble_outline import fit_outlines
+from telerig.estimator.frontend.bubble_outline_types import Outlines, Start
 from telerig.estimator.frontend.bubble_pixels import close_pairs
 from telerig.estimator.frontend.bubble_regions import (
     Blob,

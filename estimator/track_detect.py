@@ -41,7 +41,7 @@ _LARGEST_BATCH = 64
 class Scene:
     """What every frame's detection shares.
 
-    backgrounds : by camera; shift_px : by camera, (F, 2) where the lab has moved to in the image.
+    backgrounds : by camera; shift_px : by camera, (F, 2) travel of the rig, see `lab_shift_px`.
     """
 
     run: RunData
@@ -74,14 +74,15 @@ def make_scene(
 def lab_shift_px(
     camera: Camera, axis_rig: Array, position_mm: Array | None, frame_count: int
 ) -> Array:
-    """(F, 2) how far what is fixed in the lab has moved in the image since the first frame.
+    """(F, 2) travel of the rig as seen in the image since the first frame.
 
-    Evaluated in the middle of the image at depth 0; frames without a stage position have 0.
+    What is fixed in the lab and seen at p at first is seen at p - shift. Evaluated in the middle
+    of the image at depth 0; frames without a stage position have 0.
     """
     if position_mm is None:
         return np.zeros((frame_count, 2))
     travelled = position_mm - position_mm[np.isfinite(position_mm)][:1].sum()
-    moved = -np.where(np.isfinite(travelled), travelled, 0.0)[:, None] * axis_rig
+    moved = np.where(np.isfinite(travelled), travelled, 0.0)[:, None] * axis_rig
     width, height = camera.image_size_px
     origin, _ = camera.unproject(np.array([(width - 1) / 2, (height - 1) / 2]))
     return np.asarray(camera.project(origin + moved) - camera.project(origin))

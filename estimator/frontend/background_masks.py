@@ -26,7 +26,7 @@ OFTEN = 0.4
 
 _STILL, _GONE, _RING_SHARE = 0.9, 0.3, 0.7
 _CHANGES = 0.25
-_LEAST_SEEN = 5
+_LEAST_SEEN, _FEW = 5, 10
 
 
 def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Array) -> Mask:
@@ -49,13 +49,20 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
     )
     surface = bright_surface(np.quantile(log, 0.8, axis=0).astype(np.float32), 4)
     dark = np.stack([_dark_things(surface - frame) for frame in log])
-    still = _still(dark.mean(0), np.ones(dark.shape[1:], bool), 2)
-    keep = dark & ~still
-    if shifts_px is not None:
-        keep &= ~_still_in_lab(dark, np.rint(shifts_px / CELL_PX).astype(int))
+    keep = dark & ~_still(dark.mean(0), np.ones(dark.shape[1:], bool), 2)
+    places = _lab_places(shifts_px, dark.shape)
+    if places:
+        share, seen = _share_in_lab(dark, places)
+        still = _still(share, seen >= min(_LEAST_SEEN, len(dark)), 3)
+        keep &= ~np.stack([still[place] for place in places])
     grow = np.ones((5, 5), np.uint8)
     grown = np.stack([cv2.dilate(mask.astype(np.uint8), grow) for mask in keep])
-    grown *= grown.mean(0) > OFTEN
+    often = np.broadcast_to(grown.mean(0) > OFTEN, grown.shape)
+    if places:
+        share, seen = _share_in_lab(grown, places)
+        hidden = (share > OFTEN) & (seen < _FEW)
+        often = often | np.stack([hidden[place] for place in places])
+    grown *= often
     masks = np.stack([cv2.resize(m, (width, height), interpolation=0) for m in grown]) > 0
     masks &= ~_fringe(stack, gains, masks)
     return masks
@@ -101,19 +108,19 @@ def _still(share: Array, known: Mask, margin: int) -> Mask:
     return still.astype(bool)
 
 
-def _still_in_lab(dark: Mask, shifts: NDArray[np.int64]) -> Mask:
-    """(n, h, w) of each frame's dark things, those that stay where they are in the lab."""
-    count, height, width = dark.shape
-    origin = shifts.min(0)
-    extent = np.ptp(shifts, axis=0)
-    seen = np.zeros((height + extent[1], width + extent[0]))
-    total = np.zeros_like(seen)
-    places = []
-    for mask, (u, v) in zip(dark, shifts - origin):
-        place = (slice(v, v + height), slice(u, u + width))
+def _lab_places(shifts_px: Array | None, shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    """Where each frame's cells lie on a canvas of the lab; empty when nothing moves."""
+    if shifts_px is None:
+        return []
+    shifts = np.rint(shifts_px / CELL_PX).astype(int)
+    return [(slice(v, v + shape[1]), slice(u, u + shape[2])) for u, v in shifts - shifts.min(0)]
+
+
+def _share_in_lab(marks: Mask, places: list[tuple[slice, slice]]) -> tuple[Array, Array]:
+    """On the canvas: the share of the frames that see a cell which mark it, and their number."""
+    size = [max(place[axis].stop for place in places) for axis in (0, 1)]
+    total, seen = np.zeros(size), np.zeros(size)
+    for mask, place in zip(marks, places):
         total[place] += mask
         seen[place] += 1
-        places.append(place)
-    known = seen >= min(_LEAST_SEEN, count)
-    still = _still(np.where(known, total / np.maximum(seen, 1), 0.0), known, 3)
-    return np.stack([still[place] for place in places])
+    return total / np.maximum(seen, 1), seen

@@ -110,11 +110,16 @@ def _belief_propagation(log_odds: Array) -> Array:
     back = np.ones_like(weight)
     for _ in range(_PASSES):
         incoming = weight * back
-        forth = weight / (1 + incoming.sum(1, keepdims=True) - incoming)
-        new = 1 / (1 + forth.sum(0) - forth)
+        forth = weight / (1 + _others(incoming, 1))
+        new = 1 / (1 + _others(forth, 0))
         change = np.abs(new - back).max()
         back = new
         if change < 1e-9:
             break
     incoming = weight * back
     return np.asarray(incoming / (1 + incoming.sum(1, keepdims=True)))
+
+
+def _others(values: Array, axis: int) -> Array:
+    """Sums along the axis less each element, never below 0 by rounding."""
+    return np.maximum(values.sum(axis, keepdims=True) - values, 0.0)

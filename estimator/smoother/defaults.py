@@ -33,7 +33,6 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
     arms = {a.camera for a in problem.accelerometers if a.camera != CARRIAGE}
     bands: tuple[BroadBand, ...] = ()
     modes: tuple[RigMode, ...] = ()
-    rms = (SHAKE_RMS_MM,) * 3
     cameras = range(len(problem.cameras))
     if len(problem.references) or len(arms) == len(problem.cameras):
         bands = tuple(_band(j) for j in cameras)
@@ -42,7 +41,6 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
     else:
         modes = (RigMode(12.0, 0.2, (0.1,) * 3, force_hz=None),)
         modes += tuple(RigMode(19.0, 0.2, (0.05,) * 3, j, None) for j in cameras)
-    del rms
     return ShakeModel(
         bubble=default_bubble(problem),
         modes=modes,
@@ -55,9 +53,33 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
 
 
 def _band(camera: int) -> BroadBand:
-    return BroadBand(
-        (SHAKE_RMS_MM,) * 3, camera, low_hz=8.0, high_hz=60.0, slow_rms_mm=0.02, slow_tau_s=0.1
+    return BroadBand((SHAKE_RMS_MM,) * 3, camera)
+
+
+def rescaled(model: ShakeModel, rms_mm: Array) -> ShakeModel:
+    """The broad-band priors with the RMS that was found.
+
+    rms_mm : (C, 3) of each camera's offset (posterior mean and variance), the expectation step
+    of expectation maximisation. What is common to the cameras keeps its share.
+    """
+    own = [b for b in model.broad_bands if b.camera != CARRIAGE]
+    common = [b for b in model.broad_bands if b.camera == CARRIAGE]
+    before = np.zeros_like(rms_mm)
+    for band in common:
+        before += np.square(band.rms_mm)
+    for band in own:
+        before[band.camera] += np.square(band.rms_mm)
+    factor = rms_mm / np.sqrt(np.where(before > 0, before, 1.0))
+    factor = np.clip(factor, 0.05, 20.0)
+    bands = tuple(
+        replace(b, rms_mm=_triple(np.asarray(b.rms_mm) * _factor(factor, b.camera)))
+        for b in model.broad_bands
     )
+    return replace(model, broad_bands=bands)
+
+
+def _factor(factor: Array, camera: int) -> Array:
+    return np.asarray(factor.mean(0) if camera == CARRIAGE else factor[camera])
 
 
 def default_bubble(problem: SmoothingProblem) -> BubbleModel:

@@ -118,14 +118,14 @@ def _constant_priors(frame: Frame, state: State) -> list[Linear]:
         sigma = np.full(4, model.bubble.mean_sigma_mm_s)
         out = [_prior(base[2], value, sigma)]
     if problem.accelerometers:
-        given = np.array([a.delay_s for a in problem.accelerometers])
-        value = state.sensors.copy()
-        if delay:
-            value[:, -1] += frame.delays_s - given
         extra = [model.accelerometer_scale_sigma] * scale
-        extra += [model.accelerometer_delay_sigma_s] * delay
         sigma = np.array([[a.bias_sigma_mm_s2] * 3 + extra for a in problem.accelerometers])
-        out.append(_prior(base[3], value, sigma))
+        out.append(_prior(base[3], state.sensors, sigma))
+        if delay:
+            given = np.array([a.delay_s for a in problem.accelerometers])
+            _, first = np.unique(frame.clock_of, return_index=True)
+            value = state.clocks + (frame.delays_s - given)[first, None]
+            out.append(_prior(base[7], value, model.accelerometer_delay_sigma_s))
     if problem.stage is not None:
         sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
         out.append(_prior(base[4], state.encoder[None], sigmas[np.array(frame.encoder_flags)]))
@@ -290,8 +290,8 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
         + layout.offset_acceleration[sensor.camera]
     )
     bias = state.sensors[index, :3]
-    rest = iter(state.sensors[index, 3:].tolist())
-    scale, delay = (next(rest) if flag else 0.0 for flag in frame.sensor_flags)
+    clock = frame.clock_of[index]
+    scale, delay = state.sensors[index, 3:].sum(), state.clocks[clock].sum()
     states = state.shake[node]
     after = late - delay
     acceleration = states @ rows.T + after[:, None] * (states @ jerk_rows.T)
@@ -302,12 +302,14 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
     by_shake = (project @ read.by_acceleration[0]) @ (
         (rows + after[:, None, None] * jerk_rows) @ frame.shake_basis(node)
     )
-    columns = np.stack([read.by_scale, read.by_delay], -1)[..., np.array(frame.sensor_flags)]
-    by_sensor = np.concatenate([_all(np.eye(3), len(node)), columns], -1)
+    has_scale, has_delay = frame.sensor_flags
+    by_scale, by_clock = read.by_scale[..., None], read.by_delay[..., None]
+    by_sensor = np.concatenate([_all(np.eye(3), len(node)), by_scale[..., :has_scale]], -1)
+    blocks = (by_shake, project @ by_sensor, project @ by_clock[..., :has_delay])
     rhs = (sensor.reading_mm_s2 - read.reading_mm_s2) @ project.T
     log_det = np.full(len(node), white)
-    keys = (node, frame.base()[3] + index)
-    return Linear(keys, (by_shake, project @ by_sensor), rhs, log_det)
+    keys = (node, frame.base()[3] + index, frame.base()[7] + clock)
+    return Linear(keys, blocks, rhs, log_det)
 
 
 def _felt(frame: Frame, index: int) -> tuple[Array, float]:

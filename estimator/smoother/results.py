@@ -106,14 +106,15 @@ def _encoder(solution: Solution) -> dict[str, Any]:
 def _sensors(solution: Solution) -> dict[str, Any]:
     frame = solution.frame
     names = ["bias_x_mm_s2", "bias_y_mm_s2", "bias_z_mm_s2"]
-    names += [n for n, flag in zip(("scale", "delay_s"), frame.sensor_flags) if flag]
+    names += ["scale"] * frame.sensor_flags[0]
     out = {}
     for i, sensor in enumerate(frame.problem.accelerometers):
-        values = solution.state.sensors[i].copy()
-        if frame.sensor_flags[1]:
-            values[-1] = solution.delays_s[i]
-        block = _block(solution, "sensors")
-        out[sensor.name] = _with_sd(names, values, None if block is None else block[i])
+        block, clocks = _block(solution, "sensors"), _block(solution, "clocks")
+        found = _with_sd(names, solution.state.sensors[i], None if block is None else block[i])
+        found["delay_s"] = float(solution.delays_s[i])
+        if clocks is not None and frame.sensor_flags[1]:
+            found["sdelay_s"] = float(np.sqrt(clocks[frame.clock_of[i], 0, 0]))
+        out[sensor.name] = found
     return out
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
-from telerig.estimator.smoother.defaults import default_model
+from telerig.estimator.smoother.defaults import default_model, rescaled
 from telerig.estimator.smoother.linear import images
 from telerig.estimator.smoother.model import (
     CARRIAGE,
@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _INFLATE_BEYOND = 0.05
+_RESCALE_BEYOND = 0.2
 _ENCODER_SIGMA_MM = 0.005
 _SAMPLED = 500
 
@@ -79,10 +80,10 @@ def smooth(
     chosen = choose_model(problem, model, encoder_sigma)
     solution = solve(problem, chosen, options, progress)
     if not isinstance(model, ShakeModel):
-        inflation = _inflation(solution)
-        if abs(inflation - 1) > _INFLATE_BEYOND:
-            chosen = replace(chosen, pixel_inflation=chosen.pixel_inflation * inflation)
-            solution = solve(problem, chosen, options, progress)
+        better = adapted(solution)
+        if better is not None:
+            chosen = better
+            solution = solve(problem, chosen, options, progress, start=solution)
     verdict = judge(problem, chosen, solution)
     return Smoothing(
         trajectories(solution, None if tracked is None else tracked.table),
@@ -186,6 +187,36 @@ def judge(
         return {}
     verdict: Mapping[str, Any] = import_module(module).judge(problem, model, solution)
     return verdict
+
+
+def adapted(solution: Solution) -> ShakeModel | None:
+    """The model with the noise and the broad band's RMS that the data show; None if that is it."""
+    model = solution.frame.model
+    inflation = _inflation(solution)
+    better = model
+    if abs(inflation - 1) > _INFLATE_BEYOND:
+        better = replace(model, pixel_inflation=model.pixel_inflation * inflation)
+    if model.broad_bands:
+        rms = _offset_rms(solution)
+        fresh = rescaled(better, rms)
+        ratio = [np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)]
+        if np.max(np.abs(np.log(ratio))) > _RESCALE_BEYOND:
+            better = fresh
+    return None if better is model else better
+
+
+def _offset_rms(solution: Solution) -> Array:
+    """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
+    layout, found = solution.frame.shake, solution.covariances
+    rows = layout.offset[:-1]
+    states = solution.state.shake[solution.frame.nodes.of_frame]
+    square = np.einsum("cid,fd->fci", rows, states) ** 2
+    if found is not None:
+        square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
+    mean = square.mean(0)
+    unseen = mean < 1e-12
+    each = np.where(unseen, np.nan, mean)
+    return np.asarray(np.sqrt(np.where(unseen, np.nanmean(each, 1, keepdims=True), mean)))
 
 
 def _inflation(solution: Solution) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,7 +25,7 @@ T = TypeVar("T")
 STACK_BYTES = 512 << 20
 OUTLIER_SIGMAS = 4.0
 _SUSPICIOUS_SIGMAS = 5.0
-_DELAY_STEP_S = 2e-5
+_DELAY_STEP_S = 2e-4
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class Options:
     """passes : relinearisations at most.  robust : down-weight pixels that do not fit.
 
     covariances : of states ("frames"), or none (False) when only the evidence is asked.
-    tolerance_px : passes end when no predicted pixel moves more.
+    tolerance_px : passes end when no bubble moved more in the last; one more pass polishes.
     """
 
     passes: int = 6
     robust: bool = True
     covariances: bool = True
-    tolerance_px: float = 1e-4
+    tolerance_px: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class Covariances:
     encoder: Array
     calibration: Array
     marks: Array
+    clocks: Array
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Solution:
     def delays_s(self) -> Array:
         delays = self.frame.delays_s
         if self.frame.sensor_flags[1] and len(delays):
-            return np.asarray(delays + self.state.sensors[:, -1])
+            return np.asarray(delays + self.state.clocks[self.frame.clock_of, 0])
         return delays
 
 
@@ -89,9 +90,13 @@ def solve(
     model: ShakeModel,
     options: Options = Options(),
     progress: Progress | None = None,
+    start: Solution | None = None,
 ) -> Solution:
-    """Smooth. Raises CalibrationError when the measurements leave something undetermined."""
-    return in_large_stack(lambda: _solve(problem, model, options, progress or _silent))
+    """Smooth. ``start``: a solution of the same measurements under another model.
+
+    Raises CalibrationError when the measurements leave something undetermined.
+    """
+    return in_large_stack(lambda: _solve(problem, model, options, progress or _silent, start))
 
 
 def _silent(_what: str, _share: float) -> None:
@@ -99,12 +104,20 @@ def _silent(_what: str, _share: float) -> None:
 
 
 def _solve(
-    problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress
+    problem: SmoothingProblem,
+    model: ShakeModel,
+    options: Options,
+    progress: Progress,
+    start: Solution | None,
 ) -> Solution:
     delays = np.array([a.delay_s for a in problem.accelerometers])
-    frame = frame_of(problem, model, delays)
+    frame = frame_of(problem, model, delays if start is None else start.frame.delays_s)
     state = first_guess(frame)
     weights = (np.ones(len(problem.observations)), np.ones(len(problem.references)))
+    if start is not None:
+        weights = start.weights
+        if [a.shape for a in vars(start.state).values()] == [a.shape for a in vars(state).values()]:
+            state = start.state
     robust = _Truncation(options.robust)
     done = 0
     while True:
@@ -151,7 +164,7 @@ def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _
     graph = gtsam.GaussianFactorGraph()
     for linear in factors:
         add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
-    net, solution = _eliminated(graph, _ordering(frame))
+    net, solution = _eliminated(graph, frame)
     vector = solution.vector()
     if not np.all(np.isfinite(vector)):
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
@@ -159,20 +172,22 @@ def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _
     return _Pass(net, vector, largest, _log_norm(frame, factors), 2 * graph.error(solution))
 
 
-def _eliminated(graph: Any, ordering: Any) -> tuple[Any, Any]:
-    """Bayes net and solution: by Cholesky, and by QR, four times slower, where that gives up.
+def _eliminated(graph: Any, frame: Frame) -> tuple[Any, Any]:
+    """Bayes net and solution: by Cholesky, or by QR, four times slower, where digits are short.
 
-    Cholesky refuses a pivot that is 2^-12 of its variable's information, which irregular times
-    or the end of a run can bring about.
+    With steps as short as a sensor's the normal equations of a smooth prior lose more digits than
+    double precision has; without sensors QR is for what Cholesky refuses.
     """
     import gtsam
 
+    ordering = _ordering(frame)
     try:
-        net = graph.eliminateSequential(ordering)
-        return net, net.optimize()
-    except RuntimeError:
-        pass
-    try:
+        if len(frame.nodes.t_s) == len(frame.problem.t_s):
+            try:
+                net = graph.eliminateSequential(ordering)
+                return net, net.optimize()
+            except RuntimeError:
+                pass
         net = graph.eliminateSequential(ordering, gtsam.EliminateQR)
         return net, net.optimize()
     except RuntimeError as error:
@@ -212,7 +227,7 @@ def _ordering(frame: Frame) -> Any:
     for key in joined[order].tolist():
         out.push_back(key)
     counts = frame.counts()
-    for family in (3, 4, 5):
+    for family in (3, 4, 5, 7):
         number, size = counts[family]
         for key in range(base[family], base[family] + number * (size > 0)):
             out.push_back(key)
@@ -232,6 +247,7 @@ def moved(frame: Frame, state: State, step: Array) -> State:
         state.encoder + shaped[4][0],
         state.calibration + shaped[5][0],
         state.marks + shaped[6],
+        state.clocks + shaped[7],
     )
 
 
@@ -289,19 +305,16 @@ def _restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
     """Move the nodes of sensors whose estimated delay has moved."""
     if not (frame.sensor_flags[1] and frame.problem.accelerometers):
         return frame, state, False
-    found = state.sensors[:, -1]
-    if np.max(np.abs(found)) < _DELAY_STEP_S:
+    if np.max(np.abs(state.clocks)) < _DELAY_STEP_S:
         return frame, state, False
-    fresh = frame_of(frame.problem, frame.model, frame.delays_s + found)
-    sensors = state.sensors.copy()
-    sensors[:, -1] = 0.0
+    fresh = frame_of(
+        frame.problem, frame.model, frame.delays_s + state.clocks[frame.clock_of, 0]
+    )
     shake = np.stack(
         [np.interp(fresh.nodes.t_s, frame.nodes.t_s, column) for column in state.shake.T], -1
     )
-    moved_state = State(
-        shake, state.bubbles, state.means, sensors, state.encoder, state.calibration, state.marks
-    )
-    return fresh, moved_state, True
+    clocks = np.zeros_like(state.clocks)
+    return fresh, replace(state, shake=shake, clocks=clocks), True
 
 
 def _finish(
@@ -357,7 +370,8 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
     cross = cross.reshape(frame.rows, counts[0][1], counts[1][1])
     cross = frame.shake_basis(frame.node_of_row) @ cross @ np.swapaxes(bubble_basis, -1, -2)
     return Covariances(
-        shake, bubbles, cross, blocks[2], blocks[3], blocks[4][0], blocks[5][0], blocks[6]
+        shake, bubbles, cross, blocks[2], blocks[3], blocks[4][0], blocks[5][0],
+        *blocks[6:],
     )
 
 

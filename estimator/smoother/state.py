@@ -27,8 +27,9 @@ Ints = NDArray[np.int64]
 class State:
     """shake : (N, Ds).  bubbles : (sum of lengths, Db), one bubble after the other.
 
-    means : (K, 3), or (K, 4) with the constant speed.  sensors : (A, 3 + scale + delay), bias
-    first.  encoder : (0..2,) scale, delay.  calibration : (r,).  marks : (Q, 3).
+    means : (K, 3), or (K, 4) with the constant speed.  sensors : (A, 3 or 4) bias, scale.
+    encoder : (0..2,) scale, delay.  calibration : (r,).  marks : (Q, 3).  clocks : (G, 0 or 1)
+    delay of the accelerometers' clocks beyond that at which the nodes are placed.
     """
 
     shake: Array
@@ -38,6 +39,7 @@ class State:
     encoder: Array
     calibration: Array
     marks: Array
+    clocks: Array
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Frame:
     """The fixed part of one linearisation: layouts, nodes and the keys' order.
 
     nominal_mm : (N,) the carriage's prior mean.  delays_s : (A,) at which the nodes are placed.
+    clock_of : (A,) sensors with the same stamps share a clock.
     first_row : (K + 1,) where each bubble's rows begin.  sizes : dimension of each family of keys.
     """
 
@@ -54,6 +57,7 @@ class Frame:
     bubble: BubbleLayout
     nodes: Nodes
     delays_s: Array
+    clock_of: Ints
     nominal_mm: Array
     first_row: Ints
     node_of_row: Ints
@@ -108,10 +112,11 @@ class Frame:
             (len(self.nodes.t_s), self.shake.size),
             (self.rows, self.bubble.size),
             (len(problem.bubbles), self.mean_size),
-            (len(problem.accelerometers), 3 + sum(self.sensor_flags)),
+            (len(problem.accelerometers), 3 + self.sensor_flags[0]),
             (1, encoder),
             (1, share),
             (len(problem.marks), 3),
+            (int(self.clock_of.max(initial=-1)) + 1, int(self.sensor_flags[1])),
         ]
 
     def base(self) -> list[int]:
@@ -135,7 +140,7 @@ def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> F
     moving = np.setdiff1d(np.arange(len(frame_of_row)), first_row[1:] - 1)
     t = problem.t_s[frame_of_row]
     return Frame(
-        problem, model, shake, bubble, nodes, delays_s, nominal, first_row,
+        problem, model, shake, bubble, nodes, delays_s, clocks_of(problem), nominal, first_row,
         nodes.of_frame[frame_of_row],
         np.repeat(np.arange(len(lengths)), lengths),
         frame_of_row,
@@ -143,6 +148,13 @@ def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> F
         motion(bubble.components, t[moving + 1] - t[moving]),
         moving,
     )  # fmt: skip
+
+
+def clocks_of(problem: SmoothingProblem) -> Ints:
+    """(A,) number of each sensor's clock: those with the same stamps were sampled together."""
+    known: dict[tuple[bytes, float], int] = {}
+    numbers = [known.setdefault((a.t_s.tobytes(), a.delay_s), len(known)) for a in problem.accelerometers]
+    return np.array(numbers, np.int64)
 
 
 def _basis_index(index: Ints, node: ArrayLike) -> Ints:
@@ -170,7 +182,7 @@ def first_guess(frame: Frame) -> State:
         means[k, 3:] = max(float(np.linalg.norm(slope)), 1.0)
     if len(problem.marks):
         values[6][:] = [m.guess_mm for m in problem.marks]
-    return State(shake, bubbles, means, values[3], values[4][0], values[5][0], values[6])
+    return State(shake, bubbles, means, values[3], values[4][0], values[5][0], *values[6:])
 
 
 def _guess_carriage(frame: Frame, shake: Array) -> None:

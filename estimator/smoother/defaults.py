@@ -24,8 +24,12 @@ Array = NDArray[np.float64]
 SHAKE_RMS_MM = 0.2
 DELAY_SIGMA_S = 0.002
 _ZIGZAG_HZ = (3.0, 12.0)
-_ZIGZAG_RMS_MM = 0.3
+_ZIGZAG_GUESS_HZ = 6.5
+_ZIGZAG_RMS_MM = 0.5
+_ZIGZAG_DAMPING = 0.1
+_HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
+_CLEAR = 0.2
 
 
 def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
@@ -83,17 +87,13 @@ def _factor(factor: Array, camera: int) -> Array:
 
 
 def default_bubble(problem: SmoothingProblem) -> BubbleModel:
-    """Zigzag where the tracks show one, with its second harmonic upwards."""
-    found = zigzag(problem)
-    if found is None:
-        return BubbleModel(zigzags=())
-    frequency, rms = found
-    across = 1 - np.abs(problem.up)
-    up = np.abs(problem.up)
+    """Zigzag at the frequency that the tracks show, with its second harmonic upwards."""
+    frequency, rms = zigzag(problem) or (_ZIGZAG_GUESS_HZ, _ZIGZAG_RMS_MM)
+    across, up = 1 - np.abs(problem.up), np.abs(problem.up)
     return BubbleModel(
         zigzags=(
-            Zigzag(frequency, 0.05, _triple(rms * across)),
-            Zigzag(2 * frequency, 0.05, _triple(0.15 * up)),
+            Zigzag(frequency, _ZIGZAG_DAMPING, _triple(rms * across)),
+            Zigzag(2 * frequency, _ZIGZAG_DAMPING, _triple(_HARMONIC_RMS_MM * up)),
         )
     )
 
@@ -104,7 +104,7 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
-    """Frequency (Hz) and RMS (mm) of the bubbles' swing across the vertical; None without one.
+    """Frequency (Hz) and RMS (mm) of the bubbles' swing across the vertical; None without tracks.
 
     A least-squares sine through each track over a range of frequencies, drift removed.
     """
@@ -123,10 +123,12 @@ def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
             fit = wave @ np.linalg.lstsq(wave, rest, rcond=None)[0]
             power[i] += (fit**2).sum()
         total, samples = total + (rest**2).sum(), samples + 2 * len(t)
-    if not samples or power.max() < 0.4 * total:
+    if not samples:
         return None
     rms = float(np.sqrt(total / samples))
-    return (float(trials[power.argmax()]), rms) if rms > _ZIGZAG_RMS_MM else None
+    clear = power.max() > _CLEAR * total and rms > _ZIGZAG_RMS_MM / 2
+    frequency = float(trials[power.argmax()]) if clear else _ZIGZAG_GUESS_HZ
+    return frequency, max(rms, _ZIGZAG_RMS_MM)
 
 
 def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> CarriageModel:

@@ -87,7 +87,8 @@ def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
     whitener = whitener_of(covariance)
     places = np.array([b.start_mm for b in problem.bubbles])
     means = state.means[:, :3]
-    off = state.bubbles[firsts] - places @ layout.position - means @ by_input.T
+    off = state.bubbles[firsts] - means @ by_input.T
+    off[:, [0, 2, 4]] -= places
     numbers = np.arange(len(firsts))
     wide = _with_columns(-whitener @ by_input, frame.mean_size)
     begin = Linear(

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.frontend.body import fit_bodies
+from telerig.estimator.frontend.body import DEFAULT_SHAPE_SIGMA, fit_bodies
 from telerig.estimator.frontend.bubble_types import Prediction
 from telerig.estimator.frontend.matching import match_pairs
 from telerig.estimator.frontend.pair_types import PairModel
@@ -32,6 +32,10 @@ COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 _PER_CAMERA = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 _PAIRS_AT_ONCE = 2048
+
+WANDER = (21 / 8) ** 0.5
+"""Shift of an outline's centre, as a share of the radius, by a body's third harmonics of unit
+standard deviation (unit mean square over the sphere; their k = 1 part along a great circle)."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +96,17 @@ class Linker:
         predicted = self.tracker.predict(t_s, position_mm)
         pairs = pair_frame(tables, self.cameras, self.model, predicted)
         lonely = _unpaired(tables, pairs)
-        measured = _measured(self.cameras, tables, pairs, lonely)
+        measured = _measured(self.cameras, tables, pairs, lonely, self._wander)
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = _Frame(number, t_s, tables, pairs, lonely)
         self._settle(result)
         return self._flush() if self._waiting >= _PAIRS_AT_ONCE else None
+
+    @property
+    def _wander(self) -> float:
+        """How far a bubble's shape may move its outline's centre, as a share of its radius."""
+        sigma = DEFAULT_SHAPE_SIGMA if self.shape_sigma is None else self.shape_sigma
+        return WANDER * float(sigma[0])
 
     def finish(self) -> Linked | None:
         """The rows still open at the end of the run."""
@@ -122,7 +132,13 @@ class Linker:
             [f.tables[c].iloc[(f.pairs.first, f.pairs.second)[c]] for f in frames] for c in (0, 1)
         ]
         first, second = (pd.concat(part, ignore_index=True) for part in parts)
-        bodies = fit_bodies(first, second, self.cameras, shape_sigma=self.shape_sigma)
+        bodies = fit_bodies(
+            first,
+            second,
+            self.cameras,
+            shape_sigma=self.shape_sigma,
+            gap_sigma_px=float(np.hypot(self.model.frame_px, self.model.rms_px[0])),
+        )
         many = [len(f.pairs.first) for f in frames]
         table = pd.DataFrame(
             {
@@ -185,10 +201,12 @@ def _unpaired(tables: tuple[pd.DataFrame, pd.DataFrame], pairs: Pairs) -> tuple[
     return first, second
 
 
-def _pixels(table: pd.DataFrame) -> tuple[Array, Array]:
-    """(N, 2) centres and (N, 2, 2) covariances."""
+def _pixels(table: pd.DataFrame, wander: float) -> tuple[Array, Array]:
+    """(N, 2) centres and (N, 2, 2) covariances, with the share of the unknown shape."""
     covariance = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
-    return table[["u_px", "v_px"]].to_numpy(float), covariance.reshape(-1, 2, 2)
+    radius = np.nan_to_num(table["d_eq_px"].to_numpy(float)) / 2
+    shape = (wander * radius)[:, None, None] ** 2 * np.eye(2)
+    return table[["u_px", "v_px"]].to_numpy(float), covariance.reshape(-1, 2, 2) + shape
 
 
 def _measured(
@@ -196,8 +214,9 @@ def _measured(
     tables: tuple[pd.DataFrame, pd.DataFrame],
     pairs: Pairs,
     lonely: tuple[Index, Index],
+    wander: float,
 ) -> FrameMeasurements:
-    (uv_a, cov_a), (uv_b, cov_b) = (_pixels(table) for table in tables)
+    (uv_a, cov_a), (uv_b, cov_b) = (_pixels(table, wander) for table in tables)
     found = triangulate(
         cameras, (uv_a[pairs.first], uv_b[pairs.second]), (cov_a[pairs.first], cov_b[pairs.second])
     )

@@ -73,12 +73,16 @@ def fit_bodies(
     cameras: tuple[Camera, Camera],
     *,
     shape_sigma: ArrayLike | None = None,
+    gap_sigma_px: float = 0.0,
 ) -> Bodies:
     """Centres of volume of M pairs of outlines, row i of one table matching row i of the other.
 
     shape_sigma : standard deviations of the shape's coefficients (harmonics of unit mean square,
     relative to the radius) of degree 3 and 4, one number for both; by default
     `estimate_shape_sigma` of these pairs.
+
+    gap_sigma_px : how far the cameras' own motion or their calibration may part the two views
+    along the shared coordinate; so much of the centres' difference says nothing of the shape.
 
     Raises InputError for tables of unequal length or a shape_sigma that is not positive.
     """
@@ -94,7 +98,8 @@ def fit_bodies(
     for rows, correct in ((whole, True), (shaped & ~whole, False)):
         if np.any(rows):
             pair = (outlines[0].rows(rows), outlines[1].rows(rows))
-            _fill_shapes(bodies, pair, cameras, np.flatnonzero(rows), sigma, correct=correct)
+            at = np.flatnonzero(rows)
+            _fill_shapes(bodies, pair, cameras, at, sigma, gap_sigma_px, correct=correct)
     return bodies
 
 
@@ -205,6 +210,7 @@ def _fill_shapes(
     cameras: tuple[Camera, Camera],
     rows: NDArray[np.int64],
     sigma: Array,
+    gap_sigma_px: float,
     *,
     correct: bool,
 ) -> None:
@@ -216,7 +222,7 @@ def _fill_shapes(
     bodies.semi_axes_mm[rows] = np.sqrt(squares[:, ::-1])
     bodies.d_eq_mm[rows], bodies.d_eq_sd_mm[rows] = _diameter(shapes, pair, sigma)
     if correct:
-        _correct(bodies, pair, shapes, pixels, jacobian, rows, sigma)
+        _correct(bodies, pair, shapes, pixels, jacobian, rows, sigma, gap_sigma_px)
     else:
         bodies.covariance_mm2[rows] = body_modes.uncorrected_covariance(
             _pixel_noise(pair), jacobian, axes_px, shapes.pair.frames(shapes.coupling), sigma[0]
@@ -231,9 +237,12 @@ def _correct(
     jacobian: Array,
     rows: NDArray[np.int64],
     sigma: Array,
+    gap_sigma_px: float,
 ) -> None:
     """Centres of volume: every account of the shape, weighted by its evidence."""
     measured, noise, conversion = _measured(pair, pixels)
+    shared = _images(jacobian, (shapes.pair.shared, shapes.pair.shared))
+    noise[:, :4, :4] += _gap_covariance(shared, gap_sigma_px)
     slope = np.concatenate([jacobian, np.zeros_like(jacobian)], 1)
     views = Views(
         measured,
@@ -243,7 +252,7 @@ def _correct(
         _own_sigma(pair, sigma[0]),
         conversion,
         _images(jacobian, shapes.pair.sides),
-        _images(jacobian, (shapes.pair.shared, shapes.pair.shared)),
+        shared,
     )
     accounts, shares = [], []
     for coupling, share in shapes.couplings():
@@ -260,6 +269,13 @@ def _correct(
     bodies.du_px[rows], bodies.dv_px[rows] = correction[:, 0::2], correction[:, 1::2]
     bodies.used[rows] = "volume"
     bodies.zonal_probability[rows] = weight[-1]
+
+
+def _gap_covariance(shared: tuple[Array, Array], gap_sigma_px: float) -> Array:
+    """(M, 4, 4) of the two centres moved apart along the shared coordinate."""
+    left, right = (image / np.linalg.norm(image, axis=-1, keepdims=True) for image in shared)
+    apart = np.concatenate([left, -right], -1) / 2
+    return gap_sigma_px**2 * apart[:, :, None] * apart[:, None, :]
 
 
 def _images(jacobian: Array, directions: tuple[Array, Array]) -> tuple[Array, Array]:

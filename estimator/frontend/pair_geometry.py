@@ -119,7 +119,7 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     across = np.einsum("i,nij->nj", (camera.camera_from_rig.rotation @ axis)[:2], mm_by_px)
     middle, height = outline_extent(table, across)
     known, doubt, unsure = _trust(table)
-    extra = np.square(unsure * _column(table, "a_px"))
+    extra = np.square(unsure * np.nan_to_num(_column(table, "a_px")))
     area = np.pi * _column(table, "a_px") * _column(table, "b_px")
     measured = _column(table, "area_px2")
     area = np.where(measured > 0, measured, area)

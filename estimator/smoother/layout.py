@@ -16,6 +16,7 @@ from telerig.estimator.smoother.model import (
 )
 from telerig.factors.state_space import (
     Component,
+    block_diagonal,
     broad_band,
     driven_mode,
     forced_mass,
@@ -31,7 +32,9 @@ from telerig.rig.camera import Camera
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_MERGE = 0.05
+_SAME = 0.05
+_NEAR, _NEAR_S = 0.6, 1e-3
+_TERMS = 9
 _READING_SIGMA_MM = 10.0
 _ALIGNED = 1 - 1e-9
 
@@ -88,12 +91,13 @@ class BubbleLayout:
 class Nodes:
     """When the carriage's and the cameras' states are: frames and sensor samples together.
 
-    t_s : (N,).  of_frame : (F,).  of_encoder, of_accelerometers : node of each reading, and by
-    how much later than the node the reading is (encoder_late_s, accelerometer_late_s).
+    t_s : (N,).  of_frame, of_encoder, of_accelerometers : node of each frame or reading, and by how
+    much later than the node it is (..._late_s).
     """
 
     t_s: Array
     of_frame: Ints
+    frame_late_s: Array
     of_encoder: Ints
     encoder_late_s: Array
     of_accelerometers: tuple[Ints, ...]
@@ -247,38 +251,54 @@ def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
 
 
 def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[float]) -> Nodes:
-    """Frames, and the sensors' samples at stamp - delay; nearly equal times share a node.
+    """When states are: at every accelerometer sample (stamp - delay), and at frames far from one.
 
-    A reading that is not exactly at its node is carried there by the derivatives of the state. That
-    leaves an error of second order, (w dt)^2 / 2 of a motion at w, in which dt is a third of the
-    densest record's step at most, and keeps the nodes few and no step too short for its noise.
+    Accelerations are rough and have their own nodes. Positions are smooth: a frame or an encoder
+    reading within a step of a node takes its state from there, carried by the drift (`carry`).
     """
-    with_encoder = problem.stage is not None and model.carriage.kind != "readings"
-    encoder = problem.stage.t_s if problem.stage is not None and with_encoder else np.zeros(0)
-    sensors = [a.t_s - d for a, d in zip(problem.accelerometers, delays_s)]
-    sources = [problem.t_s, encoder, *sensors]
-    times = np.concatenate(sources)
-    is_frame = np.arange(len(times)) < len(problem.t_s)
-    tolerance = _MERGE * min(float(np.median(np.diff(s))) for s in sources if len(s) > 1)
-    order = np.lexsort((~is_frame, times))
-    node = np.empty(len(times), np.int64)
-    node[order], leaders = _clusters(times[order], is_frame[order], tolerance)
-    node_t = times[order][leaders]
-    edges = np.cumsum([len(s) for s in sources])[:-1]
-    split, late = np.split(node, edges), np.split(times - node_t[node], edges)
-    return Nodes(node_t, split[0], split[1], late[1], tuple(split[2:]), tuple(late[2:]))
+    rough = [a.t_s - d for a, d in zip(problem.accelerometers, delays_s)]
+    times = np.sort(np.concatenate([*rough, np.zeros(0)]))
+    step = min((float(np.median(np.diff(r))) for r in rough), default=0.0)
+    if len(times):
+        times = times[np.r_[True, np.diff(times) > _SAME * step]]
+    reach = min(_NEAR * step, _NEAR_S)
+    encoder = np.zeros(0)
+    if problem.stage is not None and model.carriage.kind != "readings":
+        encoder = problem.stage.t_s
+    for smooth in (problem.t_s, encoder):
+        _, late = _nearest(times, smooth)
+        times = np.sort(np.concatenate([times, smooth[np.abs(late) > reach]]))
+    placed = [_nearest(times, source) for source in (problem.t_s, encoder, *rough)]
+    node, late_s = [p[0] for p in placed], [p[1] for p in placed]
+    return Nodes(times, node[0], late_s[0], node[1], late_s[1], tuple(node[2:]), tuple(late_s[2:]))
 
 
-def _clusters(times: Array, is_frame: NDArray[np.bool_], tolerance: float) -> tuple[Ints, Ints]:
-    """Cluster of each of the sorted times, and the one that leads each cluster (a frame, if any)."""
-    cluster, leaders = np.empty(len(times), np.int64), []
-    begin = -np.inf
-    led = False
-    for i, (t, frame) in enumerate(zip(times.tolist(), is_frame.tolist())):
-        if t - begin > tolerance or (frame and led):
-            leaders.append(i)
-            begin, led = t, frame
-        elif frame:
-            leaders[-1], led, begin = i, True, t
-        cluster[i] = len(leaders) - 1
-    return cluster, np.array(leaders, np.int64)
+def _nearest(nodes: Array, t_s: Array) -> tuple[Ints, Array]:
+    """Nearest node of each time, and by how much later than it the time is."""
+    if not len(nodes):
+        return np.zeros(len(t_s), np.int64), np.full(len(t_s), np.inf)
+    after = np.clip(np.searchsorted(nodes, t_s), 1, max(len(nodes) - 1, 1)).clip(max=len(nodes) - 1)
+    before = np.maximum(after - 1, 0)
+    node = np.where(t_s - nodes[before] <= nodes[after] - t_s, before, after)
+    late = t_s - nodes[node]
+    return node, np.where(np.abs(late) < 1e-12, 0.0, late)
+
+
+def carry(components: Sequence[Component], late_s: Array) -> Array | None:
+    """(M, D, D) exp(F late) that takes states to slightly later or earlier times; None: all alike.
+
+    The noise of so short a time is left out.
+    """
+    if not np.any(late_s):
+        return None
+    digits, index = np.unique(np.round(late_s * 1e9), return_inverse=True)
+    late = digits[:, None, None] / 1e9
+    blocks = []
+    for component in components:
+        term = np.tile(np.eye(component.size), (len(late), 1, 1))
+        total = term.copy()
+        for i in range(1, _TERMS):
+            term = term @ component.drift * late / i
+            total += term
+        blocks.append(total)
+    return block_diagonal(blocks)[index.ravel()]

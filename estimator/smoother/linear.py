@@ -195,12 +195,13 @@ def _seen(
     inflation = frame.model.pixel_inflation
     whitener = whitener_of(obs.covariance_px2) / inflation
     out, residual = [], np.zeros((len(obs), 2))
+    at_frames = frame.shake_at_frames(state.shake)
     for c, camera in enumerate(problem.cameras):
         mine = np.flatnonzero(obs.camera == c)
         if not len(mine):
             continue
         node = frame.nodes.of_frame[obs.frame[mine]]
-        shake = state.shake[node]
+        shake = at_frames[obs.frame[mine]]
         seen = measurements.image_of_point(
             camera, points[mine], shake @ layout.position, problem.axis,
             shake @ layout.offset[c].T, shake @ layout.pitch[c],
@@ -210,6 +211,8 @@ def _seen(
             + seen.by_position[..., None] * layout.position
             + seen.by_pitch[..., None] * layout.pitch[c]
         )
+        if frame.to_frames is not None:
+            by_shake = by_shake @ frame.to_frames[obs.frame[mine]]
         off = seen.uv_px + shift[mine] - obs.uv_px[mine]
         by_rig = np.zeros((len(mine), 2, 0))
         if problem.calibration is not None and len(state.calibration):
@@ -248,15 +251,18 @@ def encoder(frame: Frame, state: State) -> list[Linear]:
     if stage is None:
         return []
     if model.carriage.kind != "readings":
-        node, late, reading = nodes.of_encoder, nodes.encoder_late_s, stage.position_mm
-        rows = layout.position + late[:, None] * layout.velocity
-        speed = state.shake[node] @ layout.velocity
+        node, reading = nodes.of_encoder, stage.position_mm
+        rows, rates = (np.tile(r, (len(node), 1)) for r in (layout.position, layout.velocity))
+        if frame.to_encoder is not None:
+            rows = np.einsum("i,mij->mj", layout.position, frame.to_encoder)
+            rates = np.einsum("i,mij->mj", layout.velocity, frame.to_encoder)
+        speed = (state.shake[node] * rates).sum(-1)
     else:
         t = problem.t_s
         inside = (t >= stage.t_s[0] - 1e-9) & (t <= stage.t_s[-1] + 1e-9)
         node = nodes.of_frame[inside]
         reading = frame.nominal_mm[node]
-        rows = np.broadcast_to(layout.position, (len(node), layout.size))
+        rows = np.tile(layout.position, (len(node), 1))
         speed = np.gradient(frame.nominal_mm, nodes.t_s)[node]
     scale, delay = _encoder_constants(frame, state)
     position = (state.shake[node] * rows).sum(-1) - delay * speed

@@ -153,9 +153,8 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
             for column in table.columns:
                 group.create_dataset(column, data=table[column].to_numpy(), compression="gzip")
         states = file.create_group("states")
-        nodes = layout.nodes.of_frame
         arrays = {
-            "shake": solution.state.shake[nodes],
+            "shake": layout.shake_at_frames(solution.state.shake),
             "bubbles": solution.state.bubbles,
             "shake_offset_rows": layout.shake.offset,
             "bubble_position_rows": layout.bubble.position,

@@ -209,7 +209,7 @@ def _offset_rms(solution: Solution) -> Array:
     """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
     layout, found = solution.frame.shake, solution.covariances
     rows = layout.offset[:-1]
-    states = solution.state.shake[solution.frame.nodes.of_frame]
+    states = solution.frame.shake_at_frames(solution.state.shake)
     square = np.einsum("cid,fd->fci", rows, states) ** 2
     if found is not None:
         square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
@@ -244,9 +244,11 @@ def _taken_up(solution: Solution) -> float:
         row, node = np.asarray(part.keys[0]) - frame.base()[1], np.asarray(part.keys[1])
         some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
         row, node = row[some], node[some]
+        at = frame.frame_of_row[row]
         by_bubble = part.blocks[0][some] @ np.linalg.inv(frame.bubble_basis(row))
         by_shake = part.blocks[1][some] @ np.linalg.inv(frame.shake_basis(node))
-        at = frame.frame_of_row[row]
+        if frame.to_frames is not None:
+            by_shake = by_shake @ np.linalg.inv(frame.to_frames[at])
         both = by_shake @ found.cross[row]
         total += float((by_bubble @ found.bubbles[row] * by_bubble).sum())
         total += float((by_shake @ found.shake[at] * by_shake).sum())

@@ -33,7 +33,7 @@ class Options:
     """passes : relinearisations at most.  robust : down-weight pixels that do not fit.
 
     covariances : of states ("frames"), or none (False) when only the evidence is asked.
-    tolerance_px : passes end when no bubble moved more in the last; one more pass polishes.
+    tolerance_px : passes end when no bubble moved more in the last; relative to that, affine cameras need one pass.
     """
 
     passes: int = 6
@@ -119,21 +119,22 @@ def _solve(
         if [a.shape for a in vars(start.state).values()] == [a.shape for a in vars(state).values()]:
             state = start.state
     robust = _Truncation(options.robust)
-    done = 0
-    while True:
-        progress("smoothing", done / (options.passes + 1))
-        pass_ = _linear_solve(frame, state, weights)
-        state = moved(frame, state, pass_.step)
-        done += 1
-        residuals = pixel_residuals(frame, state)
-        weights, changed = robust.update(weights, residuals)
-        still = pass_.largest_px < options.tolerance_px and not changed
+    for done in range(1, options.passes + 1):
+        progress("smoothing", (done - 1) / (options.passes + 1))
+        last = _linear_solve(frame, state, weights)
+        state = moved(frame, state, last.step)
+        fresh, changed = robust.update(weights, pixel_residuals(frame, state))
+        settled = last.largest_px < options.tolerance_px or _is_linear(problem, model)
+        if settled and not changed and (done > 1 or _is_linear(problem, model)):
+            break
+        weights = fresh
         frame, state, restamped = _restamped(frame, state)
-        if done >= options.passes or (still and not restamped):
-            break
-        if done == 1 and _is_linear(problem, model) and not changed:
-            break
-    return _finish(frame, state, weights, options, done, progress)
+        last = None if restamped or changed else last
+    if last is None:
+        weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
+        last = _linear_solve(frame, state, weights)
+        state = moved(frame, state, last.step)
+    return _finish(frame, state, weights, last, options, done, progress)
 
 
 def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
@@ -322,21 +323,19 @@ def _finish(
     frame: Frame,
     state: State,
     weights: tuple[Array, Array],
+    last: _Pass,
     options: Options,
     done: int,
     progress: Progress,
 ) -> Solution:
-    """One more pass at the solution: it polishes the means, and gives covariances and evidence."""
-    weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
-    last = _linear_solve(frame, state, weights)
-    state = moved(frame, state, last.step)
+    """Covariances and evidence from the last pass, whose linearisation is within the tolerance."""
     dimension = sum(n * d for n, d in frame.counts())
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
     evidence -= _log_det(last.net)
     found = _covariances(frame, last.net, progress) if options.covariances else None
     progress("smoothing", 1.0)
     return Solution(
-        frame, state, found, weights, pixel_residuals(frame, state), float(evidence), done + 1
+        frame, state, found, weights, pixel_residuals(frame, state), float(evidence), done
     )
 
 
@@ -364,12 +363,14 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
     problem_frames = frame.nodes.of_frame
     blocks = [of(keys, i) for i, keys in enumerate([at_frames, *families[1:]])]
     shake_basis = frame.shake_basis(problem_frames)
+    if frame.to_frames is not None:
+        shake_basis = frame.to_frames @ shake_basis
     bubble_basis = frame.bubble_basis(np.arange(frame.rows))
     shake = shake_basis @ blocks[0] @ np.swapaxes(shake_basis, -1, -2)
     bubbles = bubble_basis @ blocks[1] @ np.swapaxes(bubble_basis, -1, -2)
     cross = np.array([crossed[pair] for pair in pairs])
     cross = cross.reshape(frame.rows, counts[0][1], counts[1][1])
-    cross = frame.shake_basis(frame.node_of_row) @ cross @ np.swapaxes(bubble_basis, -1, -2)
+    cross = shake_basis[frame.frame_of_row] @ cross @ np.swapaxes(bubble_basis, -1, -2)
     return Covariances(
         shake, bubbles, cross, blocks[2], blocks[3], blocks[4][0], blocks[5][0],
         *blocks[6:],

@@ -13,6 +13,7 @@ from telerig.estimator.smoother.layout import (
     Nodes,
     ShakeLayout,
     bubble_layout,
+    carry,
     nodes_of,
     shake_layout,
 )
@@ -70,6 +71,23 @@ class Frame:
     def shake_basis(self, node: ArrayLike) -> Array:
         """(..., D, D) basis of the increments at nodes (...)."""
         return np.asarray(self.shake_motion.basis[_basis_index(self.shake_motion.index, node)])
+
+    @cached_property
+    def to_frames(self) -> Array | None:
+        """(F, D, D) from the shake's state at its node to that at the frame; None: the same."""
+        return carry(self.shake.components, self.nodes.frame_late_s)
+
+    @cached_property
+    def to_encoder(self) -> Array | None:
+        """(E, D, D) from the shake's state at its node to that at each reading."""
+        return carry(self.shake.components, self.nodes.encoder_late_s)
+
+    def shake_at_frames(self, shake: Array) -> Array:
+        """(F, D) states at the frames from those at the nodes (N, D)."""
+        states = shake[self.nodes.of_frame]
+        if self.to_frames is None:
+            return np.asarray(states)
+        return np.asarray((self.to_frames @ states[..., None])[..., 0])
 
     @cached_property
     def row_basis(self) -> Ints:

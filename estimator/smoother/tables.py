@@ -106,9 +106,8 @@ def shake(solution: Solution) -> pd.DataFrame:
     import pandas as pd
 
     frame, problem, layout = solution.frame, solution.frame.problem, solution.frame.shake
-    node = frame.nodes.of_frame
-    states, covariances = solution.state.shake[node], solution.covariances
-    columns: dict[str, Any] = {"frame": np.arange(len(node)), "t_s": problem.t_s}
+    states, covariances = frame.shake_at_frames(solution.state.shake), solution.covariances
+    columns: dict[str, Any] = {"frame": np.arange(len(states)), "t_s": problem.t_s}
     for c, camera in enumerate(problem.cameras):
         columns |= _named(states @ layout.offset[c].T, f"{camera.name}_{{}}_mm")
         if covariances is not None:

@@ -72,7 +72,7 @@ def problem(rng: np.random.Generator, *, sensors: bool = False, marks: bool = Fa
     item, frame, camera_of, uv = (np.array(column) for column in zip(*rows))
     noise = np.array([[1.0, 0.3], [0.3, 1.0]]) * SIGMA_PX**2
     pixels = Observations(item, frame, camera_of, uv, np.tile(noise, (len(uv), 1, 1)))
-    sampled = np.sort(np.concatenate([t, rng.uniform(t[0] - 1e-3, t[-1] + 1e-3, 25)]))
+    sampled = np.sort(np.concatenate([[t[0] - 1e-3], t, t[:-1] + 0.4 * np.diff(t)]))
     encoder = sampled[::2] if sensors else t
     stage = Stage(encoder, 280 * encoder + 0.001 * rng.normal(size=len(encoder)))
     accelerometers = ()

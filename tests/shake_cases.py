@@ -189,7 +189,7 @@ def reference(
     runs: Runs,
     *,
     parts: Callable[[Scenario, str, int], dict[str, Part]] = parts_of,
-    real: type = REAL,
+    real: type = np.float64,
 ) -> Reference:
     """The reference smoother with one of the information sets, true hyper-parameters."""
     bubbles = 5 if information == "five" else 1

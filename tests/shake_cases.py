@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from shake_reference import (
-    REAL,
     Model,
     Part,
     Posterior,
@@ -23,6 +22,7 @@ from shake_reference import (
     rising,
     smooth,
 )
+
 from telerig.io.bubble_motion import (
     mode_acceleration,
     ornstein_uhlenbeck,
@@ -191,18 +191,26 @@ def reference(
     parts: Callable[[Scenario, str, int], dict[str, Part]] = parts_of,
     real: type = np.float64,
 ) -> Reference:
-    """The reference smoother with one of the information sets, true hyper-parameters."""
+    """The reference smoother with one of the information sets, true hyper-parameters.
+
+    parts : may replace "servo" by a height anew at each frame, about what the encoder reads there,
+    or add a "carriage" of free motion, about the encoder's first reading.
+    """
     bubbles = 5 if information == "five" else 1
     model = Model(parts(scenario, information, bubbles))
     thin = round(SAMPLE_HZ / scenario.rate_hz)
     sampled = information in ("arms", "carriage")
     frames = np.arange(scenario.frames) * (thin if sampled else 1)
     times = np.arange(frames[-1] + 1) / (SAMPLE_HZ if sampled else scenario.rate_hz)
+    moving = [name for name in ("carriage", "servo") if name in model.parts]
+    nominal = runs.encoder * model.parts["servo"].anew
+    if "carriage" in model.parts:
+        nominal = runs.encoder[:1]
     readings = Readings()
-    readings.add(frames, model.read("position", "servo"), runs.encoder, ENCODER_MM)
+    readings.add(frames, model.read("position", *moving), runs.encoder - nominal, ENCODER_MM)
     for j in range(2):
-        rig = model.read("position", "servo")
-        seen = runs.image
+        rig = model.read("position", *moving)
+        seen = runs.image + nominal
         if information == "oracle":
             seen = seen + runs.offset[j]
         elif information != "rts":
@@ -213,13 +221,13 @@ def reference(
         if information == "references":
             for m in range(MARKS):
                 row = model.read("value", f"mark{j}{m}") - rig
-                readings.add(frames, row, runs.marks[j, m], MARK_PX * MM_PER_PX)
+                readings.add(frames, row, runs.marks[j, m] + nominal, MARK_PX * MM_PER_PX)
         if information == "arms":
-            row = model.read("acceleration", "servo", "common", f"own{j}")
+            row = model.read("acceleration", *moving, "common", f"own{j}")
             row = row + model.read("value", f"bias{j}")
             readings.add(range(len(times)), row, runs.felt[j], SAMPLE_SIGMA)
     if information == "carriage":
-        row = model.read("acceleration", "servo", "common") + model.read("value", "bias2")
+        row = model.read("acceleration", *moving, "common") + model.read("value", "bias2")
         readings.add(range(len(times)), row, runs.felt[2], SAMPLE_SIGMA)
     renewed = {}
     if information == "references":

@@ -100,7 +100,9 @@ def reading(sigma: float) -> Part:
     """A height that is anew at every node: known only from what reads it."""
     row = np.ones(1, REAL)
     zero = {"velocity": 0 * row, "acceleration": 0 * row}
-    return Part(np.zeros((1, 1), REAL), 0 * row, _chain([sigma**2]), {"position": row, **zero}, True)
+    return Part(
+        np.zeros((1, 1), REAL), 0 * row, _chain([sigma**2]), {"position": row, **zero}, True
+    )
 
 
 def rising(sigma: float, tau_s: float, start_mm: float, mean_mm_s: float) -> Part:

@@ -59,16 +59,19 @@ def make_scene(
 ) -> Scene:
     """Estimate each camera's background from the run itself."""
     shifts = {c.name: lab_shift_px(c, axis_rig, run.position_mm, run.frame_count) for c in cameras}
+    names = [c.name for c in cameras]
+    estimate = partial(_background, run, shifts)
     backgrounds = {}
-    for done, camera in enumerate(cameras):
+    for name, found in zip(names, ordered_map(estimate, names, quick_workers(len(names)))):
+        backgrounds[name] = found
         if progress is not None:
-            progress("background", done, len(cameras))
-        backgrounds[camera.name] = estimate_background(
-            partial(run.image, camera.name), run.frame_count, shift_px=shifts[camera.name]
-        )
-    if progress is not None:
-        progress("background", len(cameras), len(cameras))
+            progress("background", len(backgrounds), len(names))
     return Scene(run, backgrounds, shifts, min_diameter_px)
+
+
+def _background(run: RunData, shifts: dict[str, Array], camera: str) -> Background:
+    images = partial(run.image, camera)
+    return estimate_background(images, run.frame_count, shift_px=shifts[camera])
 
 
 def lab_shift_px(

@@ -100,7 +100,10 @@ def write_tracking(
         write_table(events_table(stream.events), staged / "events.csv")
         write_json_atomic(staged / "run.json", _record(run, options, record))
         if run.detections is None:
-            _write_pictures(run, calibration, options, summary, staged)
+            cameras = check_calibration(run, calibration)
+            axis = stage_axis(run, calibration)
+            scene = stream.scene or make_scene(run, cameras, axis, options.min_diameter_px)
+            _write_pictures(scene, summary, staged)
         if report:
             from telerig.io.report.track_report import write_track_report
 
@@ -135,18 +138,10 @@ def _record(run: RunData, options: TrackOptions, record: Mapping[str, Any]) -> d
     return content
 
 
-def _write_pictures(
-    run: RunData,
-    calibration: Calibration,
-    options: TrackOptions,
-    summary: Mapping[str, Any],
-    staged: Path,
-) -> None:
+def _write_pictures(scene: Scene, summary: Mapping[str, Any], staged: Path) -> None:
     """overlays/<camera>/<frame>.jpg and binary/<camera>/<frame>.png of the worst frames."""
     frames = [int(w["frame"]) for w in summary["worst_frames"]]
-    cameras = check_calibration(run, calibration)
-    scene = make_scene(run, cameras, stage_axis(run, calibration), options.min_diameter_px)
-    tasks = [(c.name, f, _labels(staged, c.name, f)) for f in frames for c in cameras]
+    tasks = [(c, f, _labels(staged, c, f)) for f in frames for c in scene.run.cameras]
     draw = partial(_draw, scene, staged)
     for _ in ordered_map(draw, tasks, quick_workers(len(tasks))):
         pass

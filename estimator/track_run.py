@@ -23,6 +23,7 @@ from telerig.estimator.frontend.pair_types import PairModel
 from telerig.estimator.track_detect import (
     DetectionStore,
     Progress,
+    Scene,
     detect_missing,
     fingerprint,
     make_scene,
@@ -64,6 +65,7 @@ class TrackingStream:
     model: PairModel
     shape_sigma: Array | None
     frames_without: dict[str, dict[str, int]]
+    scene: Scene | None
 
 
 def track(
@@ -102,7 +104,7 @@ def tracking_stream(
     chosen = options or TrackOptions()
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
-    first_id, labels = 0, None
+    first_id, labels, scene = 0, None, None
     batches: Callable[[], Iterator[pd.DataFrame]]
     if run.detections is not None:
         table, labels = numbered_particles(_complete(run.detections))
@@ -124,7 +126,7 @@ def tracking_stream(
     rows = _linked(run, cameras, batches(), linker, without, stage)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
-    return TrackingStream(rows, linker.events, model, sigma, without)
+    return TrackingStream(rows, linker.events, model, sigma, without, scene)
 
 
 def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, Camera]:

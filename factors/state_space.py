@@ -188,17 +188,20 @@ def driven_mode(
     return _scaled("driven_mode", drift, np.array([1.0, 0, 0, 0]), rms_mm)
 
 
-def broad_band(rms_mm: float, *, low_hz: float = 8.0, high_hz: float = 60.0) -> Component:
-    """Shake of unknown modes: s / ((s + a)^2 (s + b)^3) of white noise, of the given RMS.
+def broad_band(
+    rms_mm: float, *, low_hz: float = 8.0, high_hz: float = 60.0, floor: float = 0.0
+) -> Component:
+    """Shake of unknown modes: (s + floor a) / ((s + a)^2 (s + b)^3) of white noise, of given RMS.
 
-    Nothing at zero frequency, a falling density from low_hz, accelerations that are smooth from
-    high_hz on (as a force needs to be to make accelerometers useful). Five states, one for each
-    pole; displacement, velocity and acceleration are combinations of them.
+    A density that falls from low_hz (a) on and steeply from high_hz (b) on: accelerations as
+    smooth as a force through two poles makes them, without which accelerometers are of no use.
+    Below low_hz it falls too, to floor^2 of about the peak: to nothing at floor 0, while a mode of
+    little damping keeps a compliance there. Five states, one for each pole.
     """
     _positive(rms_mm=rms_mm, low_hz=low_hz, high_hz=high_hz)
     a, b = 2 * np.pi * low_hz, 2 * np.pi * high_hz
     chain = np.diag([-a, -a, -b, -b, -b]) + np.diag([1.0, 1.0, 1.0, 1.0], 1)
-    return _scaled("broad_band", chain, chain[0], rms_mm)
+    return _scaled("broad_band", chain, chain[0] + floor * a * np.eye(5)[0], rms_mm)
 
 
 def _scaled(name: str, drift: Array, position: Array, rms: float) -> Component:

@@ -120,7 +120,9 @@ def test_encoder_derivatives() -> None:
 def test_speed_residual_is_second_order_zero_on_a_zigzag() -> None:
     """Constant speed V at a small angle: v_up + v_across^2 / (2 V) - V is of fourth order."""
     angle = np.array([0.0, 0.1, 0.2])
-    velocity = 280 * (np.cos(angle)[:, None] * UP + np.sin(angle)[:, None] * np.array([0.6, 0, 0.8]))
+    velocity = 280 * (
+        np.cos(angle)[:, None] * UP + np.sin(angle)[:, None] * np.array([0.6, 0, 0.8])
+    )
     value, by_velocity, by_speed = measurements.speed_residual(velocity, np.full(3, 280.0), UP)
     assert np.all(np.abs(value) <= 280 * angle**4 / 6 + 1e-9)
 

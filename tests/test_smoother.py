@@ -43,7 +43,9 @@ def rig() -> tuple[Camera, Camera]:
 
 
 MODEL = ShakeModel(
-    bubble=BubbleModel(zigzags=(Zigzag(6.0, 0.05, (2.0, 0.0, 2.0)), Zigzag(12.0, 0.03, (0, 0.2, 0)))),
+    bubble=BubbleModel(
+        zigzags=(Zigzag(6.0, 0.05, (2.0, 0.0, 2.0)), Zigzag(12.0, 0.03, (0, 0.2, 0)))
+    ),
     modes=(
         RigMode(20.0, 0.03, (0.06, 0.12, 0.06)),
         RigMode(32.0, 0.03, (0.03, 0.07, 0.03), camera=0),
@@ -81,7 +83,12 @@ def problem(rng: np.random.Generator, *, sensors: bool = False, marks: bool = Fa
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         accelerometers = tuple(
             Accelerometer(
-                name, j, times, 9810 * UP @ turn.T + 300 * rng.normal(size=(len(times), 3)), turn, 7.0
+                name,
+                j,
+                times,
+                9810 * UP @ turn.T + 300 * rng.normal(size=(len(times), 3)),
+                turn,
+                7.0,
             )
             for j, name in enumerate(("a", "b"))
         )
@@ -127,7 +134,9 @@ class Dense:
         total = operator @ prior @ operator.T + np.diag(noise)
         gain = np.linalg.solve(total, operator @ prior).T
         rest = value - operator @ mean
-        evidence = -0.5 * (rest @ np.linalg.solve(total, rest) + np.linalg.slogdet(2 * np.pi * total)[1])
+        evidence = -0.5 * (
+            rest @ np.linalg.solve(total, rest) + np.linalg.slogdet(2 * np.pi * total)[1]
+        )
         return mean + gain @ rest, prior - gain @ operator @ prior, starts, float(evidence)
 
 
@@ -217,7 +226,9 @@ def dense(given: SmoothingProblem, model: ShakeModel) -> tuple[Dense, Any, Any, 
     for m in range(len(given.observations)):
         k, f = int(given.observations.item[m]), int(given.observations.frame[m])
         add_pixels(
-            given.observations, m, lambda line, k=k, f=f: of_bubble(k, f, line @ frame.bubble.position)
+            given.observations,
+            m,
+            lambda line, k=k, f=f: of_bubble(k, f, line @ frame.bubble.position),
         )
     marks = [whole.add(mark.guess_mm, mark.sigma_mm**2 * np.eye(3)) for mark in given.marks]
     for m in range(len(given.references)):

@@ -77,7 +77,9 @@ def test_stationary_stays_stationary(component: Component) -> None:
     steps, p = discretise(component, [0.003]), component.start_covariance
     sigma = np.sqrt(np.diag(p))
     after = steps.transition[0] @ p @ steps.transition[0].T + steps.covariance[0]
-    np.testing.assert_allclose(after / sigma / sigma[:, None], p / sigma / sigma[:, None], atol=1e-9)
+    np.testing.assert_allclose(
+        after / sigma / sigma[:, None], p / sigma / sigma[:, None], atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(

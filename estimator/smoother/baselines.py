@@ -36,9 +36,7 @@ def rts(
 
     seen = np.isfinite(position_mm).all(1)
     first = position_mm[np.argmax(seen)]
-    steps = discretise(
-        ou_velocity(model.velocity_sigma_mm_s, model.velocity_tau_s), np.diff(t_s)
-    )
+    steps = discretise(ou_velocity(model.velocity_sigma_mm_s, model.velocity_tau_s), np.diff(t_s))
     filter_: Any = KalmanFilter(dim_x=9, dim_z=3)
     filter_.x = np.r_[first, np.zeros(6)][:, None]
     each = np.diag([model.start_sigma_mm**2, 0, 0]).astype(float)

@@ -30,6 +30,9 @@ _ZIGZAG_DAMPING = 0.1
 _HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
 _CLEAR = 0.2
+_SHAKE_HZ = (4.0, 60.0)
+_FLOOR = 0.17
+"""A mode of damping z and its white force have 4 z / (pi f) RMS^2 per Hz below it: z = 0.03."""
 
 
 def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
@@ -57,11 +60,11 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
 
 
 def _band(camera: int) -> BroadBand:
-    return BroadBand((SHAKE_RMS_MM,) * 3, camera)
+    return BroadBand((SHAKE_RMS_MM,) * 3, camera, floor=_FLOOR)
 
 
-def rescaled(model: ShakeModel, rms_mm: Array) -> ShakeModel:
-    """The broad-band priors with the RMS that was found.
+def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeModel:
+    """The broad-band priors with the RMS and the dominant frequency that were found.
 
     rms_mm : (C, 3) of each camera's offset (posterior mean and variance), the expectation step
     of expectation maximisation. What is common to the cameras keeps its share.
@@ -75,11 +78,17 @@ def rescaled(model: ShakeModel, rms_mm: Array) -> ShakeModel:
         before[band.camera] += np.square(band.rms_mm)
     factor = rms_mm / np.sqrt(np.where(before > 0, before, 1.0))
     factor = np.clip(factor, 0.05, 20.0)
-    bands = tuple(
-        replace(b, rms_mm=_triple(np.asarray(b.rms_mm) * _factor(factor, b.camera)))
+    frequency = float(np.clip(frequency_hz, *_SHAKE_HZ))
+    bands = [
+        replace(
+            b,
+            rms_mm=_triple(np.asarray(b.rms_mm) * _factor(factor, b.camera)),
+            low_hz=frequency,
+            high_hz=max(60.0, 2 * frequency),
+        )
         for b in model.broad_bands
-    )
-    return replace(model, broad_bands=bands)
+    ]
+    return replace(model, broad_bands=tuple(bands))
 
 
 def _factor(factor: Array, camera: int) -> Array:

@@ -66,14 +66,19 @@ class RigMode:
 
 @dataclass(frozen=True)
 class BroadBand:
-    """Shake without modal knowledge, of each camera or (CARRIAGE) of all alike."""
+    """Shake without modal knowledge, of each camera or (CARRIAGE) of all alike.
+
+    low_hz, high_hz, floor : see `telerig.factors.state_space.broad_band`.  slow_rms_mm,
+    slow_tau_s : an Ornstein-Uhlenbeck offset besides, which accelerometers do not feel.
+    """
 
     rms_mm: Triple
     camera: int = CARRIAGE
     low_hz: float = 8.0
     high_hz: float = 60.0
+    floor: float = 0.0
     slow_rms_mm: float = 0.0
-    slow_tau_s: float = 0.3
+    slow_tau_s: float = 0.1
 
 
 @dataclass(frozen=True)

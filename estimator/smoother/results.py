@@ -91,7 +91,9 @@ def _residuals(solution: Solution, which: int) -> dict[str, Any]:
         "pixels": len(values),
         "outliers": int((~kept).sum()),
         "rms_sigmas": float(np.sqrt(square.mean() / 2)) if kept.any() else None,
-        "median_sigmas": float(np.sqrt(np.median(square) / (2 * np.log(2)))) if kept.any() else None,
+        "median_sigmas": float(np.sqrt(np.median(square) / (2 * np.log(2))))
+        if kept.any()
+        else None,
     }
 
 
@@ -122,7 +124,9 @@ def _means(solution: Solution) -> dict[str, Any]:
     names = ["x_mm_s", "y_mm_s", "z_mm_s", "speed_mm_s"][: solution.frame.mean_size]
     block = _block(solution, "means")
     return {
-        str(b.particle): _with_sd(names, solution.state.means[i], None if block is None else block[i])
+        str(b.particle): _with_sd(
+            names, solution.state.means[i], None if block is None else block[i]
+        )
         for i, b in enumerate(solution.frame.problem.bubbles)
     }
 

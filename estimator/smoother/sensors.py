@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,13 @@ def stage_of(table: Any, t_s: Array) -> Stage | None:
         return None
     t = _column(table, "t_s", "stage")
     position = _column(table, "position_mm", "stage")
+    if np.any(~(np.diff(t) > 0)):
+        row = int(np.flatnonzero(~(np.diff(t) > 0))[0]) + 3
+        raise InputError(
+            f"times do not increase at row {row}",
+            where="stage",
+            todo="sort the rows and remove duplicates",
+        )
     if t[-1] < t_s[0] or t[0] > t_s[-1]:
         raise InputError(
             f"the record ({t[0]:.6g} to {t[-1]:.6g} s) does not overlap the frames "
@@ -135,6 +143,31 @@ def _mount(name: str, mounted_on: str, cameras: Sequence[Camera]) -> int:
             todo=f'use one of {", ".join(names)} or "carriage"',
         )
     return names.index(mounted_on)
+
+
+def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelerometer, ...]:
+    """Samples averaged in blocks no longer than step_s, each at its mean time; none over a gap.
+
+    An average over T of a motion at w is too small by (w T)^2 / 24: 0.6 % at 60 Hz and 1 ms.
+    """
+    return tuple(_thinned(sensor, step_s) for sensor in sensors)
+
+
+def _thinned(sensor: Accelerometer, step_s: float) -> Accelerometer:
+    block = int(step_s / np.median(np.diff(sensor.t_s)) + 1e-6)
+    count = len(sensor.t_s) // block if block > 1 else 0
+    if count < 2:
+        return sensor
+    used = count * block
+    t = sensor.t_s[:used].reshape(count, block)
+    whole = np.ptp(t, axis=1) < 1.5 * step_s
+    reading = sensor.reading_mm_s2[:used].reshape(count, block, 3)
+    return replace(
+        sensor,
+        t_s=t.mean(1)[whole],
+        reading_mm_s2=reading.mean(1)[whole],
+        sigma_mm_s2=sensor.sigma_mm_s2 / float(np.sqrt(block)),
+    )
 
 
 def references_of(

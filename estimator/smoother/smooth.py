@@ -26,6 +26,7 @@ from telerig.estimator.smoother.sensors import (
     calibration_share,
     references_of,
     stage_of,
+    thinned,
 )
 from telerig.estimator.smoother.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoother.tables import shake as shake_table
@@ -40,6 +41,7 @@ Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
+_COARSE_STEP_S, _FINE_STEP_S = 2e-3, 1e-3
 _ENCODER_SIGMA_MM = 0.005
 _SAMPLED = 500
 
@@ -78,12 +80,11 @@ def smooth(
         references=references, rig=rig, t_s=t_s,
     )  # fmt: skip
     chosen = choose_model(problem, model, encoder_sigma)
-    solution = solve(problem, chosen, options, progress)
-    if not isinstance(model, ShakeModel):
-        better = adapted(solution)
-        if better is not None:
-            chosen = better
-            solution = solve(problem, chosen, options, progress, start=solution)
+    if isinstance(model, ShakeModel):
+        solution = solve(problem, chosen, options, progress)
+    else:
+        solution = _adapted_solution(problem, chosen, options, progress)
+        chosen = solution.frame.model
     verdict = judge(problem, chosen, solution)
     return Smoothing(
         trajectories(solution, None if tracked is None else tracked.table),
@@ -178,15 +179,27 @@ def choose_model(
     return default
 
 
-def judge(
-    problem: SmoothingProblem, model: ShakeModel, solution: Solution
-) -> Mapping[str, Any]:
+def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> Mapping[str, Any]:
     """The verdict of the identifiability module, where it is installed."""
     module = "telerig.estimator.identifiability"
     if not problem.bubbles or find_spec(module) is None:
         return {}
     verdict: Mapping[str, Any] = import_module(module).judge(problem, model, solution)
     return verdict
+
+
+def _adapted_solution(
+    problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress | None
+) -> Solution:
+    """A first solution with few sensor samples sets noise, RMS and delays of the second."""
+    sensors = problem.accelerometers
+    coarse = replace(problem, accelerometers=thinned(sensors, _COARSE_STEP_S))
+    first = solve(coarse, model, options, progress)
+    better = adapted(first)
+    if better is None and coarse.accelerometers == sensors:
+        return first
+    fine = replace(problem, accelerometers=thinned(sensors, _FINE_STEP_S))
+    return solve(fine, better or model, options, progress, start=first)
 
 
 def adapted(solution: Solution) -> ShakeModel | None:
@@ -197,9 +210,10 @@ def adapted(solution: Solution) -> ShakeModel | None:
     if abs(inflation - 1) > _INFLATE_BEYOND:
         better = replace(model, pixel_inflation=model.pixel_inflation * inflation)
     if model.broad_bands:
-        rms = _offset_rms(solution)
-        fresh = rescaled(better, rms)
-        ratio = [np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)]
+        fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
+        ratio = [
+            np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)
+        ]
         if np.max(np.abs(np.log(ratio))) > _RESCALE_BEYOND:
             better = fresh
     return None if better is model else better
@@ -217,6 +231,16 @@ def _offset_rms(solution: Solution) -> Array:
     unseen = mean < 1e-12
     each = np.where(unseen, np.nan, mean)
     return np.asarray(np.sqrt(np.where(unseen, np.nanmean(each, 1, keepdims=True), mean)))
+
+
+def _dominant_hz(solution: Solution) -> float:
+    """RMS of the offsets' velocity over that of the offsets."""
+    layout = solution.frame.shake
+    states = solution.frame.shake_at_frames(solution.state.shake)
+    place, speed = (
+        np.einsum("cid,fd->fci", r[:-1], states) for r in (layout.offset, layout.offset_velocity)
+    )
+    return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
 
 
 def _inflation(solution: Solution) -> float:

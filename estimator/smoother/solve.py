@@ -25,7 +25,9 @@ T = TypeVar("T")
 STACK_BYTES = 512 << 20
 OUTLIER_SIGMAS = 4.0
 _SUSPICIOUS_SIGMAS = 5.0
-_DELAY_STEP_S = 2e-4
+_LEAST_KEPT = 0.7
+_DELAY_STEP_S = 3e-5
+_DELAY_LEAP_S = 2e-3
 
 
 @dataclass(frozen=True)
@@ -115,9 +117,7 @@ def _solve(
     state = first_guess(frame)
     weights = (np.ones(len(problem.observations)), np.ones(len(problem.references)))
     if start is not None:
-        weights = start.weights
-        if [a.shape for a in vars(start.state).values()] == [a.shape for a in vars(state).values()]:
-            state = start.state
+        weights, state = start.weights, _warm(frame, state, start)
     robust = _Truncation(options.robust)
     for done in range(1, options.passes + 1):
         progress("smoothing", (done - 1) / (options.passes + 1))
@@ -135,6 +135,20 @@ def _solve(
         last = _linear_solve(frame, state, weights)
         state = moved(frame, state, last.step)
     return _finish(frame, state, weights, last, options, done, progress)
+
+
+def _warm(frame: Frame, state: State, start: Solution) -> State:
+    """The first guess with whatever of another solution has the same meaning here."""
+    same = {
+        name: value
+        for name, value in vars(start.state).items()
+        if value.shape == getattr(state, name).shape and name not in ("shake", "clocks")
+    }
+    if frame.shake.labels == start.frame.shake.labels:
+        t = start.frame.nodes.t_s
+        columns = [np.interp(frame.nodes.t_s, t, c) for c in start.state.shake.T]
+        same["shake"] = np.stack(columns, -1) if columns else state.shake
+    return replace(state, **same)
 
 
 def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
@@ -290,6 +304,10 @@ class _Truncation:
         else:
             self.control *= 4
         fresh = tuple(_truncated(s, bound, self.control) for s in squares)
+        if self.control > 1 and any(len(w) and w.mean() < _LEAST_KEPT for w in fresh):
+            # so many cannot be outliers: it is the motion that the priors do not allow
+            self.wanted = False
+            fresh = tuple(np.ones_like(w) for w in weights)
         change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fresh, weights))
         return (fresh[0], fresh[1]), change > 1e-3
 
@@ -309,9 +327,8 @@ def _restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
         return frame, state, False
     if np.max(np.abs(state.clocks)) < _DELAY_STEP_S:
         return frame, state, False
-    fresh = frame_of(
-        frame.problem, frame.model, frame.delays_s + state.clocks[frame.clock_of, 0]
-    )
+    leap = np.clip(state.clocks[frame.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
+    fresh = frame_of(frame.problem, frame.model, frame.delays_s + leap)
     shake = np.stack(
         [np.interp(fresh.nodes.t_s, frame.nodes.t_s, column) for column in state.shake.T], -1
     )
@@ -372,7 +389,13 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
     cross = cross.reshape(frame.rows, counts[0][1], counts[1][1])
     cross = shake_basis[frame.frame_of_row] @ cross @ np.swapaxes(bubble_basis, -1, -2)
     return Covariances(
-        shake, bubbles, cross, blocks[2], blocks[3], blocks[4][0], blocks[5][0],
+        shake,
+        bubbles,
+        cross,
+        blocks[2],
+        blocks[3],
+        blocks[4][0],
+        blocks[5][0],
         *blocks[6:],
     )
 

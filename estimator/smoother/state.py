@@ -171,7 +171,9 @@ def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> F
 def clocks_of(problem: SmoothingProblem) -> Ints:
     """(A,) number of each sensor's clock: those with the same stamps were sampled together."""
     known: dict[tuple[bytes, float], int] = {}
-    numbers = [known.setdefault((a.t_s.tobytes(), a.delay_s), len(known)) for a in problem.accelerometers]
+    numbers = [
+        known.setdefault((a.t_s.tobytes(), a.delay_s), len(known)) for a in problem.accelerometers
+    ]
     return np.array(numbers, np.int64)
 
 

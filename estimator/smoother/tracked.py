@@ -36,9 +36,7 @@ class Tracked:
     t_s: Array
 
 
-def read_tracks(
-    tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | None
-) -> Tracked:
+def read_tracks(tracks: Any, cameras: Sequence[Camera], frame_times_s: Array | None) -> Tracked:
     """Pixels out of a tracks table, and of detections that only one camera made.
 
     tracks : `Tracks`, or a table with the columns of tracks.csv.
@@ -132,9 +130,7 @@ def _single(
     paired = set(zip(table["frame"].tolist(), table["particle"].tolist()))
     ends = table.groupby("particle")["frame"].agg(["min", "max"])
     inside = [
-        p in number
-        and (f, p) not in paired
-        and ends.at[p, "min"] <= f <= ends.at[p, "max"]
+        p in number and (f, p) not in paired and ends.at[p, "min"] <= f <= ends.at[p, "max"]
         for f, p in zip(rows["frame"].tolist(), ids.tolist())
     ]
     kept = np.array(inside, bool) if inside else np.zeros(0, bool)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -121,12 +121,19 @@ def tracking_stream(
     sample = _sample(run, cameras, batches())
     model = estimate_pair_model(sample, cameras)
     sigma = _shape_sigma(sample, cameras, model)
-    tracker = Tracker(cameras, axis, chosen.tracker, first_id=first_id)
+    tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
     linker = Linker(cameras, model, tracker, sigma)
     rows = _linked(run, cameras, batches(), linker, without, stage)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
     return TrackingStream(rows, linker.events, model, sigma, without, scene)
+
+
+def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:
+    """A run shorter than what confirms a track confirms it by what it has."""
+    wanted = options.tracker
+    hits = max(1, min(wanted.confirm_hits, run.frame_count))
+    return replace(wanted, confirm_hits=hits, confirm_frames=max(hits, wanted.confirm_frames))
 
 
 def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, Camera]:

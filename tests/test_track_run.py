@@ -163,6 +163,20 @@ def test_calibration_of_another_rig(rise: Path) -> None:
         telerig.track(run, replace(good, cameras=good.cameras[:1]))
 
 
+def test_a_single_frame_is_a_track_of_one_point(rise: Path, whole: Tracks) -> None:
+    run = telerig.load_run(rise / "runs" / "rise")
+    first = whole.detections[whole.detections["frame"] == 0].assign(particle="")
+    one = replace(
+        run, detections=first, source="detections", frame_count=1, t_s=run.t_s[:1],
+        position_mm=None,
+    )  # fmt: skip
+    table = telerig.track(one, truth_calibration()).table
+    names = ["left_u_px", "right_v_px", "x_mm", "z_mm"]
+    expected = whole.table[whole.table["frame"] == 0]
+    assert len(table) == 1
+    assert np.allclose(table[names], expected[names], atol=0.05)
+
+
 def test_a_run_without_any_bubble_says_so(rise: Path) -> None:
     run = telerig.load_run(rise / "runs" / "rise")
     table = pd.DataFrame({"frame": [0], "camera": ["left"], "u_px": [np.nan], "v_px": [np.nan]})

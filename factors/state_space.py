@@ -191,7 +191,7 @@ def driven_mode(
 def broad_band(
     rms_mm: float, *, low_hz: float = 8.0, high_hz: float = 60.0, floor: float = 0.0
 ) -> Component:
-    """Shake of unknown modes: (s + floor a) / ((s + a)^2 (s + b)^3) of white noise, of given RMS.
+    """Shake of unknown modes: (s + floor a) / ((s + a)^3 (s + b)^2) of white noise, of given RMS.
 
     A density that falls from low_hz (a) on and steeply from high_hz (b) on: accelerations as
     smooth as a force through two poles makes them, without which accelerometers are of no use.
@@ -200,7 +200,7 @@ def broad_band(
     """
     _positive(rms_mm=rms_mm, low_hz=low_hz, high_hz=high_hz)
     a, b = 2 * np.pi * low_hz, 2 * np.pi * high_hz
-    chain = np.diag([-a, -a, -b, -b, -b]) + np.diag([1.0, 1.0, 1.0, 1.0], 1)
+    chain = np.diag([-a, -a, -a, -b, -b]) + np.diag([1.0, 1.0, 1.0, 1.0], 1)
     return _scaled("broad_band", chain, chain[0] + floor * a * np.eye(5)[0], rms_mm)
 
 

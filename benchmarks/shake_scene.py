@@ -1,0 +1,408 @@
+"""Runs for the smoother, in three dimensions and with the truth, made without its models.
+
+Bubbles, carriage and shake come from the simulator of motions (`telerig.io.bubble_motion`), the
+nonlinear ones from equations of motion integrated here; pixels from the cameras' projection.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from shake_cases import (
+    ARM_RATIO,
+    COMMON,
+    DAMPING,
+    ENCODER_MM,
+    FORCE_HZ,
+    MARK_PX,
+    MARKS,
+    MM_PER_PX,
+    RISE_MM_S,
+    SAMPLE_HZ,
+    SCENARIOS,
+    SERVO,
+    WANDER,
+    ZIGZAG,
+    Scenario,
+    mark_generation,
+)
+
+from telerig.estimator.calibration import Calibration
+from telerig.io.bubble_motion import (
+    Path as Motion,
+)
+from telerig.io.bubble_motion import (
+    Shake,
+    accelerometer_readings,
+    constant_speed_path,
+    mode_acceleration,
+    ornstein_uhlenbeck,
+    rig_mode,
+    rig_shake,
+    stochastic_paths,
+)
+from telerig.io.rig_description import AccelerometerDescription, StageDescription
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
+
+Array = NDArray[np.float64]
+
+UP = np.array([0.0, -1.0, 0.0])
+LATERAL = (2.0, 6.0, 0.03)
+LATERAL_SHAKE = 0.5
+NONLINEAR = ("zigzag", "ring-down", "limit cycle", "stick-slip")
+H = 1 / SAMPLE_HZ
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scenario, and what is unlike S0-S6 in it.
+
+    angle_deg between the cameras.  kappa_per_mm of both.  nonlinear : one of ``NONLINEAR``.
+    """
+
+    scenario: Scenario
+    angle_deg: float = 90.0
+    kappa_per_mm: float = 0.0
+    nonlinear: str = ""
+    outliers: float = 0.0
+    dropped: float = 0.0
+    delay_s: float = 0.0
+    encoder_scale: float = 0.0
+    ramp_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return self.nonlinear or self.scenario.name
+
+
+@dataclass(frozen=True)
+class Run:
+    """Tables as a user has them, and truth: position_mm, velocity_mm_s (5, F, 3) lab.
+
+    offset_mm : (2, F, 3) rig axes.  oracle : tracks of a rig without shake, the same noise.
+    """
+
+    case: Case
+    t_s: Array
+    calibration: Calibration
+    tracks: pd.DataFrame
+    oracle: pd.DataFrame
+    stage: pd.DataFrame
+    accelerometers: pd.DataFrame
+    references: pd.DataFrame
+    position_mm: Array
+    velocity_mm_s: Array
+    offset_mm: Array
+
+    def inputs(self, information: str) -> dict[str, Any]:
+        """Keyword arguments of `telerig.smooth`, with its first two."""
+        tracks = self.oracle if information == "oracle" else self.tracks
+        if information != "five":
+            tracks = tracks[tracks["particle"] == 0]
+        sensor = self.accelerometers["sensor"]
+        sensors = self.accelerometers[(sensor == "carriage") == (information == "carriage")]
+        used = information in ("arms", "carriage")
+        return {
+            "tracks": tracks.reset_index(drop=True),
+            "calibration": self.calibration,
+            "stage": self.stage,
+            "accelerometers": sensors if used else None,
+            "references": self.references if information == "references" else None,
+            "rig": description(),
+            "t_s": self.t_s,
+        }
+
+
+def description() -> SimpleNamespace:
+    """What rig.toml says of stage and sensors."""
+    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    sensors = {
+        name: AccelerometerDescription(name, mount, axes, 22.5)
+        for name, mount in (("arm_left", "left"), ("arm_right", "right"), ("carriage", "carriage"))
+    }
+    up = (0.0, -1.0, 0.0)
+    return SimpleNamespace(stage=StageDescription(up, up, ENCODER_MM), accelerometers=sensors)
+
+
+def cameras(case: Case) -> tuple[Camera, Camera]:
+    turn = Pose.from_rotvec([0.0, np.deg2rad(case.angle_deg), 0.0])
+    size, scale = (1024, 1024), 1 / MM_PER_PX
+    kappa = {"kappa_per_mm": case.kappa_per_mm}
+    return (
+        Camera.create("left", size, scale, **kappa),
+        Camera.create("right", size, scale, camera_from_rig=turn, **kappa),
+    )
+
+
+def simulate(case: Case, rng: Generator, *, calibration: Calibration | None = None) -> Run:
+    """One run. calibration : what the estimator is told; the true cameras by default."""
+    scenario, true = case.scenario, cameras(case)
+    thin = round(SAMPLE_HZ / scenario.rate_hz)
+    steps = (scenario.frames - 1) * thin + 1
+    t = np.arange(steps) * H
+    told = Calibration(true, np.zeros(0, int), np.zeros((0, 3)), {}, np.zeros((6, 6)), (), ((), ()))
+    carriage, push = _carriage(case, t, rng)
+    common, own = _shake(case, t, rng)
+    offset = common.offset_mm + own.offset_mm
+    place, velocity = _bubbles(case, t, rng)
+    frames = slice(None, None, thin)
+    rig = carriage[frames, None] * UP + offset[:, frames]
+    noise = scenario.noise_px * rng.standard_normal((2, 5, scenario.frames, 2))
+    spoiled = rng.random((2, 5, scenario.frames)) < case.outliers
+    noise += spoiled[..., None] * rng.uniform(-20, 20, noise.shape)
+    kept = rng.random((5, scenario.frames)) >= case.dropped
+    kept[:, [0, -1]] = True
+    calibrated = calibration or told
+    seen, calm = (
+        _tracks(calibrated, true, t[frames], place[:, frames], moved, noise, kept, scenario)
+        for moved in (rig, np.broadcast_to(carriage[frames, None] * UP, rig.shape))
+    )
+    return Run(
+        case, t[frames], calibrated, seen, calm,
+        _stage(case, t, carriage, rng),
+        _accelerometers(case, t, push, common, own, rng),
+        _references(true, t[frames], rig, rng),
+        place[:, frames], velocity[:, frames], offset[:, frames],
+    )  # fmt: skip
+
+
+def _carriage(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
+    """Position and acceleration along the axis, the servo's error included."""
+    place, push = RISE_MM_S * t, np.zeros_like(t)
+    if case.ramp_s > 0:
+        from telerig.io.bubble_motion import stage_trajectory
+
+        place, _, push = stage_trajectory(t, RISE_MM_S, case.ramp_s)
+    servo = rig_mode(*SERVO, FORCE_HZ)
+    states = servo.paths(H, len(t), rng)[0]
+    return place + states[:, 0], push + mode_acceleration(states, servo)
+
+
+def _bubbles(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
+    """Positions and velocities (5, N, 3) in the lab."""
+    if case.nonlinear == "zigzag":
+        paths = []
+        for _ in range(5):
+            hz, reach = rng.uniform(5, 8), rng.uniform(2, 5)
+            turns = {k: rng.uniform(0, 2 * np.pi) for k in ("azimuth_rad", "phase_rad")}
+            paths.append(constant_speed_path(t, RISE_MM_S, hz, (reach, 0.0), **turns))
+        columns = ("height_mm", "lateral_mm", "height_mm_s", "lateral_mm_s")
+        motion = Motion(*(np.stack([getattr(p, c) for p in paths]) for c in columns))
+        extra = ornstein_uhlenbeck(3.0, 0.3).paths(
+            H, len(t), rng, paths=15, start_covariance=np.diag([0.0, 9.0])
+        )
+        wander = extra.reshape(3, 5, len(t), 2)
+    else:
+        motion = stochastic_paths(
+            H, len(t), rng,
+            rise_mm_s=np.full(5, RISE_MM_S), wander_mm_s=WANDER[0], wander_tau_s=WANDER[1],
+            height_oscillation=ZIGZAG, lateral_oscillation=LATERAL,
+        )  # fmt: skip
+        wander = np.zeros((3, 5, len(t), 2))
+    start = rng.uniform(-5, 5, (5, 1, 3))
+    across = np.stack([motion.lateral_mm, motion.lateral_mm_s])
+    upwards = np.stack([motion.height_mm, motion.height_mm_s])
+    both = np.stack([across[..., 0], -upwards, across[..., 1]], -1)
+    both += wander.transpose(3, 1, 2, 0)
+    return start + both[0], both[1]
+
+
+def _shake(case: Case, t: Array, rng: Generator) -> tuple[Shake, Shake]:
+    """Common shake and that of the arms, each (2, N, 3)."""
+    scenario = case.scenario
+    rms = scenario.amplitude_mm / np.sqrt(2) * np.array([LATERAL_SHAKE, 1.0, LATERAL_SHAKE])
+    if case.nonlinear in NONLINEAR[1:]:
+        return _nonlinear(case.nonlinear, t, rms, rng)
+    options: dict[str, Any] = {
+        "frequency_hz": scenario.hz,
+        "arm_ratio": ARM_RATIO,
+        "damping": DAMPING,
+        "force_hz": FORCE_HZ,
+    }
+    common = rig_shake(
+        H, len(t), rng, cameras=2, rms_mm=rms * np.sqrt(COMMON), common_share=1.0, **options
+    )
+    own = rig_shake(
+        H, len(t), rng, cameras=2, rms_mm=rms * np.sqrt(1 - COMMON), common_share=0.0, **options
+    )
+    return common, own
+
+
+def _nonlinear(kind: str, t: Array, rms: Array, rng: Generator) -> tuple[Shake, Shake]:
+    """Forces that are not Gaussian, on modes of 18 Hz (common) and 29 Hz (arms)."""
+    parts = []
+    for hz, copies, share in ((18.0, 1, COMMON), (18.0 * ARM_RATIO, 2, 1 - COMMON)):
+        paths = np.stack([[_driven(kind, t, hz, rng) for _ in rms] for _ in range(copies)])
+        scale = np.sqrt((paths[..., 0] ** 2).mean(-1, keepdims=True))[..., None]
+        paths = paths / scale * (rms * np.sqrt(share))[:, None, None]
+        paths = np.broadcast_to(paths, (2, *paths.shape[1:])).transpose(3, 0, 2, 1)
+        parts.append(Shake(*paths.reshape(3, 2, len(t), len(rms))))
+    return parts[0], parts[1]
+
+
+def _driven(kind: str, t: Array, hz: float, rng: Generator) -> Array:
+    """(N, 3) displacement, velocity, acceleration of a mode under one sort of force."""
+    if kind == "limit cycle":
+        return _limit_cycle(t, 14.0, rng)
+    fine = 10
+    n, h = len(t) * fine, H / fine
+    force = np.zeros(n)
+    if kind == "ring-down":
+        for at in rng.uniform(0, t[-1], max(2, round(3 * t[-1]))).tolist() + [0.0]:
+            i = int(at / h)
+            force[i : i + round(0.004 / h)] += rng.choice([-1, 1]) * rng.uniform(0.5, 1.5)
+    else:
+        force = _stick_slip(n, h, rng)
+    return _forced(force, h, hz)[::fine]
+
+
+def _forced(force: Array, h: float, hz: float) -> Array:
+    """A mode (damping 0.03) under a force that two poles at 60 Hz smooth; exact between steps."""
+    from scipy.linalg import expm
+
+    w, f = 2 * np.pi * hz, 2 * np.pi * FORCE_HZ
+    drift = np.zeros((5, 5))
+    drift[0, 1] = drift[1, 2] = drift[2, 3] = 1.0
+    drift[1, :2] = -(w**2), -2 * DAMPING * w
+    drift[3, 2:] = -(f**2), -2 * f, f**2
+    phi = expm(drift * h)
+    x, out = np.zeros(5), np.empty((len(force), 3))
+    for i, u in enumerate(force):
+        x[4] = u
+        out[i] = x[0], x[1], drift[1] @ x
+        x = phi @ x
+    return out
+
+
+def _stick_slip(steps: int, h: float, rng: Generator) -> Array:
+    """Friction builds up while a guide sticks, and lets go at a level that varies."""
+    force, load, level = np.empty(steps), 0.0, 1.0
+    rate = rng.uniform(5, 8)
+    for i in range(steps):
+        load += rate * h
+        if load > level:
+            load, level = 0.0, rng.uniform(0.6, 1.4)
+        force[i] = load
+    return force - force.mean()
+
+
+def _limit_cycle(t: Array, hz: float, rng: Generator) -> Array:
+    """A hunting controller: constant amplitude, a third harmonic, a phase that drifts slowly."""
+    w, slow = 2 * np.pi * hz, 2 * np.pi * rng.uniform(0.3, 0.6)
+    start, turn = rng.uniform(0, 2 * np.pi, 2)
+    phase = w * t + start + 0.5 * np.sin(slow * t + turn)
+    rate = w + 0.5 * slow * np.cos(slow * t + turn)
+    bend = -0.5 * slow**2 * np.sin(slow * t + turn)
+    out = np.zeros((len(t), 3))
+    for k, a in ((1, 1.0), (3, 0.1)):
+        sine, cosine = np.sin(k * phase), np.cos(k * phase)
+        slope = k * cosine * rate
+        out += a * np.stack([sine, slope, k * cosine * bend - k**2 * sine * rate**2], -1)
+    return out
+
+
+def _tracks(
+    calibration: Calibration,
+    true: tuple[Camera, Camera],
+    t: Array,
+    place: Array,
+    rig: Array,
+    noise: Array,
+    kept: NDArray[np.bool_],
+    scenario: Scenario,
+) -> pd.DataFrame:
+    """tracks.csv of a perfect tracker."""
+    uv = [c.project(place - rig[j]) + noise[j] for j, c in enumerate(true)]
+    bubble, frame = np.nonzero(kept)
+    pixels = [a[bubble, frame] for a in uv]
+    points = calibration.triangulate(*pixels, sigma_px=scenario.noise_px)
+    columns: dict[str, Any] = {"frame": frame, "particle": bubble, "t_s": t[frame]}
+    columns |= {f"{a}_mm": points.points_mm[:, i] for i, a in enumerate("xyz")}
+    for i, a in enumerate("xyz"):
+        for j in range(i, 3):
+            columns[f"s{a}{'xyz'[j]}_mm2"] = points.covariance_mm2[:, i, j]
+    for camera, px in zip(true, pixels):
+        columns |= {f"{camera.name}_u_px": px[:, 0], f"{camera.name}_v_px": px[:, 1]}
+        variance = scenario.noise_px**2
+        for name, value in (("suu", variance), ("suv", 0.0), ("svv", variance)):
+            columns[f"{camera.name}_{name}_px2"] = value
+    return pd.DataFrame(columns)
+
+
+def _stage(case: Case, t: Array, carriage: Array, rng: Generator) -> pd.DataFrame:
+    """Read at the frames (at 500 Hz, every 2 ms), as in the reference of the design."""
+    thin = round(SAMPLE_HZ / case.scenario.rate_hz)
+    read = carriage[::thin] * (1 + case.encoder_scale)
+    read = read + ENCODER_MM * rng.standard_normal(len(read))
+    return pd.DataFrame({"t_s": t[::thin], "position_mm": read})
+
+
+def _accelerometers(
+    case: Case, t: Array, push: Array, common: Shake, own: Shake, rng: Generator
+) -> pd.DataFrame:
+    shared = push[:, None] * UP + common.acceleration_mm_s2[0]
+    tables = []
+    for name, felt in (
+        ("arm_left", shared + own.acceleration_mm_s2[0]),
+        ("arm_right", shared + own.acceleration_mm_s2[1]),
+        ("carriage", shared),
+    ):
+        reading = accelerometer_readings(
+            felt, UP, np.eye(3), rng, rate_hz=SAMPLE_HZ, density_ug_sqrt_hz=22.5,
+            bias_m_s2=0.2 * rng.standard_normal(3),
+        )  # fmt: skip
+        columns: dict[str, Any] = {"t_s": t + case.delay_s, "sensor": name}
+        columns |= {f"a{a}_m_s2": reading[:, i] for i, a in enumerate("xyz")}
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def _references(true: tuple[Camera, Camera], t: Array, rig: Array, rng: Generator) -> pd.DataFrame:
+    """Four marks a camera, all replaced every 0.3 s, at heights nobody knows."""
+    generation = mark_generation(t)
+    tables = []
+    for j, camera in enumerate(true):
+        middle = np.array([rig[j, generation == g].mean(0) for g in range(generation[-1] + 1)])
+        spread = rng.uniform(-1, 1, (len(middle), MARKS, 3)) * np.array([40.0, 8.0, 40.0])
+        places = middle[:, None] + spread
+        seen = camera.project(places[generation] - rig[j][:, None])
+        seen = seen + MARK_PX * rng.standard_normal(seen.shape)
+        frame = np.repeat(np.arange(len(t)), MARKS)
+        mark = [f"{camera.name}{g}_{m}" for g in generation for m in range(MARKS)]
+        flat = seen.reshape(-1, 2)
+        tables.append(
+            pd.DataFrame(
+                {
+                    "frame": frame,
+                    "camera": camera.name,
+                    "mark": mark,
+                    "u_px": flat[:, 0],
+                    "v_px": flat[:, 1],
+                    "sigma_px": MARK_PX,
+                }
+            )
+        )
+    return pd.concat(tables, ignore_index=True)
+
+
+def cases() -> dict[str, Case]:
+    """S0-S6 and the nonlinear suite (500 Hz, 0.5 px, 0.2 mm; the zigzag's rig shakes at 20 Hz)."""
+    out = {name: Case(s) for name, s in SCENARIOS.items()}
+    out |= {kind: Case(SCENARIOS["S2"], nonlinear=kind) for kind in NONLINEAR}
+    return out
+
+
+def oblique(case: Case) -> Case:
+    """The same with 40 degrees between cameras that are not quite telecentric."""
+    return replace(case, angle_deg=40.0, kappa_per_mm=2e-4)

@@ -159,5 +159,5 @@ def speed_residual(
 
 
 def whitener_of(covariance: Array) -> Array:
-    """(..., n, n) lower W with W covariance W^T = 1. Raises LinAlgError if not positive definite."""
+    """(..., n, n) lower W with W covariance W^T = 1. Raises LinAlgError for a singular one."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

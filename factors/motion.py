@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -103,7 +103,7 @@ def add_linear_factors(
 
     count, rows = rhs.shape
     kept = [(k, b) for k, b in zip(keys, blocks) if b.shape[-1]]
-    noise, factor = _unit_noise(rows), gtsam.JacobianFactor
+    noise, factor = _unit_noise(rows), cast(Any, gtsam.JacobianFactor)
     columns: list[Any] = []
     for key, block in kept:
         columns.append(np.broadcast_to(np.asarray(key), (count,)).tolist())

@@ -130,7 +130,7 @@ def white_jerk(
     start_sigma_mm_s: float = 300.0,
     start_sigma_mm_s2: float = 1000.0,
 ) -> Component:
-    """States (position, velocity, acceleration); the jerk is white, density in mm s^-3 / sqrt Hz."""
+    """States (position, velocity, acceleration); jerk white, density in mm s^-3 / sqrt Hz."""
     _positive(jerk_density=jerk_density)
     start = np.diag(np.square([start_sigma_mm, start_sigma_mm_s, start_sigma_mm_s2]))
     drift = np.diag([1.0, 1.0], 1)
@@ -305,7 +305,7 @@ def _exact(component: Component, dt: Array) -> tuple[Array, Array, Array]:
 
 
 def _short_step(drift: Array, noise: Array, h: Array) -> tuple[Array, Array]:
-    """Van Loan's exponential by its series, states scaled by the powers of h that they grow with."""
+    """Van Loan's exponential by its series, states scaled by the powers of h they grow with."""
     n = len(drift)
     scale = h[:, None] ** _orders(drift, noise)
     ratio = scale[:, None, :] / scale[:, :, None]

@@ -34,7 +34,7 @@ def rts(
     """
     from filterpy.kalman import KalmanFilter
 
-    seen = np.isfinite(position_mm).all(1)
+    seen = np.asarray(np.isfinite(position_mm).all(1))
     first = position_mm[np.argmax(seen)]
     steps = discretise(ou_velocity(model.velocity_sigma_mm_s, model.velocity_tau_s), np.diff(t_s))
     filter_: Any = KalmanFilter(dim_x=9, dim_z=3)
@@ -65,10 +65,10 @@ def _transition(steps: Any, i: int) -> Array:
     u = steps.index[i]
     one = np.eye(3)
     one[:2, :2], one[:2, 2] = steps.transition[u], steps.input[u][:, 0]
-    return np.kron(one, np.eye(3))
+    return np.asarray(np.kron(one, np.eye(3)), np.float64)
 
 
 def _noise(steps: Any, i: int) -> Array:
     one = np.zeros((3, 3))
     one[:2, :2] = steps.covariance[steps.index[i]]
-    return np.kron(one, np.eye(3))
+    return np.asarray(np.kron(one, np.eye(3)), np.float64)

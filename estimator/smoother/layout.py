@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from telerig.estimator.smoother.model import (
     CARRIAGE,
+    BroadBand,
     BubbleModel,
+    RigMode,
     ShakeModel,
     SmoothingProblem,
 )
@@ -84,7 +86,7 @@ class BubbleLayout:
 
     @property
     def size(self) -> int:
-        return self.position.shape[1]
+        return int(self.position.shape[1])
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ class Nodes:
 
 
 def seen_directions(camera: Camera) -> Array:
-    """(2, 3) unit vectors in rig axes across the camera's line of sight; rig axes where they fit."""
+    """(2, 3) unit vectors across the camera's line of sight, in rig axes; those where they fit."""
     rotation = camera.camera_from_rig.rotation
     along = int(np.argmax(np.abs(rotation[2])))
     if abs(rotation[2, along]) > _ALIGNED:
@@ -145,7 +147,9 @@ def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
                 offset[:, p.camera, :, columns] += block
         at += c.size
     return ShakeLayout(
-        tuple(parts), tuple(p.label for p in placed), *carriage, *offset, pitch,
+        tuple(parts), tuple(p.label for p in placed),
+        carriage[0], carriage[1], carriage[2], carriage[3],
+        offset[0], offset[1], offset[2], offset[3], pitch,
         tuple(seen_directions(c) for c in problem.cameras), _unseen(problem.cameras, model),
     )  # fmt: skip
 
@@ -205,7 +209,8 @@ def _directed(
 
 def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
     out = np.zeros((len(cameras), 3, 3))
-    for own in (*model.modes, *model.broad_bands):
+    parts: list[RigMode | BroadBand] = [*model.modes, *model.broad_bands]
+    for own in parts:
         if own.camera != CARRIAGE:
             depth = cameras[own.camera].camera_from_rig.rotation[2]
             variance = float(((depth * np.asarray(own.rms_mm)) ** 2).sum())

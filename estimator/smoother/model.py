@@ -255,8 +255,10 @@ class SmoothingProblem:
                 f"a run of {len(self.t_s)} frame(s) has no motion to smooth",
                 todo="give at least two frames",
             )
-        for name, times in (("frames", self.t_s), ("stage", self.stage and self.stage.t_s)):
-            if times is not None and np.any(~(np.diff(times) > 0)):
+        stage = [] if self.stage is None else [("stage", self.stage.t_s)]
+        sensors = [(f"accelerometer {a.name}", a.t_s) for a in self.accelerometers]
+        for name, times in [("frames", self.t_s), *stage, *sensors]:
+            if np.any(~(np.diff(times) > 0)):
                 row = int(np.flatnonzero(~(np.diff(times) > 0))[0]) + 1
                 raise InputError(
                     f"times do not increase at row {row}",

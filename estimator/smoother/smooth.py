@@ -41,7 +41,7 @@ Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
-_COARSE_STEP_S, _FINE_STEP_S = 2e-3, 1e-3
+_COARSE_STEP_S = 2e-3
 _ENCODER_SIGMA_MM = 0.005
 _SAMPLED = 500
 
@@ -56,7 +56,7 @@ def smooth(
     model: ShakeModel | Learn | str = "auto",
     rig: Any = None,
     t_s: ArrayLike | None = None,
-    options: Options = Options(),
+    options: Options | None = None,
     progress: Progress | None = None,
 ) -> Smoothing:
     """Smooth a run: every bubble in the lab, every camera's shake, with what is known of them.
@@ -79,6 +79,7 @@ def smooth(
         tracks, calibration, stage=stage, accelerometers=accelerometers,
         references=references, rig=rig, t_s=t_s,
     )  # fmt: skip
+    options = options or Options()
     chosen = choose_model(problem, model, encoder_sigma)
     if isinstance(model, ShakeModel):
         solution = solve(problem, chosen, options, progress)
@@ -196,10 +197,9 @@ def _adapted_solution(
     coarse = replace(problem, accelerometers=thinned(sensors, _COARSE_STEP_S))
     first = solve(coarse, model, options, progress)
     better = adapted(first)
-    if better is None and coarse.accelerometers == sensors:
+    if better is None and not sensors:
         return first
-    fine = replace(problem, accelerometers=thinned(sensors, _FINE_STEP_S))
-    return solve(fine, better or model, options, progress, start=first)
+    return solve(problem, better or model, options, progress, start=first)
 
 
 def adapted(solution: Solution) -> ShakeModel | None:

@@ -26,6 +26,7 @@ STACK_BYTES = 512 << 20
 OUTLIER_SIGMAS = 4.0
 _SUSPICIOUS_SIGMAS = 5.0
 _LEAST_KEPT = 0.7
+_NOTHING = np.zeros(0, np.int64)
 _DELAY_STEP_S = 3e-5
 _DELAY_LEAP_S = 2e-3
 
@@ -35,13 +36,14 @@ class Options:
     """passes : relinearisations at most.  robust : down-weight pixels that do not fit.
 
     covariances : of states ("frames"), or none (False) when only the evidence is asked.
-    tolerance_px : passes end when no bubble moved more in the last; relative to that, affine cameras need one pass.
+    tolerance_px : passes end when no bubble moved more in the last. Affine cameras and held
+        constants need one pass.
     """
 
     passes: int = 6
     robust: bool = True
     covariances: bool = True
-    tolerance_px: float = 0.02
+    tolerance_px: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Solution:
 def solve(
     problem: SmoothingProblem,
     model: ShakeModel,
-    options: Options = Options(),
+    options: Options | None = None,
     progress: Progress | None = None,
     start: Solution | None = None,
 ) -> Solution:
@@ -98,7 +100,8 @@ def solve(
 
     Raises CalibrationError when the measurements leave something undetermined.
     """
-    return in_large_stack(lambda: _solve(problem, model, options, progress or _silent, start))
+    chosen = options or Options()
+    return in_large_stack(lambda: _solve(problem, model, chosen, progress or _silent, start))
 
 
 def _silent(_what: str, _share: float) -> None:
@@ -119,13 +122,16 @@ def _solve(
     if start is not None:
         weights, state = start.weights, _warm(frame, state, start)
     robust = _Truncation(options.robust)
+    last: _Pass | None = None
+    exact = _is_linear(problem, model)
+    done = 0
     for done in range(1, options.passes + 1):
         progress("smoothing", (done - 1) / (options.passes + 1))
-        last = _linear_solve(frame, state, weights)
-        state = moved(frame, state, last.step)
+        last = made = _linear_solve(frame, state, weights)
+        state = moved(frame, state, made.step)
         fresh, changed = robust.update(weights, pixel_residuals(frame, state))
-        settled = last.largest_px < options.tolerance_px or _is_linear(problem, model)
-        if settled and not changed and (done > 1 or _is_linear(problem, model)):
+        settled = made.largest_px < options.tolerance_px or exact
+        if settled and not changed and (done > 1 or start is not None or exact):
             break
         weights = fresh
         frame, state, restamped = _restamped(frame, state)
@@ -228,12 +234,12 @@ def _ordering(frame: Frame) -> Any:
     base, problem = frame.base(), frame.problem
     nodes = np.arange(len(frame.nodes.t_s)) if frame.shake.size else np.zeros(0, np.int64)
     rows = np.arange(frame.rows)
-    last_row = frame.node_of_row[frame.first_row[1:] - 1] if len(problem.bubbles) else []
-    last_mark = np.zeros(len(problem.marks))
+    last_row = frame.node_of_row[frame.first_row[1:] - 1] if len(problem.bubbles) else _NOTHING
+    last_mark = np.zeros(len(problem.marks), np.int64)
     seen = frame.nodes.of_frame[problem.references.frame]
     np.maximum.at(last_mark, problem.references.item, seen)
     keys = [nodes, base[1] + rows, base[2] + np.arange(len(problem.bubbles))]
-    when = [nodes, frame.node_of_row, np.asarray(last_row)]
+    when = [nodes, frame.node_of_row, last_row]
     keys.append(base[6] + np.arange(len(problem.marks)))
     when.append(last_mark)
     rank = np.repeat(np.arange(4), [len(k) for k in keys])
@@ -408,7 +414,7 @@ def in_large_stack(task: Callable[[], T]) -> T:
     def run() -> None:
         try:
             result.append(task())
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
             fault.append(error)
 
     before = threading.stack_size(STACK_BYTES)

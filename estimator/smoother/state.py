@@ -98,7 +98,7 @@ class Frame:
 
     def bubble_basis(self, row: ArrayLike) -> Array:
         """(..., D, D) basis of the increments of bubble rows (...)."""
-        return np.asarray(self.bubble_motion.basis[self.row_basis[row]])
+        return np.asarray(self.bubble_motion.basis[self.row_basis[np.asarray(row)]])
 
     @property
     def rows(self) -> int:
@@ -139,7 +139,7 @@ class Frame:
 
     def base(self) -> list[int]:
         """The first key of each family."""
-        return np.r_[0, np.cumsum([n for n, _ in self.counts()])].tolist()
+        return [0, *(int(n) for n in np.cumsum([n for n, _ in self.counts()]))]
 
 
 def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> Frame:
@@ -178,7 +178,7 @@ def clocks_of(problem: SmoothingProblem) -> Ints:
 
 
 def _basis_index(index: Ints, node: ArrayLike) -> Ints:
-    return np.asarray(np.append(index, -1)[node])
+    return np.asarray(np.append(index, -1)[np.asarray(node)])
 
 
 def first_guess(frame: Frame) -> State:

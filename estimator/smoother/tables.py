@@ -69,7 +69,7 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
     number = {b.particle: i for i, b in enumerate(problem.bubbles)}
     item = tracks["particle"].map(number).to_numpy(np.int64)
     seen = tracks["frame"].to_numpy(np.int64)
-    rows = frame.row(item, seen)
+    rows = frame.row(np.asarray(item), np.asarray(seen))
     position = np.zeros(len(problem.t_s))
     if problem.stage is not None:
         position = np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm)

@@ -103,7 +103,7 @@ def _times(table: pd.DataFrame, frame_times_s: Array | None) -> Array:
         raise InputError("the tracks cover one frame", todo="give at least two frames")
     step = float(np.median(np.diff(t) / np.diff(known)))
     before = t[0] + (frames - known[0]) * step
-    return np.where(frames < known[0], before, np.interp(frames, known, t))
+    return np.asarray(np.where(frames < known[0], before, np.interp(frames, known, t)))
 
 
 def _paired(
@@ -128,9 +128,9 @@ def _single(
     rows = detections[(detections["camera"] == camera) & detections["particle"].notna()]
     ids = rows["particle"].to_numpy(float).astype(np.int64)
     paired = set(zip(table["frame"].tolist(), table["particle"].tolist()))
-    ends = table.groupby("particle")["frame"].agg(["min", "max"])
+    ends = {p: (f.min(), f.max()) for p, f in table.groupby("particle")["frame"]}
     inside = [
-        p in number and (f, p) not in paired and ends.at[p, "min"] <= f <= ends.at[p, "max"]
+        p in number and (f, p) not in paired and ends[p][0] <= f <= ends[p][1]
         for f, p in zip(rows["frame"].tolist(), ids.tolist())
     ]
     kept = np.array(inside, bool) if inside else np.zeros(0, bool)
@@ -159,12 +159,13 @@ def _covariance(values: Array) -> Array:
 def bubbles_of(tracked: Tracked, positions_mm: Array, axis: Array) -> tuple[Bubble, ...]:
     """Every bubble with its lab positions from triangulation, straight lines over its gaps."""
     out = []
-    for particle, rows in tracked.table.sort_values("frame").groupby("particle"):
+    for particle in tracked.particles:
+        rows = tracked.table[tracked.table["particle"] == particle].sort_values("frame")
         frames = rows["frame"].to_numpy(np.int64)
         lab = rows[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         lab = lab + positions_mm[frames, None] * axis
         every = np.arange(frames[0], frames[-1] + 1)
         t = tracked.t_s
         guess = np.stack([np.interp(t[every], t[frames], column) for column in lab.T], -1)
-        out.append(Bubble(int(particle), int(every[0]), int(every[-1]), guess[0], guess))
+        out.append(Bubble(particle, int(every[0]), int(every[-1]), guess[0], guess))
     return tuple(out)

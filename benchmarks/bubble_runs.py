@@ -8,7 +8,7 @@ in view when both images show it whole. A 3-D point is right when both its pixel
 3 px of one true bubble's. Recall: right points over bubbles in view; precision: right points
 over points in space (points of bubbles that an image cuts are left out of both). Swaps: changes
 of the true bubble along a track. Centre errors are of right points, from the pixels, against the
-projected centre of volume (2-D RMS over 1.414) and against the true silhouette's centroid.
+projected centre of volume (RMS per coordinate) and against the true silhouette's centroid.
 """
 
 from __future__ import annotations
@@ -55,8 +55,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     head = (
-        "| preset, seed | in view | recall | precision | tracks | swaps | breaks | "
-        "centre to volume px | corrected px | to silhouette px | frames/s |\n" + "|---" * 11 + "|"
+        "| preset, seed | in view | recall | hidden by half | recall of the others | precision | "
+        "tracks | swaps | breaks | centre to volume px | corrected px | to silhouette px | frames/s |\n"
+        + "|---" * 13
+        + "|"
     )
     lines = [head]
     print(head)
@@ -66,14 +68,21 @@ def main() -> None:
             s, speed = run_one(asked.preset, seed, asked.frames, asked.bubbles, Path(folder))
         scores.append(s)
         lines.append(
-            f"| {asked.preset} {seed} | {s.in_view} | {s.recall:.4f} | {s.precision:.4f} | "
+            f"| {asked.preset} {seed} | {s.in_view} | {s.recall:.4f} | {s.hidden} | "
+            f"{s.recall_in_sight:.4f} | {s.precision:.4f} | "
             f"{s.tracks} | {s.swaps} | {s.breaks} | {s.centre_px:.3f} | {s.corrected_px:.3f} | "
             f"{s.silhouette_px:.3f} | {speed:.1f} |"
         )
         print(lines[-1], flush=True)
     right, wrong = sum(s.right for s in scores), sum(s.wrong for s in scores)
     in_view = sum(s.in_view for s in scores)
-    total = f"\nRecall {right / in_view:.4f}, precision {right / (right + wrong):.4f}."
+    shown = sum(s.right - s.hidden_right for s in scores) / sum(
+        s.in_view - s.hidden for s in scores
+    )
+    total = (
+        f"\nRecall {right / in_view:.4f}, of bubbles that show half of their outline {shown:.4f}; "
+        f"precision {right / (right + wrong):.4f}."
+    )
     lines.append(total)
     print(total)
     if asked.out:

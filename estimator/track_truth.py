@@ -22,6 +22,8 @@ class TrackScore:
     """How tracks agree with the truth; bubbles that an image cuts are neither right nor wrong.
 
     in_view : (bubble, frame) pairs that both images show whole; right : of these, with a point;
+    hidden, hidden_right : of these and of the right ones, those of which another bubble hides half
+    of the outline or more in a view (silhouettes taken for circles of their area).
     wrong : points that are no bubble; swaps : changes of the true bubble along a track.
     centre_px, corrected_px : RMS per coordinate of the outlines' centres against the projected
     centre of volume, as measured and with the shape's correction; silhouette_px : against the
@@ -30,6 +32,8 @@ class TrackScore:
 
     in_view: int
     right: int
+    hidden: int
+    hidden_right: int
     wrong: int
     tracks: int
     swaps: int
@@ -43,6 +47,11 @@ class TrackScore:
         return self.right / max(self.in_view, 1)
 
     @property
+    def recall_in_sight(self) -> float:
+        """Recall of the bubbles that show more than half of their outline in both views."""
+        return (self.right - self.hidden_right) / max(self.in_view - self.hidden, 1)
+
+    @property
     def precision(self) -> float:
         return self.right / max(self.right + self.wrong, 1)
 
@@ -52,6 +61,7 @@ def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) ->
     bubble = _true_bubbles(tracks.table, truth, cameras)
     found = bubble["row"].notna().to_numpy()
     whole = _whole(truth, cameras)
+    hidden = whole & (_hidden_share(truth, cameras) >= 0.5)
     right = found & bubble["whole"].fillna(False).to_numpy(bool)
     measured, shift, volume, silhouette = (
         _columns(table[right], cameras, name)
@@ -65,6 +75,8 @@ def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) ->
     return TrackScore(
         int(whole.sum()),
         int(right.sum()),
+        int(hidden.sum()),
+        int(hidden.to_numpy()[bubble["row"][right].astype(int)].sum()),
         int((~found).sum()),
         len(tracks),
         _swaps(tracks.table["particle"].to_numpy()[found], bubble["particle"].to_numpy()[found]),
@@ -89,6 +101,24 @@ def _true_bubbles(table: pd.DataFrame, truth: pd.DataFrame, cameras: Sequence[st
             chosen[i] = rows[off.argmin()]
     known = truth.assign(row=np.arange(len(truth)), whole=_whole(truth, cameras))
     return known.reindex(chosen).reset_index(drop=True)
+
+
+def _hidden_share(truth: pd.DataFrame, cameras: Sequence[str]) -> Array:
+    """(N,) largest share over the views of a bubble's outline that lies inside other bubbles."""
+    turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    circle = np.stack([np.cos(turn), np.sin(turn)], -1)
+    out = np.zeros(len(truth))
+    for rows in truth.groupby("frame").indices.values():
+        for c in cameras:
+            part = truth.iloc[rows]
+            centre = part[[f"{c}_silhouette_u_px", f"{c}_silhouette_v_px"]].to_numpy(float)
+            radius = np.sqrt(part[f"{c}_area_px2"].to_numpy(float) / np.pi)
+            outline = centre[:, None] + radius[:, None, None] * circle
+            off = np.linalg.norm(outline[:, :, None] - centre, axis=-1)
+            inside = off < radius
+            inside[np.arange(len(rows)), :, np.arange(len(rows))] = False
+            out[rows] = np.maximum(out[rows], inside.any(-1).mean(-1))
+    return out
 
 
 def _whole(truth: pd.DataFrame, cameras: Sequence[str]) -> pd.Series[bool]:

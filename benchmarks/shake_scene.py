@@ -36,6 +36,8 @@ from shake_cases import (
     Scenario,
     mark_generation,
 )
+from shake_forces import NONLINEAR as FORCED
+from shake_forces import nonlinear_shake
 
 from telerig.estimator.calibration import Calibration
 from telerig.io.bubble_motion import (
@@ -60,7 +62,7 @@ Array = NDArray[np.float64]
 UP = np.array([0.0, -1.0, 0.0])
 LATERAL = (2.0, 6.0, 0.03)
 LATERAL_SHAKE = 0.5
-NONLINEAR = ("zigzag", "ring-down", "limit cycle", "stick-slip")
+NONLINEAR = ("zigzag", *FORCED)
 H = 1 / SAMPLE_HZ
 
 
@@ -222,8 +224,8 @@ def _shake(case: Case, t: Array, rng: Generator) -> tuple[Shake, Shake]:
     """Common shake and that of the arms, each (2, N, 3)."""
     scenario = case.scenario
     rms = scenario.amplitude_mm / np.sqrt(2) * np.array([LATERAL_SHAKE, 1.0, LATERAL_SHAKE])
-    if case.nonlinear in NONLINEAR[1:]:
-        return _nonlinear(case.nonlinear, t, rms, rng)
+    if case.nonlinear in FORCED:
+        return nonlinear_shake(case.nonlinear, t, rms, COMMON, rng)
     options: dict[str, Any] = {
         "frequency_hz": scenario.hz,
         "arm_ratio": ARM_RATIO,
@@ -237,79 +239,6 @@ def _shake(case: Case, t: Array, rng: Generator) -> tuple[Shake, Shake]:
         H, len(t), rng, cameras=2, rms_mm=rms * np.sqrt(1 - COMMON), common_share=0.0, **options
     )
     return common, own
-
-
-def _nonlinear(kind: str, t: Array, rms: Array, rng: Generator) -> tuple[Shake, Shake]:
-    """Forces that are not Gaussian, on modes of 18 Hz (common) and 29 Hz (arms)."""
-    parts = []
-    for hz, copies, share in ((18.0, 1, COMMON), (18.0 * ARM_RATIO, 2, 1 - COMMON)):
-        paths = np.stack([[_driven(kind, t, hz, rng) for _ in rms] for _ in range(copies)])
-        scale = np.sqrt((paths[..., 0] ** 2).mean(-1, keepdims=True))[..., None]
-        paths = paths / scale * (rms * np.sqrt(share))[:, None, None]
-        paths = np.broadcast_to(paths, (2, *paths.shape[1:])).transpose(3, 0, 2, 1)
-        parts.append(Shake(*paths.reshape(3, 2, len(t), len(rms))))
-    return parts[0], parts[1]
-
-
-def _driven(kind: str, t: Array, hz: float, rng: Generator) -> Array:
-    """(N, 3) displacement, velocity, acceleration of a mode under one sort of force."""
-    if kind == "limit cycle":
-        return _limit_cycle(t, 14.0, rng)
-    fine = 10
-    n, h = len(t) * fine, H / fine
-    force = np.zeros(n)
-    if kind == "ring-down":
-        for at in rng.uniform(0, t[-1], max(2, round(3 * t[-1]))).tolist() + [0.0]:
-            i = int(at / h)
-            force[i : i + round(0.004 / h)] += rng.choice([-1, 1]) * rng.uniform(0.5, 1.5)
-    else:
-        force = _stick_slip(n, h, rng)
-    return _forced(force, h, hz)[::fine]
-
-
-def _forced(force: Array, h: float, hz: float) -> Array:
-    """A mode (damping 0.03) under a force that two poles at 60 Hz smooth; exact between steps."""
-    from scipy.linalg import expm
-
-    w, f = 2 * np.pi * hz, 2 * np.pi * FORCE_HZ
-    drift = np.zeros((5, 5))
-    drift[0, 1] = drift[1, 2] = drift[2, 3] = 1.0
-    drift[1, :2] = -(w**2), -2 * DAMPING * w
-    drift[3, 2:] = -(f**2), -2 * f, f**2
-    phi = expm(drift * h)
-    x, out = np.zeros(5), np.empty((len(force), 3))
-    for i, u in enumerate(force):
-        x[4] = u
-        out[i] = x[0], x[1], drift[1] @ x
-        x = phi @ x
-    return out
-
-
-def _stick_slip(steps: int, h: float, rng: Generator) -> Array:
-    """Friction builds up while a guide sticks, and lets go at a level that varies."""
-    force, load, level = np.empty(steps), 0.0, 1.0
-    rate = rng.uniform(5, 8)
-    for i in range(steps):
-        load += rate * h
-        if load > level:
-            load, level = 0.0, rng.uniform(0.6, 1.4)
-        force[i] = load
-    return force - force.mean()
-
-
-def _limit_cycle(t: Array, hz: float, rng: Generator) -> Array:
-    """A hunting controller: constant amplitude, a third harmonic, a phase that drifts slowly."""
-    w, slow = 2 * np.pi * hz, 2 * np.pi * rng.uniform(0.3, 0.6)
-    start, turn = rng.uniform(0, 2 * np.pi, 2)
-    phase = w * t + start + 0.5 * np.sin(slow * t + turn)
-    rate = w + 0.5 * slow * np.cos(slow * t + turn)
-    bend = -0.5 * slow**2 * np.sin(slow * t + turn)
-    out = np.zeros((len(t), 3))
-    for k, a in ((1, 1.0), (3, 0.1)):
-        sine, cosine = np.sin(k * phase), np.cos(k * phase)
-        slope = k * cosine * rate
-        out += a * np.stack([sine, slope, k * cosine * bend - k**2 * sine * rate**2], -1)
-    return out
 
 
 def _tracks(

@@ -24,6 +24,7 @@ from shake_reference import (
 )
 
 from telerig.io.bubble_motion import (
+    LinearProcess,
     mode_acceleration,
     ornstein_uhlenbeck,
     oscillator,
@@ -116,7 +117,7 @@ def generate(scenario: Scenario, runs: int, rng: np.random.Generator) -> Runs:
     steps, frames = (scenario.frames - 1) * thin + 1, scenario.frames
     h = 1 / SAMPLE_HZ
 
-    def moved(process, count: int, start=None) -> Array:  # type: ignore[no-untyped-def]
+    def moved(process: LinearProcess, count: int, start: Array | None = None) -> Array:
         paths = process.paths(h, steps, rng, paths=count * runs, start_covariance=start)
         return paths.reshape(count, runs, steps, -1).transpose(0, 2, 1, 3)
 

@@ -92,14 +92,30 @@ def test_means_and_covariances_equal_the_reference(name: str, information: str) 
         assert sigma < RELATIVE / 2, (what, sigma)
 
 
-def test_posteriors_of_the_table() -> None:
-    scenario = SCENARIOS["S2"]
+TABLE = [
+    ("S0", "one", 114, 8.4),
+    ("S0", "five", 89, 6.5),
+    ("S0", "arms", 60, 4.4),
+    ("S0", "references", 60, 4.4),
+    ("S0", "oracle", 59, 4.4),
+    ("S2", "references", 13.9, 2.23),
+    ("S3", "one", 104, 8.0),
+    ("S3", "oracle", 12.8, 2.23),
+]
+"""Scenario, information, posterior sd of position (um) and velocity (mm/s): exact figures."""
+
+
+@pytest.mark.parametrize(("name", "information", "um", "mm_s"), TABLE)
+def test_posteriors_are_those_that_are_possible(
+    name: str, information: str, um: float, mm_s: float
+) -> None:
+    scenario = SCENARIOS[name]
     runs = generate(scenario, 1, np.random.default_rng(6))
-    found = solved(scenario, "references", runs, 0)
+    model = true_model(scenario, information)
+    found = solve(problem(scenario, information, runs), model, Options(robust=False))
     assert found.covariances is not None
-    inner = middle(scenario.frames)
-    row = UP @ found.frame.bubble.position
-    sigma = _sigma(row, found.covariances.bubbles)[inner]
-    assert np.sqrt(np.mean(sigma**2)) == pytest.approx(13.9e-3, rel=0.01)
-    speed = _sigma(UP @ found.frame.bubble.velocity, found.covariances.bubbles)[inner]
-    assert np.sqrt(np.mean(speed**2)) == pytest.approx(2.23, rel=0.01)
+    blocks = found.covariances.bubbles[: scenario.frames][middle(scenario.frames)]
+    layout = found.frame.bubble
+    position, velocity = _sigma(UP @ layout.position, blocks), _sigma(UP @ layout.velocity, blocks)
+    assert 1e3 * np.sqrt(np.mean(position**2)) == pytest.approx(um, rel=0.01)
+    assert np.sqrt(np.mean(velocity**2)) == pytest.approx(mm_s, rel=0.01)

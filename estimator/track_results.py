@@ -172,7 +172,8 @@ def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> No
     named = [_particle(labels, row) for _, row in found.iterrows()]
     words = [f"{n} {row['flags']}".strip() for n, (_, row) in zip(named, found.iterrows())]
     colours = [_GREEN if n else _ORANGE for n in named]
-    marks = [(r.u_px, r.v_px, r.radius_px, r.reason) for r in rejected.itertuples()]
+    places = rejected[["u_px", "v_px", "radius_px"]].to_numpy(float).tolist()
+    marks = [(u, v, r, str(why)) for (u, v, r), why in zip(places, rejected["reason"])]
     picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks)
     _write_image(staged / "overlays" / camera / f"{frame:06d}.jpg", picture[..., ::-1])
     _write_image(

@@ -167,7 +167,7 @@ def stage_axis(run: RunData, calibration: Calibration) -> Array:
     axis = np.array([0.0, -1.0, 0.0])
     if run.rig is not None and run.rig.stage is not None:
         axis = np.asarray(run.rig.stage.axis, float)
-    return axis / np.linalg.norm(axis)
+    return np.asarray(axis / np.linalg.norm(axis))
 
 
 def _complete(detections: pd.DataFrame) -> pd.DataFrame:
@@ -277,8 +277,9 @@ def _linked(
 def _count_reasons(batch: pd.DataFrame, without: dict[str, dict[str, int]]) -> None:
     if "reason" not in batch:
         return
-    for (camera, reason), rows in batch[batch["reason"] != ""].groupby(["camera", "reason"]):
-        without[camera][reason] = without[camera].get(reason, 0) + len(rows)
+    told = batch[batch["reason"] != ""]
+    for camera, reason in zip(told["camera"].astype(str), told["reason"].astype(str)):
+        without[camera][reason] = without[camera].get(reason, 0) + 1
 
 
 def count_rows(parts: list[Linked]) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import Any
 
 def tracking_words(summary: Mapping[str, Any], seconds: float) -> str:
     """What `telerig track` prints."""
+    tracks = "1 track" if summary["tracks"] == 1 else f"{summary['tracks']} tracks"
     lines = [
-        f"Run {summary['run']!r}: {summary['tracks']} {'track' if summary['tracks'] == 1 else 'tracks'}, {summary['points']} points in space "
+        f"Run {summary['run']!r}: {tracks}, {summary['points']} points in space "
         f"from {summary['detections']} detections in {summary['frames']} frames ({seconds:.1f} s)",
     ]
     left = summary["detections_without_partner_or_track"]

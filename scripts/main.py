@@ -30,7 +30,7 @@ def _main(
         False, "--version", help="Print the version.", callback=_version, is_eager=True
     ),
 ) -> None:
-    """Calibrate a telecentric stereo rig from hand-held views of dots, and track bubbles with it."""
+    """Calibrate a telecentric stereo rig from views of dots, and track bubbles with it."""
 
 
 for command in (demo, simulate, detect, calibrate, track):

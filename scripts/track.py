@@ -64,8 +64,12 @@ def track(
 
 def chosen_source(source: str | None) -> Literal["images", "detections"] | None:
     """The value of ``--from``; raises InputError for another word."""
-    if source in (None, "images", "detections"):
-        return source
+    if source is None:
+        return None
+    if source == "images":
+        return "images"
+    if source == "detections":
+        return "detections"
     raise InputError(f"--from {source}", todo="use --from images or --from detections")
 
 

@@ -82,7 +82,7 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Mask) -> Mask:
     steady[never] = high - low < _CHANGES
     _, labels = cv2.connectedComponents(steady.astype(np.uint8), connectivity=4)
     outside = np.unique(labels[~never])
-    return never & np.isin(labels, outside[outside > 0])
+    return np.asarray(never & np.isin(labels, outside[outside > 0]), bool)
 
 
 def _dark_things(depth: NDArray[np.float32]) -> Mask:

@@ -122,4 +122,4 @@ def _belief_propagation(log_odds: Array) -> Array:
 
 def _others(values: Array, axis: int) -> Array:
     """Sums along the axis less each element, never below 0 by rounding."""
-    return np.maximum(values.sum(axis, keepdims=True) - values, 0.0)
+    return np.asarray(np.maximum(values.sum(axis, keepdims=True) - values, 0.0))

@@ -1,7 +1,7 @@
 """How near is `telerig.smooth` to what is possible, is it honest, and what does it say?
 
 Usage: python benchmarks/shake_scenarios.py [--seeds 4] [--only S2,S3,zigzag] [--information
-    one,five,carriage,arms,references,oracle] [--models true,default] [--oblique]
+    one,five,carriage,arms,references,oracle] [--models true,default] [--oblique] [--calibrated]
     [--seed 0] [--out FILE.md] [--csv FILE.csv]
 Every seed counts. Runs come from `shake_scene`; posteriors to compare with from the independent
 reference in tests/shake_reference.py.
@@ -211,6 +211,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--information", default="one,five,carriage,arms,references,oracle")
     parser.add_argument("--models", default="true,default")
     parser.add_argument("--oblique", action="store_true", help="40 degrees, kappa not 0")
+    parser.add_argument("--calibrated", action="store_true", help="a noisy calibration each seed")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--csv", type=Path)
     return parser.parse_args()
@@ -223,6 +224,8 @@ def report(table: pd.DataFrame, possible: Mapping[str, Any], options: argparse.N
         _, case, information = keys
         lines.append(line(rows, possible.get(case, {}).get(information)))
     rig = "40 degrees between cameras with kappa = 2e-4 / mm" if options.oblique else "90 degrees"
+    if options.calibrated:
+        rig += ", each seed with a calibration of its own from dots with 0.3 px of noise"
     return f"""# Smoothing the scenarios
 
 {options.seeds} seeds each, {rig}; vertical axis, middle 80 %, position um / velocity mm/s.

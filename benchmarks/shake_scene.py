@@ -147,9 +147,12 @@ def cameras(case: Case) -> tuple[Camera, Camera]:
     )
 
 
-def simulate(case: Case, rng: Generator, *, calibration: Calibration | None = None) -> Run:
-    """One run. calibration : what the estimator is told; the true cameras by default."""
-    scenario, true = case.scenario, cameras(case)
+def simulate(
+    case: Case, rng: Generator, rig: tuple[tuple[Camera, Camera], Calibration] | None = None
+) -> Run:
+    """One run. rig : true cameras and what the estimator is told, by default the truth."""
+    scenario = case.scenario
+    true = cameras(case) if rig is None else rig[0]
     thin = round(SAMPLE_HZ / scenario.rate_hz)
     steps = (scenario.frames - 1) * thin + 1
     t = np.arange(steps) * H
@@ -159,22 +162,22 @@ def simulate(case: Case, rng: Generator, *, calibration: Calibration | None = No
     offset = common.offset_mm + own.offset_mm
     place, velocity = _bubbles(case, t, rng)
     frames = slice(None, None, thin)
-    rig = carriage[frames, None] * UP + offset[:, frames]
+    moved = carriage[frames, None] * UP + offset[:, frames]
     noise = scenario.noise_px * rng.standard_normal((2, 5, scenario.frames, 2))
     spoiled = rng.random((2, 5, scenario.frames)) < case.outliers
     noise += spoiled[..., None] * rng.uniform(-20, 20, noise.shape)
     kept = rng.random((5, scenario.frames)) >= case.dropped
     kept[:, [0, -1]] = True
-    calibrated = calibration or told
+    calibration = told if rig is None else rig[1]
     seen, calm = (
-        _tracks(calibrated, true, t[frames], place[:, frames], moved, noise, kept, scenario)
-        for moved in (rig, np.broadcast_to(carriage[frames, None] * UP, rig.shape))
+        _tracks(calibration, true, t[frames], place[:, frames], away, noise, kept, scenario)
+        for away in (moved, np.broadcast_to(carriage[frames, None] * UP, moved.shape))
     )
     return Run(
-        case, t[frames], calibrated, seen, calm,
+        case, t[frames], calibration, seen, calm,
         _stage(case, t, carriage, rng),
         _accelerometers(case, t, push, common, own, rng),
-        _references(true, t[frames], rig, rng),
+        _references(true, t[frames], moved, rng),
         place[:, frames], velocity[:, frames], offset[:, frames],
     )  # fmt: skip
 

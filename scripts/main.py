@@ -9,6 +9,7 @@ from telerig.scripts.calibrate import calibrate
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
 from telerig.scripts.simulate import simulate
+from telerig.scripts.smooth import smooth
 from telerig.scripts.track import track
 
 app = typer.Typer(
@@ -33,7 +34,7 @@ def _main(
     """Calibrate a telecentric stereo rig from views of dots, and track bubbles with it."""
 
 
-for command in (demo, simulate, detect, calibrate, track):
+for command in (demo, simulate, detect, calibrate, track, smooth):
     app.command()(command)
 
 

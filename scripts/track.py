@@ -83,6 +83,11 @@ def cameras_without_rig(run: Path, calibration: Calibration) -> dict[str, Any]:
     }
 
 
+def any_source(run: Path) -> Literal["images", "detections"] | None:
+    """For work on tracks it does not matter which of both a run holds."""
+    return "detections" if (run / "detections.csv").is_file() else None
+
+
 def default_folder(run: Path) -> Path:
     """results/<run> of the dataset that holds the run, else results/ inside the run."""
     place = run.resolve()

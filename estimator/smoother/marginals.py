@@ -10,6 +10,7 @@ marginals it works on graphs whose posterior is far from round.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,53 +20,74 @@ from scipy.linalg.lapack import dtrtri
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Marginals:
+    """own : (d, d) covariance of each wanted key.  cross : (d, e) of each wanted pair.
+
+    log_det : log |R| of the whole net.
+    """
+
+    own: dict[int, Array]
+    cross: dict[tuple[int, int], Array]
+    log_det: float
+
+
 def marginal_covariances(
-    net: Any, sizes: Sequence[int], wanted: set[int], pairs: set[tuple[int, int]]
-) -> tuple[dict[int, Array], dict[tuple[int, int], Array]]:
-    """Covariance (d, d) of each wanted key of a `gtsam.GaussianBayesNet` (one key a conditional).
+    net: Any, sizes: Sequence[int], wanted: set[int], pairs: Sequence[tuple[int, int]]
+) -> Marginals:
+    """Covariances out of a `gtsam.GaussianBayesNet` with one key a conditional.
 
     sizes : dimension of each key, keys counting from 0.  pairs : (key, later key) of one clique
-    whose cross covariances (d, e) are wanted too.
+    whose cross covariances are wanted too.
     """
-    count = int(net.size())
-    conditionals = [net.at(i) for i in range(count)]
+    conditionals = [net.at(i) for i in range(int(net.size()))]
     keys = [list(c.keys()) for c in conditionals]
     when = {clique[0]: i for i, clique in enumerate(keys)}
     parents = [min(c[1:], key=when.__getitem__, default=-1) for c in keys]
     children = [0] * len(sizes)
     for parent in parents:
         children[parent] += parent >= 0
+    seconds: dict[int, list[int]] = {}
+    for first, second in pairs:
+        seconds.setdefault(first, []).append(second)
     joint: dict[int, tuple[list[int], Array]] = {}
     patterns: dict[tuple[Any, ...], NDArray[np.int64]] = {}
-    out: dict[int, Array] = {}
-    crossed: dict[tuple[int, int], Array] = {}
-    of_first: dict[int, list[int]] = {}
-    for first, second in pairs:
-        of_first.setdefault(first, []).append(second)
+    own_of: dict[int, Array] = {}
+    cross_of: dict[tuple[int, int], Array] = {}
+    log_det = 0.0
     for conditional, clique, parent in zip(conditionals[::-1], keys[::-1], parents[::-1]):
         own, size = clique[0], sizes[clique[0]]
         inverse, _ = dtrtri(conditional.R())
-        width = size + sum(sizes[k] for k in clique[1:])
-        block = np.empty((width, width))
-        block[:size, :size] = inverse @ inverse.T
-        if width > size:
-            above = _within(clique, joint[parent], sizes, patterns)
-            gain = inverse @ conditional.S()
-            cross = gain @ above
-            block[:size, :size] += cross @ gain.T
-            block[:size, size:], block[size:, :size] = -cross, -cross.T
-            block[size:, size:] = above
+        log_det -= float(np.log(np.abs(inverse.diagonal())).sum())
+        block = inverse @ inverse.T
+        if parent >= 0:
+            block = _joined(
+                block, inverse @ conditional.S(), _within(clique, joint[parent], sizes, patterns)
+            )
             children[parent] -= 1
             if not children[parent]:
                 del joint[parent]
         if own in wanted:
-            out[own] = block[:size, :size].copy()
-        for other in of_first.get(own, ()):
-            at = sum(sizes[k] for k in clique[: clique.index(other)])
-            crossed[own, other] = block[:size, at : at + sizes[other]].copy()
+            own_of[own] = block[:size, :size].copy()
+        for other in seconds.get(own, ()):
+            at = sum([sizes[k] for k in clique[: clique.index(other)]])
+            cross_of[own, other] = block[:size, at : at + sizes[other]].copy()
         if children[own]:
             joint[own] = (clique, block)
-    return out, crossed
+    return Marginals(own_of, cross_of, log_det)
+
+
+def _joined(own: Array, gain: Array, above: Array) -> Array:
+    """Covariance of x = -gain s + noise and s, from the noise's and that of s."""
+    size, width = len(own), len(own) + len(above)
+    block = np.empty((width, width))
+    cross = gain @ above
+    block[:size, :size] = own
+    block[:size, :size] += cross @ gain.T
+    block[:size, size:] = -cross
+    block[size:, :size] = block[:size, size:].T
+    block[size:, size:] = above
+    return block
 
 
 def _within(
@@ -76,13 +98,15 @@ def _within(
 ) -> Array:
     """Covariance of a clique's separator, out of its parent's clique."""
     keys, block = parent
-    if clique[1:] == keys:
+    separator = clique[1:]
+    if separator == keys:
         return block
-    place = tuple(keys.index(k) for k in clique[1:])
-    shape = (place, tuple(sizes[k] for k in keys))
-    index = patterns.get(shape)
-    if index is None:
-        starts = np.r_[0, np.cumsum(shape[1])]
-        index = np.concatenate([np.arange(starts[p], starts[p + 1]) for p in place])
-        patterns[shape] = index
-    return np.asarray(block[index[:, None], index])
+    shape = (*[keys.index(k) for k in separator], -1, *[sizes[k] for k in keys])
+    flat = patterns.get(shape)
+    if flat is None:
+        starts = np.r_[0, np.cumsum([sizes[k] for k in keys])]
+        places = [keys.index(k) for k in separator]
+        index = np.concatenate([np.arange(starts[p], starts[p + 1]) for p in places])
+        flat = index[:, None] * len(block) + index
+        patterns[shape] = flat
+    return block.take(flat)

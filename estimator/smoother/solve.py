@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -354,8 +355,12 @@ def _finish(
     """Covariances and evidence from the last pass, whose linearisation is within the tolerance."""
     dimension = sum(n * d for n, d in frame.counts())
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
-    evidence -= _log_det(last.net)
-    found = _covariances(frame, last.net, progress) if options.covariances else None
+    found = None
+    if options.covariances:
+        found, log_det = _covariances(frame, last.net, progress)
+    else:
+        log_det = _log_det(last.net)
+    evidence -= log_det
     progress("smoothing", 1.0)
     return Solution(
         frame, state, found, weights, pixel_residuals(frame, state), float(evidence), done
@@ -368,7 +373,8 @@ def _log_det(net: Any) -> float:
     return float(sum(np.log(np.abs(d)).sum() for d in diagonals))
 
 
-def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
+def _covariances(frame: Frame, net: Any, progress: Progress) -> tuple[Covariances, float]:
+    """Marginals in physical units, and log |R| of the net."""
     base, counts = frame.base(), frame.counts()
     progress("covariances", 0.0)
     families = [range(base[i], base[i] + n * (d > 0)) for i, (n, d) in enumerate(counts)]
@@ -377,7 +383,8 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
     sizes = [d for n, d in counts for _ in range(n)]
     rows = base[1] + np.arange(frame.rows)
     pairs = list(zip(frame.node_of_row.tolist(), rows.tolist())) if counts[0][1] else []
-    found, crossed = marginal_covariances(net, sizes, wanted, set(pairs))
+    marginals = marginal_covariances(net, sizes, wanted, pairs)
+    found, crossed = marginals.own, marginals.cross
 
     def of(keys: Sequence[int], i: int) -> Array:
         number, size = len(problem_frames) if i == 0 else counts[i][0], counts[i][1]
@@ -394,7 +401,7 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
     cross = np.array([crossed[pair] for pair in pairs])
     cross = cross.reshape(frame.rows, counts[0][1], counts[1][1])
     cross = shake_basis[frame.frame_of_row] @ cross @ np.swapaxes(bubble_basis, -1, -2)
-    return Covariances(
+    covariances = Covariances(
         shake,
         bubbles,
         cross,
@@ -404,10 +411,15 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> Covariances:
         blocks[5][0],
         *blocks[6:],
     )
+    return covariances, marginals.log_det
 
 
 def in_large_stack(task: Callable[[], T]) -> T:
-    """Run in a thread with a large stack: GTSAM's recursion is as deep as the run is long."""
+    """Run in a thread with a large stack: GTSAM's recursion is as deep as the run is long.
+
+    Python's cycle collector rests meanwhile: it would walk through a million small arrays, none of
+    them in a cycle, again and again, more than linearly in the length of the run.
+    """
     result: list[T] = []
     fault: list[BaseException] = []
 
@@ -417,6 +429,8 @@ def in_large_stack(task: Callable[[], T]) -> T:
         except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
             fault.append(error)
 
+    collecting = gc.isenabled()
+    gc.disable()
     before = threading.stack_size(STACK_BYTES)
     try:
         thread = threading.Thread(target=run, name="telerig-smoother")
@@ -424,6 +438,8 @@ def in_large_stack(task: Callable[[], T]) -> T:
     finally:
         threading.stack_size(before)
     thread.join()
+    if collecting:
+        gc.enable()
     if fault:
         raise fault[0]
     return result[0]

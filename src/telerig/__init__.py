@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from telerig.estimator.frontend.bubbles import detect_bubbles as detect_bubbles
     from telerig.estimator.frontend.dots import locate_dots as locate_dots
     from telerig.estimator.frontend.target_detection import detect_target as detect_target
+    from telerig.estimator.smoother.model import ShakeModel as ShakeModel
+    from telerig.estimator.smoother.results import Smoothing as Smoothing
+    from telerig.estimator.smoother.smooth import smooth as smooth
     from telerig.estimator.track_run import track as track
     from telerig.estimator.tracks import Tracks as Tracks
     from telerig.estimator.tracks import load_tracks as load_tracks
@@ -31,7 +34,9 @@ if TYPE_CHECKING:
 _WHERE = {
     "Calibration": "telerig.estimator.calibration",
     "Dataset": "telerig.io.dataset",
+    "ShakeModel": "telerig.estimator.smoother.model",
     "SimulationConfig": "telerig.io.simulation_presets",
+    "Smoothing": "telerig.estimator.smoother.results",
     "TelerigError": "telerig.errors",
     "Triangulation": "telerig.rig.triangulation",
     "calibrate": "telerig.estimator.calibrate",
@@ -44,6 +49,7 @@ _WHERE = {
     "load_tracks": "telerig.estimator.tracks",
     "locate_dots": "telerig.estimator.frontend.dots",
     "simulate": "telerig.io.simulation",
+    "smooth": "telerig.estimator.smoother.smooth",
     "track": "telerig.estimator.track_run",
 }
 __all__ = ["__version__", *_WHERE]

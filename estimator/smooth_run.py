@@ -1,0 +1,90 @@
+"""A tracked run smoothed into its results folder."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from telerig.errors import InputError
+from telerig.estimator.smoother.smooth import smooth
+from telerig.estimator.track_detect import read_batch
+from telerig.estimator.tracks import Tracks, load_tracks
+from telerig.io.atomic import atomic_folder, write_json_atomic
+from telerig.io.provenance import run_record
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration import Calibration
+    from telerig.estimator.smoother.results import Smoothing
+    from telerig.io.run import RunData
+
+Stage = Callable[[str, int, int], None]
+
+_TRACKED = ("tracks.csv", "detections.csv", "events.csv", "tracking.json")
+
+
+def smooth_run(
+    run: RunData,
+    calibration: Calibration,
+    tracks: Path,
+    folder: Path,
+    *,
+    model: str = "auto",
+    inputs: Sequence[Path] = (),
+    report: bool = True,
+    stage: Stage | None = None,
+) -> Smoothing:
+    """Smooth and write trajectories.csv, shake.csv, smoothing.json, results.h5, run.json, report.
+
+    tracks : `tracks.csv`, or the folder that `telerig track` wrote.
+    Files appear together at the end. Raises InputError when there are no tracks.
+    """
+    begun = time.perf_counter()
+    followed, source = read_tracks(tracks, run.path)
+    percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
+    found = smooth(followed, calibration, stage=run, model=model, progress=percent)
+    tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
+    record = run_record(
+        "smooth", run.path, [*tables, source, *inputs], {"model": model},
+        {"smooth": time.perf_counter() - begun},
+    )  # fmt: skip
+    with atomic_folder(folder) as staged:
+        found.save(staged)
+        write_json_atomic(staged / "run.json", record)
+        if report:
+            _report(staged, folder, source.parent)
+    return found
+
+
+def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:
+    """What `telerig track` wrote, or a bare table of tracks; and the file it came from."""
+    if path.is_dir():
+        if not (path / "tracks.csv").is_file():
+            raise InputError(
+                "there are no tracks", where=str(path), todo=f"run `telerig track {run}` first"
+            )
+        return load_tracks(path), path / "tracks.csv"
+    if not path.is_file():
+        raise InputError("there is no such file", where=str(path), todo="give tracks.csv")
+    return read_batch(path), path
+
+
+def _report(staged: Path, folder: Path, tracked: Path) -> None:
+    """The run's page, smoothing first; it needs the tracks beside it."""
+    from telerig.io.report.track_report import write_track_report
+
+    borrowed = []
+    for place in (folder, tracked):
+        for name in (*_TRACKED, "overlays", "binary"):
+            source, target = place / name, staged / name
+            if source.exists() and not target.exists():
+                copy = shutil.copytree if source.is_dir() else shutil.copy2
+                copy(source, target)
+                borrowed.append(target)
+    if (staged / "tracking.json").is_file():
+        write_track_report(staged)
+    if folder.resolve() == tracked.resolve():
+        for target in borrowed:
+            shutil.rmtree(target) if target.is_dir() else target.unlink()

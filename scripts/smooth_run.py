@@ -1,0 +1,10 @@
+"""The command `telerig smooth` as a file: python scripts/smooth_run.py DATASET/runs/NAME."""
+
+from __future__ import annotations
+
+import typer
+
+from telerig.scripts.smooth import smooth
+
+if __name__ == "__main__":
+    typer.run(smooth)

@@ -26,7 +26,7 @@ DELAY_SIGMA_S = 0.002
 _ZIGZAG_HZ = (3.0, 12.0)
 _ZIGZAG_GUESS_HZ = 6.5
 _ZIGZAG_RMS_MM = 0.5
-_ZIGZAG_DAMPING = 0.1
+_ZIGZAG_DAMPING = 0.04
 _HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
 _CLEAR = 0.2
@@ -84,7 +84,7 @@ def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeMode
             b,
             rms_mm=_triple(np.asarray(b.rms_mm) * _factor(factor, b.camera)),
             low_hz=frequency,
-            high_hz=max(60.0, 2 * frequency),
+            high_hz=max(60.0, 1.25 * frequency),
         )
         for b in model.broad_bands
     ]

@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/shake_scenarios.py [--seeds 4] [--only S2,S3,zigzag] [--information
     one,five,carriage,arms,references,oracle] [--models true,default] [--oblique] [--calibrated]
-    [--seed 0] [--out FILE.md] [--csv FILE.csv]
+    [--seed 0] [--out FILE.md] [--csv FILE.csv] [--read FILE.csv ...]
 Every seed counts. Runs come from `shake_scene`; posteriors to compare with from the independent
 reference in tests/shake_reference.py.
 """
@@ -213,7 +213,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--oblique", action="store_true", help="40 degrees, kappa not 0")
     parser.add_argument("--calibrated", action="store_true", help="a noisy calibration each seed")
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--csv", type=Path)
+    parser.add_argument("--csv", type=Path, help="one line a run")
+    parser.add_argument("--read", type=Path, nargs="+", help="tables of --csv instead of runs")
     return parser.parse_args()
 
 
@@ -223,12 +224,16 @@ def report(table: pd.DataFrame, possible: Mapping[str, Any], options: argparse.N
     for keys, rows in table.groupby(["model", "case", "information"], sort=False):
         _, case, information = keys
         lines.append(line(rows, possible.get(case, {}).get(information)))
-    rig = "40 degrees between cameras with kappa = 2e-4 / mm" if options.oblique else "90 degrees"
+    rig = (
+        "40 degrees between the cameras, kappa = 2e-4 / mm"
+        if options.oblique
+        else "90 degrees between the cameras"
+    )
     if options.calibrated:
         rig += ", each seed with a calibration of its own from dots with 0.3 px of noise"
     return f"""# Smoothing the scenarios
 
-{options.seeds} seeds each, {rig}; vertical axis, middle 80 %, position um / velocity mm/s.
+{rig}; vertical axis, middle 80 %, position um / velocity mm/s.
 possible: the independent reference's posterior sd, true hyper-parameters. sd, RMS: of
 `telerig.smooth`. (e/sd)^2: mean, in brackets its distance from 1 in standard errors over the
 seeds. NEES 3-D: of the position, per dimension. naive / RMS: how much better than triangulating
@@ -244,19 +249,17 @@ made; default: nothing told. Nonlinear: {", ".join(NONLINEAR)}.
 """
 
 
-def main() -> None:
-    options = arguments()
+def run_all(options: argparse.Namespace) -> pd.DataFrame:
+    """Records of every case, seed, model and set of information asked for."""
     table: list[dict[str, Any]] = []
-    possible: dict[str, dict[str, tuple[float, float]]] = {}
-    every = cases()
     for name in options.only.split(","):
-        case = oblique(every[name]) if options.oblique else every[name]
-        if not case.nonlinear:
-            possible[name] = posteriors(case, np.random.default_rng(0))
+        case = oblique(cases()[name]) if options.oblique else cases()[name]
         for seed in range(options.seed, options.seed + options.seeds):
-            run = simulate(
-                case, np.random.default_rng(np.random.SeedSequence([seed, hash_of(name)]))
-            )
+            rng = np.random.default_rng([seed, hash_of(name)])
+            rig = None
+            if options.calibrated:
+                rig = calibrated(case.angle_deg, case.kappa_per_mm, rng)
+            run = simulate(case, rng, rig)
             for model in options.models.split(","):
                 for information in options.information.split(","):
                     if wanted(case, information, model):
@@ -265,7 +268,21 @@ def main() -> None:
                         print(_brief(record), flush=True)
         if options.csv:
             pd.DataFrame(table).to_csv(options.csv, index=False)
-    text = report(pd.DataFrame(table), possible, options)
+    return pd.DataFrame(table)
+
+
+def main() -> None:
+    options = arguments()
+    if options.read:
+        parts = [
+            pd.read_csv(path, keep_default_na=False, na_values=["nan"]) for path in options.read
+        ]
+        table = pd.concat(parts, ignore_index=True)
+    else:
+        table = run_all(options)
+    linear = [name for name in dict.fromkeys(table["case"]) if not cases()[name].nonlinear]
+    possible = {name: posteriors(cases()[name], np.random.default_rng(0)) for name in linear}
+    text = report(table, possible, options)
     print(text)
     if options.out:
         options.out.write_text(text, encoding="utf-8")

@@ -40,6 +40,7 @@ finally:
 def repeated(source: Path, folder: Path, frames: int) -> Path:
     """A dataset whose run has so many frames, links to the source's images."""
     run = folder / "runs" / "rise"
+    run.mkdir(parents=True)
     (folder / "rig.toml").symlink_to(source / "rig.toml")
     for camera in ("left", "right"):
         images = sorted((source / "runs" / "rise" / camera).iterdir())

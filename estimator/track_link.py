@@ -31,7 +31,7 @@ Index = NDArray[np.int64]
 COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 _PER_CAMERA = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
-_PAIRS_AT_ONCE = 2048
+_PAIRS_AT_ONCE = 512
 
 WANDER = (21 / 8) ** 0.5
 """Shift of an outline's centre, as a share of the radius, by a body's third harmonics of unit
@@ -174,6 +174,9 @@ def pair_frame(
     common = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1])
     rows = [np.array([np.flatnonzero(i == p)[0] for p in common], np.int64) for i in ids]
     free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
+    if not (len(free[0]) and len(free[1])):
+        sure = np.ones(len(common))
+        return Pairs(rows[0], rows[1], sure, np.zeros(len(common), bool), common.astype(np.int64))
     found = match_pairs(
         tables[0].iloc[free[0]], tables[1].iloc[free[1]], cameras, model, predicted=predicted
     )

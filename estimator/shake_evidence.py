@@ -1,0 +1,330 @@
+"""Marginal likelihood and posterior of one channel, from a banded Cholesky factor.
+
+The precision of a chain of states is block-tridiagonal: LAPACK's `pbtrf` takes it in time linear
+in the frames. Constants (mean velocities, places of marks) are eliminated after the chain. The
+evidence equals the graph's, channel by channel (see tests/test_shake_learning.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.shake_channels import Channel
+from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
+from telerig.factors.measurements import whitener_of
+from telerig.factors.motion import Motion, motion, start
+from telerig.factors.state_space import (
+    Component,
+    block_diagonal,
+    broad_band,
+    driven_mode,
+    oscillator,
+    ou_velocity,
+    slow_ou,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ChannelPosterior:
+    """log_evidence : of the measurements.  position_mm : (B, F) of the moving items, lab, along
+    the direction, less their start.  offset_mm : (J, F) of each camera.
+    """
+
+    log_evidence: float
+    position_mm: Array
+    velocity_mm_s: Array
+    offset_mm: Array
+
+
+@dataclass(frozen=True)
+class _System:
+    """States per frame: the shake's components (``shaken``), then each moving item's.
+
+    rows : (P, D) that read a pair's measurement.  columns : (F, P, c) effects of the constants.
+    prior_sigma : (c,).  offset : (J, D).
+    """
+
+    components: tuple[Component, ...]
+    shaken: int
+    per_bubble: int
+    bubbles: int
+    rows: Array
+    offset: Array
+    position: Array
+    velocity: Array
+    columns: Array
+    prior_sigma: Array
+
+
+def channel_evidence(channel: Channel, model: ShakeModel) -> float:
+    """Natural log of the density of the channel's measurements."""
+    return _Factor(channel, model).log_evidence()
+
+
+def channel_posterior(channel: Channel, model: ShakeModel) -> ChannelPosterior:
+    """Evidence and means."""
+    return _Factor(channel, model).posterior()
+
+
+def position_sigma(channel: Channel, model: ShakeModel, frames: NDArray[np.int64]) -> Array:
+    """(B, n) standard deviation of the moving items' positions at some frames."""
+    return _Factor(channel, model).position_sigma(frames)
+
+
+def shake_components(channel: Channel, model: ShakeModel) -> list[tuple[Component, int]]:
+    """The shake's processes along the channel's direction, with the camera (CARRIAGE: all)."""
+    out: list[tuple[Component, int]] = []
+    if not channel.shaken:
+        return out
+    for mode in model.modes:
+        rms = _along(channel, mode.rms_mm, mode.camera)
+        if rms > 0:
+            if mode.force_hz is None:
+                part = oscillator(rms, mode.frequency_hz, mode.damping)
+            else:
+                part = driven_mode(rms, mode.frequency_hz, mode.damping, force_hz=mode.force_hz)
+            out.append((part, mode.camera))
+    for band in model.broad_bands:
+        rms = _along(channel, band.rms_mm, band.camera)
+        if rms > 0:
+            part = broad_band(rms, low_hz=band.low_hz, high_hz=band.high_hz)
+            out.append((part, band.camera))
+            if band.slow_rms_mm > 0:
+                out.append((slow_ou(band.slow_rms_mm, band.slow_tau_s), band.camera))
+    return out
+
+
+def _along(channel: Channel, rms_mm: tuple[float, float, float], camera: int) -> float:
+    if camera != CARRIAGE and camera not in channel.cameras:
+        return 0.0
+    return float(np.linalg.norm(channel.direction * np.asarray(rms_mm)))
+
+
+def bubble_components(channel: Channel, model: ShakeModel) -> list[Component]:
+    """The processes of a bubble along the channel's direction."""
+    bubble, share = model.bubble, 1 / np.sqrt(channel.pooled)
+    sigma, begin = share * bubble.velocity_sigma_mm_s, share * bubble.start_sigma_mm
+    parts = [ou_velocity(sigma, bubble.velocity_tau_s, start_sigma_mm=begin)]
+    for z in bubble.zigzags:
+        rms = float(share * np.linalg.norm(channel.direction * np.asarray(z.rms_mm)))
+        if rms > 0:
+            parts.append(oscillator(rms, z.frequency_hz, z.damping))
+    return parts
+
+
+def _system(channel: Channel, model: ShakeModel) -> _System:
+    shake, bubble = shake_components(channel, model), bubble_components(channel, model)
+    parts = [c for c, _ in shake] + bubble * int(channel.moving.sum())
+    size, shaken = sum(c.size for c in parts), sum(c.size for c, _ in shake)
+    counts = len(shake), len(bubble), int(channel.moving.sum())
+    offset = np.zeros((len(channel.cameras), size))
+    at = 0
+    for part, camera in shake:
+        which = slice(None) if camera == CARRIAGE else channel.cameras.index(camera)
+        offset[which, at : at + part.size] += part.position
+        at += part.size
+    width = sum(c.size for c in bubble)
+    movers = np.flatnonzero(channel.moving)
+    position, velocity = np.zeros((len(channel.moving), size)), np.zeros((len(movers), size))
+    for k, item in enumerate(movers):
+        columns = slice(shaken + k * width, shaken + (k + 1) * width)
+        position[item, columns] = np.concatenate([c.position for c in bubble])
+        velocity[k, columns] = np.concatenate([c.velocity for c in bubble])
+    columns_, sigma = _constants(channel, model)
+    rows = position[channel.item] - offset[channel.camera]
+    return _System(tuple(parts), *counts, rows, offset, position[movers], velocity, columns_, sigma)
+
+
+def _constants(channel: Channel, model: ShakeModel) -> tuple[Array, Array]:
+    """(F, P, I): a moving item's travel at 1 mm/s, a fixed item's place; priors (I,)."""
+    t = channel.t_s
+    columns = np.zeros((len(t), len(channel.item), len(channel.moving)))
+    for p, item in enumerate(channel.item):
+        since = t - t[channel.first[item]]
+        columns[:, p, item] = since if channel.moving[item] else 1.0
+    speed = model.bubble.mean_sigma_mm_s / np.sqrt(channel.pooled)
+    sigma = np.where(channel.moving, speed, channel.start_sigma_mm)
+    return columns, sigma
+
+
+class _Factor:
+    """The Cholesky factor of the states' precision, and the constants' after them."""
+
+    def __init__(self, channel: Channel, model: ShakeModel) -> None:
+        from scipy.linalg import cholesky_banded
+
+        self.channel = channel
+        self.system = _system(channel, model)
+        steps = _steps(self.system, np.diff(channel.t_s))
+        self.which = np.append(steps.index, len(steps.basis) - 1)
+        self.bases = steps.basis
+        weight = channel.weight / model.pixel_inflation**2
+        diagonal, below, self.log_prior = _chain(self.system, steps)
+        self.rows = self.system.rows @ self.bases
+        size = self.rows.shape[-1]
+        for basis, rows in enumerate(self.rows):
+            mine = self.which == basis
+            outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+            diagonal[mine] += (weight[mine] @ outer).reshape(-1, size, size)
+        band = _banded(diagonal, below)
+        self.factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
+        self._eliminate(weight)
+
+    def _eliminate(self, weight: Array) -> None:
+        from scipy.linalg import cho_factor
+
+        channel, system = self.channel, self.system
+        guess = _fitted(channel, system, weight)
+        self.guess = guess
+        values = _replicates(channel)
+        count = values.shape[-1]
+        rest = values - system.columns @ guess
+        data = np.concatenate([rest, system.columns], -1)
+        weighted = weight[..., None] * data
+        right = np.swapaxes(self.rows, -1, -2)[self.which] @ weighted
+        self.right = right.reshape(-1, right.shape[-1])
+        self.half = _solve_half(self.factor, self.right)
+        wide = data.shape[-1]
+        square = data.reshape(-1, wide).T @ weighted.reshape(-1, wide) - self.half.T @ self.half
+        prior = 1 / system.prior_sigma**2
+        inner = square[count:, count:] + np.diag(prior)
+        self.inner = cho_factor(inner, lower=True)
+        linear = square[count:, :count] - prior[:, None] * guess
+        from scipy.linalg import cho_solve
+
+        self.constants = cho_solve(self.inner, linear)
+        self.square = float(np.trace(square[:count, :count]) + (prior @ guess**2).sum())
+        self.square -= float((linear * self.constants).sum())
+        self.count = count
+        used = weight > 0
+        self.log_noise = 0.5 * float(np.log(weight[used] / (2 * np.pi)).sum())
+
+    def log_evidence(self) -> float:
+        log_chain = float(np.log(self.factor[0]).sum())
+        log_inner = float(np.log(np.diag(self.inner[0])).sum())
+        log_sigma = float(np.log(self.system.prior_sigma).sum())
+        each = self.log_noise + self.log_prior - log_chain - log_inner - log_sigma
+        return self.count * each - self.square / 2
+
+    def _back(self, half: Array) -> Array:
+        """(F, D, c) states from L^-1 of the right side."""
+        from scipy.linalg import lapack
+
+        solved, info = lapack.dtbtrs(self.factor, half, uplo="L", trans="T")
+        assert info == 0
+        states = solved.reshape(len(self.which), -1, half.shape[1])
+        return np.asarray(self.bases[self.which] @ states)
+
+    def posterior(self) -> ChannelPosterior:
+        system, channel = self.system, self.channel
+        mixed = self.half[:, 0] - self.half[:, 1:] @ self.constants[:, 0]
+        states = self._back(mixed[:, None])[..., 0]
+        movers = np.flatnonzero(channel.moving)
+        speed = (self.guess + self.constants)[movers, 0]
+        since = channel.t_s - channel.t_s[channel.first[movers], None]
+        position = system.position @ states.T + speed[:, None] * since
+        velocity = system.velocity @ states.T + speed[:, None]
+        return ChannelPosterior(self.log_evidence(), position, velocity, system.offset @ states.T)
+
+    def position_sigma(self, frames: NDArray[np.int64]) -> Array:
+        from scipy.linalg import cho_solve
+
+        system, channel = self.system, self.channel
+        movers, size = np.flatnonzero(channel.moving), self.system.rows.shape[1]
+        count = len(movers) * len(frames)
+        unit = np.zeros((len(self.right), count))
+        by_constant = np.zeros((count, len(channel.moving)))
+        for k, item in enumerate(movers):
+            for i, f in enumerate(frames):
+                column = k * len(frames) + i
+                row = system.position[k] @ self.bases[self.which[f]]
+                unit[f * size : (f + 1) * size, column] = row
+                by_constant[column, item] = channel.t_s[f] - channel.t_s[channel.first[item]]
+        half = _solve_half(self.factor, unit)
+        rest = by_constant - half.T @ self.half[:, 1:]
+        variance = (half**2).sum(0) + (rest * cho_solve(self.inner, rest.T).T).sum(-1)
+        return np.asarray(np.sqrt(variance)).reshape(len(movers), len(frames))
+
+
+def _solve_half(factor: Array, right: Array) -> Array:
+    from scipy.linalg import lapack
+
+    solved, info = lapack.dtbtrs(factor, right, uplo="L")
+    assert info == 0
+    return np.asarray(solved)
+
+
+def _replicates(channel: Channel) -> Array:
+    """(F, P, R) the measurements, R of them alike but for their values."""
+    values = channel.value_mm
+    return values if values.ndim == 3 else values[..., None]
+
+
+def _fitted(channel: Channel, system: _System, weight: Array) -> Array:
+    """(c, R) constants by least squares without states: what is small after it keeps its digits."""
+    columns = system.columns.reshape(-1, system.columns.shape[-1])
+    offset = np.zeros((len(columns), len(channel.moving)))
+    pairs = np.tile(channel.item, len(channel.t_s))
+    offset[np.arange(len(pairs)), pairs] = channel.moving[pairs]
+    design = np.concatenate([columns, offset], 1) * np.sqrt(weight).reshape(-1, 1)
+    normal = design.T @ design + 1e-9 * np.eye(design.shape[1])
+    values = _replicates(channel)
+    right = design.T @ (np.sqrt(weight)[..., None] * values).reshape(len(design), -1)
+    return np.asarray(np.linalg.solve(normal, right)[: columns.shape[1]])
+
+
+def _steps(system: _System, dt_s: Array) -> Motion:
+    """`motion` of all components; that of the bubbles, which are alike, is worked out once."""
+    shake = motion(system.components[: system.shaken], dt_s)
+    count = system.bubbles
+    if not count:
+        return shake
+    one = motion(system.components[-system.per_bubble :], dt_s)
+    if not system.shaken:
+        shake = replace(shake, **{k: np.zeros((len(v), 0, 0)) for k, v in _blocks(one).items()})
+        shake = replace(shake, log_det=np.zeros(len(one.log_det)), index=one.index)
+    joined = {k: block_diagonal([_blocks(shake)[k], *[v] * count]) for k, v in _blocks(one).items()}
+    return replace(one, log_det=shake.log_det + count * one.log_det, **joined)
+
+
+def _blocks(steps: Motion) -> dict[str, Array]:
+    return {name: getattr(steps, name) for name in ("by_last", "by_next", "by_input", "basis")}
+
+
+def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
+    """Diagonal (F, D, D) and lower (F - 1, D, D) blocks of the prior; half log of its determinant.
+
+    The determinant is of the states' precision in the whitening bases.
+    """
+    count = len(steps.basis)
+    which = np.append(steps.index, count - 1)
+    kind, place = np.unique(steps.index * count + which[1:], return_inverse=True)
+    step, after = np.divmod(kind, count)
+    last, ahead = steps.by_last[step] @ steps.basis[step], steps.by_next[step] @ steps.basis[after]
+    backward, forward = (np.swapaxes(a, -1, -2) for a in (last, ahead))
+    frames, size = len(which), system.rows.shape[1]
+    diagonal = np.zeros((frames, size, size))
+    diagonal[:-1] = (backward @ last)[place]
+    diagonal[1:] += (forward @ ahead)[place]
+    covariance, _ = start(system.components)
+    whitener = whitener_of(covariance)
+    first = whitener @ steps.basis[which[0]]
+    diagonal[0] += first.T @ first
+    log_det = float(np.log(np.abs(np.diag(whitener))).sum() + steps.log_det[steps.index].sum())
+    each = np.linalg.slogdet(steps.basis)[1]
+    return diagonal, (forward @ last)[place], log_det + float(each[which].sum())
+
+
+def _banded(diagonal: Array, below: Array) -> Array:
+    """(2 D, F D) lower form of `scipy.linalg.cholesky_banded`."""
+    frames, size, _ = diagonal.shape
+    out = np.zeros((2 * size, frames, size))
+    for b in range(size):
+        out[: size - b, :, b] = diagonal[:, b:, b].T
+        out[size - b : 2 * size - b, :-1, b] = below[:, :, b].T
+    return out.reshape(2 * size, frames * size)

@@ -1,0 +1,173 @@
+"""Whose is a spectral line, the bubble's or the rig's? Moving lines, and what that costs.
+
+A line seen in one bubble is seen alike whoever owns it: the likelihood does not change when it is
+moved. Several bubbles, marks or sensors tell. What the images cannot tell is shared between both
+owners: with half of the variance each, the posterior says that the share is unknown, and its
+covariance holds the spread between the two readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.shake_channels import Channel
+from telerig.estimator.shake_likelihood import evidence, maximise
+from telerig.estimator.smoother.model import CARRIAGE, RigMode, ShakeModel, Zigzag
+
+Array = NDArray[np.float64]
+
+AMBIGUOUS_NATS = 5.0
+HARMONIC_NATS = 7.0
+_SAME_HZ = 0.02
+_HARMONIC = 0.12
+_REFIT_NATS = 40.0
+_ZIGZAG_MM = 0.3
+_ZIGZAG_HZ = (3.0, 12.0)
+
+
+@dataclass(frozen=True)
+class LineLabel:
+    """A line and what its other reading costs.
+
+    owner : "rig" or "bubble".  index : into the model's modes or zigzags.
+    cost_nats : by how much the data prefer this owner to the other, refitted; what is known
+    beforehand (the zigzag's second harmonic) is in ``prior_nats``.
+    """
+
+    owner: str
+    index: int
+    frequency_hz: float
+    rms_mm: float
+    cost_nats: float
+    prior_nats: float = 0.0
+
+    @property
+    def ambiguous(self) -> bool:
+        return self.cost_nats + self.prior_nats < AMBIGUOUS_NATS
+
+
+def labels(
+    channels: Sequence[Channel], model: ShakeModel, pattern: Sequence[float], up: Array
+) -> list[LineLabel]:
+    """The lines of these channels that could be the rig's as a whole or the bubbles'.
+
+    pattern : (3,) the directions along rig axes in which lines are moved.  up : (3,).
+    """
+    if not any(c.moving.any() for c in channels):
+        return []
+    at = evidence(channels, model)
+    out = []
+    for i, mode in enumerate(model.modes):
+        if _lies_in(mode.rms_mm, pattern) and _is_common(mode, channels):
+            cost = _cost(channels, model, moved_to_bubble(model, i), at)
+            label = LineLabel("rig", i, mode.frequency_hz, max(mode.rms_mm), cost)
+            out.append(label)
+    differential = any(m.camera != CARRIAGE for m in model.modes)
+    for i, line in enumerate(model.bubble.zigzags):
+        if _lies_in(line.rms_mm, pattern):
+            cost = _cost(channels, model, moved_to_rig(model, i), at)
+            prior = _own_motion_nats(model, i, differential, up)
+            out.append(LineLabel("bubble", i, line.frequency_hz, max(line.rms_mm), cost, prior))
+    return out
+
+
+def _is_common(mode: RigMode, channels: Sequence[Channel]) -> bool:
+    """Seen by all cameras of a channel alike: only then a bubble can look the same."""
+    if mode.camera == CARRIAGE:
+        return True
+    return all(c.cameras == (mode.camera,) for c in channels if mode.camera in c.cameras)
+
+
+def _lies_in(rms_mm: Sequence[float], pattern: Sequence[float]) -> bool:
+    rms, inside = np.asarray(rms_mm), np.asarray(pattern) > 0.7
+    return bool(rms[inside].max(initial=0.0) > rms[~inside].max(initial=0.0))
+
+
+def _cost(channels: Sequence[Channel], model: ShakeModel, other: ShakeModel, at: float) -> float:
+    """Loss of log likelihood, the lines refitted where that could matter."""
+    loss = at - evidence(channels, other)
+    if AMBIGUOUS_NATS / 2 < loss < _REFIT_NATS:
+        loss = min(loss, at - maximise(channels, other, _line_names(other), steps=8).log_evidence)
+    return float(loss)
+
+
+def _line_names(model: ShakeModel) -> list[str]:
+    stems = [f"modes.{i}" for i in range(len(model.modes))]
+    stems += [f"bubble.zigzags.{i}" for i in range(len(model.bubble.zigzags))]
+    return [f"{s}.{f}" for s in stems for f in ("frequency_hz", "rms_mm")]
+
+
+def _own_motion_nats(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
+    """What is known of bubbles before any image: wide swings are theirs, and twice their frequency.
+
+    The second harmonic is doubted where the cameras shake against each other, which shows a rig
+    that may well shake as a whole.
+    """
+    line = model.bubble.zigzags[index]
+    swings = [z for z in model.bubble.zigzags if is_zigzag(z, up)]
+    if line in swings:
+        return float("inf")
+    second = any(abs(line.frequency_hz / (2 * z.frequency_hz) - 1) < _HARMONIC for z in swings)
+    return HARMONIC_NATS if second and not differential else 0.0
+
+
+def is_zigzag(line: Zigzag, up: Array) -> bool:
+    """A wide swing across the vertical, at the frequency of bubbles' paths."""
+    rms, upright = np.asarray(line.rms_mm), np.abs(up)
+    across = float(np.linalg.norm(rms * (1 - upright)))
+    wide = across > _ZIGZAG_MM and across > float(np.linalg.norm(rms * upright))
+    return wide and _ZIGZAG_HZ[0] < line.frequency_hz < _ZIGZAG_HZ[1]
+
+
+def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
+    """A share of a mode's variance given to the bubbles; all of it: the mode goes."""
+    mode = model.modes[index]
+    added = Zigzag(mode.frequency_hz, mode.damping, _times(mode.rms_mm, np.sqrt(share)))
+    kept = replace(mode, rms_mm=_times(mode.rms_mm, np.sqrt(1 - share)))
+    rest = (kept,) if share < 1 else ()
+    modes = (*model.modes[:index], *rest, *model.modes[index + 1 :])
+    zigzags = _joined(model.bubble.zigzags, added)
+    return replace(model, modes=modes, bubble=replace(model.bubble, zigzags=zigzags))
+
+
+def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
+    """A share of a bubble line's variance given to a mode of the whole rig."""
+    line = model.bubble.zigzags[index]
+    force = next((m.force_hz for m in model.modes), None)
+    rms = _times(line.rms_mm, np.sqrt(share))
+    added = RigMode(line.frequency_hz, line.damping, rms, force_hz=force)
+    kept = replace(line, rms_mm=_times(line.rms_mm, np.sqrt(1 - share)))
+    rest = (kept,) if share < 1 else ()
+    zigzags = (*model.bubble.zigzags[:index], *rest, *model.bubble.zigzags[index + 1 :])
+    bubble = replace(model.bubble, zigzags=zigzags)
+    return replace(model, modes=(*model.modes, added), bubble=bubble)
+
+
+def _joined(lines: tuple[Zigzag, ...], added: Zigzag) -> tuple[Zigzag, ...]:
+    """With the variances of equal lines added up."""
+    for i, line in enumerate(lines):
+        near = abs(line.frequency_hz / added.frequency_hz - 1) < _SAME_HZ
+        if near and np.isclose(line.damping, added.damping, rtol=_SAME_HZ):
+            x, y, z = np.hypot(line.rms_mm, added.rms_mm).tolist()
+            return (*lines[:i], replace(line, rms_mm=(x, y, z)), *lines[i + 1 :])
+    return (*lines, added)
+
+
+def _times(rms_mm: Sequence[float], factor: float) -> tuple[float, float, float]:
+    x, y, z = (float(factor * r) for r in rms_mm)
+    return x, y, z
+
+
+def shared(model: ShakeModel, found: Sequence[LineLabel]) -> ShakeModel:
+    """Every ambiguous line given half to the rig, half to the bubbles."""
+    for label in sorted(found, key=lambda one: -one.index):
+        if label.ambiguous and label.owner == "bubble":
+            model = moved_to_rig(model, label.index, 0.5)
+    for label in found:
+        if label.ambiguous and label.owner == "rig":
+            model = moved_to_bubble(model, label.index, 0.5)
+    return model

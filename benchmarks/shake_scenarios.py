@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
+from shake_calibration import calibrated
 from shake_cases import generate, middle, reference
 from shake_problem import true_model
 from shake_scene import LATERAL, LATERAL_SHAKE, NONLINEAR, UP, Case, Run, cases, oblique, simulate

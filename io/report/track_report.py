@@ -11,6 +11,8 @@ from telerig.io.atomic import write_text_atomic
 from telerig.io.report import track_tables as tables
 from telerig.io.report.contact_sheet import BUDGET_BYTES, ContactSheet, picture_sheet
 from telerig.io.report.page import drawn_over_cores, plotly_javascript, render_page
+from telerig.io.report.smoothing_report import PLACES, smoothing_drawings, smoothing_words
+from telerig.io.report.smoothing_results import SmoothingResults, read_smoothing_results
 from telerig.io.report.track_figures import (
     bubbles_in_time,
     confidence,
@@ -42,19 +44,23 @@ def write_track_report(results_folder: Path) -> Path:
 
     It reads nothing but that folder: tracking.json and tracks.csv, and if they are there
     detections.csv, events.csv, run.json, overlays/<camera>/<frame>.jpg and
-    binary/<camera>/<frame>.png. The page is written whole or not at all. Raises InputError for a
+    binary/<camera>/<frame>.png. Where smoothing.json is there, with trajectories.csv and shake.csv,
+    the page begins with the smoothing. It is written whole or not at all. Raises InputError for a
     folder that holds no tracks, or files that cannot be read or do not fit together.
     """
     folder = Path(results_folder)
-    page = render(read_track_results(folder))
+    tracks = read_track_results(folder)
+    page = render(tracks, read_smoothing_results(folder, tracks.up))
     write_text_atomic(folder / "report.html", page)
     return folder / "report.html"
 
 
-def render(results: TrackResults) -> str:
+def render(results: TrackResults, smoothing: SmoothingResults | None = None) -> str:
     """The page as text."""
     scene = track_scene_json(results)
-    context = _words(results) | _pictures(results)
+    context = _words(results) | _pictures(results, smoothing)
+    if smoothing is not None:
+        context["smoothing"] = smoothing_words(smoothing, results)
     drawn = [p.source for group in context.values() for p in _list(group) if hasattr(p, "source")]
     left = PAGE_BYTES - len(plotly_javascript()) - len(scene) - sum(map(len, drawn))
     context["sheet"] = _sheet(results, max(0, int(left / _BASE64)))
@@ -102,7 +108,7 @@ def _rows(content: Mapping[str, Any], file: str) -> list[tuple[str, str]]:
     return rows if more <= 0 else [*rows[:_MOST_ROWS], ("and", f"{more} more in {file}")]
 
 
-def _pictures(results: TrackResults) -> dict[str, Any]:
+def _pictures(results: TrackResults, smoothing: SmoothingResults | None) -> dict[str, Any]:
     every = range(len(results.cameras))
     drawings: list[tuple[str, Callable[[], Any]]] = [
         *(("seen", partial(seen_where, results, i)) for i in every),
@@ -115,7 +121,10 @@ def _pictures(results: TrackResults) -> dict[str, Any]:
         ("quality", partial(confidence, results)),
         ("plans", partial(track_plans, results)),
     ]
-    pictures: dict[str, Any] = {place: [] for place, _ in drawings}
+    pictures: dict[str, Any] = {place: [] for place in (*dict(drawings), *PLACES)}
+    if smoothing is not None:
+        drawings += smoothing_drawings(smoothing)
     for (place, _), picture in zip(drawings, drawn_over_cores([d for _, d in drawings])):
-        pictures[place] += picture if isinstance(picture, list) else [picture]
+        found = picture if isinstance(picture, list) else [picture]
+        pictures[place] += [p for p in found if p is not None]
     return pictures

@@ -1,0 +1,184 @@
+"""Tables of a smoothed run's report: modes with their remedies, constants, hyper-parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from telerig.io.report.page import Row
+from telerig.io.report.smoothing_numbers import Line, shake_lines
+from telerig.io.report.smoothing_results import AXES, SmoothingResults
+from telerig.io.report.words import ABSENT, flat_rows, is_number, number, with_sd
+
+MODE_HEADS = ["what shakes", "Hz", "damping", "RMS, µm", "what helps"]
+
+MOST_ROWS = 30
+_LIGHTLY_DAMPED = 0.02
+_COMMON = (
+    "stiffer carriage guide or mount of the arms; heavy parts closer to the guide; gentler ramps"
+)
+_ARM = (
+    "shorter or stiffer arm (a third shorter raises the frequency 1.8 times), less weight at its "
+    "end, a counterweight"
+)
+_DAMPING = "a damping layer or a tuned absorber"
+_SERVO = "controller: a notch at {} Hz, less gain, smoother set points"
+_PITCH = "stiffen the arm against twisting; camera's weight on the arm's axis"
+_UNKNOWN_ARM = (
+    "find out with an accelerometer on the carriage whether it is the carriage or the arm"
+)
+
+
+def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
+    """The shake's modes and where they come from: learned or given, else peaks of the estimate."""
+    judged = [m for m in results.content.get("modes") or [] if isinstance(m, Mapping)]
+    model = results.part("model")
+    modes = judged or [m for m in model.get("modes") or [] if isinstance(m, Mapping)]
+    rows = [_mode(mode, results.cameras) for mode in modes]
+    rows += [_pitch(m, results.cameras) for m in model.get("pitches") or []
+             if isinstance(m, Mapping)]  # fmt: skip
+    servo = dict(model.get("carriage") or {}).get("servo")
+    if isinstance(servo, Sequence) and len(servo) == 3:
+        rows.append(_servo(*servo))
+    if rows:
+        return rows, "The modes of the model that the smoother used."
+    lines = [_line(line, results) for line in shake_lines(results)[:MOST_ROWS]]
+    if not lines:
+        return [], (
+            "The model has no modes, and no peak stands out of the spectrum of the estimated shake."
+        )
+    return lines, (
+        "The model has no modes: these are the peaks in the spectrum of the estimated shake. "
+        "Damping is that of a single mode as wide as the peak; “below” where the run is too short "
+        "to tell."
+    )
+
+
+def _mode(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
+    where, remedy = _place(mode.get("camera", mode.get("where")), cameras)
+    damping = mode.get("damping")
+    helps = [text for key in ("remedy", "remedies") for text in _texts(mode.get(key))]
+    if not helps:
+        helps = [remedy] if remedy else []
+        if is_number(damping) and damping < _LIGHTLY_DAMPED:
+            helps.append(_DAMPING)
+    cells = (number(mode.get("frequency_hz")), number(damping), _rms_um(mode.get("rms_mm")))
+    return Row((where, *cells, "; ".join(helps)))
+
+
+def _texts(value: Any) -> list[str]:
+    if isinstance(value, str):
+        return [value]
+    return [str(v) for v in value] if isinstance(value, list) else []
+
+
+def _place(camera: Any, cameras: Sequence[str]) -> tuple[str, str]:
+    """In words, and the remedy."""
+    if isinstance(camera, int) and 0 <= camera < len(cameras):
+        camera = cameras[camera]
+    if camera in cameras:
+        return f"arm of {camera}", _ARM
+    if camera == -1 or str(camera).lower() in ("common", "carriage", "none"):
+        return "all cameras alike (carriage, mount)", _COMMON
+    if "servo" in str(camera).lower():
+        return str(camera), _SERVO.format("its frequency in")
+    return str(camera), ""
+
+
+def _rms_um(rms_mm: Any) -> str:
+    """Of one axis or three."""
+    if is_number(rms_mm):
+        return number(1e3 * rms_mm, 3)
+    if not isinstance(rms_mm, list):
+        return ABSENT
+    known = [(a, v) for a, v in zip(AXES, rms_mm) if is_number(v) and v > 0]
+    return ", ".join(f"{axis}: {number(1e3 * value, 3)}" for axis, value in known) or "0"
+
+
+def _pitch(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
+    where, _ = _place(mode.get("camera"), cameras)
+    rms = mode.get("rms_rad")
+    angle = f"{number(math.degrees(rms), 2)}°" if is_number(rms) else ABSENT
+    return Row((f"{where}, turning", number(mode.get("frequency_hz")),
+                number(mode.get("damping")), angle, _PITCH))  # fmt: skip
+
+
+def _servo(rms_mm: Any, frequency_hz: Any, damping: Any) -> Row:
+    return Row(("servo (following error)", number(frequency_hz), number(damping),
+                _rms_um(rms_mm), _SERVO.format(number(frequency_hz))))  # fmt: skip
+
+
+def _line(line: Line, results: SmoothingResults) -> Row:
+    where, remedy = {
+        "common": (f"{line.axis}: both cameras alike (carriage, mount)", _COMMON),
+        "apart": (f"{line.axis}: both cameras, not alike (arms)", _ARM),
+    }.get(line.where, (f"{line.axis}: camera {line.where}", _ARM))
+    if line.alone and len(results.cameras) > 1:
+        where, remedy = f"{where}, which alone sees {line.axis}", f"{_UNKNOWN_ARM}; {_ARM}"
+    if line.damping < _LIGHTLY_DAMPED and not line.upper:
+        remedy += f"; {_DAMPING}"
+    damping = ("below " if line.upper else "") + number(line.damping, 2)
+    return Row((where, number(line.frequency_hz), damping, number(line.rms_um, 3), remedy))
+
+
+_CONSTANTS = (
+    ("_mm_s2", ", mm/s²", 1.0), ("_mm_s", ", mm/s", 1.0), ("_s", ", ms", 1e3),
+)  # fmt: skip
+
+
+def constant_rows(results: SmoothingResults) -> list[Row]:
+    """Constants of encoder and accelerometers: sensor, what, value with its sd."""
+    parts = {"encoder": results.part("encoder")} | dict(results.part("accelerometers"))
+    return [
+        Row((str(sensor), *named))
+        for sensor, values in parts.items()
+        if isinstance(values, Mapping)
+        for named in _constants(values)
+    ]
+
+
+def mean_rows(results: SmoothingResults) -> list[Row]:
+    """Mean velocities of the bubbles: the first rows."""
+    rows = []
+    for particle, values in results.part("bubble_means").items():
+        if isinstance(values, Mapping):
+            cells = [with_sd(values.get(f"{a}_mm_s"), values.get(f"s{a}_mm_s")) for a in AXES]
+            rows.append(Row((str(particle), *cells)))
+    return rows[:MOST_ROWS]
+
+
+def _constants(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    out = []
+    for name, value in values.items():
+        if name[:1] == "s" and name[1:] in values:
+            continue
+        shown, factor = name.replace("_", " "), 1.0
+        for ending, unit, times in _CONSTANTS:
+            if name.endswith(ending) and name != ending:
+                shown, factor = name.removesuffix(ending).replace("_", " ") + unit, times
+                break
+        sd = values.get("s" + name)
+        text = with_sd(value * factor, sd * factor) if is_number(value) and is_number(sd) else (
+            number(value * factor, 4) if is_number(value) else ABSENT)  # fmt: skip
+        out.append((shown, text))
+    return out
+
+
+def model_rows(results: SmoothingResults) -> list[tuple[str, str]]:
+    """Every hyper-parameter by its name in `smoothing.json`."""
+    rows = flat_rows(results.part("model"))
+    return [(_readable(name), _owner(name, value, results.cameras)) for name, value in rows]
+
+
+def _readable(name: str) -> str:
+    return name.replace("_", " ").replace(".", ": ")
+
+
+def _owner(name: str, value: str, cameras: Sequence[str]) -> str:
+    """A camera's index as its name."""
+    if not name.endswith(".camera"):
+        return value or "none"
+    if value == "-1":
+        return "all alike"
+    return cameras[int(value)] if value.isdigit() and int(value) < len(cameras) else value

@@ -1,0 +1,238 @@
+"""A smoothed run in words: the verdict with its remedy, and the numbers behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from telerig.io.report.page import Figure, Row
+from telerig.io.report.smoothing_numbers import axis_sd, shake_rms_um, taken_away
+from telerig.io.report.smoothing_results import AXES, SPEED, SmoothingResults
+from telerig.io.report.track_results import TrackResults
+from telerig.io.report.track_tables import Verdict
+from telerig.io.report.words import ABSENT, is_number, number, share
+
+REMEDY = (
+    "Fix a strip of dots to the tank where both cameras see it, or put one accelerometer on each "
+    "camera arm, and record again."
+)
+_NOT_JUDGED = (
+    "Not judged: nothing says how far bubble motion and shake were told apart",
+    "usable",
+    "The bands below hold if the model of bubbles and shake is right; whether the data could have "
+    "shown otherwise was not tested.",
+)
+_MEANING = {
+    "RESOLVED": (
+        "RESOLVED: the bubbles' motion and the rig's shake are told apart",
+        "good",
+        "The shake is known so well that it hardly widens the bands below.",
+    ),
+    "PARTIAL": (
+        "PARTIAL: the bubbles' motion and the rig's shake are told apart in part",
+        "usable",
+        "Part of the shake may still stand in the trajectories, or part of the bubbles' motion in "
+        "the shake; the bands below say how much.",
+    ),
+    "UNRESOLVED": (
+        "UNRESOLVED: these data do not tell the bubbles' motion from the rig's shake",
+        "rejected",
+        "What is drawn below as the bubbles' motion may be shake, and the other way round: do not "
+        "read anything from it that is as fast as the shake.",
+    ),
+}
+_FLAGS = {
+    "LABEL_AMBIGUOUS": (
+        "A line in the spectrum could be the bubbles' or the rig's, and the data do not say whose "
+        "it is. The bands are widened by what lies between the two readings."
+    ),
+    "SHAKE_BELOW_NOISE": (
+        "The shake is smaller than what the images can show. It does no harm here: the bubbles' "
+        "motion is as good as it would be on a rig that stands still."
+    ),
+}
+_HARMLESS = {"SHAKE_BELOW_NOISE"}
+_REMEDY_KEYS = ("remedy", "remedies")
+_NAMES = {
+    "verdict": "verdict", "q": "q", "eta": "η", "flags": "flags", "words": "in words",
+    "shake_rms_mm": "shake RMS, µm", "sd_mm": "sd, µm", "sd_known_mm": "sd, shake known, µm",
+}  # fmt: skip
+
+
+def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Verdict:
+    """What the smoother says of itself, with the remedy where there is one to take."""
+    content = results.content
+    word = str(content.get("verdict") or "").strip()
+    headline, colour, meaning = _MEANING.get(
+        word.upper(), (word.replace("_", " "), "usable", "") if word else _NOT_JUDGED
+    )
+    sentences = [meaning, *strings(content.get("words"))]
+    if word.upper() in ("PARTIAL", "UNRESOLVED"):
+        given = [text for key in _REMEDY_KEYS for text in strings(content.get(key))]
+        told = " ".join(sentences).lower()
+        if given or not ("strip of dots" in told or "accelerometer" in told):
+            sentences.append("What would resolve it: " + " ".join(given or [REMEDY]))
+    flags = strings(content.get("flags"))
+    told = {flag: _FLAGS.get(flag, flag.replace("_", " ").lower()) for flag in flags}
+    sentences += [f"{flag}: {text}" for flag, text in told.items() if flag in _HARMLESS]
+    warnings = [f"{flag}: {text}" for flag, text in told.items() if flag not in _HARMLESS]
+    known = tuple(dict.fromkeys(s for s in sentences if s))
+    return Verdict(headline, colour, known, (*warnings, *_stale(results, tracks)))
+
+
+def strings(value: Any) -> list[str]:
+    """A text or a list of them as a list."""
+    if isinstance(value, str):
+        return [value] if value.strip() else []
+    return [str(item) for item in value] if isinstance(value, list) else []
+
+
+def _stale(results: SmoothingResults, tracks: TrackResults) -> list[str]:
+    strange = sorted(set(results.bubbles) - {int(k) for k in tracks.tracks["particle"].unique()})
+    if not strange:
+        return []
+    some = ", ".join(str(k) for k in strange[:5]) + (", ..." if len(strange) > 5 else "")
+    return [
+        f"Bubbles {some} of trajectories.csv are not in tracks.csv: the run was tracked again "
+        "after it was smoothed. Smooth it again (`telerig smooth`)."
+    ]
+
+
+def smoothing_figures(results: SmoothingResults) -> list[Figure]:
+    """What a reader wants first."""
+    place, speed = axis_sd(results), axis_sd(results, SPEED)
+    away, away_speed = taken_away(results), taken_away(results, pattern=SPEED)
+    shake = {
+        (camera, axis): rms
+        for camera in results.cameras
+        for axis in AXES
+        if (rms := shake_rms_um(results, camera, axis)) is not None
+    }
+    worst = max(shake, key=lambda key: shake[key], default=None)
+    where = "the estimate, about its mean" if worst is None else f"camera {worst[0]}, {worst[1]}"
+    model = results.part("model")
+    source = str(model.get("name") or ABSENT)
+    return [
+        Figure("Position, 1 sd", f"{_largest(place, 1e3)} µm", "smoothed, median, worst axis"),
+        Figure("Velocity, 1 sd", f"{_largest(speed)} mm/s", "smoothed, median, worst axis"),
+        Figure("Taken from positions", f"{_largest(away, 1e3)} µm",
+               "RMS of naive (triangulated, encoder added) minus smoothed, worst axis"),
+        Figure("Taken from velocities", f"{_largest(away_speed)} mm/s",
+               "RMS of naive (difference over two frames) minus smoothed, worst axis"),
+        Figure("Shake", f"{number(None if worst is None else shake[worst], 3)} µm",
+               f"RMS, largest: {where}"),
+        Figure("Hyper-parameters", source, _MODEL_WORDS.get(source, "where they come from")),
+    ]  # fmt: skip
+
+
+_MODEL_WORDS = {
+    "default": "fixed priors; noise and size of the shake adapted to the data",
+    "learned": "learned from this run by maximum likelihood",
+    "given": "given by the user",
+}
+
+
+def _largest(values: list[float | None], factor: float = 1.0) -> str:
+    known = [value for value in values if value is not None]
+    return number(factor * max(known), 3) if known else ABSENT
+
+
+def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
+    """Heads and a row per rig axis: what was judged, then what the tables hold."""
+    judged = judged_axes(results.content)
+    keys = [k for k in dict.fromkeys(k for one in judged.values() for k in one) if _plain(k)]
+    order = ("verdict", "q", "eta")
+    keys = [k for k in order if k in keys] + [k for k in keys if k not in order]
+    columns = {
+        "sd, µm": [_scaled(v, 1e3) for v in axis_sd(results)],
+        "sd of velocity, mm/s": [_scaled(v) for v in axis_sd(results, SPEED)],
+        "naive minus smoothed, µm": [_scaled(v, 1e3) for v in taken_away(results)],
+        "RTS minus smoothed, µm": [_scaled(v, 1e3) for v in taken_away(results, "rts_")],
+    }
+    for camera in results.cameras:
+        columns[f"shake of {camera}, µm"] = [
+            "unseen" if axis in results.unseen(camera)
+            else _scaled(shake_rms_um(results, camera, axis))
+            for axis in AXES
+        ]  # fmt: skip
+    heads = [_head(key) for key in keys]
+    rows = [
+        Row((_axis_name(results, i), *(_cell(key, judged.get(axis, {}).get(key)) for key in keys),
+             *(cells[i] for cells in columns.values())))
+        for i, axis in enumerate(AXES)
+    ]  # fmt: skip
+    return ["axis", *heads, *columns], rows
+
+
+def judged_axes(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What smoothing.json says of each axis, wherever it does; empty when nothing was judged."""
+    for part in (content.get("axes"), content.get("per_axis"), content):
+        if isinstance(part, Mapping):
+            found = {a: part[a] for a in AXES if isinstance(part.get(a), Mapping)}
+            if found:
+                return found
+    return {}
+
+
+def _axis_name(results: SmoothingResults, axis: int) -> str:
+    along = float(results.up[axis])
+    vertical = {True: ", up", False: ", down"}[along > 0] if abs(along) > 0.9 else ""
+    return AXES[axis] + vertical
+
+
+def _plain(key: str) -> bool:
+    return key not in ("words", *_REMEDY_KEYS)
+
+
+def _head(key: str) -> str:
+    if key in _NAMES:
+        return _NAMES[key]
+    for unit, shown in (("_mm_s", ", mm/s"), ("_mm", ", µm"), ("_um", ", µm"), ("_hz", ", Hz"),
+                        ("_nats", ", nats")):  # fmt: skip
+        if key.endswith(unit):
+            return key.removesuffix(unit).replace("_", " ") + shown
+    return key.replace("_", " ")
+
+
+def _cell(key: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list):
+        return ", ".join(str(item) if isinstance(item, str) else number(item) for item in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if key == "eta" and is_number(value):
+        return f"{value:.4f}"
+    return _scaled(value, 1e3 if key.endswith("_mm") else 1.0)
+
+
+def _scaled(value: Any, factor: float = 1.0) -> str:
+    return number(value * factor, 3) if is_number(value) else "-"
+
+
+def residual_rows(results: SmoothingResults) -> list[Row]:
+    """Pixels of bubbles and references: how many, outliers, residuals in sigmas."""
+    rows = []
+    for name, found in results.part("residuals").items():
+        if not isinstance(found, Mapping) or not found.get("pixels"):
+            continue
+        outliers = found.get("outliers")
+        cells = (
+            number(found["pixels"]), number(outliers), share(outliers, found["pixels"]),
+            number(found.get("rms_sigmas")), number(found.get("median_sigmas")),
+        )  # fmt: skip
+        rows.append(Row((str(name), *cells)))
+    return rows
+
+
+def residual_words(results: SmoothingResults) -> str:
+    """What the sigmas mean, and what was done about them."""
+    text = (
+        "A residual is a pixel as it was measured minus the pixel that the smoothed motion "
+        "predicts, in sigmas of what was stated for it. Where the stated noise is right these are "
+        "near 1, less what the fit takes up; outliers are left out of them."
+    )
+    inflation = results.part("model").get("pixel_inflation")
+    if is_number(inflation) and inflation != 1:
+        text += f" The noise stated for the bubbles' pixels was multiplied by {number(inflation)}."
+    return text

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import gc
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
-from telerig.estimator.smoother.linear import Linear, all_factors, pixel_residuals
+from telerig.estimator.smoother.blocks import Linear
+from telerig.estimator.smoother.linear import all_factors, pixel_residuals
 from telerig.estimator.smoother.marginals import marginal_covariances
 from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
-from telerig.estimator.smoother.state import Frame, State, first_guess, frame_of
+from telerig.estimator.smoother.state import Frame, State, first_guess, frame_of, moved, times
+from telerig.estimator.smoother.threads import in_large_stack
+from telerig.estimator.smoother.truncation import Truncation
 from telerig.factors.motion import add_linear_factors
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-T = TypeVar("T")
 
-STACK_BYTES = 512 << 20
-OUTLIER_SIGMAS = 4.0
-_SUSPICIOUS_SIGMAS = 5.0
-_LEAST_KEPT = 0.7
 _NOTHING = np.zeros(0, np.int64)
 _DELAY_STEP_S = 3e-5
 _DELAY_LEAP_S = 2e-3
@@ -122,7 +118,7 @@ def _solve(
     weights = (np.ones(len(problem.observations)), np.ones(len(problem.references)))
     if start is not None:
         weights, state = start.weights, _warm(frame, state, start)
-    robust = _Truncation(options.robust)
+    robust = Truncation(options.robust)
     last: _Pass | None = None
     exact = _is_linear(problem, model)
     done = 0
@@ -257,75 +253,14 @@ def _ordering(frame: Frame) -> Any:
     return out
 
 
-def moved(frame: Frame, state: State, step: Array) -> State:
-    """The state after an increment, keys in their order."""
-    counts = [n * d for n, d in frame.counts()]
-    parts = np.split(step, np.cumsum(counts)[:-1])
-    shaped = [p.reshape(n, d) for p, (n, d) in zip(parts, frame.counts())]
-    return State(
-        state.shake + _times(frame.shake_basis(np.arange(len(shaped[0]))), shaped[0]),
-        state.bubbles + _times(frame.bubble_basis(np.arange(len(shaped[1]))), shaped[1]),
-        state.means + shaped[2],
-        state.sensors + shaped[3],
-        state.encoder + shaped[4][0],
-        state.calibration + shaped[5][0],
-        state.marks + shaped[6],
-        state.clocks + shaped[7],
-    )
-
-
-def _times(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
-
-
 def _largest_shift_px(factors: list[Linear], frame: Frame, vector: Array) -> float:
     """How far bubbles moved in this pass, in pixels of the finest camera."""
     layout, (nodes, size) = frame.bubble, frame.counts()[0]
     start = nodes * size
     states = vector[start : start + frame.rows * layout.size].reshape(-1, layout.size)
-    moves = _times(frame.bubble_basis(np.arange(frame.rows)), states) @ layout.position.T
+    moves = times(frame.bubble_basis(np.arange(frame.rows)), states) @ layout.position.T
     scale = max(c["scale_px_per_mm"] for c in frame.problem.cameras)
     return float(np.max(np.abs(moves), initial=0.0) * scale)
-
-
-class _Truncation:
-    """Truncated least squares by graduated non-convexity (Yang et al., RA-L 5:1127, 2020).
-
-    Nothing is touched as long as no residual is suspicious.
-    """
-
-    def __init__(self, wanted: bool) -> None:
-        self.wanted, self.control = wanted, 0.0
-
-    def update(
-        self, weights: tuple[Array, Array], residuals: tuple[Array, Array]
-    ) -> tuple[tuple[Array, Array], bool]:
-        """New weights, and whether they have changed."""
-        squares = [(r**2).sum(-1) for r in residuals]
-        largest = max((float(s.max(initial=0.0)) for s in squares), default=0.0)
-        bound = OUTLIER_SIGMAS**2
-        if not self.wanted or (self.control == 0 and largest < _SUSPICIOUS_SIGMAS**2):
-            return weights, False
-        if self.control == 0:
-            self.control = bound / max(2 * largest - bound, bound)
-        else:
-            self.control *= 4
-        fresh = tuple(_truncated(s, bound, self.control) for s in squares)
-        if self.control > 1 and any(len(w) and w.mean() < _LEAST_KEPT for w in fresh):
-            # so many cannot be outliers: it is the motion that the priors do not allow
-            self.wanted = False
-            fresh = tuple(np.ones_like(w) for w in weights)
-        change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fresh, weights))
-        return (fresh[0], fresh[1]), change > 1e-3
-
-
-def _truncated(squares: Array, bound: float, control: float) -> Array:
-    """(M,) weights; control grows from near 0 (convex) to infinity (truncated)."""
-    low, high = control / (control + 1) * bound, (control + 1) / control * bound
-    if control > 1e3:
-        return (squares <= bound).astype(float)
-    between = np.sqrt(bound * control * (control + 1) / np.maximum(squares, 1e-12)) - control
-    return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, np.clip(between, 0, 1)))
 
 
 def _restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
@@ -412,34 +347,3 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> tuple[Covariance
         *blocks[6:],
     )
     return covariances, marginals.log_det
-
-
-def in_large_stack(task: Callable[[], T]) -> T:
-    """Run in a thread with a large stack: GTSAM's recursion is as deep as the run is long.
-
-    Python's cycle collector rests meanwhile: it would walk through a million small arrays, none of
-    them in a cycle, again and again, more than linearly in the length of the run.
-    """
-    result: list[T] = []
-    fault: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            result.append(task())
-        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            fault.append(error)
-
-    collecting = gc.isenabled()
-    gc.disable()
-    before = threading.stack_size(STACK_BYTES)
-    try:
-        thread = threading.Thread(target=run, name="telerig-smoother")
-        thread.start()
-    finally:
-        threading.stack_size(before)
-    thread.join()
-    if collecting:
-        gc.enable()
-    if fault:
-        raise fault[0]
-    return result[0]

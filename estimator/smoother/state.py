@@ -210,3 +210,24 @@ def _guess_carriage(frame: Frame, shake: Array) -> None:
     shake[:, 0] = s
     if not frame.shake.components[0].memoryless:
         shake[:, 1] = np.gradient(s, t)
+
+
+def moved(frame: Frame, state: State, step: Array) -> State:
+    """The state after an increment, keys in their order."""
+    counts = [n * d for n, d in frame.counts()]
+    parts = np.split(step, np.cumsum(counts)[:-1])
+    shaped = [p.reshape(n, d) for p, (n, d) in zip(parts, frame.counts())]
+    return State(
+        state.shake + times(frame.shake_basis(np.arange(len(shaped[0]))), shaped[0]),
+        state.bubbles + times(frame.bubble_basis(np.arange(len(shaped[1]))), shaped[1]),
+        state.means + shaped[2],
+        state.sensors + shaped[3],
+        state.encoder + shaped[4][0],
+        state.calibration + shaped[5][0],
+        state.marks + shaped[6],
+        state.clocks + shaped[7],
+    )
+
+
+def times(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

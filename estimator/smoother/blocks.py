@@ -1,0 +1,39 @@
+"""Arrays of linear factors of one shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """M factors of one shape.
+
+    keys : one (M,) each.  blocks : (M, rows, columns) each.  rhs : (M, rows).
+    log_det : (M,) of the whiteners.  weight : (M,) 0..1 of a robust fit, already in the rest.
+    """
+
+    keys: tuple[ArrayLike, ...]
+    blocks: tuple[Array, ...]
+    rhs: Array
+    log_det: Array
+    weight: Array | None = None
+
+    def log_norm(self) -> float:
+        """log of the factors' normalisation, residuals apart."""
+        share = np.ones(len(self.rhs)) if self.weight is None else self.weight
+        each = self.log_det - self.rhs.shape[1] * 0.5 * np.log(2 * np.pi)
+        return float((share * each).sum())
+
+
+def log_det_of(whitener: Array) -> Array:
+    return np.asarray(np.log(np.abs(np.diagonal(whitener, axis1=-2, axis2=-1))).sum(-1))
+
+
+def repeated(block: Array, count: int) -> Array:
+    return np.broadcast_to(block, (count, *block.shape))

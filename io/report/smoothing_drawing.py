@@ -17,6 +17,7 @@ _BINS = 450
 _MANY = 1_500
 _SHADES = 64
 _DPI = 190
+_ROOM = 0.035
 
 
 def thin_line(t_s: Array, values: Array) -> tuple[Array, Array]:
@@ -58,15 +59,20 @@ def band(axes: Any, t_s: Array, centre: Array, sd: Array, colour: str, label: st
                       linewidth=0, label=label)  # fmt: skip
 
 
-def above(axes: Any, columns: int = 4) -> None:
-    """Room for the legend over the lines, and the legend."""
-    handles, labels = axes.get_legend_handles_labels()
-    if not labels:
-        return
+def room_left(axes: Any) -> None:
+    """For numbers of four digits beside the axis."""
+    box = axes.get_position()
+    axes.set_position((box.x0 + _ROOM, box.y0, box.width - _ROOM, box.height))
+
+
+def above(axes: Any, *, inverted: bool = False) -> None:
+    """The legend over the lines, with room for it; ``inverted`` turns the axis round as well."""
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.17 * (high - low))
-    axes.legend(handles, labels, loc="upper left", ncols=columns, columnspacing=1.0,
-                handlelength=1.2, borderaxespad=0.1)  # fmt: skip
+    room = 0.17 * (high - low)
+    axes.set_ylim(*((high, low - room) if inverted else (low, high + room)))
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="upper left", ncols=4, columnspacing=1.0, handlelength=1.2,
+                    borderaxespad=0.1)  # fmt: skip
 
 
 def source_of(figure: Any, points: int) -> str:

@@ -16,6 +16,7 @@ from telerig.io.report.smoothing_drawing import (
     band,
     limits,
     line,
+    room_left,
     source_of,
 )
 from telerig.io.report.smoothing_numbers import column
@@ -30,73 +31,73 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _MOST_BUBBLES = 60
+_FEW = 3
 _WINDOW = 1_000
+_CLOSE = 60
 _BANDS = "Bands are ± 2 sd."
 
 
 def places(results: SmoothingResults, axis: int) -> Picture:
-    """One lab coordinate of every bubble, smoothed; up is up."""
+    """One lab coordinate of every bubble; up is up. Naive and RTS beneath where bubbles are few."""
     shown = results.bubbles[:_MOST_BUBBLES]
-    name, points = AXES[axis], 0
+    name, points, few = PLACE.format(AXES[axis]), 0, len(shown) <= _FEW
     with drawing(2.6) as (figure, axes):
-        for particle in shown:
+        for i, particle in enumerate(shown):
             table = results.track(particle)
-            t, value = table["t_s"].to_numpy(float), column(table, PLACE.format(name))
-            band(axes, t, value, column(table, f"s{PLACE.format(name)}"), track_colour(particle))
-            line(axes, t, value, track_colour(particle))
-            points += len(t)
-        axes.set(xlabel="t / s", ylabel=f"{name} / mm, lab")
-        caption = "Smoothed, in the lab; a colour per bubble. "
-        if results.up[axis] < -0.5:
+            t, value = table["t_s"].to_numpy(float), column(table, name)
+            if few:
+                line(axes, t, column(table, f"naive_{name}"), NAIVE, "" if i else "naive")
+                line(axes, t, column(table, f"rts_{name}"), RTS, "" if i else "RTS", linewidth=0.6)
+            band(axes, t, value, column(table, f"s{name}"), track_colour(particle))
+            line(axes, t, value, track_colour(particle), "" if i else "smoothed")
+            points += (4 if few else 2) * len(t)
+        axes.set(xlabel="t / s", ylabel=f"lab {AXES[axis]} / mm")
+        room_left(axes)
+        if few:
+            above(axes, inverted=results.up[axis] < -0.5)
+        elif results.up[axis] < -0.5:
             axes.invert_yaxis()
-            caption = "The axis is turned round, so that up is up. " + caption
         axes.grid(True)
         source = source_of(figure, points)
-    sd = median(column(results.trajectories, f"s{PLACE.format(name)}"))
-    caption += f"{_BANDS} The sd is {_um(sd)} (median): mostly thinner than the line."
+    caption = "The axis is turned round, so that up is up. " if results.up[axis] < -0.5 else ""
+    sd = median(column(results.trajectories, f"s{name}"))
+    caption += f"A colour per bubble. {_BANDS} The sd is {_um(sd)} (median): look closer below."
     if len(shown) < len(results.bubbles):
         caption += f" The {len(shown)} longest of {number(len(results.bubbles))} are drawn."
-    return Picture(f"{name} against time", source, caption)
+    return Picture(f"{AXES[axis]} against time", source, caption)
 
 
-def path_in_detail(results: SmoothingResults, axis: int) -> Picture | None:
-    """The longest track without its straight line: smoothed, naive and RTS; None without any."""
-    table, where = detail(results)
-    if table is None:
-        return None
-    name = AXES[axis]
-    t = table["t_s"].to_numpy(float)
-    values = [column(table, kind + PLACE.format(name)) for kind in ("", "naive_", "rts_")]
-    straight = _straight(t, values[0])
-    flat = [value - straight for value in values]
-    up = -1.0 if results.up[axis] < -0.5 else 1.0
+def closer(results: SmoothingResults, axis: int) -> Picture:
+    """Some frames of the longest track's middle without their straight line."""
+    table, _ = detail(results)
+    first = max(0, (len(table) - _CLOSE) // 2)
+    table = table.iloc[first : first + _CLOSE]
+    name, t = PLACE.format(AXES[axis]), table["t_s"].to_numpy(float)
+    smooth, naive, rts = (column(table, kind + name) for kind in ("", "naive_", "rts_"))
+    straight = _straight(t, smooth)
     with drawing(2.6) as (figure, axes):
-        _three(axes, t, [up * value for value in flat], column(table, f"s{PLACE.format(name)}"))
+        dots = {"linestyle": "none", "marker": ".", "markersize": 4}
+        line(axes, t, naive - straight, NAIVE, "naive", **dots)
+        line(axes, t, rts - straight, RTS, "RTS")
+        band(axes, t, smooth - straight, column(table, f"s{name}"), SMOOTHED, "± 2 sd")
+        line(axes, t, smooth - straight, SMOOTHED, "smoothed")
         _unobserved(axes, table)
-        shown = (
-            f"{name} minus straight line / mm"
-            if up > 0
-            else f"minus {name}, minus straight line / mm"
-        )
-        axes.set(xlabel="t / s", ylabel=shown)
+        axes.set(xlabel="t / s", ylabel=f"lab {AXES[axis]}, less a line / mm")
+        room_left(axes)
+        above(axes, inverted=results.up[axis] < -0.5)
         axes.grid(True)
-        above(axes)
         source = source_of(figure, 4 * len(t))
-    slope = (straight[-1] - straight[0]) / (t[-1] - t[0]) if len(t) > 1 else np.nan
+    slope = (straight[-1] - straight[0]) / (t[-1] - t[0]) if len(t) > 1 else 0.0
     caption = (
-        f"{where} A straight line of {number(float(slope), 3)} mm/s is taken off, to show "
-        f"what stands out of it. {_BANDS}{_marks(table)}"
+        f"Bubble {results.bubbles[0]}, {number(len(t))} frames of its middle, without a straight "
+        f"line of {number(float(slope), 3)} mm/s. {_BANDS}{_marks(table)}"
     )
-    if up < 0:
-        caption += " Turned round, so that up is up."
-    return Picture(f"{name}, one bubble", source, caption)
+    return Picture(f"{AXES[axis]}, closer", source, caption)
 
 
-def taken_off(results: SmoothingResults, axis: int) -> Picture | None:
+def taken_off(results: SmoothingResults, axis: int) -> Picture:
     """Naive and RTS minus smoothed, against the smoothed band."""
     table, where = detail(results)
-    if table is None:
-        return None
     name = PLACE.format(AXES[axis])
     t, smooth = table["t_s"].to_numpy(float), column(table, name)
     sd = 1e3 * column(table, f"s{name}")
@@ -104,28 +105,26 @@ def taken_off(results: SmoothingResults, axis: int) -> Picture | None:
     with drawing(2.6) as (figure, axes):
         _three(axes, t, [np.zeros(len(t)), naive, rts], sd)
         _unobserved(axes, table)
-        axes.set(xlabel="t / s", ylabel=f"{AXES[axis]} minus smoothed / µm")
+        axes.set(xlabel="t / s", ylabel=f"{AXES[axis]}, less smoothed / µm")
         found = limits(naive, rts, 2 * sd, -2 * sd)
         if found:
             axes.set_ylim(*found)
         axes.grid(True)
+        room_left(axes)
         above(axes)
         source = source_of(figure, 4 * len(t))
-    ratio = None if not (r := rms(naive)) or not (s := median(sd)) else r / s
+    off, own = rms(naive), median(sd)
+    times = f", {number(off / own, 2)} times the sd of smoothed" if off and own else ""
     caption = (
-        f"What smoothing took off: naive minus smoothed is {number(rms(naive), 3)} µm RMS, RTS "
-        f"minus smoothed {number(rms(rts), 3)} µm; the smoothed sd is {number(median(sd), 3)} µm"
-        + (f", {number(ratio, 2)} times less than naive's. " if ratio and ratio > 1 else ". ")
-        + where
+        f"Naive minus smoothed is {number(off, 3)} µm RMS{times}; RTS minus smoothed is "
+        f"{number(rms(rts), 3)} µm. {_BANDS}{_marks(table)} {where}"
     )
     return Picture(f"{AXES[axis]}: what smoothing took off", source, caption)
 
 
-def velocities(results: SmoothingResults, axis: int) -> Picture | None:
+def velocities(results: SmoothingResults, axis: int) -> Picture:
     """The longest track's velocity: smoothed with its band, naive, RTS."""
     table, where = detail(results)
-    if table is None:
-        return None
     name = SPEED.format(AXES[axis])
     t = table["t_s"].to_numpy(float)
     smooth, naive, rts = (column(table, kind + name) for kind in ("", "naive_", "rts_"))
@@ -133,11 +132,10 @@ def velocities(results: SmoothingResults, axis: int) -> Picture | None:
     with drawing(2.6) as (figure, axes):
         _three(axes, t, [smooth, naive, rts], sd)
         _unobserved(axes, table)
-        axes.set(xlabel="t / s", ylabel=f"v{AXES[axis]} / mm/s")
-        if results.up[axis] < -0.5:
-            axes.invert_yaxis()
+        axes.set(xlabel="t / s", ylabel=f"v{AXES[axis]} / (mm/s)")
+        room_left(axes)
         axes.grid(True)
-        above(axes)
+        above(axes, inverted=results.up[axis] < -0.5)
         source = source_of(figure, 4 * len(t))
     caption = (
         f"Naive scatters by {number(rms(naive - smooth), 3)} mm/s RMS about smoothed, whose sd is "
@@ -148,10 +146,8 @@ def velocities(results: SmoothingResults, axis: int) -> Picture | None:
     return Picture(f"Velocity in {AXES[axis]}", source, caption)
 
 
-def detail(results: SmoothingResults) -> tuple[pd.DataFrame | None, str]:
+def detail(results: SmoothingResults) -> tuple[pd.DataFrame, str]:
     """The longest track, its middle where it is very long; and which that is, in words."""
-    if not len(results.trajectories):
-        return None, ""
     particle = results.bubbles[0]
     table = results.track(particle)
     what = f"Bubble {particle}"

@@ -43,6 +43,7 @@ class Spectrum:
 class Line:
     """A peak of the shake's spectrum.
 
+    width_hz : over which another peak is not another line.
     damping : of a single mode as wide as the peak; ``upper`` where the spectrum resolves no less.
     where : "common", "apart" (both cameras, not alike), or a camera's name.  alone : no other
     camera sees the axis.
@@ -55,6 +56,7 @@ class Line:
     rms_um: float
     where: str
     alone: bool
+    width_hz: float
 
 
 def column(table: pd.DataFrame, name: str) -> Array:
@@ -193,6 +195,7 @@ def _lines_of(results: SmoothingResults, axis: str, cameras: Sequence[str]) -> l
         out.append(Line(
             axis, float(peak * step), float(width_hz / (2 * peak * step)), bool(narrow),
             float(np.sqrt(np.diagonal(inside).max())), _where(inside, cameras), len(cameras) == 1,
+            float(max(width, _HANN_WIDTH) * step),
         ))  # fmt: skip
     return out
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from telerig.io.report.smoothing_figures import path_in_detail, places, taken_off, velocities
+from telerig.io.report.smoothing_figures import closer, places, taken_off, velocities
 from telerig.io.report.smoothing_results import SmoothingResults
 from telerig.io.report.smoothing_shake import (
     shake_in_time,
@@ -20,6 +20,7 @@ from telerig.io.report.smoothing_tables import (
     mean_rows,
     mode_rows,
     model_rows,
+    model_words,
 )
 from telerig.io.report.smoothing_words import (
     axis_table,
@@ -52,6 +53,7 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
         "constants": constant_rows(results),
         "means": mean_rows(results),
         "model": model_rows(results),
+        "model_words": model_words(results),
     }
 
 
@@ -61,7 +63,7 @@ def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[]
     bubbles = axes if len(results.trajectories) else range(0)
     drawings: list[tuple[str, Callable[[], Any]]] = [
         *(("lab", partial(places, results, axis)) for axis in bubbles),
-        *(("lab", partial(path_in_detail, results, axis)) for axis in bubbles),
+        *(("lab", partial(closer, results, axis)) for axis in bubbles),
         *(("taken", partial(taken_off, results, axis)) for axis in bubbles),
         *(("velocity", partial(velocities, results, axis)) for axis in bubbles),
     ]

@@ -16,6 +16,7 @@ from telerig.io.report.smoothing_drawing import (
     band,
     limits,
     line,
+    room_left,
     source_of,
 )
 from telerig.io.report.smoothing_numbers import (
@@ -51,10 +52,11 @@ def shake_in_time(results: SmoothingResults, camera: str, axis: str) -> Picture:
     with drawing(2.3) as (figure, axes):
         band(axes, t, value, sd, colour)
         line(axes, t, value, colour)
-        axes.set(xlabel="t / s", ylabel=f"shake of {camera}, {axis} / µm")
+        axes.set(xlabel="t / s", ylabel=f"{axis} / µm")
         found = limits(value - 2 * sd, value + 2 * sd) or limits(value)
         if found:
             axes.set_ylim(*found)
+        room_left(axes)
         axes.grid(True)
         source = source_of(figure, 3 * len(t))
     size = shake_rms_um(results, camera, axis)
@@ -101,7 +103,7 @@ def velocity_before_and_after(results: SmoothingResults, axis: int) -> Picture |
         _mark_modes(axes, results)
         for label, (spectrum, colour) in found.items():
             _draw(axes, spectrum, axis, colour, label)
-        _finish(axes, [s for s, _ in found.values()], [axis], f"v{AXES[axis]} / (mm/s)²/Hz")
+        _finish(axes, [s for s, _ in found.values()], [axis], f"v{AXES[axis]} / ((mm/s)²/Hz)")
         above_log(axes)
         source = source_of(figure, 0)
     caption = _velocity_words(found, axis) + _resolution(found["smoothed"][0])
@@ -138,7 +140,7 @@ def shake_spectra(results: SmoothingResults, camera: str) -> Picture | None:
         for axis in seen:
             i = AXES.index(axis)
             _draw(axes, spectrum, i, CAMERA_COLOURS[i], axis)
-        _finish(axes, [spectrum], [AXES.index(a) for a in seen], f"shake of {camera} / µm²/Hz")
+        _finish(axes, [spectrum], [AXES.index(a) for a in seen], "shake / (µm²/Hz)")
         above_log(axes)
         source = source_of(figure, 0)
     peaks = []
@@ -156,6 +158,8 @@ def _draw(axes: Any, spectrum: Spectrum, axis: int, colour: str, label: str) -> 
 
 
 def _finish(axes: Any, spectra: Sequence[Spectrum], which: Sequence[int], label: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     values = np.concatenate([s.density[1:, i] for s in spectra for i in which])
     axes.set(xlabel="frequency / Hz", ylabel=label, xscale="log", yscale="log")
     highest = max(float(s.frequency_hz[-1]) for s in spectra)
@@ -163,7 +167,11 @@ def _finish(axes: Any, spectra: Sequence[Spectrum], which: Sequence[int], label:
     top = float(values.max()) if len(values) and values.max() > 0 else 1.0
     bottom = max(float(values[values > 0].min(initial=top)), top * 10**-_DECADES)
     axes.set_ylim(bottom / 2, top * 2)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(True)
+    room_left(axes)
 
 
 def above_log(axes: Any) -> None:

@@ -43,14 +43,15 @@ def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
         rows.append(_servo(*servo))
     if rows:
         return rows, "The modes of the model that the smoother used."
-    lines = [_line(line, results) for line in shake_lines(results)[:MOST_ROWS]]
+    groups = _grouped(shake_lines(results))[:MOST_ROWS]
+    lines = [_line(group, results.cameras) for group in groups]
     if not lines:
         return [], (
             "The model has no modes, and no peak stands out of the spectrum of the estimated shake."
         )
     return lines, (
         "The model has no modes: these are the peaks in the spectrum of the estimated shake. "
-        "Damping is that of a single mode as wide as the peak; “below” where the run is too short "
+        "Damping is that of a single mode as wide as the peak, roughly; “below” where the run is too short "
         "to tell."
     )
 
@@ -109,17 +110,31 @@ def _servo(rms_mm: Any, frequency_hz: Any, damping: Any) -> Row:
                 _rms_um(rms_mm), _SERVO.format(number(frequency_hz))))  # fmt: skip
 
 
-def _line(line: Line, results: SmoothingResults) -> Row:
+def _grouped(lines: Sequence[Line]) -> list[list[Line]]:
+    """Lines of about one frequency together, the strongest first."""
+    groups: list[list[Line]] = []
+    for line in lines:
+        near = [g for g in groups if abs(g[0].frequency_hz - line.frequency_hz) <= line.width_hz]
+        if near:
+            near[0].append(line)
+        else:
+            groups.append([line])
+    return groups
+
+
+def _line(lines: Sequence[Line], cameras: Sequence[str]) -> Row:
+    shared = [line for line in lines if not line.alone or len(cameras) == 1]
     where, remedy = {
-        "common": (f"{line.axis}: both cameras alike (carriage, mount)", _COMMON),
-        "apart": (f"{line.axis}: both cameras, not alike (arms)", _ARM),
-    }.get(line.where, (f"{line.axis}: camera {line.where}", _ARM))
-    if line.alone and len(results.cameras) > 1:
-        where, remedy = f"{where}, which alone sees {line.axis}", f"{_UNKNOWN_ARM}; {_ARM}"
-    if line.damping < _LIGHTLY_DAMPED and not line.upper:
+        "common": ("all cameras alike (carriage, mount)", _COMMON),
+        "apart": ("cameras not alike (arms)", _ARM),
+        "": (f"camera {' and '.join(sorted({line.where for line in lines}))}", _UNKNOWN_ARM),
+    }.get(name := shared[0].where if shared else "", (f"camera {name} (arm)", _ARM))
+    first = lines[0]
+    if first.damping < _LIGHTLY_DAMPED and not first.upper:
         remedy += f"; {_DAMPING}"
-    damping = ("below " if line.upper else "") + number(line.damping, 2)
-    return Row((where, number(line.frequency_hz), damping, number(line.rms_um, 3), remedy))
+    damping = ("below " if first.upper else "") + number(first.damping, 2)
+    sizes = ", ".join(f"{line.axis}: {number(line.rms_um, 3)}" for line in lines)
+    return Row((where, number(first.frequency_hz), damping, sizes, remedy))
 
 
 _CONSTANTS = (
@@ -165,20 +180,46 @@ def _constants(values: Mapping[str, Any]) -> list[tuple[str, str]]:
     return out
 
 
+_UNITS = (
+    ("_mm_s2", "mm/s²"), ("_mm_s", "mm/s"), ("_mm", "mm"), ("_hz", "Hz"), ("_s", "s"),
+    ("_px", "px"), ("_rad", "rad"),
+)  # fmt: skip
+
+
+_SOURCES = {
+    "default": "fixed priors, with noise and size of the shake adapted to the data.",
+    "learned": "learned from this run by maximum likelihood.",
+    "given": "given by the user.",
+}
+
+
 def model_rows(results: SmoothingResults) -> list[tuple[str, str]]:
     """Every hyper-parameter by its name in `smoothing.json`."""
-    rows = flat_rows(results.part("model"))
+    model = {k: v for k, v in results.part("model").items() if k != "name"}
+    rows = [(name, value) for name, value in flat_rows(model) if value]
     return [(_readable(name), _owner(name, value, results.cameras)) for name, value in rows]
 
 
+def model_words(results: SmoothingResults) -> str:
+    """Where the hyper-parameters come from."""
+    source = str(results.part("model").get("name") or ABSENT)
+    return f"{source}: {_SOURCES[source]}" if source in _SOURCES else source
+
+
 def _readable(name: str) -> str:
+    for ending, unit in _UNITS:
+        if name.endswith(ending):
+            name = f"{name.removesuffix(ending)}, {unit}"
+            break
     return name.replace("_", " ").replace(".", ": ")
 
 
 def _owner(name: str, value: str, cameras: Sequence[str]) -> str:
-    """A camera's index as its name."""
-    if not name.endswith(".camera"):
+    """Numbers with the digits that matter; a camera's index as its name."""
+    if name.endswith(".camera"):
+        known = value.isdigit() and int(value) < len(cameras)
+        return cameras[int(value)] if known else "all alike" if value == "-1" else value
+    try:
+        return ", ".join(number(float(part), 4) for part in value.split(", ")) or "none"
+    except ValueError:
         return value or "none"
-    if value == "-1":
-        return "all alike"
-    return cameras[int(value)] if value.isdigit() and int(value) < len(cameras) else value

@@ -110,8 +110,6 @@ def smoothing_figures(results: SmoothingResults) -> list[Figure]:
     }
     worst = max(shake, key=lambda key: shake[key], default=None)
     where = "the estimate, about its mean" if worst is None else f"camera {worst[0]}, {worst[1]}"
-    model = results.part("model")
-    source = str(model.get("name") or ABSENT)
     return [
         Figure("Position, 1 sd", f"{_largest(place, 1e3)} µm", "smoothed, median, worst axis"),
         Figure("Velocity, 1 sd", f"{_largest(speed)} mm/s", "smoothed, median, worst axis"),
@@ -121,15 +119,7 @@ def smoothing_figures(results: SmoothingResults) -> list[Figure]:
                "RMS of naive (difference over two frames) minus smoothed, worst axis"),
         Figure("Shake", f"{number(None if worst is None else shake[worst], 3)} µm",
                f"RMS, largest: {where}"),
-        Figure("Hyper-parameters", source, _MODEL_WORDS.get(source, "where they come from")),
     ]  # fmt: skip
-
-
-_MODEL_WORDS = {
-    "default": "fixed priors; noise and size of the shake adapted to the data",
-    "learned": "learned from this run by maximum likelihood",
-    "given": "given by the user",
-}
 
 
 def _largest(values: list[float | None], factor: float = 1.0) -> str:
@@ -176,7 +166,7 @@ def judged_axes(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 def _axis_name(results: SmoothingResults, axis: int) -> str:
     along = float(results.up[axis])
-    vertical = {True: ", up", False: ", down"}[along > 0] if abs(along) > 0.9 else ""
+    vertical = {True: " (up)", False: " (down)"}[along > 0] if abs(along) > 0.9 else ""
     return AXES[axis] + vertical
 
 

@@ -233,7 +233,7 @@ def _contrasts(count: int) -> Array:
 
 
 def _bridged(t_s: Array, value: Array, weight: Array) -> tuple[Array, Array]:
-    """Values (F, P) with their gaps closed, and weights (F, P): each column's mean, spread evenly."""
+    """Values (F, P) with their gaps closed; weights (F, P), the same at all frames."""
     out = value.copy()
     for column in range(value.shape[1]):
         good = weight[:, column] > 0

@@ -266,16 +266,23 @@ def _replicates(channel: Channel) -> Array:
 
 
 def _fitted(channel: Channel, system: _System, weight: Array) -> Array:
-    """(c, R) constants by least squares without states: what is small after it keeps its digits."""
-    columns = system.columns.reshape(-1, system.columns.shape[-1])
-    offset = np.zeros((len(columns), len(channel.moving)))
-    pairs = np.tile(channel.item, len(channel.t_s))
-    offset[np.arange(len(pairs)), pairs] = channel.moving[pairs]
-    design = np.concatenate([columns, offset], 1) * np.sqrt(weight).reshape(-1, 1)
-    normal = design.T @ design + 1e-9 * np.eye(design.shape[1])
+    """(c, R) constants near the answer: what is small without them keeps its digits.
+
+    Moving items by straight lines, what is fixed where it was guessed.
+    """
     values = _replicates(channel)
-    right = design.T @ (np.sqrt(weight)[..., None] * values).reshape(len(design), -1)
-    return np.asarray(np.linalg.solve(normal, right)[: columns.shape[1]])
+    out = np.zeros((len(channel.moving), values.shape[-1]))
+    for item in np.flatnonzero(channel.moving):
+        mine = channel.item == item
+        w, t = weight[:, mine].sum(1), channel.t_s - channel.t_s[channel.first[item]]
+        if not w.any():
+            continue
+        mean = (weight[:, mine, None] * values[:, mine]).sum(1) / np.where(w > 0, w, 1.0)[:, None]
+        off = t - (w @ t) / w.sum()
+        spread = float(w @ off**2)
+        if spread > 0:
+            out[item] = (w * off) @ mean / spread
+    return out
 
 
 def _steps(system: _System, dt_s: Array) -> Motion:

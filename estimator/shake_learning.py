@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel, channels_of, pooled
-from telerig.estimator.shake_labels import is_zigzag, labels, shared
+from telerig.estimator.shake_labels import LineLabel, is_zigzag, labels, shared
 from telerig.estimator.shake_likelihood import Fit, evidence, laplace_sigma, maximise
 from telerig.estimator.shake_parameters import names_of, value_of, with_values
 from telerig.estimator.shake_spectrum import Line, coarsening, coarser, faded, unexplained
@@ -40,6 +40,7 @@ _HARMONIC = 0.12
 _TIE_NATS = 2.0
 _STRONG = 20.0
 _LOW_HZ = 15.0
+_ACROSS = 0.5
 
 
 @dataclass(frozen=True)
@@ -99,16 +100,18 @@ def learn(
     channels = tuple(c for c in channels if c.samples)
     if options.target:
         model = replace(model, bubble=replace(model.bubble, zigzags=()))
-    groups = _groups(channels, options, problem.up)
+    groups = groups_of(channels, options, problem.up)
     learned: dict[str, float] = {}
     for index, group in enumerate(groups):
+        if index and not options.target:
+            model, options = _seeded(model, group, options)
         model, sigma = _learn_group(group, model, options, first=index == 0)
         learned |= sigma
     return replace(model, name="learned", learned=learned)
 
 
-def _groups(channels: Sequence[Channel], options: Learning, up: Array) -> list[Group]:
-    """The shared coordinate, and what lies across it."""
+def groups_of(channels: Sequence[Channel], options: Learning, up: Array) -> list[Group]:
+    """The shared coordinate, and what lies across it; up : (3,)."""
     if not channels:
         return []
     bubble: tuple[Where, ...] = () if options.target else (BUBBLE,)
@@ -144,8 +147,30 @@ def _learn_group(
     sigma = np.sqrt(np.diag(laplace_sigma(coarse.fast, fit.model, names)))
     model = _unfaded(fit.model, names, factor, group.channels[0].t_s)
     if not options.target:
-        model = shared(model, labels(coarse.fast, model, group.pattern, group.up))
+        found = labels(coarse.fast, model, group.pattern, group.up)
+        model = shared(model, [x for x in found if not _is_held(x, options)])
     return model, dict(zip(names, sigma.tolist()))
+
+
+def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeModel, Learning]:
+    """The modes found so far, moving across too, their frequencies and dampings held.
+
+    A single camera and bubble cannot show whether they do: a rig that shakes along one axis is
+    not taken for still along the others.
+    """
+    at, rig = len(model.modes), [m for m in model.modes if max(m.rms_mm) > 0]
+    added = []
+    for mode in rig:
+        x, y, z = (_ACROSS * max(mode.rms_mm) * p for p in group.pattern)
+        added.append(replace(mode, rms_mm=(x, y, z)))
+    held = [f"modes.{at + i}.{f}" for i in range(len(added)) for f in ("frequency_hz", "damping")]
+    model = replace(model, modes=(*model.modes, *added))
+    return model, replace(options, hold=(*options.hold, *held))
+
+
+def _is_held(label: LineLabel, options: Learning) -> bool:
+    name = f"modes.{label.index}.frequency_hz"
+    return label.owner == "rig" and any(fnmatch(name, pattern) for pattern in options.hold)
 
 
 def _highest(group: Group, model: ShakeModel) -> float:

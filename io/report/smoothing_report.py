@@ -29,6 +29,7 @@ from telerig.io.report.smoothing_words import (
     residual_words,
     smoothing_figures,
     smoothing_verdict,
+    swap_rows,
 )
 from telerig.io.report.track_results import TrackResults
 
@@ -44,6 +45,7 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
         "figures": smoothing_figures(results),
         "axes": axis_table(results),
         "judged": bool(judged_axes(results.content)),
+        "swaps": swap_rows(results),
         "unseen": unseen_words(results),
         "mode_heads": MODE_HEADS,
         "modes": mode_rows(results),

@@ -23,7 +23,8 @@ _ARM = (
     "end, a counterweight"
 )
 _DAMPING = "a damping layer or a tuned absorber"
-_SERVO = "controller: a notch at {} Hz, less gain, smoother set points"
+_SERVO = "the controller: a notch at {} Hz, less gain, smoother set points"
+_FOLLOWING = "servo (following error)"
 _PITCH = "stiffen the arm against twisting; camera's weight on the arm's axis"
 _UNKNOWN_ARM = (
     "find out with an accelerometer on the carriage whether it is the carriage or the arm"
@@ -34,30 +35,32 @@ def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
     """The shake's modes and where they come from: learned or given, else peaks of the estimate."""
     judged = [m for m in results.content.get("modes") or [] if isinstance(m, Mapping)]
     model = results.part("model")
-    modes = judged or [m for m in model.get("modes") or [] if isinstance(m, Mapping)]
+    known = [m for m in judged if m.get("source") != "estimate"]
+    modes = known or [m for m in model.get("modes") or [] if isinstance(m, Mapping)]
     rows = [_mode(mode, results.cameras) for mode in modes]
     rows += [_pitch(m, results.cameras) for m in model.get("pitches") or []
              if isinstance(m, Mapping)]  # fmt: skip
     servo = dict(model.get("carriage") or {}).get("servo")
-    if isinstance(servo, Sequence) and len(servo) == 3:
-        rows.append(_servo(*servo))
+    followed = [_mode(m, results.cameras) for m in judged if m.get("where") == "servo"]
+    if isinstance(servo, list) and len(servo) == 3:
+        followed = [_servo(*servo)]
     if rows:
-        return rows, "The modes of the model that the smoother used."
+        return rows + followed, "The modes of the model that the smoother used."
     groups = _grouped(shake_lines(results))[:MOST_ROWS]
     lines = [_line(group, results.cameras) for group in groups]
     if not lines:
-        return [], (
+        return followed, (
             "The model has no modes, and no peak stands out of the spectrum of the estimated shake."
         )
-    return lines, (
-        "The model has no modes: these are the peaks in the spectrum of the estimated shake. "
-        "Damping is that of a single mode as wide as the peak, roughly; “below” where the run is too short "
-        "to tell."
+    return lines + followed, (
+        "The model has no modes: these are the peaks in the spectrum of the estimated shake, and "
+        "how alike the cameras move there. Damping is that of a single mode as wide as the peak, "
+        "roughly; “below” where the run is too short to tell."
     )
 
 
 def _mode(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
-    where, remedy = _place(mode.get("camera", mode.get("where")), cameras)
+    where, remedy = _place(mode.get("where", mode.get("camera")), cameras)
     damping = mode.get("damping")
     helps = [text for key in ("remedy", "remedies") for text in _texts(mode.get(key))]
     if not helps:
@@ -78,12 +81,13 @@ def _place(camera: Any, cameras: Sequence[str]) -> tuple[str, str]:
     """In words, and the remedy."""
     if isinstance(camera, int) and 0 <= camera < len(cameras):
         camera = cameras[camera]
-    if camera in cameras:
-        return f"arm of {camera}", _ARM
+    name = str(camera).removeprefix("arm ")
+    if name in cameras:
+        return f"arm of {name}", _ARM
     if camera == -1 or str(camera).lower() in ("common", "carriage", "none"):
         return "all cameras alike (carriage, mount)", _COMMON
-    if "servo" in str(camera).lower():
-        return str(camera), _SERVO.format("its frequency in")
+    if camera == "servo":
+        return _FOLLOWING, _SERVO.format("its")
     return str(camera), ""
 
 
@@ -106,7 +110,7 @@ def _pitch(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
 
 
 def _servo(rms_mm: Any, frequency_hz: Any, damping: Any) -> Row:
-    return Row(("servo (following error)", number(frequency_hz), number(damping),
+    return Row((_FOLLOWING, number(frequency_hz), number(damping),
                 _rms_um(rms_mm), _SERVO.format(number(frequency_hz))))  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +14,7 @@ from telerig.io.report.track_tables import Verdict
 from telerig.io.report.words import ABSENT, is_number, number, share
 
 REMEDY = (
-    "Fix a strip of dots to the tank where both cameras see it, or put one accelerometer on each "
+    "fix a strip of dots to the tank where both cameras see it, or put one accelerometer on each "
     "camera arm, and record again."
 )
 _NOT_JUDGED = (
@@ -54,9 +55,9 @@ _FLAGS = {
 _HARMLESS = {"SHAKE_BELOW_NOISE"}
 _REMEDY_KEYS = ("remedy", "remedies")
 _NAMES = {
-    "verdict": "verdict", "q": "q", "eta": "η", "flags": "flags", "words": "in words",
-    "shake_rms_mm": "shake RMS, µm", "sd_mm": "sd, µm", "sd_known_mm": "sd, shake known, µm",
+    "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
 }  # fmt: skip
+_ELSEWHERE = {"words", "lines", "shake_rms_mm", *_REMEDY_KEYS}
 
 
 def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Verdict:
@@ -66,18 +67,31 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Verdic
     headline, colour, meaning = _MEANING.get(
         word.upper(), (word.replace("_", " "), "usable", "") if word else _NOT_JUDGED
     )
-    sentences = [meaning, *strings(content.get("words"))]
+    sentences = [meaning, *(_micro(text) for text in strings(content.get("words")))]
     if word.upper() in ("PARTIAL", "UNRESOLVED"):
-        given = [text for key in _REMEDY_KEYS for text in strings(content.get(key))]
-        told = " ".join(sentences).lower()
-        if given or not ("strip of dots" in told or "accelerometer" in told):
-            sentences.append("What would resolve it: " + " ".join(given or [REMEDY]))
-    flags = strings(content.get("flags"))
-    told = {flag: _FLAGS.get(flag, flag.replace("_", " ").lower()) for flag in flags}
-    sentences += [f"{flag}: {text}" for flag, text in told.items() if flag in _HARMLESS]
-    warnings = [f"{flag}: {text}" for flag, text in told.items() if flag not in _HARMLESS]
+        sentences += _remedy(content, " ".join(sentences))
+    flags = {
+        flag: f"{flag}: {_FLAGS.get(flag, flag.replace('_', ' ').lower())}"
+        for flag in strings(content.get("flags"))
+    }
+    sentences += [text for flag, text in flags.items() if flag in _HARMLESS]
+    warnings = [text for flag, text in flags.items() if flag not in _HARMLESS]
+    warnings += _stale(results, tracks)
+    if warnings and colour == "good":
+        colour = "usable"
     known = tuple(dict.fromkeys(s for s in sentences if s))
-    return Verdict(headline, colour, known, (*warnings, *_stale(results, tracks)))
+    return Verdict(headline, colour, known, tuple(warnings))
+
+
+def _remedy(content: Mapping[str, Any], told: str) -> list[str]:
+    """What to do about it, unless that has been told."""
+    given = [text for key in _REMEDY_KEYS for text in strings(content.get(key))] or [REMEDY]
+    fresh = [text for text in given if text.rstrip(".").lower() not in told.lower()]
+    return [f"To resolve it: {_micro(' '.join(fresh))}"] if fresh else []
+
+
+def _micro(text: str) -> str:
+    return re.sub(r"\bum\b", "µm", text)
 
 
 def strings(value: Any) -> list[str]:
@@ -130,15 +144,17 @@ def _largest(values: list[float | None], factor: float = 1.0) -> str:
 def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
     """Heads and a row per rig axis: what was judged, then what the tables hold."""
     judged = judged_axes(results.content)
-    keys = [k for k in dict.fromkeys(k for one in judged.values() for k in one) if _plain(k)]
-    order = ("verdict", "q", "eta")
-    keys = [k for k in order if k in keys] + [k for k in keys if k not in order]
+    keys = [
+        key for key in dict.fromkeys(k for one in judged.values() for k in one)
+        if key not in _ELSEWHERE and any(one.get(key) != [] for one in judged.values())
+    ]  # fmt: skip
     columns = {
-        "sd, µm": [_scaled(v, 1e3) for v in axis_sd(results)],
         "sd of velocity, mm/s": [_scaled(v) for v in axis_sd(results, SPEED)],
         "naive minus smoothed, µm": [_scaled(v, 1e3) for v in taken_away(results)],
         "RTS minus smoothed, µm": [_scaled(v, 1e3) for v in taken_away(results, "rts_")],
     }
+    if "sigma_mm" not in keys:
+        columns = {"sd, µm": [_scaled(v, 1e3) for v in axis_sd(results)]} | columns
     for camera in results.cameras:
         columns[f"shake of {camera}, µm"] = [
             "unseen" if axis in results.unseen(camera)
@@ -170,10 +186,6 @@ def _axis_name(results: SmoothingResults, axis: int) -> str:
     return AXES[axis] + vertical
 
 
-def _plain(key: str) -> bool:
-    return key not in ("words", *_REMEDY_KEYS)
-
-
 def _head(key: str) -> str:
     if key in _NAMES:
         return _NAMES[key]
@@ -198,6 +210,24 @@ def _cell(key: str, value: Any) -> str:
 
 def _scaled(value: Any, factor: float = 1.0) -> str:
     return number(value * factor, 3) if is_number(value) else "-"
+
+
+def swap_rows(results: SmoothingResults) -> list[Row]:
+    """Lines whose owner could be another: axis, Hz, RMS, owner, what the other reading costs."""
+    rows = []
+    for axis, judged in judged_axes(results.content).items():
+        lines = judged.get("lines")
+        for line in lines if isinstance(lines, list) else ():
+            if isinstance(line, Mapping):
+                rms_mm = line.get("rms_mm")
+                cost = number(line.get("other_owner_costs_nats"))
+                rows.append(Row(
+                    (axis, number(line.get("frequency_hz")), _scaled(rms_mm, 1e3),
+                     str(line.get("owner") or ABSENT), cost,
+                     "could be the other's" if line.get("ambiguous") else "sure"),
+                    strong=bool(line.get("ambiguous")),
+                ))  # fmt: skip
+    return rows
 
 
 def residual_rows(results: SmoothingResults) -> list[Row]:

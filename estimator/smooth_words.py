@@ -17,7 +17,8 @@ def smoothing_words(found: Smoothing) -> str:
     if verdict:
         flags = ", ".join(verdict.get("flags", []))
         lines.append(f"{verdict['verdict']}" + (f" ({flags})" if flags else ""))
-        lines += [f"  {word}" for word in verdict.get("words", [])]
+        said = verdict.get("words", [])
+        lines += [f"  {word}" for word in ([said] if isinstance(said, str) else said)]
     table = found.trajectories
     lines.append(
         f"{found.summary['bubbles']} bubbles over {found.summary['frames']} frames, priors: "

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.frontend.body import DEFAULT_SHAPE_SIGMA, fit_bodies
+from telerig.estimator.frontend.body import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
 from telerig.estimator.frontend.bubble_types import Prediction
 from telerig.estimator.frontend.matching import match_pairs
 from telerig.estimator.frontend.pair_types import PairModel
@@ -149,8 +149,11 @@ class Linker:
         )
         table[["x_mm", "y_mm", "z_mm"]] = bodies.points_mm
         table[COVARIANCE_MM2] = bodies.covariance_mm2[:, _UPPER[0], _UPPER[1]]
+        shape = _shape_share_px2(self.cameras, bodies)
         for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
-            table[[f"{camera.name}_{name}" for name in _PER_CAMERA]] = rows[_PER_CAMERA].to_numpy()
+            values = rows[_PER_CAMERA].to_numpy(float)
+            values[:, 2:] += shape[:, c][:, [0, 0, 1], [0, 1, 1]]
+            table[[f"{camera.name}_{name}" for name in _PER_CAMERA]] = values
             table[f"{camera.name}_du_px"] = bodies.du_px[:, c]
             table[f"{camera.name}_dv_px"] = bodies.dv_px[:, c]
         table["ray_miss_mm"] = bodies.ray_miss_mm
@@ -161,6 +164,20 @@ class Linker:
         ambiguous = np.concatenate([f.pairs.ambiguous for f in frames])
         table["flags"] = _joined_flags(first["flags"], second["flags"], ambiguous)
         return table[table["particle"] != NO_PARTICLE].reset_index(drop=True)
+
+
+def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
+    """(M, 2, 2, 2) per camera: what the bubble's shape adds to its centre's covariance."""
+    out = np.zeros((len(bodies.points_mm), 2, 2, 2))
+    known = np.isfinite(bodies.covariance_mm2).all((1, 2))
+    share = (bodies.covariance_mm2 - bodies.silhouette_covariance_mm2)[known]
+    values, vectors = np.linalg.eigh(share)
+    share = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2)
+    _, jacobian, _ = stacked_jacobian(cameras, bodies.points_mm[known])
+    for c in range(2):
+        view = jacobian[:, 2 * c : 2 * c + 2]
+        out[known, c] = view @ share @ np.swapaxes(view, -1, -2)
+    return out
 
 
 def pair_frame(

@@ -1,8 +1,9 @@
-"""telerig demo: simulate a rig, calibrate it, track a bubble, compare with the truth."""
+"""telerig demo: simulate a rig, calibrate, track, take out the shake, compare with the truth."""
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, sa
 if TYPE_CHECKING:
     from telerig.estimator.calibration import Calibration
     from telerig.io.dataset import Dataset
+    from telerig.io.run_presets import RunConfig
 
 
 def demo(
@@ -22,7 +24,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Seed of the simulated rig and its noise.")] = 0,
     quiet: Annotated[bool, typer.Option(help="No progress.")] = False,
 ) -> None:
-    """Simulate a rig with images, calibrate from them, track a bubble, compare with the truth.
+    """Simulate a rig with images, calibrate, track a bubble, take out the shake, compare.
 
     Writes the dataset and its reports into the folder; exit code 1 when an estimate disagrees
     with the truth by more than its own standard deviations allow.
@@ -38,7 +40,7 @@ def demo(
         say("simulating two telecentric cameras of 512 x 512 px: 12 views of a hand-held target,")
         say("and a bubble of 5 mm that zigzags upwards, followed by the vibrating rig")
         begun = time.perf_counter()
-        data = simulate("rise", rng=np.random.default_rng(seed), out=out)
+        data = simulate(_config(), rng=np.random.default_rng(seed), out=out)
         simulated = time.perf_counter()
         options = {"seed": seed}
         with progress(quiet) as stage:
@@ -57,8 +59,18 @@ def demo(
         say(f"report: {page}")
         say("")
         tracked = track_and_compare(data, run.calibration, options, quiet)
-        if not (comparison.passed and tracked):
+        say("")
+        smoothed = smooth_and_compare(data, run.calibration, quiet)
+        if not (comparison.passed and tracked and smoothed):
             raise typer.Exit(EXIT_REJECTED)
+
+
+def _config() -> RunConfig:
+    """The run of 2004, with an accelerometer on each camera's arm."""
+    from telerig.io.run_presets import run_preset
+
+    config = run_preset("rise")
+    return replace(config, stage=replace(config.stage, accelerometers=("left", "right")))
 
 
 def track_and_compare(
@@ -92,6 +104,47 @@ def track_and_compare(
         f"the truth ({score.centre_px:.2f} px for the outlines' centres)"
     )
     say("PASSED: the bubble was followed throughout" if passed else "FAILED: see the report")
+    say(f"report: {folder / 'report.html'}")
+    return passed
+
+
+def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> bool:
+    """Smooth with and without the accelerometers; whether they bring the path near the truth."""
+    import pandas as pd
+
+    from telerig.estimator.smooth_run import smooth_run
+    from telerig.estimator.smooth_truth import motion_error
+    from telerig.estimator.smooth_words import smoothing_words
+
+    (name,) = data.runs
+    folder = data.results / name
+    truth = pd.read_csv(data.path / "truth" / "runs" / name / "bubbles.csv")
+    run = data.runs[name].load()
+    rows = []
+    for words, used, target in (
+        ("encoder alone", replace(run, accelerometers=None), data.results / f"{name}-encoder"),
+        ("encoder and accelerometers", run, folder),
+    ):
+        with progress(quiet) as stage:
+            found = smooth_run(
+                used, calibration, folder, target, report=used is run, stage=stage
+            )  # fmt: skip
+        say(f"{words}: {smoothing_words(found)}")
+        rows.append((words, motion_error(found.trajectories, truth), found.verdict.get("verdict")))
+    naive = motion_error(found.trajectories, truth, "naive_")
+    say("")
+    say("path and velocity against the truth     um RMS  (predicted)   mm/s RMS  (predicted)")
+    say(
+        f"{'triangulate and add the encoder':38}{naive.position_um:8.1f}{naive.velocity_mm_s:24.2f}"
+    )
+    for words, error, verdict in rows:
+        say(
+            f"{words:38}{error.position_um:8.1f}{f'({error.predicted_um:.1f})':>13}"
+            f"{error.velocity_mm_s:11.2f}{f'({error.predicted_mm_s:.2f})':>13}  {verdict}"
+        )
+    best = rows[-1][1]
+    passed = best.position_um < 0.6 * naive.position_um and best.position_um < 2 * best.predicted_um
+    say("PASSED: the shake is taken out" if passed else "FAILED: see the report")
     say(f"report: {folder / 'report.html'}")
     return passed
 

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 _LOOSE_PX = 0.5
+_SHARPEST_PX = 0.01
+"""No centre is believed to be known better, whatever its table says."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,8 @@ def _corrected(table: pd.DataFrame, camera: str) -> bool:
 
 def _covariance(values: Array) -> Array:
     a, b, c = values[:, 2], values[:, 3], values[:, 4]
-    return np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
+    stated = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
+    return np.asarray(stated + _SHARPEST_PX**2 * np.eye(2))
 
 
 def bubbles_of(tracked: Tracked, positions_mm: Array, axis: Array) -> tuple[Bubble, ...]:

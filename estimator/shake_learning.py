@@ -93,8 +93,11 @@ def learn(
 
     start : gives what is not learned. Its modes are kept and improved, unless they are the default
     guess (its name is "default"). Returns a model named "learned", with the standard deviations of
-    its log-parameters in ``learned``.
+    its log-parameters in ``learned``. Sensors are not learned from: with them a default start comes
+    back as it is, its broad band needs no modes.
     """
+    if start.name == "default" and problem.accelerometers:
+        return start
     model = replace(start, modes=()) if start.name == "default" else start
     channels = channels_of(problem, fixed=options.target)
     channels = tuple(c for c in channels if c.samples)

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 def summary(calibration: Calibration) -> str:
     """Verdict first, then residuals, cameras with standard deviations, twin, warnings."""
     s = calibration.statistics
+    if "views" not in s:
+        return _imported(calibration)
     lines = [f"Calibration {calibration.name!r}: {calibration.verdict.get('status', '?')}"]
     lines += [f"  ! {reason}" for reason in calibration.verdict.get("reasons", [])]
     lines.append(
@@ -47,3 +49,14 @@ def summary(calibration: Calibration) -> str:
     )
     lines += [f"  note: {n}" for n in (*calibration.notes, *calibration.diagnostics["weak"])]
     return "\n".join(lines)
+
+
+def _imported(calibration: Calibration) -> str:
+    """Of cameras that were not calibrated here: what they are, and the notes."""
+    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.get('status', '?')}"]
+    for camera in calibration.cameras:
+        lines.append(
+            f"  camera {camera.name}: {camera['scale_px_per_mm']:.6g} px/mm, "
+            f"kappa {camera['kappa_per_mm']:.4g} per mm"
+        )
+    return "\n".join(lines + [f"  note: {note}" for note in calibration.notes])

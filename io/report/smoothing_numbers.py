@@ -26,6 +26,7 @@ _HANN_WIDTH = 1.44
 
 _LINE_SHARE = 0.05
 _ABOVE_FLOOR = 8.0
+_PROMINENT = 0.6
 _ALIKE = 0.7
 _STRONGER = 2.0
 
@@ -179,8 +180,9 @@ def _lines_of(results: SmoothingResults, axis: str, cameras: Sequence[str]) -> l
     step = rate / length
     each = np.einsum("iif->if", cross)
     density = each.mean(0)
-    peaks, _ = find_peaks(density, prominence=0.5 * density.max() * _LINE_SHARE)
-    peaks = peaks[density[peaks] > _ABOVE_FLOOR * np.median(density)]
+    peaks, shape = find_peaks(density, prominence=0)
+    stands_out = shape["prominences"] > _PROMINENT * density[peaks]
+    peaks = peaks[stands_out & (density[peaks] > _ABOVE_FLOOR * np.median(density))]
     widths = peak_widths(density, peaks, rel_height=0.5)[0]
     variance = density.sum() * step
     out = []

@@ -57,6 +57,7 @@ _REMEDY_KEYS = ("remedy", "remedies")
 _NAMES = {
     "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
 }  # fmt: skip
+_NEXT_AXIS = re.compile(r"(?<=\.) (?=[xyz](?: \([a-z]+\))?: |To resolve it)")
 _ELSEWHERE = {"words", "lines", "shake_rms_mm", *_REMEDY_KEYS}
 
 
@@ -67,7 +68,7 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Verdic
     headline, colour, meaning = _MEANING.get(
         word.upper(), (word.replace("_", " "), "usable", "") if word else _NOT_JUDGED
     )
-    sentences = [meaning, *(_micro(text) for text in strings(content.get("words")))]
+    sentences = [meaning, *_by_axis(strings(content.get("words")))]
     if word.upper() in ("PARTIAL", "UNRESOLVED"):
         sentences += _remedy(content, " ".join(sentences))
     flags = {
@@ -88,6 +89,11 @@ def _remedy(content: Mapping[str, Any], told: str) -> list[str]:
     given = [text for key in _REMEDY_KEYS for text in strings(content.get(key))] or [REMEDY]
     fresh = [text for text in given if text.rstrip(".").lower() not in told.lower()]
     return [f"To resolve it: {_micro(' '.join(fresh))}"] if fresh else []
+
+
+def _by_axis(texts: list[str]) -> list[str]:
+    """A sentence per axis by itself."""
+    return [_micro(part) for text in texts for part in _NEXT_AXIS.split(text)]
 
 
 def _micro(text: str) -> str:
@@ -142,7 +148,7 @@ def _largest(values: list[float | None], factor: float = 1.0) -> str:
 
 
 def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
-    """Heads and a row per rig axis: what was judged, then what the tables hold."""
+    """Heads, a column per rig axis, and rows: what was judged, then what the tables hold."""
     judged = judged_axes(results.content)
     keys = [
         key for key in dict.fromkeys(k for one in judged.values() for k in one)
@@ -161,13 +167,13 @@ def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
             else _scaled(shake_rms_um(results, camera, axis))
             for axis in AXES
         ]  # fmt: skip
-    heads = [_head(key) for key in keys]
     rows = [
-        Row((_axis_name(results, i), *(_cell(key, judged.get(axis, {}).get(key)) for key in keys),
-             *(cells[i] for cells in columns.values())))
-        for i, axis in enumerate(AXES)
+        Row((_head(key), *(_cell(key, judged.get(axis, {}).get(key)) for axis in AXES)),
+            strong=key == "verdict")
+        for key in keys
     ]  # fmt: skip
-    return ["axis", *heads, *columns], rows
+    rows += [Row((name, *cells)) for name, cells in columns.items()]
+    return ["", *(_axis_name(results, axis) for axis in range(3))], rows
 
 
 def judged_axes(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

@@ -28,6 +28,8 @@ from telerig.factors.state_space import (
 
 Array = NDArray[np.float64]
 
+_STILL_MM = 1e-6
+
 
 @dataclass(frozen=True)
 class ChannelPosterior:
@@ -119,6 +121,8 @@ def bubble_components(channel: Channel, model: ShakeModel) -> list[Component]:
 
 def _system(channel: Channel, model: ShakeModel) -> _System:
     shake, bubble = shake_components(channel, model), bubble_components(channel, model)
+    if not shake and not channel.moving.any():
+        shake = [(slow_ou(_STILL_MM, 1.0), CARRIAGE)]
     parts = [c for c, _ in shake] + bubble * int(channel.moving.sum())
     size, shaken = sum(c.size for c in parts), sum(c.size for c, _ in shake)
     counts = len(shake), len(bubble), int(channel.moving.sum())

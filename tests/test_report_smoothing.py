@@ -322,7 +322,7 @@ def test_lines_that_could_be_the_others_are_listed(folder: Path) -> None:
     _edit(folder, axes=AXES | {"y": AXES["y"] | {"lines": [line]}}, flags=["LABEL_AMBIGUOUS"])
     text = _Page(write_track_report(folder)).text
     assert "Whose is the line?" in text
-    assert "y 12.1 200 bubble 0.420 could be the other's" in text
+    assert "y 12.1 200 0.4 bubble open" in text
 
 
 def test_tables_of_another_tracking_are_named(folder: Path) -> None:
@@ -427,6 +427,13 @@ def test_modes_of_the_model_come_with_what_a_mechanic_can_do(folder: Path) -> No
     assert "shorter" in arm[4] and "damping layer" in arm[4] and "damping layer" not in common[4]
     assert "turning" in turning[0] and "controller" in servo[4] and "15" in servo[4]
     assert "model" in words
+
+
+def test_a_mode_learned_axis_by_axis_is_one_row(folder: Path) -> None:
+    mode = {"where": "common", "frequency_hz": 20.36, "damping": 0.028, "source": "model"}
+    parts = [mode | {"rms_mm": [0.0, 0.075, 0.0]}, mode | {"rms_mm": [0.063, 0.0, 0.064]}]
+    rows, _ = mode_rows(_read(_edit(folder, modes=parts)))
+    assert [row.cells[3] for row in rows] == ["x: 63.0, y: 75.0, z: 64.0"]
 
 
 def test_given_remedies_of_the_modes_are_shown(folder: Path) -> None:

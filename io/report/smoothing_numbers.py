@@ -134,12 +134,11 @@ def _shake_um(results: SmoothingResults, camera: str) -> Array:
 
 
 def _welch(t_s: Array, values: Array, length: int) -> tuple[Array, Array]:
-    from scipy.signal import welch
+    from scipy.signal import detrend, welch
 
     even, rate_hz = evenly(t_s, values)
-    frequency, density = welch(
-        even, rate_hz, nperseg=min(length, len(even)), detrend="linear", axis=0
-    )
+    level = np.asarray(detrend(even, axis=0))
+    frequency, density = welch(level, rate_hz, nperseg=min(length, len(even)), axis=0)
     return np.asarray(frequency), np.asarray(density)
 
 
@@ -168,14 +167,17 @@ def shake_lines(results: SmoothingResults) -> list[Line]:
 
 
 def _lines_of(results: SmoothingResults, axis: str, cameras: Sequence[str]) -> list[Line]:
-    from scipy.signal import csd, find_peaks, peak_widths
+    from scipy.signal import csd, detrend, find_peaks, peak_widths
 
     time, place = results.shake["t_s"].to_numpy(float), AXES.index(axis)
     values = np.stack([_shake_um(results, camera)[:, place] for camera in cameras], 1)
     even, rate = evenly(time, values)
-    length = min(segment(len(time)), len(even))
-    pairs = [csd(even[:, i], even[:, j], rate, nperseg=length, detrend="linear")[1]
-             for i in range(len(cameras)) for j in range(len(cameras))]  # fmt: skip
+    level, length = np.asarray(detrend(even, axis=0)), min(segment(len(time)), len(even))
+    pairs = [
+        csd(level[:, i], level[:, j], rate, nperseg=length)[1]
+        for i in range(len(cameras))
+        for j in range(len(cameras))
+    ]
     cross = np.real(np.array(pairs)).reshape(len(cameras), len(cameras), -1)
     step = rate / length
     each = np.einsum("iif->if", cross)

@@ -37,7 +37,7 @@ def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
     model = results.part("model")
     known = [m for m in judged if m.get("source") != "estimate"]
     modes = known or [m for m in model.get("modes") or [] if isinstance(m, Mapping)]
-    rows = [_mode(mode, results.cameras) for mode in modes]
+    rows = [_mode(mode, results.cameras) for mode in _merged(modes)]
     rows += [_pitch(m, results.cameras) for m in model.get("pitches") or []
              if isinstance(m, Mapping)]  # fmt: skip
     servo = dict(model.get("carriage") or {}).get("servo")
@@ -59,9 +59,23 @@ def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
     )
 
 
+def _merged(modes: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """A mode that is learned axis by axis as one, with the RMS of all of its axes."""
+    found: dict[Any, dict[str, Any]] = {}
+    for mode in modes:
+        key = (mode.get("where", mode.get("camera")), mode.get("frequency_hz"))
+        same, rms_mm = found.setdefault(key, dict(mode)), mode.get("rms_mm")
+        if isinstance(rms_mm, list) and isinstance(same.get("rms_mm"), list):
+            same["rms_mm"] = [
+                max((v for v in pair if is_number(v)), default=0.0)
+                for pair in zip(same["rms_mm"], rms_mm)
+            ]
+    return list(found.values())
+
+
 def _mode(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
     where, remedy = _place(mode.get("where", mode.get("camera")), cameras)
-    damping = mode.get("damping")
+    damping: Any = mode.get("damping")
     helps = [text for key in ("remedy", "remedies") for text in _texts(mode.get(key))]
     if not helps:
         helps = [remedy] if remedy else []
@@ -103,7 +117,7 @@ def _rms_um(rms_mm: Any) -> str:
 
 def _pitch(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
     where, _ = _place(mode.get("camera"), cameras)
-    rms = mode.get("rms_rad")
+    rms: Any = mode.get("rms_rad")
     angle = f"{number(math.degrees(rms), 2)}°" if is_number(rms) else ABSENT
     return Row((f"{where}, turning", number(mode.get("frequency_hz")),
                 number(mode.get("damping")), angle, _PITCH))  # fmt: skip
@@ -177,7 +191,7 @@ def _constants(values: Mapping[str, Any]) -> list[tuple[str, str]]:
             if name.endswith(ending) and name != ending:
                 shown, factor = name.removesuffix(ending).replace("_", " ") + unit, times
                 break
-        sd = values.get("s" + name)
+        sd: Any = values.get("s" + name)
         text = with_sd(value * factor, sd * factor) if is_number(value) and is_number(sd) else (
             number(value * factor, 4) if is_number(value) else ABSENT)  # fmt: skip
         out.append((shown, text))

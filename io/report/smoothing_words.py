@@ -57,6 +57,7 @@ _REMEDY_KEYS = ("remedy", "remedies")
 _NAMES = {
     "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
 }  # fmt: skip
+_OPEN_NATS = 5.0
 _NEXT_AXIS = re.compile(r"(?<=\.) (?=[xyz](?: \([a-z]+\))?: |To resolve it)")
 _ELSEWHERE = {"words", "lines", "shake_rms_mm", *_REMEDY_KEYS}
 
@@ -225,15 +226,21 @@ def swap_rows(results: SmoothingResults) -> list[Row]:
         lines = judged.get("lines")
         for line in lines if isinstance(lines, list) else ():
             if isinstance(line, Mapping):
-                rms_mm = line.get("rms_mm")
-                cost = number(line.get("other_owner_costs_nats"))
-                rows.append(Row(
-                    (axis, number(line.get("frequency_hz")), _scaled(rms_mm, 1e3),
-                     str(line.get("owner") or ABSENT), cost,
-                     "could be the other's" if line.get("ambiguous") else "sure"),
-                    strong=bool(line.get("ambiguous")),
-                ))  # fmt: skip
+                rows.append(_swap_row(axis, line))
     return rows
+
+
+def _swap_row(axis: str, line: Mapping[str, Any]) -> Row:
+    cost: Any = line.get("other_owner_costs_nats")
+    open_ = bool(line.get("ambiguous"))
+    known = is_number(cost) and cost >= _OPEN_NATS
+    told = "open" if open_ else "told by the data" if known else "told by what bubbles do"
+    cells = (
+        axis, number(line.get("frequency_hz")), _scaled(line.get("rms_mm"), 1e3),
+        f"{cost + 0.0:.1f}".replace("-0.0", "0.0") if is_number(cost) else ABSENT,
+        str(line.get("owner") or ABSENT), told,
+    )  # fmt: skip
+    return Row(cells, strong=open_)
 
 
 def residual_rows(results: SmoothingResults) -> list[Row]:

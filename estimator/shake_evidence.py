@@ -8,6 +8,7 @@ evidence equals the graph's, channel by channel (see tests/test_shake_learning.p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,10 @@ Array = NDArray[np.float64]
 
 _STILL_MM = 1e-6
 
+_cached = lru_cache(maxsize=512)
+_oscillator, _driven_mode = _cached(oscillator), _cached(driven_mode)
+_broad_band, _slow_ou, _ou_velocity = _cached(broad_band), _cached(slow_ou), _cached(ou_velocity)
+
 
 @dataclass(frozen=True)
 class ChannelPosterior:
@@ -45,16 +50,13 @@ class ChannelPosterior:
 
 @dataclass(frozen=True)
 class _System:
-    """States per frame: the shake's components (``shaken``), then each moving item's.
+    """States per frame: the shake's components , then each moving item's.
 
     rows : (P, D) that read a pair's measurement.  columns : (F, P, c) effects of the constants.
     prior_sigma : (c,).  offset : (J, D).
     """
 
     components: tuple[Component, ...]
-    shaken: int
-    per_bubble: int
-    bubbles: int
     rows: Array
     offset: Array
     position: Array
@@ -87,17 +89,17 @@ def shake_components(channel: Channel, model: ShakeModel) -> list[tuple[Componen
         rms = _along(channel, mode.rms_mm, mode.camera)
         if rms > 0:
             if mode.force_hz is None:
-                part = oscillator(rms, mode.frequency_hz, mode.damping)
+                part = _oscillator(rms, mode.frequency_hz, mode.damping)
             else:
-                part = driven_mode(rms, mode.frequency_hz, mode.damping, force_hz=mode.force_hz)
+                part = _driven_mode(rms, mode.frequency_hz, mode.damping, force_hz=mode.force_hz)
             out.append((part, mode.camera))
     for band in model.broad_bands:
         rms = _along(channel, band.rms_mm, band.camera)
         if rms > 0:
-            part = broad_band(rms, low_hz=band.low_hz, high_hz=band.high_hz)
+            part = _broad_band(rms, low_hz=band.low_hz, high_hz=band.high_hz)
             out.append((part, band.camera))
             if band.slow_rms_mm > 0:
-                out.append((slow_ou(band.slow_rms_mm, band.slow_tau_s), band.camera))
+                out.append((_slow_ou(band.slow_rms_mm, band.slow_tau_s), band.camera))
     return out
 
 
@@ -111,21 +113,20 @@ def bubble_components(channel: Channel, model: ShakeModel) -> list[Component]:
     """The processes of a bubble along the channel's direction."""
     bubble, share = model.bubble, 1 / np.sqrt(channel.pooled)
     sigma, begin = share * bubble.velocity_sigma_mm_s, share * bubble.start_sigma_mm
-    parts = [ou_velocity(sigma, bubble.velocity_tau_s, start_sigma_mm=begin)]
+    parts = [_ou_velocity(sigma, bubble.velocity_tau_s, start_sigma_mm=begin)]
     for z in bubble.zigzags:
         rms = float(share * np.linalg.norm(channel.direction * np.asarray(z.rms_mm)))
         if rms > 0:
-            parts.append(oscillator(rms, z.frequency_hz, z.damping))
+            parts.append(_oscillator(rms, z.frequency_hz, z.damping))
     return parts
 
 
 def _system(channel: Channel, model: ShakeModel) -> _System:
     shake, bubble = shake_components(channel, model), bubble_components(channel, model)
     if not shake and not channel.moving.any():
-        shake = [(slow_ou(_STILL_MM, 1.0), CARRIAGE)]
+        shake = [(_slow_ou(_STILL_MM, 1.0), CARRIAGE)]
     parts = [c for c, _ in shake] + bubble * int(channel.moving.sum())
     size, shaken = sum(c.size for c in parts), sum(c.size for c, _ in shake)
-    counts = len(shake), len(bubble), int(channel.moving.sum())
     offset = np.zeros((len(channel.cameras), size))
     at = 0
     for part, camera in shake:
@@ -141,7 +142,7 @@ def _system(channel: Channel, model: ShakeModel) -> _System:
         velocity[k, columns] = np.concatenate([c.velocity for c in bubble])
     columns_, sigma = _constants(channel, model)
     rows = position[channel.item] - offset[channel.camera]
-    return _System(tuple(parts), *counts, rows, offset, position[movers], velocity, columns_, sigma)
+    return _System(tuple(parts), rows, offset, position[movers], velocity, columns_, sigma)
 
 
 def _constants(channel: Channel, model: ShakeModel) -> tuple[Array, Array]:
@@ -290,21 +291,18 @@ def _fitted(channel: Channel, system: _System, weight: Array) -> Array:
 
 
 def _steps(system: _System, dt_s: Array) -> Motion:
-    """`motion` of all components; that of the bubbles, which are alike, is worked out once."""
-    shake = motion(system.components[: system.shaken], dt_s)
-    count = system.bubbles
-    if not count:
-        return shake
-    one = motion(system.components[-system.per_bubble :], dt_s)
-    if not system.shaken:
-        shake = replace(shake, **{k: np.zeros((len(v), 0, 0)) for k, v in _blocks(one).items()})
-        shake = replace(shake, log_det=np.zeros(len(one.log_det)), index=one.index)
-    joined = {k: block_diagonal([_blocks(shake)[k], *[v] * count]) for k, v in _blocks(one).items()}
-    return replace(one, log_det=shake.log_det + count * one.log_det, **joined)
+    """`motion` of all components; what stays between two calls is not worked out again."""
+    key = dt_s.tobytes()
+    parts = [_one(component, key) for component in system.components]
+    names = ("by_last", "by_next", "by_input", "basis")
+    joined = {name: block_diagonal([getattr(part, name) for part in parts]) for name in names}
+    log_det = np.sum([part.log_det for part in parts], 0)
+    return replace(parts[0], log_det=log_det, **joined)
 
 
-def _blocks(steps: Motion) -> dict[str, Array]:
-    return {name: getattr(steps, name) for name in ("by_last", "by_next", "by_input", "basis")}
+@lru_cache(maxsize=512)
+def _one(component: Component, dt_s: bytes) -> Motion:
+    return motion([component], np.frombuffer(dt_s))
 
 
 def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:

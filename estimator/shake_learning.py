@@ -235,7 +235,7 @@ def _one_more(group: Group, step: _Step, options: Learning, first: bool) -> _Ste
     trials.sort(key=lambda trial: -trial[0])
     best: tuple[float, Where, Fit] | None = None
     for _, where, model in _distinct(trials):
-        fit = maximise(group.fast, model, _last_line(model, where), steps=12)
+        fit = maximise(group.fast, model, _last_line(model, where), steps=8)
         lead = 0.0 if best is None else _preference(model, where, best[1], group.up)
         if best is None or fit.log_evidence > best[0] + lead:
             best = (fit.log_evidence, where, fit)

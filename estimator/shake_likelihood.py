@@ -38,7 +38,7 @@ def evidence(channels: Sequence[Channel], model: ShakeModel) -> float:
 
 
 def maximise(
-    channels: Sequence[Channel], model: ShakeModel, names: Sequence[str], *, steps: int = 40
+    channels: Sequence[Channel], model: ShakeModel, names: Sequence[str], *, steps: int = 25
 ) -> Fit:
     """Quasi-Newton on the logarithms of the named parameters, within their bounds."""
     from scipy.optimize import minimize
@@ -60,7 +60,7 @@ def maximise(
         each = [cost(x + _DIFFERENCE * row) - at for row in np.eye(len(x))]
         return at, np.array(each) / _DIFFERENCE
 
-    options = {"maxiter": steps, "ftol": 1e-7, "gtol": 1e-2}
+    options = {"maxiter": steps, "ftol": 1e-6, "gtol": 3e-2}
     low, high = np.array(bounds).T
     start = np.clip(start, low + 1e-6, high - 2 * _DIFFERENCE)
     found = minimize(slope, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)

@@ -130,11 +130,11 @@ def _dots(
     found = Dots(
         views,
         reading,
-        rows["view"].astype(str).map(number).to_numpy(np.int64),
-        rows["camera"].map({n: i for i, n in enumerate(names)}).to_numpy(np.int64),
+        np.array([number[str(v)] for v in rows["view"]], np.int64),
+        np.array([names.index(c) for c in rows["camera"]], np.int64),
         calibration.target_points_mm[place],
         rows[["u_px", "v_px"]].to_numpy(float),
-        np.linalg.inv(_covariance(rows, calibration)),
+        np.asarray(np.linalg.inv(_covariance(rows, calibration)), np.float64),
     )
     return found, words
 

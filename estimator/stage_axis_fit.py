@@ -93,7 +93,7 @@ def fit(
     system = linearised(cameras, free, dots, state, sigma_mm, weights)
     limit = np.inf
     for turn in range(_STEPS):
-        step = np.linalg.solve(system.normal, system.right)
+        step = np.asarray(np.linalg.solve(system.normal, system.right), np.float64)
         state = State(
             state.rig_from_target @ Pose(rotation_from_rotvec(step[:3]), step[3:6]),
             state.slope + step[6:],

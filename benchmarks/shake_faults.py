@@ -147,6 +147,8 @@ def main() -> None:
 S2, {options.seeds} seeds; vertical RMS error of the middle 80 %, position um / velocity mm/s; its
 ratio to the same without the fault; mean of (error / sd)^2; the largest error, over the seeds, of
 the accelerometers' delay and of the encoder's scale where the smoother estimates them.
+A wrong encoder scale is unobservable without references; the defaults hold the scale, which
+`stage_axis/` is there to calibrate.
 
 | fault | information | model | runs | RMS | over clean | (e/sd)^2 | delay ms | scale ppm |
 |---|---|---|---|---|---|---|---|---|

@@ -137,7 +137,7 @@ def test_maximum_is_above_the_truth_and_laplace_covers_it() -> None:
 def test_a_fixed_target_shows_every_mode_of_the_rig() -> None:
     problem, _, _ = run(np.random.default_rng(6), bubbles=2, still=True, seconds=2.0, rate_hz=100.0)
     start = default_model(problem)
-    found = learn(problem, start, Learning(target=True))
+    found = learn(problem, start, Learning(target=True, most_modes=1))
     assert found.name == "learned"
     assert not found.bubble.zigzags
     common = [m for m in found.modes if m.camera == CARRIAGE]
@@ -153,7 +153,7 @@ def test_a_fixed_target_shows_every_mode_of_the_rig() -> None:
 
 def test_several_bubbles_tell_their_own_line_from_the_rigs() -> None:
     problem, lab, _ = run(np.random.default_rng(7), bubbles=4, seconds=2.0, rate_hz=100.0)
-    found = learn(problem, default_model(problem))
+    found = learn(problem, default_model(problem), Learning(most_modes=1))
     common = [m for m in found.modes if m.camera == CARRIAGE and m.rms_mm[1] > 0.08]
     lines = [z for z in found.bubble.zigzags if z.rms_mm[1] > 0.08]
     assert [m.frequency_hz for m in common] == pytest.approx([COMMON_HZ], rel=0.08)

@@ -319,10 +319,16 @@ def test_nothing_judged_and_nothing_optional(folder: Path) -> None:
 def test_lines_that_could_be_the_others_are_listed(folder: Path) -> None:
     line = {"owner": "bubble", "frequency_hz": 12.1, "rms_mm": 0.2, "ambiguous": True,
             "other_owner_costs_nats": 0.42}  # fmt: skip
-    _edit(folder, axes=AXES | {"y": AXES["y"] | {"lines": [line]}}, flags=["LABEL_AMBIGUOUS"])
+    sure = line | {"owner": "rig", "frequency_hz": 31.0, "ambiguous": False,
+                   "other_owner_costs_nats": 14.04}  # fmt: skip
+    free = line | {"other_owner_costs_nats": -1e-6}
+    _edit(folder, flags=["LABEL_AMBIGUOUS"],
+          axes=AXES | {"y": AXES["y"] | {"lines": [line, sure]},
+                       "z": AXES["z"] | {"lines": [free]}})  # fmt: skip
     text = _Page(write_track_report(folder)).text
     assert "Whose is the line?" in text
-    assert "y 12.1 200 0.4 bubble open" in text
+    assert "12.1 y, z 200, 200 0.0 bubble open" in text
+    assert "31.0 y 200 14.0 rig told by the data" in text
 
 
 def test_tables_of_another_tracking_are_named(folder: Path) -> None:

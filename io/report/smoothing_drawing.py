@@ -60,7 +60,9 @@ def band(axes: Any, t_s: Array, centre: Array, sd: Array, colour: str, label: st
 
 
 def room_left(axes: Any) -> None:
-    """For numbers of four digits beside the axis."""
+    """For numbers of four digits beside the axis; times are written out."""
+    if axes.get_xscale() == "linear":
+        axes.ticklabel_format(axis="x", useOffset=False)
     box = axes.get_position()
     axes.set_position((box.x0 + _ROOM, box.y0, box.width - _ROOM, box.height))
 

@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 _WINDOW = 1_000
 _DECADES = 6.0
 _PARTLY = 0.2
+_MOST_DB = 99.0
 
 
 def shake_in_time(results: SmoothingResults, camera: str, axis: str) -> Picture:
@@ -121,7 +122,7 @@ def _velocity_words(found: dict[str, tuple[Spectrum, str]], axis: int) -> str:
     at = int(np.argmax(before - after))
     return (
         f"Smoothing takes off most at {number(float(naive.frequency_hz[1 + at]), 3)} Hz: "
-        f"{gain[at]:.0f} dB. What the motion itself holds should stay where it was. "
+        f"{min(gain[at], _MOST_DB):.0f} dB. What the motion itself holds should stay where it was. "
     )
 
 

@@ -27,7 +27,8 @@ _SERVO = "the controller: a notch at {} Hz, less gain, smoother set points"
 _FOLLOWING = "servo (following error)"
 _PITCH = "stiffen the arm against twisting; camera's weight on the arm's axis"
 _UNKNOWN_ARM = (
-    "find out with an accelerometer on the carriage whether it is the carriage or the arm"
+    "no other camera sees this axis: an accelerometer on the carriage tells whether it is the "
+    "carriage or the arm"
 )
 
 
@@ -206,7 +207,7 @@ _UNITS = (
 
 _SOURCES = {
     "default": "fixed priors, with noise and size of the shake adapted to the data.",
-    "learned": "learned from this run by maximum likelihood.",
+    "learned": "found from this run by maximum likelihood.",
     "given": "given by the user.",
 }
 

@@ -220,27 +220,34 @@ def _scaled(value: Any, factor: float = 1.0) -> str:
 
 
 def swap_rows(results: SmoothingResults) -> list[Row]:
-    """Lines whose owner could be another: axis, Hz, RMS, owner, what the other reading costs."""
-    rows = []
+    """Lines whose owner could be another: Hz, axes, RMS, what the other reading costs, owner."""
+    alike: dict[tuple[str, str, str], list[tuple[str, Mapping[str, Any]]]] = {}
     for axis, judged in judged_axes(results.content).items():
         lines = judged.get("lines")
         for line in lines if isinstance(lines, list) else ():
             if isinstance(line, Mapping):
-                rows.append(_swap_row(axis, line))
-    return rows
+                hz, owner = number(line.get("frequency_hz")), str(line.get("owner") or ABSENT)
+                alike.setdefault((hz, owner, _told(line)), []).append((axis, line))
+    return [_swap_row(*key, lines) for key, lines in alike.items()]
 
 
-def _swap_row(axis: str, line: Mapping[str, Any]) -> Row:
+def _told(line: Mapping[str, Any]) -> str:
     cost: Any = line.get("other_owner_costs_nats")
-    open_ = bool(line.get("ambiguous"))
-    known = is_number(cost) and cost >= _OPEN_NATS
-    told = "open" if open_ else "told by the data" if known else "told by what bubbles do"
-    cells = (
-        axis, number(line.get("frequency_hz")), _scaled(line.get("rms_mm"), 1e3),
-        f"{cost + 0.0:.1f}".replace("-0.0", "0.0") if is_number(cost) else ABSENT,
-        str(line.get("owner") or ABSENT), told,
-    )  # fmt: skip
-    return Row(cells, strong=open_)
+    if line.get("ambiguous"):
+        return "open"
+    return (
+        "told by the data" if is_number(cost) and cost >= _OPEN_NATS else "told by what bubbles do"
+    )
+
+
+def _swap_row(hz: str, owner: str, told: str, lines: list[tuple[str, Mapping[str, Any]]]) -> Row:
+    """One line on all of its axes; of the costs the least."""
+    axes = ", ".join(axis for axis, _ in lines)
+    sizes = ", ".join(_scaled(line.get("rms_mm"), 1e3) for _, line in lines)
+    costs = [line.get("other_owner_costs_nats") for _, line in lines]
+    least = min((float(c) for c in costs if c is not None and is_number(c)), default=None)
+    cost = ABSENT if least is None else f"{round(least, 1) + 0.0:.1f}"
+    return Row((hz, axes, sizes, cost, owner, told), strong=told == "open")
 
 
 def residual_rows(results: SmoothingResults) -> list[Row]:

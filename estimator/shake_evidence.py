@@ -7,7 +7,7 @@ evidence equals the graph's, channel by channel (see tests/test_shake_learning.p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -214,7 +214,7 @@ class _Factor:
         log_inner = float(np.log(np.diag(self.inner[0])).sum())
         log_sigma = float(np.log(self.system.prior_sigma).sum())
         each = self.log_noise + self.log_prior - log_chain - log_inner - log_sigma
-        return self.count * each - self.square / 2
+        return float(self.count * each - self.square / 2)
 
     def _back(self, half: Array) -> Array:
         """(F, D, c) states from L^-1 of the right side."""
@@ -294,10 +294,14 @@ def _steps(system: _System, dt_s: Array) -> Motion:
     """`motion` of all components; what stays between two calls is not worked out again."""
     key = dt_s.tobytes()
     parts = [_one(component, key) for component in system.components]
-    names = ("by_last", "by_next", "by_input", "basis")
-    joined = {name: block_diagonal([getattr(part, name) for part in parts]) for name in names}
-    log_det = np.sum([part.log_det for part in parts], 0)
-    return replace(parts[0], log_det=log_det, **joined)
+    return Motion(
+        block_diagonal([p.by_last for p in parts]),
+        block_diagonal([p.by_next for p in parts]),
+        block_diagonal([p.by_input for p in parts]),
+        np.sum([p.log_det for p in parts], 0),
+        block_diagonal([p.basis for p in parts]),
+        parts[0].index,
+    )
 
 
 @lru_cache(maxsize=512)

@@ -227,11 +227,11 @@ def _concerns(group: Group, model: ShakeModel, name: str) -> bool:
 
 def _one_more(group: Group, step: _Step, options: Learning, first: bool) -> _Step | None:
     """The model with the line added that helps most; None when none is worth its parameters."""
-    trials = []
+    tried = []
     for where in group.wheres:
         if step.found.count(where) < options.most_modes:
-            trials += _trials(group, step.fit.model, where, options)
-    trials = [(evidence(group.fast, m), where, m) for where, m in trials]
+            tried += _trials(group, step.fit.model, where, options)
+    trials = [(evidence(group.fast, m), where, m) for where, m in tried]
     trials.sort(key=lambda trial: -trial[0])
     best: tuple[float, Where, Fit] | None = None
     for _, where, model in _distinct(trials):
@@ -251,8 +251,9 @@ def _penalty(group: Group, model: ShakeModel) -> float:
     n : two samples for each cycle of the fastest line. Frames beyond tell of noise, not of lines.
     """
     t = group.channels[0].t_s
-    lines = (*model.modes, *model.bubble.zigzags)
-    fastest = max((line.frequency_hz for line in lines), default=_LOW_HZ)
+    lines = [mode.frequency_hz for mode in model.modes]
+    lines += [line.frequency_hz for line in model.bubble.zigzags]
+    fastest = max(lines, default=_LOW_HZ)
     return 1.5 * float(np.log(max(2 * fastest * (t[-1] - t[0]), 8.0)))
 
 

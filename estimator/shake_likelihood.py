@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +49,8 @@ def maximise(
         return Fit(model, found, found)
     priors = [prior_of(n) for n in names]
     scale = np.array([p.step for p in priors])
-    bounds = [(np.log(p.low) / s, np.log(p.high) / s) for p, s in zip(priors, scale)]
-    start = np.log([value_of(model, n) for n in names]) / scale
+    bounds = [(float(np.log(p.low) / s), float(np.log(p.high) / s)) for p, s in zip(priors, scale)]
+    start: Array = np.log([value_of(model, n) for n in names]) / scale
 
     def cost(x: Array) -> float:
         moved = with_values(model, names, np.exp(x * scale).tolist())
@@ -60,12 +61,14 @@ def maximise(
         each = [cost(x + _DIFFERENCE * row) - at for row in np.eye(len(x))]
         return at, np.array(each) / _DIFFERENCE
 
-    options = {"maxiter": steps, "ftol": 1e-6, "gtol": 3e-2}
+    options: Any = {"maxiter": steps, "ftol": 1e-6, "gtol": 3e-2}
     low, high = np.array(bounds).T
     start = np.clip(start, low + 1e-6, high - 2 * _DIFFERENCE)
-    found = minimize(slope, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    best = with_values(model, names, np.exp(found.x * scale).tolist())
-    return Fit(best, evidence(channels, best), -float(found.fun))
+    result = minimize(
+        slope, start, args=(), jac=True, method="L-BFGS-B", bounds=bounds, options=options
+    )
+    best = with_values(model, names, np.exp(result.x * scale).tolist())
+    return Fit(best, evidence(channels, best), -float(result.fun))
 
 
 def laplace_sigma(channels: Sequence[Channel], model: ShakeModel, names: Sequence[str]) -> Array:

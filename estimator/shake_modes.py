@@ -107,7 +107,7 @@ def _peaks(t_s: Array, values: Array, noise: Array, where: str) -> list[dict[str
     peak &= frequency >= max(_LOWEST_HZ, 2 * width)
     out = []
     for i in sorted(np.flatnonzero(peak), key=lambda at: -total[at])[:_MOST_PEAKS]:
-        half = _half_width(total, i)
+        half = _half_width(total, int(i))
         near = slice(max(i - 2 * half, 0), i + 2 * half + 1)
         power = each[near].sum(0) * width
         if power.sum() < _LEAST_SHARE * variance or power.sum() < _SIGNIFICANT * noise.sum() / 10:

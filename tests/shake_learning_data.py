@@ -88,9 +88,10 @@ def run(
     places = rng.uniform(-20, 20, (2 * marks, 3))
     features = tuple(Mark(f"m{k}", p + rng.normal(0, 0.1, 3)) for k, p in enumerate(places))
     fixed = np.broadcast_to(places[:, None], (2 * marks, frames, 3))
+    pixels = _pixels(lab, shake, sigma_px, rng, kept, [(0, 1)] * bubbles)
     return (
         SmoothingProblem(
-            CAMERAS, t, UP, UP, tracks, _pixels(lab, shake, sigma_px, rng, kept, [(0, 1)] * bubbles),
+            CAMERAS, t, UP, UP, tracks, pixels,
             marks=features,
             references=_pixels(fixed, shake, 0.1, rng, 1.0, [(k % 2,) for k in range(2 * marks)]),
         ),

@@ -15,11 +15,12 @@ from shake_learning_data import ARM_HZ, BUBBLE_HZ, COMMON_HZ, SWING_HZ, run, tru
 from telerig.errors import InputError
 from telerig.estimator.shake_channels import channels_of, pooled, seen_channels
 from telerig.estimator.shake_evidence import channel_evidence, channel_posterior, position_sigma
+from telerig.estimator.shake_inflation import inflated
 from telerig.estimator.shake_labels import labels, moved_to_bubble, moved_to_rig
 from telerig.estimator.shake_learning import Learning, learn
 from telerig.estimator.shake_likelihood import evidence, laplace_sigma, maximise
 from telerig.estimator.shake_parameters import log_prior, names_of, value_of, with_values
-from telerig.estimator.shake_spectrum import coarser, coarsening, density, faded, unexplained
+from telerig.estimator.shake_spectrum import coarsening, coarser, density, faded, unexplained
 from telerig.estimator.smoother.defaults import default_model
 from telerig.estimator.smoother.model import CARRIAGE, BroadBand, ShakeModel
 from telerig.estimator.smoother.solve import Options, solve
@@ -114,7 +115,7 @@ def test_parameters_by_name() -> None:
     doubled = with_values(model, ["bubble.zigzags.0.rms_mm"], [4.0])
     assert doubled.bubble.zigzags[0].rms_mm == (4.0, 0.0, 4.0)
     assert log_prior(model, names) < 0
-    with pytest.raises(InputError, match="no 'modes.7.damping'"):
+    with pytest.raises(InputError, match="the model has no"):
         value_of(model, "modes.7.damping")
     with pytest.raises(InputError, match="no hyper-parameter"):
         log_prior(model, ["encoder_sigma_mm"])
@@ -190,3 +191,31 @@ def test_a_line_changes_hands_without_changing_one_bubbles_likelihood() -> None:
     costs = labels(pooled(channels_of(several)[0]), true_model(), (0, 1, 0), several.up)
     assert {(c.owner, c.index) for c in costs} == {("rig", 0), ("bubble", 1)}
     assert all(c.cost_nats > 5 and not c.ambiguous for c in costs)
+
+
+def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
+    problem, _, _ = run(np.random.default_rng(10), bubbles=2, seconds=0.5)
+    names = {"modes.0.frequency_hz": 0.05}
+    model = replace(true_model(), learned=names)
+    solution = solve(problem, model, Options(robust=False))
+    wider = inflated(solution)
+    assert solution.covariances is not None and wider.covariances is not None
+    moved = [
+        solve(
+            problem,
+            with_values(model, list(names), [9.0 * np.exp(s * 0.05)]),
+            Options(robust=False),
+        )
+        for s in (1, -1)
+    ]
+    row = solution.frame.bubble.position[1]
+    step = (moved[0].state.bubbles - moved[1].state.bubbles) @ row / 2
+    added = wider.covariances.bubbles - solution.covariances.bubbles
+    np.testing.assert_allclose(np.einsum("d,nde,e->n", row, added, row), step**2, atol=1e-9)
+    offset = solution.frame.shake.offset[1][1]
+    nodes = solution.frame.nodes.of_frame
+    step = (moved[0].state.shake - moved[1].state.shake)[nodes] @ offset / 2
+    added = wider.covariances.shake - solution.covariances.shake
+    np.testing.assert_allclose(np.einsum("d,nde,e->n", offset, added, offset), step**2, atol=1e-9)
+    plain = solve(problem, true_model(), Options(robust=False))
+    assert inflated(plain) is plain

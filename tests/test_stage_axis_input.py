@@ -19,7 +19,8 @@ from telerig.io.dataset import Dataset
 from telerig.io.rig_description import StageDescription
 from telerig.io.rigfile import read_rig_toml, write_rig_toml
 from telerig.io.run_presets import run_preset
-from telerig.io.simulation_scene import true_cameras
+from telerig.io.simulation import view_image
+from telerig.io.simulation_scene import true_cameras, true_target
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
 AXIS = np.array([0.01, -1.0, 0.02]) / np.linalg.norm([0.01, -1.0, 0.02])
@@ -73,6 +74,26 @@ def test_dots_and_positions(folder: Path) -> None:
     np.testing.assert_allclose(found.axis_rig, AXIS, atol=1e-9)
     assert found.scale == pytest.approx(0.01, abs=1e-9)
     assert not any("rig.toml" in w for w in found.words)
+
+
+def test_images(folder: Path) -> None:
+    """Rendered with noise: the dots are detected, and the scale found within its error."""
+    rng = np.random.default_rng(2)
+    dataset = telerig.load_dataset(folder)
+    config = replace(run_preset("rise").calibration, print_factor=0.0)
+    target = true_target(config, rng)
+    known = calibration(dataset)
+    for camera in known.cameras:
+        (folder / "stage_axis" / camera.name).mkdir()
+        for view, stop in STOPS.items():
+            pose = Pose(POSE.rotation, POSE.translation_mm - AXIS * stop / 1.01)
+            image = view_image(config, camera, target, pose, rng)
+            tifffile.imwrite(folder / "stage_axis" / camera.name / f"{view}.tif", image)
+    found = stage_axis_from(dataset, known)
+    assert found is not None
+    assert found.scale == pytest.approx(0.01, abs=max(4 * found.scale_sd, 1e-4))
+    assert found.scale_sd < 3e-4
+    np.testing.assert_allclose(found.axis_rig, AXIS, atol=1e-3)
 
 
 def test_a_stage_that_runs_the_other_way(folder: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
+from telerig.estimator.shake_inflation import inflated
 from telerig.estimator.smoother.defaults import default_model, rescaled
 from telerig.estimator.smoother.linear import images
 from telerig.estimator.smoother.model import (
@@ -86,6 +87,8 @@ def smooth(
     else:
         solution = _adapted_solution(problem, chosen, options, progress)
         chosen = solution.frame.model
+        if chosen.learned:
+            solution = inflated(solution)
     verdict = judge(problem, chosen, solution)
     return Smoothing(
         trajectories(solution, None if tracked is None else tracked.table),

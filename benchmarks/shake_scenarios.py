@@ -275,8 +275,10 @@ def run_all(options: argparse.Namespace) -> pd.DataFrame:
 def main() -> None:
     options = arguments()
     if options.read:
+        words = dict.fromkeys(("model", "verdict", "flags", "fault"), str)
         parts = [
-            pd.read_csv(path, keep_default_na=False, na_values=["nan"]) for path in options.read
+            pd.read_csv(path, dtype=words, keep_default_na=False, na_values=["nan"])
+            for path in options.read
         ]
         table = pd.concat(parts, ignore_index=True)
     else:

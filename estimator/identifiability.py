@@ -115,7 +115,9 @@ def _axis(
         flags.append(LABEL_AMBIGUOUS)
     if rms < base and q <= RESOLVED_Q:
         flags.append(SHAKE_BELOW_NOISE)
-    return AxisVerdict(verdict, tuple(flags), q, eta, float(np.median(sigma)), base, rms, lines)
+    return AxisVerdict(
+        verdict, tuple(flags), q, eta, float(np.median(sigma)), base, float(rms), lines
+    )
 
 
 def _matters(line: LineLabel) -> bool:

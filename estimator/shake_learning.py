@@ -241,8 +241,23 @@ def _one_more(group: Group, step: _Step, options: Learning, first: bool) -> _Ste
             best = (fit.log_evidence, where, fit)
     if best is None or best[0] < step.fit.log_evidence + _penalty(group, best[2].model):
         return None
-    names = _free(best[2].model, group, options, first)
-    return _Step(maximise(group.fast, best[2].model, names, steps=8), (*step.found, best[1]))
+    model, found = _alike(group, best[2].model, best[1]), (*step.found, best[1])
+    names = _free(model, group, options, first)
+    return _Step(maximise(group.fast, model, names, steps=8), found)
+
+
+def _alike(group: Group, model: ShakeModel, where: Where) -> ShakeModel:
+    """After an arm's first mode, the other arms given one like it, to be found smaller if it is.
+
+    Arms are built alike: one that shakes unseen would be taken for a shake of the whole rig.
+    """
+    cameras = group.channels[0].cameras
+    have = {m.camera for m in model.modes[:-1] if m.camera != CARRIAGE}
+    if where not in cameras or have:
+        return model
+    last = model.modes[-1]
+    copies = tuple(replace(last, camera=c) for c in cameras if c != last.camera)
+    return replace(model, modes=(*model.modes, *copies))
 
 
 def _penalty(group: Group, model: ShakeModel) -> float:
@@ -329,10 +344,16 @@ def _pruned(group: Group, fit: Fit, options: Learning, first: bool) -> Fit:
         less = _without(fit.model, names[at])
         free = _free(less, group, options, first)
         quick = maximise(group.fast, less, free, steps=6)
-        if quick.log_evidence > fit.log_evidence - _penalty(group, fit.model):
+        own = names[at].startswith("modes") and _owner(fit.model, names[at]) != CARRIAGE
+        worth = 0.0 if own else _penalty(group, fit.model)
+        if quick.log_evidence > fit.log_evidence - worth:
             fit = quick
         else:
             at += 1
+
+
+def _owner(model: ShakeModel, name: str) -> int:
+    return model.modes[int(name.split(".")[1])].camera
 
 
 def _without(model: ShakeModel, name: str) -> ShakeModel:

@@ -23,7 +23,6 @@ _CLIPPED_LEAST = 5
 _CLIPPED_EXCESS = 3
 _FITS_DEG = 15.0
 _CLEAR = 0.6
-_UNSEEN = 0.3
 _SMOOTHED_S = 0.03
 
 
@@ -147,8 +146,8 @@ def motion_contradicts(correlation: ArrayLike, along: ArrayLike) -> bool:
     correlation : (3,) of `motion_correlation`.  along : (3,) the travel axis in sensor axes.
     """
     found, stated = np.asarray(correlation, float), np.asarray(along, float)
-    on_axis = float(found @ stated)
-    return on_axis < -_CLEAR or (on_axis < _UNSEEN and float(np.abs(found).max()) > _CLEAR)
+    on_axis, best = float(found @ stated), float(np.abs(found).max())
+    return on_axis < -_CLEAR or (best > _CLEAR and on_axis < best / 2)
 
 
 def _averaged(t: Array, values: Array, grid: Array, step: float) -> Array:

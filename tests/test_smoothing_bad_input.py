@@ -20,6 +20,7 @@ from telerig.estimator.imported_calibration import calibration_from_cameras
 from telerig.estimator.sensor_checks import check_encoder, check_sensors
 from telerig.estimator.smoother.model import ShakeModel
 from telerig.estimator.smoother.smooth import smooth
+from telerig.io.rig_description import StageDescription
 from telerig.io.run_data import RunData
 from telerig.io.run_presets import run_preset
 from telerig.io.simulation_scene import true_cameras
@@ -320,6 +321,25 @@ def test_the_carriages_motion_is_felt_along_its_axis() -> None:
     assert found is not None
     assert found[2] < -0.9
     assert abs(found[0]) < 0.4
+
+
+@pytest.mark.parametrize(("felt", "sign", "told"), [(0, -1, ""), (2, 1, "-z"), (0, 1, "-x")])
+def test_axes_that_gravity_cannot_tell(felt: int, sign: int, told: str, run: Path) -> None:
+    """A stage that travels along x: the encoder's acceleration must be felt there, with its sign.
+
+    The run's own travel is along -y, so that minus its reading is the push along x.
+    """
+    data = telerig.load_run(run)
+    assert data.accelerometers is not None and data.rig is not None
+    table = data.accelerometers.copy()
+    push = table["ay_m_s2"].to_numpy() + 9.81
+    still = 0.05 * np.random.default_rng(1).standard_normal((len(table), 3))
+    table[ACCELERATIONS] = still - [0.0, 9.81, 0.0]
+    table[ACCELERATIONS[felt]] += sign * push
+    rig = replace(data.rig, stage=StageDescription((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), 0.001))
+    words = check_sensors(replace(data, rig=rig, accelerometers=table))
+    assert len(words) == (2 if told else 0), words
+    assert all(f"felt along {told} of the sensor" in w for w in words), words
 
 
 # --- names, NaN, short runs, tracks -------------------------------------------------------------

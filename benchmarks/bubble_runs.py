@@ -54,12 +54,12 @@ def main() -> None:
     parser.add_argument("--bubbles", type=int)
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
-    head = (
-        "| preset, seed | in view | recall | hidden by half | recall of the others | precision | "
-        "tracks | swaps | breaks | centre to volume px | corrected px | to silhouette px | frames/s |\n"
-        + "|---" * 13
-        + "|"
-    )
+    names = [
+        "preset, seed", "in view", "recall", "hidden by half", "recall of the others", "precision",
+        "tracks", "swaps", "breaks", "centre to volume px", "corrected px", "to silhouette px",
+        "frames/s",
+    ]  # fmt: skip
+    head = f"| {' | '.join(names)} |\n|{'---|' * len(names)}"
     lines = [head]
     print(head)
     scores = []

@@ -17,6 +17,9 @@ _GAP = 5.0
 _RETURNS = 0.3
 _WRAP_OF_RANGE = 0.5
 _LEAST_RECORD = 6
+_LEAST_TO_LEARN = 60
+_REACH = 4
+_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,15 @@ def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]
     t, position = np.asarray(t_s, float), np.asarray(position_mm, float)
     if len(t) < _LEAST_RECORD:
         return []
-    excess = _excess(np.diff(t), np.diff(position))
-    steps = np.flatnonzero(np.abs(excess) > _threshold(np.diff(t), np.diff(position)))
+    dt, step = np.diff(t), np.diff(position)
+    excess = _excess(dt, step)
+    unforeseen = _unforeseen(dt, step)
+    noise = 1.4826 * float(np.median(np.abs(unforeseen)))
+    odd = np.abs(unforeseen) > max(_NOISES * noise, _least(step))
+    odd &= (excess * unforeseen > 0) & (np.abs(excess) > _SHARE * np.abs(unforeseen))
+    clear = np.abs(excess) > _threshold(dt, step)
+    excess = np.where(odd & ~clear, unforeseen, excess)
+    steps = np.flatnonzero(odd | clear)
     return _named(steps, excess, t, position)
 
 
@@ -75,13 +85,44 @@ def _excess(dt: Array, step: Array) -> Array:
     return np.asarray(np.where(dt > _GAP * np.median(dt), 0.0, beyond * dt))
 
 
+def _unforeseen(dt: Array, step: Array) -> Array:
+    """(E - 1,) what each step (mm) differs from the one that eight neighbours foretell.
+
+    The weights are those of the record itself (least squares without the steps that they miss),
+    so that an oscillation is foretold too; 0 in short records and at their ends.
+    """
+    speed, reach = step / dt, _REACH
+    if len(speed) < _LEAST_TO_LEARN:
+        return np.zeros(len(speed))
+    padded = np.pad(speed, reach, mode="edge")
+    near = np.stack([padded[k : k + len(speed)] for k in range(2 * reach + 1) if k != reach], -1)
+    near = np.concatenate([near, np.ones((len(speed), 1))], -1)
+    kept = np.ones(len(speed), bool)
+    for _ in range(4):
+        weights = np.linalg.lstsq(near[kept], speed[kept], rcond=None)[0]
+        off = speed - near @ weights
+        limit = 5 * 1.4826 * float(np.median(np.abs(off)))
+        clean = np.abs(off) <= limit
+        kept = np.convolve(~clean, np.ones(2 * reach + 1), "same") < 0.5
+        if kept.sum() < _LEAST_TO_LEARN // 2:
+            return np.zeros(len(speed))
+    known = dt <= _GAP * np.median(dt)
+    known[:reach] = known[-reach:] = False
+    return np.asarray(np.where(known, off * dt, 0.0))
+
+
+def _least(step: Array) -> float:
+    """The smallest fault that is looked for (mm): some counts of the encoder."""
+    moved = np.abs(step[step != 0])
+    quantum = float(np.percentile(moved, 1)) if _counts(moved) else 0.0
+    return max(_QUANTA * quantum, _LEAST_MM)
+
+
 def _threshold(dt: Array, step: Array) -> float:
     speed = step / dt
     bend = (speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * dt[1:-1]
     noise = 1.4826 * float(np.median(np.abs(bend - np.median(bend))))
-    moved = np.abs(step[step != 0])
-    quantum = float(np.percentile(moved, 1)) if _counts(moved) else 0.0
-    return max(_NOISES * noise, _QUANTA * quantum, _LEAST_MM)
+    return max(_NOISES * noise, _least(step))
 
 
 def _counts(moved: Array) -> bool:

@@ -215,6 +215,21 @@ def test_hard_but_real_motion_is_no_jump() -> None:
         assert encoder_faults(t, counts) == []
 
 
+def test_a_jump_is_found_under_a_hunting_servo() -> None:
+    """0.1 mm RMS at 15 Hz: jumps of 50 um at 1 kHz and 0.5 mm at 100 Hz stand out, none besides."""
+    for rate, size in ((1000, 0.05), (100, 0.5)):
+        rng = np.random.default_rng(7)
+        t = np.arange(0, 2, 1 / rate)
+        noise = 0.001 * rng.standard_normal(len(t))
+        position = 280 * t + 0.14 * np.sin(2 * np.pi * 15 * t) + noise
+        assert encoder_faults(t, position) == []
+        at = len(t) // 3
+        position[at:] += size
+        (fault,) = encoder_faults(t, position)
+        assert fault.t_s == t[at]
+        assert fault.size_mm == pytest.approx(size, rel=0.5)
+
+
 # --- accelerometers ----------------------------------------------------------------------------
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
+from telerig.estimator.sensor_checks import check_sensors
 from telerig.estimator.smoother.smooth import smooth
 from telerig.estimator.track_detect import read_batch
 from telerig.estimator.tracks import Tracks, load_tracks
@@ -43,8 +45,10 @@ def smooth_run(
     """
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
+    warnings = check_sensors(run, tracks=followed, calibration=calibration)
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
     found = smooth(followed, calibration, stage=run, model=model, progress=percent)
+    found = replace(found, summary={**found.summary, "warnings": warnings})
     tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
     record = run_record(
         "smooth", run.path, [*tables, source, *inputs], {"model": model},

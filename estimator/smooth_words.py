@@ -31,4 +31,5 @@ def smoothing_words(found: Smoothing) -> str:
             "  position good to {:.3g}, {:.3g}, {:.3g} um (1 sd, x y z, median)".format(*sd)
             + ", velocity to {:.2g}, {:.2g}, {:.2g} mm/s".format(*speed)
         )
+    lines += [f"  warning: {warning}" for warning in found.summary.get("warnings", [])]
     return "\n".join(lines)

@@ -20,10 +20,9 @@ def smoothing_words(found: Smoothing) -> str:
         said = verdict.get("words", [])
         lines += [f"  {word}" for word in ([said] if isinstance(said, str) else said)]
     table = found.trajectories
-    lines.append(
-        f"{found.summary['bubbles']} bubbles over {found.summary['frames']} frames, priors: "
-        f"{found.model.name}"
-    )
+    many = found.summary["bubbles"]
+    bubbles = "1 bubble" if many == 1 else f"{many} bubbles"
+    lines.append(f"{bubbles} over {found.summary['frames']} frames, priors: {found.model.name}")
     if len(table) and "sx_mm" in table:
         sd = [1000 * float(np.median(table[f"s{x}_mm"])) for x in "xyz"]
         speed = [float(np.median(table[f"sv{x}_mm_s"])) for x in "xyz"]

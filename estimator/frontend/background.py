@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import DetectionError, InputError
-from telerig.estimator.frontend.background_layers import Layers, crop_of_lab, fit_layers
+from telerig.estimator.frontend.background_layers import Layers, fit_layers
+from telerig.estimator.frontend.background_shift import crop_of_lab
 from telerig.estimator.frontend.background_single import level_of_image
 
 Array = NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -54,6 +55,10 @@ def smooth_run(
         "smooth", run.path, [*tables, source, *inputs], {"model": model},
         {"smooth": time.perf_counter() - begun},
     )  # fmt: skip
+    tracked = source.parent / "run.json"
+    if tracked.is_file():
+        before = json.loads(tracked.read_bytes())
+        record["tracks"] = before.get("tracks", before)
     with atomic_folder(folder) as staged:
         found.save(staged)
         write_json_atomic(staged / "run.json", record)

@@ -104,10 +104,9 @@ class DetectionStore:
         self.batches = list(pairwise(edges))
         state = {"fingerprint": fingerprint, "batch": size}
         mark = folder / "work.json"
-        if not (mark.is_file() and mark.read_text(encoding="utf-8").strip() == json.dumps(state)):
+        if not (mark.is_file() and json.loads(mark.read_bytes()) == state):
             shutil.rmtree(folder, ignore_errors=True)
             write_json_atomic(mark, state)
-            mark.write_text(json.dumps(state), encoding="utf-8")
 
     def path(self, batch: tuple[int, int]) -> Path:
         return self.folder / f"detections-{batch[0]:07d}.csv"

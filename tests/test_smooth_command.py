@@ -43,6 +43,8 @@ def test_the_command_writes_the_contract_and_beats_naive(data: Path) -> None:
     summary = json.loads((out / "smoothing.json").read_text(encoding="utf-8"))
     assert summary["verdict"] in ("RESOLVED", "PARTIAL", "UNRESOLVED")
     assert summary["verdict"] in result.output
+    record = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    assert (record["command"], record["tracks"]["command"]) == ("smooth", "track")
     trajectories = pd.read_csv(out / "trajectories.csv")
     assert list(trajectories["frame"]) == list(range(40))
     truth = pd.read_csv(data / "truth" / "runs" / "rise" / "bubbles.csv")

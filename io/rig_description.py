@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import Literal
 
 from telerig.errors import InputError
+from telerig.io.record_description import DeviceDescription
 from telerig.rig.target import Polarity, Target
 
 Vector = tuple[float, float, float]
@@ -87,6 +88,7 @@ class RigDescription:
 
     second_from_first_rotvec_deg : nominal rotation, decides the mirror twin; None if not given.
     stage, references : None when the file has no such table.
+    devices : sensors on serial lines, by name.
     """
 
     name: str
@@ -97,6 +99,7 @@ class RigDescription:
     accelerometers: Mapping[str, AccelerometerDescription] = field(default_factory=dict)
     references: ReferencesDescription | None = None
     walls: Mapping[str, WallDescription] = field(default_factory=dict)
+    devices: Mapping[str, DeviceDescription] = field(default_factory=dict)
 
     @property
     def first(self) -> str:

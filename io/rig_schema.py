@@ -46,6 +46,7 @@ TOP_LEVEL = [
     "target",
     "stage",
     "accelerometers",
+    "devices",
     "references",
     "walls",
 ]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
+from telerig.io.record_description import DeviceDescription
 from telerig.io.rig_description import (
     SCHEMA,
     AccelerometerDescription,
@@ -34,6 +36,7 @@ def rig_toml(rig: RigDescription) -> str:
         blocks.append(_block("stage", _stage(rig.stage, rig.first)))
     for sensor in rig.accelerometers.values():
         blocks.append(_block(f"accelerometers.{_key(sensor.name)}", _accelerometer(sensor)))
+    blocks += [_block(f"devices.{_key(d.name)}", _device(d)) for d in rig.devices.values()]
     if rig.references is not None:
         r = rig.references
         keys = ("kind", "polarity", "dot_diameter_mm")
@@ -103,6 +106,12 @@ def _accelerometer(sensor: AccelerometerDescription) -> list[Line]:
         ("noise_density_ug_sqrt_hz", sensor.noise_density_ug_sqrt_hz, ""),
         ("bias_sigma_m_s2", sensor.bias_sigma_m_s2, ""),
     ]
+
+
+def _device(device: DeviceDescription) -> list[Line]:
+    usual = {f.name: f.default for f in fields(device)}
+    given = {key: getattr(device, key) for key in usual if key != "name"}
+    return [(key, value, "") for key, value in given.items() if value != usual[key]]
 
 
 def _wall(wall: WallDescription) -> list[Line]:

@@ -18,6 +18,7 @@ from telerig.io.rig_description import (
     RigDescription,
     suggestion,
 )
+from telerig.io.rig_devices import devices_from_tables
 from telerig.io.rig_parts import (
     accelerometers_from_tables,
     references_from_table,
@@ -138,6 +139,7 @@ def _description(raw: dict[str, Any], name: str, problems: list[Problem]) -> Rig
     accelerometers = accelerometers_from_tables(raw, names, problems)
     references = references_from_table(raw, problems)
     walls = walls_from_tables(raw, cameras, problems)
+    devices = devices_from_tables(raw, names, problems)
     if problems or target is None:
         return None
     return RigDescription(
@@ -149,6 +151,7 @@ def _description(raw: dict[str, Any], name: str, problems: list[Problem]) -> Rig
         accelerometers=accelerometers,
         references=references,
         walls=walls,
+        devices=devices,
     )
 
 

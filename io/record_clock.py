@@ -1,0 +1,249 @@
+"""A device's clock on the host's: one-way stamps, wraps, restarts, stamps that cannot be.
+
+The host sees reading i at h_i = a + b d_i + delay_i, with d_i the device's own stamp and
+delay_i >= 0 the wait in the device, the adapter (16 ms) and the host. The line that lies below
+every (d_i, h_i) and is nearest to them in the sum of distances is the estimate: the linear
+programme of Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
+measurements", INFOCOM 1999, eq. 7-8, solved on the lower convex hull (Zhang, Liu, Xia, "Clock
+synchronization algorithms for network measurements", INFOCOM 2002). The least delay itself stays
+in a: one-way stamps cannot tell it from an offset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+RESTART_S = 0.5
+"""A stamp further than this from where it is expected belongs to another count."""
+_FEWEST = 5
+"""Readings in a row that a restarted clock must give; fewer are wrong stamps."""
+_WINDOWS = 64
+_SHORT_S = 10.0
+
+
+@dataclass(frozen=True)
+class ClockFit:
+    """host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6).
+
+    drift_ppm : how much faster than the host's the device's clock runs. sd_* : from the scatter
+    of the least delays in parts of the record. delay_*_ms : of the readings above the least.
+    wander_us : how far the least delays of the parts are apart after the fit.
+    """
+
+    device_mean_s: float
+    host_mean_s: float
+    offset_s: float
+    drift_ppm: float
+    sd_offset_us: float
+    sd_drift_ppm: float
+    delay_median_ms: float
+    delay_max_ms: float
+    wander_us: float
+    readings: int
+
+    def host_s(self, device_s: Array) -> Array:
+        """Host time of device time (unwrapped, of this fit's count)."""
+        slope = 1 / (1 + 1e-6 * self.drift_ppm)
+        return self.host_mean_s + self.offset_s + (device_s - self.device_mean_s) * slope
+
+
+@dataclass(frozen=True)
+class ClockRecord:
+    """t_s : (N,) host time of each reading, NaN where its stamp cannot be; `wrong` of them.
+
+    segment : (N,) which fit; -1 for wrong stamps. wraps : how often the counter began anew.
+    """
+
+    t_s: Array
+    segment: Ints
+    fits: tuple[ClockFit, ...]
+    wraps: int
+    wrong: int
+
+
+def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockRecord:
+    """Host times of readings stamped by a device.
+
+    host_s : (N,) arrival, not decreasing. device_s : (N,) the device's stamps in seconds, modulo
+    ``wrap_s`` (0: never wraps). A stamp that is neither between its neighbours nor the first of a
+    restarted clock is wrong; so is one that repeats its predecessor.
+    """
+    t_s = np.full(len(host_s), np.nan)
+    segment = np.full(len(host_s), -1, np.int64)
+    kept = _plausible(host_s, device_s, wrap_s)
+    if not kept.size:
+        return ClockRecord(t_s, segment, (), 0, len(host_s))
+    unwrapped = unwrap(host_s[kept], device_s[kept], wrap_s)
+    number = np.cumsum(_breaks(host_s[kept], unwrapped)) - 1
+    wraps = int(np.sum(np.diff(device_s[kept]) < -wrap_s / 2)) if wrap_s else 0
+    fits = _fits(host_s[kept], unwrapped, number)
+    for k, fit in enumerate(fits):
+        own = number == k
+        t_s[kept[own]] = fit.host_s(unwrapped[own])
+    segment[kept] = number
+    return ClockRecord(t_s, segment, fits, wraps, len(host_s) - len(kept))
+
+
+def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
+    """The count continued past its wraps, as many as the host's time between readings says."""
+    if not wrap_s or not len(device_s):
+        return np.array(device_s)
+    ahead = device_s - host_s
+    turns = -np.round(np.diff(ahead, prepend=ahead[:1]) / wrap_s)
+    return np.asarray(device_s + wrap_s * np.cumsum(turns))
+
+
+def lower_line(x: Array, y: Array) -> tuple[float, float]:
+    """(y at the mean of x, slope) of the line below all points and nearest to them in the sum."""
+    hull = _lower_hull(x, y)
+    middle = float(np.mean(x))
+    if len(hull) < 2:
+        return float(y[hull[0]]), 0.0
+    right = int(np.clip(np.searchsorted(x[hull], middle), 1, len(hull) - 1))
+    i, j = hull[right - 1], hull[right]
+    slope = float((y[j] - y[i]) / (x[j] - x[i]))
+    return float(y[i] + slope * (middle - x[i])), slope
+
+
+def _lower_hull(x: Array, y: Array) -> list[int]:
+    """Indices of the lower convex hull, x increasing (Andrew's chain)."""
+    hull: list[int] = []
+    for k in range(len(x)):
+        while len(hull) > 1:
+            i, j = hull[-2], hull[-1]
+            if (x[j] - x[i]) * (y[k] - y[i]) > (y[j] - y[i]) * (x[k] - x[i]):
+                break
+            hull.pop()
+        hull.append(k)
+    return hull
+
+
+def _plausible(host_s: Array, device_s: Array, wrap_s: float) -> Ints:
+    """Indices of readings whose stamps go on from their neighbours'."""
+    kept: Ints = np.arange(len(host_s))
+    while kept.size:
+        u = unwrap(host_s[kept], device_s[kept], wrap_s)
+        starts = np.flatnonzero(_breaks(host_s[kept], u))
+        length = np.diff(np.append(starts, kept.size))
+        good = np.repeat(length >= min(_FEWEST, kept.size), length)
+        good &= _in_order(u, np.repeat(np.arange(len(starts)), length))
+        if good.all():
+            break
+        kept = kept[good]
+    return kept
+
+
+def _breaks(host_s: Array, u: Array) -> Bools:
+    """(N,) where a count begins: its stamp fits neither the one before nor the host's time."""
+    step = np.diff(u)
+    apart = np.abs(step - np.diff(host_s)) > RESTART_S
+    follows = (step > 0) & (step < RESTART_S)
+    return np.concatenate([[True], apart & ~follows])
+
+
+def _in_order(u: Array, part: Ints) -> Bools:
+    """False for a stamp that jumps ahead of its successor, falls back, or repeats."""
+    good = np.ones(len(u), bool)
+    if len(u) < 2:
+        return good
+    same = part[1:] == part[:-1]
+    falls = (u[1:] <= u[:-1]) & same
+    before = np.concatenate([[-np.inf], np.where(same[:-1], u[:-2], -np.inf)])
+    spike = falls & (u[1:] > before) & (u[1:] < u[:-1])
+    good[:-1] &= ~spike
+    good[1:] &= ~(falls & ~spike)
+    return good
+
+
+def _fits(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, ...]:
+    """One fit for each count; short ones take the drift of the longest."""
+    parts = [number == k for k in range(int(number[-1]) + 1)]
+    spans = [float(np.ptp(device_s[p])) for p in parts]
+    longest = int(np.argmax(spans))
+    best = fit_clock(host_s[parts[longest]], device_s[parts[longest]])
+    return tuple(
+        best
+        if k == longest
+        else fit_clock(
+            host_s[p], device_s[p], None if spans[k] > _SHORT_S else best.drift_ppm
+        )
+        for k, p in enumerate(parts)
+    )
+
+
+def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) -> ClockFit:
+    """The line below all stamps of one count, ``device_s`` increasing; ``drift_ppm`` if known."""
+    x_mean, y_mean = float(np.mean(device_s)), float(np.mean(host_s))
+    x, late = device_s - x_mean, (host_s - y_mean) - (device_s - x_mean)
+    edge, least = _least_delays(x, late)
+    used = np.flatnonzero(~_too_early(x, late, edge, least))
+    if drift_ppm is None and len(used) > 1:
+        at_mean, slope = _support(x[used], late[used])
+    else:
+        slope = 1 / (1 + 1e-6 * (drift_ppm or 0.0)) - 1
+        at_mean = float(np.min(late[used] - slope * x[used]))
+    delay = late[used] - at_mean - slope * x[used]
+    low = np.array([np.min(p) for p in np.array_split(delay, _parts(delay.size))])
+    scatter = float(np.std(low)) if len(low) > 1 else float(np.median(delay))
+    span = max(float(np.ptp(x)), 1e-9)
+    return ClockFit(
+        device_mean_s=x_mean,
+        host_mean_s=y_mean,
+        offset_s=at_mean,
+        drift_ppm=1e6 * (1 / (1 + slope) - 1),
+        sd_offset_us=1e6 * scatter,
+        sd_drift_ppm=1e6 * scatter * float(np.sqrt(12 / len(low))) / span,
+        delay_median_ms=1e3 * float(np.median(delay)),
+        delay_max_ms=1e3 * float(np.max(delay)),
+        wander_us=1e6 * float(np.ptp(low)),
+        readings=len(host_s),
+    )
+
+
+def _support(x: Array, late: Array) -> tuple[float, float]:
+    """`lower_line` about x = 0, of the few points that can touch it."""
+    edge, least = _least_delays(x, late, parts=4 * _WINDOWS)
+    _, slope = lower_line(x[edge], least)
+    height = late - slope * x
+    near = np.flatnonzero(height <= np.min(height) + np.ptp(least - slope * x[edge]) + 1e-9)
+    hull = np.array(_lower_hull(x[near], late[near]))
+    points = near[hull]
+    if len(points) < 2:
+        return float(late[points[0]] - slope * x[points[0]]), slope
+    right = int(np.clip(np.searchsorted(x[points], 0.0), 1, len(points) - 1))
+    i, j = points[right - 1], points[right]
+    slope = float((late[j] - late[i]) / (x[j] - x[i]))
+    return float(late[i] - slope * x[i]), slope
+
+
+def _parts(count: int) -> int:
+    return int(np.clip(count // 20, 1, _WINDOWS))
+
+
+def _least_delays(x: Array, late: Array, parts: int | None = None) -> tuple[Ints, Array]:
+    """Index and value of the least ``late`` in each of the parts of the record."""
+    bounds = np.array_split(np.arange(len(x)), min(parts or _parts(len(x)), len(x)))
+    edge = np.array([p[0] + int(np.argmin(late[p])) for p in bounds if p.size])
+    return edge, late[edge]
+
+
+def _too_early(x: Array, late: Array, edge: Ints, least: Array) -> Bools:
+    """Readings that came before they were made: wrong stamps that pass for right ones.
+
+    A part's least delay may scatter by what most of them do; a single one far below is a fault.
+    """
+    if len(edge) < 8:
+        return np.zeros(len(x), bool)
+    i, j = np.triu_indices(len(edge), len(edge) // 2)
+    slope = float(np.median((least[j] - least[i]) / (x[edge[j]] - x[edge[i]])))
+    level = least - slope * x[edge]
+    middle = float(np.median(level))
+    spread = 1.4826 * float(np.median(np.abs(level - middle)))
+    return np.asarray(late - slope * x < middle - max(8 * spread, 2e-4))

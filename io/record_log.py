@@ -1,0 +1,209 @@
+"""The raw log of a recording: every byte that a port gave, with the host's time, append-only.
+
+A file is `MAGIC`, one header of JSON, then entries: marker, kind, device, monotonic time (ns),
+length, payload, CRC-32 of all of it but the marker. A torn tail, or a damaged stretch, costs its
+own entries and no others.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from telerig.errors import InputError
+from telerig.io.record_description import DeviceDescription
+
+MAGIC = b"telerig recording 1\n"
+MARKER = b"\xa7\x1e\xc0\x9d"
+_HEAD = struct.Struct("<BBqI")
+_CRC = struct.Struct("<I")
+_LEAST = len(MARKER) + _HEAD.size + _CRC.size
+_BLOCK = 1 << 22
+
+RECEIVED, SENT, LOST, FOUND, END = 1, 2, 3, 4, 5
+"""Kinds of entry: bytes in, bytes out, line lost, line found again, recording ended."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    kind: int
+    device: int
+    time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class LogHeader:
+    """start_ns : host's monotonic time that is 0 s of the run; started : the wall clock then."""
+
+    start_ns: int
+    started: str
+    cameras: tuple[str, ...]
+    devices: tuple[DeviceDescription, ...]
+
+
+class RawLog:
+    """Writes a log; `append` costs nothing much, `flush` brings it all to the disk."""
+
+    def __init__(self, path: Path, header: LogHeader) -> None:
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: BinaryIO = path.open("xb", buffering=0)
+        except FileExistsError as error:
+            raise InputError(
+                "exists, and a recording is never written over",
+                where=str(path),
+                todo="give the new run another name, or move this one away",
+            ) from error
+        except OSError as error:
+            raise log_error(path, error) from error
+        text = json.dumps(asdict(header), ensure_ascii=False).encode()
+        self._waiting = [MAGIC + _CRC.pack(len(text)) + text + _CRC.pack(zlib.crc32(text))]
+        self.bytes = 0
+        self.flush()
+
+    def append(self, entry: Entry) -> None:
+        self._waiting.append(packed(entry))
+
+    def flush(self) -> None:
+        """Write what is waiting and have the disk confirm it. Raises InputError."""
+        if not self._waiting:
+            return
+        data, self._waiting = b"".join(self._waiting), []
+        try:
+            written = 0
+            while written < len(data):
+                written += self._file.write(memoryview(data)[written:])
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise log_error(self.path, error) from error
+        self.bytes += len(data)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> RawLog:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def packed(entry: Entry) -> bytes:
+    """The bytes of one entry."""
+    head = _HEAD.pack(entry.kind, entry.device, entry.time_ns, len(entry.data))
+    crc = zlib.crc32(entry.data, zlib.crc32(head))
+    return b"".join((MARKER, head, entry.data, _CRC.pack(crc)))
+
+
+def log_error(path: Path, error: OSError) -> InputError:
+    """The error of a log that cannot be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return InputError(
+            "the disk is full: the recording ends here",
+            where=str(path),
+            todo="make room; what was recorded until now is read with "
+            f"`telerig record --replay {path}`",
+        )
+    return InputError(
+        f"cannot be written: {error.strerror or error}",
+        where=str(path),
+        todo="choose a folder that can be written",
+    )
+
+
+def read_header(path: Path) -> LogHeader:
+    """The log's header. Raises InputError for a file that is no log."""
+    return _open(path)[0]
+
+
+def read_log(path: Path) -> Iterator[Entry]:
+    """Every sound entry, in the order of writing; damage is left out (see `damaged_bytes`)."""
+    header, start = _open(path)
+    for piece in _pieces(path, start):
+        if isinstance(piece, Entry) and piece.device < max(len(header.devices), 1):
+            yield piece
+
+
+def damaged_bytes(path: Path) -> int:
+    """How many bytes of the log belong to no sound entry: a torn tail, a damaged disk."""
+    _, start = _open(path)
+    return sum(p for p in _pieces(path, start) if isinstance(p, int))
+
+
+def _open(path: Path) -> tuple[LogHeader, int]:
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(len(MAGIC) + _CRC.size)
+            if not head.startswith(MAGIC) or len(head) < len(MAGIC) + _CRC.size:
+                raise _no_log(path, "is no recording of telerig")
+            (length,) = _CRC.unpack(head[-_CRC.size :])
+            text = stream.read(length)
+            crc = stream.read(_CRC.size)
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror}", where=str(path), todo="check the path"
+        ) from error
+    if len(crc) < _CRC.size or _CRC.unpack(crc)[0] != zlib.crc32(text):
+        raise _no_log(path, "has a damaged header, so its devices are not known")
+    return _header(json.loads(text)), len(head) + length + _CRC.size
+
+
+def _no_log(path: Path, what: str) -> InputError:
+    return InputError(what, where=str(path), todo="give the recording.raw of a run")
+
+
+def _header(raw: Mapping[str, Any]) -> LogHeader:
+    devices = tuple(DeviceDescription(**d) for d in raw["devices"])
+    devices = tuple(replace(d, cameras=tuple(d.cameras)) for d in devices)
+    return LogHeader(raw["start_ns"], raw["started"], tuple(raw["cameras"]), devices)
+
+
+def _pieces(path: Path, start: int) -> Iterator[Entry | int]:
+    """Entries, and the lengths of damaged stretches between them."""
+    with path.open("rb") as stream:
+        stream.seek(start)
+        data, at = b"", 0
+        while True:
+            block = stream.read(_BLOCK)
+            data, at = data[at:] + block, 0
+            while (found := _entry(data, at, final=not block)) is not None:
+                piece, at = found
+                yield piece
+            if not block:
+                return
+
+
+def _entry(data: bytes, at: int, *, final: bool) -> tuple[Entry | int, int] | None:
+    """The piece at ``at`` and where the next begins; None: more data are needed, or the end."""
+    left = len(data) - at
+    if left == 0 or (left < _LEAST and not final):
+        return None
+    if left >= _LEAST and data.startswith(MARKER, at):
+        body = at + len(MARKER)
+        kind, device, time_ns, length = _HEAD.unpack_from(data, body)
+        end = body + _HEAD.size + length
+        if end + _CRC.size <= len(data):
+            if _CRC.unpack_from(data, end)[0] == zlib.crc32(memoryview(data)[body:end]):
+                payload = data[body + _HEAD.size : end]
+                return Entry(kind, device, time_ns, payload), end + _CRC.size
+        elif not final and length <= _BLOCK:
+            return None
+    following = data.find(MARKER, at + 1)
+    if following < 0:
+        following = len(data) if final else max(at + 1, len(data) - len(MARKER) + 1)
+    return following - at, following

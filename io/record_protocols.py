@@ -1,0 +1,236 @@
+"""What the bytes of a serial line say: one adapter per protocol, all of them fed in any pieces."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol as Interface
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.record_description import DeviceDescription, Kind
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LONGEST_LINE = 4096
+"""Bytes without a line's end after which they are taken for garbage."""
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_STREAMS: dict[Kind, str] = {
+    "encoder": r"(?P<t>\d+),(?P<counts>[+-]?\d+)(?:,\w*)?",
+    "accelerometer": rf"(?P<t>\d+),(?P<ax>{_NUMBER}),(?P<ay>{_NUMBER}),(?P<az>{_NUMBER})",
+    "frames": r"(?P<t>\d+),(?P<frame>\d+)",
+}
+_ZABER = r"@\d\d \d(?: \d\d)? OK (?:IDLE|BUSY) \S\S (?P<counts>-?\d+)(?::[0-9A-F]{2})?"
+_GRBL_AXES = {axis: rf"(?:{_NUMBER},){{{i}}}" for i, axis in enumerate("xyz")}
+
+SYNC = b"\xa5\x5a"
+"""Begin of a binary packet; then u32 stamp, the values, and the sum of all bytes before modulo 256,
+little-endian."""
+PACKETS: dict[Kind, list[tuple[str, str]]] = {
+    "encoder": [("t", "<u4"), ("counts", "<i4")],
+    "accelerometer": [("t", "<u4"), ("ax", "<i2"), ("ay", "<i2"), ("az", "<i2")],
+}
+
+
+@dataclass(frozen=True)
+class Readings:
+    """values : by the group's name, each (N,). arrived_ns : (N,) of a reading's last byte.
+
+    malformed : arrival (ns) of each line or stretch of bytes that is no reading.
+    malformed_bytes : how many bytes these have. samples : the first of them, to show.
+    """
+
+    arrived_ns: Ints
+    values: dict[str, Array]
+    malformed: Ints
+    malformed_bytes: int = 0
+    samples: tuple[bytes, ...] = ()
+
+
+class Parser(Interface):
+    """Keeps what is incomplete until the rest of it arrives."""
+
+    def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
+        """Readings that end in these (arrival_ns, bytes)."""
+
+    def cut(self) -> int:
+        """Forget what is incomplete, and that the line begins in the middle; bytes forgotten."""
+
+
+def parser(device: DeviceDescription) -> Parser:
+    """The adapter of a device, at the begin of a connection."""
+    if device.protocol == "packets":
+        return PacketParser(PACKETS[device.kind])
+    return LineParser(line_pattern(device), xor=device.checksum == "xor")
+
+
+def poll_command(device: DeviceDescription) -> bytes | None:
+    """What asks the device for one reading; None for a stream."""
+    known = {"zaber": b"/1 get pos\n", "grbl": b"?"}
+    own = device.poll.encode() if device.poll else None
+    return known.get(device.protocol, own)
+
+
+def line_pattern(device: DeviceDescription) -> str:
+    """The regular expression that one whole line, without its end, must match."""
+    if device.protocol == "regex":
+        return device.pattern or ""
+    if device.protocol == "zaber":
+        return _ZABER
+    if device.protocol == "grbl":
+        before = _GRBL_AXES[device.axis]
+        return rf"<\w+(?::\d)?\|(?:[^|>]*\|)*?MPos:{before}(?P<position_mm>{_NUMBER})[^>]*>"
+    return _STREAMS[device.kind]
+
+
+def xor_checksum(line: bytes) -> bytes:
+    """`*hh` of a line: all its bytes exclusive-or'ed, in hexadecimal (NMEA 0183)."""
+    total = 0
+    for byte in line:
+        total ^= byte
+    return b"*%02X" % total
+
+
+class LineParser:
+    """Lines that end in LF (CR before it is dropped), each matched whole against an expression."""
+
+    def __init__(self, pattern: str, *, xor: bool = False) -> None:
+        self._match = re.compile(pattern.encode()).fullmatch
+        self._groups = list(re.compile(pattern.encode()).groupindex)
+        self._xor = xor
+        self._tail = b""
+        self._begun = False
+
+    def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
+        data = self._tail + b"".join(piece for _, piece in chunks)
+        ends = np.cumsum([len(self._tail), *(len(piece) for _, piece in chunks)])[1:]
+        stamps = np.array([stamp for stamp, _ in chunks], np.int64)
+        lines = data.split(b"\n")
+        self._tail = lines.pop()
+        if len(self._tail) > LONGEST_LINE:
+            lines.append(self._tail)
+            self._tail = b""
+        if not lines:
+            return self._readings([], np.zeros(0, np.int64), [])
+        last = np.cumsum([len(line) + 1 for line in lines]) - 1
+        arrived = stamps[np.minimum(np.searchsorted(ends, last, "right"), len(stamps) - 1)]
+        if not self._begun:
+            self._begun, lines, arrived = True, *self._first(lines, arrived)
+        return self._readings(lines, arrived, [self._found(line) for line in lines])
+
+    def cut(self) -> int:
+        forgotten, self._tail, self._begun = len(self._tail), b"", False
+        return forgotten
+
+    def _first(self, lines: list[bytes], arrived: Ints) -> tuple[list[bytes], Ints]:
+        """Without the first line if the connection began in its middle."""
+        return (lines, arrived) if self._found(lines[0]) else (lines[1:], arrived[1:])
+
+    def _found(self, line: bytes) -> re.Match[bytes] | None:
+        line = line.rstrip(b"\r")
+        if self._xor:
+            line, check = line[:-3], line[-3:]
+            if check != xor_checksum(line):
+                return None
+        return self._match(line)
+
+    def _readings(
+        self, lines: list[bytes], arrived: Ints, found: list[re.Match[bytes] | None]
+    ) -> Readings:
+        good = np.array([m is not None for m in found], bool)
+        cells = [m.group(*self._groups, 0) for m in found if m]
+        columns = list(zip(*cells)) or [()] * len(self._groups)
+        bad = [line for line, m in zip(lines, found) if m is None and line.strip(b"\r")]
+        empty = np.array([not line.strip(b"\r") for line in lines], bool)
+        return Readings(
+            arrived[good],
+            {name: _numbers(column) for name, column in zip(self._groups, columns)},
+            arrived[~good & ~empty],
+            sum(map(len, bad)),
+            tuple(bad[:3]),
+        )
+
+
+def _numbers(cells: Sequence[bytes | None]) -> Array:
+    """(N,) numbers; NaN for an empty group and for what the user's own group lets through."""
+    try:
+        return np.array(list(map(float, cells)))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return np.array([_number(cell) for cell in cells])
+
+
+def _number(cell: bytes | None) -> float:
+    try:
+        return float(cell or b"nan")
+    except ValueError:
+        return float("nan")
+
+
+class PacketParser:
+    """Binary packets: `SYNC`, fields, sum of bytes; found again after any garbage."""
+
+    def __init__(self, fields: list[tuple[str, str]]) -> None:
+        self._type = np.dtype([("sync", "S2"), *fields, ("sum", "u1")])
+        self._tail = b""
+        self._begun = False
+
+    def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
+        data = self._tail + b"".join(piece for _, piece in chunks)
+        ends = np.cumsum([len(self._tail), *(len(piece) for _, piece in chunks)])[1:]
+        stamps = np.array([stamp for stamp, _ in chunks], np.int64)
+        size = self._type.itemsize
+        starts = self._packets(data)
+        done = max(int(starts[-1]) + size if starts.size else 0, len(data) - size + 1)
+        done = min(done, len(data))
+        self._tail = data[done:]
+        rows = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(size)]
+        table = np.ascontiguousarray(rows).view(self._type)[:, 0]
+        names = [n for n in self._type.names or () if n not in ("sync", "sum")]
+        gaps = _between(starts, size, done)
+        if gaps and gaps[0][0] == 0 and not self._begun:
+            gaps = gaps[1:]
+        self._begun = self._begun or bool(starts.size)
+        return Readings(
+            _arrival(starts + size - 1, ends, stamps),
+            {name: table[name].astype(float) for name in names},
+            _arrival(np.array([b - 1 for _, b in gaps], np.int64), ends, stamps),
+            sum(b - a for a, b in gaps),
+            tuple(data[a:b] for a, b in gaps[:3]),
+        )
+
+    def cut(self) -> int:
+        forgotten, self._tail, self._begun = len(self._tail), b"", False
+        return forgotten
+
+    def _packets(self, data: bytes) -> Ints:
+        """Where sound packets start; of overlapping ones the first."""
+        size, raw = self._type.itemsize, np.frombuffer(data, np.uint8)
+        if len(raw) < size:
+            return np.zeros(0, np.int64)
+        begin = raw[: len(raw) - size + 1]
+        where = np.flatnonzero((begin == SYNC[0]) & (raw[1 : len(begin) + 1] == SYNC[1]))
+        total = np.concatenate([[0], np.cumsum(raw, dtype=np.int64)])
+        last = where + size - 1
+        where = where[(total[last] - total[where]) % 256 == raw[last]]
+        kept, free = [], 0
+        for start in where.tolist():
+            if start >= free:
+                kept.append(start)
+                free = start + size
+        return np.array(kept, np.int64)
+
+
+def _between(starts: Ints, size: int, done: int) -> list[tuple[int, int]]:
+    """The stretches before ``done`` that belong to no packet."""
+    begin, end = [0, *(starts + size).tolist()], [*starts.tolist(), done]
+    return [(a, b) for a, b in zip(begin, end) if b > a]
+
+
+def _arrival(position: Ints, ends: Ints, stamps: Ints) -> Ints:
+    if not len(stamps) or not len(position):
+        return np.zeros(0, np.int64)
+    return stamps[np.minimum(np.searchsorted(ends, position, "right"), len(stamps) - 1)]

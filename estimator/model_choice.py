@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,11 @@ from telerig.estimator.graph import solve
 from telerig.estimator.model_start import model_start
 from telerig.estimator.problem import Problem
 from telerig.factors.projection import State, pixels, whitened_error, whitened_residuals
+from telerig.io.parallel import ordered_map, standing_by
 from telerig.rig.pose import rotation_from_rotvec
 
 Array = NDArray[np.float64]
+Fit = tuple[str, Problem, State, float]
 
 LADDER = (
     "none", "radial", "tangential", "kappa", "kappa+radial", "kappa+tangential", "kappa+brown",
@@ -93,19 +96,24 @@ def climb(problem: Problem, start: State, models: tuple[str, ...] = LADDER) -> l
     A model whose own fit is `HOPELESS` times worse than the best is not asked to predict: its
     ``held_out`` is infinite.
     """
-    fits = []
-    for model in models:
-        candidate = problem.with_model(model)
-        begin = model_start(candidate, start)
-        solution = solve(candidate, begin, max_iterations=40, relative=1e-7)
-        fits.append((model, candidate, solution.state, solution.cost))
+    processes = standing_by()
+    fits = list(ordered_map(partial(_fit, problem, start), models, processes))
     best = min(cost for *_, cost in fits)
-    return [_rung(*fit, predict=fit[3] < HOPELESS * best) for fit in fits]
+    return list(ordered_map(partial(_rung, best), fits, processes))
 
 
-def _rung(model: str, problem: Problem, state: State, cost: float, *, predict: bool) -> Rung:
+def _fit(problem: Problem, start: State, model: str) -> Fit:
+    candidate = problem.with_model(model)
+    begin = model_start(candidate, start)
+    solution = solve(candidate, begin, max_iterations=40, relative=1e-7)
+    return model, candidate, solution.state, solution.cost
+
+
+def _rung(best: float, fit: Fit) -> Rung:
+    model, problem, state, cost = fit
     obs = problem.observations()
     views = len(problem.views)
+    predict = cost < HOPELESS * best
     per_view = held_out_chi2(problem, state) if predict else np.full(views, np.inf)
     count = sum(len(f) for f in problem.free)
     rows = 2 * len(obs)

@@ -70,6 +70,7 @@ class RawLog:
         self._waiting = [MAGIC + _CRC.pack(len(text)) + text + _CRC.pack(zlib.crc32(text))]
         self.bytes = 0
         self.flush()
+        _keep_name(path.parent)
 
     def append(self, entry: Entry) -> None:
         self._waiting.append(packed(entry))
@@ -101,6 +102,15 @@ class RawLog:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _keep_name(folder: Path) -> None:
+    """Have the disk confirm the folder's list of files, which a power cut could take back."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def packed(entry: Entry) -> bytes:

@@ -1,0 +1,96 @@
+"""Camera frames from trigger or frame-counter lines: which frame when, and which are missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.record_replay import DeviceRecord
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """(F,) t_s of the frames from 0; missing : names of cameras without it, joined by `|`.
+
+    interpolated : (F,) no line told the frame, its time lies between its neighbours'.
+    """
+
+    t_s: Array
+    missing: tuple[str, ...]
+    interpolated: Bools
+
+
+def frame_times(records: list[DeviceRecord]) -> FrameTimes:
+    """All frames that the lines tell of, the first being 0.
+
+    A frame that a counter skips is missing of its cameras, if its line was whole meanwhile; where
+    bytes were damaged or the line away, only its time is interpolated.
+    """
+    heard = [r for r in records if len(r.t_s)]
+    if not heard:
+        return FrameTimes(np.zeros(0), (), np.zeros(0, bool))
+    numbers = _aligned(heard)
+    count = 1 + max(int(n[-1]) for n in numbers)
+    t_s = np.full(count, np.nan)
+    gone: list[list[str]] = [[] for _ in range(count)]
+    for record, number in zip(reversed(heard), reversed(numbers)):
+        t_s[number] = record.t_s
+    for record, number in zip(heard, numbers):
+        for frame in _skipped(record, number, count):
+            gone[frame] += record.device.cameras
+    silent = np.isnan(t_s)
+    known = np.flatnonzero(~silent)
+    t_s[silent] = np.interp(np.flatnonzero(silent), known, t_s[known])
+    return FrameTimes(t_s, tuple("|".join(dict.fromkeys(names)) for names in gone), silent)
+
+
+def frame_numbers(t_s: Array, counter: Array | None) -> Ints:
+    """(N,) frames from 0 of a line's readings; by time where the counter cannot be right.
+
+    A counter may stand (a pause) but not run ahead of the time by more than a tenth, nor fall
+    back: then it began anew, wrapped, or was damaged.
+    """
+    if len(t_s) < 2:
+        return np.zeros(len(t_s), np.int64)
+    step_s = np.diff(t_s)
+    by_time = np.maximum(np.round(step_s / np.median(step_s)), 1)
+    if counter is None:
+        steps = by_time
+    else:
+        told = np.diff(counter)
+        sound = (told >= 1) & (told <= by_time + np.maximum(1, 0.1 * by_time))
+        steps = np.where(sound, told, by_time)
+    return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+
+
+def _aligned(records: list[DeviceRecord]) -> list[Ints]:
+    """Frame numbers of several lines, shifted so that equal numbers are equal times."""
+    numbers = [frame_numbers(r.t_s, r.values.get("frame")) for r in records]
+    first, base = records[0], numbers[0]
+    if len(records) == 1:
+        return numbers
+    period = float(np.median(np.diff(first.t_s))) if len(base) > 1 else 1.0
+    shifted = [base]
+    for record, number in zip(records[1:], numbers[1:]):
+        near = np.clip(np.searchsorted(first.t_s, record.t_s), 0, len(base) - 1)
+        apart = (record.t_s - first.t_s[near]) / period + base[near] - number
+        shifted.append(number + int(np.round(np.median(apart))))
+    lowest = min(int(n[0]) for n in shifted)
+    return [n - lowest for n in shifted]
+
+
+def _skipped(record: DeviceRecord, number: Ints, count: int) -> list[int]:
+    """Frames that the line skipped while it was whole."""
+    skipped = [*range(int(number[0])), *range(int(number[-1]) + 1, count)]
+    doubt = np.array([*record.malformed_s, *(t for away in record.away_s for t in away)])
+    for i in np.flatnonzero(np.diff(number) > 1):
+        begin, end = record.t_s[i] - 1e-3, record.t_s[i + 1] + 0.1
+        if not np.any((doubt >= begin) & (doubt <= end)):
+            skipped += range(int(number[i]) + 1, int(number[i + 1]))
+    return skipped

@@ -1,0 +1,78 @@
+"""Serial ports: which there are, opening one, and what to do when it cannot be opened."""
+
+from __future__ import annotations
+
+import errno
+import time
+from pathlib import Path
+from typing import Any
+
+from telerig.errors import InputError
+from telerig.io.record_description import DeviceDescription
+
+WAIT_S = 0.1
+"""How long a read waits for a byte before it looks whether to stop."""
+
+
+def known_ports() -> list[str]:
+    """The serial ports that the machine has now, each with what it calls itself."""
+    from serial.tools import list_ports
+
+    found = sorted(list_ports.comports(), key=lambda port: str(port.device))
+    return [
+        str(p.device) + (f" ({p.description})" if p.description not in (None, "n/a") else "")
+        for p in found
+    ]
+
+
+def open_port(device: DeviceDescription) -> Any:
+    """The open port, emptied of what it held. Raises InputError."""
+    import serial
+
+    try:
+        port = serial.serial_for_url(
+            device.port, baudrate=device.baud, timeout=WAIT_S, exclusive=True
+        )
+        port.reset_input_buffer()
+        return port
+    except (serial.SerialException, OSError, ValueError) as error:
+        raise _cannot_open(device, error) from error
+
+
+def read_chunk(port: Any) -> tuple[int, bytes]:
+    """(host's monotonic time in ns, bytes): what has come, after waiting for the first byte.
+
+    The time is taken when all of these bytes had arrived, before they are copied.
+    """
+    first = port.read(1)
+    if not first:
+        return time.monotonic_ns(), b""
+    more = port.in_waiting
+    now = time.monotonic_ns()
+    return now, first + port.read(more) if more else first
+
+
+def _cannot_open(device: DeviceDescription, error: Exception) -> InputError:
+    place = f"devices.{device.name} port {device.port}"
+    code = getattr(error, "errno", None)
+    local = "://" not in device.port
+    if code == errno.EACCES:
+        return InputError(
+            "you have no permission to open it",
+            where=place,
+            todo="sudo usermod -a -G dialout $USER (uucp on some systems), then log in again",
+        )
+    if local and (code == errno.ENOENT or not Path(device.port).exists()):
+        ports = known_ports()
+        there = "ports there are: " + ", ".join(ports) if ports else "no serial port is there"
+        return InputError(
+            "there is no such port",
+            where=place,
+            todo=f"{there}; plug the device in, or correct the port "
+            f"(rig.toml, or --port {device.name}=PORT)",
+        )
+    return InputError(
+        f"cannot be opened: {error}",
+        where=place,
+        todo="close other programs that use it; check port and baud in rig.toml",
+    )

@@ -1,0 +1,191 @@
+"""From a raw log to each device's readings in the host's time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.record_clock import ClockFit, host_times
+from telerig.io.record_description import DeviceDescription
+from telerig.io.record_log import (
+    END,
+    FOUND,
+    LOST,
+    RECEIVED,
+    SENT,
+    Entry,
+    LogHeader,
+    read_header,
+    read_log,
+)
+from telerig.io.record_protocols import Readings, parser
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_BLOCK_BYTES = 1 << 19
+TIME_DIGITS = 7
+"""Decimals of t_s in the tables: a tenth of a microsecond."""
+
+
+@dataclass(frozen=True)
+class DeviceRecord:
+    """What one device said, in the order of time.
+
+    t_s : (N,) since the begin of the recording, strictly increasing. values : (N,) each, as sent.
+    malformed_s : arrival of what could not be read. away_s : (lost, found) of each unplug; found
+    is NaN if it never came back. faults : readings left out, by the reason.
+    """
+
+    device: DeviceDescription
+    t_s: Array
+    values: dict[str, Array]
+    malformed_s: Array
+    malformed_bytes: int
+    samples: tuple[str, ...]
+    partial_bytes: int
+    away_s: tuple[tuple[float, float], ...]
+    clocks: tuple[ClockFit, ...]
+    wraps: int
+    faults: dict[str, int]
+    time_from: str
+    half_width_s: float
+
+
+@dataclass(frozen=True)
+class Replay:
+    """end_s : of the last entry. ended : the recording was closed, not cut off."""
+
+    header: LogHeader
+    records: tuple[DeviceRecord, ...]
+    end_s: float
+    ended: bool
+
+
+@dataclass
+class _Line:
+    """One device while the log is read."""
+
+    device: DeviceDescription
+    chunks: list[tuple[int, bytes]] = field(default_factory=list)
+    waiting: int = 0
+    found: list[Readings] = field(default_factory=list)
+    sent_ns: list[int] = field(default_factory=list)
+    lost_ns: list[int] = field(default_factory=list)
+    found_ns: list[int] = field(default_factory=list)
+    partial_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        self._parser = parser(self.device)
+
+    def take(self, entry: Entry) -> None:
+        if entry.kind == RECEIVED:
+            self.chunks.append((entry.time_ns, entry.data))
+            self.waiting += len(entry.data)
+            if self.waiting > _BLOCK_BYTES:
+                self.parse()
+        elif entry.kind == SENT:
+            self.sent_ns.append(entry.time_ns)
+        elif entry.kind == LOST:
+            self.cut()
+            self.lost_ns.append(entry.time_ns)
+        elif entry.kind == FOUND:
+            self.found_ns.append(entry.time_ns)
+
+    def parse(self) -> None:
+        self.found.append(self._parser.feed(self.chunks))
+        self.chunks, self.waiting = [], 0
+
+    def cut(self) -> None:
+        self.parse()
+        self.partial_bytes += self._parser.cut()
+
+
+def replay(path: Path) -> Replay:
+    """Read a raw log. The same log gives the same numbers, to the last bit.
+
+    Raises InputError for a file that is no log.
+    """
+    header = read_header(path)
+    lines = [_Line(device) for device in header.devices]
+    end_ns, ended = header.start_ns, False
+    for entry in read_log(path):
+        end_ns, ended = entry.time_ns, entry.kind == END
+        if not ended:
+            lines[entry.device].take(entry)
+    for line in lines:
+        line.cut()
+    records = tuple(_record(line, header.start_ns) for line in lines)
+    return Replay(header, records, (end_ns - header.start_ns) * 1e-9, ended)
+
+
+def _record(line: _Line, start_ns: int) -> DeviceRecord:
+    device = line.device
+    arrived = _seconds(np.concatenate([r.arrived_ns for r in line.found]), start_ns)
+    names = line.found[0].values
+    values = {name: np.concatenate([r.values[name] for r in line.found]) for name in names}
+    good = np.all([np.isfinite(v) for v in values.values()], axis=0) & np.isfinite(arrived)
+    faults = {"not a number": int(np.sum(~good))}
+    arrived, values = arrived[good], {name: v[good] for name, v in values.items()}
+    clocks: tuple[ClockFit, ...] = ()
+    wraps, half = 0, 0.0
+    if "t" in values:
+        wrap_s = 2.0**device.time_bits * device.time_unit_s if device.time_bits else 0.0
+        clock = host_times(arrived, values["t"] * device.time_unit_s, wrap_s)
+        t_s, clocks, wraps, time_from = clock.t_s - device.latency_s, clock.fits, clock.wraps, "device"
+        faults["wrong or repeated stamp"] = clock.wrong
+    elif line.sent_ns:
+        t_s, half = _between(arrived, _seconds(np.array(line.sent_ns), start_ns))
+        time_from = "middle of question and answer"
+        faults["which question it answers is not known"] = int(np.sum(np.isnan(t_s)))
+        faults["question without answer"] = len(line.sent_ns) - len(arrived)
+    else:
+        t_s, time_from = arrived - device.latency_s, "arrival"
+    t_s, values = _in_order(t_s, values, faults)
+    lost, back = _seconds(np.array(line.lost_ns), start_ns), _seconds(np.array(line.found_ns), start_ns)
+    back = np.append(back, np.full(len(lost) - len(back), np.nan))
+    return DeviceRecord(
+        device=device,
+        t_s=t_s,
+        values=values,
+        malformed_s=_seconds(np.concatenate([r.malformed for r in line.found]), start_ns),
+        malformed_bytes=sum(r.malformed_bytes for r in line.found),
+        samples=tuple(repr(s[:60]) for r in line.found for s in r.samples)[:5],
+        partial_bytes=line.partial_bytes,
+        away_s=tuple(zip(lost.tolist(), back.tolist())),
+        clocks=clocks,
+        wraps=wraps,
+        faults={reason: count for reason, count in faults.items() if count > 0},
+        time_from=time_from,
+        half_width_s=half,
+    )
+
+
+def _seconds(time_ns: NDArray[np.generic], start_ns: int) -> Array:
+    return (time_ns.astype(np.int64) - start_ns) * 1e-9
+
+
+def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
+    """(N,) middle of question and answer, NaN where they cannot be paired; median half width."""
+    asked = np.searchsorted(sent, arrived, "right") - 1
+    answers = np.bincount(np.maximum(asked, 0), minlength=len(sent))
+    clear = (asked >= 0) & (answers[asked] == 1) & ((asked < 1) | (answers[asked - 1] > 0))
+    half = (arrived - sent[asked]) / 2
+    t_s = np.where(clear, arrived - half, np.nan)
+    return t_s, float(np.median(half[clear])) if clear.any() else 0.0
+
+
+def _in_order(
+    t_s: Array, values: dict[str, Array], faults: dict[str, int]
+) -> tuple[Array, dict[str, Array]]:
+    """Rounded as in the tables, without what has no time or does not come later."""
+    t_s = np.round(t_s, TIME_DIGITS)
+    timed = np.isfinite(t_s)
+    t_s, values = t_s[timed], {name: v[timed] for name, v in values.items()}
+    later = np.ones(len(t_s), bool)
+    later[1:] = t_s[1:] > np.maximum.accumulate(t_s)[:-1]
+    faults["not later than the one before"] = int(np.sum(~later))
+    return t_s[later], {name: v[later] for name, v in values.items()}

@@ -1,0 +1,227 @@
+"""A recording while it runs: readers, the raw log, and what the screen shows of them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.record_description import DeviceDescription
+from telerig.io.record_log import END, FOUND, LOST, RECEIVED, Entry, LogHeader, RawLog
+from telerig.io.record_ports import open_port
+from telerig.io.record_protocols import Readings, parser
+from telerig.io.record_reader import Reader
+
+LOG_NAME = "recording.raw"
+FAILED_NAME = "recording.failed.raw"
+TICK_S = 0.5
+"""How often the log is brought to the disk and the status told; a power cut costs this much."""
+GARBAGE_S = 2.0
+"""A line that says nothing readable for so long has the wrong speed, or another protocol."""
+GAP_INTERVALS = 1.5
+"""A step of the device's clock of more than so many usual ones has lost readings in it."""
+
+
+class GarbageError(InputError):
+    """Nothing that comes over a line can be read."""
+
+
+@dataclass
+class DeviceStatus:
+    """What the screen shows of a device. rate_hz : readings of the last tick.
+
+    lost : readings that the device's own stamps show to be missing. gaps : steps they lie in.
+    """
+
+    name: str
+    connected: bool = True
+    readings: int = 0
+    rate_hz: float = 0.0
+    bytes: int = 0
+    malformed: int = 0
+    lost: int = 0
+    gaps: int = 0
+    unplugged: int = 0
+    sample: bytes = b""
+    _last: float = field(default=np.nan, repr=False)
+    _step: float = field(default=np.nan, repr=False)
+
+    def add(self, device: DeviceDescription, found: Readings) -> None:
+        """Count readings, and those that are missing between them."""
+        self.readings += len(found.arrived_ns)
+        self.malformed += len(found.malformed)
+        self.sample = found.samples[0] if found.samples else self.sample
+        if device.poll is None and "t" in found.values and len(found.arrived_ns):
+            self._count_gaps(found.values["t"], 2.0**device.time_bits if device.time_bits else 0.0)
+
+    def _count_gaps(self, stamps: NDArray[np.float64], wrap: float) -> None:
+        steps = np.diff(np.concatenate([[self._last], stamps]))[0 if self._last == self._last else 1 :]
+        steps = np.mod(steps, wrap) if wrap else steps
+        steps = steps[np.isfinite(steps) & (steps > 0)]
+        self._last = float(stamps[-1])
+        if steps.size >= 8:
+            self._step = float(np.median(steps))
+        wide = steps[(steps > GAP_INTERVALS * self._step) & (steps < 1e5 * self._step)]
+        self.gaps += len(wide)
+        self.lost += int(np.sum(np.round(wide / self._step) - 1))
+
+
+@dataclass(frozen=True)
+class Status:
+    """Of the whole recording, told every `TICK_S`."""
+
+    seconds: float
+    log_bytes: int
+    devices: tuple[DeviceStatus, ...]
+
+
+def record(
+    devices: Sequence[DeviceDescription],
+    folder: Path,
+    *,
+    cameras: Sequence[str] = (),
+    seconds: float | None = None,
+    stop: threading.Event | None = None,
+    tell: Callable[[Status], None] = lambda _: None,
+) -> Path:
+    """Record all devices into ``folder``/recording.raw until ``stop`` is set or time is up.
+
+    Returns the log's path; `telerig.io.record_tables.write_tables` makes the run's tables of it.
+    Raises InputError for a port that cannot be opened, a log that cannot be written, and a device
+    of which nothing readable comes in the first `GARBAGE_S`.
+    """
+    if not devices:
+        raise InputError("no device to record", todo="add a table [devices.<name>] to rig.toml")
+    stop = stop or threading.Event()
+    log_path = folder / LOG_NAME
+    ports = _open_all(devices)
+    try:
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        header = LogHeader(time.monotonic_ns(), now, tuple(cameras), tuple(devices))
+        log = RawLog(log_path, header)
+    except InputError:
+        _close_all(ports)
+        raise
+    with log:
+        try:
+            _Session(header, ports, log).run(seconds, stop, tell)
+        except GarbageError:
+            log_path.rename(folder / FAILED_NAME)
+            raise
+    return log_path
+
+
+def _open_all(devices: Sequence[DeviceDescription]) -> list[Any]:
+    ports: list[Any] = []
+    try:
+        for device in devices:
+            ports.append(open_port(device))
+    except InputError:
+        _close_all(ports)
+        raise
+    return ports
+
+
+def _close_all(ports: list[Any]) -> None:
+    for port in ports:
+        port.close()
+
+
+class _Session:
+    def __init__(self, header: LogHeader, ports: list[Any], log: RawLog) -> None:
+        self._devices, self._start_ns = header.devices, header.start_ns
+        self._log = log
+        self._queue: queue.SimpleQueue[Entry] = queue.SimpleQueue()
+        self._readers = [
+            Reader(i, device, port, self._queue.put)
+            for i, (device, port) in enumerate(zip(self._devices, ports))
+        ]
+        self._parsers = [parser(device) for device in self._devices]
+        self._status = [DeviceStatus(device.name) for device in self._devices]
+        self._suspects = set(range(len(self._devices)))
+
+    def run(
+        self, seconds: float | None, stop: threading.Event, tell: Callable[[Status], None]
+    ) -> None:
+        for reader in self._readers:
+            reader.start()
+        try:
+            self._ticks(seconds, stop, tell)
+        finally:
+            for reader in self._readers:
+                reader.stop()
+            for reader in self._readers:
+                reader.join(2.0)
+        self._drain()
+        self._log.append(Entry(END, 0, time.monotonic_ns(), b""))
+        self._log.flush()
+        tell(self._told())
+
+    def _ticks(
+        self, seconds: float | None, stop: threading.Event, tell: Callable[[Status], None]
+    ) -> None:
+        begin = due = time.monotonic()
+        end = float("inf") if seconds is None else begin + seconds
+        while not stop.is_set() and due < end:
+            due = min(due + TICK_S, end)
+            stop.wait(max(0.0, due - time.monotonic()))
+            self._drain()
+            self._check(time.monotonic() - begin)
+            tell(self._told())
+
+    def _drain(self) -> None:
+        """Bring what has come to the disk, then count it."""
+        chunks: list[list[tuple[int, bytes]]] = [[] for _ in self._devices]
+        before = [status.readings for status in self._status]
+        while not self._queue.empty():
+            entry = self._queue.get()
+            self._log.append(entry)
+            if entry.kind == RECEIVED:
+                chunks[entry.device].append((entry.time_ns, entry.data))
+            elif entry.kind == LOST:
+                self._parsers[entry.device].cut()
+                self._status[entry.device].unplugged += 1
+            elif entry.kind == FOUND:
+                self._parsers[entry.device].cut()
+        self._log.flush()
+        for i, (device, status) in enumerate(zip(self._devices, self._status)):
+            status.bytes += sum(len(data) for _, data in chunks[i])
+            status.add(device, self._parsers[i].feed(chunks[i]))
+            status.rate_hz = (status.readings - before[i]) / TICK_S
+            status.connected = self._readers[i].connected
+
+    def _check(self, elapsed_s: float) -> None:
+        """Raises what ended a reader, and InputError for a line of garbage from the start."""
+        for reader in self._readers:
+            if reader.fault is not None:
+                raise reader.fault
+        self._suspects = {i for i in self._suspects if not self._status[i].readings}
+        if elapsed_s < GARBAGE_S:
+            return
+        for i in sorted(self._suspects):
+            if self._status[i].bytes:
+                raise _garbage(self._devices[i], self._status[i])
+        self._suspects = set()
+
+    def _told(self) -> Status:
+        seconds = (time.monotonic_ns() - self._start_ns) * 1e-9
+        return Status(seconds, self._log.bytes, tuple(self._status))
+
+
+def _garbage(device: DeviceDescription, status: DeviceStatus) -> GarbageError:
+    shown = f", like {status.sample[:40]!r}" if status.sample else ""
+    return GarbageError(
+        f"{status.bytes} bytes came in {GARBAGE_S:g} s, and not one reading{shown}",
+        where=f"devices.{device.name} port {device.port}",
+        todo=f"set baud in rig.toml as the device has it (now {device.baud}); "
+        f"if the bytes look right, correct its protocol (now {device.protocol})",
+    )

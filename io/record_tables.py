@@ -1,0 +1,186 @@
+"""A run's tables from a raw log: stage.csv, accelerometer.csv, frames.csv, recording.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.atomic import atomic_folder, write_json_atomic
+from telerig.io.record_frames import FrameTimes, frame_times
+from telerig.io.record_log import damaged_bytes
+from telerig.io.record_replay import TIME_DIGITS, DeviceRecord, Replay, replay
+
+Array = NDArray[np.float64]
+
+GAP_INTERVALS = 1.5
+"""A step of more than so many usual ones is a gap."""
+_ROWS = 20_000
+_GAPS_TOLD = 200
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was made of a log: the summary is that of recording.json, rows by table's name."""
+
+    folder: Path
+    summary: dict[str, Any]
+    rows: dict[str, int]
+
+
+def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = None) -> Recording:
+    """Write the tables that the log's devices give into ``folder`` (the log's own by default).
+
+    All are written beside and renamed at the end. Raises InputError for a file that is no log,
+    or a folder that cannot be written.
+    """
+    path = Path(log)
+    out = Path(folder) if folder is not None else path.parent
+    found = replay(path)
+    of = {k: [r for r in found.records if r.device.kind == k] for k in _WRITERS}
+    frames = frame_times(of["frames"])
+    rows: dict[str, int] = {}
+    with atomic_folder(out) as beside:
+        for kind, records in of.items():
+            if not records:
+                continue
+            name, write = _WRITERS[kind]
+            rows[name] = _write(beside / name, write(records, frames), out / name)
+        summary = _summary(found, frames, path, rows)
+        write_json_atomic(beside / "recording.json", summary)
+    return Recording(out, summary, rows)
+
+
+def _stage(records: Sequence[DeviceRecord], _: FrameTimes) -> Iterator[str]:
+    yield "t_s,position_mm\n"
+    (record,) = records
+    yield from _rows(f"%.{TIME_DIGITS}f,%.9g\n", [record.t_s, position_mm(record)])
+
+
+def _accelerometers(records: Sequence[DeviceRecord], _: FrameTimes) -> Iterator[str]:
+    yield "t_s,sensor,ax_m_s2,ay_m_s2,az_m_s2\n"
+    for record in records:
+        unit = record.device.unit_m_s2
+        name = record.device.name.replace("%", "%%")
+        columns = [record.t_s, *(unit * record.values[axis] for axis in ("ax", "ay", "az"))]
+        yield from _rows(f"%.{TIME_DIGITS}f,{name},%.9g,%.9g,%.9g\n", columns)
+
+
+def _frames(_: Sequence[DeviceRecord], frames: FrameTimes) -> Iterator[str]:
+    told = any(frames.missing)
+    yield "frame,t_s,missing\n" if told else "frame,t_s\n"
+    for frame, (t_s, missing) in enumerate(zip(frames.t_s, frames.missing)):
+        yield f"{frame},{t_s:.{TIME_DIGITS}f}" + (f",{missing}\n" if told else "\n")
+
+
+_WRITERS = {
+    "encoder": ("stage.csv", _stage),
+    "accelerometer": ("accelerometer.csv", _accelerometers),
+    "frames": ("frames.csv", _frames),
+}
+
+
+def position_mm(record: DeviceRecord) -> Array:
+    """(N,) the encoder's readings in mm."""
+    if "position_mm" in record.values:
+        return record.values["position_mm"]
+    return record.values["counts"] / (record.device.counts_per_mm or 1.0)
+
+
+def _rows(line: str, columns: list[Array]) -> Iterator[str]:
+    for start in range(0, len(columns[0]), _ROWS):
+        cells = [column[start : start + _ROWS].tolist() for column in columns]
+        yield "".join([line % row for row in zip(*cells)])
+
+
+def _write(path: Path, text: Iterable[str], final: Path) -> int:
+    lines = -1
+    try:
+        with path.open("w", encoding="utf-8", newline="\n") as stream:
+            for part in text:
+                stream.write(part)
+                lines += part.count("\n")
+    except OSError as error:
+        raise InputError(
+            f"cannot be written: {error.strerror or error}",
+            where=str(final),
+            todo="make room on the disk, then `telerig record --replay` the recording.raw",
+        ) from error
+    return lines
+
+
+def _summary(found: Replay, frames: FrameTimes, log: Path, rows: dict[str, int]) -> dict[str, Any]:
+    header = found.header
+    return {
+        "schema": 1,
+        "started": header.started,
+        "seconds": round(found.end_s, 6),
+        "clock": "t_s is the host's monotonic clock since the begin of the recording",
+        "closed": found.ended,
+        "log_bytes": log.stat().st_size,
+        "log_damaged_bytes": damaged_bytes(log),
+        "rows": rows,
+        "devices": {r.device.name: _device_summary(r) for r in found.records},
+        "frames": _frames_summary(frames) if "frames.csv" in rows else None,
+    }
+
+
+def _device_summary(record: DeviceRecord) -> dict[str, Any]:
+    gaps = list(gaps_of(record))
+    return {
+        "kind": record.device.kind,
+        "protocol": record.device.protocol,
+        "readings": len(record.t_s),
+        "rate_hz": _rate_hz(record.t_s),
+        "time_from": record.time_from,
+        "half_question_to_answer_ms": 1e3 * record.half_width_s or None,
+        "malformed": len(record.malformed_s),
+        "malformed_bytes": record.malformed_bytes,
+        "malformed_like": record.samples,
+        "partial_bytes": record.partial_bytes,
+        "left_out": record.faults,
+        "counter_wraps": record.wraps,
+        "clocks": [asdict(fit) for fit in record.clocks],
+        "unplugged": [{"lost_s": a, "found_s": b} for a, b in record.away_s],
+        "lost": sum(gap["lost"] for gap in gaps),
+        "gap_count": len(gaps),
+        "gaps": gaps[:_GAPS_TOLD],
+    }
+
+
+def gaps_of(record: DeviceRecord) -> Iterator[dict[str, Any]]:
+    """Where readings are missing: from_s, to_s, how many are lost, and why."""
+    step = np.diff(record.t_s)
+    if record.device.kind == "frames" or step.size < 8:
+        return
+    usual = float(np.median(step))
+    limit = GAP_INTERVALS if record.time_from == "device" else 10.0
+    for i in np.flatnonzero(step > limit * usual):
+        begin, end = float(record.t_s[i]), float(record.t_s[i + 1])
+        lost = round(float(step[i]) / usual) - 1
+        yield {"from_s": begin, "to_s": end, "lost": lost, "why": _why(record, begin, end)}
+
+
+def _why(record: DeviceRecord, begin: float, end: float) -> str:
+    if any(lost <= end and not found < begin for lost, found in record.away_s):
+        return "unplugged"
+    near = (record.malformed_s >= begin) & (record.malformed_s <= end + 0.1)
+    return "damaged bytes" if np.any(near) else "nothing came"
+
+
+def _rate_hz(t_s: Array) -> float | None:
+    return round(1 / float(np.median(np.diff(t_s))), 6) if len(t_s) > 1 else None
+
+
+def _frames_summary(frames: FrameTimes) -> dict[str, Any]:
+    return {
+        "count": len(frames.t_s),
+        "missing": sum(map(bool, frames.missing)),
+        "interpolated": np.flatnonzero(frames.interpolated).tolist(),
+    }

@@ -45,26 +45,38 @@ def van_loan(dynamics: Array, diffusion: Array, dt_s: float) -> tuple[Array, Arr
 
 
 def state_size(settings: TrackerSettings) -> int:
-    return 9 if settings.acceleration_state else 6
+    if not settings.acceleration_state:
+        return 6
+    return 12 if settings.zigzag_hz > 0 else 9
 
 
-def _one_axis(settings: TrackerSettings) -> Array:
-    """Dynamics of one axis, per state."""
-    order = state_size(settings) // 3
-    dynamics = np.diag(np.ones(order - 1), 1)
+def _along(settings: TrackerSettings) -> tuple[Array, Array]:
+    """Dynamics along the rise, per state, and the spectral density of the noise on each."""
+    order, driven = state_size(settings) // 3, 2 if settings.acceleration_state else 1
+    dynamics, density = np.zeros((order, order)), np.zeros((order, order))
+    dynamics[range(driven), range(1, driven + 1)] = 1.0
     dynamics[1, 1] = -1 / settings.velocity_time_s
-    if order == 3:
-        dynamics[2, 2] = -1 / settings.acceleration_time_s
-    return dynamics
+    tau, variance = settings.acceleration_time_s, settings.rise_acceleration_mm_s2**2
+    if driven == 2:
+        dynamics[2, 2] = -1 / tau
+    density[driven, driven] = variance * (2 / tau if driven == 2 else 2 * tau)
+    return dynamics, density
 
 
-def _intensity(settings: TrackerSettings, up: Array) -> Array:
-    """(3, 3) spectral density of the white noise that drives the last state."""
-    along = np.outer(up, up)
-    variance = settings.rise_acceleration_mm_s2**2 * along
-    variance = variance + settings.lateral_acceleration_mm_s2**2 * (np.eye(3) - along)
-    tau = settings.acceleration_time_s
-    return np.asarray(variance * (2 / tau if settings.acceleration_state else 2 * tau))
+def _across(settings: TrackerSettings) -> tuple[Array, Array]:
+    """The same across the rise, where the velocity swings about a drift that wanders slowly."""
+    dynamics, density = _along(settings)
+    ratio = settings.lateral_acceleration_mm_s2 / settings.rise_acceleration_mm_s2
+    if len(dynamics) < 4:
+        return dynamics, density * ratio**2
+    turn = 2 * np.pi * settings.zigzag_hz
+    rate = 2 * settings.zigzag_damping * turn
+    dynamics[1, 1] = 0.0
+    dynamics[2, 1:] = -(turn**2), -rate, turn**2
+    dynamics[3, 3] = -1 / settings.drift_time_s
+    density[2, 2] = 2 * rate * settings.lateral_acceleration_mm_s2**2
+    density[3, 3] = 2 / settings.drift_time_s * settings.drift_sd_mm_s**2
+    return dynamics, density
 
 
 @lru_cache(maxsize=256)
@@ -80,25 +92,20 @@ def transition(
     encoder : it told the stage's motion; in_lab : velocities are the lab's, not the rig's.
     """
     n = state_size(settings)
-    dynamics = _one_axis(settings)
-    unit = np.zeros_like(dynamics)
-    unit[-1, -1] = 1.0
-    matrix, noise = van_loan(dynamics, unit, dt_s)
-    mean = np.zeros(n)
-    if in_lab:
-        mean[3:6] = settings.rise_mm_s * np.array(up)
-    full = np.asarray(np.kron(matrix, np.eye(3)), float)
+    along = np.outer(up, up)
+    full, noise = np.zeros((n, n)), np.zeros((n, n))
     drift = np.zeros(n)
-    if np.isfinite(settings.velocity_time_s):
-        relax = np.kron(matrix[:, 1], np.ones(3)) * np.tile(mean[3:6], n // 3)
-        drift = mean - relax
+    parts = ((_along(settings), along), (_across(settings), np.eye(3) - along))
+    for (dynamics, density), direction in parts:
+        matrix, spread = van_loan(dynamics, density, dt_s)
+        full += np.kron(matrix, direction)
+        noise += np.kron(spread, direction)
+    if in_lab and np.isfinite(settings.velocity_time_s):
+        mean = np.zeros(n)
+        mean[3:6] = settings.rise_mm_s * np.array(up)
+        drift = mean - full @ mean
         drift[:3] += dt_s * mean[3:6]
-    return Transition(
-        full,
-        np.asarray(np.kron(noise, _intensity(settings, np.array(up))), float),
-        drift,
-        _common_noise(settings, dt_s, n, encoder),
-    )
+    return Transition(full, noise, drift, _common_noise(settings, dt_s, n, encoder))
 
 
 def _common_noise(settings: TrackerSettings, dt_s: float, n: int, encoder: bool) -> Array:
@@ -122,5 +129,7 @@ def birth_covariance(settings: TrackerSettings, measured: Array, encoder: bool) 
         speed = settings.birth_speed_sd_no_encoder_mm_s
     out[3:6, 3:6] = speed**2 * np.eye(3)
     if settings.acceleration_state:
-        out[6:, 6:] = settings.lateral_acceleration_mm_s2**2 * np.eye(3)
+        out[6:9, 6:9] = settings.lateral_acceleration_mm_s2**2 * np.eye(3)
+    if len(out) == 12:
+        out[9:, 9:] = settings.drift_sd_mm_s**2 * np.eye(3)
     return out

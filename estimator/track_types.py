@@ -24,6 +24,10 @@ class TrackerSettings:
     lateral_acceleration_mm_s2, rise_acceleration_mm_s2 : RMS across and along the travel axis.
     acceleration_time_s : how long an acceleration lasts. With `acceleration_state` it is a state
         (Singer's model), else white noise of the same spectral density at 0 Hz.
+    zigzag_hz, zigzag_damping : with `acceleration_state`, how the velocity across the travel axis
+        swings, and the share of its critical damping: small for one frequency, 0.7 for any up to
+        it. 0 Hz: no swing, across as along the axis.
+    drift_sd_mm_s, drift_time_s : of the slow velocity across the axis about which it swings.
     velocity_time_s : relaxation of the velocity towards the rise; inf: none.
     shake_sd_mm, shake_time_s : offset common to all bubbles in a frame, sd and correlation time.
     stage_acceleration_mm_s2 : of the stage, where the encoder does not tell its position.
@@ -47,9 +51,13 @@ class TrackerSettings:
     birth_speed_sd_mm_s: float = 120.0
     birth_speed_sd_no_encoder_mm_s: float = 300.0
     lateral_acceleration_mm_s2: float = 3000.0
-    rise_acceleration_mm_s2: float = 1000.0
+    rise_acceleration_mm_s2: float = 1800.0
     acceleration_time_s: float = 0.02
     acceleration_state: bool = True
+    zigzag_hz: float = 6.5
+    zigzag_damping: float = 0.2
+    drift_sd_mm_s: float = 100.0
+    drift_time_s: float = 0.5
     velocity_time_s: float = float("inf")
     shake_sd_mm: float = 0.3
     shake_time_s: float = 0.01

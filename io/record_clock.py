@@ -171,9 +171,7 @@ def _fits(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, ...]:
     return tuple(
         best
         if k == longest
-        else fit_clock(
-            host_s[p], device_s[p], None if spans[k] > _SHORT_S else best.drift_ppm
-        )
+        else fit_clock(host_s[p], device_s[p], None if spans[k] > _SHORT_S else best.drift_ppm)
         for k, p in enumerate(parts)
     )
 

@@ -35,13 +35,15 @@ TIME_DIGITS = 7
 class DeviceRecord:
     """What one device said, in the order of time.
 
-    t_s : (N,) since the begin of the recording, strictly increasing. values : (N,) each, as sent.
+    t_s : (N,) since the begin of the recording, strictly increasing. arrived_s :
+    when the host had it. values : (N,) each, as sent.
     malformed_s : arrival of what could not be read. away_s : (lost, found) of each unplug; found
     is NaN if it never came back. faults : readings left out, by the reason.
     """
 
     device: DeviceDescription
     t_s: Array
+    arrived_s: Array
     values: dict[str, Array]
     malformed_s: Array
     malformed_bytes: int
@@ -135,7 +137,12 @@ def _record(line: _Line, start_ns: int) -> DeviceRecord:
     if "t" in values:
         wrap_s = 2.0**device.time_bits * device.time_unit_s if device.time_bits else 0.0
         clock = host_times(arrived, values["t"] * device.time_unit_s, wrap_s)
-        t_s, clocks, wraps, time_from = clock.t_s - device.latency_s, clock.fits, clock.wraps, "device"
+        t_s, clocks, wraps, time_from = (
+            clock.t_s - device.latency_s,
+            clock.fits,
+            clock.wraps,
+            "device",
+        )
         faults["wrong or repeated stamp"] = clock.wrong
     elif line.sent_ns:
         t_s, half = _between(arrived, _seconds(np.array(line.sent_ns), start_ns))
@@ -144,13 +151,18 @@ def _record(line: _Line, start_ns: int) -> DeviceRecord:
         faults["question without answer"] = len(line.sent_ns) - len(arrived)
     else:
         t_s, time_from = arrived - device.latency_s, "arrival"
-    t_s, values = _in_order(t_s, values, faults)
-    lost, back = _seconds(np.array(line.lost_ns), start_ns), _seconds(np.array(line.found_ns), start_ns)
+    t_s = np.round(t_s, TIME_DIGITS)
+    kept = _in_order(t_s, faults)
+    lost, back = (
+        _seconds(np.array(line.lost_ns), start_ns),
+        _seconds(np.array(line.found_ns), start_ns),
+    )
     back = np.append(back, np.full(len(lost) - len(back), np.nan))
     return DeviceRecord(
         device=device,
-        t_s=t_s,
-        values=values,
+        t_s=t_s[kept],
+        arrived_s=arrived[kept],
+        values={name: v[kept] for name, v in values.items()},
         malformed_s=_seconds(np.concatenate([r.malformed for r in line.found]), start_ns),
         malformed_bytes=sum(r.malformed_bytes for r in line.found),
         samples=tuple(repr(s[:60]) for r in line.found for s in r.samples)[:5],
@@ -165,7 +177,7 @@ def _record(line: _Line, start_ns: int) -> DeviceRecord:
 
 
 def _seconds(time_ns: NDArray[np.generic], start_ns: int) -> Array:
-    return (time_ns.astype(np.int64) - start_ns) * 1e-9
+    return np.asarray((time_ns.astype(np.int64) - start_ns) * 1e-9, np.float64)
 
 
 def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
@@ -178,14 +190,10 @@ def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
     return t_s, float(np.median(half[clear])) if clear.any() else 0.0
 
 
-def _in_order(
-    t_s: Array, values: dict[str, Array], faults: dict[str, int]
-) -> tuple[Array, dict[str, Array]]:
-    """Rounded as in the tables, without what has no time or does not come later."""
-    t_s = np.round(t_s, TIME_DIGITS)
-    timed = np.isfinite(t_s)
-    t_s, values = t_s[timed], {name: v[timed] for name, v in values.items()}
-    later = np.ones(len(t_s), bool)
-    later[1:] = t_s[1:] > np.maximum.accumulate(t_s)[:-1]
+def _in_order(t_s: Array, faults: dict[str, int]) -> Ints:
+    """Indices of the readings that have a time, and one later than all before."""
+    timed = np.flatnonzero(np.isfinite(t_s))
+    later = np.ones(len(timed), bool)
+    later[1:] = t_s[timed][1:] > np.maximum.accumulate(t_s[timed])[:-1]
     faults["not later than the one before"] = int(np.sum(~later))
-    return t_s[later], {name: v[later] for name, v in values.items()}
+    return timed[later]

@@ -46,7 +46,7 @@ class DeviceStatus:
     connected: bool = True
     readings: int = 0
     rate_hz: float = 0.0
-    bytes: int = 0
+    byte_count: int = 0
     malformed: int = 0
     lost: int = 0
     gaps: int = 0
@@ -64,7 +64,9 @@ class DeviceStatus:
             self._count_gaps(found.values["t"], 2.0**device.time_bits if device.time_bits else 0.0)
 
     def _count_gaps(self, stamps: NDArray[np.float64], wrap: float) -> None:
-        steps = np.diff(np.concatenate([[self._last], stamps]))[0 if self._last == self._last else 1 :]
+        steps = np.diff(np.concatenate([[self._last], stamps]))[
+            0 if self._last == self._last else 1 :
+        ]
         steps = np.mod(steps, wrap) if wrap else steps
         steps = steps[np.isfinite(steps) & (steps > 0)]
         self._last = float(stamps[-1])
@@ -148,6 +150,7 @@ class _Session:
         self._parsers = [parser(device) for device in self._devices]
         self._status = [DeviceStatus(device.name) for device in self._devices]
         self._suspects = set(range(len(self._devices)))
+        self._drained = time.monotonic()
 
     def run(
         self, seconds: float | None, stop: threading.Event, tell: Callable[[Status], None]
@@ -182,6 +185,8 @@ class _Session:
         """Bring what has come to the disk, then count it."""
         chunks: list[list[tuple[int, bytes]]] = [[] for _ in self._devices]
         before = [status.readings for status in self._status]
+        now = time.monotonic()
+        elapsed_s, self._drained = max(now - self._drained, 1e-3), now
         while not self._queue.empty():
             entry = self._queue.get()
             self._log.append(entry)
@@ -194,9 +199,9 @@ class _Session:
                 self._parsers[entry.device].cut()
         self._log.flush()
         for i, (device, status) in enumerate(zip(self._devices, self._status)):
-            status.bytes += sum(len(data) for _, data in chunks[i])
+            status.byte_count += sum(len(data) for _, data in chunks[i])
             status.add(device, self._parsers[i].feed(chunks[i]))
-            status.rate_hz = (status.readings - before[i]) / TICK_S
+            status.rate_hz = (status.readings - before[i]) / elapsed_s
             status.connected = self._readers[i].connected
 
     def _check(self, elapsed_s: float) -> None:
@@ -208,7 +213,7 @@ class _Session:
         if elapsed_s < GARBAGE_S:
             return
         for i in sorted(self._suspects):
-            if self._status[i].bytes:
+            if self._status[i].byte_count:
                 raise _garbage(self._devices[i], self._status[i])
         self._suspects = set()
 
@@ -220,7 +225,7 @@ class _Session:
 def _garbage(device: DeviceDescription, status: DeviceStatus) -> GarbageError:
     shown = f", like {status.sample[:40]!r}" if status.sample else ""
     return GarbageError(
-        f"{status.bytes} bytes came in {GARBAGE_S:g} s, and not one reading{shown}",
+        f"{status.byte_count} bytes came in {GARBAGE_S:g} s, and not one reading{shown}",
         where=f"devices.{device.name} port {device.port}",
         todo=f"set baud in rig.toml as the device has it (now {device.baud}); "
         f"if the bytes look right, correct its protocol (now {device.protocol})",

@@ -1,4 +1,4 @@
-"""Sensors to practise with: each speaks over a pseudo-terminal, as a real one does over its port."""
+"""Sensors to practise with: each speaks over a pseudo-terminal, as a real one over its port."""
 
 from __future__ import annotations
 

@@ -114,9 +114,7 @@ def pattern_problems(place: str, kind: str, pattern: str | None) -> Iterator[Pro
         return
     known = {"t"}.union(*needed)
     for name in sorted(groups - known):
-        yield Problem(
-            place, "pattern", f"has a group {name!r}", suggestion(name, sorted(known))
-        )
+        yield Problem(place, "pattern", f"has a group {name!r}", suggestion(name, sorted(known)))
     if not any(group <= groups for group in needed):
         named = ", ".join(sorted(groups)) or "none"
         yield Problem(place, "pattern", f"lacks groups (it names {named})", f"name {words}")

@@ -8,6 +8,7 @@ from telerig import __version__
 from telerig.scripts.calibrate import calibrate
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
+from telerig.scripts.record import record
 from telerig.scripts.simulate import simulate
 from telerig.scripts.smooth import smooth
 from telerig.scripts.track import track
@@ -34,7 +35,7 @@ def _main(
     """Calibrate a telecentric stereo rig from views of dots, and track bubbles with it."""
 
 
-for command in (demo, simulate, detect, calibrate, track, smooth):
+for command in (demo, simulate, detect, calibrate, track, smooth, record):
     app.command()(command)
 
 

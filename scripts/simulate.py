@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,27 +18,56 @@ if TYPE_CHECKING:
 
 def simulate(
     preset: Annotated[
-        str,
+        str | None,
         typer.Argument(
             help="A calibration (paper, dense, scheimpflug, near_telecentric, symmetric, "
             "unbounded, two_sided) or bubbles with a calibration (rise, swarm, crossing, S0 to S6)."
         ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder to create; must be new or empty.")],
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to create; must be new or empty.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
     images: Annotated[
         bool, typer.Option(help="Render images; without, write dots.csv and detections.csv.")
     ] = True,
     frames: Annotated[int | None, typer.Option(help="Frames of the run.")] = None,
     bubbles: Annotated[int | None, typer.Option(help="Bubbles in view at a time.")] = None,
+    stage_axis: Annotated[
+        int | None,
+        typer.Option(help="Views of the target at rest while the stage travels [0: none]."),
+    ] = None,
+    encoder_scale: Annotated[
+        float | None, typer.Option(help="The encoder reads so much too far, like 0.01.")
+    ] = None,
+    devices: Annotated[
+        bool,
+        typer.Option(
+            "--devices", help="Serial devices to practise `telerig record` with, until Ctrl-C."
+        ),
+    ] = False,
+    seconds: Annotated[float | None, typer.Option(help="With --devices: how long.")] = None,
 ) -> None:
-    """Simulate a calibration, or a run of bubbles with one: images, rig.toml, and the truth."""
+    """Simulate a calibration, or a run of bubbles with one: images, rig.toml, and the truth.
+
+    With --stage-axis 7, `stage_axis/` holds views of the target from seven stops of the stage, from
+    which `telerig calibrate` finds the travel axis and the encoder's scale.
+    """
     with errors_in_words():
         import numpy as np
 
+        if devices:
+            from telerig.scripts.simulate_devices import simulate_devices
+
+            simulate_devices(out, seconds, np.random.default_rng(seed))
+            return
+        preset, out = _both(preset, out)
+
         from telerig.io.simulation import simulate as run
 
-        settings = _settings(preset, frames, bubbles)
+        run_only = {"frames": frames, "bubbles": bubbles}
+        stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale}
+        settings = _settings(preset, run_only, stage)
         data = run(settings, rng=np.random.default_rng(seed), out=out, images=images)
         say(f"{preset}: {len(data.views)} views of {len(data.rig.cameras)} cameras in {data.path}")
         for name in data.runs:
@@ -45,18 +75,32 @@ def simulate(
         say(f"next: telerig calibrate {data.path}")
 
 
-def _settings(name: str, frames: int | None, bubbles: int | None) -> SimulationConfig | RunConfig:
+def _both(preset: str | None, out: Path | None) -> tuple[str, Path]:
+    if preset is None or out is None:
+        what = "the name of what to simulate" if preset is None else "--out"
+        raise InputError(
+            f"{what} is missing", todo="for instance telerig simulate paper --out tank"
+        )
+    return preset, out
+
+
+def _settings(
+    name: str, run: dict[str, int | None], stage: dict[str, Any]
+) -> SimulationConfig | RunConfig:
     from telerig.io.run_presets import RUN_PRESETS, any_preset, run_preset
 
-    given = {"frames": frames, "bubbles": bubbles}
-    changes = {key: value for key, value in given.items() if value is not None}
-    if not changes:
+    changes: dict[str, Any] = {key: value for key, value in run.items() if value is not None}
+    moved = {key: value for key, value in stage.items() if value is not None}
+    if not changes and not moved:
         return any_preset(name)
     if name in RUN_PRESETS:
+        if moved:
+            changes["stage"] = replace(run_preset(name).stage, **moved)
         return run_preset(name, **changes)
     any_preset(name)
+    given = [*changes, *(key.replace("axis_views", "stage_axis") for key in moved)]
     raise InputError(
-        f"{name} is a calibration without a run, so {' and '.join(changes)} mean nothing",
+        f"{name} is a calibration without a run, so {' and '.join(given)} mean nothing",
         todo=f"leave them out, or choose one of {', '.join(RUN_PRESETS)}",
     )
 

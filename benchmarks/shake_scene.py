@@ -121,20 +121,22 @@ class Run:
             "stage": self.stage,
             "accelerometers": sensors if used else None,
             "references": self.references if information == "references" else None,
-            "rig": description(),
+            "rig": description(None if self.case.encoder_scale else 0.0),
             "t_s": self.t_s,
         }
 
 
-def description() -> SimpleNamespace:
-    """What rig.toml says of stage and sensors."""
+def description(scale_sigma: float | None = 0.0) -> SimpleNamespace:
+    """What rig.toml says of stage and sensors; an encoder whose scale is known unless said."""
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     sensors = {
         name: AccelerometerDescription(name, mount, axes, 22.5)
         for name, mount in (("arm_left", "left"), ("arm_right", "right"), ("carriage", "carriage"))
     }
     up = (0.0, -1.0, 0.0)
-    return SimpleNamespace(stage=StageDescription(up, up, ENCODER_MM), accelerometers=sensors)
+    return SimpleNamespace(
+        stage=StageDescription(up, up, ENCODER_MM, scale_sigma), accelerometers=sensors
+    )
 
 
 def cameras(case: Case) -> tuple[Camera, Camera]:

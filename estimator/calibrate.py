@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -97,13 +97,24 @@ def run_calibration(
         notes=notes,
         name=rig.name,
     )
+    calibration = replace(calibration, stage=_stage(dataset, calibration, stage))
     return CalibrationRun(_with_measured(calibration, table, seed), detected)
+
+
+def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:
+    """Travel axis and encoder scale from `stage_axis/`; empty without it, or a usable rig."""
+    from telerig.estimator.stage_axis_input import stage_axis_from
+
+    if calibration.verdict["status"] == "REJECTED":
+        return {}
+    if stage is not None:
+        stage("stage axis", 0, 0)
+    found = stage_axis_from(dataset, calibration)
+    return {} if found is None else found.as_dict()
 
 
 def _with_measured(calibration: Calibration, table: pd.DataFrame, seed: int) -> Calibration:
     """Put the covariance and chi-square of the image fit beside the dots; record the seed."""
-    from dataclasses import replace
-
     columns = ["suu_px2", "suv_px2", "svv_px2", "chi2_dof"]
     measured = table.reindex(columns=["view", "camera", "dot", *columns]).copy()
     measured["view"] = measured["view"].astype(str)

@@ -30,6 +30,7 @@ class Calibration:
         of each camera, then the tangent (rotation, translation) of rig_from_<second>.
     free : per camera, names of the free intrinsics.
     joint_names, joint_covariance : the whole estimate, or empty when loaded without it.
+    stage : travel axis and encoder scale with their covariance (`StageAxis.as_dict`), or empty.
     statistics, twin, model : what `calibration.json` says of them; see docs/files.md.
     """
 
@@ -47,6 +48,7 @@ class Calibration:
     model: Mapping[str, Any] = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    stage: Mapping[str, Any] = field(default_factory=dict)
     joint_names: tuple[str, ...] = ()
     joint_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     dots: Any = None

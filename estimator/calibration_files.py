@@ -70,6 +70,7 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
             "matrix": calibration.covariance.tolist(),
         },
         "model": dict(calibration.model),
+        "stage": dict(calibration.stage),
         "twin": dict(calibration.twin),
         "statistics": dict(calibration.statistics),
         "diagnostics": dict(calibration.diagnostics),
@@ -156,9 +157,20 @@ def _from_dict(data: dict[str, Any], file: Path) -> Calibration:
         model=data["model"],
         diagnostics=data["diagnostics"],
         notes=tuple(data["notes"]),
+        stage=_stage(data.get("stage", {})),
         joint_names=names,
         joint_covariance=joint,
     )
+
+
+def _stage(data: dict[str, Any]) -> dict[str, Any]:
+    """Checked for what the smoother reads; the file of an older version has none."""
+    if data:
+        for key, shape in (("axis", (3,)), ("basis", (3, 2)), ("joint_covariance", (3, 3))):
+            if np.shape(data[key]) != shape:
+                raise ValueError(f"stage.{key} has shape {np.shape(data[key])}, not {shape}")
+        float(data["encoder_scale"])
+    return data
 
 
 def _joint_covariance(beside: Path, rig: Array) -> tuple[tuple[str, ...], Array]:

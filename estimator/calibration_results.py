@@ -27,7 +27,8 @@ OVERLAY_QUALITY = 80
 
 def input_files(dataset: Dataset) -> list[Path]:
     """The files that a calibration reads."""
-    files = [dataset.path / "rig.toml"]
+    beside = dataset.path / "stage_axis"
+    files = [dataset.path / "rig.toml", *sorted(p for p in beside.rglob("*") if p.is_file())]
     if dataset.source == "dots":
         return [*files, dataset.path / "calibration" / "dots.csv"]
     return files + [path for view in dataset.views for path in view.image_paths.values()]

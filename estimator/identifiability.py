@@ -28,6 +28,7 @@ from telerig.estimator.smoother.model import (
     SmoothingProblem,
 )
 from telerig.estimator.smoother.solve import Options, Solution, solve
+from telerig.estimator.smoother.travel import carriage, scale_sigma
 from telerig.factors.motion import start
 
 Array = NDArray[np.float64]
@@ -135,10 +136,15 @@ def _flags(found: dict[str, AxisVerdict]) -> list[str]:
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
-    """(n, 3) sd of positions, and what they would be were the shake known, away from the ends."""
+    """(n, 3) sd of positions, and what they would be were the shake known, away from the ends.
+
+    What the encoder's scale leaves open is in neither.
+    """
     still = solve(
         without_sensors(window.problem),
-        replace(solution.frame.model.without_shake(), carriage=CarriageModel()),
+        replace(
+            solution.frame.model.without_shake(), carriage=CarriageModel(), encoder_scale_sigma=0.0
+        ),
         Options(robust=False),
     )
     assert still.covariances is not None and solution.covariances is not None
@@ -147,7 +153,12 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
     bubble, frame = ours.bubble_of_row[rows], ours.frame_of_row[rows] + window.first
     same = whole.row(window.bubbles[bubble], frame)
     known = _position_sigma(still, rows)
-    return _position_sigma(solution, same), known
+    sigma = _position_sigma(solution, same)
+    if solution.frame.encoder_flags[0]:
+        along = carriage(solution)[0][frame] * scale_sigma(solution)
+        rest = sigma**2 - (along[:, None] * solution.frame.problem.axis) ** 2
+        sigma = np.sqrt(np.clip(rest, np.minimum(sigma, known) ** 2, None))
+    return sigma, known
 
 
 def without_sensors(problem: SmoothingProblem) -> SmoothingProblem:

@@ -10,6 +10,36 @@ if TYPE_CHECKING:
     from telerig.estimator.smoother.results import Smoothing
 
 
+_NOTICED = 0.5
+_SCALE_FROM = {
+    "assumed": "its scale is assumed to 0.1 %; say better with [stage] scale_sigma in rig.toml, or "
+    "calibrate it (stage_axis/)",
+    "rig.toml": "its scale as rig.toml states it",
+    "stage_axis": "its scale as stage_axis/ showed it",
+    "run": "its scale as the marks showed it",
+    "given": "its scale taken as exact",
+}
+
+
+def _travel_words(found: Smoothing) -> list[str]:
+    """Encoder scale, and what of the positions' sd it makes where that is much."""
+    encoder, travel = found.summary["encoder"], found.summary["travel"]
+    if not encoder:
+        return []
+    ppm, sd = 1e6 * encoder["scale"], 1e6 * encoder["sscale"]
+    words = f"  encoder: {_SCALE_FROM[encoder['scale_from']]} ({ppm:+.0f} +- {sd:.0f} ppm)"
+    table = found.trajectories
+    if travel and len(table) and "sx_mm" in table:
+        share = max(travel["left_open_mm"])
+        whole = max(float(np.median(table[f"s{x}_mm"])) for x in "xyz")
+        if share > _NOTICED * whole:
+            words += (
+                f"; {1000 * share:.3g} um of the sd above are that: alike for all bubbles, and "
+                "growing with the travel"
+            )
+    return [words]
+
+
 def smoothing_words(found: Smoothing) -> str:
     """What `telerig smooth` prints: the verdict first."""
     verdict = found.verdict
@@ -30,5 +60,6 @@ def smoothing_words(found: Smoothing) -> str:
             "  position good to {:.3g}, {:.3g}, {:.3g} um (1 sd, x y z, median)".format(*sd)
             + ", velocity to {:.2g}, {:.2g}, {:.2g} mm/s".format(*speed)
         )
+    lines += _travel_words(found)
     lines += [f"  warning: {warning}" for warning in found.summary.get("warnings", [])]
     return "\n".join(lines)

@@ -69,6 +69,10 @@ class StageAxis:
             "encoder_scale": self.scale,
             "encoder_scale_sd": self.scale_sd,
             "joint_covariance": self.joint_covariance.tolist(),
+            "rig_from_target": {
+                "rotation": self.rig_from_target.rotation.tolist(),
+                "translation_mm": self.rig_from_target.translation_mm.tolist(),
+            },
             "chi2_dof": self.chi2_dof,
             "position_sigma_mm": self.position_sigma_mm,
             "wander_sigma_mm": self.wander_sigma_mm,

@@ -47,6 +47,7 @@ def summary(calibration: Calibration) -> str:
         f"  mirror twin: cost {t['cost']:.9g} kept, {t['other_cost']:.9g} for the other; "
         f"decided by {t['decided_by']}: {t['words']}"
     )
+    lines += [f"  stage: {word}" for word in calibration.stage.get("notes", ())]
     lines += [f"  note: {n}" for n in (*calibration.notes, *calibration.diagnostics["weak"])]
     return "\n".join(lines)
 

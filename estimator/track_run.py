@@ -163,9 +163,11 @@ def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, C
 
 
 def stage_axis(run: RunData, calibration: Calibration) -> Array:
-    """(3,) unit travel direction in the rig frame, from rig.toml; upwards without one."""
+    """(3,) unit travel direction in the rig frame: calibrated, from rig.toml, or upwards."""
     axis = np.array([0.0, -1.0, 0.0])
-    if run.rig is not None and run.rig.stage is not None:
+    if calibration.stage:
+        axis = np.asarray(calibration.stage["axis"], float)
+    elif run.rig is not None and run.rig.stage is not None:
         axis = np.asarray(run.rig.stage.axis, float)
     return np.asarray(axis / np.linalg.norm(axis))
 

@@ -93,6 +93,16 @@ class EncoderPrediction:
     by_delay: Array
 
 
+def carriage_position(reading_mm: ArrayLike, scale: float) -> tuple[Array, float, Array]:
+    """Where the carriage is when its encoder reads so: reading / (1 + scale).
+
+    Also its derivatives by the reading and by the scale.
+    """
+    gain = 1 / (1 + scale)
+    position = gain * np.asarray(reading_mm, float)
+    return position, gain, -gain * position
+
+
 def encoder_reading(
     position_mm: ArrayLike, velocity_mm_s: ArrayLike, scale: ArrayLike = 0.0
 ) -> EncoderPrediction:

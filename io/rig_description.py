@@ -35,11 +35,15 @@ class CameraDescription:
 
 @dataclass(frozen=True)
 class StageDescription:
-    """axis : nominal travel direction, up : away from gravity; unit vectors in rig axes."""
+    """axis : nominal travel direction, up : away from gravity; unit vectors in rig axes.
+
+    scale_sigma : sd of the encoder's relative scale error, 0 if it is exact; None: not stated.
+    """
 
     axis: Vector
     up: Vector
     position_sigma_mm: float = 0.005
+    scale_sigma: float | None = None
 
 
 @dataclass(frozen=True)

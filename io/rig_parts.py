@@ -76,7 +76,7 @@ def stage_from_table(
         return None
     axis = _unit(table.axis, "stage", f"axis_{first}", problems)
     up = axis if table.up is None else _unit(table.up, "stage", f"up_{first}", problems)
-    return StageDescription(axis, up, table.position_sigma_mm)
+    return StageDescription(axis, up, table.position_sigma_mm, table.scale_sigma)
 
 
 def accelerometers_from_tables(

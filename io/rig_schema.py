@@ -108,6 +108,9 @@ class StageTable(Table):
     axis: Triple
     up: Triple | None = None
     position_sigma_mm: Positive = Field(0.005, description="a positive number")
+    scale_sigma: Annotated[float, Field(ge=0, lt=0.5)] | None = Field(
+        None, description="a share like 0.001: how far the encoder's scale may be off"
+    )
 
 
 class AccelerometerTable(Table):

@@ -92,11 +92,14 @@ def _scale_dots(t: Target) -> Any:
 
 
 def _stage(stage: StageDescription, first: str) -> list[Line]:
-    return [
+    lines: list[Line] = [
         (f"axis_{first}", stage.axis, "nominal travel direction in the rig frame"),
         (f"up_{first}", stage.up, "away from gravity"),
         ("position_sigma_mm", stage.position_sigma_mm, ""),
     ]
+    if stage.scale_sigma is not None:
+        lines.append(("scale_sigma", stage.scale_sigma, "of the encoder, relative"))
+    return lines
 
 
 def _accelerometer(sensor: AccelerometerDescription) -> list[Line]:

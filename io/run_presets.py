@@ -76,7 +76,9 @@ class StageConfig:
     """The stage and how it shakes.
 
     follow : its speed over the bubbles' mean rise; ramp_s : of the start from rest at t = 0.
-    servo_* : the following error, seen by the encoder. encoder_sigma_mm, encoder_rate_hz.
+    servo_* : the following error, seen by the encoder. encoder_sigma_mm, encoder_rate_hz;
+    it reads (1 + encoder_scale) times the travel.
+    axis_views : of a target at rest, over axis_travel_mm, for `stage_axis/`; 0 for none.
     shake_mm : amplitude A; every camera's offset along the axis has RMS A / sqrt 2, across it
     ``shake_lateral`` times that. shake_* : see `telerig.io.bubble_motion.rig_shake`.
     accelerometers : mounted on cameras' arms (by name) or on the "carriage"; written if any.
@@ -90,6 +92,9 @@ class StageConfig:
     servo_rms_mm: float = 0.1
     encoder_sigma_mm: float = 0.001
     encoder_rate_hz: float = 1000.0
+    encoder_scale: float = 0.0
+    axis_views: int = 0
+    axis_travel_mm: float = 30.0
     shake_mm: float = 0.2
     shake_hz: float = 12.0
     shake_lateral: float = 0.5
@@ -177,6 +182,12 @@ class RunConfig:
             ("bubbles", self.bubbles, self.bubbles < 0, "0 or more"),
             ("frame_rate_hz", self.frame_rate_hz, not self.frame_rate_hz > 0, "positive"),
             ("d_eq_mm", self.bubble.d_eq_mm, not self.bubble.d_eq_mm[0] > 0, "positive"),
+            (
+                "axis_views",
+                self.stage.axis_views,
+                self.stage.axis_views in (1, 2),
+                "0, or 3 or more",
+            ),
             ("blur_px", self.image.blur_px, not self.image.blur_px >= 0.2, "at least 0.2"),
             ("dropped", self.image.dropped, not 0 <= self.image.dropped < 1, "within 0 and 1"),
             (

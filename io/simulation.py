@@ -83,8 +83,8 @@ def write_calibration(
     *,
     images: bool,
     complete: Callable[[RigDescription], RigDescription] = lambda rig: rig,
-) -> Mapping[str, Camera]:
-    """Write `rig.toml`, `calibration/` and `truth/`; the true cameras by name.
+) -> tuple[Mapping[str, Camera], TrueTarget]:
+    """Write `rig.toml`, `calibration/` and `truth/`; the true cameras by name, and the target.
 
     complete : adds to the rig file what only runs need.
     """
@@ -99,11 +99,11 @@ def write_calibration(
     write_json_atomic(folder / "truth" / "truth.json", truth)
     write_table(exact, folder / "truth" / "dots.csv")
     if images:
-        _write_images(settings, cameras, target, views, folder / "calibration", image_rng)
+        write_images(settings, cameras, target, views, folder / "calibration", image_rng)
     else:
-        measured = _measured_dots(settings, exact, cameras, dots_rng)
+        measured = measured_dots(settings, exact, cameras, dots_rng)
         write_table(measured, folder / "calibration" / "dots.csv")
-    return cameras
+    return cameras, target
 
 
 def rig_description(config: SimulationConfig, target: TrueTarget) -> RigDescription:
@@ -155,7 +155,7 @@ def exact_dots(
     return pd.concat(tables, ignore_index=True)
 
 
-def _measured_dots(
+def measured_dots(
     config: SimulationConfig,
     exact: pd.DataFrame,
     cameras: Mapping[str, Camera],
@@ -173,7 +173,7 @@ def _measured_dots(
     return dots[["view", "camera", "dot", "u_px", "v_px", "sigma_px", "row", "column"]]
 
 
-def _write_images(
+def write_images(
     config: SimulationConfig,
     cameras: Mapping[str, Camera],
     target: TrueTarget,
@@ -181,6 +181,7 @@ def _write_images(
     folder: Path,
     rng: np.random.Generator,
 ) -> None:
+    """``folder/<camera>/<view>.tif`` of every view."""
     import tifffile
 
     for view in views:

@@ -28,6 +28,7 @@ from telerig.io.run_scene import AXIS_RIG, RunScene, run_scene
 from telerig.io.run_sensors import accelerometer_table, references_table, stage_table
 from telerig.io.run_views import CameraView, camera_view, linear_projection, truth_rows
 from telerig.io.simulation import seed_of, write_calibration
+from telerig.io.simulation_stage import write_stage_axis
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,14 +54,16 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     same seed gives the same bubbles with images or without.
     """
     seed = seed_of(rng)
-    calibration_rng, scene_rng, sensor_rng, image_rng, table_rng = rng.spawn(5)
+    calibration_rng, scene_rng, sensor_rng, image_rng, table_rng, stage_rng = rng.spawn(6)
 
     def complete(rig: RigDescription) -> RigDescription:
         return _with_run_parts(rig, config)
 
-    cameras = write_calibration(
+    cameras, target = write_calibration(
         config.calibration, folder, calibration_rng, images=images, complete=complete
     )
+    if config.stage.axis_views:
+        write_stage_axis(config, cameras, target, folder, stage_rng, images=images)
     scene = run_scene(config, cameras, scene_rng)
     run = folder / "runs" / config.name
     lost = _lost_frames(scene, image_rng)

@@ -18,6 +18,7 @@ from telerig.estimator.smoother.model import (
     Stage,
     Zigzag,
 )
+from telerig.estimator.smoother.travel import default_scale_sigma
 
 Array = NDArray[np.float64]
 
@@ -54,9 +55,16 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
         broad_bands=bands,
         carriage=default_carriage(problem, encoder_sigma_mm),
         encoder_sigma_mm=encoder_sigma_mm,
+        encoder_scale_sigma=_scale_sigma(problem),
         accelerometer_delay_sigma_s=DELAY_SIGMA_S if problem.accelerometers else 0.0,
         name="default",
     )
+
+
+def _scale_sigma(problem: SmoothingProblem) -> float:
+    """Marks tell the encoder's scale; without them nothing does, and it is held."""
+    marked = len(problem.references) > 0 and problem.stage is not None
+    return default_scale_sigma(problem.travel) if marked else 0.0
 
 
 def _band(camera: int) -> BroadBand:

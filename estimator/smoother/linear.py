@@ -107,15 +107,14 @@ def _constant_priors(frame: Frame, state: State) -> list[Linear]:
             given = np.array([a.delay_s for a in problem.accelerometers])
             _, first = np.unique(frame.clock_of, return_index=True)
             value = state.clocks + (frame.delays_s - given)[first, None]
-            out.append(_prior(base[7], value, model.accelerometer_delay_sigma_s))
-    if problem.stage is not None:
-        sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
-        out.append(_prior(base[4], state.encoder[None], sigmas[np.array(frame.encoder_flags)]))
-    out.append(_prior(base[5], state.calibration[None], 1.0))
+            out.append(_prior(base[6], value, model.accelerometer_delay_sigma_s))
+    sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
+    sigmas = np.concatenate([sigmas[np.array(frame.encoder_flags)], np.ones(frame.share_size)])
+    out.append(_prior(base[4], np.concatenate([state.encoder, state.calibration])[None], sigmas))
     if problem.marks:
         guess = np.array([m.guess_mm for m in problem.marks])
         sigma = np.array([[m.sigma_mm] for m in problem.marks])
-        out.append(_prior(base[6], state.marks - guess, sigma))
+        out.append(_prior(base[5], state.marks - guess, sigma))
     return [p for p in out if p.rhs.size]
 
 
@@ -154,7 +153,7 @@ def references(frame: Frame, state: State, weight: Array) -> Seen:
     """Pixels of the marks fixed to the tank; weight (R,)."""
     obs = frame.problem.references
     points = state.marks[obs.item]
-    keys = frame.base()[6] + obs.item
+    keys = frame.base()[5] + obs.item
     extra, shift = np.zeros((len(obs), 2, 3)), np.zeros((len(obs), 2))
     by_point = repeated(np.eye(3), len(obs))
     return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
@@ -177,6 +176,9 @@ def _seen(
     whitener = whitener_of(obs.covariance_px2) / inflation
     out, residual = [], np.zeros((len(obs), 2))
     at_frames = frame.shake_at_frames(state.shake)
+    position, gain, by_scale = measurements.carriage_position(
+        at_frames @ layout.position, state.encoder_scale(frame)
+    )
     for c, camera in enumerate(problem.cameras):
         mine = np.flatnonzero(obs.camera == c)
         if not len(mine):
@@ -184,12 +186,12 @@ def _seen(
         node = frame.nodes.of_frame[obs.frame[mine]]
         shake = at_frames[obs.frame[mine]]
         seen = measurements.image_of_point(
-            camera, points[mine], shake @ layout.position, problem.axis,
+            camera, points[mine], position[obs.frame[mine]], problem.axis,
             shake @ layout.offset[c].T, shake @ layout.pitch[c],
         )  # fmt: skip
         by_shake = (
             seen.by_offset @ layout.offset[c]
-            + seen.by_position[..., None] * layout.position
+            + seen.by_position[..., None] * (gain * layout.position)
             + seen.by_pitch[..., None] * layout.pitch[c]
         )
         if frame.to_frames is not None:
@@ -197,8 +199,9 @@ def _seen(
         off = seen.uv_px + shift[mine] - obs.uv_px[mine]
         by_rig = np.zeros((len(mine), 2, 0))
         if problem.calibration is not None and len(state.calibration):
-            by_rig = _by_calibration(frame, c, points[mine], shake)
+            by_rig = _by_calibration(frame, c, points[mine], position[obs.frame[mine]], shake)
             off += by_rig @ state.calibration
+        by_travel = seen.by_position * by_scale[obs.frame[mine], None]
         w = whitener[mine]
         residual[mine] = np.einsum("mij,mj->mi", w, off)
         root = np.sqrt(weight[mine])
@@ -206,20 +209,21 @@ def _seen(
         blocks = (
             w @ (seen.by_point @ by_state[mine] + extra[mine]),
             w @ (by_shake @ frame.shake_basis(node)),
-            w @ by_rig,
+            w @ np.concatenate([frame.by_scale(by_travel), by_rig], -1),
         )
         rhs = -residual[mine] * root[:, None]
         log_det = log_det_of(whitener[mine])
-        linear = Linear((keys[mine], node, base[5]), blocks, rhs, log_det, weight[mine])
+        linear = Linear((keys[mine], node, base[4]), blocks, rhs, log_det, weight[mine])
         out.append(linear)
     return Seen(out, residual)
 
 
-def _by_calibration(frame: Frame, camera: int, points: Array, shake: Array) -> Array:
+def _by_calibration(
+    frame: Frame, camera: int, points: Array, position: Array, shake: Array
+) -> Array:
     """(M, 2, r) pixels by the unit directions of the calibration's uncertainty."""
     problem, share = frame.problem, frame.problem.calibration
     assert share is not None
-    position = shake @ frame.shake.position
     rig = points - position[:, None] * problem.axis - shake @ frame.shake.offset[camera].T
     rows = rig_jacobian(problem.cameras, share.free, rig)[..., 2 * camera : 2 * camera + 2, :]
     return np.asarray(rows @ share.root)

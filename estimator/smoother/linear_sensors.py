@@ -6,16 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoother.blocks import Linear, log_det_of, repeated
-from telerig.estimator.smoother.model import CARRIAGE
+from telerig.estimator.smoother.model import CARRIAGE, Accelerometer
 from telerig.estimator.smoother.state import Frame, State
 from telerig.factors import measurements
 from telerig.factors.measurements import whitener_of
 
 Array = NDArray[np.float64]
 
+_SLOPE_S = 2e-3
+
 
 def encoder(frame: Frame, state: State) -> list[Linear]:
-    """Readings of the stage's position: at their own times, or interpolated at the frames."""
+    """Readings of the stage's position: at their own times, or interpolated at the frames.
+
+    The carriage's states are in units of the reading, so that its scale is not a factor of what
+    the encoder pins: the mode of (states, scale) together would shrink the states' noise, by one
+    nat in the log of the scale for every reading, where no data speak of the scale.
+    """
     problem, model, layout = frame.problem, frame.model, frame.shake
     stage, nodes = problem.stage, frame.nodes
     if stage is None:
@@ -34,26 +41,23 @@ def encoder(frame: Frame, state: State) -> list[Linear]:
         reading = frame.nominal_mm[node]
         rows = np.tile(layout.position, (len(node), 1))
         speed = np.gradient(frame.nominal_mm, nodes.t_s)[node]
-    scale, delay = _encoder_constants(frame, state)
-    position = (state.shake[node] * rows).sum(-1) - delay * speed
-    read = measurements.encoder_reading(position, speed, scale)
-    columns = np.stack([read.by_scale, read.by_delay], -1)[:, np.array(frame.encoder_flags)]
+    position = (state.shake[node] * rows).sum(-1) - state.encoder_delay_s(frame) * speed
+    read = measurements.encoder_reading(position, speed)
+    columns = np.stack([np.zeros_like(speed), read.by_delay], -1)[:, np.array(frame.encoder_flags)]
     sigma = model.encoder_sigma_mm
     by_shake = (read.by_position[:, None] * rows)[:, None] @ frame.shake_basis(node)
+    columns = np.concatenate([columns, np.zeros((len(node), frame.share_size))], -1)
     blocks = (by_shake, columns[:, None])
     rhs = (reading - read.reading_mm)[:, None] / sigma
     log_det = np.full(len(rhs), -np.log(sigma))
     return [Linear((node, frame.base()[4]), tuple(b / sigma for b in blocks), rhs, log_det)]
 
 
-def _encoder_constants(frame: Frame, state: State) -> tuple[float, float]:
-    values = iter(state.encoder.tolist())
-    scale, delay = (next(values) if flag else 0.0 for flag in frame.encoder_flags)
-    return scale, delay
-
-
 def accelerometers(frame: Frame, state: State) -> list[Linear]:
-    """Samples of all sensors, along the directions in which their mount's motion is modelled."""
+    """Samples of all sensors, along the directions in which their mount's motion is modelled.
+
+    What they say of the encoder's scale, by the carriage's own acceleration, is not used.
+    """
     return [_accelerometer(frame, state, i) for i in range(len(frame.problem.accelerometers))]
 
 
@@ -61,32 +65,47 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
     problem, layout = frame.problem, frame.shake
     sensor = problem.accelerometers[index]
     node, late = frame.nodes.of_accelerometers[index], frame.nodes.accelerometer_late_s[index]
-    jerk_rows = np.multiply.outer(problem.axis, layout.jerk) + layout.offset_jerk[sensor.camera]
-    rows = (
-        np.multiply.outer(problem.axis, layout.acceleration)
-        + layout.offset_acceleration[sensor.camera]
-    )
+    gain = 1 / (1 + state.encoder_scale(frame))
+    jerk_rows = np.multiply.outer(gain * problem.axis, layout.jerk)
+    jerk_rows += layout.offset_jerk[sensor.camera]
+    rows = np.multiply.outer(gain * problem.axis, layout.acceleration)
+    rows += layout.offset_acceleration[sensor.camera]
     bias = state.sensors[index, :3]
     clock = frame.clock_of[index]
     scale, delay = state.sensors[index, 3:].sum(), state.clocks[clock].sum()
     states = state.shake[node]
-    after = late - delay
-    acceleration = states @ rows.T + after[:, None] * (states @ jerk_rows.T)
+    acceleration = states @ rows.T + late[:, None] * (states @ jerk_rows.T)
     read = measurements.accelerometer_reading(
-        acceleration, states @ jerk_rows.T, problem.up, sensor.axes, bias, np.asarray(scale)
+        acceleration, np.zeros_like(acceleration), problem.up, sensor.axes, bias, np.asarray(scale)
     )
+    slope = _slope(sensor)
     project, white = _felt(frame, index)
     by_shake = (project @ read.by_acceleration[0]) @ (
-        (rows + after[:, None, None] * jerk_rows) @ frame.shake_basis(node)
+        (rows + late[:, None, None] * jerk_rows) @ frame.shake_basis(node)
     )
     has_scale, has_delay = frame.sensor_flags
-    by_scale, by_clock = read.by_scale[..., None], read.by_delay[..., None]
+    by_scale, by_clock = read.by_scale[..., None], -slope[..., None]
     by_sensor = np.concatenate([repeated(np.eye(3), len(node)), by_scale[..., :has_scale]], -1)
     blocks = (by_shake, project @ by_sensor, project @ by_clock[..., :has_delay])
-    rhs = (sensor.reading_mm_s2 - read.reading_mm_s2) @ project.T
+    rhs = (sensor.reading_mm_s2 - read.reading_mm_s2 + delay * slope) @ project.T
     log_det = np.full(len(node), white)
-    keys = (node, frame.base()[3] + index, frame.base()[7] + clock)
+    keys = (node, frame.base()[3] + index, frame.base()[6] + clock)
     return Linear(keys, blocks, rhs, log_det)
+
+
+def _slope(sensor: Accelerometer) -> Array:
+    """(N, 3) change of the readings per second over a few ms, by which a delay changes them.
+
+    Of the readings, not of the states: the states' jerk is as rough as the model's force, readings
+    moved along it would be rougher than the force allows, and the priors would hold the delay
+    where it is. An odd filter of the readings themselves leaves their roughness alone.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    step = float(np.median(np.diff(sensor.t_s)))
+    width = max(_SLOPE_S / step, 1.0)
+    slope = gaussian_filter1d(sensor.reading_mm_s2, width, axis=0, order=1, mode="nearest")
+    return np.asarray(slope / step, np.float64)
 
 
 def _felt(frame: Frame, index: int) -> tuple[Array, float]:

@@ -192,10 +192,27 @@ class Mark:
 
 @dataclass(frozen=True)
 class Stage:
-    """The encoder's record: t_s, position_mm (E,)."""
+    """The encoder's record: t_s, position_mm (E,), a calibrated scale taken off."""
 
     t_s: Array
     position_mm: Array
+
+
+@dataclass(frozen=True)
+class Travel:
+    """The stage's travel as known before the run.
+
+    axis : (3,) unit vector in rig axes.  basis : (3, 2) unit vectors across it.
+    scale : (reading - travel) / travel, already taken off the readings of `Stage`.
+    covariance : (3, 3) of the axis' tilts (rad, along basis) and the scale.
+    source : "stage_axis" (calibrated), "rig.toml" (stated) or "assumed".
+    """
+
+    axis: Array
+    basis: Array
+    scale: float
+    covariance: Array
+    source: Literal["stage_axis", "rig.toml", "assumed"]
 
 
 @dataclass(frozen=True)
@@ -234,6 +251,7 @@ class SmoothingProblem:
 
     t_s : (F,) frame times.  axis, up : (3,) unit vectors in rig axes.
     observations, references : pixels of ``bubbles`` and of ``marks``.
+    travel : how well axis and encoder are known; None: exactly.
     """
 
     cameras: tuple[Camera, ...]
@@ -247,6 +265,7 @@ class SmoothingProblem:
     marks: tuple[Mark, ...] = ()
     references: Observations = field(default_factory=Observations.none)
     calibration: CalibrationShare | None = None
+    travel: Travel | None = None
 
     def __post_init__(self) -> None:
         """Raises InputError for times that do not increase or a run of fewer than two frames."""

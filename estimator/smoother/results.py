@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.smoother.model import ShakeModel
 from telerig.estimator.smoother.solve import Solution
+from telerig.estimator.smoother.travel import left_open, scale_sigma, total_scale
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,6 +73,7 @@ def summary_of(solution: Solution) -> dict[str, Any]:
             "references": _residuals(solution, 1),
         },
         "encoder": _encoder(solution),
+        "travel": _travel(solution),
         "accelerometers": _sensors(solution),
         "bubble_means": _means(solution),
     }
@@ -98,11 +100,35 @@ def _residuals(solution: Solution, which: int) -> dict[str, Any]:
 
 
 def _encoder(solution: Solution) -> dict[str, Any]:
-    flags = solution.frame.encoder_flags
-    if solution.frame.problem.stage is None:
+    """Scale and delay; ``scale_from`` : "run" where marks told it, else where it was known from."""
+    frame, block = solution.frame, _block(solution, "encoder")
+    if frame.problem.stage is None:
         return {}
-    names = [n for n, flag in zip(("scale", "delay_s"), flags) if flag]
-    return _with_sd(names, solution.state.encoder, _block(solution, "encoder"))
+    travel = frame.problem.travel
+    known = "given" if travel is None else travel.source
+    out: dict[str, Any] = {
+        "scale": total_scale(solution),
+        "sscale": scale_sigma(solution),
+        "scale_from": "run" if frame.encoder_flags[0] else known,
+    }
+    if frame.encoder_flags[1]:
+        out["delay_s"] = float(solution.state.encoder[-1])
+        if block is not None:
+            out["sdelay_s"] = float(np.sqrt(block[-1, -1]))
+    return out
+
+
+def _travel(solution: Solution) -> dict[str, Any]:
+    travel = solution.frame.problem.travel
+    if travel is None or solution.frame.problem.stage is None:
+        return {}
+    place, _ = left_open(solution)
+    return {
+        "axis": travel.axis.tolist(),
+        "axis_from": "stage_axis" if travel.source == "stage_axis" else "rig.toml",
+        "axis_sd_deg": np.degrees(np.sqrt(np.diagonal(travel.covariance)[:2])).tolist(),
+        "left_open_mm": np.sqrt(np.median(place, axis=0)).tolist() if len(place) else [0.0] * 3,
+    }
 
 
 def _sensors(solution: Solution) -> dict[str, Any]:

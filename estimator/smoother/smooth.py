@@ -33,6 +33,7 @@ from telerig.estimator.smoother.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoother.tables import shake as shake_table
 from telerig.estimator.smoother.tables import trajectories
 from telerig.estimator.smoother.tracked import Tracked, bubbles_of, read_tracks
+from telerig.estimator.smoother.travel import travel_of
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration import Calibration
@@ -71,7 +72,8 @@ def smooth(
     references : a table frame, camera, mark, u_px, v_px[, sigma_px].
     model : "auto" (defaults for the information at hand; learned modes for images alone, where
         learning is available), "default", a `ShakeModel`, or a function that makes one.
-    rig : the description in rig.toml: travel axis, sensors. t_s : (F,) frame times, else those of
+    rig : the description in rig.toml: travel axis (where the calibration has no stage), how well
+        the encoder's scale is known, sensors. t_s : (F,) frame times, else those of
         the tracks.
 
     Raises InputError for tables that cannot be used together.
@@ -126,8 +128,12 @@ def problem_of(
             where="smooth",
             todo="give t_s, the times at which offsets are wanted",
         )
-    axis, up, encoder_sigma = _stage_geometry(rig)
+    up, encoder_sigma = _stage_geometry(rig)
+    travel = travel_of(calibration.stage, None if rig is None else rig.stage)
+    axis = travel.axis
     record = stage_of(stage, times)
+    if record is not None and travel.scale:
+        record = replace(record, position_mm=record.position_mm / (1 + travel.scale))
     positions = np.zeros(len(times))
     if record is not None:
         positions = np.interp(times, record.t_s, record.position_mm)
@@ -143,22 +149,18 @@ def problem_of(
         cameras, times, axis, up, bubbles,
         Observations.none() if tracked is None else tracked.observations,
         record, accelerometers_of(accelerometers, rig, cameras, times), marks, seen, share,
+        travel,
     )  # fmt: skip
     return problem, tracked, encoder_sigma
 
 
-def _stage_geometry(rig: Any) -> tuple[Array, Array, float]:
-    """Travel axis, up, and the encoder's sd; without a description, upwards in the images."""
+def _stage_geometry(rig: Any) -> tuple[Array, float]:
+    """Up, and the encoder's sd; without a description, upwards in the images."""
     described = None if rig is None else rig.stage
     if described is None:
-        up = np.array([0.0, -1.0, 0.0])
-        return up, up, _ENCODER_SIGMA_MM
-    axis, up = (np.asarray(v, float) for v in (described.axis, described.up))
-    return (
-        axis / np.linalg.norm(axis),
-        up / np.linalg.norm(up),
-        float(described.position_sigma_mm),
-    )
+        return np.array([0.0, -1.0, 0.0]), _ENCODER_SIGMA_MM
+    up = np.asarray(described.up, float)
+    return up / np.linalg.norm(up), float(described.position_sigma_mm)
 
 
 def choose_model(

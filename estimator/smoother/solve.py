@@ -26,12 +26,14 @@ Progress = Callable[[str, float], None]
 _NOTHING = np.zeros(0, np.int64)
 _DELAY_STEP_S = 3e-5
 _DELAY_LEAP_S = 2e-3
+_CLOCK_PASSES = 6
 
 
 @dataclass(frozen=True)
 class Options:
-    """passes : relinearisations at most.  robust : down-weight pixels that do not fit.
+    """passes : relinearisations at most, some more while a sensor's clock moves.
 
+    robust : down-weight pixels that do not fit.
     covariances : of states ("frames"), or none (False) when only the evidence is asked.
     tolerance_px : passes end when no bubble moved more in the last. Affine cameras and held
         constants need one pass.
@@ -122,12 +124,14 @@ def _solve(
     last: _Pass | None = None
     exact = _is_linear(problem, model)
     done = 0
-    for done in range(1, options.passes + 1):
-        progress("smoothing", (done - 1) / (options.passes + 1))
+    for done in range(1, options.passes + _CLOCK_PASSES + 1):
+        if done > options.passes and not _late(frame, state):
+            break
+        progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
         last = made = _linear_solve(frame, state, weights)
         state = moved(frame, state, made.step)
         fresh, changed = robust.update(weights, pixel_residuals(frame, state))
-        settled = made.largest_px < options.tolerance_px or exact
+        settled = (made.largest_px < options.tolerance_px and not _late(frame, state)) or exact
         if settled and not changed and (done > 1 or start is not None or exact):
             break
         weights = fresh
@@ -237,7 +241,7 @@ def _ordering(frame: Frame) -> Any:
     np.maximum.at(last_mark, problem.references.item, seen)
     keys = [nodes, base[1] + rows, base[2] + np.arange(len(problem.bubbles))]
     when = [nodes, frame.node_of_row, last_row]
-    keys.append(base[6] + np.arange(len(problem.marks)))
+    keys.append(base[5] + np.arange(len(problem.marks)))
     when.append(last_mark)
     rank = np.repeat(np.arange(4), [len(k) for k in keys])
     joined = np.concatenate(keys).astype(np.int64)
@@ -246,7 +250,7 @@ def _ordering(frame: Frame) -> Any:
     for key in joined[order].tolist():
         out.push_back(key)
     counts = frame.counts()
-    for family in (3, 4, 5, 7):
+    for family in (3, 4, 6):
         number, size = counts[family]
         for key in range(base[family], base[family] + number * (size > 0)):
             out.push_back(key)
@@ -263,11 +267,16 @@ def _largest_shift_px(factors: list[Linear], frame: Frame, vector: Array) -> flo
     return float(np.max(np.abs(moves), initial=0.0) * scale)
 
 
+def _late(frame: Frame, state: State) -> bool:
+    """Whether a sensor's delay has moved so far that its samples belong elsewhere."""
+    if not (frame.sensor_flags[1] and frame.problem.accelerometers):
+        return False
+    return bool(np.max(np.abs(state.clocks)) >= _DELAY_STEP_S)
+
+
 def _restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
     """Move the nodes of sensors whose estimated delay has moved."""
-    if not (frame.sensor_flags[1] and frame.problem.accelerometers):
-        return frame, state, False
-    if np.max(np.abs(state.clocks)) < _DELAY_STEP_S:
+    if not _late(frame, state):
         return frame, state, False
     leap = np.clip(state.clocks[frame.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
     fresh = frame_of(frame.problem, frame.model, frame.delays_s + leap)
@@ -342,8 +351,8 @@ def _covariances(frame: Frame, net: Any, progress: Progress) -> tuple[Covariance
         cross,
         blocks[2],
         blocks[3],
-        blocks[4][0],
-        blocks[5][0],
-        *blocks[6:],
+        blocks[4][0, : frame.encoder_size, : frame.encoder_size],
+        blocks[4][0, frame.encoder_size :, frame.encoder_size :],
+        *blocks[5:],
     )
     return covariances, marginals.log_det

@@ -26,8 +26,9 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class State:
-    """shake : (N, Ds).  bubbles : (sum of lengths, Db), one bubble after the other.
+    """shake : (N, Ds), the carriage in units of the encoder's reading.
 
+    bubbles : (sum of lengths, Db), one bubble after the other.
     means : (K, 3), or (K, 4) with the constant speed.  sensors : (A, 3 or 4) bias, scale.
     encoder : (0..2,) scale, delay.  calibration : (r,).  marks : (Q, 3).  clocks : (G, 0 or 1)
     delay of the accelerometers' clocks beyond that at which the nodes are placed.
@@ -41,6 +42,14 @@ class State:
     calibration: Array
     marks: Array
     clocks: Array
+
+    def encoder_scale(self, frame: Frame) -> float:
+        """0 where it is held."""
+        return float(self.encoder[0]) if frame.encoder_flags[0] else 0.0
+
+    def encoder_delay_s(self, frame: Frame) -> float:
+        """0 where it is held."""
+        return float(self.encoder[-1]) if frame.encoder_flags[1] else 0.0
 
 
 @dataclass(frozen=True)
@@ -119,20 +128,38 @@ class Frame:
 
     @property
     def encoder_flags(self) -> tuple[bool, bool]:
-        return self.model.encoder_scale_sigma > 0, self.model.encoder_delay_sigma_s > 0
+        """Whether the encoder's scale and its delay are variables."""
+        read = self.problem.stage is not None
+        model = self.model
+        return read and model.encoder_scale_sigma > 0, read and model.encoder_delay_sigma_s > 0
+
+    def by_scale(self, column: Array) -> Array:
+        """(..., n, 0 to 2) derivatives by the encoder's scale and delay, from (..., n) by scale."""
+        both = np.stack([column, np.zeros_like(column)], -1)
+        return np.asarray(both[..., np.array(self.encoder_flags)])
+
+    @property
+    def encoder_size(self) -> int:
+        return sum(self.encoder_flags)
+
+    @property
+    def share_size(self) -> int:
+        """Directions of the calibration's uncertainty."""
+        share = self.problem.calibration
+        return 0 if share is None else int(share.root.shape[1])
 
     def counts(self) -> list[tuple[int, int]]:
-        """(number, dimension) of the keys of each family, in the order of `State`."""
+        """(number, dimension) of the keys of each family, in the order of `State`.
+
+        Encoder and calibration are one key: a factor takes three at most.
+        """
         problem = self.problem
-        share = 0 if problem.calibration is None else problem.calibration.root.shape[1]
-        encoder = sum(self.encoder_flags) if problem.stage is not None else 0
         return [
             (len(self.nodes.t_s), self.shake.size),
             (self.rows, self.bubble.size),
             (len(problem.bubbles), self.mean_size),
             (len(problem.accelerometers), 3 + self.sensor_flags[0]),
-            (1, encoder),
-            (1, share),
+            (1, self.encoder_size + self.share_size),
             (len(problem.marks), 3),
             (int(self.clock_of.max(initial=-1)) + 1, int(self.sensor_flags[1])),
         ]
@@ -201,8 +228,9 @@ def first_guess(frame: Frame) -> State:
         means[k, :3] = slope
         means[k, 3:] = max(float(np.linalg.norm(slope)), 1.0)
     if len(problem.marks):
-        values[6][:] = [m.guess_mm for m in problem.marks]
-    return State(shake, bubbles, means, values[3], values[4][0], values[5][0], *values[6:])
+        values[5][:] = [m.guess_mm for m in problem.marks]
+    encoder, calibration = np.split(values[4][0], [frame.encoder_size])
+    return State(shake, bubbles, means, values[3], encoder, calibration, *values[5:])
 
 
 def _guess_carriage(frame: Frame, shake: Array) -> None:
@@ -222,10 +250,10 @@ def moved(frame: Frame, state: State, step: Array) -> State:
         state.bubbles + times(frame.bubble_basis(np.arange(len(shaped[1]))), shaped[1]),
         state.means + shaped[2],
         state.sensors + shaped[3],
-        state.encoder + shaped[4][0],
-        state.calibration + shaped[5][0],
-        state.marks + shaped[6],
-        state.clocks + shaped[7],
+        state.encoder + shaped[4][0, : frame.encoder_size],
+        state.calibration + shaped[4][0, frame.encoder_size :],
+        state.marks + shaped[5],
+        state.clocks + shaped[6],
     )
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.smoother.baselines import central_velocity, rts
 from telerig.estimator.smoother.solve import Solution
+from telerig.estimator.smoother.travel import carriage, carriage_sigma, left_open
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,7 +22,10 @@ LONGEST_RTS = 5000
 
 
 def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFrame:
-    """One row for every frame between a bubble's first and last detection; lab frame."""
+    """One row for every frame between a bubble's first and last detection; lab frame.
+
+    The standard deviations hold what is not known of the encoder's scale and the travel axis.
+    """
     import pandas as pd
 
     frame, problem = solution.frame, solution.frame.problem
@@ -37,8 +41,11 @@ def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFram
     columns |= _named(states @ layout.position.T, "{}_mm")
     columns |= _named(states @ layout.velocity.T, "v{}_mm_s")
     if covariances is not None:
-        columns |= _named(_sigma(layout.position, covariances.bubbles), "s{}_mm")
-        columns |= _named(_sigma(layout.velocity, covariances.bubbles), "sv{}_mm_s")
+        place, speed = left_open(solution)
+        sigma = _sigma(layout.position, covariances.bubbles)
+        columns |= _named(np.sqrt(sigma**2 + place), "s{}_mm")
+        sigma = _sigma(layout.velocity, covariances.bubbles)
+        columns |= _named(np.sqrt(sigma**2 + speed), "sv{}_mm_s")
     columns["observed"] = _observed(solution)
     if tracks is not None:
         columns |= _baselines(solution, tracks)
@@ -115,7 +122,8 @@ def shake(solution: Solution) -> pd.DataFrame:
             unseen = np.diagonal(layout.unseen_variance_mm2[c])
             columns |= _named(np.sqrt(sigma**2 + unseen), f"s{camera.name}_{{}}_mm")
     if problem.stage is not None:
-        columns["position_mm"] = states @ layout.position
+        columns["position_mm"], _ = carriage(solution)
         if covariances is not None:
-            columns["sposition_mm"] = _sigma(layout.position[None], covariances.shake)[:, 0]
+            sigma = _sigma(layout.position[None], covariances.shake)[:, 0]
+            columns["sposition_mm"] = carriage_sigma(solution, sigma)
     return pd.DataFrame(columns)

@@ -24,6 +24,7 @@ _COLOURS = {"GOOD": "good", "USABLE": "usable", "REJECTED": "rejected"}
 _SHOWN = {
     "schema", "kind", "name", "pixel_origin", "units", "gauge", "verdict", "cameras", "target",
     "views", "covariance", "model", "twin", "statistics", "diagnostics", "notes",
+    "stage",
 }  # fmt: skip
 
 
@@ -75,6 +76,8 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
         "figures": tables.key_numbers(results),
         "parameters": tables.parameter_rows(results),
         "pose": tables.pose_rows(results),
+        "stage": tables.stage_rows(results),
+        "stage_words": (results.content.get("stage") or {}).get("notes") or [],
         "ladder": tables.ladder_rows(results),
         "worst": tables.worst_rows(results),
         "left_out": int((~results.residuals["kept"]).sum()),

@@ -148,6 +148,24 @@ def pose_rows(results: CalibrationResults) -> list[Row]:
     ]  # fmt: skip
 
 
+def stage_rows(results: CalibrationResults) -> list[Row]:
+    """Travel axis and encoder scale from `stage_axis/`; empty without it."""
+    stage = results.content.get("stage") or {}
+    if not stage:
+        return []
+    tilts = np.sqrt(np.diagonal(np.array(stage["axis_covariance_rad2"], float)))
+    scale, sd = (1e6 * float(stage[key]) for key in ("encoder_scale", "encoder_scale_sd"))
+    across, along = (1e3 * float(stage[f"{k}_sigma_mm"]) for k in ("wander", "position"))
+    return [
+        Row(("direction of travel in the rig frame", _fixed(stage["axis"], 6))),
+        Row(("sd of its two tilts (°)", _fixed(_degrees([float(t) for t in tilts]), 5))),
+        Row(("encoder reads too much (ppm of the travel)", with_sd(scale, sd)), True),
+        Row(("scatter of the readings along the axis (µm)", number(along, 2))),
+        Row(("the carriage's wander across it (µm)", number(across, 2))),
+        Row(("chi² per degree of freedom of the dots", number(stage.get("chi2_dof"), 3))),
+    ]
+
+
 def _degrees(radians: list[float] | None) -> list[float] | None:
     return None if radians is None else [float(np.degrees(r)) for r in radians]
 

@@ -134,9 +134,8 @@ def description(scale_sigma: float | None = 0.0) -> SimpleNamespace:
         for name, mount in (("arm_left", "left"), ("arm_right", "right"), ("carriage", "carriage"))
     }
     up = (0.0, -1.0, 0.0)
-    return SimpleNamespace(
-        stage=StageDescription(up, up, ENCODER_MM, scale_sigma), accelerometers=sensors
-    )
+    stage = StageDescription(up, up, ENCODER_MM, scale_sigma)
+    return SimpleNamespace(stage=stage, accelerometers=sensors)
 
 
 def cameras(case: Case) -> tuple[Camera, Camera]:

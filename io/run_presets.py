@@ -77,8 +77,7 @@ class StageConfig:
 
     follow : its speed over the bubbles' mean rise; ramp_s : of the start from rest at t = 0.
     servo_* : the following error, seen by the encoder. encoder_sigma_mm, encoder_rate_hz;
-    it reads (1 + encoder_scale) times the travel.
-    axis_views : of a target at rest, over axis_travel_mm, for `stage_axis/`; 0 for none.
+    it reads 1 + encoder_scale times the travel. axis_* : views of a target at rest, or none.
     shake_mm : amplitude A; every camera's offset along the axis has RMS A / sqrt 2, across it
     ``shake_lateral`` times that. shake_* : see `telerig.io.bubble_motion.rig_shake`.
     accelerometers : mounted on cameras' arms (by name) or on the "carriage"; written if any.
@@ -182,20 +181,9 @@ class RunConfig:
             ("bubbles", self.bubbles, self.bubbles < 0, "0 or more"),
             ("frame_rate_hz", self.frame_rate_hz, not self.frame_rate_hz > 0, "positive"),
             ("d_eq_mm", self.bubble.d_eq_mm, not self.bubble.d_eq_mm[0] > 0, "positive"),
-            (
-                "axis_views",
-                self.stage.axis_views,
-                self.stage.axis_views in (1, 2),
-                "0, or 3 or more",
-            ),
             ("blur_px", self.image.blur_px, not self.image.blur_px >= 0.2, "at least 0.2"),
             ("dropped", self.image.dropped, not 0 <= self.image.dropped < 1, "within 0 and 1"),
-            (
-                "bubbles",
-                self.bubbles,
-                self.motion.pairs and self.bubbles % 2 == 1,
-                "even, as they come in pairs",
-            ),
+            ("bubbles", self.bubbles, self.motion.pairs and self.bubbles % 2, "even: pairs"),
         ]
         for name, value, wrong, wanted in faults:
             if wrong:

@@ -29,9 +29,8 @@ def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
     carriage, stage = scene.carriage, scene.config.stage
     step = _thinning(scene, stage.encoder_rate_hz)
     position = carriage.position_mm[::step]
-    reading = (1 + stage.encoder_scale) * position + stage.encoder_sigma_mm * rng.standard_normal(
-        len(position)
-    )
+    noise = stage.encoder_sigma_mm * rng.standard_normal(len(position))
+    reading = (1 + stage.encoder_scale) * position + noise
     return pd.DataFrame({"t_s": carriage.t_s[::step], "position_mm": reading})
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.atomic import write_json_atomic
@@ -17,6 +19,9 @@ from telerig.io.tables import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
+Array = NDArray[np.float64]
+
+_LEAST_VIEWS = 3
 _TRIES = 50
 _LEAST_DOTS = 0.3
 _SHORTER = 0.8
@@ -34,10 +39,16 @@ def write_stage_axis(
     """positions.csv with images or dots.csv in ``folder / "stage_axis"``, and the truth.
 
     The travel is ``stage.axis_travel_mm``, or less where the target would leave the images.
-    Raises InputError when no pose keeps the target in them.
+    Raises InputError for fewer than three views, or when no pose keeps the target in them.
     """
     import pandas as pd
 
+    if config.stage.axis_views < _LEAST_VIEWS:
+        raise InputError(
+            f"axis_views is {config.stage.axis_views}",
+            where=f"simulation {config.name!r}",
+            todo=f"must be 0, or {_LEAST_VIEWS} or more",
+        )
     pose_rng, encoder_rng, picture_rng = rng.spawn(3)
     stage, calibration = config.stage, config.calibration
     views, stops = _views(config, cameras, target, pose_rng)
@@ -63,10 +74,8 @@ def _views(
     cameras: Mapping[str, Camera],
     target: TrueTarget,
     rng: np.random.Generator,
-) -> tuple[list[View], np.ndarray]:
+) -> tuple[list[View], Array]:
     """A pose that both cameras see at every stop, and the stops in mm."""
-    from dataclasses import replace
-
     upright = replace(
         config.calibration, views=1, roll_deg=0.0, single_camera_views=0, shift_mm=(1.0, 1.0, 1.0)
     )

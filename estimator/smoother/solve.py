@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
 from telerig.estimator.smoother.blocks import Linear
+from telerig.estimator.smoother.clocks import late, restamped
 from telerig.estimator.smoother.linear import all_factors, pixel_residuals
 from telerig.estimator.smoother.marginals import marginal_covariances
 from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
@@ -24,8 +25,6 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 _NOTHING = np.zeros(0, np.int64)
-_DELAY_STEP_S = 3e-5
-_DELAY_LEAP_S = 2e-3
 _CLOCK_PASSES = 6
 
 
@@ -125,18 +124,18 @@ def _solve(
     exact = _is_linear(problem, model)
     done = 0
     for done in range(1, options.passes + _CLOCK_PASSES + 1):
-        if done > options.passes and not _late(frame, state):
+        if done > options.passes and not late(frame, state):
             break
         progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
         last = made = _linear_solve(frame, state, weights)
         state = moved(frame, state, made.step)
         fresh, changed = robust.update(weights, pixel_residuals(frame, state))
-        settled = (made.largest_px < options.tolerance_px and not _late(frame, state)) or exact
+        settled = (made.largest_px < options.tolerance_px and not late(frame, state)) or exact
         if settled and not changed and (done > 1 or start is not None or exact):
             break
         weights = fresh
-        frame, state, restamped = _restamped(frame, state)
-        last = None if restamped or changed else last
+        frame, state, again = restamped(frame, state)
+        last = None if again or changed else last
     if last is None:
         weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
         last = _linear_solve(frame, state, weights)
@@ -265,26 +264,6 @@ def _largest_shift_px(factors: list[Linear], frame: Frame, vector: Array) -> flo
     moves = times(frame.bubble_basis(np.arange(frame.rows)), states) @ layout.position.T
     scale = max(c["scale_px_per_mm"] for c in frame.problem.cameras)
     return float(np.max(np.abs(moves), initial=0.0) * scale)
-
-
-def _late(frame: Frame, state: State) -> bool:
-    """Whether a sensor's delay has moved so far that its samples belong elsewhere."""
-    if not (frame.sensor_flags[1] and frame.problem.accelerometers):
-        return False
-    return bool(np.max(np.abs(state.clocks)) >= _DELAY_STEP_S)
-
-
-def _restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
-    """Move the nodes of sensors whose estimated delay has moved."""
-    if not _late(frame, state):
-        return frame, state, False
-    leap = np.clip(state.clocks[frame.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
-    fresh = frame_of(frame.problem, frame.model, frame.delays_s + leap)
-    shake = np.stack(
-        [np.interp(fresh.nodes.t_s, frame.nodes.t_s, column) for column in state.shake.T], -1
-    )
-    clocks = np.zeros_like(state.clocks)
-    return fresh, replace(state, shake=shake, clocks=clocks), True
 
 
 def _finish(

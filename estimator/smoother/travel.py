@@ -9,7 +9,7 @@ Schmidt, parameter). Marks fixed to the tank do tell the scale; there it is a va
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
     axis = axis / np.linalg.norm(axis)
     basis = np.linalg.svd(axis[None])[2][1:].T
     sigma = SCALE_SIGMA if stated is None else stated
-    source = "assumed" if stated is None else "rig.toml"
+    source: Literal["rig.toml", "assumed"] = "assumed" if stated is None else "rig.toml"
     return Travel(axis, basis, 0.0, np.diag([0.0, 0.0, sigma**2]), source)
 
 

@@ -1,7 +1,7 @@
 """Are bubbles kept apart when they cross, and in swarms? Beside trackpy, laptrack and others.
 
 Usage: python benchmarks/crossings.py [--events 500] [--swarms 4] [--seed 0]
-    [--only TEXT] [--out FILE.md]
+    [--only TEXT] [--linkers NAME ...] [--out FILE.md]
 Needs trackpy and laptrack (pip install trackpy laptrack) for the comparison.
 """
 
@@ -165,8 +165,10 @@ def main() -> None:
     parser.add_argument("--swarms", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="sections whose title contains this")
+    parser.add_argument("--linkers", nargs="*", help="by name [all]")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    who = {k: v for k, v in linkers().items() if not options.linkers or k in options.linkers}
     lines = ["# Crossings and swarms", "", *SCENE_TEXT.splitlines(), ""]
     lines += ["Times: CPU, with other work on the machine.", ""]
     for title, scene in CROSSINGS.items():
@@ -174,13 +176,13 @@ def main() -> None:
             head = "| | events | swaps % | breaks % | not tracked % | ms / frame |"
             lines += [f"## Crossing: {title}", "", head, "|---|---|---|---|---|---|"]
             print(title)
-            lines += [*run_crossings(options.events, options.seed, linkers(), **scene), ""]
+            lines += [*run_crossings(options.events, options.seed, who, **scene), ""]
     for title, (rate, bubbles) in SWARMS.items():
         if options.only in title:
             head = "| | IDF1 | links kept % | links wrong % | tracks per bubble | ms / frame |"
             lines += [f"## Swarm: {title}", "", head, "|---|---|---|---|---|---|"]
             print(title)
-            lines += [*run_swarms(options.swarms, options.seed, linkers(), rate, bubbles), ""]
+            lines += [*run_swarms(options.swarms, options.seed, who, rate, bubbles), ""]
     if options.out:
         options.out.write_text("\n".join(lines))
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.track_advance import Scan
 from telerig.estimator.track_association import best_assignment, gate2
 from telerig.estimator.track_state import Track
-from telerig.estimator.track_types import Ids, SingleMeasurements, TrackerSettings
+from telerig.estimator.track_types import Ids, SeenAlone, SingleMeasurements, TrackerSettings
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 
@@ -58,6 +59,37 @@ def pair_singles(
     chosen = best_assignment(len(between), row, local, score)
     safe = unrivalled(row, local, score, chosen, settings.margin_nats)
     return [(int(r), int(indices[chosen[r]])) for r in np.flatnonzero(safe)]
+
+
+def continue_alone(
+    missed: Sequence[Track], scan: Scan, cameras: Sequence[Camera], common_mm2: Array
+) -> list[tuple[Track, int]]:
+    """Update the tracks by the singles that are theirs; which single (its index) updated which."""
+    singles, out = scan.measured.singles, []
+    for index, camera in enumerate(cameras):
+        mine = np.flatnonzero(singles.camera == index)
+        if not len(mine) or not len(missed):
+            continue
+        seen = expected(camera, missed, common_mm2)
+        for row, single in pair_singles(seen, singles, mine, scan.settings):
+            track, noise = missed[row], singles.covariance_px2[single]
+            update_pixels(track, singles.uv_px[single], noise, seen.uv_px[row], seen.by_point[row])
+            track.saw(scan.frame, scan.t_s, float("nan"))
+            out.append((track, single))
+    return out
+
+
+def seen_alone(found: Sequence[tuple[Track, int]], common_mm2: Array) -> SeenAlone:
+    """Where the tracks are after their updates by single cameras."""
+    if not found:
+        return SeenAlone()
+    return SeenAlone(
+        np.array([single for _, single in found], np.int64),
+        np.array([t.particle for t, _ in found], np.int64),
+        np.array([t.filter.x[:3] for t, _ in found]),
+        np.array([t.filter.P[:3, :3] for t, _ in found]) + common_mm2,
+        np.array([t.d_eq_mm for t, _ in found]),
+    )
 
 
 def unrivalled(row: Ids, column: Ids, score: Array, chosen: Ids, margin_nats: float) -> Ids:

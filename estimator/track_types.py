@@ -194,11 +194,28 @@ class FrameIds:
 
 
 @dataclass(frozen=True)
+class SeenAlone:
+    """Tracks that were continued by single-camera measurements in a frame; S updates.
+
+    single : (S,) index of the measurement; particle : (S,) as of now; points_mm (S, 3),
+    covariance_mm2 (S, 3, 3) : where the bubble is by what its track and the measurement say;
+    d_eq_mm : (S,), NaN where unknown.
+    """
+
+    single: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    particle: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    points_mm: Array = field(default_factory=lambda: _empty(0, 3))
+    covariance_mm2: Array = field(default_factory=lambda: _empty(0, 3, 3))
+    d_eq_mm: Array = field(default_factory=lambda: _empty(0))
+
+
+@dataclass(frozen=True)
 class FrameResult:
     """particle, single : ids as of now, the best guess where a conflict or a birth is still open.
 
     settled : the earlier frames (and this one, if nothing is open) whose ids are final now, in
         order; write these to the tables. events : what became known in this frame.
+    alone : the tracks that one camera alone continued in this frame.
     """
 
     frame: int
@@ -206,3 +223,4 @@ class FrameResult:
     single: Ids
     events: tuple[TrackEvent, ...]
     settled: tuple[FrameIds, ...]
+    alone: SeenAlone = field(default_factory=SeenAlone)

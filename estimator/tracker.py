@@ -12,12 +12,13 @@ from telerig.errors import InputError
 from telerig.estimator import track_store
 from telerig.estimator.frontend.bubble_types import Prediction
 from telerig.estimator.track_advance import Scan, advance
-from telerig.estimator.track_birth import beside, born, extend, hopeless, volumes_balance
+from telerig.estimator.track_birth import born, extend, hopeless
+from telerig.estimator.track_death import ended, split_off
 from telerig.estimator.track_given import follow_given
 from telerig.estimator.track_hypotheses import Broken, Cluster, Decision, decide
 from telerig.estimator.track_ledger import Ledger
 from telerig.estimator.track_motion import Transition, state_size, transition
-from telerig.estimator.track_single import expected, pair_singles, update_pixels
+from telerig.estimator.track_single import continue_alone, seen_alone
 from telerig.estimator.track_stage import StageMotion
 from telerig.estimator.track_state import Common, Track, predict
 from telerig.estimator.track_types import (
@@ -25,6 +26,7 @@ from telerig.estimator.track_types import (
     FrameMeasurements,
     FrameResult,
     Ids,
+    SeenAlone,
     TrackerSettings,
     TrackEvent,
 )
@@ -113,14 +115,13 @@ class Tracker:
         scan = Scan(frame, t_s, measured, free, self.settings)
         grown, common, gain = advance(self.clusters, scan, self.common, gains)
         claimed = self._decide(grown, scan, events)
-        if measured.singles.uv_px.size:
-            self._single(scan, common)
+        alone = self._single(scan, common)
         self._births(scan, np.setdiff1d(free, claimed), common, gain, events)
         self._deaths(scan, events)
         now = self.ledger.now(frame)
         settled, gaps = self.ledger.settle(self._open_since(frame))
         self.ledger.forget({t.particle for t in self._confirmed()})
-        return FrameResult(frame, *now, (*events, *gaps), settled)
+        return FrameResult(frame, *now, (*events, *gaps), settled, alone)
 
     def finish(self) -> FrameResult | None:
         """Settle the frames still open, conflicts as if their time were over; None if no frame.
@@ -293,23 +294,14 @@ class Tracker:
         self.ledger.write(broken.new, broken.track.particle)
         return broken.track
 
-    def _single(self, scan: Scan, common: Common) -> None:
+    def _single(self, scan: Scan, common: Common) -> SeenAlone:
         """Confirmed tracks that were missed in this frame, continued by one camera alone."""
         closed = [c.tracks[0] for c in self.clusters if not c.open]
         missed = [t for t in closed if t.seen_frame < scan.frame]
-        singles = scan.measured.singles
-        for index, camera in enumerate(self.cameras):
-            mine = np.flatnonzero(singles.camera == index)
-            if not len(mine) or not missed:
-                continue
-            seen = expected(camera, missed, common.covariance_mm2)
-            for row, single in pair_singles(seen, singles, mine, self.settings):
-                track, noise = missed[row], singles.covariance_px2[single]
-                update_pixels(
-                    track, singles.uv_px[single], noise, seen.uv_px[row], seen.by_point[row]
-                )
-                track.saw(scan.frame, scan.t_s, float("nan"))
-                self.ledger.write_single(scan.frame, single, track.particle)
+        found = continue_alone(missed, scan, self.cameras, common.covariance_mm2)
+        for track, single in found:
+            self.ledger.write_single(scan.frame, single, track.particle)
+        return seen_alone(found, common.covariance_mm2)
 
     def _births(
         self,
@@ -343,48 +335,14 @@ class Tracker:
         self.ledger.write(track.history, track.particle)
         reason = f"first seen in frame {track.history[0][0]}"
         self._event(events, "birth", scan, (track.particle,), reason)
-        self._split(track, scan, events)
+        events += split_off(track, self._confirmed(), scan)
         track.history, track.parent = [], None
         self.clusters.append(Cluster.of(track))
 
-    def _split(self, track: Track, scan: Scan, events: list[TrackEvent]) -> None:
-        parents = {t.particle: t for t in self._confirmed()}
-        if track.parent is None or track.parent[0] not in parents:
-            return
-        parent, before = parents[track.parent[0]], track.parent[1]
-        sizes = (before, parent.d_last_mm, track.d_last_mm)
-        if volumes_balance(*sizes, self.settings.balance_tolerance):
-            reason = "d_eq {:.2f} mm became {:.2f} and {:.2f} mm".format(*sizes)
-            self._event(events, "split", scan, (parent.particle, track.particle), reason)
-
     def _deaths(self, scan: Scan, events: list[TrackEvent]) -> None:
-        """Tracks unseen for too long end; those that were just lost remember who was beside."""
         closed = [c.tracks[0] for c in self.clusters if not c.open] + self.given
-        dead = set()
-        for track in closed:
-            if track.seen_frame == scan.frame:
-                continue
-            if track.near is None:
-                others = [t for t in self._confirmed() if t.particle != track.particle]
-                track.near = beside(track.filter.x[:3], others)
-            unseen = scan.t_s - track.seen_t_s
-            if unseen > self.settings.gap_s and (
-                scan.frame - track.seen_frame > self.settings.gap_frames
-            ):
-                dead.add(track.particle)
-                self._merger(track, scan, events)
-                reason = f"not seen since frame {track.seen_frame}, {unseen:.3f} s"
-                self._event(events, "death", scan, (track.particle,), reason)
+        dead, found = ended(closed, self._confirmed(), scan)
+        events += found
         if dead:
             self.clusters = [c for c in self.clusters if c.tracks[0].particle not in dead]
             self.given = [t for t in self.given if t.particle not in dead]
-
-    def _merger(self, track: Track, scan: Scan, events: list[TrackEvent]) -> None:
-        others = {t.particle: t for t in self._confirmed()}
-        if track.near is None or track.near[0] not in others:
-            return
-        other, before = others[track.near[0]], track.near[1]
-        sizes = (other.d_last_mm, before, track.d_eq_mm)
-        if volumes_balance(*sizes, self.settings.balance_tolerance):
-            reason = "d_eq {1:.2f} and {2:.2f} mm became {0:.2f} mm".format(*sizes)
-            self._event(events, "merge", scan, (other.particle, track.particle), reason)

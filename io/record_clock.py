@@ -25,6 +25,7 @@ RESTART_S = 0.5
 _FEWEST = 5
 """Readings in a row that a restarted clock must give; fewer are wrong stamps."""
 _WINDOWS = 64
+_BLOCKS = 8
 _SHORT_S = 10.0
 
 
@@ -32,8 +33,9 @@ _SHORT_S = 10.0
 class ClockFit:
     """host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6).
 
-    drift_ppm : how much faster than the host's the device's clock runs. sd_* : from the scatter
-    of the least delays in parts of the record. delay_*_ms : of the readings above the least.
+    drift_ppm : how much faster than the host's the device's clock runs. sd_offset_us : scatter of
+    the least delays in parts of the record. sd_drift_ppm : jackknife, or from that scatter if it
+    is larger; NaN where the drift is that of a longer count. delay_*_ms : above the least.
     wander_us : how far the least delays of the parts are apart after the fit.
     """
 
@@ -190,14 +192,16 @@ def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) ->
     delay = late[used] - at_mean - slope * x[used]
     low = np.array([np.min(p) for p in np.array_split(delay, _parts(delay.size))])
     scatter = float(np.std(low)) if len(low) > 1 else float(np.median(delay))
-    span = max(float(np.ptp(x)), 1e-9)
+    known = drift_ppm is not None or len(used) < _WINDOWS
+    even = scatter * float(np.sqrt(12 / len(low))) / max(float(np.ptp(x)), 1e-9)
+    sd_slope = float("nan") if known else max(even, _sd_slope(x[used], late[used]))
     return ClockFit(
         device_mean_s=x_mean,
         host_mean_s=y_mean,
         offset_s=at_mean,
         drift_ppm=1e6 * (1 / (1 + slope) - 1),
         sd_offset_us=1e6 * scatter,
-        sd_drift_ppm=1e6 * scatter * float(np.sqrt(12 / len(low))) / span,
+        sd_drift_ppm=1e6 * sd_slope,
         delay_median_ms=1e3 * float(np.median(delay)),
         delay_max_ms=1e3 * float(np.max(delay)),
         wander_us=1e6 * float(np.ptp(low)),
@@ -219,6 +223,15 @@ def _support(x: Array, late: Array) -> tuple[float, float]:
     i, j = points[right - 1], points[right]
     slope = float((late[j] - late[i]) / (x[j] - x[i]))
     return float(late[i] - slope * x[i]), slope
+
+
+def _sd_slope(x: Array, late: Array) -> float:
+    """Jackknife over `_BLOCKS` stretches of the record, of the line below their least delays."""
+    edge, least = _least_delays(x, late)
+    block = np.arange(len(edge)) * _BLOCKS // len(edge)
+    kept = [block != k for k in range(_BLOCKS)]
+    slopes = [lower_line(x[edge][keep], least[keep])[1] for keep in kept]
+    return float(np.sqrt((_BLOCKS - 1) * np.var(slopes)))
 
 
 def _parts(count: int) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.io.record_clock import ClockFit, host_times
+from telerig.io.record_damage import beside_gaps
 from telerig.io.record_description import DeviceDescription
 from telerig.io.record_log import (
     END,
@@ -153,6 +154,10 @@ def _record(line: _Line, start_ns: int) -> DeviceRecord:
         t_s, time_from = arrived - device.latency_s, "arrival"
     t_s = np.round(t_s, TIME_DIGITS)
     kept = _in_order(t_s, faults)
+    if "t" in values and device.kind != "frames" and device.checksum == "none":
+        sound = beside_gaps(t_s[kept], [v[kept] for k, v in values.items() if k != "t"])
+        faults["far from its neighbours, beside lost bytes"] = int(np.sum(~sound))
+        kept = kept[sound]
     lost, back = (
         _seconds(np.array(line.lost_ns), start_ns),
         _seconds(np.array(line.found_ns), start_ns),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
+from telerig.io.record_damage import GAP_INTERVALS
 from telerig.io.record_description import DeviceDescription
 from telerig.io.record_log import END, FOUND, LOST, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.record_ports import open_port
@@ -27,8 +28,6 @@ TICK_S = 0.5
 """How often the log is brought to the disk and the status told; a power cut costs this much."""
 GARBAGE_S = 2.0
 """A line that says nothing readable for so long has the wrong speed, or another protocol."""
-GAP_INTERVALS = 1.5
-"""A step of the device's clock of more than so many usual ones has lost readings in it."""
 
 
 class GarbageError(InputError):

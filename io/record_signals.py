@@ -69,11 +69,6 @@ class SimulatedDevice:
         ticks = np.round(number * self._ticks_apart()).astype(np.int64) + self.start_ticks
         return ticks % 2**self.device.time_bits if self.device.time_bits else ticks
 
-    def number_at(self, host_s: Array) -> Ints:
-        """Which reading was made nearest to ``host_s``."""
-        elapsed = np.asarray(host_s) * (1 + 1e-6 * self.drift_ppm)
-        return np.round(elapsed / self.device.time_unit_s / self._ticks_apart()).astype(np.int64)
-
     def _ticks_apart(self) -> float:
         return 1 / (self.rate_hz * self.device.time_unit_s)
 
@@ -132,13 +127,11 @@ def damage(
             noise = rng.integers(0, 256, int(rng.integers(1, _GARBAGE_BYTES)), np.uint8).tobytes()
             out[i] = piece[:at] + noise + piece[at:]
             spoilt.add(i)
-        if rng.random() < faults.cut_hz * per_reading_s:
+        if rng.random() < faults.cut_hz * per_reading_s and i + 1 < len(out):
             at = int(rng.integers(0, len(piece)))
             out[i] = out[i][:at]
-            spoilt.add(i)
-            if i + 1 < len(out):
-                out[i + 1] = out[i + 1][int(rng.integers(0, len(pieces[i + 1]))) :]
-                spoilt.add(i + 1)
+            out[i + 1] = out[i + 1][int(rng.integers(0, len(pieces[i + 1]))) :]
+            spoilt |= {i, i + 1}
     return b"".join(out), sorted(spoilt)
 
 

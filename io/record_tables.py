@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.atomic import atomic_folder, write_json_atomic
+from telerig.io.record_damage import GAP_INTERVALS
 from telerig.io.record_frames import FrameTimes, frame_times
 from telerig.io.record_log import damaged_bytes
 from telerig.io.record_replay import TIME_DIGITS, DeviceRecord, Replay, replay
 
 Array = NDArray[np.float64]
 
-GAP_INTERVALS = 1.5
-"""A step of more than so many usual ones is a gap."""
 _ROWS = 20_000
 _GAPS_TOLD = 200
 

@@ -13,9 +13,15 @@ from telerig.estimator.frontend.body import DEFAULT_SHAPE_SIGMA, Bodies, fit_bod
 from telerig.estimator.frontend.bubble_types import Prediction
 from telerig.estimator.frontend.matching import match_pairs
 from telerig.estimator.frontend.pair_types import PairModel
+from telerig.estimator.track_shared import (
+    FRAMES_AFTER,
+    FRAMES_BEFORE,
+    Frame,
+    Pairs,
+    shared_rows,
+)
 from telerig.estimator.track_types import (
     NO_PARTICLE,
-    FrameIds,
     FrameMeasurements,
     FrameResult,
     SingleMeasurements,
@@ -39,20 +45,6 @@ standard deviation (unit mean square over the sphere; their k = 1 part along a g
 
 
 @dataclass(frozen=True)
-class Pairs:
-    """Rows of the two tables that show the same bubble.
-
-    particle : (M,) ids given by the user, -1 where the pair was found here.
-    """
-
-    first: Index
-    second: Index
-    confidence: Array
-    ambiguous: NDArray[np.bool_]
-    particle: Index
-
-
-@dataclass(frozen=True)
 class Linked:
     """Finished rows of `tracks.csv` and `detections.csv`."""
 
@@ -61,28 +53,17 @@ class Linked:
 
 
 @dataclass
-class _Frame:
-    """One frame whose ids are not final yet."""
-
-    number: int
-    t_s: float
-    tables: tuple[pd.DataFrame, pd.DataFrame]
-    pairs: Pairs
-    singles: tuple[Index, Index]
-    ids: FrameIds | None = None
-
-
-@dataclass
 class Linker:
-    """Turns frames of detections into finished rows; holds no more than the frames still open."""
+    """Turns frames of detections into finished rows; holds the frames still open, and a few."""
 
     cameras: tuple[Camera, Camera]
     model: PairModel
     tracker: Tracker
     shape_sigma: Array | None
     events: list[TrackEvent] = field(default_factory=list)
-    _open: dict[int, _Frame] = field(default_factory=dict)
-    _closed: list[_Frame] = field(default_factory=list)
+    _open: dict[int, Frame] = field(default_factory=dict)
+    _closed: list[Frame] = field(default_factory=list)
+    _before: list[Frame] = field(default_factory=list)
     _waiting: int = 0
 
     def add(
@@ -98,9 +79,12 @@ class Linker:
         lonely = _unpaired(tables, pairs)
         measured = _measured(self.cameras, tables, pairs, lonely, self._wander)
         result = self.tracker.update(number, t_s, measured, position_mm)
-        self._open[number] = _Frame(number, t_s, tables, pairs, lonely)
+        self._open[number] = Frame(
+            number, t_s, tables, pairs, lonely, measured, result.alone, result.motion
+        )
         self._settle(result)
-        return self._flush() if self._waiting >= _PAIRS_AT_ONCE else None
+        enough = self._waiting >= _PAIRS_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
+        return self._flush(FRAMES_AFTER) if enough else None
 
     @property
     def _wander(self) -> float:
@@ -113,7 +97,7 @@ class Linker:
         result = self.tracker.finish()
         if result is not None:
             self._settle(result)
-        return self._flush() if self._closed else None
+        return self._flush(0) if self._closed else None
 
     def _settle(self, result: FrameResult) -> None:
         self.events.extend(result.events)
@@ -123,11 +107,19 @@ class Linker:
             self._closed.append(frame)
             self._waiting += 1 + len(frame.pairs.first)
 
-    def _flush(self) -> Linked:
-        frames, self._closed, self._waiting = self._closed, [], 0
-        return Linked(self._tracks(frames), _detections(frames))
+    def _flush(self, ahead: int) -> Linked:
+        """Rows of all closed frames but the last few, which tell where hidden bubbles went."""
+        done = self._closed[: len(self._closed) - ahead]
+        self._closed, self._waiting = self._closed[len(done) :], 0
+        hidden = shared_rows(self._before, done, self._closed, self.cameras, self.tracker.settings)
+        self._before = [*self._before, *done][-FRAMES_BEFORE:]
+        found = self._tracks(done)
+        if hidden:
+            found = pd.concat([found, pd.DataFrame(hidden, columns=found.columns)], ignore_index=True)
+            found = found.sort_values(["frame", "particle"], kind="stable", ignore_index=True)
+        return Linked(found, _detections(done))
 
-    def _tracks(self, frames: Sequence[_Frame]) -> pd.DataFrame:
+    def _tracks(self, frames: Sequence[Frame]) -> pd.DataFrame:
         parts = [
             [f.tables[c].iloc[(f.pairs.first, f.pairs.second)[c]] for f in frames] for c in (0, 1)
         ]
@@ -273,7 +265,7 @@ def _diameter_mm(
     return np.sqrt(product)
 
 
-def _detections(frames: Sequence[_Frame]) -> pd.DataFrame:
+def _detections(frames: Sequence[Frame]) -> pd.DataFrame:
     """Every detection with the id of its track, blank where it has none."""
     tables = []
     for frame in frames:

@@ -210,12 +210,24 @@ class SeenAlone:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """From the frame before: a bubble's state x -> matrix @ x + offset (n,), plus noise (n, n).
+
+    The offset holds the stage's travel and the shift common to all bubbles.
+    """
+
+    matrix: Array
+    noise: Array
+    offset: Array
+
+
+@dataclass(frozen=True)
 class FrameResult:
     """particle, single : ids as of now, the best guess where a conflict or a birth is still open.
 
     settled : the earlier frames (and this one, if nothing is open) whose ids are final now, in
         order; write these to the tables. events : what became known in this frame.
-    alone : the tracks that one camera alone continued in this frame.
+    alone : the tracks that one camera alone continued in this frame. motion : None in the first.
     """
 
     frame: int
@@ -224,3 +236,4 @@ class FrameResult:
     events: tuple[TrackEvent, ...]
     settled: tuple[FrameIds, ...]
     alone: SeenAlone = field(default_factory=SeenAlone)
+    motion: Motion | None = None

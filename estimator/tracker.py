@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from telerig.estimator.track_types import (
     FrameMeasurements,
     FrameResult,
     Ids,
+    Motion,
     SeenAlone,
     TrackerSettings,
     TrackEvent,
@@ -106,7 +108,7 @@ class Tracker:
         a camera that the tracker does not have.
         """
         self._check(frame, t_s, measured)
-        self._predict_all(t_s, position_mm)
+        motion = self._predict_all(t_s, position_mm)
         self.last = (frame, t_s)
         self.ledger.open_frame(frame, t_s, len(measured), len(measured.singles))
         events: list[TrackEvent] = []
@@ -115,13 +117,14 @@ class Tracker:
         scan = Scan(frame, t_s, measured, free, self.settings)
         grown, common, gain = advance(self.clusters, scan, self.common, gains)
         claimed = self._decide(grown, scan, events)
+        moved = None if motion is None else replace(motion, offset=motion.offset + common.shift)
         alone = self._single(scan, common)
         self._births(scan, np.setdiff1d(free, claimed), common, gain, events)
         self._deaths(scan, events)
         now = self.ledger.now(frame)
         settled, gaps = self.ledger.settle(self._open_since(frame))
         self.ledger.forget({t.particle for t in self._confirmed()})
-        return FrameResult(frame, *now, (*events, *gaps), settled, alone)
+        return FrameResult(frame, *now, (*events, *gaps), settled, alone, moved)
 
     def finish(self) -> FrameResult | None:
         """Settle the frames still open, conflicts as if their time were over; None if no frame.
@@ -194,16 +197,17 @@ class Tracker:
         control[:3] -= axis * moved.moved_mm
         return step, control, axis * moved.found_speed_mm_s
 
-    def _predict_all(self, t_s: float, position_mm: float | None) -> None:
+    def _predict_all(self, t_s: float, position_mm: float | None) -> Motion | None:
         if self.last is None:
             self.stage.step(position_mm, t_s, 0.0)
-            return
+            return None
         step, control, found = self._motion(self.stage, t_s, position_mm)
         self.common = self.common.predicted(step)
         for track in self._every():
             if found.any():
                 track.filter.x = track.filter.x + np.pad(found, (3, len(control) - 6))
             predict(track, step, control)
+        return Motion(step.matrix, step.noise, step.matrix[:, 3:6] @ found + control)
 
     def _follow_given(
         self, frame: int, t_s: float, measured: FrameMeasurements, events: list[TrackEvent]

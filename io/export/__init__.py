@@ -1,0 +1,1 @@
+"""Calibrations and trajectories in the formats of other programs; see docs/exports.md."""

@@ -1,0 +1,110 @@
+"""The space that the cameras see together, as points where one camera model is held to another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+from telerig.rig.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A box in the rig frame: lower_mm (3,) and upper_mm (3,)."""
+
+    lower_mm: Array
+    upper_mm: Array
+
+    def grid(self, per_edge: int) -> Array:
+        """(per_edge^3, 3) points, the faces included."""
+        edges = [np.linspace(a, b, per_edge) for a, b in zip(self.lower_mm, self.upper_mm)]
+        return np.stack(np.meshgrid(*edges, indexing="ij"), -1).reshape(-1, 3)
+
+    def words(self) -> str:
+        """The box in words, for a file's header."""
+        return ", ".join(
+            f"{axis} {a:.6g} to {b:.6g} mm"
+            for axis, a, b in zip("xyz", self.lower_mm, self.upper_mm)
+        )
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How far one projection is from another over some points, in pixels.
+
+    rms_px : root mean square of the distance; max_px : the largest; points : how many.
+    """
+
+    rms_px: float
+    max_px: float
+    points: int
+
+    @staticmethod
+    def between(one_px: Array, other_px: Array) -> Misfit:
+        """one_px, other_px : (N, 2)."""
+        distance = np.linalg.norm(one_px - other_px, axis=-1)
+        rms = float(np.sqrt(np.mean(distance**2)))
+        return Misfit(rms, float(distance.max()), len(distance))
+
+    def words(self) -> str:
+        """The two figures and the number of points."""
+        return f"RMS {self.rms_px:.3g} px, largest {self.max_px:.3g} px, at {self.points} points"
+
+
+def volume_of(bounds_mm: ArrayLike) -> Volume:
+    """The box of ((x, x), (y, y), (z, z)). Raises InputError when it holds nothing."""
+    bounds = np.asarray(bounds_mm, float)
+    if bounds.shape != (3, 2) or not np.all(bounds[:, 0] < bounds[:, 1]):
+        raise InputError(
+            f"volume {bounds.tolist()} is no box",
+            todo="give ((x_low, x_high), (y_low, y_high), (z_low, z_high)) in mm",
+        )
+    return Volume(bounds[:, 0], bounds[:, 1])
+
+
+def working_volume(cameras: Sequence[Camera]) -> Volume:
+    """A cube about the point where the rays of the image centres come closest.
+
+    Its edge is the shortest image edge of any camera at nominal scale. Parts of it may lie outside
+    an image: see `seen_points`.
+    """
+    if not cameras:
+        raise InputError("no camera", todo="give at least one")
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for camera in cameras:
+        middle = (np.array(camera.image_size_px, float) - 1) / 2
+        origin, direction = camera.unproject(middle)
+        across = np.eye(3) - np.outer(direction, direction)
+        normal, right = normal + across, right + across @ origin
+    centre = np.linalg.lstsq(normal, right, rcond=1e-6)[0]
+    half = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras) / 2
+    return Volume(centre - half, centre + half)
+
+
+def seen_points(cameras: Sequence[Camera], volume: Volume, per_edge: int) -> Array:
+    """(N, 3) points of the volume's grid that lie inside the image of every camera.
+
+    Raises InputError when fewer than 100 do.
+    """
+    points = volume.grid(per_edge)
+    seen = np.ones(len(points), bool)
+    for camera in cameras:
+        depth = camera.camera_from_rig.apply(points)[:, 2]
+        seen &= 1 + camera["kappa_per_mm"] * depth > 0
+    points = points[seen]
+    for camera in cameras:
+        uv, size = camera.project(points), np.array(camera.image_size_px)
+        points = points[np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1)]
+    if len(points) < 100:
+        raise InputError(
+            f"only {len(points)} of {per_edge**3} points of the volume ({volume.words()}) are in "
+            "every camera's image",
+            todo="give a volume inside the images",
+        )
+    return points

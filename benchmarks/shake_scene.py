@@ -70,6 +70,7 @@ H = 1 / SAMPLE_HZ
 class Case:
     """A scenario, and what is unlike S0-S6 in it.
 
+    scale_sigma : what rig.toml states of the encoder's scale, 0 exact, None nothing.
     angle_deg between the cameras.  kappa_per_mm of both.  nonlinear : one of ``NONLINEAR``.
     """
 
@@ -81,6 +82,7 @@ class Case:
     dropped: float = 0.0
     delay_s: float = 0.0
     encoder_scale: float = 0.0
+    scale_sigma: float | None = 0.0
     ramp_s: float = 0.0
 
     @property
@@ -121,7 +123,7 @@ class Run:
             "stage": self.stage,
             "accelerometers": sensors if used else None,
             "references": self.references if information == "references" else None,
-            "rig": description(None if self.case.encoder_scale else 0.0),
+            "rig": description(self.case.scale_sigma),
             "t_s": self.t_s,
         }
 

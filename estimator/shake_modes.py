@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,20 @@ from telerig.estimator.smoother.model import CARRIAGE, RigMode, ShakeModel
 from telerig.estimator.smoother.solve import Solution
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 _LOWEST_HZ = 2.0
 _MOST_PEAKS = 3
 _LEAST_SHARE = 0.08
 _SIGNIFICANT = 3.0
+_LEAST_SAMPLES = 32
+_BLUR = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+"""One record's spectrum of a random vibration is speckled: a line is not one of its grains."""
+_BLUR_HALF = 1.0
+_ALIKE = 0.7
+_STRONGER = 2.0
+SEEN_BY = "seen only by "
+"""Of a line on an axis that one camera sees: its arm's, or common to all."""
 
 
 def shake_modes(solution: Solution) -> list[dict[str, Any]]:
@@ -57,7 +67,10 @@ def remedy(where: str, frequency_hz: float, damping: float) -> str:
     """What would make this mode smaller."""
     if where == "servo":
         return "tune the stage's controller: more damping, a softer ramp, less gain at this line"
-    if where == "common":
+    if where.startswith(SEEN_BY):
+        text = "one camera alone sees this axis, so whether its arm or the whole rig swings is not "
+        text += "known: an accelerometer on the carriage would tell"
+    elif where == "common":
         text = "all cameras move alike: stiffen the mount between carriage and camera bridge, "
         text += "or lighten what hangs on it"
     else:
@@ -70,50 +83,120 @@ def remedy(where: str, frequency_hz: float, damping: float) -> str:
 
 
 def _from_offsets(solution: Solution, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Peaks of the mean of the cameras' offsets, and of what each has beyond it."""
+    """Lines of the cameras' offsets: who moves shows where two cameras see the same axis.
+
+    There the cameras move alike (common), one alone or both independently (arms). An axis that one
+    camera sees shares in the lines found so; a line that shows nowhere else has no known owner.
+    """
     frame, found = solution.frame, solution.covariances
     if not frame.shake.size or not frame.model.broad_bands:
         return []
     rows = frame.shake.offset[:-1]
-    offsets = np.einsum("cid,fd->cfi", rows, solution.state.shake[frame.nodes.of_frame])
-    noise = np.zeros(3)
+    offsets = np.einsum("cid,fd->cfi", rows, frame.shake_at_frames(solution.state.shake))
+    noise = 0.0
     if found is not None:
-        noise = np.einsum("cid,fde,cie->i", rows, found.shake, rows, optimize=True)
-        noise = noise / len(rows) / len(frame.problem.t_s)
+        variance = np.einsum("cid,fde,cie->", rows, found.shake, rows, optimize=True)
+        noise = float(variance) / len(rows) / len(frame.problem.t_s)
+    spectra = _spectra(frame.problem.t_s, offsets)
+    if spectra is None:
+        return []
     seen = np.abs(rows).sum(-1) > 0
-    shared = offsets.sum(0) / np.maximum(seen.sum(0), 1)[None]
-    out = _peaks(frame.problem.t_s, shared, noise, "common")
+    shared = seen.sum(0) > 1
+    out: list[dict[str, Any]] = []
+    for line in _lines(spectra, spectra.own[:, shared].sum((0, 1)), noise):
+        out += _owned(spectra, line, seen, shared, names)
     for camera, name in enumerate(names):
-        both = seen[camera] & (seen.sum(0) > 1)
-        # with two arms alike, half of each arm's own variance went into the mean
-        own = (offsets[camera] - shared) * both * np.sqrt(len(names) / max(len(names) - 1, 1))
-        out += _peaks(frame.problem.t_s, own, noise, f"arm {name}")
+        alone = seen[camera] & ~shared
+        for line in _lines(spectra, spectra.own[camera, alone].sum(0), noise):
+            if not any(_same_line(line, row) for row in out):
+                rms = np.sqrt(line.power(spectra.own[camera])) * alone
+                out.append(line.row(f"{SEEN_BY}{name}", rms))
     return out
 
 
-def _peaks(t_s: Array, values: Array, noise: Array, where: str) -> list[dict[str, Any]]:
-    """Lines in (F, 3) series that hold a good share of the variance and rise above its noise."""
-    from scipy.signal import periodogram
+@dataclass(frozen=True)
+class _Spectra:
+    """frequency_hz (F,), own (C, 3, F) and cross (C, C, 3, F) densities of (C, n, 3) series."""
 
+    frequency_hz: Array
+    own: Array
+    cross: Array
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A peak: its bins, and the half width from which its damping follows."""
+
+    frequency_hz: float
+    half_hz: float
+    near: slice
+    step_hz: float
+
+    def power(self, density: Array) -> Array:
+        return np.asarray(density[..., self.near].sum(-1) * self.step_hz)
+
+    def row(self, where: str, rms_mm: Array) -> dict[str, Any]:
+        damping = self.half_hz / self.frequency_hz
+        return _row(where, self.frequency_hz, damping, rms_mm.tolist(), "estimate")
+
+
+def _owned(
+    spectra: _Spectra, line: _Line, seen: Bools, shared: Bools, names: Sequence[str]
+) -> list[dict[str, Any]]:
+    """The line as common, or as the arms'."""
+    own, cross = line.power(spectra.own), line.power(spectra.cross)
+    among = cross[:, :, shared].sum(-1)
+    sd = np.sqrt(np.clip(np.diagonal(among), 0, None))
+    strongest, weakest = int(sd.argmax()), int(sd.argmin())
+    lone = sd[strongest] > _STRONGER * sd[weakest]
+    if not lone and among[strongest, weakest] > _ALIKE * sd[strongest] * sd[weakest]:
+        rms = np.sqrt((own * seen).sum(0) / np.maximum(seen.sum(0), 1))
+        return [line.row("common", rms)]
+    arms = [strongest] if lone else range(len(names))
+    return [line.row(f"arm {names[c]}", np.sqrt(own[c]) * seen[c]) for c in arms]
+
+
+def _same_line(line: _Line, row: dict[str, Any]) -> bool:
+    reach = 2 * max(line.half_hz, row["damping"] * row["frequency_hz"]) + line.step_hz
+    return bool(abs(line.frequency_hz - row["frequency_hz"]) <= reach)
+
+
+def _spectra(t_s: Array, series: Array) -> _Spectra | None:
+    """Of (C, n, 3) at times (n,); None for a short record or one without motion."""
     step = float(np.median(np.diff(t_s)))
-    if len(t_s) < 32 or not np.any(values):
-        return []
+    if len(t_s) < _LEAST_SAMPLES or not np.any(series):
+        return None
     grid = np.arange(t_s[0], t_s[-1] + step / 2, step)
-    even = np.stack([np.interp(grid, t_s, v) for v in values.T], -1)
-    frequency, each = periodogram(even, 1 / step, "hann", axis=0)
-    total = each.sum(-1)
-    width, variance = frequency[1], float(total.sum() * frequency[1])
-    peak = np.r_[False, (total[1:-1] > total[:-2]) & (total[1:-1] >= total[2:]), False]
+    even = np.array([[np.interp(grid, t_s, v) for v in one.T] for one in series])
+    window = np.hanning(len(grid) + 1)[:-1]
+    wave = np.fft.rfft((even - even.mean(-1, keepdims=True)) * window, axis=-1)
+    cross = np.real(np.einsum("cif,dif->cdif", wave, wave.conj()))
+    cross *= 2 * step / (window**2).sum()
+    own = np.einsum("ccif->cif", cross)
+    return _Spectra(np.fft.rfftfreq(len(grid), step), own, cross)
+
+
+def _lines(spectra: _Spectra, total: Array, noise_mm2: float) -> list[_Line]:
+    """Peaks of a density (F,) that hold a good share of its variance and rise above its noise."""
+    frequency = spectra.frequency_hz
+    width = float(frequency[1])
+    variance = float(total.sum() * width)
+    even = np.convolve(total, _BLUR, mode="same")
+    peak = np.r_[False, (even[1:-1] > even[:-2]) & (even[1:-1] >= even[2:]), False]
     peak &= frequency >= max(_LOWEST_HZ, 2 * width)
-    out = []
-    for i in sorted(np.flatnonzero(peak), key=lambda at: -total[at])[:_MOST_PEAKS]:
-        half = _half_width(total, int(i))
-        near = slice(max(i - 2 * half, 0), i + 2 * half + 1)
-        power = each[near].sum(0) * width
-        if power.sum() < _LEAST_SHARE * variance or power.sum() < _SIGNIFICANT * noise.sum() / 10:
+    out: list[_Line] = []
+    for i in sorted(np.flatnonzero(peak), key=lambda at: -even[at]):
+        reach = 2 * _half_width(even, int(i))
+        near = slice(max(i - reach, 0), i + reach + 1)
+        power = float(total[near].sum() * width)
+        if len(out) == _MOST_PEAKS or any(line.near.start <= i < line.near.stop for line in out):
             continue
-        damping = half * width / frequency[i]
-        out.append(_row(where, frequency[i], damping, np.sqrt(power).tolist(), "estimate"))
+        if even[near].max() > even[i]:  # a bump on the flank of another line
+            continue
+        if power < _LEAST_SHARE * variance or power < _SIGNIFICANT * noise_mm2 / 10:
+            continue
+        half = max(reach / 2 - _BLUR_HALF, 1.0)
+        out.append(_Line(float(frequency[i]), half * width, near, width))
     return out
 
 
@@ -138,8 +221,11 @@ def _from_carriage(solution: Solution) -> list[dict[str, Any]]:
     x = 2 * (t - t[0]) / (t[-1] - t[0]) - 1
     rest = position - np.polynomial.Chebyshev.fit(x, position, 5)(x)
     noise = _encoder_noise(model)
-    values = rest[:, None] * np.abs(problem.axis)
-    rows = _peaks(t, values, np.full(3, noise**2 / 3), "servo")
+    spectra = _spectra(t, (rest[:, None] * np.abs(problem.axis))[None])
+    if spectra is None:
+        return []
+    lines = _lines(spectra, spectra.own.sum((0, 1)), noise**2)
+    rows = [line.row("servo", np.sqrt(line.power(spectra.own[0]))) for line in lines]
     return [row for row in rows if max(row["rms_mm"]) > _SIGNIFICANT * noise][:1]
 
 

@@ -79,7 +79,7 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
         acceleration, np.zeros_like(acceleration), problem.up, sensor.axes, bias, np.asarray(scale)
     )
     slope = _slope(sensor)
-    project, white = _felt(frame, index)
+    project, white = felt(frame, index)
     by_shake = (project @ read.by_acceleration[0]) @ (
         (rows + late[:, None, None] * jerk_rows) @ frame.shake_basis(node)
     )
@@ -108,7 +108,7 @@ def _slope(sensor: Accelerometer) -> Array:
     return np.asarray(slope / step, np.float64)
 
 
-def _felt(frame: Frame, index: int) -> tuple[Array, float]:
+def felt(frame: Frame, index: int) -> tuple[Array, float]:
     """(k, 3) whitened rows that take a reading to the directions of modelled motion; log det."""
     sensor = frame.problem.accelerometers[index]
     directions = np.eye(3) if sensor.camera == CARRIAGE else frame.shake.seen[sensor.camera]

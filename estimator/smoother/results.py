@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from telerig.estimator.smoother.model import ShakeModel
 from telerig.estimator.smoother.solve import Solution
 from telerig.estimator.smoother.travel import left_open, scale_sigma, total_scale
+from telerig.estimator.smoother.whiteness import accelerometer_spectra, pixel_whiteness
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,6 +73,8 @@ def summary_of(solution: Solution) -> dict[str, Any]:
             "bubbles": _residuals(solution, 0),
             "references": _residuals(solution, 1),
         },
+        "whiteness": pixel_whiteness(solution),
+        "accelerometer_spectra": accelerometer_spectra(solution),
         "encoder": _encoder(solution),
         "travel": _travel(solution),
         "accelerometers": _sensors(solution),

@@ -22,6 +22,14 @@ from telerig.io.report.smoothing_tables import (
     model_rows,
     model_words,
 )
+from telerig.io.report.smoothing_whiteness import (
+    WHITENESS_HEADS,
+    accelerometer_before_and_after,
+    accelerometer_names,
+    autocorrelation,
+    whiteness_rows,
+    whiteness_words,
+)
 from telerig.io.report.smoothing_words import (
     axis_table,
     judged_axes,
@@ -33,7 +41,7 @@ from telerig.io.report.smoothing_words import (
 )
 from telerig.io.report.track_results import TrackResults
 
-PLACES = ("lab", "taken", "velocity", "shake", "spectra")
+PLACES = ("lab", "taken", "velocity", "shake", "spectra", "white")
 """Sections that hold drawings."""
 
 
@@ -52,6 +60,9 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
         "unsure": verdict.colour == "rejected",
         "residuals": residual_rows(results),
         "residual_words": residual_words(results),
+        "whiteness_heads": WHITENESS_HEADS,
+        "whiteness": whiteness_rows(results),
+        "whiteness_words": whiteness_words(results),
         "constants": constant_rows(results),
         "means": mean_rows(results),
         "model": model_rows(results),
@@ -73,4 +84,10 @@ def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[]
         drawings += [("shake", partial(shake_in_time, results, camera, axis))
                      for axis in results.seen(camera)]  # fmt: skip
     drawings += [("spectra", partial(velocity_before_and_after, results, axis)) for axis in axes]
-    return drawings + [("spectra", partial(shake_spectra, results, c)) for c in results.cameras]
+    drawings += [("spectra", partial(shake_spectra, results, c)) for c in results.cameras]
+    drawings += [
+        ("spectra", partial(accelerometer_before_and_after, results, sensor))
+        for sensor in accelerometer_names(results)
+    ]
+    white = [("white", partial(autocorrelation, results))] if whiteness_rows(results) else []
+    return drawings + white

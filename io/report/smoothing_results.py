@@ -111,7 +111,8 @@ def _content(file: Path) -> Mapping[str, Any]:
     expected: dict[str, type | tuple[type, ...]] = {
         "verdict": str, "flags": list, "cameras": list, "model": dict, "residuals": dict,
         "encoder": dict, "accelerometers": dict, "bubble_means": dict, "unseen": dict,
-        "words": (list, str), "axes": dict, "modes": list,
+        "words": (list, str), "axes": dict, "modes": list, "whiteness": dict,
+        "accelerometer_spectra": dict,
     }  # fmt: skip
     for name, kind in expected.items():
         if content.get(name) is not None and not isinstance(content[name], kind):

@@ -56,7 +56,7 @@ class RawLog:
     def __init__(self, path: Path, header: LogHeader) -> None:
         self.path = path
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            _make(path.parent)
             self._file: BinaryIO = path.open("xb", buffering=0)
         except FileExistsError as error:
             raise InputError(
@@ -102,6 +102,15 @@ class RawLog:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise InputError(
+            "is a file, and a folder is needed", where=str(folder), todo="give another name"
+        ) from error
 
 
 def _keep_name(folder: Path) -> None:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.io.record_bend import bend
+
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -27,6 +29,7 @@ _FEWEST = 5
 _WINDOWS = 64
 _BLOCKS = 8
 _SHORT_S = 10.0
+_BEND_WINDOW_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,8 @@ class ClockFit:
     drift_ppm : how much faster than the host's the device's clock runs. sd_offset_us : scatter of
     the least delays in parts of the record. sd_drift_ppm : jackknife, or from that scatter if it
     is larger; NaN where the drift is that of a longer count. delay_*_ms : above the least.
-    wander_us : how far the least delays of the parts are apart after the fit.
+    wander_us : how far the least delays of the parts are apart after the fit. knots_s, bend_s :
+    where the rate changed, what a chain of straight pieces adds at these times from the mean.
     """
 
     device_mean_s: float
@@ -49,11 +53,15 @@ class ClockFit:
     delay_max_ms: float
     wander_us: float
     readings: int
+    knots_s: tuple[float, ...] = ()
+    bend_s: tuple[float, ...] = ()
 
     def host_s(self, device_s: Array) -> Array:
         """Host time of device time (unwrapped, of this fit's count)."""
         slope = 1 / (1 + 1e-6 * self.drift_ppm)
-        return self.host_mean_s + self.offset_s + (device_s - self.device_mean_s) * slope
+        x = device_s - self.device_mean_s
+        line = self.host_mean_s + self.offset_s + x * slope
+        return line + np.interp(x, self.knots_s, self.bend_s) if self.knots_s else line
 
 
 @dataclass(frozen=True)
@@ -190,6 +198,9 @@ def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) ->
         slope = 1 / (1 + 1e-6 * (drift_ppm or 0.0)) - 1
         at_mean = float(np.min(late[used] - slope * x[used]))
     delay = late[used] - at_mean - slope * x[used]
+    bent = None if drift_ppm is not None else _bent(x[used], delay)
+    if bent is not None:
+        delay = delay - np.interp(x[used], *bent)
     low = np.array([np.min(p) for p in np.array_split(delay, _parts(delay.size))])
     scatter = float(np.std(low)) if len(low) > 1 else float(np.median(delay))
     known = drift_ppm is not None or len(used) < _WINDOWS
@@ -206,7 +217,15 @@ def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) ->
         delay_max_ms=1e3 * float(np.max(delay)),
         wander_us=1e6 * float(np.ptp(low)),
         readings=len(host_s),
+        knots_s=tuple(bent[0].tolist()) if bent else (),
+        bend_s=tuple(bent[1].tolist()) if bent else (),
     )
+
+
+def _bent(x: Array, delay: Array) -> tuple[Array, Array] | None:
+    parts = int(np.clip(np.ptp(x) / _BEND_WINDOW_S, 1, len(x) // 20 + 1))
+    edge, least = _least_delays(x, delay, parts)
+    return bend(x[edge], least)
 
 
 def _support(x: Array, late: Array) -> tuple[float, float]:

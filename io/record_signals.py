@@ -120,6 +120,8 @@ def damage(
     pieces: list[bytes], faults: Faults, per_reading_s: float, rng: Generator
 ) -> tuple[bytes, list[int]]:
     """The bytes as they come over a bad line, and which of the pieces it spoilt."""
+    if not faults.garbage_hz and not faults.cut_hz:
+        return b"".join(pieces), []
     out, spoilt = list(pieces), set()
     for i, piece in enumerate(pieces):
         if rng.random() < faults.garbage_hz * per_reading_s:

@@ -140,6 +140,26 @@ def test_the_stated_drift_error_is_of_the_order_of_the_true_one() -> None:
     assert np.median(stated) < 2.0
 
 
+def test_a_clock_that_warms_up_is_followed() -> None:
+    rng = np.random.default_rng(9)
+    made = np.arange(900_000) / 1000
+    device = made + 40e-6 * made + 200e-6 * np.sin(2 * np.pi * made / 600)
+    flushes = np.cumsum(rng.uniform(0, 0.016, 240_000))
+    arrived = flushes[np.searchsorted(flushes, made)]
+    found = host_times(arrived, device)
+    (fit,) = found.fits
+    assert len(fit.knots_s) > 10
+    assert np.max(np.abs(found.t_s - made)) < 40e-6
+    straight = made - (np.polyval(np.polyfit(device, made, 1), device))
+    assert np.max(np.abs(straight)) > 150e-6, "which no straight line does"
+
+
+def test_a_steady_clock_is_not_bent() -> None:
+    rng = np.random.default_rng(10)
+    _, arrived, device = arrivals(rng, rate_hz=100, seconds=600, drift_ppm=40.0)
+    assert fit_clock(arrived + rng.exponential(1e-4, len(arrived)), device).knots_s == ()
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 4])
 def test_few_readings(count: int) -> None:
     device = np.arange(count) / 100

@@ -6,6 +6,8 @@ them in the sum: the same linear programme with a value for each knot.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,7 +45,7 @@ def _lower_chain(x_s: Array, least_s: Array, knots: Array) -> Array:
     left = np.clip(np.searchsorted(knots, x_s, "right") - 1, 0, len(knots) - 2)
     share = (x_s - knots[left]) / np.diff(knots)[left]
     row = np.arange(len(x_s))
-    weights = csr_array(
+    weights: Any = csr_array(
         (
             np.concatenate([1 - share, share]),
             (np.concatenate([row, row]), np.concatenate([left, left + 1])),

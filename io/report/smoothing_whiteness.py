@@ -17,6 +17,7 @@ from telerig.io.report.words import is_number, number
 Array = NDArray[np.float64]
 
 WHITENESS_HEADS = ["camera", "residuals are", "next frame", "largest", "Ljung-Box p"]
+_LITTLE = 0.5
 
 
 def whiteness_rows(results: SmoothingResults) -> list[Row]:
@@ -105,7 +106,10 @@ def _words(before: Array, after: Array, noise: Any) -> str:
     share = float(after.sum() / before.sum()) if before.sum() > 0 else 0.0
     text = f"The model leaves {number(100 * share, 2)} % of the readings' power"
     if is_number(noise) and noise > 0:
-        text += f", {number(float(np.median(after)) / noise, 2)} times the stated noise (median)"
+        times = float(np.median(after)) / noise
+        text += f", {number(times, 2)} times the stated noise (median)"
+        if times < _LITTLE:
+            text += "; where it is below, the priors have room for motion as fast as the noise"
     return text + ". Welch's estimate, over the directions that the model moves the sensor in."
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -137,11 +138,15 @@ def fingerprint(run: RunData, options: dict[str, Any]) -> str:
     """Changes when the recording, the options or the version do."""
     from telerig import __version__
 
-    files = sorted(p for p in run.path.rglob("*") if p.is_file())
-    listed = [(p.relative_to(run.path).as_posix(), p.stat().st_size) for p in files]
-    times = [p.stat().st_mtime_ns for p in files]
-    text = json.dumps([__version__, options, listed, times], default=str)
-    return hashlib.sha256(text.encode()).hexdigest()
+    found = hashlib.sha256(json.dumps([__version__, options], default=str).encode())
+    for folder, folders, names in os.walk(run.path):
+        folders.sort()
+        inside = Path(folder).relative_to(run.path)
+        for name in sorted(names):
+            state = (Path(folder) / name).stat()
+            place = (inside / name).as_posix()
+            found.update(f"{place} {state.st_size} {state.st_mtime_ns}\n".encode())
+    return found.hexdigest()
 
 
 def detect_missing(scene: Scene, store: DetectionStore, progress: Progress | None) -> None:

@@ -115,7 +115,9 @@ class Linker:
         self._before = [*self._before, *done][-FRAMES_BEFORE:]
         found = self._tracks(done)
         if hidden:
-            found = pd.concat([found, pd.DataFrame(hidden, columns=found.columns)], ignore_index=True)
+            found = pd.concat(
+                [found, pd.DataFrame(hidden, columns=found.columns)], ignore_index=True
+            )
             found = found.sort_values(["frame", "particle"], kind="stable", ignore_index=True)
         return Linked(found, _detections(done))
 

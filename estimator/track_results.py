@@ -133,8 +133,11 @@ def _record(run: RunData, options: TrackOptions, record: Mapping[str, Any]) -> d
         {**record.get("options", {}), "track": repr(options)},
         record.get("seconds", {}),
     )
-    images = [p for p in run.path.rglob("*") if p.is_file() and p not in tables]
-    content["images"] = {"files": len(images), "bytes": sum(p.stat().st_size for p in images)}
+    known, files, size = set(tables), 0, 0
+    for path in run.path.rglob("*"):
+        if path.is_file() and path not in known:
+            files, size = files + 1, size + path.stat().st_size
+    content["images"] = {"files": files, "bytes": size}
     return content
 
 
@@ -152,7 +155,7 @@ def _labels(staged: Path, camera: str, frame: int) -> pd.DataFrame:
 
     chunks = pd.read_csv(
         staged / "detections.csv", usecols=["frame", "camera", "particle", "u_px", "v_px"],
-        dtype={"camera": str}, chunksize=200_000,
+        dtype={"camera": str}, chunksize=20_000,
     )  # fmt: skip
     found = [c[(c["frame"] == frame) & (c["camera"] == camera)] for c in chunks]
     return pd.concat(found, ignore_index=True)

@@ -20,7 +20,10 @@ _crew: Pool | None = None
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Cores that this process may use: TELERIG_CORES, else all that the system lets it have."""
+    asked = os.environ.get("TELERIG_CORES", "")
+    if asked.isdecimal() and int(asked) > 0:
+        return int(asked)
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -5,10 +5,12 @@ from __future__ import annotations
 import typer
 
 from telerig import __version__
+from telerig.scripts.batch import batch
 from telerig.scripts.calibrate import calibrate
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
 from telerig.scripts.record import record
+from telerig.scripts.run import run as run_dataset
 from telerig.scripts.simulate import simulate
 from telerig.scripts.smooth import smooth
 from telerig.scripts.track import track
@@ -35,8 +37,9 @@ def _main(
     """Calibrate a telecentric stereo rig from views of dots, and track bubbles with it."""
 
 
-for command in (demo, simulate, detect, calibrate, track, smooth, record):
+for command in (demo, simulate, detect, calibrate, track, smooth, batch, record):
     app.command()(command)
+app.command("run")(run_dataset)
 
 
 def run() -> None:

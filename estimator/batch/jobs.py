@@ -1,0 +1,186 @@
+"""What is to be done for a list of datasets, in which order, and whether it has been done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from telerig import __version__
+from telerig.errors import InputError
+from telerig.io.dataset import load_dataset
+
+Kind = Literal["calibrate", "track", "smooth"]
+
+MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
+_INPUTS = {"calibrate": ("calibration", "stage_axis")}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work. Paths are text, so that a job can be sent to another machine.
+
+    run : empty for a calibration. calibration : a file for all runs, or empty for the dataset's.
+    model : the lens model of a calibration. needs : names of the jobs that must be done before.
+    """
+
+    kind: Kind
+    dataset: str
+    run: str = ""
+    calibration: str = ""
+    model: str = "auto"
+    report: bool = True
+    min_diameter_px: float = 8.0
+    needs: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Unique within a batch, and fit for a file name."""
+        place = Path(self.dataset)
+        mark = hashlib.sha256(str(place).encode()).hexdigest()[:6]
+        return ".".join(filter(None, (place.name, mark, self.run, self.kind)))
+
+    @property
+    def where(self) -> str:
+        """For messages."""
+        return f"{self.dataset}/runs/{self.run}" if self.run else self.dataset
+
+    @property
+    def results(self) -> Path:
+        """The folder that it fills."""
+        return Path(self.dataset) / "results" / (self.run or "calibration")
+
+    @property
+    def result(self) -> Path:
+        """The file without which it has not been done."""
+        return self.results / MAIN_RESULT[self.kind]
+
+    def as_json(self) -> str:
+        """One line."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, line: str) -> Job:
+        """The job of `as_json`."""
+        content = json.loads(line)
+        return cls(**{**content, "needs": tuple(content["needs"])})
+
+
+def jobs_of(
+    datasets: Iterable[Path],
+    *,
+    calibration: Path | None = None,
+    model: str = "auto",
+    report: bool = True,
+    min_diameter_px: float = 8.0,
+    only: Sequence[str] = (),
+    strict: bool = False,
+) -> list[Job]:
+    """Calibration, tracking and smoothing of every dataset, in an order that can be followed.
+
+    calibration : one for all; nothing is calibrated then. only : names of runs; empty takes all.
+    A dataset without views of the target is calibrated already, or it cannot be used.
+    strict : raise InputError for a dataset that cannot be used; otherwise it becomes a calibration
+        that fails, so that it does not stop the others.
+
+    Raises InputError for folders that do not exist or are named twice, and unknown runs.
+    """
+    places = _checked(datasets)
+    shared: dict[str, Any] = {
+        "calibration": "" if calibration is None else str(Path(calibration).resolve()),
+        "model": model, "report": report, "min_diameter_px": min_diameter_px,
+    }  # fmt: skip
+    jobs: list[Job] = []
+    for place in places:
+        try:
+            jobs += _jobs_of_one(place, only, shared)
+        except InputError:
+            if strict:
+                raise
+            jobs.append(Job("calibrate", str(place), **shared))
+    _check_only(jobs, only)
+    return jobs
+
+
+def _jobs_of_one(place: Path, only: Sequence[str], shared: Mapping[str, Any]) -> list[Job]:
+    given = bool(shared["calibration"])
+    calibrated_before = (place / "results" / "calibration" / "calibration.json").is_file()
+    data = load_dataset(place, need_views=not given and not calibrated_before)
+    jobs = [Job("calibrate", str(place), **shared)] if data.views and not given else []
+    calibrated = tuple(job.name for job in jobs)
+    for run in data.runs:
+        if only and run not in only:
+            continue
+        tracked = Job("track", str(place), run, needs=calibrated, **shared)
+        smoothed = Job("smooth", str(place), run, needs=(*calibrated, tracked.name), **shared)
+        jobs += [tracked, smoothed]
+    return jobs
+
+
+def _checked(datasets: Iterable[Path]) -> list[Path]:
+    places = [Path(place).resolve() for place in datasets]
+    for place in places:
+        if not place.is_dir():
+            raise InputError(
+                "there is no such folder", where=str(place), todo="give folders with a rig.toml"
+            )
+        if places.count(place) > 1:
+            raise InputError("the dataset is named twice", where=str(place), todo="name it once")
+    return places
+
+
+def _check_only(jobs: Sequence[Job], only: Sequence[str]) -> None:
+    known = sorted({job.run for job in jobs if job.run})
+    for run in only:
+        if run not in known:
+            raise InputError(
+                f"no dataset has a run {run!r}", where="--only",
+                todo="leave --only out, or name runs as their folders in runs/ are named",
+            )  # fmt: skip
+
+
+def share_of(jobs: Sequence[Job], index: int, of: int) -> list[Job]:
+    """The jobs of every ``of``-th dataset, from dataset ``index`` (0-based) on.
+
+    A dataset's jobs stay together, as they need each other.
+    """
+    places = list(dict.fromkeys(job.dataset for job in jobs))
+    mine = set(places[index::of])
+    return [job for job in jobs if job.dataset in mine]
+
+
+def fingerprint(job: Job) -> str:
+    """Of all that the result depends on: the program, the options, the input files.
+
+    Images go by size and time of change, calibrations and tracks by content.
+    """
+    hashed = hashlib.sha256(f"{__version__} {job.as_json()}".encode())
+    place = Path(job.dataset)
+    listed = [place / "rig.toml"]
+    for folder in _INPUTS.get(job.kind, (f"runs/{job.run}",)):
+        listed += sorted(_files(place / folder))
+    for file in listed:
+        if file.is_file():
+            stat = file.stat()
+            hashed.update(f"{file.relative_to(place)} {stat.st_size} {stat.st_mtime_ns}".encode())
+    for file in _used_results(job):
+        if file.is_file():
+            hashed.update(file.read_bytes())
+    return hashed.hexdigest()[:16]
+
+
+def _used_results(job: Job) -> list[Path]:
+    if job.kind == "calibrate":
+        return []
+    own = Path(job.dataset) / "results" / "calibration" / "calibration.json"
+    used = [Path(job.calibration) if job.calibration else own]
+    return used if job.kind == "track" else [*used, job.results / "tracks.csv"]
+
+
+def _files(folder: Path) -> Iterable[Path]:
+    for base, _, names in os.walk(folder):
+        yield from (Path(base) / name for name in names)

@@ -1,0 +1,189 @@
+"""One job, done: in this process, or in a process of its own that may die without harm."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from telerig.estimator.batch.jobs import Job
+
+Stage = Callable[[str, int, int], None]
+
+DONE, REJECTED, FAILED, CRASHED, LEFT_OUT = "done", "rejected", "failed", "crashed", "left out"
+_LAST_WORDS = 2000
+_CHILD = "telerig.scripts.batch_job"
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+_children: set[subprocess.Popen[str]] = set()
+_stopped = threading.Event()
+
+
+def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
+    """Do it here; returns status, words and figures. Raises telerig's errors."""
+    return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """Do it in a process of its own; returns what came of it, never raises.
+
+    The process ends when this one does: its standard input closes.
+    """
+    begun = time.perf_counter()
+    result = _outcome(job)
+    return {
+        **result,
+        "seconds": round(time.perf_counter() - begun, 2),
+        "host": socket.gethostname(),
+    }
+
+
+def allow() -> None:
+    """Let `perform` begin work again after `stop_all`."""
+    _stopped.clear()
+
+
+def stop_all() -> None:
+    """End the processes of `perform` in all threads; those not yet begun fail at once."""
+    _stopped.set()
+    for child in list(_children):
+        child.kill()
+
+
+def _outcome(job: Job) -> dict[str, Any]:
+    if not Path(job.dataset).is_dir():
+        return failure(FAILED, f"{job.dataset}: this machine has no such folder; share it")
+    environment = {**dict.fromkeys(_ONE_THREAD, "1"), **os.environ}
+    child = subprocess.Popen(
+        [sys.executable, "-m", _CHILD], env=environment, stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    _children.add(child)
+    if _stopped.is_set():
+        child.kill()
+    try:
+        answer, said = _asked(child, job)
+    finally:
+        _children.discard(child)
+    code = child.returncode
+    if code == 0 and answer:
+        return dict(json.loads(answer))
+    how = f"ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
+    tail = said.strip()[-_LAST_WORDS:]
+    return failure(CRASHED, f"{how}: {tail}" if tail else f"{how} without a word (memory?)")
+
+
+def _asked(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
+    """Its answer, and what it said besides. Its standard input stays open until it has answered."""
+    assert child.stdin and child.stdout and child.stderr
+    said: list[str] = []
+    listener = threading.Thread(target=lambda: said.append(child.stderr.read()))
+    listener.start()
+    with suppress(BrokenPipeError):
+        child.stdin.write(job.as_json() + "\n")
+        child.stdin.flush()
+    answer = child.stdout.readline()
+    child.wait()
+    listener.join()
+    with suppress(BrokenPipeError):
+        child.stdin.close()
+    child.stdout.close()
+    child.stderr.close()
+    return answer, "".join(said)
+
+
+def failure(status: str, words: str) -> dict[str, Any]:
+    """What came of a job that gave no result."""
+    return {"status": status, "words": words, "figures": {}}
+
+
+def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
+    from telerig.estimator.calibrate import run_calibration
+    from telerig.estimator.calibration_results import write_results
+    from telerig.io.dataset import load_dataset
+
+    begun = time.perf_counter()
+    data = load_dataset(Path(job.dataset))
+    run = run_calibration(data, model=job.model, stage=stage)
+    found = run.calibration
+    write_results(
+        data, run, job.results, command="run", options={"model": job.model},
+        seconds={"calibrate": time.perf_counter() - begun}, report=job.report,
+    )  # fmt: skip
+    figures = {
+        "verdict": found.verdict["status"],
+        **{k: found.statistics[k] for k in ("views", "dots_kept", "share_kept", "rms_px")},
+        "lens_model": found.model.get("name"),
+    }
+    status = REJECTED if found.verdict["status"] == "REJECTED" else DONE
+    return {"status": status, "words": found.report(), "figures": figures}
+
+
+def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
+    from telerig.estimator.track_calibration import calibration_for
+    from telerig.estimator.track_results import write_tracking
+    from telerig.estimator.track_run import TrackOptions
+    from telerig.estimator.track_words import tracking_words
+    from telerig.io.run import load_run
+
+    begun = time.perf_counter()
+    run = Path(job.dataset) / "runs" / job.run
+    calibration, files = calibration_for(run, _given(job))
+    record = {
+        "command": "run", "options": {"min_diameter_px": job.min_diameter_px}, "inputs": files
+    }  # fmt: skip
+    summary = write_tracking(
+        load_run(run), calibration, job.results,
+        options=TrackOptions(min_diameter_px=job.min_diameter_px), record=record,
+        report=job.report, stage=stage,
+    )  # fmt: skip
+    figures = {name: summary[name] for name in ("frames", "detections", "points", "tracks")}
+    words = tracking_words(summary, time.perf_counter() - begun)
+    return {"status": DONE, "words": words, "figures": figures}
+
+
+def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
+    from telerig.estimator.smooth_run import smooth_run
+    from telerig.estimator.smooth_words import smoothing_words
+    from telerig.estimator.track_calibration import calibration_for
+    from telerig.io.run import load_run
+
+    run = Path(job.dataset) / "runs" / job.run
+    calibration, files = calibration_for(run, _given(job))
+    found = smooth_run(
+        load_run(run), calibration, job.results, job.results, inputs=files, report=job.report,
+        stage=stage,
+    )  # fmt: skip
+    table = found.trajectories
+    figures: dict[str, Any] = {
+        "verdict": " ".join([found.verdict.get("verdict", ""), *found.verdict.get("flags", [])]),
+        "bubbles": found.summary["bubbles"],
+        "frames": found.summary["frames"],
+    }
+    if len(table):
+        figures |= {f"s{x}_um": 1000 * float(np.median(table[f"s{x}_mm"])) for x in "xyz"}
+        figures |= {f"sv{x}_mm_s": float(np.median(table[f"sv{x}_mm_s"])) for x in "xyz"}
+    return {"status": DONE, "words": smoothing_words(found), "figures": figures}
+
+
+def _given(job: Job) -> list[Path] | None:
+    return [Path(job.calibration)] if job.calibration else None
+
+
+def summary_line(job: Job, result: Mapping[str, Any]) -> str:
+    """A job's end in one line."""
+    what = f"{job.kind} {Path(job.dataset).name}" + (f" {job.run}" if job.run else "")
+    verdict = result["figures"].get("verdict")
+    first = "" if result["status"] == DONE else f": {str(result['words']).splitlines()[0]}"
+    how = "done before" if result.get("resumed") else result["status"]
+    return f"{what}: {how}" + (f", {verdict}" if verdict else "") + first

@@ -1,0 +1,47 @@
+"""One job of a batch in a process of its own: `python -m telerig.scripts.batch_job`.
+
+Reads the job, a line of JSON, from standard input and answers with a line of JSON. The standard
+input stays open as long as somebody wants the answer.
+"""
+
+from __future__ import annotations
+
+import _thread
+import json
+import os
+import sys
+import threading
+import time
+
+from telerig.errors import TelerigError
+from telerig.estimator.batch.jobs import Job
+from telerig.estimator.batch.work import FAILED, do_job, failure
+from telerig.io.atomic import plain
+
+_PATIENCE_S = 10.0
+
+
+def main() -> None:
+    """Do the job that is asked for. What other code prints goes to standard error."""
+    answer = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    job = Job.from_json(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        result = do_job(job)
+    except TelerigError as error:
+        result = failure(FAILED, str(error))
+    answer.write(json.dumps(plain(result)) + "\n")
+    answer.flush()
+
+
+def _end_with_parent() -> None:
+    """Nobody waits for the result any more: tidy up as after Ctrl-C, and if that hangs, leave."""
+    os.read(0, 1)
+    _thread.interrupt_main()
+    time.sleep(_PATIENCE_S)
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,240 @@
+"""Batches: what is planned, done again or not, and what a failure stops."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from telerig.errors import InputError
+from telerig.estimator.batch.batch import local_executor, run_batch
+from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
+from telerig.estimator.batch.journal import Journal
+from telerig.estimator.batch.summary import write_batch
+from telerig.estimator.batch.work import perform
+from telerig.io.run_presets import run_preset
+from telerig.io.simulation import simulate
+from telerig.scripts.main import app
+
+RESULTS = ["calibration/calibration.json", "rise/tracks.csv", "rise/trajectories.csv"]
+
+
+def _dataset(folder: Path, seed: int) -> Path:
+    """A rig with 12 views as dots, a short run as detections with arm sensors: no images."""
+    config = run_preset("rise", frames=15)
+    config = replace(config, stage=replace(config.stage, accelerometers=("left", "right")))
+    simulate(config, rng=np.random.default_rng(seed), out=folder, images=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory) -> list[Path]:
+    base = tmp_path_factory.mktemp("batch")
+    return [_dataset(base / name, seed) for seed, name in enumerate(["monday", "tuesday"])]
+
+
+@pytest.fixture(scope="module")
+def first_run(datasets) -> tuple[Path, list[dict]]:
+    """Both datasets done, by two workers."""
+    out = datasets[0].parent / "out"
+    with local_executor(2) as executor:
+        records = run_batch(jobs_of(datasets), executor, Journal(out))
+    write_batch(records, out)
+    return out, records
+
+
+def _tables(dataset: Path) -> dict[str, bytes]:
+    return {name: (dataset / "results" / name).read_bytes() for name in RESULTS}
+
+
+def test_a_dataset_is_calibrated_then_tracked_then_smoothed(datasets):
+    jobs = jobs_of(datasets)
+    assert [(Path(j.dataset).name, j.kind, j.run) for j in jobs] == [
+        (name, kind, run)
+        for name in ("monday", "tuesday")
+        for kind, run in (("calibrate", ""), ("track", "rise"), ("smooth", "rise"))
+    ]
+    assert jobs[0].needs == ()
+    assert jobs[1].needs == (jobs[0].name,)
+    assert jobs[2].needs == (jobs[0].name, jobs[1].name)
+    assert len({j.name for j in jobs}) == 6
+    assert Job.from_json(jobs[2].as_json()) == jobs[2]
+
+
+def test_with_a_calibration_given_nothing_is_calibrated(datasets):
+    jobs = jobs_of(datasets, calibration=Path("elsewhere.json"))
+    assert [j.kind for j in jobs] == ["track", "smooth"] * 2
+    assert all(Path(j.calibration).is_absolute() for j in jobs)
+
+
+def test_shares_keep_a_dataset_together_and_cover_all(datasets):
+    jobs = jobs_of(datasets)
+    shares = [share_of(jobs, i, 2) for i in range(2)]
+    assert [{Path(j.dataset).name for j in s} for s in shares] == [{"monday"}, {"tuesday"}]
+    assert sorted(j.name for s in shares for j in s) == sorted(j.name for j in jobs)
+
+
+def test_all_is_done_and_summed_up(first_run, datasets):
+    out, records = first_run
+    assert [r["status"] for r in records] == ["done"] * 6, [r["words"] for r in records]
+    table = pd.read_csv(out / "batch.csv")
+    assert list(table["kind"]) == ["calibrate", "track", "smooth"] * 2
+    calibrated = json.loads((datasets[0] / "results/calibration/calibration.json").read_bytes())
+    assert table["rms_px"][0] == pytest.approx(calibrated["statistics"]["rms_px"])
+    assert (table.loc[table["kind"] == "smooth", "sy_um"] > 0).all()
+    page = (out / "report.html").read_text()
+    assert "2 of 2 runs done" in page
+    assert 'href="../monday/results/rise/report.html"' in page
+
+
+def test_what_is_done_is_not_done_again_until_an_input_changes(first_run, datasets):
+    out, _ = first_run
+    before = [_tables(d) for d in datasets]
+    stamps = [(d / "results" / name).stat().st_mtime_ns for d in datasets for name in RESULTS]
+    with local_executor(2) as executor:
+        again = run_batch(jobs_of(datasets), executor, Journal(out))
+    assert all(r["resumed"] for r in again)
+    assert stamps == [
+        (d / "results" / name).stat().st_mtime_ns for d in datasets for name in RESULTS
+    ]
+    job = jobs_of(datasets)[4]
+    same = fingerprint(job)
+    table = datasets[1] / "runs" / "rise" / "detections.csv"
+    os.utime(table, ns=(1, 1))
+    assert fingerprint(job) != same
+    with local_executor(2) as executor:
+        third = run_batch(jobs_of(datasets), executor, Journal(out))
+    assert [bool(r.get("resumed")) for r in third] == [True] * 4 + [False] * 2
+    assert [_tables(d) for d in datasets] == before
+
+
+def test_a_failure_stops_only_what_needs_it(tmp_path, datasets):
+    broken = _dataset(tmp_path / "broken", 7)
+    (broken / "calibration" / "dots.csv").write_text("view,camera,dot,u_px,v_px\n")
+    no_rig = tmp_path / "no_rig"
+    no_rig.mkdir()
+    good = _dataset(tmp_path / "good", 8)
+    out = tmp_path / "out"
+    given = [str(place) for place in (no_rig, broken, good)]
+    result = CliRunner().invoke(app, ["batch", *given, "--out", str(out)])
+    assert result.exit_code == 1, result.output
+    table = pd.read_csv(out / "batch.csv", keep_default_na=False)
+    assert list(table["status"]) == ["failed", "failed", "done", "done", "done"]
+    assert "rig.toml" in table["words"][0]
+    assert "dots.csv" in table["words"][1]
+    page = (out / "report.html").read_text()
+    assert "What failed" in page and "dots.csv" in page
+
+
+def test_a_process_that_is_killed_fails_alone_and_is_done_the_next_time(tmp_path):
+    """The work's process dies as when the system runs out of memory."""
+    data = _dataset(tmp_path / "data", 3)
+    jobs = jobs_of([data])[:1]
+    killer = threading.Thread(target=_kill_the_first_child)
+    killer.start()
+    with ThreadPoolExecutor(1) as executor:
+        records = run_batch(jobs, executor, Journal(tmp_path / "out"))
+    killer.join()
+    assert records[0]["status"] == "crashed"
+    assert "signal 9" in records[0]["words"]
+    assert not (data / "results" / "calibration" / "calibration.json").exists()
+    with ThreadPoolExecutor(1) as executor:
+        records = run_batch(jobs, executor, Journal(tmp_path / "out"))
+    assert records[0]["status"] == "done"
+
+
+def _kill_the_first_child() -> None:
+    from telerig.estimator.batch import work
+
+    while not work._children:
+        time.sleep(0.005)
+    next(iter(work._children)).kill()
+
+
+def test_a_job_ends_with_the_process_that_asked_for_it(tmp_path):
+    data = _dataset(tmp_path / "data", 4)
+    (job, *_) = jobs_of([data])
+    asker = (
+        "import sys; from telerig.estimator.batch.work import perform;"
+        "from telerig.estimator.batch.jobs import Job; print(perform(Job.from_json(sys.argv[1])))"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", asker, job.as_json()])
+    child = _child_of(parent.pid)
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{child}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{child}").exists()
+    leftovers = (
+        [p.name for p in (data / "results").glob("*")] if (data / "results").exists() else []
+    )
+    assert leftovers == []
+
+
+def _child_of(pid: int) -> int:
+    if not Path("/proc/self/task").exists():
+        pytest.skip("needs /proc")
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        children = [
+            c for task in Path(f"/proc/{pid}/task").iterdir()
+            for c in (task / "children").read_text().split()
+        ]  # fmt: skip
+        if children:
+            return int(children[0])
+        time.sleep(0.01)
+    raise AssertionError("no child was started")
+
+
+def test_a_folder_that_this_machine_does_not_see_is_named(tmp_path):
+    result = perform(Job("calibrate", str(tmp_path / "elsewhere")))
+    assert result["status"] == "failed"
+    assert "elsewhere" in result["words"] and "share" in result["words"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere"], "there is no such folder"),
+        (["{0}", "{0}"], "named twice"),
+        (["{0}", "--share", "3/2"], "--share 3/2"),
+        (["{0}", "--workers", "0"], "0 workers"),
+        (["{0}", "--workers", "2", "--scheduler", "tcp://x:1"], "both --workers and --scheduler"),
+    ],
+)
+def test_bad_requests_are_told_in_words(datasets, tmp_path, arguments, words):
+    given = [a.format(datasets[0]) for a in arguments]
+    result = CliRunner().invoke(app, ["batch", *given, "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2, result.output
+    assert words in result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_run_does_everything_for_one_dataset(tmp_path):
+    data = _dataset(tmp_path / "data", 5)
+    result = CliRunner().invoke(app, ["run", str(data), "--no-report", "--quiet"])
+    assert result.exit_code == 0, result.output
+    assert "calibrate: 1 done\ntrack: 1 done\nsmooth: 1 done" in result.output
+    assert all((data / "results" / name).is_file() for name in RESULTS)
+
+
+def test_run_refuses_an_unknown_run(datasets):
+    result = CliRunner().invoke(app, ["run", str(datasets[0]), "--only", "fall"])
+    assert result.exit_code == 2
+    assert "no dataset has a run 'fall'" in result.output
+
+
+def test_unknown_runs_are_an_error_of_the_library_too(datasets):
+    with pytest.raises(InputError, match="fall"):
+        jobs_of(datasets, only=["fall"])

@@ -47,6 +47,10 @@ WORDS = {
     "encoder scale": "the encoder reads 1 % too much",
     "encoder scale stated": "the same, and rig.toml states scale_sigma = 0.01",
 }
+HEAD = (
+    "| fault | information | model | runs | RMS | over clean | predicted | (e/sd)^2 | delay ms "
+    "| scale ppm |\n" + 10 * "|---" + "|"
+)
 INFORMATION = ("references", "arms")
 
 
@@ -159,16 +163,16 @@ def main() -> None:
     rows = list(lines(options))
     text = f"""# Faults in the data
 
-S2, {options.seeds} seeds from {options.seed}; vertical RMS error of the middle 80 %, position um / velocity mm/s; its
+S2, {options.seeds} seeds from {options.seed};
+vertical RMS error of the middle 80 %, position um / velocity mm/s; its
 ratio to the same without the fault, and the ratio that the posterior predicts (RMS of the stated
 standard deviations, exact for the true model); mean of (error / sd)^2; the largest error, over the
 seeds, of the accelerometers' delay and of the encoder's scale where the smoother estimates them.
 The encoder's scale is stated as exact except where it is at fault. There the true model gives it a
-prior of 2 %; the defaults free it with marks (1 %), and without add what is assumed of it (0.1 %)
+prior of 2 %; the defaults free it with marks, and without add what is assumed of it (0.1 %)
 or stated to the standard deviations: no residual shows it.
 
-| fault | information | model | runs | RMS | over clean | predicted | (e/sd)^2 | delay ms | scale ppm |
-|---|---|---|---|---|---|---|---|---|---|
+{HEAD}
 {chr(10).join(rows)}
 """
     print(text)

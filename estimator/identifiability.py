@@ -28,7 +28,6 @@ from telerig.estimator.smoother.model import (
     SmoothingProblem,
 )
 from telerig.estimator.smoother.solve import Options, Solution, solve
-from telerig.estimator.smoother.travel import carriage, scale_sigma
 from telerig.factors.motion import start
 
 Array = NDArray[np.float64]
@@ -153,12 +152,10 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
     bubble, frame = ours.bubble_of_row[rows], ours.frame_of_row[rows] + window.first
     same = whole.row(window.bubbles[bubble], frame)
     known = _position_sigma(still, rows)
-    sigma = _position_sigma(solution, same)
     if solution.frame.encoder_flags[0]:
-        along = carriage(solution)[0][frame] * scale_sigma(solution)
-        rest = sigma**2 - (along[:, None] * solution.frame.problem.axis) ** 2
-        sigma = np.sqrt(np.clip(rest, np.minimum(sigma, known) ** 2, None))
-    return sigma, known
+        model = replace(solution.frame.model, encoder_scale_sigma=0.0)
+        return _position_sigma(solve(window.problem, model, Options(robust=False)), rows), known
+    return _position_sigma(solution, same), known
 
 
 def without_sensors(problem: SmoothingProblem) -> SmoothingProblem:

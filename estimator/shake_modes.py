@@ -173,7 +173,8 @@ def _spectra(t_s: Array, series: Array) -> _Spectra | None:
     cross = np.real(np.einsum("cif,dif->cdif", wave, wave.conj()))
     cross *= 2 * step / (window**2).sum()
     own = np.einsum("ccif->cif", cross)
-    return _Spectra(np.fft.rfftfreq(len(grid), step), own, cross)
+    frequency = np.asarray(np.fft.rfftfreq(len(grid), step), np.float64)
+    return _Spectra(frequency, own, cross)
 
 
 def _lines(spectra: _Spectra, total: Array, noise_mm2: float) -> list[_Line]:

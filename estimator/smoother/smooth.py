@@ -33,7 +33,7 @@ from telerig.estimator.smoother.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoother.tables import shake as shake_table
 from telerig.estimator.smoother.tables import trajectories
 from telerig.estimator.smoother.tracked import Tracked, bubbles_of, read_tracks
-from telerig.estimator.smoother.travel import travel_of
+from telerig.estimator.smoother.travel import travel_of, widened
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration import Calibration
@@ -208,12 +208,18 @@ def _adapted_solution(
 
 
 def adapted(solution: Solution) -> ShakeModel | None:
-    """The model with the noise and the broad band's RMS that the data show; None if that is it."""
+    """The model with noise, broad band's RMS and prior of the encoder's scale that the data show.
+
+    None if that is it.
+    """
     model = solution.frame.model
     inflation = _inflation(solution)
     better = model
+    wide = widened(solution)
+    if wide is not None:
+        better = replace(better, encoder_scale_sigma=wide)
     if abs(inflation - 1) > _INFLATE_BEYOND:
-        better = replace(model, pixel_inflation=model.pixel_inflation * inflation)
+        better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
     if model.broad_bands:
         fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
         ratio = [

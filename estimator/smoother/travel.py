@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 SCALE_SIGMA = 1e-3
 """Of an encoder of which nothing is said: lead screws, belts, thermal growth."""
-SCALE_SIGMA_WITH_MARKS = 1e-2
+_FAR = 3.0
 
 
 def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
@@ -48,10 +48,23 @@ def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
 
 
 def default_scale_sigma(travel: Travel | None) -> float:
-    """Prior of the encoder's scale where marks tell it: as known, else one per cent."""
-    if travel is None or travel.source == "assumed":
-        return SCALE_SIGMA_WITH_MARKS
-    return float(np.sqrt(travel.covariance[2, 2]))
+    """Prior of the encoder's scale where marks tell it.
+
+    Not wider for that: a lens that is not quite telecentric and sees marks at unknown depths tells
+    the scale hardly at all. See `widened`.
+    """
+    return SCALE_SIGMA if travel is None else float(np.sqrt(travel.covariance[2, 2]))
+
+
+def widened(solution: Solution) -> float | None:
+    """The prior's sd that a well-measured scale far outside an assumed one asks for, or None."""
+    prior, travel = solution.frame.model.encoder_scale_sigma, solution.frame.problem.travel
+    assumed = travel is None or travel.source == "assumed"
+    if not solution.frame.encoder_flags[0] or not assumed:
+        return None
+    off = abs(solution.state.encoder_scale(solution.frame))
+    clear = off > _FAR * prior and scale_sigma(solution) < prior / _FAR
+    return off if clear else None
 
 
 def left_open(solution: Solution) -> tuple[Array, Array]:

@@ -40,7 +40,8 @@ def write_netcdf(results: RunResults, path: str | PathLike[str]) -> None:
     points = results.points
     numbers, names = numbered(points)
     starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
-    with atomic_path(path) as temporary, netcdf_file(temporary, "w", version=2) as file:
+    with atomic_path(path) as temporary, netcdf_file(temporary, "w", version=2) as handle:
+        file: Any = handle
         file.Conventions, file.featureType = "CF-1.8", "trajectory"
         file.title = f"Bubble trajectories of run {results.name}"
         for key, value in facts(results).items():

@@ -62,8 +62,9 @@ def write_mat(
         content["shake"] = _fields(results.shake)
     if cameras:
         content["cameras"] = _unique({c.name: _camera(c) for c in cameras})
-    with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        savemat(stream, content, long_field_names=True, oned_as="column", do_compression=True)
+    with atomic_path(path) as temporary:
+        options = {"appendmat": False, "long_field_names": True, "do_compression": True}
+        savemat(str(temporary), content, oned_as="column", **options)
 
 
 def _fields(table: pd.DataFrame) -> dict[str, Any]:

@@ -82,9 +82,9 @@ def working_volume(cameras: Sequence[Camera]) -> Volume:
         origin, direction = camera.unproject(middle)
         across = np.eye(3) - np.outer(direction, direction)
         normal, right = normal + across, right + across @ origin
-    centre = np.linalg.lstsq(normal, right, rcond=1e-6)[0]
+    centre = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-6)[0], np.float64)
     half = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras) / 2
-    return Volume(centre - half, centre + half)
+    return Volume(np.asarray(centre - half), np.asarray(centre + half))
 
 
 def seen_points(cameras: Sequence[Camera], volume: Volume, per_edge: int) -> Array:

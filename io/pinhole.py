@@ -1,0 +1,186 @@
+"""Pinhole cameras of other programs as cameras of this library, exactly.
+
+A pinhole camera is the model of `telerig.rig.projection` with kappa = 1 / working distance. The
+matrix K [R | t] is split anew into an upper triangular map and a rotation (RQ), because R is often
+not orthonormal (printed digits, or a fit of nine numbers): what R has of shear becomes the camera's
+skew and aspect, and every pixel stays what the other program computes.
+
+Where images are left-handed against the world (fy < 0 with a proper R) the *world* is mirrored,
+since the images are what was recorded: `rig_from_world` is then a rotation with a reflection
+(determinant -1), and the cameras are ordinary ones, x right, y down, z away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, nearest_rotation
+
+Array = NDArray[np.float64]
+
+_SHEAR_BESIDE_DISTORTION = 1e-5
+_RATIONAL, _TILT = slice(5, 8), slice(12, 14)
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """One camera: pixel = camera_matrix (rotation X + translation), homogeneous.
+
+    where : the file, for errors. camera_matrix (3, 3), rotation (3, 3), translation_mm (3,) from
+    the world. distortion : (up to 14,) in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 ...
+    """
+
+    where: str
+    image_size_px: tuple[int, int]
+    camera_matrix: Array
+    rotation: Array
+    translation_mm: Array
+    distortion: Array
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the image is left-handed against the world."""
+        return bool(np.linalg.det(self.camera_matrix @ self.rotation) < 0)
+
+
+def cameras_from_pinholes(
+    pinholes: Sequence[Pinhole], names: Sequence[str]
+) -> tuple[tuple[Camera, ...], Pose]:
+    """Cameras, and `rig_from_world` for points in the other program's world.
+
+    The rig frame is the first camera's, its origin where the first two optical axes come closest
+    (for one camera: at the depth of the world's origin).
+
+    Raises InputError for names that do not fit, cameras of unequal handedness, a matrix that is no
+    pinhole, and distortion that this library's model cannot express exactly.
+    """
+    if len(names) != len(pinholes) or len(set(names)) != len(names):
+        raise InputError(
+            f"{len(pinholes)} camera files with the names {list(names)}",
+            todo="give one name for each file, no two alike",
+        )
+    mirror = np.diag([1.0, 1.0, -1.0 if pinholes[0].mirrored else 1.0])
+    for one in pinholes:
+        _check(one)
+        if one.mirrored != pinholes[0].mirrored:
+            raise InputError(
+                f"its image is mirrored against that of {pinholes[0].where}",
+                where=one.where,
+                todo="flip one camera's images and calibrate again",
+            )
+    split = [_split(one, mirror) for one in pinholes]
+    distances = _working_distances([pose for _, pose in split])
+    poses = [
+        Pose(pose.rotation, pose.translation_mm - np.array([0, 0, distance]))
+        for (_, pose), distance in zip(split, distances)
+    ]
+    rig_from_world = Pose(poses[0].rotation @ mirror, poses[0].translation_mm)
+    world_from_rig = poses[0].inverse()
+    cameras = [
+        _camera(name, one, matrix, distance, pose @ world_from_rig if i else Pose.identity())
+        for i, (name, one, (matrix, _), distance, pose) in enumerate(
+            zip(names, pinholes, split, distances, poses)
+        )
+    ]
+    return tuple(cameras), rig_from_world
+
+
+def _check(one: Pinhole) -> None:
+    k, r = one.camera_matrix, one.rotation
+    if min(one.image_size_px) < 1:
+        raise InputError(f"image size {one.image_size_px}", where=one.where, todo="it must be > 0")
+    if not np.array_equal(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]) or not k[0, 0] > 0:
+        raise InputError(
+            "the camera matrix is not [f 0 c; 0 f c; 0 0 1], f > 0 first", where=one.where
+        )
+    deviation = float(np.abs(r @ r.T - np.eye(3)).max())
+    if deviation > 0.05 or np.linalg.det(r) < 0 or k[1, 1] == 0:
+        raise InputError(
+            f"the rotation matrix is none (R R' is {deviation:.2g} from the unit matrix, "
+            f"det {np.linalg.det(r):.3f})",
+            where=one.where,
+            todo="export the camera again",
+        )
+    if np.any(one.distortion[_RATIONAL]) or np.any(one.distortion[_TILT]):
+        raise InputError(
+            "distortion coefficients k4 k5 k6 and tau have no exact counterpart here",
+            where=one.where,
+            todo="calibrate with k1 k2 p1 p2 k3 (and s1 to s4), or with telerig",
+        )
+    if np.any(one.distortion) and deviation > _SHEAR_BESIDE_DISTORTION:
+        raise InputError(
+            f"distortion and a rotation matrix with shear ({deviation:.2g}) have no exact "
+            "counterpart together",
+            where=one.where,
+            todo="export the camera again, with an orthonormal rotation matrix",
+        )
+
+
+def _split(one: Pinhole, mirror: Array) -> tuple[Array, Pose]:
+    """(3, 3) upper triangular map with positive diagonal, and camera_from_world (unmirrored)."""
+    rotation = nearest_rotation(one.rotation) if np.any(one.distortion) else one.rotation
+    total = one.camera_matrix @ rotation @ mirror
+    flip = np.eye(3)[::-1]
+    q, r = np.linalg.qr((flip @ total).T)
+    upper, proper = flip @ r.T @ flip, flip @ q.T
+    signs = np.sign(np.diag(upper))
+    upper, proper = upper * signs, signs[:, None] * proper
+    translation = np.linalg.solve(upper, one.camera_matrix @ one.translation_mm)
+    return upper, Pose(proper, translation)
+
+
+def _working_distances(camera_from_world: list[Pose]) -> list[float]:
+    """Depth of each camera's plane Z = 0: where its axis is closest to the first's (second's)."""
+    back = [p.inverse() for p in camera_from_world]
+    out = [float(p.translation_mm[2]) for p in camera_from_world]
+    for i in range(len(back) if len(back) > 1 else 0):
+        mine, other = back[i], back[1 if i == 0 else 0]
+        a, b = mine.rotation[:, 2], other.rotation[:, 2]
+        cross = np.cross(a, b)
+        if cross @ cross > 1e-4:
+            between = other.translation_mm - mine.translation_mm
+            out[i] = float(np.cross(between, b) @ cross / (cross @ cross))
+    return out
+
+
+def _camera(name: str, one: Pinhole, upper: Array, distance_mm: float, pose: Pose) -> Camera:
+    if not distance_mm > 0:
+        raise InputError(
+            f"its subject lies {distance_mm:.1f} mm behind the camera",
+            where=one.where,
+            todo="check the translation vector's sign",
+        )
+    upper = upper / upper[2, 2]
+    scale = upper[0, 0] / distance_mm
+    width, height = one.image_size_px
+    rho = float(np.hypot(width, height) / 2 / scale)
+    ratio = rho / distance_mm
+    k1, k2, p1, p2, k3, *_, s1, s2, s3, s4 = np.concatenate([one.distortion, np.zeros(12)])[:12]
+    turn = -1.0 if one.camera_matrix[1, 1] < 0 else 1.0
+    return Camera.create(
+        name,
+        one.image_size_px,
+        scale,
+        camera_from_rig=pose,
+        rho_mm=rho,
+        aspect=upper[1, 1] / upper[0, 0],
+        skew=upper[0, 1] / upper[0, 0],
+        centre_u_px=upper[0, 2],
+        centre_v_px=upper[1, 2],
+        kappa_per_mm=1 / distance_mm,
+        k1=k1 * ratio**2,
+        k2=k2 * ratio**4,
+        k3=k3 * ratio**6,
+        p1=turn * p1 * ratio,
+        p2=p2 * ratio,
+        s1=s1 * ratio,
+        s2=s2 * ratio**3,
+        s3=turn * s3 * ratio,
+        s4=turn * s4 * ratio**3,
+    )

@@ -25,7 +25,8 @@ from telerig.rig.triangulation import triangulate
 
 UP = np.array([0.0, -1.0, 0.0])
 RATE_HZ, FRAMES, SIGMA_PX = 500.0, 300, 0.5
-RIG = SimpleNamespace(stage=StageDescription((0, -1, 0), (0, -1, 0), 0.001), accelerometers={})
+RIG = SimpleNamespace(stage=StageDescription((0, -1, 0), (0, -1, 0), 0.001, 0.0), accelerometers={})
+UNSAID = SimpleNamespace(stage=StageDescription((0, -1, 0), (0, -1, 0), 0.001), accelerometers={})
 TRUE = ShakeModel(
     bubble=BubbleModel(
         zigzags=(Zigzag(6.0, 0.03, (2.0, 0.0, 2.0)), Zigzag(12.0, 0.03, (0.0, 0.177, 0.0)))
@@ -250,6 +251,19 @@ def test_encoder_scale_is_found_with_references() -> None:
     scale = found.summary["encoder"]
     assert scale["scale"] == pytest.approx(0.01, abs=max(4 * scale["sscale"], 1e-4))
     assert scale["sscale"] < 2e-4
+
+
+def test_encoder_scale_far_from_what_is_assumed_is_found_by_default() -> None:
+    """The assumed 0.1 % is no obstacle to marks that show 1 %."""
+    off = simulated(2, encoder_scale=0.01)
+    found = smooth(
+        off.tracks, off.calibration, stage=off.stage, references=off.references, rig=UNSAID
+    )
+    scale = found.summary["encoder"]
+    assert scale["scale_from"] == "run"
+    assert scale["scale"] == pytest.approx(0.01, abs=4 * scale["sscale"])
+    assert scale["sscale"] < 3e-4
+    assert found.model.encoder_scale_sigma > 0.01
 
 
 def test_gap_and_single_camera_detections(run: Run) -> None:

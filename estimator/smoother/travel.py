@@ -57,14 +57,16 @@ def default_scale_sigma(travel: Travel | None) -> float:
 
 
 def widened(solution: Solution) -> float | None:
-    """The prior's sd that a well-measured scale far outside an assumed one asks for, or None."""
+    """The prior's sd for a scale that the run puts far outside an assumed one; None: it stays.
+
+    Twice the estimate, which the narrow prior has drawn towards 0.
+    """
     prior, travel = solution.frame.model.encoder_scale_sigma, solution.frame.problem.travel
     assumed = travel is None or travel.source == "assumed"
     if not solution.frame.encoder_flags[0] or not assumed:
         return None
     off = abs(solution.state.encoder_scale(solution.frame))
-    clear = off > _FAR * prior and scale_sigma(solution) < prior / _FAR
-    return off if clear else None
+    return 2 * off if off > _FAR * prior else None
 
 
 def left_open(solution: Solution) -> tuple[Array, Array]:

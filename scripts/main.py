@@ -9,8 +9,10 @@ from telerig.scripts.batch import batch
 from telerig.scripts.calibrate import calibrate
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
+from telerig.scripts.doctor import doctor
 from telerig.scripts.export import export
 from telerig.scripts.import_files import app as import_files
+from telerig.scripts.init import init
 from telerig.scripts.record import record
 from telerig.scripts.run import run as run_dataset
 from telerig.scripts.simulate import simulate
@@ -39,10 +41,12 @@ def _main(
     """Calibrate a telecentric stereo rig from views of dots, and track bubbles with it."""
 
 
-for command in (demo, simulate, detect, calibrate, track, smooth, batch, record, export):
+for command in (demo, init, doctor, simulate, detect, calibrate, track, smooth):
+    app.command()(command)
+app.command("run")(run_dataset)
+for command in (batch, record, export):
     app.command()(command)
 app.add_typer(import_files, name="import")
-app.command("run")(run_dataset)
 
 
 def run() -> None:

@@ -1,0 +1,161 @@
+"""Is a dataset fit to be calibrated, tracked and smoothed? One `Check` per question."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from telerig.errors import TelerigError
+from telerig.io.dataset import Dataset, load_dataset
+from telerig.io.doctor import Check
+
+if TYPE_CHECKING:
+    from telerig.io.run_data import RunData
+
+FEWEST_VIEWS = 6
+_GOOD_VIEWS = 10
+_LEAST_FREE_GB = 2.0
+_RESULT_BYTES_PER_FRAME = 20_000
+_DECODED = 3
+_UNEVEN = 0.2
+_FEW_READINGS = 2
+
+
+def check_dataset(place: Path) -> Iterator[Check]:
+    """rig.toml, the views, every run with its clocks and sensors, room on the disk."""
+    try:
+        data = load_dataset(place, need_views=False)
+    except TelerigError as error:
+        yield _failure("dataset", error)
+        return
+    cameras = ", ".join(
+        f"{c.name} {c.image_size_px[0]} x {c.image_size_px[1]}" for c in data.rig.cameras.values()
+    )
+    yield Check("rig.toml", "ok", f"{data.rig.name!r}: {cameras}")
+    yield from _views(data)
+    for name in data.runs:
+        yield from _run(data, name)
+    if not data.runs:
+        yield Check("runs", "note", "none", "put recordings into runs/<name>/<camera>/")
+    yield _disk(data)
+
+
+def _views(data: Dataset) -> Iterator[Check]:
+    done = (data.results / "calibration" / "calibration.json").is_file()
+    if not data.views:
+        words = "no views of the target, but a calibration" if done else "no views of the target"
+        todo = "" if done else "put images into calibration/<camera>/<view>.tif"
+        yield Check("views", "ok" if done else "warning", words, todo)
+        return
+    count = len(data.views)
+    single = [v.name for v in data.views if v.image_paths and len(v.image_paths) == 1]
+    words = f"{count} views from {data.source}"
+    if single:
+        words += f", {len(single)} of them from one camera only ({', '.join(single[:4])})"
+    if count < FEWEST_VIEWS:
+        yield Check("views", "warning", words, f"take {FEWEST_VIEWS} or more, better a dozen")
+    elif count < _GOOD_VIEWS:
+        yield Check("views", "note", words, "a dozen, tilted all ways, know more")
+    else:
+        yield Check("views", "ok", words)
+    yield from _decoded(data)
+    for note in data.notes:
+        yield Check("views", "note", note)
+
+
+def _decoded(data: Dataset) -> Iterator[Check]:
+    """The first images of every camera must open and have the stated size."""
+    if data.source != "images":
+        return
+    for camera in data.rig.cameras:
+        mine = [v for v in data.views if camera in v.image_paths]
+        try:
+            kinds = {data.image(v, camera).dtype.name for v in mine[:_DECODED]}
+        except TelerigError as error:
+            yield _failure(f"images of {camera}", error)
+        else:
+            yield Check(f"images of {camera}", "ok", f"{len(mine)}, {', '.join(sorted(kinds))}")
+
+
+def _run(data: Dataset, name: str) -> Iterator[Check]:
+    what = f"run {name}"
+    try:
+        run = data.runs[name].load(source=_source(data.runs[name].path))
+    except TelerigError as error:
+        yield _failure(what, error)
+        return
+    span = float(run.t_s[-1] - run.t_s[0]) if run.frame_count > 1 else 0.0
+    rate = (run.frame_count - 1) / span if span else 0.0
+    words = f"{run.frame_count} frames from {run.source}, {span:.3g} s, {rate:.4g} per second"
+    yield Check(what, "ok", words)
+    for note in run.notes:
+        yield Check(what, "note", note)
+    yield from _clocks(run, what)
+    yield from _sensors(run, what)
+
+
+def _source(path: Path) -> str | None:
+    return "detections" if (path / "detections.csv").is_file() else None
+
+
+def _clocks(run: RunData, what: str) -> Iterator[Check]:
+    steps = np.diff(run.t_s)
+    if not len(steps):
+        return
+    usual = float(np.median(steps))
+    gaps = int((steps > (1 + _UNEVEN) * usual).sum())
+    if gaps:
+        yield Check(
+            f"{what} frames.csv", "note",
+            f"{gaps} steps are longer than the usual {1000 * usual:.3g} ms, "
+            f"the longest {1000 * float(steps.max()):.3g} ms",
+            "frames were lost, or the camera was not triggered evenly; both are allowed for",
+        )  # fmt: skip
+
+
+def _sensors(run: RunData, what: str) -> Iterator[Check]:
+    from telerig.estimator.sensor_checks import check_sensors
+
+    try:
+        warnings = check_sensors(run)
+    except TelerigError as error:
+        yield _failure(f"{what} sensors", error)
+        return
+    told = [f"encoder {_rate(run.stage['t_s'].to_numpy(float))}"] if run.stage is not None else []
+    if run.accelerometers is not None:
+        for sensor, rows in run.accelerometers.groupby("sensor"):
+            told.append(f"{sensor} {_rate(rows['t_s'].to_numpy(float))}")
+    if run.references is not None:
+        told.append(f"{run.references['mark'].nunique()} marks")
+    words = ", ".join(told) or "none: the rig's shake cannot be told from the bubbles' motion"
+    todo = "" if told else "record the encoder, and an accelerometer on each arm"
+    yield Check(f"{what} sensors", "ok" if told else "note", words, todo)
+    for warning in warnings:
+        yield Check(f"{what} sensors", "warning", warning)
+
+
+def _rate(t_s: np.ndarray) -> str:
+    if len(t_s) < _FEW_READINGS:
+        return f"{len(t_s)} readings"
+    return f"{(len(t_s) - 1) / (t_s[-1] - t_s[0]):.4g} Hz"
+
+
+def _disk(data: Dataset) -> Check:
+    free = shutil.disk_usage(data.path).free
+    frames = sum(len(list(r.path.rglob("*.tif*"))) for r in data.runs.values())
+    wanted = max(_LEAST_FREE_GB * 1e9, frames * _RESULT_BYTES_PER_FRAME)
+    words = f"{free / 1e9:.3g} GB free"
+    if free < wanted:
+        return Check("disk", "warning", words, f"results may need {wanted / 1e9:.2g} GB: make room")
+    return Check("disk", "ok", words)
+
+
+def _failure(what: str, error: TelerigError) -> Check:
+    where = getattr(error, "where", "")
+    said = getattr(error, "what", str(error))
+    words = f"{where}: {said}" if where else said
+    return Check(what, "failure", words, getattr(error, "todo", ""))

@@ -1,0 +1,132 @@
+"""Is this installation whole, and do the serial ports work? One `Check` per question."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distributions, requires, version
+from pathlib import Path
+from typing import Literal
+
+Status = Literal["ok", "note", "warning", "failure"]
+
+_IMPORTS = {"opencv-python-headless": "cv2", "scikit-image": "skimage", "pyserial": "serial"}
+_EXTRAS = {"av": "films and AVI/MP4 input (video)", "distributed": "batches on a cluster (cluster)"}
+_OPENCV = ("opencv-python", "opencv-contrib-python", "opencv-contrib-python-headless")
+_OLDEST, _NEWEST = (3, 11), (3, 14)
+_SLOW_TIMER_MS = 2
+LATENCY = Path("/sys/bus/usb-serial/devices")
+
+
+@dataclass(frozen=True)
+class Check:
+    """what : the question. words : the answer. todo : what to do about it, if anything."""
+
+    what: str
+    status: Status
+    words: str
+    todo: str = ""
+
+
+def check_installation() -> Iterator[Check]:
+    """Python, the packages that telerig needs, one OpenCV only, the extras."""
+    python = platform.python_version()
+    known = _OLDEST <= sys.version_info[:2] <= _NEWEST
+    yield Check(
+        "Python", "ok" if known else "warning", python,
+        "" if known else "telerig is tested with 3.11 to 3.14",
+    )  # fmt: skip
+    for name in _required():
+        yield _package(name)
+    yield _opencv()
+    for name, purpose in _EXTRAS.items():
+        have = _version(name)
+        extra = purpose.split("(")[1].rstrip(")")
+        yield Check(
+            name, "ok" if have else "note", have or f"not installed: no {purpose.split(' (')[0]}",
+            "" if have else f"pip install 'telerig[{extra}]' if you want it",
+        )  # fmt: skip
+
+
+def _required() -> list[str]:
+    """Names of the packages that the installed telerig states as its dependencies."""
+    try:
+        stated = requires("telerig") or []
+    except PackageNotFoundError:
+        return ["gtsam", "numpy", "scipy", "opencv-python-headless", "scikit-image", "pyserial"]
+    plain = [r for r in stated if "extra ==" not in r]
+    return [r.split(";")[0].split(">")[0].split("<")[0].split("=")[0].strip() for r in plain]
+
+
+def _package(name: str) -> Check:
+    have = _version(name)
+    if have is None:
+        return Check(name, "failure", "not installed", f"pip install {name}")
+    try:
+        importlib.import_module(_IMPORTS.get(name, name))
+    except ImportError as error:
+        todo = f"pip install --force-reinstall {name}"
+        return Check(name, "failure", f"{have}, cannot be imported: {error}", todo)
+    return Check(name, "ok", have)
+
+
+def _opencv() -> Check:
+    """OpenCV 4 and 5 both work; two distributions of it overwrite each other's files."""
+    here = {d.metadata["Name"] for d in distributions()}
+    rivals = sorted(here & set(_OPENCV))
+    have = _version("opencv-python-headless") or "none"
+    if rivals:
+        both = " ".join([*rivals, "opencv-python-headless"])
+        return Check(
+            "one OpenCV", "warning", f"also installed: {', '.join(rivals)}; they share one folder",
+            f"pip uninstall -y {both} && pip install opencv-python-headless",
+        )  # fmt: skip
+    major = have.split(".")[0]
+    if major not in ("4", "5"):
+        return Check("one OpenCV", "warning", f"version {have}", "telerig is tested with 4 and 5")
+    return Check("one OpenCV", "ok", f"major version {major}, of 4 and 5 that are tested")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
+    """Every serial port: may it be opened, and how long does its adapter hold bytes back?"""
+    from serial.tools import list_ports
+
+    ports = sorted(list_ports.comports(), key=lambda p: str(p.device))
+    if not ports:
+        words = "none found"
+        yield Check("serial ports", "note", words, "plug the sensors in if you want to record")
+    for port in ports:
+        device = str(port.device)
+        said = device if port.description in (None, "n/a") else f"{device}: {port.description}"
+        if not os.access(device, os.R_OK | os.W_OK):
+            yield Check(
+                device, "warning", f"{said}; you may not open it",
+                "sudo usermod -aG dialout $USER, then log in again",
+            )  # fmt: skip
+        else:
+            yield Check(device, "ok", said)
+        yield from _latency(device, latency / Path(device).name / "latency_timer")
+
+
+def _latency(device: str, timer: Path) -> Iterator[Check]:
+    """USB adapters gather bytes for so long before they send them: 16 ms unless told otherwise."""
+    try:
+        held_ms = int(timer.read_text())
+    except (OSError, ValueError):
+        return
+    slow = held_ms > _SLOW_TIMER_MS
+    yield Check(
+        f"{device} latency timer", "warning" if slow else "ok", f"{held_ms} ms",
+        f"echo 1 | sudo tee {timer}" if slow else "",
+    )  # fmt: skip

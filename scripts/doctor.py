@@ -1,0 +1,47 @@
+"""telerig doctor: what is wrong with the installation, the ports or a dataset, and what to do."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from telerig.scripts.console import EXIT_REJECTED, errors_in_words, say
+
+_SIGNS = {"ok": "ok      ", "note": "note    ", "warning": "WARNING ", "failure": "FAILURE "}
+
+
+def doctor(
+    dataset: Annotated[
+        Path | None, typer.Argument(help="Dataset folder to look at as well.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for other programs.")] = False,
+) -> None:
+    """Check the installation, the serial ports, and a dataset if one is given.
+
+    Exit code 0: nothing stands in the way, though there may be warnings. 1: something does.
+    """
+    with errors_in_words():
+        from telerig.estimator.doctor import check_dataset
+        from telerig.io.doctor import check_installation, check_ports
+
+        checks = [*check_installation(), *check_ports()]
+        if dataset is not None:
+            checks += check_dataset(dataset)
+        if as_json:
+            say(json.dumps([asdict(check) for check in checks], indent=1, ensure_ascii=False))
+        else:
+            width = max(len(check.what) for check in checks)
+            for check in checks:
+                say(f"{_SIGNS[check.status]}{check.what:<{width}}  {check.words}")
+                if check.todo:
+                    say(f"{'':{width + 10}}-> {check.todo}")
+        if any(check.status == "failure" for check in checks):
+            raise typer.Exit(EXIT_REJECTED)
+
+
+if __name__ == "__main__":
+    typer.run(doctor)

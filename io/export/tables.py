@@ -63,8 +63,10 @@ def write_mat(
     if cameras:
         content["cameras"] = _unique({c.name: _camera(c) for c in cameras})
     with atomic_path(path) as temporary:
-        options = {"appendmat": False, "long_field_names": True, "do_compression": True}
-        savemat(str(temporary), content, oned_as="column", **options)
+        savemat(
+            str(temporary), content, appendmat=False, long_field_names=True, do_compression=True,
+            oned_as="column",
+        )  # fmt: skip
 
 
 def _fields(table: pd.DataFrame) -> dict[str, Any]:

@@ -228,10 +228,10 @@ def polled(protocol: str, seconds: float, seed: int, folder: Path) -> tuple[int,
 
 def clean_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[str]:
     yield f"## {costs['seconds'] / 60:.1f} minutes, encoder at 1 kHz and two accelerometers at 2 kHz\n\n"
-    yield "| device | readings | missing | wrong | drift error ppm (sd) | least delay us "
-    yield "| offset error us (sd) | worst time us |\n" + "|" + "---|" * 8 + "\n"
+    yield "| device | readings | missing | of these overrun in the port | wrong | drift error ppm (sd) | least delay us "
+    yield "| offset error us (sd) | worst time us |\n" + "|" + "---|" * 9 + "\n"
     for j in judged:
-        yield f"| {j.name} | {j.came} | {j.missing} | {j.wrong} "
+        yield f"| {j.name} | {j.came} | {j.missing} | {j.overrun} | {j.wrong} "
         yield f"| {j.drift_error_ppm:+.4f} ({j.drift_sd_ppm:.4f}) | {j.least_delay_us:.0f} "
         yield f"| {j.offset_error_us:+.1f} ({j.sd_offset_us:.0f}) | {j.worst_time_us:.1f} |\n"
     yield "\nOffset error and worst time are beyond the line's least delay, which one-way stamps "

@@ -22,8 +22,8 @@ class DeviceDescription:
     counts_per_mm : encoder counts (or microsteps) in 1 mm. unit_m_s2 : acceleration of one unit.
     time_unit_s, time_bits : of the device's own clock, which wraps at 2**time_bits; 0 never.
     checksum : "xor" demands `*hh` at a line's end, as NMEA 0183 has it.
-    latency_s : known least delay of the line, which one-way stamps cannot see; subtracted. For frames
-    stamped at the begin of their exposure add minus half the exposure.
+    latency_s : known least delay of the line, which one-way stamps cannot see; subtracted. For
+    frames stamped at the begin of their exposure add minus half the exposure.
     axis : which of GRBL's positions. cameras : those whose frames the counter counts.
     """
 

@@ -12,6 +12,8 @@ from telerig.io.record_description import DeviceDescription
 
 WAIT_S = 0.1
 """How long a read waits for a byte before it looks whether to stop."""
+WRITE_S = 1.0
+"""A port that takes no question for so long is lost."""
 
 
 def known_ports() -> list[str]:
@@ -31,7 +33,7 @@ def open_port(device: DeviceDescription) -> Any:
 
     try:
         port = serial.serial_for_url(
-            device.port, baudrate=device.baud, timeout=WAIT_S, exclusive=True
+            device.port, baudrate=device.baud, timeout=WAIT_S, write_timeout=WRITE_S, exclusive=True
         )
         port.reset_input_buffer()
         return port

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import queue
 import threading
 import time
@@ -218,7 +219,7 @@ class _Session:
 
     def _told(self) -> Status:
         seconds = (time.monotonic_ns() - self._start_ns) * 1e-9
-        return Status(seconds, self._log.bytes, tuple(self._status))
+        return Status(seconds, self._log.bytes, tuple(map(copy.copy, self._status)))
 
 
 def _garbage(device: DeviceDescription, status: DeviceStatus) -> GarbageError:

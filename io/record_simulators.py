@@ -27,7 +27,8 @@ from telerig.io.record_signals import (
 )
 
 _POLLED_WAIT_S = 0.05
-_UNHEARD_S = 0.002
+_BUFFER_S = 0.25
+"""What a device keeps while the host is busy and its port takes no more; then readings are lost."""
 
 
 @dataclass
@@ -73,14 +74,14 @@ class PseudoTerminal:
     def write(self, data: bytes) -> int:
         """How many of the bytes went into the port's buffer."""
         written = 0
-        deadline = time.monotonic() + _UNHEARD_S
+        deadline = time.monotonic() + _BUFFER_S
         while written < len(data):
             try:
                 written += os.write(self.master, data[written:])
             except OSError as error:
                 if error.errno != errno.EAGAIN or time.monotonic() > deadline:
                     return written
-                select.select([], [self.master], [], _UNHEARD_S)
+                select.select([], [self.master], [], 0.05)
         return written
 
 

@@ -99,6 +99,8 @@ def recording_words(done: Recording) -> str:
 
 def _device_words(device: dict[str, Any]) -> Iterator[str]:
     yield f"{device['readings']} readings"
+    if not device["readings"]:
+        yield "nothing came: is it switched on, and must it be asked (poll in rig.toml)?"
     if device["rate_hz"]:
         yield f"{device['rate_hz']:.6g} Hz"
     if device["lost"]:

@@ -71,12 +71,14 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
 
 
 def _tables(results: CalibrationResults) -> dict[str, Any]:
-    extra = {k: v for k, v in results.content.items() if k not in _SHOWN}
+    stage = tables.stage_rows(results)
+    shown = _SHOWN if stage else _SHOWN - {"stage"}
+    extra = {k: v for k, v in results.content.items() if k not in shown and v != {}}
     return {
         "figures": tables.key_numbers(results),
         "parameters": tables.parameter_rows(results),
         "pose": tables.pose_rows(results),
-        "stage": tables.stage_rows(results),
+        "stage": stage,
         "stage_words": (results.content.get("stage") or {}).get("notes") or [],
         "ladder": tables.ladder_rows(results),
         "worst": tables.worst_rows(results),

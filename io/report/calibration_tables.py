@@ -148,10 +148,16 @@ def pose_rows(results: CalibrationResults) -> list[Row]:
     ]  # fmt: skip
 
 
+_STAGE = {
+    "axis", "axis_covariance_rad2", "encoder_scale", "encoder_scale_sd", "wander_sigma_mm",
+    "position_sigma_mm",
+}  # fmt: skip
+
+
 def stage_rows(results: CalibrationResults) -> list[Row]:
     """Travel axis and encoder scale from `stage_axis/`; empty without it."""
     stage = results.content.get("stage") or {}
-    if not stage:
+    if not _STAGE.issubset(stage):
         return []
     tilts = np.sqrt(np.diagonal(np.array(stage["axis_covariance_rad2"], float)))
     scale, sd = (1e6 * float(stage[key]) for key in ("encoder_scale", "encoder_scale_sd"))

@@ -227,24 +227,29 @@ def polled(protocol: str, seconds: float, seed: int, folder: Path) -> tuple[int,
 
 
 def clean_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[str]:
-    yield f"## {costs['seconds'] / 60:.1f} minutes, encoder at 1 kHz and two accelerometers at 2 kHz\n\n"
-    yield "| device | readings | missing | of these overrun in the port | wrong | drift error ppm (sd) | least delay us "
-    yield "| offset error us (sd) | worst time us |\n" + "|" + "---|" * 9 + "\n"
+    yield f"## {costs['seconds'] / 60:.1f} minutes, encoder at 1 kHz, two accelerometers at 2 kHz\n\n"
+    yield "| device | readings | missing | of these overrun in the port | wrong "
+    yield (
+        "| drift error ppm (sd) | least delay us | offset error us (sd) | worst time us |\n"
+        + "|"
+        + "---|" * 9
+        + "\n"
+    )
     for j in judged:
         yield f"| {j.name} | {j.came} | {j.missing} | {j.overrun} | {j.wrong} "
         yield f"| {j.drift_error_ppm:+.4f} ({j.drift_sd_ppm:.4f}) | {j.least_delay_us:.0f} "
         yield f"| {j.offset_error_us:+.1f} ({j.sd_offset_us:.0f}) | {j.worst_time_us:.1f} |\n"
     yield "\nOffset error and worst time are beyond the line's least delay, which one-way stamps "
     yield "cannot see and which is in all times of that device.\n\n"
-    yield f"CPU while recording: {costs['cpu']:.1f} % of one core. Tables: {costs['tables_s']:.1f} s "
-    yield f"of CPU. Log: {costs['log_mb']:.0f} MB. Memory: {costs['memory_mb']:.0f} MB at most. "
+    yield f"CPU while recording: {costs['cpu']:.1f} % of one core. Tables: {costs['tables_s']:.1f} "
+    yield f"s of CPU. Log: {costs['log_mb']:.0f} MB. Memory: {costs['memory_mb']:.0f} MB at most. "
     yield f"Tables made twice are the same, byte for byte: {'yes' if costs['same'] else 'NO'}.\n\n"
 
 
 def bad_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[str]:
     yield f"## {costs['seconds']:.0f} s of bad lines\n\n"
-    yield "Once a second, at random, up to 40 bytes of garbage in the middle of a reading, and once a "
-    yield "second the bytes between two readings are lost; unplugged twice for 2 s.\n\n"
+    yield "Once a second, at random, up to 40 bytes of garbage in the middle of a reading, and once "
+    yield "a second the bytes between two readings are lost; unplugged twice for 2 s.\n\n"
     yield "| device | came | spoilt by faults | sound but missing | malformed | wrong values let "
     yield (
         "through | gaps | unplugged | drift error ppm | worst time us |\n"
@@ -255,8 +260,8 @@ def bad_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[str]
     for j in judged:
         yield f"| {j.name} | {j.came} | {j.spoilt} | {j.missing} | {j.malformed} | {j.wrong} "
         yield f"| {j.gaps} | {j.unplugged} | {j.drift_error_ppm:+.3f} | {j.worst_time_us:.0f} |\n"
-    yield f"\nCPU: {costs['cpu']:.1f} %. A damaged line that still reads like a line cannot be told "
-    yield "from a sound one without a checksum.\n\n"
+    yield f"\nCPU: {costs['cpu']:.1f} %. A damaged line that still reads like a line cannot be "
+    yield "told from a sound one without a checksum.\n\n"
 
 
 def main() -> None:
@@ -279,7 +284,8 @@ def main() -> None:
     text += "".join(clean_text(*clean)) + "".join(bad_text(*bad))
     text += f"## Killed while recording\n\nReadings of the last {lost_s:.2f} s are lost.\n\n"
     text += "## Polled stages, answers up to 16 ms late\n\n"
-    text += "| protocol | readings | half of question to answer ms | RMS of time ms |\n|---|---|---|---|\n"
+    text += "| protocol | readings | half of question to answer ms | RMS of time ms |\n"
+    text += "|---|---|---|---|\n"
     for row in stages:
         text += f"| {row[0]} | {row[1]} | {row[2]:.2f} | {row[3]:.2f} |\n"
     load = os.getloadavg()[2]

@@ -57,4 +57,6 @@ def _lower_chain(x_s: Array, least_s: Array, knots: Array) -> Array:
         -np.asarray(weights.sum(axis=0)).ravel(), A_ub=weights, b_ub=least_s / unit,
         bounds=(-10.0, 10.0), method="highs",
     )  # fmt: skip
-    return np.asarray(unit * found.x) if found.success else np.zeros(len(knots))
+    if not found.success or found.x is None:
+        return np.zeros(len(knots))
+    return np.asarray(unit * np.asarray(found.x))

@@ -227,7 +227,7 @@ def polled(protocol: str, seconds: float, seed: int, folder: Path) -> tuple[int,
 
 
 def clean_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[str]:
-    yield f"## {costs['seconds'] / 60:.1f} minutes, encoder at 1 kHz, two accelerometers at 2 kHz\n\n"
+    yield f"## {costs['seconds'] / 60:.1f} minutes: encoder 1 kHz, two accelerometers 2 kHz\n\n"
     yield "| device | readings | missing | of these overrun in the port | wrong "
     yield (
         "| drift error ppm (sd) | least delay us | offset error us (sd) | worst time us |\n"
@@ -248,8 +248,8 @@ def clean_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[st
 
 def bad_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[str]:
     yield f"## {costs['seconds']:.0f} s of bad lines\n\n"
-    yield "Once a second, at random, up to 40 bytes of garbage in the middle of a reading, and once "
-    yield "a second the bytes between two readings are lost; unplugged twice for 2 s.\n\n"
+    yield "Once a second, at random, up to 40 bytes of garbage in the middle of a reading, and "
+    yield "once a second the bytes between two readings are lost; unplugged twice for 2 s.\n\n"
     yield "| device | came | spoilt by faults | sound but missing | malformed | wrong values let "
     yield (
         "through | gaps | unplugged | drift error ppm | worst time us |\n"

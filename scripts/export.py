@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -64,34 +64,42 @@ def export(
     Exit code 0: written. 2: the input cannot be used, with what, where and what to do.
     """
     with errors_in_words():
-        from telerig.io.export.write import (
-            CAMERA_FORMATS,
-            RUN_FORMATS,
-            SUFFIXES,
-            export_cameras,
-            export_run,
-        )
-
-        if to not in CAMERA_FORMATS + RUN_FORMATS:
-            known = ", ".join(CAMERA_FORMATS + RUN_FORMATS)
-            raise InputError(f"--to {to}", todo=f"use one of: {known}")
-        results = results_root(source)
-        cameras = cameras_of(source, calibration, required=to in CAMERA_FORMATS)
-        if to in CAMERA_FORMATS:
-            place = out or results / "export" / f"{to}{SUFFIXES.get(to, '')}"
-            words = export_cameras(
-                cameras, to, place, volume=volume_from(volume),
-                full_cubic=full_cubic, first_pixel=first_pixel,
-            )  # fmt: skip
-        else:
-            from telerig.io.export.results import read_results
-
-            found = read_results(run_folder(source, run))
-            place = out or results / "export" / f"{found.name}{SUFFIXES[to]}"
-            words = export_run(found, to, place, cameras)
-        for line in words:
+        polynomial = {"full_cubic": full_cubic, "first_pixel": first_pixel}
+        for line in _export(source, to, run, calibration, out, volume_from(volume), polynomial):
             say(line)
-        say(f"written: {place}")
+
+
+def _export(
+    source: Path,
+    to: str,
+    run: str | None,
+    calibration: Path | None,
+    out: Path | None,
+    volume: Volume | None,
+    polynomial: dict[str, Any],
+) -> list[str]:
+    from telerig.io.export.results import read_results
+    from telerig.io.export.write import (
+        CAMERA_FORMATS,
+        RUN_FORMATS,
+        SUFFIXES,
+        export_cameras,
+        export_run,
+    )
+
+    if to not in CAMERA_FORMATS + RUN_FORMATS:
+        known = ", ".join(CAMERA_FORMATS + RUN_FORMATS)
+        raise InputError(f"--to {to}", todo=f"use one of: {known}")
+    folder = results_root(source) / "export"
+    cameras = cameras_of(source, calibration, required=to in CAMERA_FORMATS)
+    if to in CAMERA_FORMATS:
+        place = out or folder / f"{to}{SUFFIXES.get(to, '')}"
+        words = export_cameras(cameras, to, place, volume=volume, **polynomial)
+    else:
+        results = read_results(run_folder(source, run))
+        place = out or folder / f"{results.name}{SUFFIXES[to]}"
+        words = export_run(results, to, place, cameras)
+    return [*words, f"written: {place}"]
 
 
 def results_root(source: Path) -> Path:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import fsolve
 
-from telerig.errors import InputError
+from telerig.errors import GeometryError, InputError
 from telerig.io.export.halcon import halcon_cameras
 from telerig.io.export.halcon_files import hdevelop_lines, write_halcon
 from telerig.io.export.opencv import camera_matrices, write_opencv
@@ -191,6 +191,13 @@ def test_halcon_states_the_residual_perspective_it_leaves_out() -> None:
     for ours in halcon_cameras(cameras, lens="perspective"):
         assert ours.exact and ours.parameters["focus"] == pytest.approx(500.0)
         assert ours.misfit.max_px < 1e-7
+
+
+@pytest.mark.parametrize("kind", ["division", "polynomial"])
+def test_halcon_distortion_without_inverse_is_an_error(kind: str) -> None:
+    ours = halcon_cameras(pair(k1=0.02), distortion=kind)[0]  # type: ignore[arg-type]
+    with pytest.raises(GeometryError, match="no inverse"):
+        ours.project([[2000.0, 1500.0, 0.0]])
 
 
 def test_halcon_files(tmp_path: Path) -> None:

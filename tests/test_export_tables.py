@@ -197,6 +197,14 @@ def test_trackpy_computes_with_it(folder: Path, tmp_path: Path) -> None:
             assert found[particle].iloc[lag - 1] == pytest.approx(expected, rel=1e-9)
 
 
+def test_given_names_reach_the_export_unchanged(folder: Path, tmp_path: Path) -> None:
+    given = table().assign(particle=lambda t: t["particle"].map({3: "007", 7: "7", 12: "12"}))
+    write_table(given, folder / "trajectories.csv")
+    write_trackpy(read_results(folder), tmp_path / "out.csv")
+    read = pd.read_csv(tmp_path / "out.csv", dtype={"particle_name": str})
+    assert read.groupby("particle_name").size().to_dict() == {"007": 25, "7": 30, "12": 1}
+
+
 def test_units_come_from_the_names() -> None:
     expected = {"svx_mm_s": "mm s-1", "sxx_mm2": "mm2", "left_u_px": "px", "frame": "1", "t_s": "s"}
     assert {name: unit_of(name) for name in expected} == expected

@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.errors import InputError
+from telerig.errors import GeometryError, InputError
 from telerig.io.export.volume import Misfit, Volume, seen_points, working_volume
 from telerig.rig import projection
 from telerig.rig.camera import Camera
@@ -44,6 +44,8 @@ PERSPECTIVE_PX = 0.5
 _POINTS_PER_EDGE = 25
 _PIXELS_PER_EDGE = 41
 _SQUARE = 1e-13
+_NO_INVERSE = "HALCON's distortion has no inverse at some of these points"
+_USE_OPENCV = "keep to a smaller volume, or export to OpenCV, which has telerig's distortion"
 
 
 @dataclass(frozen=True)
@@ -232,12 +234,19 @@ def _pixel_from_camera(points_m: Array, values: dict[str, float]) -> Array:
 
 
 def _distorted(straight: Array, values: dict[str, float]) -> Array:
-    """The inverse of HALCON's distortion: closed for the division model, else by fixed point."""
+    """The inverse of HALCON's distortion: closed for the division model, else by fixed point.
+
+    Raises GeometryError where there is none.
+    """
     if "kappa" in values:
         r2 = np.sum(straight**2, axis=-1, keepdims=True)
-        return np.asarray(2 * straight / (1 + np.sqrt(1 - 4 * values["kappa"] * r2)))
+        inside = 1 - 4 * values["kappa"] * r2
+        if np.any(inside < 0):
+            raise GeometryError(_NO_INVERSE, todo=_USE_OPENCV)
+        return np.asarray(2 * straight / (1 + np.sqrt(inside)))
     k1, k2, k3, p1, p2 = (values[name] for name in ("k1", "k2", "k3", "p1", "p2"))
-    bent = straight
+    bent, size = straight, float(np.max(np.abs(straight), initial=1e-6))
+    step = np.inf
     for _ in range(100):
         x, y = bent[..., :1], bent[..., 1:]
         r2 = x * x + y * y
@@ -245,6 +254,11 @@ def _distorted(straight: Array, values: dict[str, float]) -> Array:
             [p1 * (r2 + 2 * x * x) + 2 * p2 * x * y, 2 * p1 * x * y + p2 * (r2 + 2 * y * y)], -1
         )
         last, bent = bent, straight - shift
-        if np.max(np.abs(bent - last), initial=0.0) < 1e-18:
+        step = np.max(np.abs(bent - last), initial=0.0)
+        if not step < 1e3 * size:
             break
-    return bent
+        if step < 1e-16 * size:
+            return np.asarray(bent)
+    if step < 1e-12 * size:
+        return np.asarray(bent)
+    raise GeometryError(_NO_INVERSE, todo=_USE_OPENCV)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,9 +77,9 @@ def read_results(folder: str | PathLike[str]) -> RunResults:
 
 
 def _whole_particles(points: pd.DataFrame) -> pd.DataFrame:
-    """Ids as whole numbers where all of them are; given names stay text."""
+    """Ids as whole numbers where all of them are; given names stay text, so does "007"."""
     text = points["particle"].astype(str)
-    if text.str.fullmatch(r"-?\d{1,18}").all():
+    if text.str.fullmatch(r"0|-?[1-9]\d{0,17}").all():
         return points.assign(particle=text.astype(np.int64))
     return points.assign(particle=text.astype(object))
 
@@ -116,12 +117,14 @@ def numbered(points: pd.DataFrame) -> tuple[NDArray[np.int64], list[str]]:
 
 def facts(results: RunResults) -> dict[str, str]:
     """What every file says of its content."""
-    from telerig import __version__
-
+    try:
+        made_by = f"telerig {version('telerig')}"
+    except PackageNotFoundError:
+        made_by = "telerig, not installed"
     return {
         "run": results.name,
         "frame": results.frame,
-        "source": f"telerig {__version__}, {results.source}",
+        "source": f"{made_by}, {results.source}",
         "verdict": results.verdict or "none: tracked, not smoothed",
     }
 

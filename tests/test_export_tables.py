@@ -189,6 +189,8 @@ def test_trackpy_computes_with_it(folder: Path, tmp_path: Path) -> None:
     trackpy = pytest.importorskip("trackpy")
     write_trackpy(read_results(folder), tmp_path / "out.csv")
     read = pd.read_csv(tmp_path / "out.csv")
+    places = table()[["x_mm", "y_mm", "z_mm"]].to_numpy()
+    np.testing.assert_array_equal(read[["x", "y", "z"]], places)
     found = trackpy.imsd(read, mpp=1, fps=100, max_lagtime=3, pos_columns=["x", "y", "z"])
     for particle in (3, 7):
         places = read[read["particle"] == particle][["x", "y", "z"]].to_numpy()

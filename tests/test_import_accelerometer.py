@@ -68,6 +68,12 @@ def test_wav(tmp_path: Path) -> None:
         check(readings(path, scale_m_s2=20.0), atol=max(step, 1e-9))
 
 
+def test_wav_of_eight_bits_has_its_zero_in_the_middle(tmp_path: Path) -> None:
+    wavfile.write(tmp_path / "a.wav", 10, np.array([[128, 0, 192]] * 3, np.uint8))
+    _, found = readings(tmp_path / "a.wav", scale_m_s2=20.0)
+    np.testing.assert_array_equal(found[0], [0.0, -20.0, 10.0])
+
+
 def test_mat(tmp_path: Path) -> None:
     names = {"time": T_S, "ax": TRUE_M_S2[:, 0], "ay": TRUE_M_S2[:, 1], "az": TRUE_M_S2[:, 2]}
     savemat(tmp_path / "a.mat", names)

@@ -68,8 +68,6 @@ def run_calibration(
 ) -> CalibrationRun:
     """Like `calibrate`, with progress, the choice of what dots may do, and the detections."""
     from telerig.estimator.self_calibration import self_calibrate
-    from telerig.io.parallel import get_ready
-    from telerig.io.report.figures_common import prepare_drawing
 
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
@@ -81,7 +79,6 @@ def run_calibration(
             dataset, progress=None if stage is None else lambda i, n: stage("images", i, n)
         )
         table, notes = detected.dots, [*notes, *detected.notes]
-        get_ready(prepare_drawing)
     else:
         table = dataset.dots()
     rig = dataset.rig

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from telerig.estimator.graph import solve
 from telerig.estimator.model_start import model_start
 from telerig.estimator.problem import Problem
 from telerig.factors.projection import State, pixels, whitened_error, whitened_residuals
-from telerig.io.parallel import ordered_map, standing_by
 from telerig.rig.pose import rotation_from_rotvec
 
 Array = NDArray[np.float64]
@@ -96,10 +94,9 @@ def climb(problem: Problem, start: State, models: tuple[str, ...] = LADDER) -> l
     A model whose own fit is `HOPELESS` times worse than the best is not asked to predict: its
     ``held_out`` is infinite.
     """
-    processes = standing_by()
-    fits = list(ordered_map(partial(_fit, problem, start), models, processes))
+    fits = [_fit(problem, start, model) for model in models]
     best = min(cost for *_, cost in fits)
-    return list(ordered_map(partial(_rung, best), fits, processes))
+    return [_rung(best, fit) for fit in fits]
 
 
 def _fit(problem: Problem, start: State, model: str) -> Fit:

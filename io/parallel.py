@@ -9,14 +9,11 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from multiprocessing.pool import Pool
 from typing import TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-_crew: Pool | None = None
 
 
 def cores() -> int:
@@ -44,8 +41,6 @@ def ordered_map(
     """
     if workers <= 1:
         yield from map(function, tasks)
-    elif _crew is not None:
-        yield from _crew.imap(function, tasks)
     elif can_fork():
         with _forked(workers) as pool:
             yield from pool.imap(function, tasks)
@@ -58,38 +53,7 @@ def ordered_map(
 
 def quick_workers(tasks: int) -> int:
     """How many processes pay for short work: one per core where they start at once, else 1."""
-    return min(cores(), tasks) if _crew is not None or can_fork() else 1
-
-
-def standing_by() -> int:
-    """How many processes of `crew` wait for work; 1 where there are none."""
-    return 1 if _crew is None else cores()
-
-
-def get_ready(prepare: Callable[[], None]) -> None:
-    """Let the processes that stand by run ``prepare`` while this one goes on."""
-    if _crew is not None:
-        for _ in range(cores()):
-            _crew.apply_async(prepare)
-
-
-@contextmanager
-def crew() -> Iterator[None]:
-    """While it lasts, short works of `ordered_map` share one set of processes, one per core.
-
-    They are copies of this process as it is at the start: import first what they all need.
-    Without a second core, or where copies are not safe, nothing changes.
-    """
-    global _crew
-    if _crew is not None or cores() < 2 or not can_fork():
-        yield
-        return
-    with _forked(cores()) as pool:
-        _crew = pool
-        try:
-            yield
-        finally:
-            _crew = None
+    return min(cores(), tasks) if can_fork() else 1
 
 
 def _forked(workers: int) -> Pool:
@@ -101,6 +65,4 @@ def _forked(workers: int) -> Pool:
 
 def _begin_work() -> None:
     """An interrupt is this process's parent's to handle, which then ends it."""
-    global _crew
-    _crew = None
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -40,28 +40,22 @@ def calibrate(
     used, with what, where and what to do. 130: interrupted.
     """
     with errors_in_words():
-        # imported here so that the crew's processes share them
-        import telerig.estimator.frontend.dataset_dots
-        import telerig.estimator.self_calibration  # noqa: F401
         from telerig.estimator.calibrate import run_calibration
         from telerig.estimator.calibration_results import write_results
         from telerig.io.dataset import load_dataset
-        from telerig.io.parallel import crew
 
         begun = time.perf_counter()
         data = load_dataset(dataset, source=checked_source(source))
         options = {"model": model, "solver": solver, "dots": dots, "from": source, "seed": seed}
         folder = out or data.results / "calibration"
-        with crew():
-            with progress(quiet) as stage:
-                run = run_calibration(
-                    data, model=model, solver=solver, seed=seed, dots_free=dots, stage=stage
-                )
-            seconds = {"calibrate": time.perf_counter() - begun}
-            write_results(
-                data, run, folder, command="calibrate", options=options, seconds=seconds,
-                report=report,
-            )  # fmt: skip
+        with progress(quiet) as stage:
+            run = run_calibration(
+                data, model=model, solver=solver, seed=seed, dots_free=dots, stage=stage
+            )
+        seconds = {"calibrate": time.perf_counter() - begun}
+        write_results(
+            data, run, folder, command="calibrate", options=options, seconds=seconds, report=report
+        )
         say(run.calibration.report())
         say(f"written: {folder}" + ("/report.html" if report else ""))
         if run.calibration.verdict["status"] == "REJECTED":

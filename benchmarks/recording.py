@@ -28,18 +28,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_practice import practice_rig
-from telerig.io.record_replay import DeviceRecord, replay
-from telerig.io.record_session import record
-from telerig.io.record_signals import (
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.practice import practice_rig
+from telerig.io.recording.replay import DeviceRecord, replay
+from telerig.io.recording.session import record
+from telerig.io.recording.signals import (
     Faults,
     SimulatedDevice,
     stage_position_mm,
     true_values,
 )
-from telerig.io.record_simulators import SimulatedPorts, Truth
-from telerig.io.record_tables import write_tables
+from telerig.io.recording.simulators import SimulatedPorts, Truth
+from telerig.io.recording.tables import write_tables
 from telerig.io.rigfile import write_rig_toml
 
 Array = NDArray[np.float64]

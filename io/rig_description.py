@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from typing import Literal
 
 from telerig.errors import InputError
-from telerig.io.record_description import DeviceDescription
+from telerig.io.recording.description import DeviceDescription
 from telerig.rig.target import Polarity, Target
 
 Vector = tuple[float, float, float]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from telerig.io.record_description import DeviceDescription
+from telerig.io.recording.description import DeviceDescription
 from telerig.io.rig_description import (
     SCHEMA,
     AccelerometerDescription,

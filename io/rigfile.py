@@ -11,6 +11,7 @@ from typing import Any
 
 from telerig.errors import InputError
 from telerig.io.atomic import write_text_atomic
+from telerig.io.recording.rig_devices import devices_from_tables
 from telerig.io.rig_description import (
     CARRIAGE,
     SCHEMA,
@@ -18,7 +19,6 @@ from telerig.io.rig_description import (
     RigDescription,
     suggestion,
 )
-from telerig.io.rig_devices import devices_from_tables
 from telerig.io.rig_parts import (
     accelerometers_from_tables,
     references_from_table,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import typer
 
 from telerig import __version__
@@ -41,11 +43,13 @@ def _main(
     """Calibrate a telecentric stereo rig from views of dots, and track bubbles with it."""
 
 
-for command in (demo, init, doctor, simulate, detect, calibrate, track, smooth):
-    app.command()(command)
-app.command("run")(run_dataset)
-for command in (batch, record, export):
-    app.command()(command)
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": demo, "init": init, "doctor": doctor, "simulate": simulate, "detect": detect,
+    "calibrate": calibrate, "track": track, "smooth": smooth, "run": run_dataset, "batch": batch,
+    "record": record, "export": export,
+}  # fmt: skip
+for name, command in _COMMANDS.items():
+    app.command(name)(command)
 app.add_typer(import_files, name="import")
 
 

@@ -17,7 +17,7 @@ from telerig.errors import InputError
 from telerig.scripts.console import errors_in_words, say
 
 if TYPE_CHECKING:
-    from telerig.io.record_description import DeviceDescription
+    from telerig.io.recording.description import DeviceDescription
     from telerig.io.rig_description import RigDescription
 
 
@@ -52,7 +52,7 @@ def record(
         if ports:
             _list_ports()
             return
-        from telerig.io.record_tables import write_tables
+        from telerig.io.recording.tables import write_tables
         from telerig.scripts.record_display import recording_words
 
         if replay is not None:
@@ -75,7 +75,7 @@ def _alone(run: Path | None, seconds: float | None, port: list[str] | None) -> N
 def _recorded(
     run: Path | None, seconds: float | None, ports: list[str], rig: Path | None, quiet: bool
 ) -> Path:
-    from telerig.io.record_session import record as record_run
+    from telerig.io.recording.session import record as record_run
     from telerig.scripts.record_display import display
 
     if run is None:
@@ -158,7 +158,7 @@ def _stopped_by_signals() -> Iterator[threading.Event]:
 
 
 def _list_ports() -> None:
-    from telerig.io.record_ports import known_ports
+    from telerig.io.recording.ports import known_ports
 
     found = known_ports()
     for text in found:

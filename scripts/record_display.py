@@ -12,8 +12,8 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from telerig.io.record_session import DeviceStatus, Status
-    from telerig.io.record_tables import Recording
+    from telerig.io.recording.session import DeviceStatus, Status
+    from telerig.io.recording.tables import Recording
 
 _PLAIN_EVERY_S = 5.0
 

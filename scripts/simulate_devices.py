@@ -18,8 +18,8 @@ def simulate_devices(out: Path | None, seconds: float | None, rng: Generator) ->
     """Print the ports' names; with ``out`` also write a dataset whose rig.toml has them."""
     if sys.platform == "win32":
         raise InputError("Windows has no pseudo-terminals", todo="practise on Linux or macOS")
-    from telerig.io.record_practice import practice_devices, practice_rig
-    from telerig.io.record_simulators import SimulatedPorts
+    from telerig.io.recording.practice import practice_devices, practice_rig
+    from telerig.io.recording.simulators import SimulatedPorts
     from telerig.io.rig_writer import rig_toml
     from telerig.io.rigfile import write_rig_toml
 

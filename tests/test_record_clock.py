@@ -8,7 +8,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from telerig.io.record_clock import fit_clock, host_times, lower_line, unwrap
+from telerig.io.recording.clock import fit_clock, host_times, lower_line, unwrap
 
 Array = NDArray[np.float64]
 

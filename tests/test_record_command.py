@@ -17,9 +17,9 @@ import pytest
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
-from telerig.io.record_practice import practice_devices, practice_rig
-from telerig.io.record_signals import SimulatedDevice
-from telerig.io.record_simulators import SimulatedPorts, simulated_log
+from telerig.io.recording.practice import practice_devices, practice_rig
+from telerig.io.recording.signals import SimulatedDevice
+from telerig.io.recording.simulators import SimulatedPorts, simulated_log
 from telerig.io.rigfile import description_from_toml, read_rig_toml, write_rig_toml
 from telerig.scripts.main import app
 
@@ -139,9 +139,9 @@ def test_what_record_refuses(dataset: Path, tmp_path: Path) -> None:
 
 
 def test_ports_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("telerig.io.record_ports.known_ports", lambda: ["/dev/ttyACM0 (Stage)"])
+    monkeypatch.setattr("telerig.io.recording.ports.known_ports", lambda: ["/dev/ttyACM0 (Stage)"])
     assert run("record", "--ports") == "/dev/ttyACM0 (Stage) "
-    monkeypatch.setattr("telerig.io.record_ports.known_ports", list)
+    monkeypatch.setattr("telerig.io.recording.ports.known_ports", list)
     assert "telerig simulate --devices" in run("record", "--ports")
 
 

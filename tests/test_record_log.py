@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_log import (
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.log import (
     MARKER,
     RECEIVED,
     SENT,
@@ -94,7 +94,7 @@ def test_damage_in_the_middle_costs_its_own_entry(log: Path) -> None:
 
 def test_blocks_do_not_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for size in (2500, 2100, 3001):
-        monkeypatch.setattr("telerig.io.record_log._BLOCK", size)
+        monkeypatch.setattr("telerig.io.recording.log._BLOCK", size)
         assert list(read_log(log)) == entries()
 
 

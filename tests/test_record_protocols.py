@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_protocols import Parser, Readings, parser, poll_command, xor_checksum
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.protocols import Parser, Readings, parser, poll_command, xor_checksum
 
 ENCODER = DeviceDescription("encoder", "encoder", "x", counts_per_mm=1.0)
 ACCELEROMETER = DeviceDescription("arm", "accelerometer", "x")

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from telerig.errors import InputError
-from telerig.io import record_ports
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_practice import practice_devices
-from telerig.io.record_replay import replay
-from telerig.io.record_session import FAILED_NAME, LOG_NAME, Status, record
-from telerig.io.record_signals import Faults, SimulatedDevice, stage_position_mm, true_values
-from telerig.io.record_simulators import SimulatedPorts
-from telerig.io.record_tables import write_tables
+from telerig.io.recording import ports as record_ports
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.practice import practice_devices
+from telerig.io.recording.replay import replay
+from telerig.io.recording.session import FAILED_NAME, LOG_NAME, Status, record
+from telerig.io.recording.signals import Faults, SimulatedDevice, stage_position_mm, true_values
+from telerig.io.recording.simulators import SimulatedPorts
+from telerig.io.recording.tables import write_tables
 
 
 @pytest.fixture
@@ -136,7 +136,7 @@ class NoisyPort:
 def test_only_garbage_is_said_after_two_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("telerig.io.record_session.open_port", lambda _: NoisyPort())
+    monkeypatch.setattr("telerig.io.recording.session.open_port", lambda _: NoisyPort())
     device = DeviceDescription("encoder", "encoder", "/dev/x", counts_per_mm=1.0)
     begun = time.monotonic()
     with pytest.raises(InputError, match=r"not one reading(.|\n)*set baud in rig.toml"):

@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.record_damage import beside_gaps
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_frames import frame_numbers
-from telerig.io.record_log import (
+from telerig.io.recording.damage import beside_gaps
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.frames import frame_numbers
+from telerig.io.recording.log import (
     FOUND,
     LOST,
     RECEIVED,
@@ -24,11 +24,11 @@ from telerig.io.record_log import (
     RawLog,
     read_log,
 )
-from telerig.io.record_practice import practice_devices
-from telerig.io.record_replay import replay
-from telerig.io.record_signals import Faults, SimulatedDevice, stage_position_mm, true_values
-from telerig.io.record_simulators import Truth, simulated_log
-from telerig.io.record_tables import write_tables
+from telerig.io.recording.practice import practice_devices
+from telerig.io.recording.replay import replay
+from telerig.io.recording.signals import Faults, SimulatedDevice, stage_position_mm, true_values
+from telerig.io.recording.simulators import Truth, simulated_log
+from telerig.io.recording.tables import write_tables
 from telerig.io.run_tables import read_accelerometer_csv, read_frames_csv, read_stage_csv
 
 SECONDS = 20.0

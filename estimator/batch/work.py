@@ -87,7 +87,8 @@ def _asked(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
     """Its answer, and what it said besides. Its standard input stays open until it has answered."""
     assert child.stdin and child.stdout and child.stderr
     said: list[str] = []
-    listener = threading.Thread(target=lambda: said.append(child.stderr.read()))
+    errors = child.stderr
+    listener = threading.Thread(target=lambda: said.append(errors.read()))
     listener.start()
     with suppress(BrokenPipeError):
         child.stdin.write(job.as_json() + "\n")
@@ -98,7 +99,7 @@ def _asked(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
     with suppress(BrokenPipeError):
         child.stdin.close()
     child.stdout.close()
-    child.stderr.close()
+    errors.close()
     return answer, "".join(said)
 
 

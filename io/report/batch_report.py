@@ -108,7 +108,7 @@ def _calibration(job: Job, folder: Path) -> Line:
         str(found.get("verdict") or job["status"]),
         str(found.get("lens_model") or ABSENT),
         str(found.get("views") or ABSENT),
-        f"{100 * share:.1f}%" if is_number(share) else ABSENT,
+        f"{100 * float(share):.1f}%" if share is not None else ABSENT,
         _text(found.get("rms_px")),
     )
     link = _link(job, folder, "calibration")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from telerig.io.record_description import DeviceDescription
+from telerig.io.recording.description import DeviceDescription
 from telerig.io.rig_description import suggestion
 from telerig.io.rig_parts import subtables
 from telerig.io.rig_schema import Positive, Problem, Table, validate

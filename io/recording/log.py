@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from telerig.errors import InputError
-from telerig.io.record_description import DeviceDescription
+from telerig.io.recording.description import DeviceDescription
 
 MAGIC = b"telerig recording 1\n"
 MARKER = b"\xa7\x1e\xc0\x9d"

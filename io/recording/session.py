@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.record_damage import GAP_INTERVALS
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_log import END, FOUND, LOST, RECEIVED, Entry, LogHeader, RawLog
-from telerig.io.record_ports import open_port
-from telerig.io.record_protocols import Readings, parser
-from telerig.io.record_reader import Reader
+from telerig.io.recording.damage import GAP_INTERVALS
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.log import END, FOUND, LOST, RECEIVED, Entry, LogHeader, RawLog
+from telerig.io.recording.ports import open_port
+from telerig.io.recording.protocols import Readings, parser
+from telerig.io.recording.reader import Reader
 
 LOG_NAME = "recording.raw"
 FAILED_NAME = "recording.failed.raw"
@@ -97,7 +97,7 @@ def record(
 ) -> Path:
     """Record all devices into ``folder``/recording.raw until ``stop`` is set or time is up.
 
-    Returns the log's path; `telerig.io.record_tables.write_tables` makes the run's tables of it.
+    Returns the log's path; `telerig.io.recording.tables.write_tables` makes the run's tables of it.
     Raises InputError for a port that cannot be opened, a log that cannot be written, and a device
     of which nothing readable comes in the first `GARBAGE_S`.
     """

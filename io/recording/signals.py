@@ -9,8 +9,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_protocols import SYNC, xor_checksum
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.protocols import SYNC, xor_checksum
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.record_bend import bend
+from telerig.io.recording.bend import bend
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -15,10 +15,10 @@ from types import TracebackType
 import numpy as np
 from numpy.random import Generator
 
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_log import END, RECEIVED, Entry, LogHeader, RawLog
-from telerig.io.record_protocols import poll_command
-from telerig.io.record_signals import (
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.log import END, RECEIVED, Entry, LogHeader, RawLog
+from telerig.io.recording.protocols import poll_command
+from telerig.io.recording.signals import (
     SimulatedDevice,
     answer,
     damage,

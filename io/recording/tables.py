@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.atomic import atomic_folder, write_json_atomic
-from telerig.io.record_damage import GAP_INTERVALS
-from telerig.io.record_frames import FrameTimes, frame_times
-from telerig.io.record_log import damaged_bytes
-from telerig.io.record_replay import TIME_DIGITS, DeviceRecord, Replay, replay
+from telerig.io.recording.damage import GAP_INTERVALS
+from telerig.io.recording.frames import FrameTimes, frame_times
+from telerig.io.recording.log import damaged_bytes
+from telerig.io.recording.replay import TIME_DIGITS, DeviceRecord, Replay, replay
 
 Array = NDArray[np.float64]
 

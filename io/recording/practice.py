@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_signals import SimulatedDevice
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.signals import SimulatedDevice
 from telerig.io.rig_description import (
     AccelerometerDescription,
     CameraDescription,

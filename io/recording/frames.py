@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.record_replay import DeviceRecord
+from telerig.io.recording.replay import DeviceRecord
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.record_clock import ClockFit, host_times
-from telerig.io.record_damage import beside_gaps
-from telerig.io.record_description import DeviceDescription
-from telerig.io.record_log import (
+from telerig.io.recording.clock import ClockFit, host_times
+from telerig.io.recording.damage import beside_gaps
+from telerig.io.recording.description import DeviceDescription
+from telerig.io.recording.log import (
     END,
     FOUND,
     LOST,
@@ -22,7 +22,7 @@ from telerig.io.record_log import (
     read_header,
     read_log,
 )
-from telerig.io.record_protocols import Readings, parser
+from telerig.io.recording.protocols import Readings, parser
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -22,6 +22,8 @@ LADDER = (
 )  # fmt: skip
 FOLDS = 4
 HOPELESS = 10.0
+FOLD_COST = 1e-4
+"""Relative change of cost that ends a fold's fit: a model must predict 5 % better to matter."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def held_out_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
         mine = np.isin(problem.view, left_out)
         if len(views) - len(left_out) < 2:
             continue
-        trained = solve(problem.subset(~mine), state, max_iterations=12, relative=1e-6).state
+        trained = solve(problem.subset(~mine), state, max_iterations=12, relative=FOLD_COST).state
         trained = replace(trained, rig_from_target=state.rig_from_target)
         test = problem.subset(mine)
         fitted = pose_only(test, trained)

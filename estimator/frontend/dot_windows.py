@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from telerig.estimator.frontend.blurred_ellipse import (
     approximate_distance_px,
-    axes_from_shape,
     coverage_on_grid,
     extent_px,
+    semi_axes,
 )
 from telerig.estimator.frontend.dot_candidates import Candidate
 from telerig.estimator.frontend.dot_types import DotFit, Start, Window
@@ -37,7 +37,7 @@ def dot_window(
     dot, only the surroundings of its edge count, and one in four of those beyond its blur
     (``coarse``: one in four everywhere, for a first look).
     """
-    a, b, _ = axes_from_shape(start.shape_px)
+    a, b = semi_axes(start.shape_px)
     reach = 4.0 * start.sigma_px + 2.0
     outer = float(np.clip(1.3 * np.sqrt(a * b), reach, max(reach, _MAX_MARGIN_PX)))
     half = extent_px(start.shape_px) + outer

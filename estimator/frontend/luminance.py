@@ -174,9 +174,9 @@ def _normal_equations(problem: _Problem, state: _State) -> tuple[Array, Array]:
 
 
 def _damped_step(information: Array, pull: Array, damping: float) -> Array:
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    equilibrated = information / np.outer(scale, scale)
-    equilibrated[np.diag_indices_from(equilibrated)] += damping
+    scale = np.sqrt(np.maximum(information.diagonal(), 1e-300))
+    equilibrated = information / (scale[:, None] * scale)
+    equilibrated.flat[:: len(scale) + 1] += damping
     step: Array = np.linalg.solve(equilibrated, pull / scale) / scale
     return step
 

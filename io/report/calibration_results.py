@@ -97,6 +97,14 @@ def read_results(folder: Path) -> CalibrationResults:
     )  # fmt: skip
 
 
+def read_cameras(file: Path) -> tuple[Camera, ...]:
+    """The cameras of a calibration.json. Raises InputError when it cannot be read."""
+    try:
+        return tuple(_camera(name, c) for name, c in _content(file)["cameras"].items())
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise _broken(file, f"lacks or garbles {error}") from error
+
+
 def _broken(file: Path, what: str) -> InputError:
     return InputError(what, where=str(file), todo=_AGAIN)
 

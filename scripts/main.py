@@ -16,6 +16,7 @@ from telerig.scripts.export import export
 from telerig.scripts.import_files import app as import_files
 from telerig.scripts.init import init
 from telerig.scripts.record import record
+from telerig.scripts.report import report
 from telerig.scripts.run import run as run_dataset
 from telerig.scripts.simulate import simulate
 from telerig.scripts.smooth import smooth
@@ -46,7 +47,7 @@ def _main(
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo, "init": init, "doctor": doctor, "simulate": simulate, "detect": detect,
     "calibrate": calibrate, "track": track, "smooth": smooth, "run": run_dataset, "batch": batch,
-    "record": record, "export": export,
+    "record": record, "export": export, "report": report,
 }  # fmt: skip
 for name, command in _COMMANDS.items():
     app.command(name)(command)

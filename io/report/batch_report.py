@@ -38,8 +38,8 @@ class Line:
     failed: bool
 
 
-def write_batch_report(folder: Path) -> Path:
-    """Write report.html beside batch.json and return its path.
+def write_batch_report(folder: Path, out: Path | None = None) -> Path:
+    """Write report.html beside batch.json, or into ``out``; returns its path.
 
     Raises InputError for a folder without a batch, or one that cannot be read.
     """
@@ -51,8 +51,9 @@ def write_batch_report(folder: Path) -> Path:
             f"holds no batch that can be read: {error}", where=str(file),
             todo="run `telerig batch` with --out of this folder",
         ) from error  # fmt: skip
-    write_text_atomic(file.with_name("report.html"), render(jobs, Path(folder)))
-    return file.with_name("report.html")
+    place = Path(folder) if out is None else Path(out)
+    write_text_atomic(place / "report.html", render(jobs, place))
+    return place / "report.html"
 
 
 def render(jobs: Sequence[Job], folder: Path) -> str:

@@ -28,8 +28,8 @@ _SHOWN = {
 }  # fmt: skip
 
 
-def write_calibration_report(results_folder: Path) -> Path:
-    """Write report.html into a calibration's results folder and return its path.
+def write_calibration_report(results_folder: Path, out: Path | None = None) -> Path:
+    """Write report.html into a calibration's results folder, or into ``out``; returns its path.
 
     It reads nothing but that folder: calibration.json and residuals.csv, and if they are there
     dots.csv, covariance.npz, run.json, overlays/<camera>/<view>.jpg and dot_example.npz. The page
@@ -38,8 +38,9 @@ def write_calibration_report(results_folder: Path) -> Path:
     """
     folder = Path(results_folder)
     page = render(read_results(folder))
-    write_text_atomic(folder / "report.html", page)
-    return folder / "report.html"
+    file = (folder if out is None else Path(out)) / "report.html"
+    write_text_atomic(file, page)
+    return file
 
 
 def render(results: CalibrationResults) -> str:

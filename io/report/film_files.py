@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ def write_film(
     *,
     rate_hz: float = 25.0,
     gif_width_px: int = 640,
+    palette: Sequence[tuple[int, int, int]] | None = None,
     what: str = "film",
     stage: Progress | None = None,
 ) -> None:
@@ -35,15 +36,15 @@ def write_film(
 
     pictures : RGB (height, width, 3), all of one even size. count : how many, for the progress.
     rate_hz : a GIF's is rounded to whole hundredths of a second a picture; it runs for ever and
-    is not wider than gif_width_px. stage : called with (what, done, count).
+    is not wider than gif_width_px. palette : a GIF's, up to 256 colours; by default those of its
+    first picture. stage : called with (what, done, count).
 
     Raises InputError for another kind of file, a place that cannot be written, and for an MP4
     without PyAV.
     """
-    makers = {".mp4": _Mp4, ".gif": _Gif}
     targets = [Path(file) for file in files]
     for file in targets:
-        if file.suffix.lower() not in makers:
+        if file.suffix.lower() not in (".mp4", ".gif"):
             raise InputError(
                 f"films are .mp4 or .gif, not {file.suffix!r}", where=str(file),
                 todo="choose one of these endings",
@@ -54,9 +55,10 @@ def write_film(
         writers: list[Any] = []
         for file in targets:
             temporary = stack.enter_context(atomic_path(file))
-            kind = makers[file.suffix.lower()]
-            writers.append(kind(temporary, rate_hz, gif_width_px))
-        stack.callback(lambda: None)
+            writers.append(
+                _Mp4(temporary, rate_hz) if file.suffix.lower() == ".mp4"
+                else _Gif(temporary, rate_hz, gif_width_px, palette)
+            )  # fmt: skip
         try:
             for done, picture in enumerate(pictures, 1):
                 for writer in writers:
@@ -83,7 +85,7 @@ def need_av() -> Any:
 
 
 class _Mp4:
-    def __init__(self, path: Path, rate_hz: float, _gif_width_px: int) -> None:
+    def __init__(self, path: Path, rate_hz: float) -> None:
         self._path, self._rate_hz = path, rate_hz
         self._container: Any = None
         self._stream: Any = None
@@ -116,11 +118,23 @@ class _Mp4:
 
 
 class _Gif:
-    def __init__(self, path: Path, rate_hz: float, width_px: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        rate_hz: float,
+        width_px: int,
+        palette: Sequence[tuple[int, int, int]] | None,
+    ) -> None:
+        from PIL import Image
+
         self._path, self._width_px = path, width_px
         self._duration_ms = 10 * max(2, round(100 / rate_hz))
         self._pages: list[Any] = []
         self._palette: Any = None
+        if palette is not None:
+            self._palette = Image.new("P", (1, 1))
+            parts = [part for colour in palette for part in colour]
+            self._palette.putpalette(parts + parts[:3] * (256 - len(palette)))
 
     def add(self, picture: Picture) -> None:
         from PIL import Image

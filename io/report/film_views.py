@@ -16,7 +16,6 @@ from telerig.io.csv_table import Column
 from telerig.io.parallel import ordered_map, quick_workers
 from telerig.io.report.film_files import Progress, write_film
 from telerig.io.report.results_tables import optional_columns
-from telerig.io.report.track_scene import track_colour
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,14 +23,20 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
+Colour = tuple[int, int, int]
 
 MOST_FRAMES = 1_000
 TAIL_FRAMES = 24
 WIDTH_PX = 640
+_GIF_WIDTH_PX = 800
 _RATE_HZ = 25.0
 _STRIP_PX, _GAP_PX = 30, 4
 _BITS = 4
-_ALONE = (240, 160, 30)
+_ALONE: Colour = (250, 190, 20)
+_COLOURS: tuple[Colour, ...] = (
+    (20, 110, 255), (235, 70, 0), (15, 165, 60), (205, 40, 200), (225, 25, 60), (0, 165, 175),
+    (150, 120, 0), (120, 70, 240),
+)  # fmt: skip
 _SHAPE = [f"{part}{k}_px" for k in range(3, 7) for part in "cs"]
 _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 _LOOKED_AT = 5
@@ -83,7 +88,7 @@ def write_views_film(
     pictures = ordered_map(draw, frames, quick_workers(len(frames)))
     write_film(
         pictures, len(frames), files, rate_hz=_RATE_HZ, what="both views", stage=stage,
-        gif_width_px=WIDTH_PX,
+        gif_width_px=_GIF_WIDTH_PX, palette=_palette(),
     )  # fmt: skip
     return (f"both views: every {step}. of {frame_count} frames is shown",) if step > 1 else ()
 
@@ -138,8 +143,8 @@ def view_frames(
     }
     centres = table[["u_px", "v_px"]].to_numpy(float)
     number, names = table["frame"].to_numpy(np.int64), table["particle"].to_numpy()
-    tracks = table.sort_values("frame").groupby(["camera", "particle"]).indices
     order = np.argsort(number, kind="stable")
+    tracks = table.iloc[order].groupby(["camera", "particle"]).indices
     paths = {key: order[rows] for key, rows in tracks.items()}
     for frame in frames:
         views = []
@@ -219,7 +224,7 @@ def _view(
     return page
 
 
-def _tail(picture: Picture, points: Array, colour: tuple[int, int, int]) -> None:
+def _tail(picture: Picture, points: Array, colour: Colour) -> None:
     """Where the bubble came from; each place is a small dot on the line."""
     import cv2
 
@@ -233,11 +238,20 @@ def _fixed(points: Array) -> NDArray[np.int32]:
     return np.round(points * (1 << _BITS)).astype(np.int32).reshape(-1, 2)
 
 
-def _bright(particle: int) -> tuple[int, int, int]:
-    """The track's colour, lighter, to be seen on a dark bubble as well."""
-    code = track_colour(particle).lstrip("#")
-    parts = [int(code[i : i + 2], 16) for i in (0, 2, 4)]
-    return tuple(round(0.45 * p + 0.55 * (255 if p == max(parts) else p)) for p in parts)  # type: ignore[return-value]
+def _bright(particle: int) -> Colour:
+    """One to a track, to be seen on a dark bubble and on a light background."""
+    return _COLOURS[particle % len(_COLOURS)]
+
+
+def _palette() -> list[Colour]:
+    """For a GIF: grey, and the lines' colours with what lies between them and black or white."""
+    greys = [(g, g, g) for g in np.linspace(0, 255, 140).astype(int).tolist()]
+    mixed = [
+        tuple(round(share * part + (1 - share) * ground) for part in colour)
+        for colour in (*_COLOURS, _ALONE)
+        for share, ground in ((1.0, 0), (0.5, 0), (0.4, 230), (0.7, 230))
+    ]
+    return [*greys, *((c[0], c[1], c[2]) for c in mixed)]
 
 
 def _shades(images: Images, camera: str, frame_count: int) -> tuple[float, float]:
@@ -255,12 +269,15 @@ def _words(
     words: str,
     place: tuple[float, float],
     anchor: str,
-    colour: tuple[int, int, int] = (28, 31, 36),
+    colour: Colour = (28, 31, 36),
 ) -> None:
     from PIL import Image, ImageDraw
 
     from telerig.io.report.film_drawing import font
 
     canvas = Image.fromarray(page)
-    ImageDraw.Draw(canvas).text(place, words, fill=colour, font=font(14), anchor=anchor)
+    ImageDraw.Draw(canvas).text(
+        place, words, fill=colour, font=font(14), anchor=anchor, stroke_width=2,
+        stroke_fill=(255, 255, 255),
+    )  # fmt: skip
     page[:] = np.asarray(canvas)

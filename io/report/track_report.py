@@ -10,7 +10,9 @@ from typing import Any
 from telerig.io.atomic import write_text_atomic
 from telerig.io.report import track_tables as tables
 from telerig.io.report.contact_sheet import BUDGET_BYTES, ContactSheet, picture_sheet
+from telerig.io.report.figures_rays import two_rays
 from telerig.io.report.page import drawn_over_cores, plotly_javascript, render_page
+from telerig.io.report.results_cameras import run_cameras
 from telerig.io.report.smoothing_report import PLACES, smoothing_drawings, smoothing_words
 from telerig.io.report.smoothing_results import SmoothingResults, read_smoothing_results
 from telerig.io.report.track_figures import (
@@ -29,6 +31,7 @@ from telerig.io.report.track_figures_rays import (
 from telerig.io.report.track_results import TrackResults, binary_column, read_track_results
 from telerig.io.report.track_scene import track_plans, track_scene_json
 from telerig.io.report.words import flat_rows
+from telerig.rig.camera import Camera
 
 PAGE_BYTES = 7_600_000
 """Of all that is large; words and tables come on top."""
@@ -39,10 +42,11 @@ _MOST_ROWS = 150
 _SHOWN = {"schema", "kind", "run", "notes", "worst_frames", "pairs", "covariance", "events"}
 
 
-def write_track_report(results_folder: Path) -> Path:
-    """Write report.html into a tracked run's results folder and return its path.
+def write_track_report(results_folder: Path, out: Path | None = None) -> Path:
+    """Write report.html into a tracked run's results folder, or into ``out``; returns its path.
 
-    It reads nothing but that folder: tracking.json and tracks.csv, and if they are there
+    It reads nothing but that folder, and the calibration beside it (`results_cameras`) for the
+    drawing of two rays: tracking.json and tracks.csv, and if they are there
     detections.csv, events.csv, run.json, overlays/<camera>/<frame>.jpg and
     binary/<camera>/<frame>.png. Where smoothing.json is there, with trajectories.csv and shake.csv,
     the page begins with the smoothing. It is written whole or not at all. Raises InputError for a
@@ -50,15 +54,22 @@ def write_track_report(results_folder: Path) -> Path:
     """
     folder = Path(results_folder)
     tracks = read_track_results(folder)
-    page = render(tracks, read_smoothing_results(folder, tracks.up))
-    write_text_atomic(folder / "report.html", page)
-    return folder / "report.html"
+    rig = run_cameras(folder, tracks)
+    page = render(tracks, read_smoothing_results(folder, tracks.up), rig)
+    file = (folder if out is None else Path(out)) / "report.html"
+    write_text_atomic(file, page)
+    return file
 
 
-def render(results: TrackResults, smoothing: SmoothingResults | None = None) -> str:
-    """The page as text."""
+def render(
+    results: TrackResults,
+    smoothing: SmoothingResults | None = None,
+    rig: tuple[tuple[Camera, Camera] | None, str] = (None, ""),
+) -> str:
+    """The page as text. rig : the two cameras, or None and why they are not known."""
     scene = track_scene_json(results)
-    context = _words(results) | _pictures(results, smoothing)
+    context = _words(results) | _pictures(results, smoothing, rig[0])
+    context["no_rays"] = rig[1]
     if smoothing is not None:
         context["smoothing"] = smoothing_words(smoothing, results)
     drawn = [p.source for group in context.values() for p in _list(group) if hasattr(p, "source")]
@@ -108,7 +119,11 @@ def _rows(content: Mapping[str, Any], file: str) -> list[tuple[str, str]]:
     return rows if more <= 0 else [*rows[:_MOST_ROWS], ("and", f"{more} more in {file}")]
 
 
-def _pictures(results: TrackResults, smoothing: SmoothingResults | None) -> dict[str, Any]:
+def _pictures(
+    results: TrackResults,
+    smoothing: SmoothingResults | None,
+    cameras: tuple[Camera, Camera] | None,
+) -> dict[str, Any]:
     every = range(len(results.cameras))
     drawings: list[tuple[str, Callable[[], Any]]] = [
         *(("seen", partial(seen_where, results, i)) for i in every),
@@ -122,6 +137,8 @@ def _pictures(results: TrackResults, smoothing: SmoothingResults | None) -> dict
         ("plans", partial(track_plans, results)),
     ]
     pictures: dict[str, Any] = {place: [] for place in (*dict(drawings), *PLACES)}
+    if cameras is not None:
+        drawings.append(("rays", partial(two_rays, results, cameras)))
     if smoothing is not None:
         drawings += smoothing_drawings(smoothing)
     for (place, _), picture in zip(drawings, drawn_over_cores([d for _, d in drawings])):

@@ -1,0 +1,72 @@
+"""Every report that a folder's files allow, made again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from telerig.errors import InputError
+
+Kind = Literal["calibration", "run", "batch"]
+
+_KINDS: dict[str, Kind] = {
+    "calibration.json": "calibration", "tracking.json": "run", "batch.json": "batch",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ResultsFolder:
+    """A folder with the results of a calibration, a run or a batch."""
+
+    folder: Path
+    kind: Kind
+
+
+def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
+    """What a results folder, or a dataset's folder, holds results of, by name.
+
+    calibration.json, tracking.json or batch.json say which kind a folder is; of a dataset, those
+    in its ``results`` are taken, the calibration first. Raises InputError where there is none.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        what = "is a file, not a folder" if place.exists() else "there is no such folder"
+        raise InputError(what, where=str(place), todo="give a folder of results, or a dataset's")
+    own = _of(place)
+    if own:
+        return (own,)
+    below = place / "results" if (place / "results").is_dir() else place
+    candidates = [below, *below.iterdir()] if below != place else list(below.iterdir())
+    found = [r for r in map(_of, sorted(p for p in candidates if p.is_dir())) if r]
+    if not found:
+        raise InputError(
+            "holds no results: no calibration.json, tracking.json or batch.json", where=str(place),
+            todo="run `telerig calibrate`, `telerig track` or `telerig batch` first",
+        )  # fmt: skip
+    return tuple(sorted(found, key=lambda r: list(_KINDS.values()).index(r.kind)))
+
+
+def remake_report(results: ResultsFolder, out: Path | None = None) -> Path:
+    """Write the page of a results folder into it, or into ``out``; returns report.html's path.
+
+    Raises InputError for results that cannot be read.
+    """
+    if results.kind == "calibration":
+        from telerig.io.report.calibration_report import write_calibration_report
+
+        return write_calibration_report(results.folder, out)
+    if results.kind == "run":
+        from telerig.io.report.track_report import write_track_report
+
+        return write_track_report(results.folder, out)
+    from telerig.io.report.batch_report import write_batch_report
+
+    return write_batch_report(results.folder, out)
+
+
+def _of(folder: Path) -> ResultsFolder | None:
+    if folder.name.startswith("."):
+        return None
+    kind = next((kind for file, kind in _KINDS.items() if (folder / file).is_file()), None)
+    return None if kind is None else ResultsFolder(folder, kind)

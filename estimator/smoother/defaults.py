@@ -32,8 +32,8 @@ _HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
 _CLEAR = 0.2
 _SHAKE_HZ = (4.0, 60.0)
-_FLOOR = 0.17
-"""A mode of damping z and its white force have 4 z / (pi f) RMS^2 per Hz below it: z = 0.03."""
+DEFAULT_FLOOR = 0.12
+"""Of the band. A mode of damping z has 4 z / (pi f) RMS^2 per Hz below it; this is z = 0.05."""
 
 
 def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
@@ -68,7 +68,7 @@ def _scale_sigma(problem: SmoothingProblem) -> float:
 
 
 def _band(camera: int) -> BroadBand:
-    return BroadBand((SHAKE_RMS_MM,) * 3, camera, floor=_FLOOR)
+    return BroadBand((SHAKE_RMS_MM,) * 3, camera, floor=DEFAULT_FLOOR)
 
 
 def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeModel:

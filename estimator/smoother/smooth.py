@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.shake_inflation import inflated
-from telerig.estimator.smoother.defaults import default_model, rescaled
-from telerig.estimator.smoother.linear import images
+from telerig.estimator.smoother.adapting import adapted
+from telerig.estimator.smoother.defaults import default_model
 from telerig.estimator.smoother.model import (
     CARRIAGE,
     Observations,
@@ -33,7 +33,7 @@ from telerig.estimator.smoother.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoother.tables import shake as shake_table
 from telerig.estimator.smoother.tables import trajectories
 from telerig.estimator.smoother.tracked import Tracked, bubbles_of, read_tracks
-from telerig.estimator.smoother.travel import travel_of, widened
+from telerig.estimator.smoother.travel import travel_of
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration import Calibration
@@ -41,11 +41,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Learn = Callable[[SmoothingProblem], ShakeModel]
 
-_INFLATE_BEYOND = 0.05
-_RESCALE_BEYOND = 0.2
 _COARSE_STEP_S = 2e-3
 _ENCODER_SIGMA_MM = 0.005
-_SAMPLED = 500
 
 
 def smooth(
@@ -205,88 +202,3 @@ def _adapted_solution(
     if better is None and not sensors:
         return first
     return solve(problem, better or model, options, progress, start=first)
-
-
-def adapted(solution: Solution) -> ShakeModel | None:
-    """The model with noise, broad band's RMS and prior of the encoder's scale that the data show.
-
-    None if that is it.
-    """
-    model = solution.frame.model
-    inflation = _inflation(solution)
-    better = model
-    wide = widened(solution)
-    if wide is not None:
-        better = replace(better, encoder_scale_sigma=wide)
-    if abs(inflation - 1) > _INFLATE_BEYOND:
-        better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
-    if model.broad_bands:
-        fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
-        ratio = [
-            np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)
-        ]
-        if np.max(np.abs(np.log(ratio))) > _RESCALE_BEYOND:
-            better = fresh
-    return None if better is model else better
-
-
-def _offset_rms(solution: Solution) -> Array:
-    """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
-    layout, found = solution.frame.shake, solution.covariances
-    rows = layout.offset[:-1]
-    states = solution.frame.shake_at_frames(solution.state.shake)
-    square = np.einsum("cid,fd->fci", rows, states) ** 2
-    if found is not None:
-        square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
-    mean = square.mean(0)
-    unseen = mean < 1e-12
-    each = np.where(unseen, np.nan, mean)
-    return np.asarray(np.sqrt(np.where(unseen, np.nanmean(each, 1, keepdims=True), mean)))
-
-
-def _dominant_hz(solution: Solution) -> float:
-    """RMS of the offsets' velocity over that of the offsets."""
-    layout = solution.frame.shake
-    states = solution.frame.shake_at_frames(solution.state.shake)
-    place, speed = (
-        np.einsum("cid,fd->fci", r[:-1], states) for r in (layout.offset, layout.offset_velocity)
-    )
-    return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
-
-
-def _inflation(solution: Solution) -> float:
-    """By how much the pixels' stated noise is too small (above 1) or too large.
-
-    From the median, which outliers do not move; the share of the noise that the fit takes up is
-    given back by counting states as far as the pixels determine them.
-    """
-    kept = solution.weights[0] > 0.5
-    if kept.sum() < 30:
-        return 1.0
-    square = (solution.residuals[0][kept] ** 2).sum(-1)
-    spare = 1 - min(_taken_up(solution), 0.9)
-    return float(np.sqrt(np.median(square) / (2 * np.log(2)) / spare))
-
-
-def _taken_up(solution: Solution) -> float:
-    """Mean leverage of a pixel: var(prediction) / var(noise), from the bubbles' covariances."""
-    frame, found = solution.frame, solution.covariances
-    if found is None or not frame.rows:
-        return 0.0
-    linear = images(frame, solution.state, np.ones(len(frame.problem.observations))).linear
-    total, count = 0.0, 0
-    for part in linear:
-        row, node = np.asarray(part.keys[0]) - frame.base()[1], np.asarray(part.keys[1])
-        some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
-        row, node = row[some], node[some]
-        at = frame.frame_of_row[row]
-        by_bubble = part.blocks[0][some] @ np.linalg.inv(frame.bubble_basis(row))
-        by_shake = part.blocks[1][some] @ np.linalg.inv(frame.shake_basis(node))
-        if frame.to_frames is not None:
-            by_shake = by_shake @ np.linalg.inv(frame.to_frames[at])
-        both = by_shake @ found.cross[row]
-        total += float((by_bubble @ found.bubbles[row] * by_bubble).sum())
-        total += float((by_shake @ found.shake[at] * by_shake).sum())
-        total += float(2 * (both * by_bubble).sum())
-        count += 2 * len(row)
-    return total / count

@@ -1,0 +1,171 @@
+"""What a first solution tells of its own priors: pixel noise, the shake's size and spectrum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoother.defaults import DEFAULT_FLOOR, rescaled
+from telerig.estimator.smoother.linear import images
+from telerig.estimator.smoother.model import CARRIAGE, BroadBand, ShakeModel
+from telerig.estimator.smoother.solve import Solution
+from telerig.estimator.smoother.travel import widened
+from telerig.factors.state_space import broad_band_density
+
+Array = NDArray[np.float64]
+
+_INFLATE_BEYOND = 0.05
+_RESCALE_BEYOND = 0.2
+_SAMPLED = 500
+_FLOORS = np.geomspace(0.03, 0.4, 40)
+_FLOOR_SPREAD = np.log(2.0)
+_LOW_BAND = 0.4
+_FEWEST_BINS = 3
+_UNSEEN_MM = 1e-6
+_INDEPENDENT = 0.5
+"""Neighbouring bins of a tapered spectrum, and cameras that shake alike, tell the same thing."""
+
+
+def adapted(solution: Solution) -> ShakeModel | None:
+    """The model with noise, broad band's RMS and prior of the encoder's scale that the data show.
+
+    None if that is it.
+    """
+    model = solution.frame.model
+    inflation = _inflation(solution)
+    better = model
+    wide = widened(solution)
+    if wide is not None:
+        better = replace(better, encoder_scale_sigma=wide)
+    if abs(inflation - 1) > _INFLATE_BEYOND:
+        better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
+    if model.broad_bands:
+        fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
+        ratio = [
+            np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)
+        ]
+        floor = fitted_floor(solution.frame.problem.t_s, _offsets(solution), fresh.broad_bands)
+        moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
+        if max(np.max(np.abs(np.log(ratio))), moved) > _RESCALE_BEYOND:
+            better = _with_floor(fresh, floor)
+    return None if better is model else better
+
+
+def _with_floor(model: ShakeModel, floor: float | None) -> ShakeModel:
+    if floor is None:
+        return model
+    return replace(model, broad_bands=tuple(replace(b, floor=floor) for b in model.broad_bands))
+
+
+def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) -> float | None:
+    """The bands' floor that offsets show below the frequencies of the shake itself.
+
+    t_s (F,) times; offsets_mm (F, C, 3) of the cameras, 0 where unseen; a band for each camera.
+
+    How far a mode yields to slow forces, its damping, decides how well the slow motion of a bubble
+    is known. Whittle's likelihood of the low end of the spectra (Whittle, Arkiv foer Matematik 2,
+    1953), with a prior of a factor of two about `DEFAULT_FLOOR`. None where the run is too short
+    to see it, or where a band is common to the cameras, so that the offsets are not its own.
+    """
+    t = np.asarray(t_s, float)
+    if any(b.camera == CARRIAGE for b in bands) or not bands[0].floor or len(t) < 2:
+        return None
+    step = float(np.median(np.diff(t)))
+    even = np.arange(t[0], t[-1] + step / 2, step)
+    frequency = np.fft.rfftfreq(len(even), step)
+    low = (frequency * len(even) * step > 1.5) & (frequency <= _LOW_BAND * bands[0].low_hz)
+    if np.count_nonzero(low) < _FEWEST_BINS:
+        return None
+    score = -0.5 * (np.log(_FLOORS / DEFAULT_FLOOR) / _FLOOR_SPREAD) ** 2
+    for band in bands:
+        for axis in range(3):
+            series = np.interp(even, t, offsets_mm[:, band.camera, axis])
+            if series.std() < _UNSEEN_MM:
+                continue
+            seen = _periodogram(series, step)[low]
+            for i, floor in enumerate(_FLOORS):
+                density = broad_band_density(
+                    frequency[low], band.rms_mm[axis], low_hz=band.low_hz, high_hz=band.high_hz,
+                    floor=float(floor),
+                )  # fmt: skip
+                score[i] -= _INDEPENDENT * float(np.sum(np.log(density) + seen / density))
+    return float(_FLOORS[np.argmax(score)])
+
+
+def _periodogram(series: Array, step_s: float) -> Array:
+    """One-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
+    x = np.linspace(-1, 1, len(series))
+    rest = series - np.polyval(np.polyfit(x, series, 1), x)
+    taper = np.hanning(len(series))
+    spectrum = np.abs(np.fft.rfft(rest * taper)) ** 2
+    return np.asarray(2 * step_s * spectrum / (taper @ taper))
+
+
+def _offsets(solution: Solution) -> Array:
+    """(F, C, 3) of each camera, mm."""
+    states = solution.frame.shake_at_frames(solution.state.shake)
+    return np.einsum("cid,fd->fci", solution.frame.shake.offset[:-1], states)
+
+
+def _offset_rms(solution: Solution) -> Array:
+    """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
+    layout, found = solution.frame.shake, solution.covariances
+    rows = layout.offset[:-1]
+    states = solution.frame.shake_at_frames(solution.state.shake)
+    square = np.einsum("cid,fd->fci", rows, states) ** 2
+    if found is not None:
+        square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
+    mean = square.mean(0)
+    unseen = mean < 1e-12
+    each = np.where(unseen, np.nan, mean)
+    return np.asarray(np.sqrt(np.where(unseen, np.nanmean(each, 1, keepdims=True), mean)))
+
+
+def _dominant_hz(solution: Solution) -> float:
+    """RMS of the offsets' velocity over that of the offsets."""
+    layout = solution.frame.shake
+    states = solution.frame.shake_at_frames(solution.state.shake)
+    place, speed = (
+        np.einsum("cid,fd->fci", r[:-1], states) for r in (layout.offset, layout.offset_velocity)
+    )
+    return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
+
+
+def _inflation(solution: Solution) -> float:
+    """By how much the pixels' stated noise is too small (above 1) or too large.
+
+    From the median, which outliers do not move; the share of the noise that the fit takes up is
+    given back by counting states as far as the pixels determine them.
+    """
+    kept = solution.weights[0] > 0.5
+    if kept.sum() < 30:
+        return 1.0
+    square = (solution.residuals[0][kept] ** 2).sum(-1)
+    spare = 1 - min(_taken_up(solution), 0.9)
+    return float(np.sqrt(np.median(square) / (2 * np.log(2)) / spare))
+
+
+def _taken_up(solution: Solution) -> float:
+    """Mean leverage of a pixel: var(prediction) / var(noise), from the bubbles' covariances."""
+    frame, found = solution.frame, solution.covariances
+    if found is None or not frame.rows:
+        return 0.0
+    linear = images(frame, solution.state, np.ones(len(frame.problem.observations))).linear
+    total, count = 0.0, 0
+    for part in linear:
+        row, node = np.asarray(part.keys[0]) - frame.base()[1], np.asarray(part.keys[1])
+        some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
+        row, node = row[some], node[some]
+        at = frame.frame_of_row[row]
+        by_bubble = part.blocks[0][some] @ np.linalg.inv(frame.bubble_basis(row))
+        by_shake = part.blocks[1][some] @ np.linalg.inv(frame.shake_basis(node))
+        if frame.to_frames is not None:
+            by_shake = by_shake @ np.linalg.inv(frame.to_frames[at])
+        both = by_shake @ found.cross[row]
+        total += float((by_bubble @ found.bubbles[row] * by_bubble).sum())
+        total += float((by_shake @ found.shake[at] * by_shake).sum())
+        total += float(2 * (both * by_bubble).sum())
+        count += 2 * len(row)
+    return total / count

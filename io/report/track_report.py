@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -67,15 +68,24 @@ def render(
     rig: tuple[tuple[Camera, Camera] | None, str] = (None, ""),
 ) -> str:
     """The page as text. rig : the two cameras, or None and why they are not known."""
-    scene = track_scene_json(results)
+    in_space = _in_space(results, smoothing)
+    scene = track_scene_json(in_space)
     context = _words(results) | _pictures(results, smoothing, rig[0])
-    context["no_rays"] = rig[1]
+    context["plans"] = track_plans(in_space)
+    context |= {"no_rays": rig[1], "in_lab": in_space is not results}
     if smoothing is not None:
         context["smoothing"] = smoothing_words(smoothing, results)
     drawn = [p.source for group in context.values() for p in _list(group) if hasattr(p, "source")]
     left = PAGE_BYTES - len(plotly_javascript()) - len(scene) - sum(map(len, drawn))
     context["sheet"] = _sheet(results, max(0, int(left / _BASE64)))
     return render_page("template_track.html", context, scene)
+
+
+def _in_space(results: TrackResults, smoothing: SmoothingResults | None) -> TrackResults:
+    """What the scene shows: smoothed paths in the lab if there are any, else the tracks."""
+    if smoothing is None or not len(smoothing.trajectories):
+        return results
+    return replace(results, tracks=smoothing.trajectories)
 
 
 def _list(group: Any) -> list[Any]:
@@ -134,7 +144,6 @@ def _pictures(
         ("quality", partial(predicted_sd, results)),
         ("quality", partial(sizes, results)),
         ("quality", partial(confidence, results)),
-        ("plans", partial(track_plans, results)),
     ]
     pictures: dict[str, Any] = {place: [] for place in (*dict(drawings), *PLACES)}
     if cameras is not None:

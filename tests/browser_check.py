@@ -72,7 +72,13 @@ def print_pdf(page: Path, work: Path) -> bytes:
 
 def _run(options: list[str], page: Path, work: Path) -> str:
     assert BROWSER is not None
-    command = [BROWSER, "--headless", "--no-sandbox", f"--user-data-dir={work / 'profile'}"]
+    command = [
+        BROWSER,
+        "--headless",
+        "--no-sandbox",
+        "--hide-scrollbars",
+        f"--user-data-dir={work / 'profile'}",
+    ]
     offline = ["--host-resolver-rules=MAP * ~NOTFOUND"]
     done = subprocess.run(
         [*command, *offline, *options, page.as_uri()],

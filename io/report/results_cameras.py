@@ -12,15 +12,17 @@ from telerig.io.report.track_results import TrackResults
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
 
-_AGREE_MM = 1e-4
+_AGREE_MM, _NEAR_MM = 1e-4, 0.02
+_POINT = ["x_mm", "y_mm", "z_mm"]
+_SILHOUETTES = ["silhouettes_x_mm", "silhouettes_y_mm", "silhouettes_z_mm"]
 
 
 def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Camera] | None, str]:
     """The two cameras, or None and the reason in words.
 
     calibration.json is looked for in the run's results folder and in `calibration/` beside it.
-    It counts only if the rays of the pixels in tracks.csv miss each other as that table says, so
-    another calibration is not taken for the run's.
+    It counts only if the rays of the pixels in tracks.csv meet where that table says, so another
+    calibration is not taken for the run's.
     Raises InputError for a calibration.json that cannot be read.
     """
     places = (folder, folder.resolve().parent / "calibration")
@@ -54,10 +56,15 @@ def paired_rows(results: TrackResults) -> NDArray[np.int64]:
 
 
 def _agree(results: TrackResults, cameras: tuple[Camera, Camera]) -> bool:
+    """Whether the rays miss each other as tracks.csv says, and meet where it says."""
     rows = paired_rows(results)
     if not len(rows):
         return True
     rays = [camera.unproject(uv) for camera, uv in zip(cameras, pair_pixels(results, rows))]
-    miss = midpoint(*rays[0], *rays[1])[1]
+    middle, miss = midpoint(*rays[0], *rays[1])
     stated = results.tracks["ray_miss_mm"].to_numpy(float)[rows]
-    return bool(np.median(np.abs(miss - stated)) < _AGREE_MM)
+    names = _SILHOUETTES if set(_SILHOUETTES) <= set(results.tracks) else _POINT
+    away = np.linalg.norm(middle - results.tracks[names].to_numpy(float)[rows], axis=1)
+    if np.median(np.abs(miss - stated)) > _AGREE_MM:
+        return False
+    return bool(np.nanmedian(away) < _NEAR_MM + np.median(np.abs(stated)))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,3 +195,26 @@ def test_bad_input_is_told_in_words(dataset: Path, tmp_path: Path) -> None:
     ):
         said = command(*arguments, code=2)
         assert words in said and "->" in said
+
+
+def test_the_pages_commands_and_code_run(
+    filmed: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Every command of docs/reports.md, with few views, and its Python."""
+    text = (Path(__file__).parents[1] / "docs" / "reports.md").read_text(encoding="utf-8")
+    (tmp_path / "tank2").mkdir()
+    for name in ("results", "runs"):
+        shutil.move(tmp_path / name, tmp_path / "tank2" / name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("telerig.io.report.film.STEP_DEG", 60)
+    lines = re.findall(r"^telerig report (.*)$", text, re.M)
+    assert len(lines) == 7
+    for line in lines:
+        command(*shlex.split(line, comments=True))
+    assert Path("films/film/views.mp4").is_file() and Path("films/film/path.mp4").is_file()
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    row = names["results"].tracks.iloc[3]
+    assert names["pair"].miss_mm == pytest.approx(row["ray_miss_mm"], abs=1e-9)
+    assert "frame 3" in names["picture"].caption

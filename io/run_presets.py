@@ -159,9 +159,35 @@ class TableConfig:
     reference_sigma_px: float = 0.1
 
 
+MARKS_AT = 0.88
+"""Where a strip of marks stands, from the image's middle over half its width."""
+
+MARKS_JITTER = 0.25
+"""Unevenness of a strip of marks, over their spacing."""
+
+
+@dataclass(frozen=True)
+class StripConfig:
+    """A strip of dots fixed to the tank for each camera, drawn into the images.
+
+    dots : in view at a time. diameter_mm. transmission : of the ink. at, jitter : as `MARKS_AT`,
+    `MARKS_JITTER`. depth_mm : its depth is drawn from -depth_mm to depth_mm.
+    """
+
+    dots: int = 6
+    diameter_mm: float = 1.0
+    transmission: float = 0.08
+    at: float = MARKS_AT
+    jitter: float = MARKS_JITTER
+    depth_mm: float = 0.0
+
+
 @dataclass(frozen=True)
 class RunConfig:
-    """A run and the calibration that goes with it; ``bubbles`` are in view at a time."""
+    """A run and the calibration that goes with it; ``bubbles`` are in view at a time.
+
+    strip : None for no dots in the images; see `TableConfig.references` for runs without images.
+    """
 
     name: str
     calibration: SimulationConfig
@@ -173,6 +199,7 @@ class RunConfig:
     stage: StageConfig = field(default_factory=StageConfig)
     image: ImageConfig = field(default_factory=ImageConfig)
     table: TableConfig = field(default_factory=TableConfig)
+    strip: StripConfig | None = None
 
     def __post_init__(self) -> None:
         """Raises InputError for values that no run can have."""

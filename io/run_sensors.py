@@ -9,17 +9,15 @@ from numpy.typing import NDArray
 
 from telerig.io.bubble_motion import accelerometer_readings
 from telerig.io.rig_description import CARRIAGE
+from telerig.io.run_presets import MARKS_AT, MARKS_JITTER
 from telerig.io.run_scene import AXIS_RIG, RunScene
+from telerig.io.run_strip import strip_places
 
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.random import Generator
 
 Array = NDArray[np.float64]
-
-_MARK_AT = 0.88
-"""Where the strip of marks stands, from the image's middle over half its width."""
-_JITTER = 0.25
 
 
 def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
@@ -83,7 +81,9 @@ def _camera_marks(scene: RunScene, index: int, rng: Generator) -> pd.DataFrame:
 
     name, camera = list(scene.cameras.items())[index]
     table = scene.config.table
-    lab_mm = _strip(scene, index, rng)
+    lab_mm = strip_places(
+        camera, scene.position_mm, table.references, rng, at=MARKS_AT, jitter=MARKS_JITTER
+    )
     frames, marks, pixels = [], [], []
     size = np.array(camera.image_size_px) - 1
     half_mm = size[1] / 2 / camera["scale_px_per_mm"]
@@ -107,22 +107,6 @@ def _camera_marks(scene: RunScene, index: int, rng: Generator) -> pd.DataFrame:
             "sigma_px": max(table.reference_sigma_px, 1e-4),
         }
     )
-
-
-def _strip(scene: RunScene, index: int, rng: Generator) -> Array:
-    """(K, 3) lab places of a camera's marks, over all the height that it sees."""
-    camera = list(scene.cameras.values())[index]
-    size = np.array(camera.image_size_px) - 1
-    height_mm = size[1] / camera["scale_px_per_mm"]
-    pitch = height_mm / scene.config.table.references
-    position = scene.position_mm
-    low, high = position.min() - 0.6 * height_mm, position.max() + 0.6 * height_mm
-    heights = np.arange(low, high, pitch)
-    heights = heights + _JITTER * pitch * rng.uniform(-1, 1, len(heights))
-    side = rng.choice([-1.0, 1.0]) * _MARK_AT
-    origin, _ = camera.unproject(size / 2 * np.array([1 + side, 1.0]))
-    foot = origin - AXIS_RIG * (origin @ AXIS_RIG)
-    return np.asarray(foot + heights[:, None] * AXIS_RIG)
 
 
 def _thinning(scene: RunScene, rate_hz: float) -> int:

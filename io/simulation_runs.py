@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.atomic import write_json_atomic
+from telerig.io.atomic import plain, write_json_atomic
 from telerig.io.backlight import Screen, Specks, random_screen, random_specks
 from telerig.io.bubble_bodies import MODES
-from telerig.io.bubble_render import exposed, render_bubbles
+from telerig.io.bubble_render import Silhouette, exposed, render_bubbles
 from telerig.io.csv_table import write_table
 from telerig.io.rig_description import (
     CARRIAGE,
@@ -26,6 +26,7 @@ from telerig.io.rig_description import (
 from telerig.io.run_presets import ImageConfig, RunConfig
 from telerig.io.run_scene import AXIS_RIG, RunScene, run_scene
 from telerig.io.run_sensors import accelerometer_table, references_table, stage_table
+from telerig.io.run_strip import Strip, random_strips, strip_truth
 from telerig.io.run_views import CameraView, camera_view, linear_projection, truth_rows
 from telerig.io.simulation import seed_of, write_calibration
 from telerig.io.simulation_stage import write_stage_axis
@@ -65,15 +66,16 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     if config.stage.axis_views:
         write_stage_axis(config, cameras, target, folder, stage_rng, images=images)
     scene = run_scene(config, cameras, scene_rng)
+    strips = random_strips(scene, rng.spawn(1)[0]) if config.strip and images else []
     run = folder / "runs" / config.name
     lost = _lost_frames(scene, image_rng)
-    _write_clocks_and_sensors(scene, run, lost, sensor_rng)
+    _write_clocks_and_sensors(scene, run, lost, sensor_rng, marks=not strips)
     truth: list[dict[str, Any]] = []
     detections: list[dict[str, Any]] = []
     with ExitStack() as stack:
         if images:
             write = stack.enter_context(_image_files(run, config.image, list(cameras)))
-            picture = _Pictures(scene, image_rng)
+            picture = _Pictures(scene, image_rng, strips)
         for frame in range(config.frames):
             views = {name: camera_view(scene, frame, j) for j, name in enumerate(cameras)}
             truth.append(truth_rows(scene, frame, views))
@@ -88,7 +90,10 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
                     detections.append(rows)
     if not images:
         write_table(_joined(detections), run / "detections.csv")
-    _write_truth(scene, folder / "truth" / "runs" / config.name, seed, truth, lost)
+    known = folder / "truth" / "runs" / config.name
+    _write_truth(scene, known, seed, truth, lost)
+    if strips:
+        write_table(strip_truth(scene, strips), known / "references.csv")
 
 
 def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
@@ -107,12 +112,15 @@ def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
             max(config.stage.accelerometer_bias_m_s2, LEAST_ACCELEROMETER_SIGMA),
         )
     marks = ReferencesDescription() if config.table.references else None
+    if config.strip is not None:
+        marks = ReferencesDescription(dot_diameter_mm=config.strip.diameter_mm)
     return replace(rig, stage=stage, accelerometers=sensors, references=marks)
 
 
 def _write_clocks_and_sensors(
-    scene: RunScene, run: Path, lost: NDArray[np.bool_], rng: Generator
+    scene: RunScene, run: Path, lost: NDArray[np.bool_], rng: Generator, *, marks: bool
 ) -> None:
+    """marks : False where the marks are in the images, to be found there."""
     import pandas as pd
 
     encoder_rng, accelerometer_rng, mark_rng = rng.spawn(3)
@@ -125,7 +133,7 @@ def _write_clocks_and_sensors(
     write_table(stage_table(scene, encoder_rng), run / "stage.csv")
     if scene.config.stage.accelerometers:
         write_table(accelerometer_table(scene, accelerometer_rng), run / "accelerometer.csv")
-    if scene.config.table.references:
+    if marks and scene.config.table.references:
         write_table(references_table(scene, mark_rng), run / "references.csv")
 
 
@@ -139,8 +147,8 @@ def _lost_frames(scene: RunScene, rng: Generator) -> NDArray[np.bool_]:
 class _Pictures:
     """The surroundings of the bubbles in each camera, drawn once, and each frame's light."""
 
-    def __init__(self, scene: RunScene, rng: Generator) -> None:
-        self.scene = scene
+    def __init__(self, scene: RunScene, rng: Generator, strips: Sequence[Strip]) -> None:
+        self.scene, self.strips = scene, strips
         image = scene.config.image
         names = list(scene.cameras)
         look_rng, light_rng, *self.noise = rng.spawn(2 + len(names))
@@ -160,7 +168,7 @@ class _Pictures:
         lab_shift = self.lab_shift[index, frame]
         grey = render_bubbles(
             self.sizes[index],
-            view.silhouettes(self.scene),
+            view.silhouettes(self.scene) + self._marks(frame, index),
             self.screens[index],
             screen_shift_px=lab_shift if image.screen_fixed_to == "lab" else np.zeros(2),
             window_dirt=self.window[index],
@@ -175,6 +183,16 @@ class _Pictures:
             shot_noise=image.shot_noise,
             bit_depth=image.bit_depth,
             left_aligned=image.left_aligned,
+        )
+
+
+    def _marks(self, frame: int, index: int) -> list[Silhouette]:
+        if not self.strips:
+            return []
+        scene, image = self.scene, self.scene.config.image
+        velocity = AXIS_RIG * scene.velocity_mm_s[frame] + scene.shake_mm_s[index, frame]
+        return self.strips[index].silhouettes(
+            scene.rig_from_lab_mm(index, frame), -velocity * image.exposure_s, image.blur_px
         )
 
 
@@ -309,7 +327,9 @@ def _write_truth(
 
 
 def _summary(scene: RunScene, seed: dict[str, Any]) -> Mapping[str, Any]:
-    fleet = scene.fleet
+    fleet, config = scene.fleet, plain(scene.config)
+    if config["strip"] is None:
+        del config["strip"]
     return {
         "schema": RUN_TRUTH_SCHEMA,
         "pixel_origin": "centre",
@@ -325,5 +345,5 @@ def _summary(scene: RunScene, seed: dict[str, Any]) -> Mapping[str, Any]:
             "spin_hz": fleet.spin_hz,
         },
         "pairs_closest_s": scene.closest_s,
-        "config": scene.config,
+        "config": config,
     }

@@ -40,6 +40,10 @@ def simulate(
     encoder_scale: Annotated[
         float | None, typer.Option(help="The encoder reads so much too far, like 0.01.")
     ] = None,
+    references: Annotated[
+        int | None,
+        typer.Option(help="Dots of a strip fixed to the tank that each camera sees [0: no strip]."),
+    ] = None,
     devices: Annotated[
         bool,
         typer.Option(
@@ -67,7 +71,7 @@ def simulate(
 
         run_only = {"frames": frames, "bubbles": bubbles}
         stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale}
-        settings = _settings(preset, run_only, stage)
+        settings = _with_strip(preset, _settings(preset, run_only, stage), references, images)
         data = run(settings, rng=np.random.default_rng(seed), out=out, images=images)
         say(f"{preset}: {len(data.views)} views of {len(data.rig.cameras)} cameras in {data.path}")
         for name in data.runs:
@@ -103,6 +107,25 @@ def _settings(
         f"{name} is a calibration without a run, so {' and '.join(given)} mean nothing",
         todo=f"leave them out, or choose one of {', '.join(RUN_PRESETS)}",
     )
+
+
+def _with_strip(
+    name: str, settings: SimulationConfig | RunConfig, dots: int | None, images: bool
+) -> SimulationConfig | RunConfig:
+    """In the images, or in `references.csv` where there are none."""
+    from telerig.io.run_presets import RunConfig, StripConfig
+
+    if dots is None:
+        return settings
+    if not isinstance(settings, RunConfig):
+        raise InputError(
+            f"{name} is a calibration without a run, so references mean nothing",
+            todo="leave them out, or choose a run of bubbles, like rise",
+        )
+    if dots < 0:
+        raise InputError(f"--references {dots}", todo="give the number of dots in view, like 6")
+    strip = StripConfig(dots) if images and dots else None
+    return replace(settings, table=replace(settings.table, references=dots), strip=strip)
 
 
 if __name__ == "__main__":

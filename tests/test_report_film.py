@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from telerig.io.report.film_views import (
 )
 from telerig.io.report.results_cameras import run_cameras
 from telerig.io.report.track_results import read_track_results
+from telerig.io.report.track_scene import scene_widening, track_scene_json
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.triangulation import triangulate
@@ -395,3 +397,16 @@ def test_only_the_runs_own_calibration_counts(run: Path, tmp_path: Path) -> None
     (tmp_path / "a" / "calibration" / "calibration.json").write_text("{")
     with pytest.raises(InputError, match="JSON"):
         run_cameras(alone, read_track_results(alone))
+
+
+def test_the_scene_of_a_slender_path_is_widened_by_what_the_page_says(run: Path) -> None:
+    results = read_track_results(run)
+    assert scene_widening(results) == 1
+    assert json.loads(track_scene_json(results))["layout"]["scene"]["aspectmode"] == "data"
+    tall = replace(results, tracks=results.tracks.assign(y_mm=10 * results.tracks["y_mm"]))
+    scene = json.loads(track_scene_json(tall))["layout"]["scene"]
+    ratio, sides = scene["aspectratio"], np.ptp(tall.points_mm, axis=0)
+    per_mm = [ratio[axis] / side for axis, side in zip("xyz", sides)]
+    assert scene["aspectmode"] == "manual" and scene_widening(tall) > 4
+    assert per_mm[0] == pytest.approx(scene_widening(tall) * per_mm[1], rel=1e-3)
+    assert per_mm[2] == pytest.approx(per_mm[0], rel=1e-3)

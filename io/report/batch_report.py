@@ -91,7 +91,8 @@ def _key_numbers(jobs: Sequence[Job]) -> list[Figure]:
     seconds = [float(j["seconds"]) for j in jobs if is_number(j.get("seconds"))]
     if seconds:
         hosts = len({j.get("host") for j in jobs if j.get("host")})
-        remark = f"longest job {max(seconds):.0f} s, {hosts} machine" + ("s" if hosts > 1 else "")
+        machines = f", {hosts} machine" + ("s" if hosts > 1 else "") if hosts else ""
+        remark = f"longest job {max(seconds):.0f} s{machines}"
         figures.append(Figure("work", f"{sum(seconds) / 60:.3g} min", remark))
     return figures
 
@@ -181,6 +182,7 @@ def _values(
         for at in np.flatnonzero(~np.isfinite(values).any(1)):
             axes.axvline(at + 1, color=LEFT_OUT, lw=0.8)
         axes.set(xlabel="in the order of the batch", ylabel=label)
+        axes.set_xlim(0.5, len(mine) + 0.5)
         _finish(axes, legend=len(names) > 1)
         return Picture(title, svg(figure), caption + " A red line: no result.")
 

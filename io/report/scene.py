@@ -20,6 +20,7 @@ Trace = dict[str, Any]
 MOST_DOTS = 6000
 """Above this number only the outlines of the target are drawn, and the caption says so."""
 
+_FEW_TICKS = 6
 _BOX = [0, 1, 2, 3, 0, 4, 5, 1, 5, 6, 2, 6, 7, 3, 7, 4]
 _BOX_FACES = [[0, 0, 4, 4, 0, 0, 1, 1, 2, 2, 3, 3], [1, 2, 6, 7, 1, 5, 2, 6, 3, 7, 0, 4],
               [2, 3, 5, 6, 5, 4, 6, 5, 7, 6, 4, 7]]  # fmt: skip
@@ -34,14 +35,22 @@ def scene_json(results: CalibrationResults) -> str:
 
 
 def scene_text(
-    traces: list[Trace], up: Sequence[float] = (0.0, -1.0, 0.0), distance: float = 1.0
+    traces: list[Trace],
+    up: Sequence[float] = (0.0, -1.0, 0.0),
+    distance: float = 1.0,
+    ratio: Sequence[float] | None = None,
 ) -> str:
     """Traces with a layout for them, safe inside a script element.
 
     up : (3,) unit vector, up on the screen. distance : of the eye; from afar it looks a little
-    lower, where tilted boxes reach farthest.
+    lower, where tilted boxes reach farthest. ratio : of the box' sides, None: true proportions.
     """
-    text = json.dumps({"data": traces, "layout": _layout(up, distance)}, allow_nan=False)
+    layout = _layout(up, distance)
+    if ratio is not None:
+        layout["scene"] |= {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio))}
+        for name in ("xaxis", "yaxis", "zaxis"):
+            layout["scene"][name] |= {"nticks": _FEW_TICKS}
+    text = json.dumps({"data": traces, "layout": layout}, allow_nan=False)
     return text.replace("</", "<\\/")
 
 

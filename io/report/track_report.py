@@ -30,7 +30,7 @@ from telerig.io.report.track_figures_rays import (
     shared_pictures,
 )
 from telerig.io.report.track_results import TrackResults, binary_column, read_track_results
-from telerig.io.report.track_scene import track_plans, track_scene_json
+from telerig.io.report.track_scene import scene_widening, track_plans, track_scene_json
 from telerig.io.report.words import flat_rows
 from telerig.rig.camera import Camera
 
@@ -73,6 +73,7 @@ def render(
     context = _words(results) | _pictures(results, smoothing, rig[0])
     context["plans"] = track_plans(in_space)
     context |= {"no_rays": rig[1], "in_lab": in_space is not results}
+    context["widened"] = scene_widening(in_space)
     if smoothing is not None:
         context["smoothing"] = smoothing_words(smoothing, results)
     drawn = [p.source for group in context.values() for p in _list(group) if hasattr(p, "source")]

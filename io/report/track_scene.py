@@ -27,6 +27,7 @@ MANY_POINTS = 3_000
 SHADES = 64
 _NAMED = len(TRACK_COLOURS)
 _EYE = 1.5
+_WIDENING, _WIDEST, _FLATTEST = (1, 2, 5, 10, 20), 0.5, 0.02
 
 
 def track_colour(particle: int) -> str:
@@ -70,15 +71,36 @@ def track_scene_json(results: TrackResults) -> str:
         _group(table[group == k], TRACK_COLOURS[k], named=bool(few)) for k in np.unique(group)
     ]
     up = [float(part) + 0.0 for part in results.up]
-    return scene_text(traces, up, _EYE * _slenderness(table[["x_mm", "y_mm", "z_mm"]].to_numpy()))
+    sides = _sides_mm(table) * _drawn_wider(results.up, scene_widening(results))
+    ratio = None
+    if scene_widening(results) > 1:
+        ratio = (sides / np.prod(sides) ** (1 / 3)).round(4).tolist()
+    return scene_text(traces, up, _EYE * _slenderness(sides), ratio)
 
 
-def _slenderness(points_mm: Array) -> float:
-    """Diagonal of the points' box over that of a cube of its volume; the eye steps back for it."""
-    if not len(points_mm):
-        return 1.0
-    sides = np.ptp(points_mm, axis=0) + 1e-9
-    sides = np.maximum(sides, 0.05 * sides.max())
+def scene_widening(results: TrackResults) -> int:
+    """How many times wider than true the scene is drawn, for slender paths; 1: true."""
+    sides = _sides_mm(thinned(results.tracks, MOST_POINTS))
+    upright = int(np.argmax(np.abs(results.up)))
+    across = float(np.delete(sides, upright).max())
+    return max(f for f in _WIDENING if f == 1 or f * across <= _WIDEST * sides[upright])
+
+
+def _drawn_wider(up: Array, times: int) -> Array:
+    """(3,) factors per axis."""
+    return np.where(np.arange(3) == int(np.argmax(np.abs(up))), 1.0, float(times))
+
+
+def _sides_mm(table: pd.DataFrame) -> Array:
+    """(3,) of the points' box; none is quite flat."""
+    if not len(table):
+        return np.ones(3)
+    sides = np.ptp(table[["x_mm", "y_mm", "z_mm"]].to_numpy(float), axis=0) + 1e-9
+    return np.asarray(np.maximum(sides, _FLATTEST * sides.max()))
+
+
+def _slenderness(sides: Array) -> float:
+    """Diagonal of a box over that of a cube of its volume; the eye steps back for it."""
     return float(np.linalg.norm(sides) / np.sqrt(3) / np.prod(sides) ** (1 / 3))
 
 

@@ -215,8 +215,8 @@ def _ticks(
     if upright:
         top = corner.copy()
         top[2] = high
-        end = top @ matrix[:2].T + offset + (-8.0, -6.0)
-    texts.append((f"{name} / mm", (end[0], end[1]), 14, _INK, "rs" if upright else "ma"))
+        end = top @ matrix[:2].T + offset + (-16.0, -8.0)
+    texts.append((f"{name} / mm", (end[0], end[1]), 14, _INK, "ms" if upright else "ma"))
     return texts
 
 
@@ -242,13 +242,17 @@ def _draw_tracks(
                    _rgb(int(path.particle[piece[0]])))  # fmt: skip
     cv2.addWeighted(veil, 0.35, picture, 0.65, 0, picture)
     texts: list[_Text] = []
+    ends = set(np.flatnonzero(np.append(np.diff(path.particle) != 0, True)).tolist())
     names = len(set(path.particle.tolist())) <= _MOST_NAMES
     for piece in sorted(pieces, key=lambda p: -float(away[p].mean())):
         colour = _rgb(int(path.particle[piece[0]]))
         cv2.polylines(picture, [_fixed(uv[piece])], False, colour, 1, cv2.LINE_AA, _BITS)
         last = uv[piece[-1]]
-        cv2.circle(picture, tuple(_fixed(last)[0].tolist()), 3 << _BITS, colour, -1, cv2.LINE_AA,
-                   _BITS)  # fmt: skip
+        if piece[-1] not in ends:
+            continue
+        cv2.circle(
+            picture, tuple(_fixed(last)[0].tolist()), 3 << _BITS, colour, -1, cv2.LINE_AA, _BITS
+        )
         if names:
             texts.append((f"{path.particle[piece[0]]}", (last[0] + 8, last[1]), 13, colour, "lm"))
     return texts

@@ -74,7 +74,7 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
         return None
     step = float(np.median(np.diff(t)))
     even = np.arange(t[0], t[-1] + step / 2, step)
-    frequency = np.fft.rfftfreq(len(even), step)
+    frequency = np.asarray(np.fft.rfftfreq(len(even), step), np.float64)
     low = (frequency * len(even) * step > 1.5) & (frequency <= _LOW_BAND * bands[0].low_hz)
     if np.count_nonzero(low) < _FEWEST_BINS:
         return None
@@ -106,7 +106,7 @@ def _periodogram(series: Array, step_s: float) -> Array:
 def _offsets(solution: Solution) -> Array:
     """(F, C, 3) of each camera, mm."""
     states = solution.frame.shake_at_frames(solution.state.shake)
-    return np.einsum("cid,fd->fci", solution.frame.shake.offset[:-1], states)
+    return np.asarray(np.einsum("cid,fd->fci", solution.frame.shake.offset[:-1], states))
 
 
 def _offset_rms(solution: Solution) -> Array:

@@ -46,13 +46,14 @@ def smooth_run(
     """
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
+    run, marks = with_followed_references(run, source.parent)
     warnings = check_sensors(run, tracks=followed, calibration=calibration)
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
     found = smooth(followed, calibration, stage=run, model=model, progress=percent)
     found = replace(found, summary={**found.summary, "warnings": warnings})
     tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
     record = run_record(
-        "smooth", run.path, [*tables, source, *inputs], {"model": model},
+        "smooth", run.path, [*tables, source, *marks, *inputs], {"model": model},
         {"smooth": time.perf_counter() - begun},
     )  # fmt: skip
     tracked = source.parent / "run.json"
@@ -78,6 +79,19 @@ def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), todo="give tracks.csv")
     return read_batch(path), path
+
+
+def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list[Path]]:
+    """The run with the marks that `telerig track` followed in its images, and their file; a run's
+    own references.csv goes before them."""
+    file = tracked / "references.csv"
+    if run.references is not None or not file.is_file() or tracked.resolve() == run.path:
+        return run, []
+    from telerig.io.run_tables import read_references_csv
+
+    sizes = dict(run.image_sizes_px)
+    table = read_references_csv(file, list(run.cameras), sizes, run.frame_count)
+    return replace(run, references=table), [file]
 
 
 def _report(staged: Path, folder: Path, tracked: Path) -> None:

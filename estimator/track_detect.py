@@ -6,8 +6,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +20,7 @@ from telerig.errors import InputError
 from telerig.estimator.frontend.background import Background, estimate_background
 from telerig.estimator.frontend.bubble_types import DETECTION_COLUMNS
 from telerig.estimator.frontend.bubbles import detect_bubbles
+from telerig.estimator.frontend.reference_erasing import StripInImages
 from telerig.io.atomic import write_json_atomic
 from telerig.io.parallel import cores, ordered_map, quick_workers
 from telerig.io.run import RunData
@@ -43,12 +44,18 @@ class Scene:
     """What every frame's detection shares.
 
     backgrounds : by camera; shift_px : by camera, (F, 2) travel of the rig, see `lab_shift_px`.
+    strips : by camera, dots fixed to the tank, which are taken out of the images.
     """
 
     run: RunData
     backgrounds: dict[str, Background]
     shift_px: dict[str, Array]
     min_diameter_px: float
+    strips: Mapping[str, StripInImages] = field(default_factory=dict)
+
+    def image(self, camera: str, frame: int) -> NDArray[Any] | None:
+        """(H, W) without the strip's dots; None where it is missing."""
+        return image_without_strip(self.run, self.strips, camera, frame)
 
 
 def make_scene(
@@ -57,21 +64,31 @@ def make_scene(
     axis_rig: Array,
     min_diameter_px: float,
     progress: Progress | None = None,
+    strips: Mapping[str, StripInImages] | None = None,
 ) -> Scene:
     """Estimate each camera's background from the run itself."""
     shifts = {c.name: lab_shift_px(c, axis_rig, run.position_mm, run.frame_count) for c in cameras}
     names = [c.name for c in cameras]
-    estimate = partial(_background, run, shifts)
+    estimate = partial(_background, run, shifts, strips or {})
     backgrounds = {}
     for name, found in zip(names, ordered_map(estimate, names, quick_workers(len(names)))):
         backgrounds[name] = found
         if progress is not None:
             progress("background", len(backgrounds), len(names))
-    return Scene(run, backgrounds, shifts, min_diameter_px)
+    return Scene(run, backgrounds, shifts, min_diameter_px, strips or {})
 
 
-def _background(run: RunData, shifts: dict[str, Array], camera: str) -> Background:
-    images = partial(run.image, camera)
+def image_without_strip(
+    run: RunData, strips: Mapping[str, StripInImages], camera: str, frame: int
+) -> NDArray[Any] | None:
+    image, strip = run.image(camera, frame), strips.get(camera)
+    return image if image is None or strip is None else strip.erased(image, frame)
+
+
+def _background(
+    run: RunData, shifts: dict[str, Array], strips: Mapping[str, StripInImages], camera: str
+) -> Background:
+    images = partial(image_without_strip, run, strips, camera)
     return estimate_background(images, run.frame_count, shift_px=shifts[camera])
 
 
@@ -179,7 +196,7 @@ def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
     """One image's bubbles; an image without one gives a row that only says why."""
     import pandas as pd
 
-    image = scene.run.image(camera, frame)
+    image, strip = scene.image(camera, frame), scene.strips.get(camera)
     if image is None:
         found, reason = pd.DataFrame(columns=DETECTION_COLUMNS), "no image"
     else:
@@ -190,7 +207,11 @@ def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
             raise InputError(
                 error.what, where=f"camera {camera}, frame {frame}", todo=error.todo
             ) from error
-        reason = str(found.attrs.get("reason", "no bubble")) if found.empty else ""
+        if strip is not None and len(found):
+            centres = found[["u_px", "v_px"]].to_numpy(float)
+            dots = strip.are_dots(frame, centres, found["d_eq_px"].to_numpy(float))
+            found = found[~dots].reset_index(drop=True)
+        reason = str(found.attrs.get("reason", "")) or "no bubble" if found.empty else ""
     if found.empty:
         found = pd.DataFrame({name: [np.nan] for name in DETECTION_COLUMNS}).assign(flags="")
     return found.assign(frame=frame, camera=camera, reason=reason)

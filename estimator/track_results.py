@@ -98,16 +98,24 @@ def write_tracking(
         summary = summary_of(run, stream, counts) | {"worst_frames": worst.frames()}
         write_json_atomic(staged / "tracking.json", summary)
         write_table(events_table(stream.events), staged / "events.csv")
+        table = stream.followed.table if stream.followed is not None else None
+        if table is not None:
+            shutil.copyfile(table, staged / "references.csv")
         write_json_atomic(staged / "run.json", _record(run, options, record))
         if run.detections is None:
             cameras = check_calibration(run, calibration)
             axis = stage_axis(run, calibration)
-            scene = stream.scene or make_scene(run, cameras, axis, options.min_diameter_px)
+            strips = stream.followed.strips if stream.followed is not None else None
+            scene = stream.scene or make_scene(
+                run, cameras, axis, options.min_diameter_px, strips=strips
+            )
             _write_pictures(scene, summary, staged)
         if report:
             from telerig.io.report.track_report import write_track_report
 
             write_track_report(staged)
+    if table is None:
+        (folder / "references.csv").unlink(missing_ok=True)
     shutil.rmtree(work, ignore_errors=True)
     return summary
 
@@ -165,11 +173,11 @@ def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> No
     from telerig.io.report.bubble_overlay import draw_binary, draw_bubble_overlay
 
     camera, frame, labels = task
-    image = scene.run.image(camera, frame)
-    if image is None:
+    image, plain = scene.run.image(camera, frame), scene.image(camera, frame)
+    if image is None or plain is None:
         return
     level = scene.backgrounds[camera].at(tuple(scene.shift_px[camera][frame]))
-    bubbles = find_bubbles(image, background=level, min_diameter_px=scene.min_diameter_px)
+    bubbles = find_bubbles(plain, background=level, min_diameter_px=scene.min_diameter_px)
     found, rejected = bubbles.accepted, bubbles.rejected
     outlines = [outline_points(row, _OUTLINE_POINTS) for _, row in found.iterrows()]
     named = [_particle(labels, row) for _, row in found.iterrows()]

@@ -28,6 +28,7 @@ from telerig.estimator.track_detect import (
     fingerprint,
     make_scene,
 )
+from telerig.estimator.track_references import Followed, follow_references, wanted
 from telerig.estimator.track_link import Linked, Linker
 from telerig.estimator.track_types import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracker import Tracker
@@ -66,6 +67,7 @@ class TrackingStream:
     shape_sigma: Array | None
     frames_without: dict[str, dict[str, int]]
     scene: Scene | None
+    followed: Followed | None = None
 
 
 def track(
@@ -84,13 +86,19 @@ def track(
     with tempfile.TemporaryDirectory(prefix="telerig-") as work:
         stream = tracking_stream(run, calibration, Path(work) / "work", options, stage)
         parts = list(stream.rows)
+        marks = _references(stream.followed)
     tables = [p.tracks for p in parts if len(p.tracks)] or [p.tracks for p in parts[:1]]
     joined = pd.concat(tables, ignore_index=True)
     detections = pd.concat([p.detections for p in parts], ignore_index=True)
     counts = count_rows(parts)
-    return Tracks(
-        run.name, detections, joined, events_table(stream.events), summary_of(run, stream, counts)
-    )
+    summary = summary_of(run, stream, counts)
+    return Tracks(run.name, detections, joined, events_table(stream.events), summary, marks)
+
+
+def _references(followed: Followed | None) -> pd.DataFrame | None:
+    if followed is None or followed.table is None:
+        return None
+    return pd.read_csv(followed.table, dtype={"camera": str})
 
 
 def tracking_stream(
@@ -104,17 +112,23 @@ def tracking_stream(
     chosen = options or TrackOptions()
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
-    first_id, labels, scene = 0, None, None
+    first_id, labels, scene, followed = 0, None, None, None
     batches: Callable[[], Iterator[pd.DataFrame]]
     if run.detections is not None:
         table, labels = numbered_particles(_complete(run.detections))
         first_id = int(table["particle"].max()) + 1
         batches = partial(_once, table)
     else:
-        mark = fingerprint(run, {"options": repr(chosen), "cameras": repr(cameras)})
+        asked = {"options": repr(chosen), "cameras": repr(cameras)}
+        strip = wanted(run)
+        if strip is not None:
+            asked |= {"references": repr(strip), "axis": repr(axis)}
+        mark = fingerprint(run, asked)
         store = DetectionStore(work, mark, run.frame_count, cores())
+        followed = follow_references(run, cameras, axis, store, stage)
         if store.missing:
-            scene = make_scene(run, cameras, axis, chosen.min_diameter_px, stage)
+            strips = followed.strips if followed is not None else None
+            scene = make_scene(run, cameras, axis, chosen.min_diameter_px, stage, strips)
             detect_missing(scene, store, stage)
         batches = store.tables
     without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
@@ -126,7 +140,7 @@ def tracking_stream(
     rows = _linked(run, cameras, batches(), linker, without, stage)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
-    return TrackingStream(rows, linker.events, model, sigma, without, scene)
+    return TrackingStream(rows, linker.events, model, sigma, without, scene, followed)
 
 
 def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:
@@ -310,7 +324,7 @@ def summary_of(run: RunData, stream: TrackingStream, counts: dict[str, Any]) -> 
             todo="look at the images; bubbles must be darker than the screen, and wider than "
             "--min-diameter",
         )
-    return {
+    content: dict[str, Any] = {
         "schema": 1,
         "kind": "telerig tracks",
         "run": run.name,
@@ -337,3 +351,6 @@ def summary_of(run: RunData, stream: TrackingStream, counts: dict[str, Any]) -> 
         "in tracks.csv",
         "notes": list(run.notes),
     }
+    if stream.followed is not None:
+        content["references"] = stream.followed.summary
+    return content

@@ -25,6 +25,7 @@ class Tracks:
     table : one row per frame and bubble seen by both cameras, see docs/files.md; rig frame.
     events : births, deaths, gaps, breaks, splits and mergers, each with its reason.
     summary : numbers and sentences of tracking.json.
+    references : dots of a strip fixed to the tank, found in the images; None where there is none.
     """
 
     name: str
@@ -32,13 +33,14 @@ class Tracks:
     table: pd.DataFrame
     events: pd.DataFrame
     summary: Mapping[str, Any] = field(default_factory=dict)
+    references: pd.DataFrame | None = None
 
     def __len__(self) -> int:
         """Number of tracks."""
         return int(self.table["particle"].nunique())
 
     def save(self, folder: str | Path) -> None:
-        """Write detections.csv, tracks.csv, events.csv and tracking.json."""
+        """Write detections.csv, tracks.csv, events.csv, tracking.json, and references.csv if any."""
         from telerig.io.atomic import write_json_atomic
         from telerig.io.tables import write_table
 
@@ -47,6 +49,8 @@ class Tracks:
             write_table(
                 self.table if name == "tracks" else getattr(self, name), out / f"{name}.csv"
             )
+        if self.references is not None:
+            write_table(self.references, out / "references.csv")
         write_json_atomic(out / "tracking.json", dict(self.summary))
 
 

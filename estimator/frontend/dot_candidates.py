@@ -23,6 +23,7 @@ Grey = NDArray[np.float32]
 Polarity = Literal["white_on_black", "black_on_white"]
 
 TOUCHES_BORDER = "touches the image border"
+TOO_LARGE = "larger than the dots"
 MERGED = "merged with its neighbour"
 NOT_ELLIPSE = "outline is not an ellipse"
 TOO_SMALL = "smaller than the smallest dot asked for"
@@ -68,6 +69,14 @@ class Candidates:
     @property
     def promising(self) -> tuple[Candidate, ...]:
         return tuple(blob for blob in self.blobs if not blob.reason)
+
+    def up_to(self, diameter_px: float) -> Candidates:
+        """The same, with a reason against those that are larger."""
+        if np.isinf(diameter_px):
+            return self
+        most = np.pi / 4 * diameter_px**2
+        blobs = (replace(b, reason=TOO_LARGE) if b.area_px2 > most else b for b in self.blobs)
+        return replace(self, blobs=tuple(blobs))
 
 
 @dataclass(frozen=True)

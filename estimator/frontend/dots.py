@@ -96,8 +96,12 @@ def measure_dots(
     *,
     polarity: Literal["auto", "white_on_black", "black_on_white"] = "auto",
     min_diameter_px: float = 5.0,
+    max_diameter_px: float = np.inf,
 ) -> DotMeasurement:
-    """Like :func:`locate_dots`, with the rejected candidates and the noise model."""
+    """Like :func:`locate_dots`, with the rejected candidates and the noise model.
+
+    max_diameter_px : larger blobs are no dots, and tell nothing of the dots' size.
+    """
     grey = _checked(image, polarity, min_diameter_px)
     response = high_pass(grey)
     edges = edge_map(grey, rough_sigma(response))
@@ -105,7 +109,9 @@ def measure_dots(
     wanted: tuple[Polarity, ...] = (
         ("white_on_black", "black_on_white") if polarity == "auto" else (polarity,)
     )
-    options = [find_candidates(edges, option, min_diameter_px) for option in wanted]
+    options = [
+        find_candidates(edges, option, min_diameter_px).up_to(max_diameter_px) for option in wanted
+    ]
     chosen = options[0] if len(options) == 1 else choose_polarity((options[0], options[1]))
     return _measure(grey, chosen, noise)
 

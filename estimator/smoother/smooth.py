@@ -115,6 +115,8 @@ def problem_of(
         stage, rig, t_s = run.stage, run.rig if rig is None else rig, run.t_s
         accelerometers = run.accelerometers if accelerometers is None else accelerometers
         references = run.references if references is None else references
+    if references is None:
+        references = getattr(tracks, "references", None)
     cameras = calibration.cameras
     frame_times = None if t_s is None else np.asarray(t_s, float)
     tracked = None if tracks is None else read_tracks(tracks, cameras, frame_times)

@@ -1,0 +1,119 @@
+"""The pictures of docs/gallery.md, made again from a dataset with results.
+
+Usage: python benchmarks/make_gallery.py DATASET RUN [--out docs/pictures]
+
+For instance after `telerig demo`: python benchmarks/make_gallery.py telerig-demo rise. The pictures
+are the reports' own, as PNG with few colours: each below 150 kB, 1.2 MB in all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from telerig.io.report import (
+    figures_coverage,
+    figures_dot,
+    figures_residuals,
+    figures_rig,
+    figures_target,
+    smoothing_figures,
+    smoothing_shake,
+)
+from telerig.io.report.calibration_results import read_results
+from telerig.io.report.figures_common import Picture
+from telerig.io.report.figures_rays import two_rays
+from telerig.io.report.results_cameras import run_cameras
+from telerig.io.report.smoothing_results import read_smoothing_results
+from telerig.io.report.track_figures_rays import ray_miss_histogram
+from telerig.io.report.track_results import read_track_results
+
+DPI = 150
+COLOURS = 64
+LARGEST_BYTES, ALL_BYTES = 150_000, 1_200_000
+_SAVE = Figure.savefig
+
+
+def _as_png(figure: Figure, stream: Any, **options: Any) -> None:
+    _SAVE(figure, stream, format="png", dpi=DPI, metadata={"Software": None})
+
+
+def calibration_pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
+    results = read_results(folder)
+    yield "rig", figures_rig.rig_plan(results)
+    yield "coverage", figures_coverage.coverage(results, 0)
+    yield "tilts", figures_coverage.tilts(results)
+    yield "residuals", figures_residuals.residual_field(results, 0)
+    yield "residual-histogram", figures_residuals.residual_histogram(results)
+    yield "target", figures_target.target_pictures(results)[0]
+    with np.load(folder / "dot_example.npz") as example:
+        yield "dot", figures_dot.dot_pictures(dict(example))[-1]
+
+
+def run_pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
+    tracks = read_track_results(folder)
+    yield "ray-miss", ray_miss_histogram(tracks)
+    cameras, _ = run_cameras(folder, tracks)
+    rays = None if cameras is None else two_rays(tracks, cameras)
+    if rays is not None:
+        yield "two-rays", rays
+    smoothed = read_smoothing_results(folder, np.array([0.0, -1.0, 0.0]))
+    if smoothed is None:
+        raise SystemExit(f"{folder} is not smoothed: telerig smooth first")
+    up, first = 1, smoothed.cameras[0]
+    yield "closer", smoothing_figures.closer(smoothed, up)
+    yield "velocity", smoothing_figures.velocities(smoothed, up)
+    yield "shake", smoothing_shake.shake_in_time(smoothed, first, "y")
+
+    spectra = smoothing_shake.shake_spectra(smoothed, first)
+    if spectra is not None:
+        yield "shake-spectra", spectra
+
+
+def save(image: Image.Image, file: Path) -> int:
+    """Few colours, no metadata; bytes written."""
+    few = image.convert("RGB").quantize(COLOURS, method=Image.Quantize.FASTOCTREE)
+    few.save(file, optimize=True)
+    size = file.stat().st_size
+    if size > LARGEST_BYTES:
+        raise SystemExit(f"{file} has {size} bytes: fewer colours or a smaller figure")
+    return size
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("run")
+    default = Path(__file__).parents[1] / "docs" / "pictures"
+    parser.add_argument("--out", type=Path, default=default)
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    results = given.dataset / "results"
+    total = 0
+    with patch.object(Figure, "savefig", _as_png):
+        drawn = [*calibration_pictures(results / "calibration"), *run_pictures(results / given.run)]
+    for name, picture in drawn:
+        pixels = base64.b64decode(picture.source.partition(",")[2])
+        size = save(Image.open(BytesIO(pixels)), given.out / f"{name}.png")
+        print(f"{name}: {size} bytes; {picture.title}. {picture.caption}")
+        total += size
+    for name, folder in (("view", results / "calibration"), ("bubble", results / given.run)):
+        overlay = min((folder / "overlays").glob("*/*"))
+        total += save(Image.open(overlay), given.out / f"{name}.png")
+        print(f"{name}: {overlay}")
+    if total > ALL_BYTES:
+        raise SystemExit(f"{total} bytes in all: more than {ALL_BYTES}")
+    print(f"{total} bytes in all")
+
+
+if __name__ == "__main__":
+    main()

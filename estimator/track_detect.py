@@ -208,9 +208,7 @@ def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
                 error.what, where=f"camera {camera}, frame {frame}", todo=error.todo
             ) from error
         if strip is not None and len(found):
-            centres = found[["u_px", "v_px"]].to_numpy(float)
-            dots = strip.are_dots(frame, centres, found["d_eq_px"].to_numpy(float))
-            found = found[~dots].reset_index(drop=True)
+            found = found[~strip.are_dots(frame, found)].reset_index(drop=True)
         reason = str(found.attrs.get("reason", "")) or "no bubble" if found.empty else ""
     if found.empty:
         found = pd.DataFrame({name: [np.nan] for name in DETECTION_COLUMNS}).assign(flags="")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from telerig.estimator.frontend.reference_following import Follower, Mark
 from telerig.estimator.frontend.reference_view import TankView
 from telerig.estimator.frontend.references import DotLook
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -26,6 +29,7 @@ class StripInImages:
 
     places_mm : (K, 2) lab; epochs : (K,). shift_mm : (F, 2) of each frame. position_mm : (F,).
     epoch_starts : first frame of each epoch; a dot's place holds for its own.
+    line_mm : least and greatest place across the travel. diameter_mm : of a dot.
     """
 
     view: TankView
@@ -35,9 +39,16 @@ class StripInImages:
     epoch_starts: NDArray[np.int64]
     shift_mm: Array
     position_mm: Array
+    line_mm: tuple[float, float]
+    diameter_mm: float
 
     @staticmethod
-    def of(follower: Follower, look: DotLook, marks: list[Mark], position_mm: Array) -> StripInImages:
+    def of(
+        follower: Follower, look: DotLook, kept: list[Mark], position_mm: Array
+    ) -> StripInImages:
+        """kept : at least one mark."""
+        marks = [*kept, *follower.brief(kept)]
+        across = [float(m.place_mm[1]) for m in kept]
         shift, starts = follower.shift_mm.copy(), [*follower.epoch_starts, len(position_mm)]
         for first, last in zip(starts[:-1], starts[1:]):
             part = shift[first:last]
@@ -52,6 +63,8 @@ class StripInImages:
             np.array(follower.epoch_starts, np.int64),
             np.nan_to_num(shift),
             position_mm,
+            (min(across), max(across)),
+            follower.diameter_mm,
         )
 
     def centres_px(self, frame: int) -> Array:
@@ -73,14 +86,21 @@ class StripInImages:
             _erase(out, centre, radius)
         return out
 
-    def are_dots(self, frame: int, uv_px: Array, diameter_px: Array) -> NDArray[np.bool_]:
-        """(n,) which bubbles, by their centres (n, 2) and diameters, are dots of the strip."""
-        centres = self.centres_px(frame)
-        if not len(centres) or not len(uv_px):
-            return np.zeros(len(uv_px), bool)
-        near = np.linalg.norm(uv_px[:, None] - centres, axis=-1).min(1)
-        reach = self.look.a_px + _PAD_PX
-        return np.asarray((near < reach) & (diameter_px < _LARGEST * 2 * self.look.a_px))
+    def are_dots(self, frame: int, bubbles: pd.DataFrame) -> NDArray[np.bool_]:
+        """(n,) which rows, columns as those of detections, are dots of the strip: by their place
+        and size, and those that the border cuts by the strip's line."""
+        uv = bubbles[["u_px", "v_px"]].to_numpy(float)
+        size, centres = bubbles["d_eq_px"].to_numpy(float), self.centres_px(frame)
+        if not len(uv):
+            return np.zeros(0, bool)
+        small = size < _LARGEST * 2 * self.look.a_px
+        apart = np.linalg.norm(uv[:, None] - centres, axis=-1)
+        near = apart.min(1, initial=np.inf) < self.look.a_px + _PAD_PX
+        across = self.view.lab_mm(uv, float(self.position_mm[frame])) - self.shift_mm[frame]
+        low, high = self.line_mm[0] - self.diameter_mm / 2, self.line_mm[1] + self.diameter_mm / 2
+        in_line = (across[:, 1] > low) & (across[:, 1] < high)
+        cut = bubbles["flags"].astype(str).str.contains("border").to_numpy(bool)
+        return np.asarray(small & (near | (cut & in_line)))
 
 
 def _erase(image: NDArray[Any], centre: Array, radius: float) -> None:

@@ -127,8 +127,25 @@ class Follower:
         moved : False where it never did, so that being seen often must do.
         """
         far = self.diameter_mm * self._scale if moved else 0.0
-        every = [*self.finished, *self.marks]
-        return [m for m in every if m.sightings >= _CONFIRM and m.travelled_px >= far]
+        return [
+            m
+            for m in [*self.finished, *self.marks]
+            if m.sightings >= _CONFIRM and (m.travelled_px >= far or _always_seen(m))
+        ]
+
+    def brief(self, kept: list[Mark]) -> list[Mark]:
+        """Dots in line with the kept marks, seen too rarely to be measured, but never missed: as
+        at a run's ends."""
+        if not kept:
+            return []
+        across = np.array([m.place_mm[1] for m in kept])
+        low, high = across.min() - self.diameter_mm / 2, across.max() + self.diameter_mm / 2
+        taken = {m.number for m in kept}
+        return [
+            m
+            for m in [*self.finished, *self.marks]
+            if m.number not in taken and low < m.place_mm[1] < high and _always_seen(m)
+        ]
 
     def _prediction(self, frame: int, place: Array, known: bool) -> tuple[Array, float]:
         """Shift (2,) mm expected now, and its standard deviation."""
@@ -258,7 +275,9 @@ class Follower:
     def _forget(self, frame: int) -> None:
         """Dots that were not where they had been seen: bubbles, dirt on the lens."""
         self.marks = [
-            m for m in self.marks if m.sightings >= _CONFIRM or frame - m.last_frame < _FORGET
+            m
+            for m in self.marks
+            if m.sightings >= _CONFIRM or _always_seen(m) or frame - m.last_frame < _FORGET
         ]
 
     def _count_missing(self, frame: int, seen: list[int], known: bool) -> None:
@@ -281,3 +300,7 @@ class Follower:
         self.marks = []
         self.epoch_starts.append(frame)
         self._speed, self._step_mm = np.zeros(2), None
+
+
+def _always_seen(mark: Mark) -> bool:
+    return not mark.left_out.get(HIDDEN)

@@ -27,5 +27,6 @@ html_show_copyright = False
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": False}
 autodoc_typehints = "signature"
+autodoc_use_type_comments = False
 toc_object_entries = False
 python_maximum_signature_line_length = 88

@@ -24,6 +24,7 @@ from telerig.scripts.track import track
 
 app = typer.Typer(
     no_args_is_help=True,
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="Telecentric stereo: self-calibration with a true covariance, bubbles tracked in space.",
 )

@@ -146,3 +146,15 @@ def test_pages_build_without_a_warning(tmp_path: Path) -> None:
     assert "telerig.smooth(" in api and "Raises InputError" in api
     cameras = (tmp_path / "text/_generated/reference/telerig.rig.txt").read_text(encoding="utf-8")
     assert "class telerig.rig.camera.Camera(" in cameras and "the rig frame" in cameras
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [("record", "[until Ctrl-C]"), ("batch", "[one per core]"), ("record", "[devices.NAME]")],
+)
+def test_help_keeps_what_stands_in_brackets(command: str, words: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "telerig.scripts.main", command, "--help"],
+        text=True, capture_output=True, timeout=60, env={**os.environ, "COLUMNS": "160"},
+    )  # fmt: skip
+    assert words in done.stdout

@@ -76,4 +76,8 @@ def load_tracks(folder: str | Path) -> Tracks:
             raise InputError(f"there is no {file.name}", where=str(place), todo="run telerig track")
     summary = json.loads(files[3].read_text(encoding="utf-8"))
     detections, table, events = (read_batch(file) for file in files[:3])
-    return Tracks(str(summary.get("run", place.name)), detections, table, events, summary)
+    marks = place / "references.csv"
+    references = read_batch(marks) if marks.is_file() else None
+    return Tracks(
+        str(summary.get("run", place.name)), detections, table, events, summary, references
+    )

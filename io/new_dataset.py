@@ -9,9 +9,10 @@ from string import Template
 
 from telerig.errors import InputError
 from telerig.io.atomic import write_text_atomic
-from telerig.io.rigfile import read_rig_toml
+from telerig.io.rigfile import description_from_toml
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
+_NOT_IN_TOML = re.compile(r'["\\\x00-\x1f\x7f]')
 
 
 def new_dataset(
@@ -35,12 +36,12 @@ def new_dataset(
     _check(cameras, image_size_px, scale_px_per_mm)
     template = (resources.files("telerig.io") / "rig_template.toml").read_text(encoding="utf-8")
     text = Template(template).substitute(
-        name=place.resolve().name.replace('"', ""), first=cameras[0], second=cameras[1],
+        name=_NOT_IN_TOML.sub("", place.resolve().name), first=cameras[0], second=cameras[1],
         width=image_size_px[0], height=image_size_px[1], scale=float(scale_px_per_mm),
         angle=float(angle_deg),
     )  # fmt: skip
+    description_from_toml(text, where=str(rig))
     write_text_atomic(rig, text)
-    read_rig_toml(rig)
     folders = [place / "calibration" / name for name in cameras] + [place / "runs"]
     for made in folders:
         made.mkdir(parents=True, exist_ok=True)

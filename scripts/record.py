@@ -52,7 +52,7 @@ def record(
         if ports:
             _list_ports()
             return
-        from telerig.io.recording.tables import write_tables
+        from telerig.io.recording.tables import refuse_existing, write_tables
         from telerig.scripts.record_display import recording_words
 
         if replay is not None:
@@ -60,6 +60,9 @@ def record(
             folder = replay / "recording.raw" if replay.is_dir() else replay
             done = write_tables(folder, out)
         else:
+            place = out or run
+            if place is not None:
+                refuse_existing(place)
             done = write_tables(_recorded(run, seconds, port or [], rig, quiet), out)
         say(recording_words(done))
 

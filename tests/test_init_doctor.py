@@ -60,6 +60,18 @@ def test_init_makes_a_rig_file_that_says_what_was_asked(tmp_path):
     assert (tmp_path / "tank" / "runs").is_dir()
 
 
+def test_init_of_a_folder_whose_name_toml_would_misread(tmp_path):
+    file, *_ = new_dataset(tmp_path / 'q\\uses "both"\nü')
+    assert read_rig_toml(file).name == "quses bothü"
+
+
+@pytest.mark.parametrize("option", ["--angle", "--scale"])
+def test_init_that_is_refused_leaves_nothing_in_the_way(tmp_path, option):
+    assert _asked("init", str(tmp_path / "tank"), option, "inf").exit_code == 2
+    assert not (tmp_path / "tank").exists()
+    assert _asked("init", str(tmp_path / "tank")).exit_code == 0
+
+
 def test_every_example_in_the_rig_file_can_be_switched_on(tmp_path):
     file, *_ = new_dataset(tmp_path / "tank")
     lines = file.read_text().splitlines()

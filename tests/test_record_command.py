@@ -138,6 +138,20 @@ def test_what_record_refuses(dataset: Path, tmp_path: Path) -> None:
     assert not folder.exists()
 
 
+@pytest.mark.parametrize("name", ["stage.csv", "accelerometer.csv", "frames.csv"])
+def test_tables_that_are_there_are_not_written_over(dataset: Path, name: str) -> None:
+    """As of a run whose images are there already, with the camera program's own times."""
+    folder = dataset / "runs" / "one"
+    folder.mkdir(parents=True)
+    (folder / name).write_text("precious")
+    assert "never written over" in run("record", folder, "--seconds", "0.2", code=2)
+    elsewhere = ("--seconds", "0.2", "--out", folder)
+    assert "never written over" in run("record", dataset / "runs" / "two", *elsewhere, code=2)
+    assert [p.name for p in folder.iterdir()] == [name]
+    assert (folder / name).read_text() == "precious"
+    assert not (dataset / "runs" / "two").exists()
+
+
 def test_ports_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("telerig.io.recording.ports.known_ports", lambda: ["/dev/ttyACM0 (Stage)"])
     assert run("record", "--ports") == "/dev/ttyACM0 (Stage) "

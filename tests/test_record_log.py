@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,18 @@ def test_what_is_no_log(tmp_path: Path, content: bytes, words: str) -> None:
         read_header(path)
     with pytest.raises(InputError, match="check the path"):
         read_header(tmp_path / "absent.raw")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"{}", b"[]", b"no JSON", b'{"start_ns":1,"started":"","cameras":[],"devices":[{"new":1}]}'],
+)
+def test_a_sound_header_of_another_version(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "x.raw"
+    length, crc = (n.to_bytes(4, "little") for n in (len(text), zlib.crc32(text)))
+    path.write_bytes(b"telerig recording 1\n" + length + text + crc)
+    with pytest.raises(InputError, match="does not know"):
+        read_header(path)
 
 
 def test_a_damaged_header(log: Path) -> None:

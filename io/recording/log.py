@@ -179,7 +179,15 @@ def _open(path: Path) -> tuple[LogHeader, int]:
         ) from error
     if len(crc) < _CRC.size or _CRC.unpack(crc)[0] != zlib.crc32(text):
         raise _no_log(path, "has a damaged header, so its devices are not known")
-    return _header(json.loads(text)), len(head) + length + _CRC.size
+    try:
+        header = _header(json.loads(text))
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"has a header that this telerig does not know ({error})",
+            where=str(path),
+            todo="replay it with the telerig that recorded it, or a newer one",
+        ) from error
+    return header, len(head) + length + _CRC.size
 
 
 def _no_log(path: Path, what: str) -> InputError:

@@ -56,6 +56,18 @@ def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = 
     return Recording(out, summary, rows)
 
 
+def refuse_existing(folder: str | PathLike[str]) -> None:
+    """Raise InputError where ``folder`` holds a table that a recording would replace."""
+    for name in (*(name for name, _ in _WRITERS.values()), "recording.json"):
+        file = Path(folder) / name
+        if file.exists():
+            raise InputError(
+                "exists, and a recording is never written over",
+                where=str(file),
+                todo="give the new run another name, or move this one away",
+            )
+
+
 def _stage(records: Sequence[DeviceRecord], _: FrameTimes) -> Iterator[str]:
     yield "t_s,position_mm\n"
     (record,) = records

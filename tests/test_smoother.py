@@ -305,6 +305,17 @@ def test_images_and_encoder_equal_the_dense_posterior(rng: np.random.Generator) 
     compare(problem(rng), MODEL)
 
 
+def test_a_bubble_unseen_from_its_first_frame_on_equals_the_dense_posterior(
+    rng: np.random.Generator,
+) -> None:
+    """As in a window of a run that begins while the bubble is hidden."""
+    given = problem(rng)
+    seen = given.observations
+    keep = ~((seen.item == 1) & (seen.frame <= 4))
+    parts = {name: getattr(seen, name)[keep] for name in vars(seen)}
+    compare(replace(given, observations=Observations(**parts)), MODEL)
+
+
 def test_references_equal_the_dense_posterior(rng: np.random.Generator) -> None:
     compare(problem(rng, marks=True), MODEL)
 

@@ -185,12 +185,29 @@ def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _
     graph = gtsam.GaussianFactorGraph()
     for linear in factors:
         add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
+    _add_bonds(graph, frame)
     net, solution = _eliminated(graph, frame)
     vector = solution.vector()
     if not np.all(np.isfinite(vector)):
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
     largest = _largest_shift_px(factors, frame, vector)
     return _Pass(net, vector, largest, _log_norm(frame, factors), 2 * graph.error(solution))
+
+
+def _add_bonds(graph: Any, frame: Frame) -> None:
+    """Empty factors between shake and bubbles where no image joins them.
+
+    Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
+    its first row on would share none.
+    """
+    size = frame.counts()[0][1]
+    seen = frame.row(frame.problem.observations.item, frame.problem.observations.frame)
+    alone = np.setdiff1d(np.arange(frame.rows), seen)
+    if not size or not len(alone):
+        return
+    keys = (frame.node_of_row[alone], frame.base()[1] + alone)
+    blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, frame.bubble.size))
+    add_linear_factors(graph, keys, blocks, np.zeros((len(alone), 1)))
 
 
 def _eliminated(graph: Any, frame: Frame) -> tuple[Any, Any]:

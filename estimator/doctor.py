@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from telerig.errors import TelerigError
+from telerig.estimator.batch.jobs import check_run_name
 from telerig.io.dataset import Dataset, load_dataset
 from telerig.io.doctor import Check
 
@@ -84,6 +85,7 @@ def _decoded(data: Dataset) -> Iterator[Check]:
 def _run(data: Dataset, name: str) -> Iterator[Check]:
     what = f"run {name}"
     try:
+        check_run_name(data.runs[name].path)
         run = data.runs[name].load(source=_source(data.runs[name].path))
     except TelerigError as error:
         yield _failure(what, error)

@@ -46,21 +46,24 @@ def batch(
     """
     with errors_in_words():
         from telerig.estimator.batch.batch import dask_executor, local_executor, run_batch
-        from telerig.estimator.batch.jobs import jobs_of, share_of
+        from telerig.estimator.batch.jobs import check_options, jobs_of, share_of
         from telerig.estimator.batch.journal import Journal
         from telerig.estimator.batch.summary import batch_words, write_batch
         from telerig.estimator.batch.work import DONE, summary_line
 
         def tell(job: Job, record: dict[str, Any], done: int, of: int) -> None:
-            say(f"[{done}/{of}] {summary_line(job, record)}")
+            say(f"[{done}/{of}] {summary_line(job, record, whole_path=alike)}")
 
         if scheduler is not None and workers is not None:
             raise InputError(
                 "both --workers and --scheduler", todo="a cluster has its own number of workers"
             )
         index, of = _share(share)
+        check_options(calibration, model)
         jobs = jobs_of(datasets, calibration=calibration, model=model, report=report)
         mine = share_of(jobs, index, of)
+        places = {job.dataset for job in mine}
+        alike = len({Path(place).name for place in places}) < len(places)
         given_out = local_executor(workers) if scheduler is None else dask_executor(scheduler)
         with given_out as executor:
             records = run_batch(mine, executor, Journal(out), told=None if quiet else tell)

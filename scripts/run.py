@@ -38,10 +38,11 @@ def run(
     used. 130: interrupted; the same command goes on.
     """
     with errors_in_words():
-        from telerig.estimator.batch.jobs import jobs_of
+        from telerig.estimator.batch.jobs import check_options, jobs_of
         from telerig.estimator.batch.summary import batch_words
-        from telerig.estimator.batch.work import DONE, LEFT_OUT, failure
+        from telerig.estimator.batch.work import DONE, FAILED, LEFT_OUT, failure
 
+        check_options(calibration, model)
         jobs = jobs_of([dataset], calibration=calibration, only=only or (), model=model,
                        report=report, strict=True)  # fmt: skip
         records: dict[str, dict[str, Any]] = {}
@@ -49,9 +50,11 @@ def run(
             lost = [n for n in job.needs if records[n]["status"] != DONE]
             result = failure(LEFT_OUT, f"needs {lost[0]}") if lost else _done(job, quiet)
             records[job.name] = {"kind": job.kind, "dataset": job.dataset, "run": job.run, **result}
-            if not lost:
+            if not lost and (not quiet or result["status"] != DONE):
                 say(result["words"])
-                say(f"written: {job.results}" + ("/report.html" if report else "") + "\n")
+                if result["status"] != FAILED:
+                    say(f"written: {job.results}" + ("/report.html" if report else ""))
+                say("")
         say(batch_words(list(records.values())))
         if any(r["status"] != DONE for r in records.values()):
             raise typer.Exit(EXIT_REJECTED)

@@ -41,12 +41,15 @@ def track(
     130: interrupted.
     """
     with errors_in_words():
+        from telerig.estimator.batch.jobs import check_run_name
         from telerig.estimator.track_calibration import calibration_for
         from telerig.estimator.track_results import write_tracking
         from telerig.estimator.track_run import TrackOptions
         from telerig.estimator.track_words import tracking_words
         from telerig.io.run import load_run
 
+        if out is None:
+            check_run_name(run)
         begun = time.perf_counter()
         calibrated, files = calibration_for(run, calibration)
         data = load_run(run, source=chosen_source(source), **cameras_without_rig(run, calibrated))

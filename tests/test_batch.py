@@ -17,6 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
+from telerig.estimator.batch import work
 from telerig.estimator.batch.batch import local_executor, run_batch
 from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
 from telerig.estimator.batch.journal import Journal
@@ -154,8 +155,6 @@ def test_a_process_that_is_killed_fails_alone_and_is_done_the_next_time(tmp_path
 
 
 def _kill_the_first_child() -> None:
-    from telerig.estimator.batch import work
-
     while not work._children:
         time.sleep(0.005)
     next(iter(work._children)).kill()
@@ -210,6 +209,8 @@ def test_a_folder_that_this_machine_does_not_see_is_named(tmp_path):
         (["{0}", "{0}"], "named twice"),
         (["{0}", "--share", "3/2"], "--share 3/2"),
         (["{0}", "--workers", "0"], "0 workers"),
+        (["{0}", "--model", "fisheye"], "--model fisheye"),
+        (["{0}", "--calibration", "nowhere.json"], "no such calibration"),
         (["{0}", "--workers", "2", "--scheduler", "tcp://x:1"], "both --workers and --scheduler"),
     ],
 )
@@ -225,7 +226,7 @@ def test_run_does_everything_for_one_dataset(tmp_path):
     data = _dataset(tmp_path / "data", 5)
     result = CliRunner().invoke(app, ["run", str(data), "--no-report", "--quiet"])
     assert result.exit_code == 0, result.output
-    assert "calibrate: 1 done\ntrack: 1 done\nsmooth: 1 done" in result.output
+    assert result.output == "calibrate: 1 done\ntrack: 1 done\nsmooth: 1 done\n"
     assert all((data / "results" / name).is_file() for name in RESULTS)
 
 
@@ -238,3 +239,82 @@ def test_run_refuses_an_unknown_run(datasets):
 def test_unknown_runs_are_an_error_of_the_library_too(datasets):
     with pytest.raises(InputError, match="fall"):
         jobs_of(datasets, only=["fall"])
+
+
+@pytest.mark.parametrize("command", ["run", "batch"])
+@pytest.mark.parametrize("option", ["--model", "--calibration"])
+def test_an_option_that_cannot_be_used_is_refused_before_work_begins(
+    tmp_path, monkeypatch, command, option
+):
+    monkeypatch.chdir(tmp_path)
+    data = _dataset(tmp_path / "data", 5)
+    result = CliRunner().invoke(app, [command, str(data), option, "nothing"])
+    assert result.exit_code == 2, result.output
+    assert not (data / "results").exists() and not (tmp_path / "telerig-batch").exists()
+
+
+def test_a_run_named_calibration_does_not_mix_with_the_calibration(tmp_path):
+    data = _dataset(tmp_path / "data", 5)
+    (data / "runs" / "rise").rename(data / "runs" / "calibration")
+    result = CliRunner().invoke(app, ["run", str(data), "--no-report", "--quiet"])
+    assert result.exit_code == 1, result.output
+    assert "track: 1 failed" in result.output and "rename the folder" in result.output
+    assert "written" not in result.output
+    assert not (data / "results" / "calibration" / "tracks.csv").exists()
+    alone = CliRunner().invoke(app, ["track", str(data / "runs" / "calibration")])
+    assert alone.exit_code == 2 and "rename the folder" in alone.output
+    seen = CliRunner().invoke(app, ["doctor", str(data)])
+    assert seen.exit_code == 1 and "rename the folder" in seen.output
+
+
+def test_an_input_that_changes_during_the_work_is_done_again(tmp_path, monkeypatch):
+    data = _dataset(tmp_path / "data", 5)
+    jobs = jobs_of([data])[:1]
+
+    def perform_slowly(job: Job) -> dict:
+        job.result.parent.mkdir(parents=True, exist_ok=True)
+        job.result.write_text("{}")
+        os.utime(data / "rig.toml", ns=(1, 1))
+        return {"status": "done", "words": "", "figures": {}}
+
+    monkeypatch.setattr("telerig.estimator.batch.batch.perform", perform_slowly)
+    resumed = []
+    for _ in range(3):
+        with ThreadPoolExecutor(1) as executor:
+            (record,) = run_batch(jobs, executor, Journal(tmp_path / "out"))
+        resumed.append(bool(record.get("resumed")))
+    assert resumed == [False, False, True]
+
+
+def test_datasets_of_the_same_name_are_told_apart(tmp_path):
+    places = [tmp_path / day / "tank" for day in ("monday", "tuesday")]
+    for place in places:
+        place.mkdir(parents=True)
+    given = [str(place) for place in places]
+    result = CliRunner().invoke(app, ["batch", *given, "--out", str(tmp_path / "out")])
+    assert result.exit_code == 1, result.output
+    told = [line for line in result.output.splitlines() if line.startswith("[")]
+    assert all(sum(place in line.split(": failed")[0] for line in told) == 1 for place in given)
+
+
+def test_an_interrupted_job_takes_its_temporary_files_away(tmp_path, monkeypatch):
+    """Ctrl-C of a batch while a job writes."""
+    script = (
+        "import sys, time; from pathlib import Path; from telerig.io.atomic import atomic_folder\n"
+        "with atomic_folder(Path(sys.argv[-1])) as beside:\n"
+        "    (beside / 'x').write_text('half'); time.sleep(60)\n"
+    )
+    out = tmp_path / "results"
+    begun = work.subprocess.Popen
+    monkeypatch.setattr(
+        work.subprocess, "Popen",
+        lambda _, **rest: begun([sys.executable, "-c", script, str(out)], **rest),
+    )  # fmt: skip
+    with pytest.raises(KeyboardInterrupt), local_executor(1) as executor:
+        executor.submit(perform, Job("calibrate", str(tmp_path)))
+        deadline = time.monotonic() + 20
+        while not list(tmp_path.glob(".results.*.part/x")):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from telerig.errors import InputError
-from telerig.estimator.batch.jobs import Job
+from telerig.estimator.batch.jobs import Job, fingerprint
 from telerig.estimator.batch.journal import Journal
 from telerig.estimator.batch.work import (
     CRASHED,
@@ -36,7 +36,7 @@ def run_batch(
     only those that need it: they are left out, and their record says because of which.
     """
     records: dict[str, dict[str, Any]] = {}
-    waiting, running = list(jobs), dict[Future[dict[str, Any]], Job]()
+    waiting, running = list(jobs), dict[Future[dict[str, Any]], tuple[Job, str]]()
 
     def keep(job: Job, record: dict[str, Any]) -> None:
         records[job.name] = record
@@ -49,13 +49,14 @@ def run_batch(
         for job in ready:
             settled = _settled(job, records, journal)
             if settled is None:
-                running[executor.submit(perform, job)] = job
+                inputs = fingerprint(job)
+                running[executor.submit(perform, job)] = job, inputs
             else:
                 keep(job, settled)
         if running and not (ready and any(_is_ready(j, records) for j in waiting)):
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job = running.pop(future)
-                keep(job, journal.write(job, _result(future)))
+                job, inputs = running.pop(future)
+                keep(job, journal.write(job, _result(future), inputs))
     return [records[job.name] for job in jobs]
 
 
@@ -70,7 +71,7 @@ def _settled(
     for needed in job.needs:
         if records[needed]["status"] != DONE:
             words = f"needs {needed}, which was {records[needed]['status']}"
-            return journal.write(job, failure(LEFT_OUT, words))
+            return journal.write(job, failure(LEFT_OUT, words), fingerprint(job))
     before = journal.done(job)
     return None if before is None else {**before, "resumed": True}
 

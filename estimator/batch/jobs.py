@@ -17,6 +17,8 @@ from telerig.io.dataset import load_dataset
 Kind = Literal["calibrate", "track", "smooth"]
 
 MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
+RESERVED = "calibration"
+"""results/calibration is the calibration's: no run can have this name."""
 _INPUTS = {"calibrate": ("calibration", "stage_axis")}
 
 
@@ -151,6 +153,29 @@ def share_of(jobs: Sequence[Job], index: int, of: int) -> list[Job]:
     places = list(dict.fromkeys(job.dataset for job in jobs))
     mine = set(places[index::of])
     return [job for job in jobs if job.dataset in mine]
+
+
+def check_run_name(run: Path) -> None:
+    """Raise InputError for a run whose results would mix with the calibration's."""
+    place = Path(run).resolve()
+    if place.name == RESERVED and place.parent.name == "runs":
+        raise InputError(
+            "a run of this name would write into the calibration's results",
+            where=str(run), todo="rename the folder",
+        )  # fmt: skip
+
+
+def check_options(calibration: Path | None, model: str) -> None:
+    """Raise InputError for a calibration that is not there, or an unknown lens model."""
+    from telerig.estimator.problem import MODELS
+
+    if calibration is not None and not Path(calibration).exists():
+        raise InputError(
+            "there is no such calibration", where=str(calibration),
+            todo="give the calibration.json that `telerig calibrate` wrote",
+        )  # fmt: skip
+    if model != "auto" and model not in MODELS:
+        raise InputError(f"--model {model}", todo=f"known: auto, {', '.join(MODELS)}")
 
 
 def fingerprint(job: Job) -> str:

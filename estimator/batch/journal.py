@@ -36,11 +36,14 @@ class Journal:
             return None
         return dict(content) if isinstance(content, dict) else None
 
-    def write(self, job: Job, result: Mapping[str, Any]) -> dict[str, Any]:
-        """Keep what came of the job; returns the record."""
+    def write(self, job: Job, result: Mapping[str, Any], inputs: str) -> dict[str, Any]:
+        """Keep what came of the job; returns the record.
+
+        inputs : `fingerprint` before it began, so that what changes meanwhile is done again.
+        """
         record = {
             "kind": job.kind, "dataset": job.dataset, "run": job.run, **result,
-            "fingerprint": fingerprint(job),
+            "fingerprint": inputs,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         }  # fmt: skip
         write_json_atomic(self.folder / f"{job.name}.json", record)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -16,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from telerig.estimator.batch.jobs import Job
+from telerig.estimator.batch.jobs import Job, check_run_name
 
 Stage = Callable[[str, int, int], None]
 
 DONE, REJECTED, FAILED, CRASHED, LEFT_OUT = "done", "rejected", "failed", "crashed", "left out"
 _LAST_WORDS = 2000
+_PATIENCE_S = 5.0
 _CHILD = "telerig.scripts.batch_job"
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -54,10 +56,23 @@ def allow() -> None:
 
 
 def stop_all() -> None:
-    """End the processes of `perform` in all threads; those not yet begun fail at once."""
+    """End the processes of `perform` in all threads; those not yet begun fail at once.
+
+    Each is interrupted as by Ctrl-C, so that it takes its temporary files away, and killed if it
+    has not ended after `_PATIENCE_S`.
+    """
     _stopped.set()
-    for child in list(_children):
-        child.kill()
+    ending = list(_children)
+    try:
+        for child in ending:
+            child.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + _PATIENCE_S
+        for child in ending:
+            with suppress(subprocess.TimeoutExpired):
+                child.wait(max(0.0, deadline - time.monotonic()))
+    finally:
+        for child in ending:
+            child.kill()
 
 
 def _outcome(job: Job) -> dict[str, Any]:
@@ -139,6 +154,7 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
 
     begun = time.perf_counter()
     run = Path(job.dataset) / "runs" / job.run
+    check_run_name(run)
     calibration, files = calibration_for(run, _given(job))
     record = {
         "command": "run", "options": {"min_diameter_px": job.min_diameter_px}, "inputs": files
@@ -181,9 +197,10 @@ def _given(job: Job) -> list[Path] | None:
     return [Path(job.calibration)] if job.calibration else None
 
 
-def summary_line(job: Job, result: Mapping[str, Any]) -> str:
-    """A job's end in one line."""
-    what = f"{job.kind} {Path(job.dataset).name}" + (f" {job.run}" if job.run else "")
+def summary_line(job: Job, result: Mapping[str, Any], *, whole_path: bool = False) -> str:
+    """A job's end in one line. whole_path : where datasets have the same name."""
+    place = job.dataset if whole_path else Path(job.dataset).name
+    what = f"{job.kind} {place}" + (f" {job.run}" if job.run else "")
     verdict = result["figures"].get("verdict")
     first = "" if result["status"] == DONE else f": {str(result['words']).splitlines()[0]}"
     how = "done before" if result.get("resumed") else result["status"]

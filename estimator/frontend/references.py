@@ -27,10 +27,11 @@ BORDER_PX = 1.5
 
 _FIRST_SIZE = (0.7, 1.35)
 _SIZE, _CONTRAST = 0.15, 0.25
-_MISFIT, _LEAST_MISFIT = 3.0, 2.0
+_MISFIT, _LEAST_MISFIT = 2.0, 1.0
 _LEAST_ROUND, _LEAST_CONTRAST = 0.5, 0.2
 _LEAST_FRAMES, _LEAST_SHARE = 3, 0.25
 _SYSTEMATIC_PX = 0.005
+_RING_TAIL, _RING_STEP = 0.1, 0.25
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
     parts = [np.zeros((0, len(_COLUMNS)))]
     for window in look.windows:
         found = _round_dots(image[window], look.polarity, look.diameter_px)
+        free = [_is_free(image[window], dot, look) for dot in found]
+        found = found[np.array(free, bool)]
         found[:, :2] += (window[1].start, window[0].start)
         parts.append(found)
     dots = np.concatenate(parts)
@@ -129,11 +132,29 @@ def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
     return DotSightings(kept[:, :2], np.hypot(sigma, _SYSTEMATIC_PX))
 
 
-_COLUMNS = ("u_px", "v_px", "suu_px2", "svv_px2", "a_px", "b_px", "contrast", "chi2_dof", "blur_px")
+_COLUMNS = (
+    *("u_px", "v_px", "suu_px2", "svv_px2", "a_px", "b_px", "contrast", "chi2_dof", "blur_px"),
+    *("inner_level", "outer_level"),
+)
+
+
+def _is_free(image: NDArray[Any], dot: Array, look: DotLook) -> bool:
+    """Whether the screen shows all round a dot: neither a bubble's rim nor its bright heart."""
+    u, v, inner, outer = dot[0], dot[1], dot[9], dot[10]
+    first = look.a_px + 3 * look.blur_px
+    last = first + max(3.0, 0.8 * look.a_px)
+    low = np.maximum(np.floor(np.array([u, v]) - last).astype(int), 0)
+    high = np.ceil(np.array([u, v]) + last).astype(int) + 1
+    window = image[low[1] : high[1], low[0] : high[0]]
+    rows, columns = np.indices(window.shape)
+    distance = np.hypot(columns + low[0] - u, rows + low[1] - v)
+    ring = window[(distance > first) & (distance < last)]
+    off = np.abs(np.quantile(ring, (_RING_TAIL, 1 - _RING_TAIL)) - outer)
+    return bool(ring.size > 0 and off.max() < _RING_STEP * abs(outer - inner))
 
 
 def _round_dots(image: NDArray[Any], polarity: Polarity, diameter_px: float) -> Array:
-    """(n, 9) _COLUMNS of the dots of about the right size."""
+    """(n, 11) _COLUMNS of the dots of about the right size."""
     low, high = (share * diameter_px for share in _FIRST_SIZE)
     if min(image.shape) < 8:
         return np.zeros((0, len(_COLUMNS)))

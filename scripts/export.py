@@ -69,6 +69,10 @@ def export(
             say(line)
 
 
+_TRAJECTORIES = ("trajectories.csv", "tracks.csv")
+_RESULTS = (*_TRAJECTORIES, "calibration.json")
+
+
 def _export(
     source: Path,
     to: str,
@@ -105,7 +109,7 @@ def _export(
 def results_root(source: Path) -> Path:
     """DATASET/results for a dataset, one of its results folders, or a file in one of them.
 
-    Raises InputError when there is nothing at ``source``.
+    Raises InputError when there is nothing at ``source``, or a folder of something else.
     """
     if not source.exists():
         raise InputError("there is no such dataset", where=str(source), todo="check the path")
@@ -114,7 +118,15 @@ def results_root(source: Path) -> Path:
         place = place.parent
     if (place / "rig.toml").is_file() or (place / "results").is_dir():
         return place / "results"
-    return place if place.name == "results" else place.parent
+    if place.name == "results":
+        return place
+    if source.is_dir() and not any((place / name).is_file() for name in _RESULTS):
+        raise InputError(
+            "is neither a dataset nor a folder of results",
+            where=str(source),
+            todo="give DATASET, or DATASET/results/NAME after `telerig track`",
+        )
+    return place.parent
 
 
 def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Sequence[Camera]:
@@ -145,7 +157,8 @@ def run_folder(source: Path, run: str | None) -> Path:
     """
 
     def holds(folder: Path) -> bool:
-        return any((folder / n).is_file() for n in ("trajectories.csv", "tracks.csv"))
+        files = (folder / name for name in _TRAJECTORIES)
+        return not folder.name.startswith(".") and any(file.is_file() for file in files)
 
     if run is None and holds(source):
         return source

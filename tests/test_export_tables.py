@@ -18,6 +18,7 @@ from telerig.io.export.results import LAB, RIG, RunResults, identifier, read_res
 from telerig.io.export.tables import write_hdf5, write_mat, write_trackpy
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
+from telerig.scripts.export import run_folder
 
 CAMERAS = (
     Camera.create("left", (512, 500), 10.0, k1=0.01),
@@ -210,3 +211,16 @@ def test_given_names_reach_the_export_unchanged(folder: Path, tmp_path: Path) ->
 def test_units_come_from_the_names() -> None:
     expected = {"svx_mm_s": "mm s-1", "sxx_mm2": "mm2", "left_u_px": "px", "frame": "1", "t_s": "s"}
     assert {name: unit_of(name) for name in expected} == expected
+
+
+def test_only_the_results_of_runs_are_taken_for_runs(folder: Path, tmp_path: Path) -> None:
+    """What an interrupted command left behind is none, and a wrong path finds nobody else's run."""
+    left_behind = folder.with_name(".rise.123-abc.part")
+    left_behind.mkdir()
+    write_table(table(), left_behind / "tracks.csv")
+    (tmp_path / "rig.toml").write_text("")
+    assert run_folder(tmp_path, None) == folder
+    elsewhere = folder.parent / "fall"
+    elsewhere.mkdir()
+    with pytest.raises(InputError, match="neither a dataset nor a folder of results"):
+        run_folder(elsewhere, None)

@@ -332,6 +332,16 @@ def test_two_frames_and_a_bubble_seen_once(run: Run) -> None:
     assert seen[-1] == 1.0
 
 
+def test_too_short_a_run_to_learn_from_is_not_said_to_be_still(run: Run) -> None:
+    """In 0.1 s a shake of 20 Hz shows two periods at most; the encoder alone cannot clear it."""
+    frames = int(0.1 * RATE_HZ)
+    few = run.tracks[run.tracks["frame"] < frames]
+    found = smooth(few, run.calibration, stage=run.stage, rig=RIG)
+    assert found.model.name == "default"
+    assert found.verdict["verdict"] == "UNRESOLVED"
+    assert "SHAKE_BELOW_NOISE" not in found.verdict["flags"]
+
+
 def test_offsets_without_tracks(run: Run) -> None:
     """Accelerometers and encoder alone, true modes: the left arm's shake at the asked times."""
     from dataclasses import replace

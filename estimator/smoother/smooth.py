@@ -43,6 +43,8 @@ Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _COARSE_STEP_S = 2e-3
 _ENCODER_SIGMA_MM = 0.005
+_LEAST_LEARNED_S = 0.2
+"""In less time a slow shake shows no period, and would be learned not to be there."""
 
 
 def smooth(
@@ -178,10 +180,17 @@ def choose_model(
     arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
     known = len(problem.references) > 0 or len(arms) == len(problem.cameras)
     learning = "telerig.estimator.shake_learning"
-    if model == "auto" and not known and problem.bubbles and find_spec(learning) is not None:
+    long_enough = _longest_s(problem) >= _LEAST_LEARNED_S
+    if model == "auto" and not known and long_enough and find_spec(learning) is not None:
         learned: ShakeModel = import_module(learning).learn(problem, default)
         return learned
     return default
+
+
+def _longest_s(problem: SmoothingProblem) -> float:
+    """Time from a bubble's first frame to its last, the longest; 0 without bubbles."""
+    t = problem.t_s
+    return max((float(t[b.last] - t[b.first]) for b in problem.bubbles), default=0.0)
 
 
 def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> Mapping[str, Any]:

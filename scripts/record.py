@@ -57,8 +57,10 @@ def record(
 
         if replay is not None:
             _alone(run, seconds, port)
-            folder = replay / "recording.raw" if replay.is_dir() else replay
-            done = write_tables(folder, out)
+            log = replay / "recording.raw" if replay.is_dir() else replay
+            if not ((out or log.parent) / "recording.json").exists():
+                refuse_existing(out or log.parent)
+            done = write_tables(log, out)
         else:
             place = out or run
             if place is not None:

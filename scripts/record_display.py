@@ -108,7 +108,10 @@ def _device_words(device: dict[str, Any]) -> Iterator[str]:
     if device["malformed"]:
         yield f"{device['malformed']} malformed"
     if device["unplugged"]:
-        yield f"unplugged {len(device['unplugged'])} times"
+        times = len(device["unplugged"])
+        yield "unplugged once" if times == 1 else f"unplugged {times} times"
+        if device["unplugged"][-1]["found_s"] is None:
+            yield "not plugged in again"
     for reason, count in device["left_out"].items():
         yield f"{count} left out ({reason})"
 

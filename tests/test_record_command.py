@@ -22,6 +22,7 @@ from telerig.io.recording.signals import SimulatedDevice
 from telerig.io.recording.simulators import SimulatedPorts, simulated_log
 from telerig.io.rigfile import description_from_toml, read_rig_toml, write_rig_toml
 from telerig.scripts.main import app
+from telerig.scripts.record_display import _device_words
 
 runner = CliRunner()
 
@@ -150,6 +151,27 @@ def test_tables_that_are_there_are_not_written_over(dataset: Path, name: str) ->
     assert [p.name for p in folder.iterdir()] == [name]
     assert (folder / name).read_text() == "precious"
     assert not (dataset / "runs" / "two").exists()
+
+
+def test_a_replay_replaces_nothing_but_tables_of_a_recording(dataset: Path) -> None:
+    run("record", dataset / "runs" / "one", "--seconds", "0.3", "--quiet")
+    other = dataset / "runs" / "other"
+    other.mkdir()
+    (other / "stage.csv").write_text("precious")
+    again = ("record", "--replay", dataset / "runs" / "one")
+    assert "never written over" in run(*again, "--out", other, code=2)
+    assert (other / "stage.csv").read_text() == "precious"
+    run(*again)
+    run(*again, "--out", dataset / "new")
+    run(*again, "--out", dataset / "new")
+
+
+def test_a_device_that_stays_away_is_told() -> None:
+    device = {
+        "readings": 3, "rate_hz": 1.0, "lost": 0, "malformed": 0, "left_out": {},
+        "unplugged": [{"lost_s": 2.0, "found_s": None}],
+    }  # fmt: skip
+    assert ", ".join(_device_words(device)).endswith("unplugged once, not plugged in again")
 
 
 def test_ports_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,6 +27,8 @@ from telerig.io.parallel import cores, ordered_map, quick_workers
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from telerig.estimator.track_detect import DetectionStore, Progress
     from telerig.io.rig_description import ReferencesDescription
     from telerig.io.run import RunData
@@ -57,6 +59,12 @@ class Followed:
     table: Path | None
     strips: Mapping[str, StripInImages]
     summary: Mapping[str, Any] = field(default_factory=dict)
+
+    def rows(self) -> pd.DataFrame | None:
+        """The table, read."""
+        import pandas as pd
+
+        return None if self.table is None else pd.read_csv(self.table, dtype={"camera": str})
 
 
 def wanted(run: RunData) -> ReferencesDescription | None:
@@ -104,7 +112,8 @@ def follow_references(
         if marks
     }
     summary = {
-        c.name: _summary(followers.get(c.name), kept.get(c.name, []), folder, names) for c in cameras
+        c.name: _summary(followers.get(c.name), kept.get(c.name, []), folder, names)
+        for c in cameras
     }
     return Followed(table, strips, {"cameras": summary, "words": _words(summary, run)})
 
@@ -265,8 +274,8 @@ def _summary(
             else:
                 others += 1
     left: dict[str, int] = {}
-    for mark in kept:
-        for why, count in mark.left_out.items():
+    for one in kept:
+        for why, count in one.left_out.items():
             left[why] = left.get(why, 0) + count
     return {
         "marks": len(kept),

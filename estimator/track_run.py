@@ -28,8 +28,8 @@ from telerig.estimator.track_detect import (
     fingerprint,
     make_scene,
 )
-from telerig.estimator.track_references import Followed, follow_references, wanted
 from telerig.estimator.track_link import Linked, Linker
+from telerig.estimator.track_references import Followed, follow_references, wanted
 from telerig.estimator.track_types import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracker import Tracker
 from telerig.estimator.tracks import Tracks, events_table
@@ -86,19 +86,13 @@ def track(
     with tempfile.TemporaryDirectory(prefix="telerig-") as work:
         stream = tracking_stream(run, calibration, Path(work) / "work", options, stage)
         parts = list(stream.rows)
-        marks = _references(stream.followed)
+        marks = None if stream.followed is None else stream.followed.rows()
     tables = [p.tracks for p in parts if len(p.tracks)] or [p.tracks for p in parts[:1]]
     joined = pd.concat(tables, ignore_index=True)
     detections = pd.concat([p.detections for p in parts], ignore_index=True)
     counts = count_rows(parts)
     summary = summary_of(run, stream, counts)
     return Tracks(run.name, detections, joined, events_table(stream.events), summary, marks)
-
-
-def _references(followed: Followed | None) -> pd.DataFrame | None:
-    if followed is None or followed.table is None:
-        return None
-    return pd.read_csv(followed.table, dtype={"camera": str})
 
 
 def tracking_stream(

@@ -40,7 +40,7 @@ class Tracks:
         return int(self.table["particle"].nunique())
 
     def save(self, folder: str | Path) -> None:
-        """Write detections.csv, tracks.csv, events.csv, tracking.json, and references.csv if any."""
+        """Write detections.csv, tracks.csv, events.csv, tracking.json; references.csv if any."""
         from telerig.io.atomic import write_json_atomic
         from telerig.io.tables import write_table
 

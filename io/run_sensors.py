@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from telerig.io.bubble_motion import accelerometer_readings
 from telerig.io.rig_description import CARRIAGE
-from telerig.io.run_presets import MARKS_AT, MARKS_JITTER
 from telerig.io.run_scene import AXIS_RIG, RunScene
 from telerig.io.run_strip import strip_places
+from telerig.io.strip_config import MARKS_AT, MARKS_JITTER
 
 if TYPE_CHECKING:
     import pandas as pd

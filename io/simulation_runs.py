@@ -185,7 +185,6 @@ class _Pictures:
             left_aligned=image.left_aligned,
         )
 
-
     def _marks(self, frame: int, index: int) -> list[Silhouette]:
         if not self.strips:
             return []

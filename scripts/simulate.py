@@ -113,7 +113,8 @@ def _with_strip(
     name: str, settings: SimulationConfig | RunConfig, dots: int | None, images: bool
 ) -> SimulationConfig | RunConfig:
     """In the images, or in `references.csv` where there are none."""
-    from telerig.io.run_presets import RunConfig, StripConfig
+    from telerig.io.run_presets import RunConfig
+    from telerig.io.strip_config import StripConfig
 
     if dots is None:
         return settings

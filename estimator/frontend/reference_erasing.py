@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,7 +51,7 @@ class StripInImages:
         marks = [*kept, *follower.brief(kept)]
         across = [float(m.place_mm[1]) for m in kept]
         shift, starts = follower.shift_mm.copy(), [*follower.epoch_starts, len(position_mm)]
-        for first, last in zip(starts[:-1], starts[1:]):
+        for first, last in pairwise(starts):
             part = shift[first:last]
             known = np.flatnonzero(np.isfinite(part[:, 0]))
             for axis in (0, 1) if known.size else ():

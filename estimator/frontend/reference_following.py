@@ -207,9 +207,7 @@ class Follower:
         nearest, back = distance.argmin(1), distance.argmin(0)
         limit = 3 * _TOLERANCE * self.diameter_mm
         return [
-            (i, int(k))
-            for i, k in enumerate(nearest)
-            if back[k] == i and distance[i, k] < limit
+            (i, int(k)) for i, k in enumerate(nearest) if back[k] == i and distance[i, k] < limit
         ]
 
     def _learn(self, leap: Array, sd: float) -> None:
@@ -263,9 +261,7 @@ class Follower:
         out = []
         for i in chosen:
             uv = dots.uv_px[i]
-            mark = Mark(
-                self._number, place[i], len(self.epoch_starts) - 1, frame, frame, uv, uv, 1
-            )
+            mark = Mark(self._number, place[i], len(self.epoch_starts) - 1, frame, frame, uv, uv, 1)
             self.marks.append(mark)
             out.append((i, mark.number))
             self._number += 1

@@ -182,9 +182,7 @@ def _bands(seen: Array, across: Array, diameter_px: float) -> list[NDArray[np.in
     least = min(_LEAST_FRAMES, int(seen[:, 0].max()) + 1)
     enough = max(least, _LEAST_SHARE * max(frames))
     counts = [len(g) for g in groups]
-    return [
-        g for g, f, n in zip(groups, frames, counts) if f >= enough and n >= 0.2 * max(counts)
-    ]
+    return [g for g, f, n in zip(groups, frames, counts) if f >= enough and n >= 0.2 * max(counts)]
 
 
 def _window(place: Array, across: Array, diameter_px: float, shape: Sequence[int]) -> Window:

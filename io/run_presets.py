@@ -162,10 +162,7 @@ class TableConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """A run and the calibration that goes with it; ``bubbles`` are in view at a time.
-
-    strip : None for no dots in the images; see `TableConfig.references` for runs without images.
-    """
+    """A run and its calibration; ``bubbles`` in view at a time; ``strip`` drawn into images."""
 
     name: str
     calibration: SimulationConfig

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ import pytest
 from telerig.estimator.calibrate import nominal_cameras
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.self_calibration import self_calibrate
+from telerig.io import parallel
 from telerig.io.simulation import exact_dots, rig_description
 from telerig.io.simulation_presets import SimulationConfig, preset
 from telerig.io.simulation_scene import View, hand_held_views, true_cameras, true_target
@@ -22,6 +24,10 @@ from telerig.rig.camera import Camera
 from telerig.rig.target import Target
 
 HALF_VOLUME_MM = 15.0
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # a worker of xdist has a thread that `threading` does not count: a copy of it can hang
+    parallel.can_fork = lambda: False
 
 
 def rigidly_aligned(points: Any, onto: Any) -> Any:

@@ -1,9 +1,9 @@
 """Work over the cores: order, errors, interrupts."""
 
+import math
 import os
 import signal
 import threading
-import time
 
 import pytest
 
@@ -11,11 +11,6 @@ from telerig.io import parallel
 from telerig.io.parallel import cores, ordered_map, quick_workers
 
 forks = pytest.mark.skipif(not parallel.can_fork(), reason="needs a system that can fork")
-
-
-def _slow_square(number: int) -> int:
-    time.sleep(0.02 * (number % 3))
-    return number * number
 
 
 def _fail_at_three(number: int) -> int:
@@ -31,7 +26,8 @@ def _interrupted(_: int) -> str:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_the_order_of_the_tasks(workers):
-    assert list(ordered_map(_slow_square, range(9), workers)) == [n * n for n in range(9)]
+    tasks = [3000, 1, 2000, 2, 1000, 3]
+    assert list(ordered_map(math.factorial, tasks, workers)) == [math.factorial(n) for n in tasks]
 
 
 @forks

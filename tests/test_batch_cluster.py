@@ -16,6 +16,8 @@ from telerig.estimator.batch.jobs import jobs_of
 from telerig.estimator.batch.journal import Journal
 from telerig.io.simulation import simulate
 
+pytestmark = pytest.mark.slow
+
 distributed = pytest.importorskip(
     "distributed", reason="the extra 'cluster' is not installed: pip install 'telerig[cluster]'"
 )

@@ -72,6 +72,7 @@ def measured_pixels(folder: Path) -> dict[str, object]:
     return {"uv_left_px": pixels[0], "uv_right_px": pixels[1]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_run(
     page: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -128,6 +129,7 @@ def test_output_is_compared() -> None:
         docs_pages.check_output(block, "read: 12 mm\n")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     find_spec("sphinx") is None or find_spec("myst_parser") is None or find_spec("furo") is None,
     reason="the extra 'docs' is not installed: pip install 'telerig[docs]'",

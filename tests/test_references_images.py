@@ -38,6 +38,8 @@ from telerig.io.strip_config import StripConfig
 from telerig.rig.camera import Camera
 from telerig.scripts.main import app
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 UP = np.array([0.0, -1.0, 0.0])

@@ -26,6 +26,8 @@ from telerig.io.report.batch_report import write_batch_report
 from telerig.io.report.remake import results_folders
 from telerig.scripts.main import app
 
+pytestmark = pytest.mark.slow
+
 browser = pytest.mark.skipif(BROWSER is None, reason="no chromium or chrome here")
 PAGES = ("calibration", "rise", "batch")
 

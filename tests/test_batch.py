@@ -137,6 +137,7 @@ def test_a_failure_stops_only_what_needs_it(tmp_path, datasets):
     assert "What failed" in page and "dots.csv" in page
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_fails_alone_and_is_done_the_next_time(tmp_path):
     """The work's process dies as when the system runs out of memory."""
     data = _dataset(tmp_path / "data", 3)
@@ -160,6 +161,7 @@ def _kill_the_first_child() -> None:
     next(iter(work._children)).kill()
 
 
+@pytest.mark.slow
 def test_a_job_ends_with_the_process_that_asked_for_it(tmp_path):
     data = _dataset(tmp_path / "data", 4)
     (job, *_) = jobs_of([data])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import _thread
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -22,7 +23,11 @@ _PATIENCE_S = 10.0
 
 
 def main() -> None:
-    """Do the job that is asked for. What other code prints goes to standard error."""
+    """Do the job that is asked for. What other code prints goes to standard error.
+
+    A batch begun in the background of a shell hands down that Ctrl-C is ignored: heard here again.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     answer = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     job = Job.from_json(sys.stdin.readline())

@@ -137,7 +137,6 @@ def test_a_failure_stops_only_what_needs_it(tmp_path, datasets):
     assert "What failed" in page and "dots.csv" in page
 
 
-@pytest.mark.slow
 def test_a_process_that_is_killed_fails_alone_and_is_done_the_next_time(tmp_path):
     """The work's process dies as when the system runs out of memory."""
     data = _dataset(tmp_path / "data", 3)
@@ -161,7 +160,6 @@ def _kill_the_first_child() -> None:
     next(iter(work._children)).kill()
 
 
-@pytest.mark.slow
 def test_a_job_ends_with_the_process_that_asked_for_it(tmp_path):
     data = _dataset(tmp_path / "data", 4)
     (job, *_) = jobs_of([data])
@@ -299,12 +297,16 @@ def test_datasets_of_the_same_name_are_told_apart(tmp_path):
     assert all(sum(place in line.split(": failed")[0] for line in told) == 1 for place in given)
 
 
-def test_an_interrupted_job_takes_its_temporary_files_away(tmp_path, monkeypatch):
-    """Ctrl-C of a batch while a job writes."""
+@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN])
+def test_an_interrupted_job_takes_its_temporary_files_away(tmp_path, monkeypatch, handler):
+    """Ctrl-C of a batch while a job writes; a shell's background work inherits SIG_IGN."""
     script = (
         "import sys, time; from pathlib import Path; from telerig.io.atomic import atomic_folder\n"
-        "with atomic_folder(Path(sys.argv[-1])) as beside:\n"
-        "    (beside / 'x').write_text('half'); time.sleep(60)\n"
+        "from telerig.scripts import batch_job\n"
+        "def write(job):\n"
+        "    with atomic_folder(Path(sys.argv[-1])) as beside:\n"
+        "        (beside / 'x').write_text('half'); time.sleep(60)\n"
+        "batch_job.do_job = write; batch_job.main()\n"
     )
     out = tmp_path / "results"
     begun = work.subprocess.Popen
@@ -312,11 +314,15 @@ def test_an_interrupted_job_takes_its_temporary_files_away(tmp_path, monkeypatch
         work.subprocess, "Popen",
         lambda _, **rest: begun([sys.executable, "-c", script, str(out)], **rest),
     )  # fmt: skip
-    with pytest.raises(KeyboardInterrupt), local_executor(1) as executor:
-        executor.submit(perform, Job("calibrate", str(tmp_path)))
-        deadline = time.monotonic() + 20
-        while not list(tmp_path.glob(".results.*.part/x")):
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        raise KeyboardInterrupt
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), local_executor(1) as executor:
+            executor.submit(perform, Job("calibrate", str(tmp_path)))
+            deadline = time.monotonic() + 20
+            while not list(tmp_path.glob(".results.*.part/x")):
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            raise KeyboardInterrupt
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert list(tmp_path.iterdir()) == []

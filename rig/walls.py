@@ -1,0 +1,286 @@
+"""Plane glass between a camera and the water, and what it does to rays.
+
+The wall stands in the camera's frame: its near face meets the camera's axis at ``distance_mm``.
+With d the unit direction of a ray in air, c = n.d and T = d - c n its part along the wall, Snell
+keeps that part but for the ratio of the indices: per mm of travel along n the ray moves sideways
+by T m / sqrt(1 - m^2 T.T), m = n_air / n_medium (Born and Wolf, Principles of Optics, 1.5). A
+point X in water, h = n.X - far face, lies on the ray that enters the glass at H when
+
+    X = H + (thickness + h) n + A T,   A = thickness m_g / sqrt(...) + h m_w / sqrt(...).
+
+For kappa = 0 all rays share T and this is an affine map in closed form; otherwise it is solved for
+the ray. Points before the wall are taken as if the water reached there, which is what the affine
+map means by them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import GeometryError
+
+Array = NDArray[np.float64]
+
+_STEPS = 60
+_WEAK = 1e-3
+"""kappa times distance below which the affine map is start enough."""
+
+
+@dataclass(frozen=True)
+class Wall:
+    """normal : (3,) unit vector in the camera's frame, away from the camera (z > 0).
+
+    distance_mm : where the camera's axis meets the near face, negative before the camera's origin.
+    indices : of the medium on the camera's side, the glass, and the medium behind it.
+    """
+
+    normal: Array
+    distance_mm: float
+    thickness_mm: float
+    indices: tuple[float, float, float]
+
+    @property
+    def ratios(self) -> tuple[float, float]:
+        """Index of the camera's side over that of the glass, and over that behind it."""
+        return self.indices[0] / self.indices[1], self.indices[0] / self.indices[2]
+
+    @property
+    def near_mm(self) -> float:
+        """n.X of the near face."""
+        return float(self.normal[2] * self.distance_mm)
+
+    def turned(self, tangent: Array) -> Wall:
+        """The normal moved by ``tangent_basis(normal) @ tangent`` (rad) and made unit again."""
+        normal = self.normal + tangent_basis(self.normal) @ np.asarray(tangent, float)
+        return replace(self, normal=normal / np.linalg.norm(normal))
+
+
+@dataclass(frozen=True)
+class IdealPrediction:
+    """value : (..., 2) telecentric coordinates at depth 0 (mm) of the air ray, and derivatives.
+
+    by_point : (..., 2, 3).  by_kappa : (..., 2).  by_wall : (..., 2, 3) by the two tangents of
+    `Wall.turned` and by the distance.
+    """
+
+    value: Array
+    by_point: Array
+    by_kappa: Array
+    by_wall: Array
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays in air, (..., 3) unless said: entry on the near face, unnormalised direction, T.
+
+    along : (...,) n . unit direction.  spread, slope : A of the module's text, and dA / d(T.T).
+    water : m_w / sqrt(1 - m_w^2 T.T).
+    """
+
+    entry: Array
+    direction: Array
+    along: Array
+    tangential: Array
+    spread: Array
+    slope: Array
+    water: Array
+    reached: Array
+
+
+def tangent_basis(normal: Array) -> Array:
+    """(3, 2) orthonormal vectors along the wall, near the camera's x and y for a facing wall."""
+    x, y, z = normal
+    f = 1 / (1 + z)
+    return np.array([[1 - f * x * x, -f * x * y], [-f * x * y, 1 - f * y * y], [-x, -y]])
+
+
+def affine_map(wall: Wall) -> tuple[Array, Array]:
+    """(2, 3) matrix and (2,) offset: telecentric coordinates (kappa = 0) of a point in water."""
+    tangential = _tangential_of_axis(wall)
+    glass, water = (_sideways(m, 1 - wall.normal[2] ** 2) for m in wall.ratios)
+    by_height = (wall.normal + water * tangential)[:2]
+    by_thickness = (wall.normal + glass * tangential)[:2]
+    matrix = np.eye(2, 3) - np.outer(by_height, wall.normal)
+    offset = (wall.near_mm + wall.thickness_mm) * by_height - wall.thickness_mm * by_thickness
+    return matrix, offset
+
+
+def ideal_from_water(points_mm: Array, kappa: float, wall: Wall) -> Array:
+    """(..., 3) points in water, camera frame -> (..., 2) where their air rays cross depth 0.
+
+    Raises GeometryError for points that no ray of the camera reaches.
+    """
+    matrix, offset = affine_map(wall)
+    ideal = points_mm @ matrix.T + offset
+    if kappa == 0:
+        return np.asarray(ideal)
+    if abs(kappa) * np.max(np.linalg.norm(points_mm, axis=-1), initial=0.0) > _WEAK:
+        ideal = _start(points_mm, kappa, wall)
+    for _ in range(_STEPS):
+        rays = _refract(ideal, points_mm, kappa, wall)
+        by_ideal, _ = _ray_jacobians(ideal, rays, kappa, wall)
+        miss = (rays.reached - points_mm)[..., :2]
+        step = np.linalg.solve(by_ideal[..., :2, :], miss[..., None])[..., 0]
+        ideal = ideal - step
+        size = np.abs(step).max(initial=0.0)
+        if not size > 1e-12 * max(1.0, np.abs(ideal).max(initial=0.0)):
+            break
+    if not np.all(np.isfinite(ideal)) or size > 1e-9 * max(1.0, np.abs(ideal).max(initial=0.0)):
+        raise _unreached()
+    return np.asarray(ideal)
+
+
+def ideal_jacobians(points_mm: Array, kappa: float, wall: Wall) -> IdealPrediction:
+    """`ideal_from_water` with its derivatives, by the implicit function theorem."""
+    ideal = ideal_from_water(points_mm, kappa, wall)
+    rays = _refract(ideal, points_mm, kappa, wall)
+    by_ideal, by_kappa = _ray_jacobians(ideal, rays, kappa, wall)
+    by_point = (wall.normal + rays.water[..., None] * rays.tangential)[..., None] * wall.normal
+    by_point = by_point - np.eye(3)
+    by_wall = _wall_jacobian(rays, points_mm, wall)
+    moved = np.concatenate([by_point, by_kappa[..., None], by_wall], -1)[..., :2, :]
+    gain = -np.linalg.solve(by_ideal[..., :2, :], moved)
+    return IdealPrediction(ideal, gain[..., :3], gain[..., 3], gain[..., 4:])
+
+
+def water_from_ideal(ideal_mm: Array, kappa: float, wall: Wall) -> tuple[Array, Array]:
+    """(..., 2) telecentric coordinates at depth 0 -> rays in water, camera frame.
+
+    (..., 3) origins, where the ray drawn on backwards crosses depth 0, and (..., 3) unit
+    directions. Raises GeometryError for total reflection and rays that never meet the wall.
+    """
+    entry, direction, along = _enter(ideal_mm, kappa, wall)
+    tangential = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    tangential = tangential - along[..., None] * wall.normal
+    tau = (tangential**2).sum(-1)
+    to_glass, to_water = wall.ratios
+    glass = _sideways(to_glass, tau)[..., None]
+    leaving = entry + wall.thickness_mm * (wall.normal + glass * tangential)
+    straight = np.sqrt(1 - to_water**2 * tau)[..., None]
+    bent = to_water * tangential + straight * wall.normal
+    return np.asarray(leaving - (leaving[..., 2:] / bent[..., 2:]) * bent), bent
+
+
+def _sideways(ratio: float, tau: Array) -> Array:
+    """m / sqrt(1 - m^2 T.T). Raises GeometryError for total reflection."""
+    inside = 1 - ratio**2 * np.asarray(tau)
+    if not np.all(inside > 0):
+        raise GeometryError(
+            "a ray is totally reflected at the glass wall",
+            todo="check the normal and the order of the indices: camera's side, glass, behind",
+        )
+    return np.asarray(ratio / np.sqrt(inside))
+
+
+def _tangential_of_axis(wall: Wall) -> Array:
+    return np.asarray(np.array([0.0, 0.0, 1.0]) - wall.normal[2] * wall.normal)
+
+
+def _enter(ideal: Array, kappa: float, wall: Wall) -> tuple[Array, Array, Array]:
+    """Entry points on the near face, directions (kappa x, kappa y, 1), n . unit direction."""
+    shape = (*ideal.shape[:-1], 1)
+    direction = np.concatenate([kappa * ideal, np.ones(shape)], -1)
+    origin = np.concatenate([ideal, np.zeros(shape)], -1)
+    normal_part = direction @ wall.normal
+    if not np.all(normal_part > 0):
+        raise _unreached()
+    travel = (wall.near_mm - origin @ wall.normal) / normal_part
+    length = np.linalg.norm(direction, axis=-1)
+    return origin + travel[..., None] * direction, direction, normal_part / length
+
+
+def _refract(ideal: Array, points: Array, kappa: float, wall: Wall) -> _Rays:
+    """The rays and where they reach the height of the points above the wall."""
+    entry, direction, along = _enter(ideal, kappa, wall)
+    unit = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    tangential = unit - along[..., None] * wall.normal
+    tau = (tangential**2).sum(-1)
+    height = points @ wall.normal - wall.near_mm - wall.thickness_mm
+    glass, water = (_sideways(m, tau) for m in wall.ratios)
+    spread = wall.thickness_mm * glass + height * water
+    slope = (wall.thickness_mm * glass**3 + height * water**3) / 2
+    reached = entry + (wall.thickness_mm + height)[..., None] * wall.normal
+    reached = reached + spread[..., None] * tangential
+    return _Rays(entry, direction, along, tangential, spread, slope, water, reached)
+
+
+def _ray_jacobians(ideal: Array, rays: _Rays, kappa: float, wall: Wall) -> tuple[Array, Array]:
+    """(..., 3, 2) and (..., 3): the reached point by the telecentric coordinates and by kappa."""
+    normal, length = wall.normal, np.linalg.norm(rays.direction, axis=-1)
+    unit = rays.direction / length[..., None]
+    along_ray = np.eye(3) - unit[..., None] * normal / rays.along[..., None, None]
+    tangential = rays.tangential
+    by_unit = rays.spread[..., None, None] * (np.eye(3) - np.outer(normal, normal))
+    by_unit = by_unit + (2 * rays.slope)[..., None, None] * (
+        tangential[..., :, None] * tangential[..., None, :]
+    )
+    unit_by_direction = np.eye(3) - unit[..., :, None] * unit[..., None, :]
+    by_direction = rays.entry[..., 2, None, None] * along_ray
+    by_direction = by_direction + by_unit @ unit_by_direction / length[..., None, None]
+    by_ideal = along_ray[..., :2] + kappa * by_direction[..., :2]
+    return by_ideal, np.einsum("...ij,...j->...i", by_direction[..., :2], ideal)
+
+
+def _wall_jacobian(rays: _Rays, points: Array, wall: Wall) -> Array:
+    """(..., 3, 3): reached point minus point, by the normal's two tangents and the distance."""
+    normal, basis = wall.normal, tangent_basis(wall.normal)
+    unit = rays.direction / np.linalg.norm(rays.direction, axis=-1, keepdims=True)
+    near = wall.distance_mm * basis[2]
+    height = points @ basis - near
+    travel = (near - rays.entry @ basis) / rays.along[..., None]
+    along = unit @ basis
+    grown = -2 * rays.slope[..., None] * rays.along[..., None] * along
+    grown = grown + rays.water[..., None] * height
+    turned = along[..., None, :] * normal[:, None] + rays.along[..., None, None] * basis
+    by_normal = (
+        unit[..., :, None] * travel[..., None, :]
+        + normal[:, None] * height[..., None, :]
+        + (points @ normal - wall.near_mm)[..., None, None] * basis
+        + rays.tangential[..., :, None] * grown[..., None, :]
+        - rays.spread[..., None, None] * turned
+    )
+    by_near = unit / rays.along[..., None] - normal - rays.water[..., None] * rays.tangential
+    return np.concatenate([by_normal, normal[2] * by_near[..., None]], -1)
+
+
+def _start(points: Array, kappa: float, wall: Wall) -> Array:
+    """Rays by Newton in the plane through the perspective centre, the point and the normal.
+
+    With q the tangent of incidence, kappa times the point's distance from the normal through the
+    centre is D q + kappa (thickness tan(glass) + h tan(water)), D = n_z + kappa near: increasing,
+    and concave (kappa > 0) or convex (kappa < 0), so that Newton from q = 0 cannot fail.
+    """
+    normal = wall.normal
+    depth = normal[2] + kappa * wall.near_mm
+    height = points @ normal - wall.near_mm - wall.thickness_mm
+    away = kappa * (points - (points @ normal)[..., None] * normal) + _tangential_of_axis(wall)
+    radius = np.linalg.norm(away, axis=-1)
+    weights = ((wall.ratios[0], kappa * wall.thickness_mm), (wall.ratios[1], kappa * height))
+    q = np.zeros_like(radius)
+    for _ in range(_STEPS):
+        value, slope = depth * q - radius, np.full_like(q, depth)
+        for ratio, weight in weights:
+            inside = 1 + q**2 * (1 - ratio**2)
+            value = value + weight * ratio * q / np.sqrt(inside)
+            slope = slope + weight * ratio / inside**1.5
+        if not np.all(slope > 0):
+            raise _unreached()
+        step = value / slope
+        q = q - step
+        if np.abs(step).max(initial=0.0) < 1e-9:
+            break
+    aside = away / np.where(radius > 0, radius, 1.0)[..., None]
+    direction = normal + q[..., None] * aside
+    if not np.all(direction[..., 2] > 0):
+        raise _unreached()
+    return np.asarray(direction[..., :2] / direction[..., 2:] / kappa)
+
+
+def _unreached() -> GeometryError:
+    return GeometryError(
+        "a point behind a glass wall is out of the camera's reach",
+        todo="check the wall's distance_mm and normal, and keep to points in front of the camera",
+    )

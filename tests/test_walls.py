@@ -1,0 +1,170 @@
+"""Rays through plane glass: against an independent tracer, Snell's law, and numerical slopes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent))
+from ray_tracer import trace_pixels
+
+from telerig.errors import GeometryError
+from telerig.rig import projection, walls
+from telerig.rig.camera import Camera
+from telerig.rig.walls import Wall
+
+Array = NDArray[np.float64]
+
+WALLS = {
+    "facing": ((0.0, 0.0, 1.0), -70.0, (1.0, 1.52, 1.333)),
+    "1 deg": ((np.sin(np.radians(1)), 0.0, np.cos(np.radians(1))), -70.0, (1.0, 1.52, 1.333)),
+    "25 deg": ((-0.25, 0.34, 0.9), -60.0, (1.0, 1.46, 1.35)),
+    "into air": ((0.1, 0.05, 1.0), -60.0, (1.333, 1.5, 1.0)),
+}
+KAPPAS = (0.0, 1e-9, 2e-5, -3e-5, 1e-3, 1 / 150, -1 / 200)
+
+
+def wall_named(name: str) -> Wall:
+    normal, distance, indices = WALLS[name]
+    return Wall(np.array(normal) / np.linalg.norm(normal), distance, 12.0, indices)
+
+
+def water_points(rng: np.random.Generator, shape: tuple[int, ...] = (12,)) -> Array:
+    return rng.uniform(-25, 25, (*shape, 3))
+
+
+def differences(function: Callable[[Array], Array], at: Array, step: float) -> Array:
+    """Fourth-order central differences, last axis of the result the variable."""
+    columns = []
+    for direction in np.eye(len(at)) * step:
+        near = function(at + direction) - function(at - direction)
+        far = function(at + 2 * direction) - function(at - 2 * direction)
+        columns.append((8 * near - far) / (12 * step))
+    return np.stack(columns, -1)
+
+
+@pytest.mark.parametrize("kappa", KAPPAS)
+@pytest.mark.parametrize("name", WALLS)
+def test_pixels_are_those_of_the_independent_tracer(name: str, kappa: float) -> None:
+    wall, points = wall_named(name), water_points(np.random.default_rng(1), (6,))
+    lens = {"kappa_per_mm": kappa, "k1": 2e-3, "p1": -4e-4, "tilt_x": 0.01, "aspect": 1.001}
+    camera = Camera.create("left", (800, 600), 16.0, **lens)
+    ideal = walls.ideal_from_water(points, kappa, wall)
+    in_air = np.concatenate([ideal, np.zeros((len(ideal), 1))], -1)
+    uv = projection.pixel_from_camera(in_air, camera.intrinsics, camera.rho_mm)
+    traced = trace_pixels(
+        lens | {"scale_px_per_mm": 16.0, "rho_mm": camera.rho_mm, "centre_px": (399.5, 299.5)},
+        {
+            "normal": wall.normal, "distance_mm": wall.distance_mm,
+            "thickness_mm": wall.thickness_mm, "indices": wall.indices,
+        },
+        points, "snell",
+    )  # fmt: skip
+    np.testing.assert_allclose(uv, traced, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kappa", KAPPAS)
+@pytest.mark.parametrize("name", WALLS)
+def test_the_ray_of_an_image_goes_through_its_point(name: str, kappa: float) -> None:
+    wall, points = wall_named(name), water_points(np.random.default_rng(2), (3, 5))
+    ideal = walls.ideal_from_water(points, kappa, wall)
+    assert ideal.shape == (3, 5, 2)
+    origin, direction = walls.water_from_ideal(ideal, kappa, wall)
+    between = points - origin
+    off = between - np.sum(between * direction, -1, keepdims=True) * direction
+    assert np.abs(off).max() < 1e-10
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, rtol=1e-14)
+    assert np.abs(origin[..., 2]).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_rays_in_water_obey_snells_law(name: str) -> None:
+    wall, kappa = wall_named(name), 1 / 150
+    ideal = np.random.default_rng(3).uniform(-25, 25, (9, 2))
+    in_air = np.concatenate([kappa * ideal, np.ones((9, 1))], -1)
+    in_air /= np.linalg.norm(in_air, axis=-1, keepdims=True)
+    _, in_water = walls.water_from_ideal(ideal, kappa, wall)
+    before = wall.indices[0] * np.cross(in_air, wall.normal)
+    np.testing.assert_allclose(
+        wall.indices[2] * np.cross(in_water, wall.normal), before, atol=1e-14
+    )
+    assert np.all(in_water @ wall.normal > 0)
+
+
+def test_equal_indices_are_no_wall() -> None:
+    wall = replace(wall_named("25 deg"), indices=(1.333, 1.333, 1.333))
+    points = water_points(np.random.default_rng(4))
+    for kappa in KAPPAS:
+        expected = points[:, :2] / (1 + kappa * points[:, 2:])
+        np.testing.assert_allclose(
+            walls.ideal_from_water(points, kappa, wall), expected, atol=1e-12
+        )
+
+
+def test_the_affine_map_is_that_of_all_points_and_a_facing_wall_does_nothing() -> None:
+    points = water_points(np.random.default_rng(5))
+    matrix, offset = walls.affine_map(wall_named("25 deg"))
+    seen = walls.ideal_from_water(points, 0.0, wall_named("25 deg"))
+    np.testing.assert_allclose(seen, points @ matrix.T + offset, atol=1e-13)
+    matrix, offset = walls.affine_map(wall_named("facing"))
+    np.testing.assert_array_equal(matrix, np.eye(2, 3))
+    np.testing.assert_array_equal(offset, 0)
+
+
+@pytest.mark.parametrize(("tilt_deg", "shear_um"), [(0.1, 13), (1.0, 131)])
+def test_a_tilted_wall_shears_depth_as_the_design_says(tilt_deg: float, shear_um: int) -> None:
+    tilt = np.radians(tilt_deg)
+    wall = Wall(np.array([np.sin(tilt), 0, np.cos(tilt)]), 0.0, 10.0, (1.0, 1.52, 1.333))
+    near, far = walls.ideal_from_water(np.array([[0, 0, 20.0], [0, 0, 50.0]]), 0.0, wall)
+    assert np.abs(far - near)[0] * 1e3 == pytest.approx(shear_um, abs=0.5)
+
+
+@pytest.mark.parametrize("kappa", KAPPAS)
+@pytest.mark.parametrize("name", WALLS)
+def test_derivatives_are_those_of_differences(name: str, kappa: float) -> None:
+    wall, points = wall_named(name), water_points(np.random.default_rng(6), (4,))
+    found = walls.ideal_jacobians(points, kappa, wall)
+    np.testing.assert_array_equal(found.value, walls.ideal_from_water(points, kappa, wall))
+
+    def of_wall(change: Array) -> Array:
+        turned = wall.turned(change[:2])
+        moved = replace(turned, distance_mm=wall.distance_mm + change[2])
+        return walls.ideal_from_water(points, kappa, moved)
+
+    by_wall = differences(of_wall, np.zeros(3), 1e-3)
+    np.testing.assert_allclose(found.by_wall, by_wall, rtol=1e-7, atol=1e-7)
+    for i, point in enumerate(points):
+        by_point = differences(lambda p: walls.ideal_from_water(p, kappa, wall), point, 0.05)
+        np.testing.assert_allclose(found.by_point[i], by_point, atol=1e-8)
+
+    def of_kappa(change: Array) -> Array:
+        return walls.ideal_from_water(points, kappa + float(change[0]), wall)
+
+    by_kappa = differences(of_kappa, np.zeros(1), 2e-5)[..., 0]
+    np.testing.assert_allclose(found.by_kappa, by_kappa, rtol=2e-5, atol=1e-4)
+
+
+def test_the_tangents_are_a_turn_of_the_normal() -> None:
+    wall = wall_named("25 deg")
+    basis = walls.tangent_basis(wall.normal)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(basis.T @ wall.normal, 0, atol=1e-15)
+    angle = np.arccos(wall.turned([3e-3, -4e-3]).normal @ wall.normal)
+    assert angle == pytest.approx(np.arctan(5e-3), rel=1e-9)
+
+
+def test_what_no_ray_reaches_is_an_error() -> None:
+    wall = wall_named("facing")
+    with pytest.raises(GeometryError, match="out of the camera's reach"):
+        walls.ideal_from_water(np.array([[0.0, 0.0, -500.0]]), 1 / 150, wall)
+    with pytest.raises(GeometryError, match="out of the camera's reach"):
+        walls.ideal_from_water(np.array([[0.0, 0.0, 900.0]]), -1 / 200, wall)
+    steep = Wall(np.array([np.sin(1.2), 0, np.cos(1.2)]), -60.0, 10.0, (1.333, 1.5, 1.0))
+    with pytest.raises(GeometryError, match="totally reflected"):
+        walls.ideal_from_water(np.array([[0.0, 0.0, 10.0]]), 0.0, steep)

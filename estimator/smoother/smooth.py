@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from importlib import import_module
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
+from telerig.estimator.identifiability import judge
 from telerig.estimator.shake_inflation import inflated
+from telerig.estimator.shake_learning import learn
 from telerig.estimator.smoother.adapting import adapted
 from telerig.estimator.smoother.defaults import default_model
 from telerig.estimator.smoother.model import (
@@ -69,8 +69,8 @@ def smooth(
         describes, or a mapping of name to {t_s, a_m_s2 (N, 3), mounted_on, axes,
         noise_density_ug_sqrt_hz}.
     references : a table frame, camera, mark, u_px, v_px[, sigma_px].
-    model : "auto" (defaults for the information at hand; learned modes for images alone, where
-        learning is available), "default", a `ShakeModel`, or a function that makes one.
+    model : "auto" (defaults for the information at hand; learned modes for images alone),
+        "default", a `ShakeModel`, or a function that makes one.
     rig : the description in rig.toml: travel axis (where the calibration has no stage), how well
         the encoder's scale is known, sensors. t_s : (F,) frame times, else those of
         the tracks.
@@ -90,7 +90,7 @@ def smooth(
         chosen = solution.frame.model
         if chosen.learned:
             solution = inflated(solution)
-    verdict = judge(problem, chosen, solution)
+    verdict = judge(problem, chosen, solution) if problem.bubbles else {}
     return Smoothing(
         trajectories(solution, None if tracked is None else tracked.table),
         shake_table(solution),
@@ -179,11 +179,8 @@ def choose_model(
     default = default_model(problem, encoder_sigma_mm)
     arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
     known = len(problem.references) > 0 or len(arms) == len(problem.cameras)
-    learning = "telerig.estimator.shake_learning"
-    long_enough = _longest_s(problem) >= _LEAST_LEARNED_S
-    if model == "auto" and not known and long_enough and find_spec(learning) is not None:
-        learned: ShakeModel = import_module(learning).learn(problem, default)
-        return learned
+    if model == "auto" and not known and _longest_s(problem) >= _LEAST_LEARNED_S:
+        return learn(problem, default)
     return default
 
 
@@ -191,15 +188,6 @@ def _longest_s(problem: SmoothingProblem) -> float:
     """Time from a bubble's first frame to its last, the longest; 0 without bubbles."""
     t = problem.t_s
     return max((float(t[b.last] - t[b.first]) for b in problem.bubbles), default=0.0)
-
-
-def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> Mapping[str, Any]:
-    """The verdict of the identifiability module, where it is installed."""
-    module = "telerig.estimator.identifiability"
-    if not problem.bubbles or find_spec(module) is None:
-        return {}
-    verdict: Mapping[str, Any] = import_module(module).judge(problem, model, solution)
-    return verdict
 
 
 def _adapted_solution(

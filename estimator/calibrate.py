@@ -44,17 +44,24 @@ def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
 
 
 def calibrate(
-    dataset: Dataset, *, model: str = "auto", solver: str = "auto", seed: int = 0
+    dataset: Dataset,
+    *,
+    model: str = "auto",
+    solver: str = "auto",
+    medium: str = "air",
+    seed: int = 0,
 ) -> Calibration:
     """Calibrate a rig from the images or the dots of a dataset.
 
     model : "auto" or a name of `telerig.estimator.problem.MODELS`.
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
+    medium : "air" or "water", of the target; with `[walls]` in `rig.toml` runs are in water.
     seed : recorded with the result; the calibration itself draws no random numbers.
 
     Raises InputError, DetectionError or CalibrationError, each with what, where and what to do.
     """
-    return run_calibration(dataset, model=model, solver=solver, seed=seed).calibration
+    run = run_calibration(dataset, model=model, solver=solver, medium=medium, seed=seed)
+    return run.calibration
 
 
 def run_calibration(
@@ -62,13 +69,22 @@ def run_calibration(
     *,
     model: str = "auto",
     solver: str = "auto",
+    medium: str = "air",
     seed: int = 0,
     dots_free: str = "3d",
     stage: Stage | None = None,
 ) -> CalibrationRun:
     """Like `calibrate`, with progress, the choice of what dots may do, and the detections."""
+    from telerig.estimator.behind_walls import (
+        checked_medium,
+        put_behind_walls,
+        stated_walls,
+        wall_words,
+        with_walls,
+    )
     from telerig.estimator.self_calibration import self_calibrate
 
+    checked_medium(medium)
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     detected, table, notes = None, None, list(dataset.notes)
@@ -82,9 +98,11 @@ def run_calibration(
     else:
         table = dataset.dots()
     rig = dataset.rig
+    walls = stated_walls(rig)
+    cameras = nominal_cameras(rig)
     calibration = self_calibrate(
         table,
-        nominal_cameras(rig),
+        with_walls(cameras, walls) if medium == "water" else cameras,
         dataset.target,
         nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
         model=model,
@@ -94,7 +112,13 @@ def run_calibration(
         notes=notes,
         name=rig.name,
     )
-    calibration = replace(calibration, stage=_stage(dataset, calibration, stage))
+    calibration = replace(
+        calibration, stage=_stage(dataset, calibration, stage), medium=medium
+    )
+    if medium == "air":
+        calibration = put_behind_walls(calibration, walls)
+    words = wall_words(calibration, rig)
+    calibration = replace(calibration, notes=(*calibration.notes, *words))
     return CalibrationRun(_with_measured(calibration, table, seed), detected)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ class Calibration:
     free : per camera, names of the free intrinsics.
     joint_names, joint_covariance : the whole estimate, or empty when loaded without it.
     stage : travel axis and encoder scale with their covariance (`StageAxis.as_dict`), or empty.
+    medium : of the target, "air" or "water". Cameras may have walls either way: points that are
+        projected and triangulated lie in the water behind them.
     statistics, twin, model : what `calibration.json` says of them; see docs/files.md.
     """
 
@@ -49,6 +51,7 @@ class Calibration:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     stage: Mapping[str, Any] = field(default_factory=dict)
+    medium: str = "air"
     joint_names: tuple[str, ...] = ()
     joint_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     dots: Any = None
@@ -64,12 +67,19 @@ class Calibration:
         names = ", ".join(repr(c.name) for c in self.cameras)
         raise CalibrationError(f"no camera {camera!r} in this calibration", todo=f"it has {names}")
 
+    def in_air(self) -> Calibration:
+        """The same rig without its walls: for points in air, such as a target held there."""
+        return replace(self, cameras=tuple(replace(c, wall=None) for c in self.cameras))
+
     def project(self, camera: str | int, points_mm: ArrayLike) -> Array:
-        """(N, 3) rig points -> (N, 2) pixels."""
+        """(N, 3) rig points, behind the camera's wall if it has one -> (N, 2) pixels."""
         return self.camera(camera).project(points_mm)
 
     def unproject(self, camera: str | int, uv_px: ArrayLike) -> tuple[Array, Array]:
-        """(N, 2) pixels -> (N, 3) ray origins and (N, 3) unit directions in the rig frame."""
+        """(N, 2) pixels -> (N, 3) ray origins and (N, 3) unit directions in the rig frame.
+
+        Behind a wall the rays are those in the water.
+        """
         return self.camera(camera).unproject(uv_px)
 
     def project_covariance(self, camera: str | int, points_mm: ArrayLike) -> Array:

@@ -16,7 +16,8 @@ from telerig.io.atomic import atomic_path, write_json_atomic
 from telerig.io.tables import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-from telerig.rig.projection import PARAMETERS
+from telerig.rig.projection import PARAMETERS, intrinsics_from
+from telerig.rig.walls import Wall
 
 Array = NDArray[np.float64]
 
@@ -55,11 +56,13 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
         "pixel_origin": "centre",
         "units": {"length": "mm", "image": "px", "angle": "rad unless the name ends in _deg"},
         "gauge": calibration.diagnostics.get("gauge", ""),
+        "medium": calibration.medium,
         "verdict": dict(calibration.verdict),
         "cameras": {
             c.name: _camera(calibration, c, f)
             for c, f in zip(calibration.cameras, calibration.free)
         },
+        "walls": {c.name: c.wall.as_dict() for c in calibration.cameras if c.wall is not None},
         "target": {
             "dots": calibration.dot_ids.tolist(),
             "points_mm": calibration.target_points_mm.tolist(),
@@ -132,11 +135,11 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def _from_dict(data: dict[str, Any], file: Path) -> Calibration:
+    walls = {name: Wall.from_dict(wall) for name, wall in data.get("walls", {}).items()}
     cameras = tuple(
         Camera(
             name, (int(c["image_size_px"][0]), int(c["image_size_px"][1])), float(c["rho_mm"]),
-            np.array([c["parameters"][p] for p in PARAMETERS], float),
-            _pose_from(c["camera_from_rig"]),
+            intrinsics_from(c["parameters"]), _pose_from(c["camera_from_rig"]), walls.get(name),
         )
         for name, c in data["cameras"].items()
     )  # fmt: skip
@@ -158,6 +161,7 @@ def _from_dict(data: dict[str, Any], file: Path) -> Calibration:
         diagnostics=data["diagnostics"],
         notes=tuple(data["notes"]),
         stage=_stage(data.get("stage", {})),
+        medium=data.get("medium", "air"),
         joint_names=names,
         joint_covariance=joint,
     )

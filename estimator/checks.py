@@ -213,6 +213,7 @@ _SPOKEN = {
     "centre_u_px": "the image centre (u)", "centre_v_px": "the image centre (v)",
     "kappa_per_mm": "the residual perspective kappa", "tilt_x": "the sensor tilt (x)",
     "tilt_y": "the sensor tilt (y)", "image_convergence_per_mm": "the image-side convergence",
+    "wall_x_rad": "the wall's tilt along x", "wall_y_rad": "the wall's tilt along y",
     "rx_rad": "the inter-camera angle about its x", "ry_rad": "the inter-camera angle about its y",
     "rz_rad": "the inter-camera angle about its axis", "tx_mm": "the offset along x",
     "ty_mm": "the offset along y", "tz_mm": "the depth origin",

@@ -37,9 +37,9 @@ LABEL_AMBIGUOUS, SHAKE_BELOW_NOISE = "LABEL_AMBIGUOUS", "SHAKE_BELOW_NOISE"
 AXES = ("x", "y", "z")
 
 RESOLVED_Q, PARTIAL_Q, RESOLVED_ETA = 1.25, 2.0, 0.99
-REMEDY = (
-    "fix a strip of dots to the tank inside both views, or one accelerometer on each camera arm"
-)
+_STRIP = "fix a strip of dots to the tank inside both views"
+_ARMS = "one accelerometer on each camera arm"
+_MORE = "a longer record, more bubbles in view"
 _EDGE = 0.1
 _SEEN = 0.25
 
@@ -77,7 +77,7 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
         "flags": _flags(found),
         "axes": {name: _as_json(axis) for name, axis in found.items()},
         "words": words(problem, model, found),
-        "remedy": "" if worst == RESOLVED else REMEDY,
+        "remedy": "" if worst == RESOLVED else what_would_tell(problem),
         "left_out": _left_out(problem),
         "modes": shake_modes(solution),
     }
@@ -246,10 +246,21 @@ def words(problem: SmoothingProblem, model: ShakeModel, found: dict[str, AxisVer
     upright = AXES[int(np.abs(problem.up).argmax())]
     parts = [_sentence(name, axis, name == upright) for name, axis in found.items()]
     if any(axis.verdict != RESOLVED for axis in found.values()):
-        parts.append(f"To resolve it: {REMEDY}.")
+        parts.append(f"To resolve it: {what_would_tell(problem)}.")
     if model.name == "learned":
         parts.append("The shake's modes were learned from this run.")
     return " ".join(parts)
+
+
+def what_would_tell(problem: SmoothingProblem) -> str:
+    """What would tell more, of what this run does not have."""
+    arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
+    has_arms = len(arms) == len(problem.cameras)
+    if len(problem.references) and has_arms:
+        return _MORE
+    if len(problem.references):
+        return _ARMS
+    return _STRIP if has_arms else f"{_STRIP}, or {_ARMS}"
 
 
 def _sentence(name: str, axis: AxisVerdict, upright: bool) -> str:

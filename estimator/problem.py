@@ -25,6 +25,7 @@ GAUGE_SIGMA_MM = 1e-4
 """Holds the rig origin where the optical axes come closest; see docs/decisions/003."""
 
 _CENTRE = ("centre_u_px", "centre_v_px")
+_WALL = ("wall_x_rad", "wall_y_rad")
 MODELS: dict[str, tuple[str, ...]] = {
     "none": (),
     "radial": ("k1",),
@@ -61,6 +62,7 @@ PRIOR_SIGMA = {
     "s1": 0.2, "s2": 0.2, "s3": 0.2, "s4": 0.2,
     "tilt_x": 0.3, "tilt_y": 0.3, "image_convergence_per_mm": 0.05,
     "centre_u_px": 0.05, "centre_v_px": 0.05,  # of the image width
+    "wall_x_rad": 0.1, "wall_y_rad": 0.1,  # unless the wall says better
 }  # fmt: skip
 """Weak priors: several times what any telecentric lens shows. They bound what data leave open."""
 
@@ -115,7 +117,7 @@ class Problem:
         plate = (self.target.plate_thickness_mm, self.target.plate_index)
         return Observations(
             self.view[keep], self.camera[keep], self.dot[keep], self.uv_px[keep], whitener,
-            self.plate_shift, plate,
+            self.plate_shift, plate, tuple(c.wall for c in self.cameras),
         )  # fmt: skip
 
     def with_model(self, model: str | Sequence[str]) -> Problem:
@@ -129,7 +131,10 @@ class Problem:
                 raise CalibrationError(
                     f"unknown model {name!r}", todo=f"known: auto, {', '.join(MODELS)}"
                 )
-        return replace(self, free=tuple(("scale_px_per_mm", *MODELS[n]) for n in names))
+        free = (
+            ("scale_px_per_mm", *MODELS[n], *wall_freedom(c)) for n, c in zip(names, self.cameras)
+        )
+        return replace(self, free=tuple(free))
 
     def subset(self, rows: NDArray[np.bool_]) -> Problem:
         """Only some measurements; views, dots and priors stay."""
@@ -159,7 +164,7 @@ class Problem:
 
 
 def parameter_unit(camera: Camera) -> Array:
-    """(18,) the change of each parameter that moves a pixel at the image corner by about 1 px."""
+    """(20,) the change of each parameter that moves a pixel at the image corner by about 1 px."""
     scale, rho = camera["scale_px_per_mm"], camera.rho_mm
     corner_px = scale * rho
     unit = np.full(len(PARAMETERS), 1 / corner_px)
@@ -167,16 +172,24 @@ def parameter_unit(camera: Camera) -> Array:
     unit[INDEX["centre_u_px"]] = unit[INDEX["centre_v_px"]] = 1.0
     unit[INDEX["kappa_per_mm"]] = 1 / corner_px / rho
     unit[INDEX["image_convergence_per_mm"]] = 10 / corner_px / rho
+    unit[[INDEX[name] for name in _WALL]] = 4 / corner_px
     return unit
 
 
+def wall_freedom(camera: Camera) -> tuple[str, ...]:
+    """The wall's orientation where it is not known exactly."""
+    return _WALL if camera.wall is not None and camera.wall.normal_sigma_rad > 0 else ()
+
+
 def prior_sigma(camera: Camera) -> Array:
-    """(18,) standard deviations of the weak priors, in the parameters' units."""
+    """(20,) standard deviations of the weak priors, in the parameters' units."""
     sigma = np.array([PRIOR_SIGMA[p] for p in PARAMETERS])
     sigma[INDEX["scale_px_per_mm"]] *= camera["scale_px_per_mm"]
     sigma[INDEX["kappa_per_mm"]] /= camera.rho_mm
     for name in _CENTRE:
         sigma[INDEX[name]] *= camera.image_size_px[0]
+    if wall_freedom(camera) and camera.wall is not None:
+        sigma[[INDEX[name] for name in _WALL]] = camera.wall.normal_sigma_rad
     return sigma
 
 

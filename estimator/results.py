@@ -78,7 +78,7 @@ def calibration_from_fit(
 def cameras_from_state(problem: Problem, state: State) -> tuple[Camera, ...]:
     """The estimated cameras."""
     return tuple(
-        Camera(c.name, c.image_size_px, c.rho_mm, k, _pose(m).inverse())
+        Camera(c.name, c.image_size_px, c.rho_mm, k, _pose(m).inverse(), c.wall)
         for c, k, m in zip(problem.cameras, state.intrinsics, state.rig_from_camera)
     )
 

@@ -15,7 +15,6 @@ from telerig.errors import CalibrationError
 from telerig.estimator.covariance import rig_jacobian
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, hat, nearest_rotation, rotation_from_rotvec
-from telerig.rig.projection import pixel_jacobians
 from telerig.rig.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -178,7 +177,7 @@ def derivatives(
     for c, camera in enumerate(cameras):
         mine = dots.camera == c
         in_camera = camera.camera_from_rig.apply(points[mine])
-        uv, by_camera_point, _ = pixel_jacobians(in_camera, camera.intrinsics, camera.rho_mm)
+        uv, by_camera_point, _ = camera.pixel_jacobians(in_camera)
         residual[mine] = dots.uv_px[mine] - uv
         by_point[mine] = by_camera_point @ camera.camera_from_rig.rotation
         by_rig[mine] = whole[mine, 2 * c : 2 * c + 2]

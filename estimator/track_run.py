@@ -105,6 +105,7 @@ def tracking_stream(
     """Detect (keeping what is found in ``work``), learn how pairs look, then link lazily."""
     chosen = options or TrackOptions()
     cameras = check_calibration(run, calibration)
+    run.notes.extend(n for n in forgotten_walls(run.rig, calibration) if n not in run.notes)
     axis = stage_axis(run, calibration)
     first_id, labels, scene, followed = 0, None, None, None
     batches: Callable[[], Iterator[pd.DataFrame]]

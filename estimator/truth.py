@@ -13,7 +13,7 @@ from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import aligned_covariance
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, nearest_rotation
-from telerig.rig.projection import PARAMETERS
+from telerig.rig.projection import intrinsics_from
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def true_cameras(truth: Mapping[str, Any]) -> tuple[Camera, ...]:
     out = []
     for name, data in truth["cameras"].items():
         pose = data["camera_from_rig"]
-        intrinsics = np.array([data["parameters"][p] for p in PARAMETERS], float)
+        intrinsics = intrinsics_from(data["parameters"])
         out.append(
             Camera(
                 name, (data["image_size_px"][0], data["image_size_px"][1]), data["rho_mm"],
@@ -68,7 +68,11 @@ def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
 def space_error(
     calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array
 ) -> SpaceError:
-    """Triangulate the true pixels of true points with the estimated rig, and align rigidly."""
+    """Triangulate the true pixels of true points with the estimated rig, and align rigidly.
+
+    Of cameras alone: without the walls that runs are taken through.
+    """
+    calibration = calibration.in_air()
     pixels = [camera.project(points_mm) for camera in truth]
     found = calibration.triangulate(*pixels, sigma_px=1.0, include_calibration=False).points_mm
     a, b = found - found.mean(0), points_mm - points_mm.mean(0)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.rig import projection
 from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
@@ -71,7 +70,7 @@ def image_of_point(
     pose = camera.camera_from_rig
     in_camera = point @ pose.rotation.T + pose.translation_mm
     flat = in_camera.reshape(-1, 3)
-    uv, by_camera, _ = projection.pixel_jacobians(flat, camera.intrinsics, camera.rho_mm)
+    uv, by_camera, _ = camera.pixel_jacobians(flat)
     by_camera = by_camera.reshape(*in_camera.shape[:-1], 2, 3)
     by_rig = by_camera @ pose.rotation
     by_pitch = -by_camera[..., 1] * depth[..., None]

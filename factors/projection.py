@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from telerig.rig import projection
 from telerig.rig.pose import hat
+from telerig.rig.walls import Wall
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,7 +26,7 @@ Ints = NDArray[np.int64]
 class State:
     """Everything that is estimated, as arrays.
 
-    intrinsics : (C, 18), order `telerig.rig.projection.PARAMETERS`.
+    intrinsics : (C, 20), order `telerig.rig.projection.PARAMETERS`.
     rig_from_camera : (C, 4, 4); the first is the identity.
     rig_from_target : (V, 4, 4).
     dots_mm : (N, 3) in the target's frame.
@@ -45,6 +46,7 @@ class Observations:
     whitener : (M, 2, 2), W with W^T W = inverse covariance; a weight multiplies its square.
     plate_shift : (V, C) +1 or -1 where the camera sees the dots through the plate, else 0.
     plate : (thickness_mm, index).
+    walls : per camera, the glass that it sees the dots through; () where they are in air.
     """
 
     view: Ints
@@ -54,6 +56,10 @@ class Observations:
     whitener: Array
     plate_shift: Array
     plate: tuple[float, float] = (0.0, 1.5)
+    walls: tuple[Wall | None, ...] = ()
+
+    def wall(self, camera: int) -> Wall | None:
+        return self.walls[camera] if self.walls else None
 
     def __len__(self) -> int:
         return len(self.view)
@@ -64,7 +70,7 @@ class Residuals:
     """Whitened residuals (M, 2) and their derivatives (M, 2, k).
 
     by_dot : 3 columns; by_view, by_camera : 6, GTSAM's Pose3 tangent (rotation, translation),
-    right perturbation of rig_from_target and rig_from_camera; by_intrinsics : 18.
+    right perturbation of rig_from_target and rig_from_camera; by_intrinsics : 20.
     """
 
     value: Array
@@ -111,7 +117,9 @@ def pixels(state: State, obs: Observations, rho_mm: Sequence[float]) -> Array:
     out = np.empty((len(obs), 2))
     for c, rho in enumerate(rho_mm):
         mine = obs.camera == c
-        out[mine] = projection.pixel_from_camera(in_camera[mine], state.intrinsics[c], rho)
+        out[mine] = projection.pixel_from_camera(
+            in_camera[mine], state.intrinsics[c], rho, obs.wall(c)
+        )
     return out
 
 
@@ -130,7 +138,7 @@ def whitened_residuals(state: State, obs: Observations, rho_mm: Sequence[float])
     for c, rho in enumerate(rho_mm):
         mine = obs.camera == c
         uv[mine], by_point[mine], by_intrinsics[mine] = projection.pixel_jacobians(
-            in_camera[mine], state.intrinsics[c], rho
+            in_camera[mine], state.intrinsics[c], rho, obs.wall(c)
         )
     white_by_point = obs.whitener @ by_point
     by_dot = white_by_point @ rotation
@@ -267,7 +275,7 @@ def _as_bytes(values: Any, keys: ImageKeys) -> dict[int, bytes]:
 
 
 def intrinsics_from_values(values: Any, keys: ImageKeys, start: State, camera: int) -> Array:
-    """(18,) intrinsics of one camera: the start with the free ones moved."""
+    """(20,) intrinsics of one camera: the start with the free ones moved."""
     out: Array = start.intrinsics[camera].copy()
     if len(keys.free[camera]):
         out[keys.free[camera]] += values.atVector(keys.intrinsics[camera]) * keys.unit[camera]

@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Literal
 
+import numpy as np
+
 from telerig.errors import InputError
 from telerig.io.recording.description import DeviceDescription
 from telerig.rig.target import Polarity, Target
+from telerig.rig.walls import Wall
 
 Vector = tuple[float, float, float]
 
@@ -75,8 +78,9 @@ class WallDescription:
 
     normal : unit vector pointing away from the camera (z > 0).
     indices : of the medium on the camera's side, the glass, and the medium behind it.
-    distance_mm : along the camera's axis from its origin to the wall's near face; None where
-    nothing depends on it (kappa = 0).
+    distance_mm : along the camera's axis from its origin to the wall's near face, negative where
+    that lies before the origin; None where nothing but the image's place depends on it (kappa = 0).
+    normal_sigma_deg : how well the normal is known, 0 for exactly.
     """
 
     camera: str
@@ -84,6 +88,14 @@ class WallDescription:
     indices: Vector
     thickness_mm: float
     distance_mm: float | None = None
+    normal_sigma_deg: float = 0.0
+
+    def wall(self) -> Wall:
+        """For `Camera.wall`; without a distance the near face is at the camera's origin."""
+        return Wall(
+            np.array(self.normal), self.distance_mm or 0.0, self.thickness_mm, self.indices,
+            float(np.radians(self.normal_sigma_deg)),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -150,8 +150,9 @@ def walls_from_tables(
         problems += _wall_problems(place, normal, table, cameras.get(name))
         x, y, z = (float(np.copysign(1.0, normal[2])) * component for component in normal)
         out[name] = WallDescription(
-            name, (x, y, z), _vector(table.indices), table.thickness_mm, table.distance_mm
-        )
+            name, (x, y, z), _vector(table.indices), table.thickness_mm, table.distance_mm,
+            table.normal_sigma_deg,
+        )  # fmt: skip
     return out
 
 

@@ -136,7 +136,10 @@ class WallTable(Table):
         Field(description="three refractive indices of 1 or more, like [1.0, 1.52, 1.333]")
     )
     thickness_mm: Positive = Field(description="a positive number")
-    distance_mm: Positive | None = Field(None, description="a positive number")
+    distance_mm: float | None = Field(None, description="a number, negative before the origin")
+    normal_sigma_deg: Annotated[float, Field(ge=0, le=10)] = Field(
+        0.0, description="degrees from 0 to 10"
+    )
 
 
 def stereo_table(first: str, second: str) -> type[StereoTable]:

@@ -122,7 +122,8 @@ def _wall(wall: WallDescription) -> list[Line]:
         ("normal", wall.normal, "in the camera's frame"),
         ("indices", wall.indices, "camera side, glass, behind"),
         ("thickness_mm", wall.thickness_mm, ""),
-        ("distance_mm", wall.distance_mm, ""),
+        ("distance_mm", wall.distance_mm, "of the near face on the camera's axis"),
+        ("normal_sigma_deg", wall.normal_sigma_deg or None, ""),
     ]
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import GeometryError
-from telerig.rig import projection
+from telerig.rig import projection, walls
 from telerig.rig.pose import Pose
 from telerig.rig.projection import INDEX, PARAMETERS
+from telerig.rig.walls import Wall
 
 Array = NDArray[np.float64]
 
@@ -19,9 +20,10 @@ Array = NDArray[np.float64]
 class Camera:
     """A camera of the rig.
 
-    intrinsics : (18,) in the order of `telerig.rig.projection.PARAMETERS`.
+    intrinsics : (20,) in the order of `telerig.rig.projection.PARAMETERS`.
     rho_mm : half the image diagonal in object space at nominal scale; normalises the distortion.
     camera_from_rig : pose; the identity for the first camera, whose frame is the rig frame.
+    wall : the glass it looks through; points are then in the water behind, pixels as in air.
     """
 
     name: str
@@ -29,6 +31,7 @@ class Camera:
     rho_mm: float
     intrinsics: Array
     camera_from_rig: Pose
+    wall: Wall | None = None
 
     @staticmethod
     def create(
@@ -80,34 +83,50 @@ class Camera:
     def project(self, points_rig_mm: ArrayLike) -> Array:
         """(..., 3) rig points -> (..., 2) pixels.
 
-        Raises GeometryError for points behind the perspective centre (1 + kappa Z <= 0).
+        Raises GeometryError for points behind the perspective centre (1 + kappa Z <= 0), or that
+        no ray reaches through the wall.
         """
         points = self.camera_from_rig.apply(np.atleast_2d(points_rig_mm))
-        if np.any(1 + self["kappa_per_mm"] * points[..., 2] <= 0):
+        if self.wall is None and np.any(1 + self["kappa_per_mm"] * points[..., 2] <= 0):
             raise GeometryError(
                 f"a point lies behind the perspective centre of camera {self.name!r} "
                 f"(z < {-1 / self['kappa_per_mm']:.1f} mm)",
                 todo="keep to points in front of the camera",
             )
-        uv = projection.pixel_from_camera(points, self.intrinsics, self.rho_mm)
+        uv = projection.pixel_from_camera(points, self.intrinsics, self.rho_mm, self.wall)
         return uv.reshape(*np.shape(points_rig_mm)[:-1], 2)
+
+    def pixel_jacobians(self, points_camera_mm: Array) -> tuple[Array, Array, Array]:
+        """`projection.pixel_jacobians` of this camera: (..., 3) in its own frame."""
+        return projection.pixel_jacobians(
+            points_camera_mm, self.intrinsics, self.rho_mm, self.wall
+        )
 
     def unproject(self, uv_px: ArrayLike) -> tuple[Array, Array]:
         """(..., 2) pixels -> rays in the rig frame: (..., 3) origins and (..., 3) unit directions.
 
-        Origins lie in the camera's plane Z = 0. Raises GeometryError outside the invertible region.
+        Origins lie in the camera's plane Z = 0, to which rays in water are drawn on straight.
+        Raises GeometryError outside the invertible region.
         """
         ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), self.intrinsics, self.rho_mm)
+        if self.wall is not None:
+            stands = projection.standing_wall(self.intrinsics, self.wall)
+            return self._in_rig(*walls.water_from_ideal(ideal, self["kappa_per_mm"], stands))
         zero, one = np.zeros((*ideal.shape[:-1], 1)), np.ones((*ideal.shape[:-1], 1))
         origin = np.concatenate([ideal, zero], -1)
         direction = np.concatenate([self["kappa_per_mm"] * ideal, one], -1)
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        return self._in_rig(origin, direction)
+
+    def _in_rig(self, origin: Array, direction: Array) -> tuple[Array, Array]:
         rotation = self.camera_from_rig.rotation
         return (origin - self.camera_from_rig.translation_mm) @ rotation, direction @ rotation
 
     def twin(self) -> Camera:
-        """The mirror twin's camera: mirrored pose, opposite kappa, the same pixels."""
+        """The mirror twin's camera in air: mirrored pose, opposite kappa, the same pixels."""
         pose = self.camera_from_rig.twin()
         return replace(
-            self.with_parameters(kappa_per_mm=-self["kappa_per_mm"]), camera_from_rig=pose
+            self.with_parameters(kappa_per_mm=-self["kappa_per_mm"]),
+            camera_from_rig=pose,
+            wall=None,
         )

@@ -8,31 +8,61 @@ tangent vector of the tilt and w = 1 / image distance (object-space mm):
 
 w = 0 is the bilateral telecentric lens (an affine stretch, even in q: the sign of the tilt is
 unobservable); w > 0 the object-side telecentric one (a homography).
+
+Behind a glass wall the first step is `telerig.rig.walls`; wall_x_rad and wall_y_rad turn the wall's
+stated normal (`Wall.turned`) and mean nothing without a wall.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.rig import distortion
+from telerig.rig import distortion, walls
+from telerig.rig.walls import Wall
 
 Array = NDArray[np.float64]
 
 PARAMETERS = (
     "scale_px_per_mm", "aspect", "skew", "centre_u_px", "centre_v_px", "kappa_per_mm",
     "k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4",
-    "tilt_x", "tilt_y", "image_convergence_per_mm",
+    "tilt_x", "tilt_y", "image_convergence_per_mm", "wall_x_rad", "wall_y_rad",
 )  # fmt: skip
 INDEX = {name: i for i, name in enumerate(PARAMETERS)}
 _SCALE, _ASPECT, _SKEW, _CU, _CV, _KAPPA = range(6)
 _DISTORTION = slice(6, 15)
 _TX, _TY, _W = 15, 16, 17
+_WALL = slice(18, 20)
 
 
-def pixel_from_camera(points_mm: Array, intrinsics: Array, rho_mm: float) -> Array:
-    """(..., 3) camera coordinates -> (..., 2) pixels; intrinsics (18,) ordered as `PARAMETERS`."""
-    telecentric = points_mm[..., :2] / (1 + intrinsics[_KAPPA] * points_mm[..., 2:3])
+def intrinsics_from(parameters: Mapping[str, float]) -> Array:
+    """(20,) in the order of `PARAMETERS`; files from before walls lack theirs, which are then 0.
+
+    Raises KeyError for any other that is missing.
+    """
+    wall = dict.fromkeys(PARAMETERS[_WALL], 0.0)
+    return np.array([(wall | dict(parameters))[name] for name in PARAMETERS], float)
+
+
+def standing_wall(intrinsics: Array, wall: Wall) -> Wall:
+    """The wall with its normal turned as the intrinsics say."""
+    return wall.turned(intrinsics[_WALL])
+
+
+def pixel_from_camera(
+    points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall | None = None
+) -> Array:
+    """(..., 3) camera coordinates -> (..., 2) pixels; intrinsics (20,) ordered as `PARAMETERS`.
+
+    wall : the points are in the water behind it; then raises what `walls.ideal_from_water` does.
+    """
+    if wall is None:
+        telecentric = points_mm[..., :2] / (1 + intrinsics[_KAPPA] * points_mm[..., 2:3])
+    else:
+        stands = standing_wall(intrinsics, wall)
+        telecentric = walls.ideal_from_water(points_mm, float(intrinsics[_KAPPA]), stands)
     distorted = distortion.distort(telecentric / rho_mm, intrinsics[_DISTORTION]) * rho_mm
     return _pixel_from_sensor(sensor_from_distorted(distorted, intrinsics), intrinsics)
 
@@ -69,28 +99,50 @@ def _pixel_from_sensor(xy_mm: Array, intrinsics: Array) -> Array:
 
 
 def pixel_jacobians(
-    points_mm: Array, intrinsics: Array, rho_mm: float
+    points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall | None = None
 ) -> tuple[Array, Array, Array]:
     """Pixels with their derivatives.
 
-    Returns (..., 2) pixels, (..., 2, 3) with respect to the camera point and (..., 2, 18) with
-    respect to the intrinsics.
+    Returns (..., 2) pixels, (..., 2, 3) with respect to the camera point and (..., 2, 20) with
+    respect to the intrinsics. wall : as in `pixel_from_camera`.
     """
+    if wall is not None:
+        return _behind_wall(points_mm, intrinsics, rho_mm, wall)
     kappa = intrinsics[_KAPPA]
     inverse_depth = 1 / (1 + kappa * points_mm[..., 2])
     ideal = points_mm[..., :2] * inverse_depth[..., None]
+    uv, by_ideal, by_intrinsics = _lens_jacobians(ideal, intrinsics, rho_mm)
+    by_point = np.empty((*ideal.shape, 3))
+    by_point[..., :2] = by_ideal * inverse_depth[..., None, None]
+    towards_axis = np.einsum("...ij,...j->...i", by_ideal, ideal) * inverse_depth[..., None]
+    by_point[..., 2] = -kappa * towards_axis
+    by_intrinsics[..., _KAPPA] = -towards_axis * points_mm[..., 2:3]
+    return uv, by_point, by_intrinsics
+
+
+def _behind_wall(
+    points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall
+) -> tuple[Array, Array, Array]:
+    stands = standing_wall(intrinsics, wall)
+    seen = walls.ideal_jacobians(points_mm, float(intrinsics[_KAPPA]), stands)
+    uv, by_ideal, by_intrinsics = _lens_jacobians(seen.value, intrinsics, rho_mm)
+    by_intrinsics[..., _KAPPA] = np.einsum("...ij,...j->...i", by_ideal, seen.by_kappa)
+    by_turn = seen.by_wall[..., :2] @ wall.turn_jacobian(intrinsics[_WALL])
+    by_intrinsics[..., _WALL] = by_ideal @ by_turn
+    return uv, by_ideal @ seen.by_point, by_intrinsics
+
+
+def _lens_jacobians(
+    ideal: Array, intrinsics: Array, rho_mm: float
+) -> tuple[Array, Array, Array]:
+    """Pixels, (..., 2, 2) by telecentric coordinates, (..., 2, 20) by all but kappa and wall."""
     normal = ideal / rho_mm
     coefficients = intrinsics[_DISTORTION]
     distorted = distortion.distort(normal, coefficients) * rho_mm
     sensor, sensor_jac, tilt_jac = _tilt_jacobians(distorted, intrinsics)
     affine = intrinsics[_SCALE] * np.array([[1, intrinsics[_SKEW]], [0, intrinsics[_ASPECT]]])
-
     pixel_from_distorted = affine @ sensor_jac
-    pixel_from_ideal = pixel_from_distorted @ distortion.distortion_jacobian(normal, coefficients)
-    by_point = np.empty((*ideal.shape, 3))
-    by_point[..., :2] = pixel_from_ideal * inverse_depth[..., None, None]
-    towards_axis = np.einsum("...ij,...j->...i", pixel_from_ideal, ideal) * inverse_depth[..., None]
-    by_point[..., 2] = -kappa * towards_axis
+    by_ideal = pixel_from_distorted @ distortion.distortion_jacobian(normal, coefficients)
 
     by_intrinsics = np.zeros((*ideal.shape, len(PARAMETERS)))
     by_intrinsics[..., 0, _SCALE] = sensor[..., 0] + intrinsics[_SKEW] * sensor[..., 1]
@@ -98,11 +150,10 @@ def pixel_jacobians(
     by_intrinsics[..., 1, _ASPECT] = intrinsics[_SCALE] * sensor[..., 1]
     by_intrinsics[..., 0, _SKEW] = intrinsics[_SCALE] * sensor[..., 1]
     by_intrinsics[..., 0, _CU] = by_intrinsics[..., 1, _CV] = 1
-    by_intrinsics[..., _KAPPA] = -towards_axis * points_mm[..., 2:3]
     by_coefficients = distortion.coefficient_jacobian(normal) * rho_mm
     by_intrinsics[..., _DISTORTION] = pixel_from_distorted @ by_coefficients
-    by_intrinsics[..., _TX:] = affine @ tilt_jac
-    return _pixel_from_sensor(sensor, intrinsics), by_point, by_intrinsics
+    by_intrinsics[..., _TX : _W + 1] = affine @ tilt_jac
+    return _pixel_from_sensor(sensor, intrinsics), by_ideal, by_intrinsics
 
 
 def _tilt_jacobians(xy_mm: Array, intrinsics: Array) -> tuple[Array, Array, Array]:

@@ -11,6 +11,7 @@ from telerig.errors import GeometryError, InputError
 from telerig.rig import distortion, projection
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX
+from telerig.rig.walls import affine_map
 
 Array = NDArray[np.float64]
 
@@ -113,11 +114,11 @@ def triangulate(
 
 
 def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Array, Array, Array]:
-    """(..., 2C) pixels, (..., 2C, 3) by the rig point, (C, ..., 2, 18) by the intrinsics."""
+    """(..., 2C) pixels, (..., 2C, 3) by the rig point, (C, ..., 2, 20) by the intrinsics."""
     pixels, jacobians, by_intrinsics = [], [], []
     for camera in cameras:
         in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
-        uv, by_point, by_k = projection.pixel_jacobians(in_camera, camera.intrinsics, camera.rho_mm)
+        uv, by_point, by_k = camera.pixel_jacobians(in_camera)
         pixels.append(uv)
         jacobians.append(by_point @ camera.camera_from_rig.rotation)
         by_intrinsics.append(by_k)
@@ -187,16 +188,19 @@ def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
     """(3, N) rig points -> (2, N) pixels, (2, 3, N) by the rig point; quick for untilted lenses."""
     pose = camera.camera_from_rig
     x, y, z = pose.rotation @ points + pose.translation_mm[:, None]
-    if np.any(camera.intrinsics[INDEX["tilt_x"] :]):
-        uv, by_tilted, _ = projection.pixel_jacobians(
-            np.stack([x, y, z], -1), camera.intrinsics, camera.rho_mm
-        )
-        return uv.T, np.moveaxis(by_tilted @ pose.rotation, 0, -1)
     kappa = camera["kappa_per_mm"]
-    shrink = 1 / (1 + kappa * z)
-    x, y = x * shrink, y * shrink
-    across, down, depth = pose.rotation[:, :, None]
-    by_x, by_y = (across - kappa * x * depth) * shrink, (down - kappa * y * depth) * shrink
+    if np.any(camera.intrinsics[INDEX["tilt_x"] : INDEX["wall_x_rad"]]) or (kappa and camera.wall):
+        uv, by_tilted, _ = camera.pixel_jacobians(np.stack([x, y, z], -1))
+        return uv.T, np.moveaxis(by_tilted @ pose.rotation, 0, -1)
+    if camera.wall is not None:
+        matrix, offset = affine_map(projection.standing_wall(camera.intrinsics, camera.wall))
+        x, y = matrix @ np.array([x, y, z]) + offset[:, None]
+        by_x, by_y = (matrix @ pose.rotation)[:, :, None]
+    else:
+        shrink = 1 / (1 + kappa * z)
+        x, y = x * shrink, y * shrink
+        across, down, depth = pose.rotation[:, :, None]
+        by_x, by_y = (across - kappa * x * depth) * shrink, (down - kappa * y * depth) * shrink
     coefficients = camera.intrinsics[INDEX["k1"] : INDEX["tilt_x"]]
     if np.any(coefficients):
         normal = np.stack([x, y], -1) / camera.rho_mm

@@ -15,7 +15,9 @@ map means by them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +37,14 @@ class Wall:
 
     distance_mm : where the camera's axis meets the near face, negative before the camera's origin.
     indices : of the medium on the camera's side, the glass, and the medium behind it.
+    normal_sigma_rad : how well the normal is known beforehand, 0 for exactly.
     """
 
     normal: Array
     distance_mm: float
     thickness_mm: float
     indices: tuple[float, float, float]
+    normal_sigma_rad: float = 0.0
 
     @property
     def ratios(self) -> tuple[float, float]:
@@ -54,8 +58,36 @@ class Wall:
 
     def turned(self, tangent: Array) -> Wall:
         """The normal moved by ``tangent_basis(normal) @ tangent`` (rad) and made unit again."""
+        if not np.any(tangent):
+            return self
         normal = self.normal + tangent_basis(self.normal) @ np.asarray(tangent, float)
         return replace(self, normal=normal / np.linalg.norm(normal))
+
+    def turn_jacobian(self, tangent: Array) -> Array:
+        """(2, 2): tangents at the turned normal by ``tangent`` of `turned`."""
+        turned, length = self.turned(tangent), float(np.sqrt(1 + np.sum(np.square(tangent))))
+        return np.asarray(tangent_basis(turned.normal).T @ tangent_basis(self.normal) / length)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What calibration.json says of it."""
+        return {
+            "normal": [float(v) for v in self.normal],
+            "distance_mm": self.distance_mm,
+            "thickness_mm": self.thickness_mm,
+            "indices": list(self.indices),
+            "normal_sigma_deg": float(np.degrees(self.normal_sigma_rad)),
+        }
+
+    @staticmethod
+    def from_dict(data: Mapping[str, Any]) -> Wall:
+        """The inverse of `as_dict`. Raises KeyError, TypeError or ValueError for other contents."""
+        normal = np.array(data["normal"], float).reshape(3)
+        air, glass, behind = (float(n) for n in data["indices"])
+        return Wall(
+            normal / np.linalg.norm(normal), float(data["distance_mm"]),
+            float(data["thickness_mm"]), (air, glass, behind),
+            float(np.radians(data["normal_sigma_deg"])),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

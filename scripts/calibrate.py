@@ -23,6 +23,10 @@ def calibrate(
     dots: Annotated[
         str, typer.Option(help="What dots may do: 3d, plane (stay in the plane), nominal (held).")
     ] = "3d",
+    medium: Annotated[
+        str,
+        typer.Option(help="air or water: where the target was. With [walls], runs are in water."),
+    ] = "air",
     source: Annotated[
         str | None, typer.Option("--from", help="images or dots, when the dataset has both.")
     ] = None,
@@ -46,12 +50,14 @@ def calibrate(
 
         begun = time.perf_counter()
         data = load_dataset(dataset, source=checked_source(source))
-        options = {"model": model, "solver": solver, "dots": dots, "from": source, "seed": seed}
+        options = {"model": model, "solver": solver, "dots": dots, "medium": medium,
+                   "from": source, "seed": seed}  # fmt: skip
         folder = out or data.results / "calibration"
         with progress(quiet) as stage:
             run = run_calibration(
-                data, model=model, solver=solver, seed=seed, dots_free=dots, stage=stage
-            )
+                data, model=model, solver=solver, medium=medium, seed=seed, dots_free=dots,
+                stage=stage,
+            )  # fmt: skip
         seconds = {"calibrate": time.perf_counter() - begun}
         write_results(
             data, run, folder, command="calibrate", options=options, seconds=seconds, report=report

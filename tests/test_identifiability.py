@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,13 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from shake_learning_data import ARM_HZ, COMMON_HZ, run, true_model
 
-from telerig.estimator.identifiability import judge, shake_share, verdicts, without_sensors
+from telerig.estimator.identifiability import (
+    judge,
+    shake_share,
+    verdicts,
+    what_would_tell,
+    without_sensors,
+)
 from telerig.estimator.shake_modes import remedy, shake_modes
 from telerig.estimator.shake_window import window_of
 from telerig.estimator.smoother.model import BroadBand, ShakeModel, Stage
@@ -62,6 +69,23 @@ def test_marks_fixed_to_the_tank_resolve_it() -> None:
         assert found["axes"]["y"]["verdict"] == "RESOLVED"  # type: ignore[index]
         assert found["flags"] == []
     assert found["remedy"] == "" or found["verdict"] != "RESOLVED"
+
+
+def test_the_remedy_is_never_what_the_run_already_has() -> None:
+    alone, _, _ = run(np.random.default_rng(2), seconds=0.2)
+    marked, _, _ = run(np.random.default_rng(2), seconds=0.2, marks=4)
+    sensors = [SimpleNamespace(camera=c, name=f"arm {c}") for c in range(len(alone.cameras))]
+    strip, arms = "fix a strip of dots", "one accelerometer on each camera arm"
+    for problem, said, unsaid in (
+        (alone, (strip, arms), ()),
+        (marked, (arms,), (strip,)),
+        (replace(alone, accelerometers=sensors), (strip,), (arms,)),
+        (replace(alone, accelerometers=sensors[:1]), (strip, arms), ()),
+        (replace(marked, accelerometers=sensors), ("longer record",), (strip, arms)),
+    ):
+        words = what_would_tell(problem)
+        assert all(word in words for word in said)
+        assert not any(word in words for word in unsaid)
 
 
 def test_shake_far_below_the_noise_is_called_so() -> None:

@@ -159,7 +159,8 @@ def _warm(frame: Frame, state: State, start: Solution) -> State:
 
 def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
     """Whether one pass is exact: affine cameras, no bilinear constants."""
-    flat = all(not np.any(c.intrinsics[INDEX["kappa_per_mm"] :]) for c in problem.cameras)
+    lens = slice(INDEX["kappa_per_mm"], INDEX["wall_x_rad"])
+    flat = all(not np.any(c.intrinsics[lens]) for c in problem.cameras)
     held = (
         model.encoder_scale_sigma,
         model.encoder_delay_sigma_s,

@@ -16,7 +16,8 @@ from telerig.io.csv_table import Column, read_table
 from telerig.io.report.results_files import check_kind, read_object
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-from telerig.rig.projection import PARAMETERS
+from telerig.rig.projection import intrinsics_from
+from telerig.rig.walls import Wall
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,7 +79,8 @@ def read_results(folder: Path) -> CalibrationResults:
     """
     content = _content(folder / "calibration.json")
     try:
-        cameras = tuple(_camera(name, c) for name, c in content["cameras"].items())
+        in_water = content.get("medium") == "water"
+        cameras = _cameras(content, behind_walls=in_water)
         views = {name: _pose(p) for name, p in content["views"].items()}
         dot_ids = np.array(content["target"]["dots"], np.int64)
         points = np.array(content["target"]["points_mm"], float).reshape(len(dot_ids), 3)
@@ -98,9 +100,12 @@ def read_results(folder: Path) -> CalibrationResults:
 
 
 def read_cameras(file: Path) -> tuple[Camera, ...]:
-    """The cameras of a calibration.json. Raises InputError when it cannot be read."""
+    """The cameras of a calibration.json, behind the walls through which runs are taken.
+
+    Raises InputError when it cannot be read.
+    """
     try:
-        return tuple(_camera(name, c) for name, c in _content(file)["cameras"].items())
+        return _cameras(_content(file), behind_walls=True)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise _broken(file, f"lacks or garbles {error}") from error
 
@@ -121,11 +126,17 @@ def _content(file: Path) -> Mapping[str, Any]:
     return content
 
 
-def _camera(name: str, content: Mapping[str, Any]) -> Camera:
+def _cameras(content: Mapping[str, Any], *, behind_walls: bool) -> tuple[Camera, ...]:
+    stated = content.get("walls", {}) if behind_walls else {}
+    walls = {name: Wall.from_dict(data) for name, data in stated.items()}
+    return tuple(_camera(name, c, walls.get(name)) for name, c in content["cameras"].items())
+
+
+def _camera(name: str, content: Mapping[str, Any], wall: Wall | None = None) -> Camera:
     width, height = (int(n) for n in content["image_size_px"])
-    intrinsics = np.array([content["parameters"][p] for p in PARAMETERS], float)
+    intrinsics = intrinsics_from(content["parameters"])
     pose = _pose(content["camera_from_rig"])
-    return Camera(name, (width, height), float(content["rho_mm"]), intrinsics, pose)
+    return Camera(name, (width, height), float(content["rho_mm"]), intrinsics, pose, wall)
 
 
 def _pose(content: Mapping[str, Any]) -> Pose:

@@ -39,6 +39,8 @@ _WORDS = {
     "tilt_x": "sensor tilt about v, tangent",
     "tilt_y": "sensor tilt about u, tangent",
     "image_convergence_per_mm": "image-side convergence, 1/mm",
+    "wall_x_rad": "wall's normal from the stated one, x",
+    "wall_y_rad": "wall's normal from the stated one, y",
 }
 
 
@@ -87,6 +89,8 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
     cameras = list(results.content["cameras"].values())
     rows = []
     for name in PARAMETERS:
+        if name.startswith("wall_") and not results.content.get("walls"):
+            continue
         cells = [_parameter_cell(camera, name) for camera in cameras]
         free = any(name in camera.get("free", []) for camera in cameras)
         rows.append(Row((f"{_WORDS[name]} ({name})", *cells), faint=not free))
@@ -101,7 +105,7 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
 
 
 def _parameter_cell(camera: Mapping[str, Any], name: str) -> str:
-    value = camera["parameters"][name]
+    value = camera["parameters"].get(name, 0.0)
     if name not in camera.get("free", []):
         return f"{number(value, 7)} (held)"
     return with_sd(value, (camera.get("standard_deviations") or {}).get(name))

@@ -6,7 +6,6 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from telerig.estimator.identifiability import (
 )
 from telerig.estimator.shake_modes import remedy, shake_modes
 from telerig.estimator.shake_window import window_of
-from telerig.estimator.smoother.model import BroadBand, ShakeModel, Stage
+from telerig.estimator.smoother.model import Accelerometer, BroadBand, ShakeModel, Stage
 from telerig.estimator.smoother.solve import Options, solve
 
 QUIET = Options(robust=False)
@@ -74,7 +73,10 @@ def test_marks_fixed_to_the_tank_resolve_it() -> None:
 def test_the_remedy_is_never_what_the_run_already_has() -> None:
     alone, _, _ = run(np.random.default_rng(2), seconds=0.2)
     marked, _, _ = run(np.random.default_rng(2), seconds=0.2, marks=4)
-    sensors = [SimpleNamespace(camera=c, name=f"arm {c}") for c in range(len(alone.cameras))]
+    sensors = tuple(
+        Accelerometer(f"arm {c}", c, alone.t_s, np.zeros((len(alone.t_s), 3)), np.eye(3), 10.0)
+        for c in range(2)
+    )
     strip, arms = "fix a strip of dots", "one accelerometer on each camera arm"
     for problem, said, unsaid in (
         (alone, (strip, arms), ()),

@@ -112,9 +112,7 @@ def run_calibration(
         notes=notes,
         name=rig.name,
     )
-    calibration = replace(
-        calibration, stage=_stage(dataset, calibration, stage), medium=medium
-    )
+    calibration = replace(calibration, stage=_stage(dataset, calibration, stage), medium=medium)
     if medium == "air":
         calibration = put_behind_walls(calibration, walls)
     words = wall_words(calibration, rig)

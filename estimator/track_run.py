@@ -14,6 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.behind_walls import forgotten_walls
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.frontend.body import estimate_shape_sigma
 from telerig.estimator.frontend.bubble_types import DETECTION_COLUMNS

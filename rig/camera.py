@@ -98,9 +98,7 @@ class Camera:
 
     def pixel_jacobians(self, points_camera_mm: Array) -> tuple[Array, Array, Array]:
         """`projection.pixel_jacobians` of this camera: (..., 3) in its own frame."""
-        return projection.pixel_jacobians(
-            points_camera_mm, self.intrinsics, self.rho_mm, self.wall
-        )
+        return projection.pixel_jacobians(points_camera_mm, self.intrinsics, self.rho_mm, self.wall)
 
     def unproject(self, uv_px: ArrayLike) -> tuple[Array, Array]:
         """(..., 2) pixels -> rays in the rig frame: (..., 3) origins and (..., 3) unit directions.

@@ -132,9 +132,7 @@ def _behind_wall(
     return uv, by_ideal @ seen.by_point, by_intrinsics
 
 
-def _lens_jacobians(
-    ideal: Array, intrinsics: Array, rho_mm: float
-) -> tuple[Array, Array, Array]:
+def _lens_jacobians(ideal: Array, intrinsics: Array, rho_mm: float) -> tuple[Array, Array, Array]:
     """Pixels, (..., 2, 2) by telecentric coordinates, (..., 2, 20) by all but kappa and wall."""
     normal = ideal / rho_mm
     coefficients = intrinsics[_DISTORTION]

@@ -1,0 +1,187 @@
+"""A rig that was calibrated in one medium and measures behind glass walls in water."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.calibration import Calibration
+from telerig.estimator.problem import prior_sigma, wall_freedom
+from telerig.estimator.truth import working_volume
+from telerig.io.rig_description import RigDescription
+from telerig.rig.camera import Camera
+from telerig.rig.projection import INDEX
+from telerig.rig.triangulation import triangulate
+from telerig.rig.walls import Wall
+
+Array = NDArray[np.float64]
+
+MEDIA = ("air", "water")
+_NOTABLE_UM = 0.1
+_STEP_MM = 10.0
+
+
+def checked_medium(medium: str) -> str:
+    """Raises InputError for anything but "air" and "water"."""
+    if medium not in MEDIA:
+        raise InputError(f"unknown medium {medium!r}", todo='give "air" or "water"')
+    return medium
+
+
+def stated_walls(rig: RigDescription) -> dict[str, Wall]:
+    """The walls of `rig.toml`, by camera."""
+    return {name: wall.wall() for name, wall in rig.walls.items()}
+
+
+def with_walls(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
+    """The cameras, each behind its wall if it has one."""
+    return tuple(replace(c, wall=walls.get(c.name, c.wall)) for c in cameras)
+
+
+def put_behind_walls(calibration: Calibration, walls: Mapping[str, Wall]) -> Calibration:
+    """A calibration made in air, for use in the water behind walls.
+
+    What is not known of a wall's orientation joins the covariance as its prior, so it reaches
+    every projected and triangulated point.
+    """
+    cameras = with_walls(calibration.cameras, walls)
+    names, covariance = _with_priors(
+        calibration, cameras, calibration.covariance_names, calibration.covariance
+    )
+    joint_names, joint = calibration.joint_names, calibration.joint_covariance
+    if joint_names:
+        joint_names, joint = _with_priors(calibration, cameras, joint_names, joint)
+    return replace(
+        calibration, cameras=cameras, covariance=covariance, covariance_names=names,
+        free=tuple((*f, *wall_freedom(c)) for f, c in zip(calibration.free, cameras)),
+        joint_names=joint_names, joint_covariance=joint,
+    )  # fmt: skip
+
+
+def _with_priors(
+    calibration: Calibration, cameras: Sequence[Camera], names: tuple[str, ...], matrix: Array
+) -> tuple[tuple[str, ...], Array]:
+    """Names and covariance with each camera's wall after its intrinsics."""
+    grown: list[str] = []
+    added: dict[str, float] = {}
+    at = 0
+    for camera, free in zip(cameras, calibration.free):
+        grown += names[at : at + len(free)]
+        at += len(free)
+        for name in wall_freedom(camera):
+            added[f"{camera.name}.{name}"] = float(prior_sigma(camera)[INDEX[name]] ** 2)
+            grown.append(f"{camera.name}.{name}")
+    grown += names[at:]
+    variance = np.array([added.get(name, 0.0) for name in grown])
+    out, old = np.diag(variance), np.flatnonzero([name not in added for name in grown])
+    out[np.ix_(old, old)] = matrix
+    return tuple(grown), out
+
+
+def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
+    """How wrong points are, at most, over the working volume (um): the same but for their walls.
+
+    A shift of all points alike is set aside: the rig's origin is a matter of definition. With one
+    camera, its error across its own axis.
+    """
+    points = working_volume(tuple(used))
+    pixels = [camera.project(points) for camera in true]
+    if len(used) == 2:
+        wrong = triangulate((used[0], used[1]), (pixels[0], pixels[1]), 1.0).points_mm - points
+    else:
+        wrong = (pixels[0] - used[0].project(points)) / used[0]["scale_px_per_mm"]
+    wrong = wrong - wrong.mean(0)
+    return float(1e3 * np.linalg.norm(wrong, axis=-1).max())
+
+
+def wall_words(calibration: Calibration, rig: RigDescription) -> list[str]:
+    """What a user should know of the walls: what they do, and what is not known of them."""
+    cameras = [c for c in calibration.cameras if c.wall is not None]
+    if not cameras:
+        return []
+    words = [_in_words(calibration, [c.name for c in cameras])]
+    for camera in cameras:
+        words += _uncertain(calibration, camera)
+        if rig.walls[camera.name].distance_mm is None:
+            words += _without_distance(camera)
+    return words
+
+
+def _in_words(calibration: Calibration, names: Sequence[str]) -> str:
+    where = f"behind the walls of {', '.join(names)}"
+    error = model_error_um(calibration.in_air().cameras, calibration.cameras)
+    if calibration.medium == "air":
+        return (
+            f"calibrated in air; points of runs lie in the water {where}: a model without them "
+            f"would be up to {error:.3g} um wrong over the working volume"
+        )
+    return f"calibrated in the water {where}; in air the same rig sees up to {error:.3g} um else"
+
+
+def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
+    """The share of a wall's unknown orientation, one standard deviation in the worse direction."""
+    sd = max((calibration.sd(f"{camera.name}.{n}") for n in wall_freedom(camera)), default=0.0)
+    if sd == 0 or camera.wall is None:
+        return []
+    turned = camera.with_parameters(wall_x_rad=camera["wall_x_rad"] + sd)
+    points = working_volume((camera,))
+    moved = (turned.project(points) - camera.project(points)) / camera["scale_px_per_mm"]
+    moved = moved - moved.mean(0)
+    return [
+        f"the normal of the wall of {camera.name} is known to {np.degrees(sd):.2g} deg: "
+        f"{1e3 * np.abs(moved).max():.2g} um over the working volume, counted in the covariances"
+    ]
+
+
+def _without_distance(camera: Camera) -> list[str]:
+    """What 10 mm of a wall's unknown distance would do."""
+    if camera.wall is None:
+        return []
+    farther = replace(camera.wall, distance_mm=camera.wall.distance_mm + _STEP_MM)
+    points = working_volume((camera,))
+    moved = replace(camera, wall=farther).project(points) - camera.project(points)
+    moved = moved / camera["scale_px_per_mm"] * 1e3
+    common = moved.mean(0)
+    shift, rest = np.linalg.norm(common), np.abs(moved - common).max()
+    if max(shift, rest) < _NOTABLE_UM:
+        return []
+    return [
+        f"[walls.{camera.name}] has no distance_mm, so the wall is taken at the camera's origin: "
+        f"every {_STEP_MM:.0f} mm that it stands elsewhere shift this camera's points by "
+        f"{shift:.3g} um, all alike, and change them by up to {rest:.2g} um"
+    ]
+
+
+def forgotten_walls(rig: RigDescription | None, calibration: Calibration) -> list[str]:
+    """Warnings where `rig.toml` has walls that the calibration does not model.
+
+    A calibration made in water without walls holds them in its scales and axes, but for what
+    perspective does.
+    """
+    stated = {} if rig is None else stated_walls(rig)
+    have = {c.name: c.wall for c in calibration.cameras}
+    missing = [name for name, wall in stated.items() if not _same(have.get(name), wall)]
+    if not missing or calibration.medium == "water":
+        return []
+    error = model_error_um(calibration.cameras, with_walls(calibration.cameras, stated))
+    if error < _NOTABLE_UM:
+        return []
+    return [
+        f"rig.toml states walls for {', '.join(missing)} that the calibration does not have: "
+        f"points are up to {error:.3g} um wrong over the working volume; calibrate again"
+    ]
+
+
+def _same(one: Wall | None, other: Wall) -> bool:
+    """Alike to what a file keeps of them."""
+    if one is None:
+        return False
+    return np.allclose(_numbers(one), _numbers(other), rtol=1e-9, atol=1e-12)
+
+
+def _numbers(wall: Wall) -> Array:
+    return np.concatenate([np.atleast_1d(value) for value in wall.as_dict().values()])

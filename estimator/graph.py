@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from telerig.errors import CalibrationError
+from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.normal_equations import ArraySystem
 from telerig.estimator.problem import (
     GAUGE_SIGMA_MM,
@@ -207,7 +207,7 @@ def solve(
     schur = problem.solver == "schur" or (problem.solver == "auto" and is_large(problem))
     system: Any = ArraySystem(problem, start) if schur else GraphSystem(problem, start)
     point = system.first()
-    cost = system.cost(point)
+    cost = _cost(system, point)
     if not np.isfinite(cost):
         raise CalibrationError("the starting point has no finite cost", todo="check rig.toml")
     damping, iteration = 1e-4, 0
@@ -217,7 +217,7 @@ def solve(
         if promised <= relative * cost and damping <= NEARLY_UNDAMPED:
             break
         trial = system.moved(point, step)
-        trial_cost = system.cost(trial)
+        trial_cost = _cost(system, trial)
         gained = cost - trial_cost
         if np.isfinite(trial_cost) and gained >= -1e-13 * cost:
             done = promised <= relative * cost and gained <= relative * cost
@@ -233,6 +233,14 @@ def solve(
                 break
     information = equations.information()
     return Solution(system.state(point), float(cost), iteration, information, slots(problem))
+
+
+def _cost(system: Any, point: Any) -> float:
+    """Infinite where a camera cannot see a dot through its wall at all: a step too far."""
+    try:
+        return float(system.cost(point))
+    except GeometryError:
+        return float("inf")
 
 
 def _damped_step(information: Array, gradient: Array, damping: float) -> tuple[Array, float]:

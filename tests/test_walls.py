@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +18,9 @@ from ray_tracer import trace_pixels
 from telerig.errors import GeometryError
 from telerig.rig import projection, walls
 from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.projection import INDEX
+from telerig.rig.triangulation import triangulate
 from telerig.rig.walls import Wall
 
 Array = NDArray[np.float64]
@@ -150,13 +154,86 @@ def test_derivatives_are_those_of_differences(name: str, kappa: float) -> None:
     np.testing.assert_allclose(found.by_kappa, by_kappa, rtol=2e-5, atol=1e-4)
 
 
+@pytest.mark.parametrize("kappa", [0.0, 2e-5, 1 / 150])
+def test_a_camera_behind_a_wall(kappa: float) -> None:
+    pose = Pose(rotation_from_rotvec(np.array([0.1, 1.4, -0.2])), np.array([1.0, -2.0, 3.0]))
+    camera = Camera.create(
+        "left", (800, 600), 16.0, kappa_per_mm=kappa, k1=2e-3, tilt_x=0.02, wall_x_rad=0.03,
+        wall_y_rad=-0.02, camera_from_rig=pose,
+    )  # fmt: skip
+    camera = replace(camera, wall=wall_named("25 deg"))
+    points = water_points(np.random.default_rng(7), (2, 3))
+    uv = camera.project(points)
+    origin, direction = camera.unproject(uv)
+    off = np.cross(points - origin, direction)
+    assert np.abs(off).max() < 1e-10
+
+    in_camera = pose.apply(points.reshape(-1, 3))
+    found, by_point, by_intrinsics = camera.pixel_jacobians(in_camera)
+    np.testing.assert_allclose(found, uv.reshape(-1, 2), atol=1e-10)
+    level = replace(camera, camera_from_rig=Pose.identity())
+    for i, point in enumerate(in_camera):
+        expected = differences(level.project, point, 0.02)
+        np.testing.assert_allclose(by_point[i], expected, atol=1e-6)
+    for name in ("scale_px_per_mm", "kappa_per_mm", "k1", "tilt_x", "wall_x_rad", "wall_y_rad"):
+
+        def of(change: Array, name: str = name) -> Array:
+            changed = level.with_parameters(**{name: level[name] + float(change[0])})
+            return changed.project(in_camera)
+
+        expected = differences(of, np.zeros(1), 1e-5)[..., 0]
+        np.testing.assert_allclose(by_intrinsics[..., INDEX[name]], expected, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 1e-4])
+def test_triangulation_goes_through_the_refracted_rays(kappa: float) -> None:
+    side = Pose(rotation_from_rotvec(np.array([0.0, np.pi / 2, 0.0])), np.zeros(3))
+    cameras = tuple(
+        replace(
+            Camera.create(n, (800, 600), 16.0, kappa_per_mm=kappa, camera_from_rig=p),
+            wall=wall_named(w),
+        )
+        for n, p, w in (("left", Pose.identity(), "25 deg"), ("right", side, "1 deg"))
+    )
+    pair = (cameras[0], cameras[1])
+    rng = np.random.default_rng(8)
+    points = water_points(rng, (5,))
+    exact = tuple(c.project(points) for c in pair)
+    for method in ("ml", "midpoint"):
+        found = triangulate(pair, (exact[0], exact[1]), 0.1, method)
+        np.testing.assert_allclose(found.points_mm, points, atol=1e-8)
+        assert np.abs(found.ray_miss_mm).max() < 1e-9
+    noisy = [uv + 0.1 * rng.standard_normal((4000, 5, 2)) for uv in exact]
+    spread = triangulate(pair, (noisy[0], noisy[1]), 0.1).points_mm
+    for i in range(5):
+        seen = np.cov(spread[:, i].T)
+        stated = triangulate(pair, (exact[0][i], exact[1][i]), 0.1).covariance_mm2
+        np.testing.assert_allclose(np.diag(seen), np.diag(stated), rtol=0.12)
+
+
 def test_the_tangents_are_a_turn_of_the_normal() -> None:
     wall = wall_named("25 deg")
-    basis = walls.tangent_basis(wall.normal)
+    basis = tangent_basis_of(wall)
     np.testing.assert_allclose(basis.T @ basis, np.eye(2), atol=1e-15)
     np.testing.assert_allclose(basis.T @ wall.normal, 0, atol=1e-15)
+    delta = np.array([0.02, -0.03])
+    slope = differences(lambda d: wall.turned(d).normal, delta, 1e-3)
+    turned = tangent_basis_of(wall.turned(delta))
+    np.testing.assert_allclose(wall.turn_jacobian(delta), turned.T @ slope, atol=1e-9)
     angle = np.arccos(wall.turned([3e-3, -4e-3]).normal @ wall.normal)
     assert angle == pytest.approx(np.arctan(5e-3), rel=1e-9)
+
+
+def tangent_basis_of(wall: Wall) -> Array:
+    return walls.tangent_basis(wall.normal)
+
+
+def test_a_wall_survives_its_file() -> None:
+    wall = replace(wall_named("25 deg"), normal_sigma_rad=0.01)
+    again = Wall.from_dict(json.loads(json.dumps(wall.as_dict())))
+    np.testing.assert_allclose(again.normal, wall.normal, atol=1e-15)
+    assert again.normal_sigma_rad == pytest.approx(0.01, rel=1e-15)
+    assert replace(again, normal=wall.normal, normal_sigma_rad=0.01) == wall
 
 
 def test_what_no_ray_reaches_is_an_error() -> None:

@@ -12,9 +12,10 @@ from telerig.errors import InputError
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.problem import prior_sigma, wall_freedom
 from telerig.estimator.truth import working_volume
+from telerig.estimator.twins import ENTOCENTRIC
 from telerig.io.rig_description import RigDescription
 from telerig.rig.camera import Camera
-from telerig.rig.projection import INDEX
+from telerig.rig.projection import INDEX, standing_wall
 from telerig.rig.triangulation import triangulate
 from telerig.rig.walls import Wall
 
@@ -105,7 +106,7 @@ def wall_words(calibration: Calibration, rig: RigDescription) -> list[str]:
         return []
     words = [_in_words(calibration, [c.name for c in cameras])]
     for camera in cameras:
-        words += _uncertain(calibration, camera)
+        words += _uncertain(calibration, camera) + _sign_open(calibration, camera)
         if rig.walls[camera.name].distance_mm is None:
             words += _without_distance(camera)
     return words
@@ -135,6 +136,32 @@ def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
         f"the normal of the wall of {camera.name} is known to {np.degrees(sd):.2g} deg: "
         f"{1e3 * np.abs(moved).max():.2g} um over the working volume, counted in the covariances"
     ]
+
+
+def _sign_open(calibration: Calibration, camera: Camera) -> list[str]:
+    """Whether a wall that leans as much to the other side fits as well, and was as likely before.
+
+    Without perspective a target in the water shows the square of the tilt only.
+    """
+    free, wall = wall_freedom(camera), camera.wall
+    weak = abs(camera["kappa_per_mm"]) * camera.rho_mm < ENTOCENTRIC
+    if calibration.medium == "air" or not free or wall is None or not weak:
+        return []
+    normal = standing_wall(camera.intrinsics, wall).normal
+    mirrored = normal * [-1, -1, 1]
+    apart, from_stated = (_angle_rad(mirrored, n) for n in (normal, wall.normal))
+    sd = max(calibration.sd(f"{camera.name}.{name}") for name in free)
+    if apart < 3 * sd or from_stated > 3 * wall.normal_sigma_rad:
+        return []
+    return [
+        f"the wall of {camera.name} may as well lean {np.degrees(apart / 2):.2g} deg to the other "
+        "side: a telecentric lens with the target in the water sees no sign; points are not "
+        "affected, but state the normal's side better if its value matters"
+    ]
+
+
+def _angle_rad(a: Array, b: Array) -> float:
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
 def _without_distance(camera: Camera) -> list[str]:

@@ -32,6 +32,9 @@ def batch(
         Path | None, typer.Option(help="One calibration.json for all, instead of calibrating.")
     ] = None,
     model: Annotated[str, typer.Option(help="Lens model of the calibrations.")] = "auto",
+    medium: Annotated[
+        str, typer.Option(help="air or water: where the targets were (see [walls]).")
+    ] = "air",
     report: Annotated[bool, typer.Option(help="Write the reports.")] = True,
     quiet: Annotated[bool, typer.Option(help="Print only the summary.")] = False,
 ) -> None:
@@ -59,8 +62,8 @@ def batch(
                 "both --workers and --scheduler", todo="a cluster has its own number of workers"
             )
         index, of = _share(share)
-        check_options(calibration, model)
-        jobs = jobs_of(datasets, calibration=calibration, model=model, report=report)
+        check_options(calibration, model, medium)
+        jobs = jobs_of(datasets, calibration=calibration, model=model, medium=medium, report=report)
         mine = share_of(jobs, index, of)
         places = {job.dataset for job in mine}
         alike = len({Path(place).name for place in places}) < len(places)

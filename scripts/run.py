@@ -26,6 +26,10 @@ def run(
     model: Annotated[
         str, typer.Option(help="Lens model: auto, none, radial, tangential, kappa, ...")
     ] = "auto",
+    medium: Annotated[
+        str,
+        typer.Option(help="air or water: where the target was. With [walls], runs are in water."),
+    ] = "air",
     report: Annotated[bool, typer.Option(help="Write the reports.")] = True,
     quiet: Annotated[bool, typer.Option(help="Print only the summary.")] = False,
 ) -> None:
@@ -42,9 +46,9 @@ def run(
         from telerig.estimator.batch.summary import batch_words
         from telerig.estimator.batch.work import DONE, FAILED, LEFT_OUT, failure
 
-        check_options(calibration, model)
+        check_options(calibration, model, medium)
         jobs = jobs_of([dataset], calibration=calibration, only=only or (), model=model,
-                       report=report, strict=True)  # fmt: skip
+                       medium=medium, report=report, strict=True)  # fmt: skip
         records: dict[str, dict[str, Any]] = {}
         for job in jobs:
             lost = [n for n in job.needs if records[n]["status"] != DONE]

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,21 @@ from ray_tracer import trace_pixels
 
 import telerig
 from telerig.errors import InputError
-from telerig.estimator.behind_walls import forgotten_walls, put_behind_walls, with_walls
+from telerig.estimator.behind_walls import (
+    forgotten_walls,
+    put_behind_walls,
+    wall_words,
+    with_walls,
+)
 from telerig.estimator.calibrate import run_calibration
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.self_calibration import self_calibrate
 from telerig.estimator.truth import true_cameras
 from telerig.io.dataset import load_dataset
+from telerig.io.export.halcon import halcon_cameras
+from telerig.io.export.opencv import camera_matrices
 from telerig.io.report.calibration_results import read_cameras, read_results
+from telerig.io.rig_description import WallDescription
 from telerig.rig.camera import Camera
 from telerig.rig.projection import PARAMETERS, standing_wall
 from telerig.rig.walls import Wall
@@ -185,6 +194,38 @@ def test_what_is_not_known_of_a_wall_reaches_the_points(in_air: Calibration) -> 
     expected = np.cov(np.array(moved).T)
     difference = grown[0] - grown[1]
     np.testing.assert_allclose(difference, expected, atol=0.15 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kappa", [0.0, 1e-4])
+def test_exported_matrices_are_those_of_the_water(in_air: Calibration, kappa: float) -> None:
+    straight = [
+        c.with_parameters(k1=0.0, k2=0.0, p1=0.0, p2=0.0, kappa_per_mm=kappa)
+        for c in in_air.cameras
+    ]
+    for found in camera_matrices(straight):
+        assert found.undistorted_misfit.max_px < (1e-9 if kappa == 0 else 0.02)
+        assert found.affine_misfit.max_px < (1e-9 if kappa == 0 else 1.0)
+    left, right = halcon_cameras(straight, lens="telecentric")
+    assert "the glass wall left out: HALCON's models have none" in left.notes
+    assert left.misfit.max_px > 0.1
+    assert kappa or right.misfit.max_px < 1e-9
+
+
+def test_a_sign_that_nothing_decides_is_said(scene: Callable[..., Any]) -> None:
+    walls = {"left": wall(5.0), "right": wall(0.0)}
+    made, _, dots = in_water(walls, 0.0, scene)
+    for sigma_deg, open_ in ((6.0, True), (1.0, False)):
+        stated = {"left": wall(4.0, sigma_deg=sigma_deg), "right": wall(0.0)}
+        found = self_calibrate(
+            dots, with_walls(made.cameras, stated), made.target, model="none",
+            nominal_rotvec_deg=made.nominal_rotvec_deg,
+        )  # fmt: skip
+        descriptions = {
+            n: WallDescription(n, (0.0, 0.0, 1.0), INDICES, 10.0, -60.0) for n in stated
+        }
+        rig = SimpleNamespace(walls=descriptions)
+        words = wall_words(replace(found, medium="water"), rig)
+        assert any("to the other side" in line for line in words) == open_
 
 
 def in_water(

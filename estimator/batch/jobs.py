@@ -27,7 +27,8 @@ class Job:
     """One piece of work. Paths are text, so that a job can be sent to another machine.
 
     run : empty for a calibration. calibration : a file for all runs, or empty for the dataset's.
-    model : the lens model of a calibration. needs : names of the jobs that must be done before.
+    model, medium : the lens model of a calibration, and where its target was.
+    needs : names of the jobs that must be done before.
     """
 
     kind: Kind
@@ -35,6 +36,7 @@ class Job:
     run: str = ""
     calibration: str = ""
     model: str = "auto"
+    medium: str = "air"
     report: bool = True
     min_diameter_px: float = 8.0
     needs: tuple[str, ...] = ()
@@ -77,6 +79,7 @@ def jobs_of(
     *,
     calibration: Path | None = None,
     model: str = "auto",
+    medium: str = "air",
     report: bool = True,
     min_diameter_px: float = 8.0,
     only: Sequence[str] = (),
@@ -94,7 +97,7 @@ def jobs_of(
     places = _checked(datasets)
     shared: dict[str, Any] = {
         "calibration": "" if calibration is None else str(Path(calibration).resolve()),
-        "model": model, "report": report, "min_diameter_px": min_diameter_px,
+        "model": model, "medium": medium, "report": report, "min_diameter_px": min_diameter_px,
     }  # fmt: skip
     jobs: list[Job] = []
     for place in places:
@@ -165,8 +168,9 @@ def check_run_name(run: Path) -> None:
         )  # fmt: skip
 
 
-def check_options(calibration: Path | None, model: str) -> None:
-    """Raise InputError for a calibration that is not there, or an unknown lens model."""
+def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
+    """Raise InputError for a calibration that is not there, an unknown lens model or medium."""
+    from telerig.estimator.behind_walls import checked_medium
     from telerig.estimator.problem import MODELS
 
     if calibration is not None and not Path(calibration).exists():
@@ -176,6 +180,7 @@ def check_options(calibration: Path | None, model: str) -> None:
         )  # fmt: skip
     if model != "auto" and model not in MODELS:
         raise InputError(f"--model {model}", todo=f"known: auto, {', '.join(MODELS)}")
+    checked_medium(medium)
 
 
 def fingerprint(job: Job) -> str:

@@ -130,10 +130,11 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 
     begun = time.perf_counter()
     data = load_dataset(Path(job.dataset))
-    run = run_calibration(data, model=job.model, stage=stage)
+    run = run_calibration(data, model=job.model, medium=job.medium, stage=stage)
     found = run.calibration
     write_results(
-        data, run, job.results, command="run", options={"model": job.model},
+        data, run, job.results, command="run",
+        options={"model": job.model, "medium": job.medium},
         seconds={"calibrate": time.perf_counter() - begun}, report=job.report,
     )  # fmt: skip
     figures = {

@@ -206,6 +206,8 @@ def _fitted_distortion(camera: Camera, stretch: Array, turn: Array, model: str) 
 
 def _notes(camera: Camera, bent: bool, perspective: bool) -> tuple[str, ...]:
     notes = []
+    if camera.wall is not None:
+        notes.append("the glass wall left out: HALCON's models have none")
     if bent:
         notes.append("distortion fitted: HALCON's model runs from distorted to undistorted")
     if camera["kappa_per_mm"] != 0 and not perspective:

@@ -18,6 +18,8 @@ from telerig.io.atomic import atomic_path
 from telerig.io.export.volume import Misfit, Volume, seen_points, working_volume
 from telerig.rig.camera import Camera
 from telerig.rig.distortion import COEFFICIENTS
+from telerig.rig.projection import standing_wall
+from telerig.rig.walls import ideal_jacobians
 
 Array = NDArray[np.float64]
 
@@ -46,7 +48,10 @@ class Matrices:
 
 
 def undistorted_matrix(camera: Camera) -> Array:
-    """(3, 4) projection of the camera without its distortion, in closed form."""
+    """(3, 4) projection of the camera without its distortion, in closed form.
+
+    Behind a glass wall it is exact for kappa = 0 only.
+    """
     q = np.array([camera["tilt_x"], camera["tilt_y"]])
     tilt = np.eye(3)
     tilt[:2, :2] += np.outer(q, q) / (1 + np.sqrt(1 + q @ q))
@@ -60,9 +65,24 @@ def undistorted_matrix(camera: Camera) -> Array:
         ]
     )
     pose = camera.camera_from_rig
-    flat = np.c_[pose.rotation, pose.translation_mm]
-    flat[2] = camera["kappa_per_mm"] * flat[2] + [0, 0, 0, 1]
-    return np.asarray(pixel @ tilt @ flat)
+    placed = np.vstack([np.c_[pose.rotation, pose.translation_mm], [0, 0, 0, 1]])
+    return np.asarray(pixel @ tilt @ _telecentric_matrix(camera) @ placed)
+
+
+def _telecentric_matrix(camera: Camera) -> Array:
+    """(3, 4) telecentric coordinates of a camera point.
+
+    Behind a wall that of all rays near the origin's, which spread n_air / n_water as fast.
+    """
+    kappa, out = camera["kappa_per_mm"], np.eye(3, 4)
+    out[2] = [0, 0, kappa, 1]
+    if camera.wall is not None:
+        wall = standing_wall(camera.intrinsics, camera.wall)
+        seen = ideal_jacobians(np.zeros(3), kappa, wall)
+        spread = kappa * wall.ratios[1] * np.sqrt(np.linalg.det(seen.by_point[:, :2]))
+        out[2, 2] = spread
+        out[:2] = np.c_[seen.by_point + np.outer(seen.value, [0, 0, spread]), seen.value]
+    return out
 
 
 def projected(matrix: Array, points_mm: Array) -> Array:

@@ -15,6 +15,7 @@ from telerig.io.export.opencv import undistorted_matrix
 from telerig.io.export.results import RunResults, facts, identifier, numbered, unit_of
 from telerig.rig.camera import Camera
 from telerig.rig.projection import PARAMETERS
+from telerig.rig.walls import Wall
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,7 +94,12 @@ def _camera(camera: Camera) -> dict[str, Any]:
         "translation_camera_from_rig_mm": camera.camera_from_rig.translation_mm,
         "undistorted_matrix": undistorted_matrix(camera),
         "pixel_origin": "centre of the top-left pixel is (0, 0)",
+        **({} if camera.wall is None else _wall(camera.wall)),
     }
+
+
+def _wall(wall: Wall) -> dict[str, Any]:
+    return {f"wall_{name}": np.array(value) for name, value in wall.as_dict().items()}
 
 
 def trackpy_table(results: RunResults) -> pd.DataFrame:

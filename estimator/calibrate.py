@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,8 +74,12 @@ def run_calibration(
     seed: int = 0,
     dots_free: str = "3d",
     stage: Stage | None = None,
+    pictures: bool = False,
 ) -> CalibrationRun:
-    """Like `calibrate`, with progress, the choice of what dots may do, and the detections."""
+    """Like `calibrate`, with progress, the choice of what dots may do, and the detections.
+
+    pictures : draw what was found over each image, as `write_results` needs.
+    """
     from telerig.estimator.behind_walls import (
         checked_medium,
         put_behind_walls,
@@ -82,21 +87,14 @@ def run_calibration(
         wall_words,
         with_walls,
     )
-    from telerig.estimator.self_calibration import self_calibrate
 
     checked_medium(medium)
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
-    detected, table, notes = None, None, list(dataset.notes)
-    if dataset.source == "images":
-        from telerig.estimator.frontend.dataset_dots import detect_dataset
+    detected, table, notes = _measured(dataset, stage, pictures)
 
-        detected = detect_dataset(
-            dataset, progress=None if stage is None else lambda i, n: stage("images", i, n)
-        )
-        table, notes = detected.dots, [*notes, *detected.notes]
-    else:
-        table = dataset.dots()
+    from telerig.estimator.self_calibration import self_calibrate
+
     rig = dataset.rig
     walls = stated_walls(rig)
     cameras = nominal_cameras(rig)
@@ -118,6 +116,35 @@ def run_calibration(
     words = wall_words(calibration, rig)
     calibration = replace(calibration, notes=(*calibration.notes, *words))
     return CalibrationRun(_with_measured(calibration, table, seed), detected)
+
+
+def _measured(
+    dataset: Dataset, stage: Stage | None, pictures: bool
+) -> tuple[DatasetDots | None, pd.DataFrame, list[str]]:
+    """Detections, None for a table; all dots; notes."""
+    if dataset.source != "images":
+        return None, dataset.dots(), list(dataset.notes)
+    from telerig.estimator.frontend.dataset_dots import detect_dataset
+
+    detected = detect_dataset(
+        dataset,
+        progress=None if stage is None else lambda i, n: stage("images", i, n),
+        overlays=pictures,
+        meanwhile=partial(_load_libraries, pictures),
+    )
+    return detected, detected.dots, [*dataset.notes, *detected.notes]
+
+
+def _load_libraries(pictures: bool) -> None:
+    """Load what comes after the detection while other processes detect."""
+    import gtsam  # noqa: F401
+
+    import telerig.estimator.self_calibration  # noqa: F401
+
+    if pictures:
+        from telerig.io.report.page import prepare_page
+
+        prepare_page()
 
 
 def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,18 +10,14 @@ import numpy as np
 
 from telerig.estimator.calibrate import CalibrationRun
 from telerig.io.atomic import atomic_folder, write_json_atomic
-from telerig.io.parallel import ordered_map, quick_workers
 from telerig.io.provenance import run_record
 from telerig.io.tables import write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from telerig.estimator.frontend.dataset_dots import DatasetDots, ImageDots
+    from telerig.estimator.frontend.dataset_dots import DatasetDots
     from telerig.io.dataset import Dataset
-
-OVERLAY_WIDTH_PX = 900
-OVERLAY_QUALITY = 80
 
 
 def input_files(dataset: Dataset) -> list[Path]:
@@ -55,35 +50,20 @@ def write_results(
         run.calibration.save(staged)
         write_json_atomic(staged / "run.json", record)
         if run.detected is not None:
-            write_detections(dataset, run.detected, staged)
+            write_detections(run.detected, staged)
             _write_example(dataset, run, staged / "dot_example.npz")
         if report:
             write_calibration_report(staged)
     return folder / "report.html"
 
 
-def write_detections(dataset: Dataset, detected: DatasetDots, folder: Path) -> None:
-    """rejected.csv and overlays/<camera>/<view>.jpg."""
+def write_detections(detected: DatasetDots, folder: Path) -> None:
+    """rejected.csv, and overlays/<camera>/<view>.jpg where they were drawn."""
     write_table(detected.rejected, folder / "rejected.csv")
-    write = partial(_write_overlay, dataset, folder / "overlays")
-    for _ in ordered_map(write, detected.images, quick_workers(len(detected.images))):
-        pass
-
-
-def _write_overlay(dataset: Dataset, folder: Path, image: ImageDots) -> None:
-    import cv2
-
-    from telerig.io.report.overlay import draw_overlay
-
-    view = next(v for v in dataset.views if v.name == image.view)
-    picture = draw_overlay(
-        dataset.image(view, image.camera), image.dots, image.rejected, max_width_px=OVERLAY_WIDTH_PX
-    )
-    target = folder / image.camera / f"{image.view}.jpg"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, OVERLAY_QUALITY]
-    _, encoded = cv2.imencode(".jpg", picture[..., ::-1], quality)
-    target.write_bytes(encoded.tobytes())
+    for image in detected.images:
+        target = folder / "overlays" / image.camera / f"{image.view}.jpg"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(image.overlay)
 
 
 def _write_example(dataset: Dataset, run: CalibrationRun, path: Path) -> None:

@@ -32,18 +32,25 @@ def can_fork() -> bool:
 
 
 def ordered_map(
-    function: Callable[[Task], Result], tasks: Sequence[Task], workers: int
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    workers: int,
+    meanwhile: Callable[[], object] | None = None,
 ) -> Iterator[Result]:
     """``function`` of each task, in the order of the tasks, by ``workers`` processes.
 
     function : a module's function or a `functools.partial` of one. An error raised in a process
         is raised here.
+    meanwhile : called once in this process while copies of it work.
     """
     if workers <= 1:
         yield from map(function, tasks)
     elif can_fork():
         with _forked(workers) as pool:
-            yield from pool.imap(function, tasks)
+            results = pool.imap(function, tasks)
+            if meanwhile is not None:
+                meanwhile()
+            yield from results
     else:
         from joblib import Parallel, delayed
 

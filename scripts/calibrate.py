@@ -56,7 +56,7 @@ def calibrate(
         with progress(quiet) as stage:
             run = run_calibration(
                 data, model=model, solver=solver, medium=medium, seed=seed, dots_free=dots,
-                stage=stage,
+                stage=stage, pictures=True,
             )  # fmt: skip
         seconds = {"calibrate": time.perf_counter() - begun}
         write_results(

@@ -44,7 +44,7 @@ def demo(
         simulated = time.perf_counter()
         options = {"seed": seed}
         with progress(quiet) as stage:
-            run = run_calibration(data, seed=seed, stage=stage)
+            run = run_calibration(data, seed=seed, stage=stage, pictures=True)
         seconds = {
             "simulate": simulated - begun,
             "calibrate": time.perf_counter() - simulated,

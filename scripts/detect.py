@@ -31,11 +31,11 @@ def detect(
 
         data = load_dataset(dataset, source="images")
         with progress(quiet) as stage:
-            found = detect_dataset(data, progress=lambda i, n: stage("images", i, n))
+            found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
         folder = out or data.results / "calibration"
         with atomic_folder(folder) as staged:
             write_table(found.dots, staged / "dots.csv")
-            write_detections(data, found, staged)
+            write_detections(found, staged)
         for image in found.images:
             words = image.failure or f"{len(image.dots)} dots, {len(image.rejected)} rejected"
             say(f"view {image.view}, camera {image.camera}: {words}")

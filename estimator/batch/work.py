@@ -130,7 +130,9 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 
     begun = time.perf_counter()
     data = load_dataset(Path(job.dataset))
-    run = run_calibration(data, model=job.model, medium=job.medium, stage=stage)
+    run = run_calibration(
+        data, model=job.model, medium=job.medium, stage=stage, pictures=True
+    )  # fmt: skip
     found = run.calibration
     write_results(
         data, run, job.results, command="run",

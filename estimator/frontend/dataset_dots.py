@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.frontend.dots import DotMeasurement, measure_dots
@@ -28,13 +30,17 @@ Progress = Callable[[int, int], None]
 MEGAPIXELS_FOR_WORKERS = 40
 """Below this, starting fresh worker processes costs more than it saves."""
 
+OVERLAY_WIDTH_PX = 900
 
 NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
 
 
 @dataclass(frozen=True)
 class ImageDots:
-    """One image: its numbered dots, its rejected candidates, and why it was left out, if it was."""
+    """One image: its numbered dots, its rejected candidates, and why it was left out, if it was.
+
+    overlay : a JPEG of the image with all of them, where it was asked for.
+    """
 
     view: str
     camera: str
@@ -43,6 +49,7 @@ class ImageDots:
     handedness: int
     failure: str = ""
     notes: tuple[str, ...] = ()
+    overlay: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -59,11 +66,17 @@ class DatasetDots:
 
 
 def detect_dataset(
-    dataset: Dataset, *, progress: Progress | None = None, workers: int | None = None
+    dataset: Dataset,
+    *,
+    progress: Progress | None = None,
+    workers: int | None = None,
+    overlays: bool = False,
+    meanwhile: Callable[[], object] | None = None,
 ) -> DatasetDots:
     """Detect the target in every calibration image.
 
-    workers : processes; None takes one per core where that pays.
+    workers : processes; None takes one per core where that pays.  overlays : draw them, too.
+    meanwhile : called in this process while the others work.
 
     Raises InputError for images that cannot be read, DetectionError when no image shows the
     target or when images contradict each other's handedness.
@@ -71,7 +84,8 @@ def detect_dataset(
     tasks = [(view, camera) for view in dataset.views for camera in view.image_paths]
     count = _workers(dataset, len(tasks)) if workers is None else workers
     found: list[ImageDots] = []
-    for done, image in enumerate(ordered_map(partial(_one_of, dataset), tasks, count), 1):
+    work = partial(_one_of, dataset, overlays)
+    for done, image in enumerate(ordered_map(work, tasks, count, meanwhile), 1):
         found.append(image)
         if progress is not None:
             progress(done, len(tasks))
@@ -109,12 +123,18 @@ def _workers(dataset: Dataset, images: int) -> int:
     return min(cores(), images) if large else quick_workers(images)
 
 
-def _one_of(dataset: Dataset, task: tuple[View, str]) -> ImageDots:
-    return _one(dataset, *task)
+def _one_of(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> ImageDots:
+    image = dataset.image(*task)
+    found = _one(dataset, image, *task)
+    if not overlay:
+        return found
+    from telerig.io.report.overlay import overlay_jpeg
+
+    drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=OVERLAY_WIDTH_PX)
+    return replace(found, overlay=drawn)
 
 
-def _one(dataset: Dataset, view: View, camera: str) -> ImageDots:
-    image = dataset.image(view, camera)
+def _one(dataset: Dataset, image: NDArray[Any], view: View, camera: str) -> ImageDots:
     target: Target = dataset.target
     smallest = _smallest_px(dataset, camera)
     try:

@@ -20,7 +20,7 @@ GREEN, RED, PAPER, INK = (40, 200, 70), (235, 45, 45), (255, 255, 255), (30, 30,
 _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 _LARGEST_ID = 9999
 _FRACTION_BITS = 4
-_SCALE, _LINE_PX = 0.36, 14
+_SCALE, _LINE_PX, _JPEG_QUALITY = 0.36, 14, 80
 
 
 def draw_overlay(
@@ -67,6 +67,18 @@ def _check(image: NDArray[Any], table: pd.DataFrame, extra: list[str], name: str
             f"the table of {name} dots lacks {', '.join(missing)}",
             todo=f"it needs {', '.join(_ELLIPSE + extra)}",
         )
+
+
+def overlay_jpeg(
+    image: NDArray[Any], accepted: pd.DataFrame, rejected: pd.DataFrame, *, max_width_px: int
+) -> bytes:
+    """`draw_overlay` as a JPEG file's content."""
+    import cv2
+
+    picture = draw_overlay(image, accepted, rejected, max_width_px=max_width_px)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    _, encoded = cv2.imencode(".jpg", picture[..., ::-1], quality)
+    return encoded.tobytes()
 
 
 def grey_picture(image: NDArray[Any], factor: float, least_contrast: float = 0.0) -> Picture:

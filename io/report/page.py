@@ -54,6 +54,13 @@ def plotly_javascript() -> str:
     return file.read_text(encoding="utf-8")
 
 
+def prepare_page() -> None:
+    """Load what every page needs."""
+    import jinja2  # noqa: F401
+
+    prepare_drawing()
+
+
 def drawn_over_cores(drawings: Sequence[Callable[[], Any]]) -> list[Any]:
     """What each drawing returns, in order."""
     prepare_drawing()

@@ -24,9 +24,12 @@ from ray_tracer import trace_pixels
 
 import telerig
 from telerig.errors import InputError
+from telerig.estimator.batch.jobs import Job, check_options, jobs_of
 from telerig.estimator.behind_walls import (
     forgotten_walls,
+    model_error_um,
     put_behind_walls,
+    stated_walls,
     wall_words,
     with_walls,
 )
@@ -34,11 +37,13 @@ from telerig.estimator.calibrate import run_calibration
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.self_calibration import self_calibrate
 from telerig.estimator.truth import true_cameras
+from telerig.factors.measurements import image_of_point
 from telerig.io.dataset import load_dataset
 from telerig.io.export.halcon import halcon_cameras
 from telerig.io.export.opencv import camera_matrices
 from telerig.io.report.calibration_results import read_cameras, read_results
 from telerig.io.rig_description import WallDescription
+from telerig.io.rigfile import read_rig_toml, write_rig_toml
 from telerig.rig.camera import Camera
 from telerig.rig.projection import PARAMETERS, standing_wall
 from telerig.rig.walls import Wall
@@ -250,6 +255,61 @@ def in_water(
     dots["suu_px2"] = dots["svv_px2"] = 1e-4
     dots["suv_px2"] = 0.0
     return made, behind, dots
+
+
+def test_a_perspective_lens_from_air_into_water(scene: Callable[..., Any]) -> None:
+    kappa = 1 / 300
+    made, true, dots = in_water({}, kappa, scene)
+    nominal = [c.with_parameters(kappa_per_mm=kappa) for c in made.cameras]
+    air = self_calibrate(
+        dots, nominal, made.target, nominal_rotvec_deg=made.nominal_rotvec_deg, model="kappa"
+    )
+    points = np.random.default_rng(0).uniform(-12, 12, (20, 3))
+    uv = [traced(c, WALLS[c.name], points) for c in true]
+    wrong = {}
+    for calibration in (air, put_behind_walls(air, WALLS)):
+        seen = calibration.triangulate(uv[0], uv[1], sigma_px=0.01).points_mm - points
+        wrong[calibration is air] = np.abs(seen - seen.mean(0)).max()
+    assert wrong[False] < 2e-3 < 0.3 < wrong[True]
+
+
+def test_one_camera_is_told_too(in_air: Calibration) -> None:
+    both = in_air.cameras
+    alone = model_error_um([replace(both[0], wall=None)], both[:1])
+    assert alone == pytest.approx(SHEAR_UM / 30 * 0.5 * 0.6 * 512 / 10.0, rel=0.05)
+
+
+def test_the_smoother_sees_through_the_wall(in_air: Calibration) -> None:
+    camera, points = in_air.cameras[0], rising()
+    axis, position = np.array([0.0, -1.0, 0.0]), 7.0
+    seen = image_of_point(camera, points + axis * position, position, axis, np.zeros(3))
+    np.testing.assert_allclose(seen.uv_px, camera.project(points), atol=1e-9)
+    for i, step in enumerate(1e-3 * np.eye(3)):
+        slope = (camera.project(points + step) - camera.project(points - step)) / 2e-3
+        np.testing.assert_allclose(seen.by_point[..., i], slope, atol=1e-6)
+
+
+def test_rig_toml_states_the_wall(tank: Path, tmp_path: Path) -> None:
+    rig = load_dataset(tank).rig
+    walls = {n: replace(w, normal_sigma_deg=0.25) for n, w in rig.walls.items()}
+    write_rig_toml(replace(rig, walls=walls), tmp_path / "rig.toml")
+    again = read_rig_toml(tmp_path / "rig.toml")
+    assert again.walls == walls
+    stated = stated_walls(again)["left"]
+    assert stated.normal_sigma_rad == pytest.approx(np.radians(0.25))
+    assert stated.distance_mm == -60.0
+    text = (tmp_path / "rig.toml").read_text(encoding="utf-8").replace("= 0.25", "= -0.25")
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="normal_sigma_deg"):
+        read_rig_toml(tmp_path / "rig.toml")
+
+
+def test_run_and_batch_pass_the_medium_on(tank: Path) -> None:
+    jobs = jobs_of([tank], medium="water")
+    assert {job.medium for job in jobs} == {"water"}
+    assert Job.from_json(jobs[0].as_json()) == jobs[0]
+    with pytest.raises(InputError, match="unknown medium 'oil'"):
+        check_options(None, "auto", "oil")
 
 
 @pytest.mark.parametrize(("kappa", "model"), [(0.0, "none"), (1 / 300, "kappa")])

@@ -113,7 +113,7 @@ def tracking_stream(
     if run.detections is not None:
         table, labels = numbered_particles(_complete(run.detections))
         first_id = int(table["particle"].max()) + 1
-        batches = partial(_once, table)
+        batches = partial(iter, (table,))
     else:
         asked = {"options": repr(chosen), "cameras": repr(cameras)}
         strip = wanted(run)
@@ -187,10 +187,6 @@ def _complete(detections: pd.DataFrame) -> pd.DataFrame:
     missing = [name for name in DETECTION_COLUMNS if name not in detections]
     blank = {name: "" if name == "flags" else np.nan for name in missing}
     return detections.assign(**blank)
-
-
-def _once(table: pd.DataFrame) -> Iterator[pd.DataFrame]:
-    yield table
 
 
 def numbered_particles(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str] | None]:

@@ -27,13 +27,18 @@ class JointCovariance:
     """matrix : (D, D) in physical units; names : D strings, ``left.k1``, ``view 03.rx_rad``.
 
     Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
-    effective_dof : degrees of freedom that are left to the residuals.
+    leverage : (M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs.
     """
 
     names: tuple[str, ...]
     matrix: Array
     rig: int
-    effective_dof: float
+    leverage: Array
+
+    @property
+    def effective_dof(self) -> float:
+        """E[sum of squared whitened residuals] = rows - trace(J C J^T)."""
+        return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
         """Names and covariance of the cameras alone: intrinsics, then the second camera's pose."""
@@ -63,9 +68,9 @@ def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
     units = _units(problem, len(scale))
     names = _names(problem)
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
-    dof = _effective_dof(problem, solution, inverse)
+    leverage = hat_matrix_blocks(problem, solution, inverse)
     inverse[untouched, untouched] = np.inf
-    return JointCovariance(names, inverse * units[:, None] * units, rig, dof)
+    return JointCovariance(names, inverse * units[:, None] * units, rig, leverage)
 
 
 def _units(problem: Problem, size: int) -> Array:
@@ -83,12 +88,6 @@ def _names(problem: Problem) -> tuple[str, ...]:
     names += [f"view {v}.{p}" for v in problem.views for p in POSE_COMPONENTS]
     names += [f"dot {d}.{p}" for d in problem.dot_ids for p in ("x_mm", "y_mm", "z_mm")]
     return tuple(names)
-
-
-def _effective_dof(problem: Problem, solution: Solution, inverse: Array) -> float:
-    """E[sum of squared whitened residuals] = rows - trace(J C J^T)."""
-    leverages = hat_matrix_blocks(problem, solution, inverse)
-    return float(2 * len(leverages) - np.trace(leverages, axis1=-2, axis2=-1).sum())
 
 
 def hat_matrix_blocks(problem: Problem, solution: Solution, inverse: Array) -> Array:
@@ -144,7 +143,15 @@ def aligned_covariance(
     covariance: Array,
     points_mm: Array,
 ) -> Array:
-    """(3 N, 3 N) calibration covariance of rig points, their common rigid motion projected out.
+    """(3 N, 3 N) calibration covariance of rig points, their common rigid motion projected out."""
+    inner = aligned_shift(cameras, free, points_mm)
+    return np.asarray(inner @ covariance @ inner.T)
+
+
+def aligned_shift(
+    cameras: tuple[Camera, Camera], free: tuple[tuple[str, ...], ...], points_mm: Array
+) -> Array:
+    """(3 N, P): rig points by the rig block's parameters, their common rigid motion projected out.
 
     What is left is the error of shapes, distances and motions inside the rig; where the rig's own
     frame lies is a matter of definition (Baarda's S-transformation to the points' own frame).
@@ -155,8 +162,7 @@ def aligned_covariance(
     centred = points_mm - points_mm.mean(0)
     motion = np.concatenate([np.tile(np.eye(3), (len(points_mm), 1, 1)), -hat(centred)], -1)
     basis, _ = np.linalg.qr(motion.reshape(-1, 6))
-    inner = shift - basis @ (basis.T @ shift)
-    return np.asarray(inner @ covariance @ inner.T)
+    return np.asarray(shift - basis @ (basis.T @ shift))
 
 
 def point_shift_jacobian(

@@ -13,17 +13,19 @@ from numpy.typing import NDArray
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator import checks, initial, model_choice, numbering, tilt_signs, twins
 from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import joint_covariance
+from telerig.estimator.covariance import JointCovariance, joint_covariance
 from telerig.estimator.eccentricity import eccentricity_px
 from telerig.estimator.graph import Progress, Solution, solve
+from telerig.estimator.halves import halves
 from telerig.estimator.initial_unknown import dots_from_images
 from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.model_choice import Rung
 from telerig.estimator.model_start import model_start
 from telerig.estimator.problem import MODELS, SOLVERS, Problem, held_at_nominal
+from telerig.estimator.residual_tests import residual_tests
 from telerig.estimator.results import calibration_from_fit
 from telerig.estimator.robust import RobustFit, robust_solve
-from telerig.factors.projection import State
+from telerig.factors.projection import State, whitened_error
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX
 from telerig.rig.target import Target
@@ -107,7 +109,18 @@ def self_calibrate(
         notes=tuple(said),
     )  # fmt: skip
     joint = joint_covariance(done.robust.problem, done.robust.solution)
-    return calibration_from_fit(done, joint, nominal_rotvec_deg=nominal, name=name)
+    found = calibration_from_fit(done, joint, nominal_rotvec_deg=nominal, name=name)
+    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint)})
+
+
+def _trust(fit: RobustFit, joint: JointCovariance) -> dict[str, Any]:
+    """What the data themselves say of the covariance: repeatability, and structure in residuals."""
+    problem, state = fit.problem, fit.solution.state
+    whitened = whitened_error(state, problem.observations(), problem.rho_mm)
+    return {
+        "halves": halves(problem, state),
+        "structure": residual_tests(problem, whitened, joint.leverage),
+    }
 
 
 def dots_unknown(problem: Problem) -> bool:

@@ -27,6 +27,10 @@ def calibrate(
         str,
         typer.Option(help="air or water: where the target was. With [walls], runs are in water."),
     ] = "air",
+    compare: Annotated[
+        Path | None,
+        typer.Option(help="An earlier calibration of this rig: says what moved since then."),
+    ] = None,
     source: Annotated[
         str | None, typer.Option("--from", help="images or dots, when the dataset has both.")
     ] = None,
@@ -45,13 +49,17 @@ def calibrate(
     """
     with errors_in_words():
         from telerig.estimator.calibrate import run_calibration
+        from telerig.estimator.calibration import load_calibration
         from telerig.estimator.calibration_results import write_results
+        from telerig.estimator.compare_calibrations import compare_calibrations
         from telerig.io.dataset import load_dataset
 
         begun = time.perf_counter()
+        earlier = None if compare is None else load_calibration(compare)
         data = load_dataset(dataset, source=checked_source(source))
         options = {"model": model, "solver": solver, "dots": dots, "medium": medium,
-                   "from": source, "seed": seed}  # fmt: skip
+                   "compare": None if compare is None else str(compare), "from": source,
+                   "seed": seed}  # fmt: skip
         folder = out or data.results / "calibration"
         with progress(quiet) as stage:
             run = run_calibration(
@@ -59,10 +67,14 @@ def calibrate(
                 stage=stage, pictures=True,
             )  # fmt: skip
         seconds = {"calibrate": time.perf_counter() - begun}
+        change = None if earlier is None else compare_calibrations(earlier, run.calibration)
         write_results(
-            data, run, folder, command="calibrate", options=options, seconds=seconds, report=report
-        )
+            data, run, folder, command="calibrate", options=options, seconds=seconds,
+            change=change, report=report,
+        )  # fmt: skip
         say(run.calibration.report())
+        if change is not None:
+            say(f"since {compare}: {change.words()}")
         say(f"written: {folder}" + ("/report.html" if report else ""))
         if run.calibration.verdict["status"] == "REJECTED":
             raise typer.Exit(EXIT_REJECTED)

@@ -7,16 +7,15 @@ whichever is smaller (Triggs et al., Bundle Adjustment, 1999, section 6).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotrs
 
-from telerig.errors import CalibrationError
+from telerig.estimator.schur import Blocks, Reduced
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -69,42 +68,73 @@ class NormalEquations:
 
     def step(self, damping: float) -> tuple[Array, float]:
         """(S + 6 V + 3 N,) damped step, and the decrease of the cost that it promises."""
-        solve = self._solver(damping)
+        views_left = 6 * len(self.views) <= 3 * self.dots.shape[-1]
+        reduced = self.without_dots(damping) if views_left else self.without_views(damping)
         if self.distance is None:
-            step = solve(self.right)
+            step = reduced.solve(self.right)
         else:
-            row = np.r_[np.zeros(self.common), self.distance]
-            step, along = solve(np.stack([self.right, row], -1)).T
+            row = self.distance_row()
+            step, along = reduced.solve(np.stack([self.right, row], -1)).T
             step = step - along * (row @ step) / (1 + row @ along)
         return step, float(0.5 * step @ self.right)
 
-    def _solver(self, damping: float) -> Callable[[Array], Array]:
-        """Solves with the damped matrix, the distance left out."""
-        size = self.common
+    def distance_row(self) -> Array:
+        """(S + 6 V + 3 N,) of the known distance."""
+        assert self.distance is not None
+        return np.concatenate([np.zeros(self.common), self.distance])
+
+    def without_dots(self, damping: float = 0.0) -> Reduced:
+        """The damped system with the dots eliminated, the distance left out."""
+        size, count = self.common, self.dots.shape[-1]
         dots = self.dots.copy()
         dots[range(3), range(3)] *= 1 + damping
         whiten = _cholesky3(dots)
-        whitened = _forward(whiten, self.cross)
-        flat = whitened.reshape(size, -1)
-        reduced = self._common(_damped(self.shared, damping), _damped(self.views, damping))
-        reduced -= flat @ flat.T
-        factor, failed = dpotrf(reduced.T, lower=1, overwrite_a=1, clean=0)
-        if failed:
-            raise CalibrationError(
-                "the normal equations are not positive definite",
-                todo="add views with other tilts, or fix the model with --model",
-            )
 
-        def solve(right: Array) -> Array:
-            columns = right.reshape(len(right), -1)
-            of_dots = columns[size:].reshape(-1, 3, columns.shape[1]).transpose(2, 1, 0)
-            inner = _forward(whiten, of_dots).reshape(columns.shape[1], -1)
-            first, _ = dpotrs(factor, columns[:size] - flat @ inner.T, lower=1)
-            rest = (inner - first.T @ flat).reshape(of_dots.shape)
-            second = _backward(whiten, rest).transpose(2, 1, 0).reshape(-1, columns.shape[1])
-            return np.asarray(np.concatenate([first, second]).reshape(right.shape))
+        def forward(right: Array) -> Array:
+            shape = right.shape
+            return _forward(whiten, right.reshape(*shape[:-1], 3, count)).reshape(shape)
 
-        return solve
+        def backward(right: Array) -> Array:
+            shape = right.shape
+            return _backward(whiten, right.reshape(*shape[:-1], 3, count)).reshape(shape)
+
+        matrix = self._common(_damped(self.shared, damping), _damped(self.views, damping))
+        places = np.arange(count)[:, None] + count * np.arange(3)
+        blocks = Blocks(forward, backward, places, dots.transpose(2, 0, 1))
+        coupling = self.cross.reshape(size, -1)
+        return Reduced.of(np.arange(size), self._dot_places(), matrix, coupling, blocks)
+
+    def _dot_places(self) -> Ints:
+        """Where the dots' numbers stand in the graph's order, component by component."""
+        return self.common + (np.arange(3)[:, None] + 3 * np.arange(self.dots.shape[-1])).ravel()
+
+    def without_views(self, damping: float = 0.0) -> Reduced:
+        """The damped system with the views eliminated, the distance left out."""
+        s, count, views = len(self.shared), self.dots.shape[-1], len(self.views)
+        matrix = np.zeros((s + 3 * count, s + 3 * count))
+        matrix[:s, :s] = _damped(self.shared, damping)
+        matrix[:s, s:] = self.cross[:s].reshape(s, -1)
+        matrix[s:, :s] = matrix[:s, s:].T
+        dots = self.dots.copy()
+        dots[range(3), range(3)] *= 1 + damping
+        at = np.arange(count)
+        matrix[s:, s:].reshape(3, count, 3, count)[:, at, :, at] = dots.transpose(2, 0, 1)
+        of_views = _damped(self.views, damping)
+        inverse = np.linalg.inv(np.linalg.cholesky(of_views))
+
+        def forward(right: Array) -> Array:
+            columns = right.reshape(-1, views, 6).transpose(1, 2, 0)
+            return (inverse @ columns).transpose(2, 0, 1).reshape(right.shape)
+
+        def backward(right: Array) -> Array:
+            columns = right.reshape(-1, views, 6).transpose(1, 2, 0)
+            return (np.swapaxes(inverse, -1, -2) @ columns).transpose(2, 0, 1).reshape(right.shape)
+
+        coupling = np.concatenate([self.by_view, self.cross[s:].reshape(6 * views, -1).T])
+        kept = np.concatenate([np.arange(s), self._dot_places()])
+        places = np.arange(6 * views).reshape(views, 6)
+        blocks = Blocks(forward, backward, places, of_views)
+        return Reduced.of(kept, np.arange(s, self.common), matrix, coupling, blocks)
 
 
 def _damped(matrix: Array, damping: float) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from telerig.errors import CalibrationError, GeometryError
-from telerig.estimator.normal_equations import ArraySystem
+from telerig.estimator.array_system import ArraySystem
 from telerig.estimator.problem import (
     GAUGE_SIGMA_MM,
     Problem,

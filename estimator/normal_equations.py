@@ -1,29 +1,18 @@
-"""The same least-squares problem as the graph's, as normal equations with the dots eliminated.
+"""Normal equations of a calibration in blocks, and their damped solution.
 
-For many dots GTSAM's dense Hessian is what costs (2 s a step for 400 dots). Here every image adds
-its few columns, the dots form 3 x 3 blocks, and a step solves the Schur complement on cameras and
-views (Triggs et al., Bundle Adjustment, 1999, section 6). Cost, information and minimum are the
-graph's; tests/test_schur.py.
+Cameras couple with everything, but no view couples with a view and no dot with a dot. A step
+eliminates dots and solves the Schur complement on cameras and views, or the other way round,
+whichever is smaller (Triggs et al., Bundle Adjustment, 1999, section 6).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
-from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem, parameter_unit, prior_sigma
-from telerig.factors.priors import depth_gauge_residual, distance_residual
-from telerig.factors.projection import (
-    Residuals,
-    State,
-    whitened_residuals,
-)
-from telerig.rig.pose import rotation_from_rotvec
+from telerig.estimator.schur import Blocks, Reduced
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,65 +20,121 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """J^T J and -J^T r in parts. Common: intrinsics, camera poses, views, in the graph's order.
+    """J^T J and -J^T r in blocks, for S numbers of cameras, V views and N dots.
 
-    common : (C, C).  cross : (C, N, 3).  dots : (N, 3, 3).  right_common : (C,); right_dots :
-    (N, 3).  distance : (3 N,) row of the known distance, which couples two dots, or None; its
-    share is in ``right_dots`` but not in ``dots``.
+    Rows and columns in the graph's order: intrinsics, camera poses (S together), views, dots.
+
+    shared : (S, S).  by_view : (S, 6 V).  views : (V, 6, 6).  dots : (3, 3, N).
+    cross : (S + 6 V, 3, N) of cameras and views with dots, component by component.
+    right : (S + 6 V + 3 N,).
+    distance : (3 N,) row of the known distance, which couples two dots, or None; its share is in
+    ``right`` but not in ``dots``.
     """
 
     cost: float
-    common: Array
-    cross: Array
+    shared: Array
+    by_view: Array
+    views: Array
     dots: Array
-    right_common: Array
-    right_dots: Array
+    cross: Array
+    right: Array
     distance: Array | None
 
+    @property
+    def common(self) -> int:
+        """S + 6 V."""
+        return len(self.cross)
+
     def information(self) -> Array:
-        """(C + 3 N, C + 3 N) dense J^T J."""
-        size, width = len(self.common), 3 * len(self.dots)
-        out = np.zeros((size + width, size + width))
-        out[:size, :size] = self.common
-        out[:size, size:] = self.cross.reshape(size, width)
+        """(S + 6 V + 3 N, ...) dense J^T J."""
+        size, count = self.common, self.dots.shape[-1]
+        out = np.zeros((len(self.right), len(self.right)))
+        out[:size, :size] = self._common(self.shared, self.views)
+        out[:size, size:] = self.cross.transpose(0, 2, 1).reshape(size, -1)
         out[size:, :size] = out[:size, size:].T
-        at = size + 3 * np.arange(len(self.dots))[:, None] + np.arange(3)
-        out[at[:, :, None], at[:, None, :]] = self.dots
+        at = size + 3 * np.arange(count)[:, None] + np.arange(3)
+        out[at[:, :, None], at[:, None, :]] = np.moveaxis(self.dots, -1, 0)
         if self.distance is not None:
             out[size:, size:] += np.outer(self.distance, self.distance)
         return out
 
+    def _common(self, shared: Array, views: Array) -> Array:
+        s = len(shared)
+        out = np.zeros((self.common, self.common))
+        out[:s, :s], out[:s, s:], out[s:, :s] = shared, self.by_view, self.by_view.T
+        at = s + 6 * np.arange(len(views))[:, None] + np.arange(6)
+        out[at[:, :, None], at[:, None, :]] = views
+        return out
+
     def step(self, damping: float) -> tuple[Array, float]:
-        """(C + 3 N,) damped step, and the decrease of the cost that it promises."""
-        right = np.r_[self.right_common, self.right_dots.ravel()]
-        solve = self._solver(damping)
-        step = solve(right)
-        if self.distance is not None:
-            row = np.r_[np.zeros(len(self.common)), self.distance]
-            along = solve(row)
+        """(S + 6 V + 3 N,) damped step, and the decrease of the cost that it promises."""
+        views_left = 6 * len(self.views) <= 3 * self.dots.shape[-1]
+        reduced = self.without_dots(damping) if views_left else self.without_views(damping)
+        if self.distance is None:
+            step = reduced.solve(self.right)
+        else:
+            row = self.distance_row()
+            step, along = reduced.solve(np.stack([self.right, row], -1)).T
             step = step - along * (row @ step) / (1 + row @ along)
-        return step, float(0.5 * step @ right)
+        return step, float(0.5 * step @ self.right)
 
-    def _solver(self, damping: float) -> Callable[[Array], Array]:
-        """Solves with the damped matrix, the distance left out."""
-        size = len(self.common)
-        common, dots = _damped(self.common, damping), _damped(self.dots, damping)
-        inverse = np.linalg.inv(dots)
-        gain = np.einsum("cni,nij->cnj", self.cross, inverse)
-        width = 3 * len(dots)
-        reduced = common - gain.reshape(size, width) @ self.cross.reshape(size, width).T
-        scale = 1 / np.sqrt(np.diag(common))
-        factor = cho_factor(reduced * scale[:, None] * scale, check_finite=False)
+    def distance_row(self) -> Array:
+        """(S + 6 V + 3 N,) of the known distance."""
+        assert self.distance is not None
+        return np.concatenate([np.zeros(self.common), self.distance])
 
-        def solve(right: Array) -> Array:
-            of_dots = right[size:].reshape(-1, 3)
-            rest = right[:size] - np.einsum("cni,ni->c", gain, of_dots)
-            first = scale * cho_solve(factor, scale * rest, check_finite=False)
-            second = of_dots - np.einsum("cni,c->ni", self.cross, first)
-            last: Array = np.einsum("nij,nj->ni", inverse, second).ravel()
-            return np.concatenate([first, last])
+    def without_dots(self, damping: float = 0.0) -> Reduced:
+        """The damped system with the dots eliminated, the distance left out."""
+        size, count = self.common, self.dots.shape[-1]
+        dots = self.dots.copy()
+        dots[range(3), range(3)] *= 1 + damping
+        whiten = _cholesky3(dots)
 
-        return solve
+        def forward(right: Array) -> Array:
+            shape = right.shape
+            return _forward(whiten, right.reshape(*shape[:-1], 3, count)).reshape(shape)
+
+        def backward(right: Array) -> Array:
+            shape = right.shape
+            return _backward(whiten, right.reshape(*shape[:-1], 3, count)).reshape(shape)
+
+        matrix = self._common(_damped(self.shared, damping), _damped(self.views, damping))
+        places = np.arange(count)[:, None] + count * np.arange(3)
+        blocks = Blocks(forward, backward, places, dots.transpose(2, 0, 1))
+        coupling = self.cross.reshape(size, -1)
+        return Reduced.of(np.arange(size), self._dot_places(), matrix, coupling, blocks)
+
+    def _dot_places(self) -> Ints:
+        """Where the dots' numbers stand in the graph's order, component by component."""
+        return self.common + (np.arange(3)[:, None] + 3 * np.arange(self.dots.shape[-1])).ravel()
+
+    def without_views(self, damping: float = 0.0) -> Reduced:
+        """The damped system with the views eliminated, the distance left out."""
+        s, count, views = len(self.shared), self.dots.shape[-1], len(self.views)
+        matrix = np.zeros((s + 3 * count, s + 3 * count))
+        matrix[:s, :s] = _damped(self.shared, damping)
+        matrix[:s, s:] = self.cross[:s].reshape(s, -1)
+        matrix[s:, :s] = matrix[:s, s:].T
+        dots = self.dots.copy()
+        dots[range(3), range(3)] *= 1 + damping
+        at = np.arange(count)
+        matrix[s:, s:].reshape(3, count, 3, count)[:, at, :, at] = dots.transpose(2, 0, 1)
+        of_views = _damped(self.views, damping)
+        inverse = np.linalg.inv(np.linalg.cholesky(of_views))
+
+        def forward(right: Array) -> Array:
+            columns = right.reshape(-1, views, 6).transpose(1, 2, 0)
+            return (inverse @ columns).transpose(2, 0, 1).reshape(right.shape)
+
+        def backward(right: Array) -> Array:
+            columns = right.reshape(-1, views, 6).transpose(1, 2, 0)
+            return (np.swapaxes(inverse, -1, -2) @ columns).transpose(2, 0, 1).reshape(right.shape)
+
+        coupling = np.concatenate([self.by_view, self.cross[s:].reshape(6 * views, -1).T])
+        kept = np.concatenate([np.arange(s), self._dot_places()])
+        places = np.arange(6 * views).reshape(views, 6)
+        blocks = Blocks(forward, backward, places, of_views)
+        return Reduced.of(kept, np.arange(s, self.common), matrix, coupling, blocks)
 
 
 def _damped(matrix: Array, damping: float) -> Array:
@@ -101,143 +146,31 @@ def _damped(matrix: Array, damping: float) -> Array:
     return out
 
 
-class ArraySystem:
-    """A problem without a graph; points are states. The interface is `graph.GraphSystem`'s."""
-
-    def __init__(self, problem: Problem, start: State) -> None:
-        self.problem, self.start = problem, start
-        self.obs, self.keys = problem.observations(), problem.keys()
-        self._last: tuple[State, NormalEquations] | None = None
-        image = self.obs.view * len(problem.cameras) + self.obs.camera
-        edges = np.r_[0, np.flatnonzero(np.diff(image)) + 1, len(image)]
-        self.images = [slice(int(a), int(b)) for a, b in pairwise(edges)]
-        sizes = [len(f) for f in problem.free] + [6] * (len(problem.cameras) - 1)
-        self.edges = np.r_[0, np.cumsum(sizes + [6] * len(problem.views))]
-
-    def first(self) -> State:
-        return self.start
-
-    def cost(self, state: State) -> float:
-        return self.linearised(state).cost
-
-    def linearised(self, state: State) -> NormalEquations:
-        """The normal equations, kept for the state that was asked last."""
-        if self._last is None or self._last[0] is not state:
-            self._last = (state, self.normal_equations(state))
-        return self._last[1]
-
-    def state(self, state: State) -> State:
-        return state
-
-    def _intrinsics(self, camera: int) -> Ints:
-        return np.arange(self.edges[camera], self.edges[camera + 1])
-
-    def _camera(self, camera: int) -> Ints:
-        first = self.edges[len(self.problem.cameras) + camera - 1]
-        return np.arange(first, first + 6)
-
-    def _view(self, view: int | Ints) -> Ints:
-        first = self.edges[2 * len(self.problem.cameras) - 1] + 6 * np.asarray(view)
-        return np.asarray(first[..., None] + np.arange(6))
-
-    def normal_equations(self, state: State) -> NormalEquations:
-        """Everything at one state: images, then priors and gauge."""
-        problem, size, count = self.problem, int(self.edges[-1]), len(self.problem.dot_ids)
-        full = whitened_residuals(state, self.obs, problem.rho_mm)
-        common, cross = np.zeros((size, size)), np.zeros((size, count, 3))
-        right = np.zeros(size)
-        for rows in self.images:
-            columns = self._columns(full, rows)
-            _add_image(common, cross, right, full, columns, self.obs.dot[rows], rows)
-        dots, right_dots = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        by_dot = full.by_dot
-        np.add.at(dots, self.obs.dot, np.swapaxes(by_dot, -1, -2) @ by_dot)
-        np.add.at(right_dots, self.obs.dot, -np.einsum("mij,mi->mj", by_dot, full.value))
-        twice = float((full.value**2).sum())
-        twice += self._add_priors(state, common, right)
-        off = (state.dots_mm - problem.nominal_mm) / problem.dot_sigma_mm
-        twice += float((off**2).sum())
-        dots[:, np.arange(3), np.arange(3)] += problem.dot_sigma_mm**-2.0
-        right_dots -= off / problem.dot_sigma_mm
-        row = None
-        if problem.scale is not None:
-            value, jacobian = distance_residual(state.dots_mm, *problem.scale)
-            row, twice = jacobian[0], twice + float(value @ value)
-            right_dots -= (row * value[0]).reshape(-1, 3)
-        return NormalEquations(0.5 * twice, common, cross, dots, right, right_dots, row)
-
-    def _columns(self, full: Residuals, rows: slice) -> tuple[Array, Ints]:
-        """(m, 2, p) Jacobian of an image by its intrinsics, camera and view, and their places."""
-        view, camera = int(self.obs.view[rows.start]), int(self.obs.camera[rows.start])
-        free, unit = self.keys.free[camera], self.keys.unit[camera]
-        parts = [full.by_intrinsics[rows][..., free] * unit, full.by_view[rows]]
-        places = [self._intrinsics(camera), self._view(view)]
-        if camera:
-            parts.append(full.by_camera[rows])
-            places.append(self._camera(camera))
-        return np.concatenate(parts, -1), np.concatenate(places)
-
-    def _add_priors(self, state: State, common: Array, right: Array) -> float:
-        """Intrinsics, depth gauge and view places; returns twice their cost."""
-        problem, twice = self.problem, 0.0
-        for c, nominal in enumerate(problem.cameras):
-            free, unit = self.keys.free[c], parameter_unit(nominal)[self.keys.free[c]]
-            sigma = prior_sigma(nominal)[free] / unit
-            off = (state.intrinsics[c] - nominal.intrinsics)[free] / unit / sigma
-            at = self._intrinsics(c)
-            common[at, at] += sigma**-2.0
-            right[at] -= off / sigma
-            twice += float(off @ off)
-        for c in range(1, len(problem.cameras)):
-            value, jacobian = depth_gauge_residual(state.rig_from_camera[c], GAUGE_SIGMA_MM)
-            at = self._camera(c)
-            common[np.ix_(at, at)] += jacobian.T @ jacobian
-            right[at] -= jacobian.T @ value
-            twice += float(value @ value)
-        loose = 10 * max(problem.rho_mm)
-        place, turn = state.rig_from_target[:, :3, 3] / loose, state.rig_from_target[:, :3, :3]
-        at = self._view(np.arange(len(problem.views)))[:, 3:]
-        common[at, at] += loose**-2.0
-        right[at] -= np.einsum("vji,vj->vi", turn, place) / loose
-        return twice + float((place**2).sum())
-
-    def moved(self, state: State, step: Array) -> State:
-        """The state after a step: poses R exp(w), t + R v."""
-        problem, intrinsics = self.problem, state.intrinsics.copy()
-        for c, (free, unit) in enumerate(zip(self.keys.free, self.keys.unit)):
-            intrinsics[c, free] += step[self._intrinsics(c)] * unit
-        cameras = state.rig_from_camera.copy()
-        for c in range(1, len(problem.cameras)):
-            cameras[c] = _retracted(cameras[c], step[self._camera(c)])
-        views = self._view(np.arange(len(problem.views)))
-        dots = state.dots_mm + step[self.edges[-1] :].reshape(-1, 3)
-        return replace(
-            state, intrinsics=intrinsics, rig_from_camera=cameras,
-            rig_from_target=_retracted(state.rig_from_target, step[views]), dots_mm=dots,
-        )  # fmt: skip
+def _cholesky3(matrix: Array) -> list[Array]:
+    """Lower factor of (3, 3, N), component by component; diagonal elements inverted."""
+    a = 1 / np.sqrt(matrix[0, 0])
+    b, c = matrix[1, 0] * a, matrix[2, 0] * a
+    d = 1 / np.sqrt(matrix[1, 1] - b * b)
+    e = (matrix[2, 1] - c * b) * d
+    f = 1 / np.sqrt(matrix[2, 2] - c * c - e * e)
+    return [a, b, c, d, e, f]
 
 
-def _add_image(
-    common: Array,
-    cross: Array,
-    right: Array,
-    full: Residuals,
-    columns: tuple[Array, Ints],
-    dots: Ints,
-    rows: slice,
-) -> None:
-    jacobian, at = columns
-    flat = jacobian.reshape(-1, len(at))
-    common[np.ix_(at, at)] += flat.T @ flat
-    right[at] -= flat.T @ full.value[rows].ravel()
-    # a dot is seen once in an image, so that no two rows add to the same place
-    cross[at[:, None], dots] += np.einsum("mip,mij->pmj", jacobian, full.by_dot[rows])
+def _forward(factor: list[Array], right: Array) -> Array:
+    """(..., 3, N) L^-1 right."""
+    a, b, c, d, e, f = factor
+    out = np.empty_like(right)
+    np.multiply(right[..., 0, :], a, out=out[..., 0, :])
+    out[..., 1, :] = (right[..., 1, :] - out[..., 0, :] * b) * d
+    out[..., 2, :] = (right[..., 2, :] - out[..., 0, :] * c - out[..., 1, :] * e) * f
+    return out
 
 
-def _retracted(pose: Array, tangent: Array) -> Array:
-    """(..., 4, 4) poses moved by (..., 6) tangents (rotation, translation)."""
-    out = pose.copy()
-    turn = pose[..., :3, :3]
-    out[..., :3, :3] = turn @ rotation_from_rotvec(tangent[..., :3])
-    out[..., :3, 3] += np.einsum("...ij,...j->...i", turn, tangent[..., 3:])
+def _backward(factor: list[Array], right: Array) -> Array:
+    """(..., 3, N) L^-T right."""
+    a, b, c, d, e, f = factor
+    out = np.empty_like(right)
+    np.multiply(right[..., 2, :], f, out=out[..., 2, :])
+    out[..., 1, :] = (right[..., 1, :] - out[..., 2, :] * e) * d
+    out[..., 0, :] = (right[..., 0, :] - out[..., 1, :] * b - out[..., 2, :] * c) * a
     return out

@@ -137,7 +137,7 @@ def _lens_jacobians(ideal: Array, intrinsics: Array, rho_mm: float) -> tuple[Arr
     normal = ideal / rho_mm
     coefficients = intrinsics[_DISTORTION]
     distorted = distortion.distort(normal, coefficients) * rho_mm
-    sensor, sensor_jac, tilt_jac = _tilt_jacobians(distorted, intrinsics)
+    sensor, sensor_jac, tilt_jac = tilt_jacobians(distorted, intrinsics)
     affine = intrinsics[_SCALE] * np.array([[1, intrinsics[_SKEW]], [0, intrinsics[_ASPECT]]])
     pixel_from_distorted = affine @ sensor_jac
     by_ideal = pixel_from_distorted @ distortion.distortion_jacobian(normal, coefficients)
@@ -154,7 +154,7 @@ def _lens_jacobians(ideal: Array, intrinsics: Array, rho_mm: float) -> tuple[Arr
     return _pixel_from_sensor(sensor, intrinsics), by_ideal, by_intrinsics
 
 
-def _tilt_jacobians(xy_mm: Array, intrinsics: Array) -> tuple[Array, Array, Array]:
+def tilt_jacobians(xy_mm: Array, intrinsics: Array) -> tuple[Array, Array, Array]:
     """Sensor coordinates, (..., 2, 2) by the coordinates, (..., 2, 3) by tilt_x, tilt_y, w."""
     q, w = intrinsics[_TX : _TY + 1], intrinsics[_W]
     root = np.sqrt(1 + q @ q)

@@ -11,8 +11,8 @@ import pytest
 
 from telerig.errors import CalibrationError
 from telerig.estimator import graph, initial
+from telerig.estimator.array_system import ArraySystem
 from telerig.estimator.measurements import problem_from_dots
-from telerig.estimator.normal_equations import ArraySystem
 from telerig.estimator.problem import Problem
 from telerig.factors.projection import State
 
@@ -59,12 +59,12 @@ def test_cost_information_and_gradient(either: tuple[Problem, State]) -> None:
     state = perturbed(problem, start)
     factors, values, keys = graph.build(problem, state)
     information, right = factors.linearize(values).hessian(graph._ordering(problem, keys))
-    ours = ArraySystem(problem, state).normal_equations(state)
+    ours = ArraySystem(problem, state).linearised(state)
     assert ours.cost == pytest.approx(factors.error(values), rel=1e-12)
     length = np.sqrt(np.maximum(np.diag(information), 1e-30))
     difference = (ours.information() - information) / np.outer(length, length)
     assert np.abs(difference).max() < 1e-9
-    mine = np.r_[ours.right_common, ours.right_dots.ravel()]
+    mine = ours.right
     np.testing.assert_allclose(
         mine / length, right / length, atol=1e-9 * np.abs(right / length).max()
     )
@@ -73,11 +73,11 @@ def test_cost_information_and_gradient(either: tuple[Problem, State]) -> None:
 @pytest.mark.parametrize("damping", [1e-8, 1e-3, 1.0])
 def test_a_step_solves_the_damped_equations(damping: float, either: tuple[Problem, State]) -> None:
     problem, start = either
-    ours = ArraySystem(problem, start).normal_equations(start)
+    ours = ArraySystem(problem, start).linearised(start)
     step, promised = ours.step(damping)
     dense = ours.information()
     if ours.distance is not None:
-        size = len(ours.common)
+        size = ours.common
         undamped = np.r_[np.zeros(size), ours.distance]
         dense -= np.outer(undamped, undamped)
     untouched = np.diag(dense) == 0
@@ -85,7 +85,7 @@ def test_a_step_solves_the_damped_equations(damping: float, either: tuple[Proble
     dense[untouched, untouched] = 1
     if ours.distance is not None:
         dense += np.outer(undamped, undamped)
-    right = np.r_[ours.right_common, ours.right_dots.ravel()]
+    right = ours.right
     scale = 1 / np.sqrt(np.diag(dense))
     expected = scale * np.linalg.solve(dense * scale[:, None] * scale, scale * right)
     np.testing.assert_allclose(

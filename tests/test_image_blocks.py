@@ -1,0 +1,171 @@
+"""Normal equations from padded chunks against those of the full Jacobian, and their solution.
+
+The reference multiplies out `whitened_residuals`, which test_factors.py proves by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from telerig.estimator.array_system import ArraySystem
+from telerig.estimator.problem import Problem, nominal_state
+from telerig.factors import image_rows
+from telerig.factors.image_rows import in_chunks
+from telerig.factors.projection import State, whitened_residuals
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.projection import PARAMETERS
+from telerig.rig.target import Target
+from telerig.rig.walls import Wall
+
+MODELS = {
+    "scale": {"scale_px_per_mm": 20.4},
+    "radial": {"k1": 0.02, "k2": -0.01, "k3": 0.004},
+    "one power": {"k1": 0.02},
+    "tangential": {"p1": 0.003, "p2": -0.002},
+    "prism": {"s1": 0.004, "s2": 0.002, "s3": -0.003, "s4": 0.005},
+    "affine": {"aspect": 1.01, "skew": -0.004, "k1": 0.01},
+    "kappa": {"kappa_per_mm": 2e-3, "k1": 0.01, "centre_u_px": 520.0, "centre_v_px": 380.0},
+    "tilt": {"tilt_x": 0.05, "tilt_y": -0.03, "image_convergence_per_mm": 1e-3, "p1": 0.002},
+}
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+def problem_of(
+    free: tuple[str, ...], rng: Any, seen: float = 0.9, walls: tuple[Any, ...] = (None, None)
+) -> Problem:
+    """Two cameras, five views, twelve dots of which a share is seen; random measurements."""
+    views, dots = 5, 12
+    second = Pose.from_rotvec((0.1, np.deg2rad(60), 0.0), (1.0, -2.0, 3.0))
+    cameras = [
+        Camera.create("left", (1024, 768), 20.0),
+        Camera.create("right", (1024, 768), 21.0, camera_from_rig=second),
+    ]
+    cameras = [replace(c, wall=w) for c, w in zip(cameras, walls)]
+    view, camera, dot = np.nonzero(rng.random((views, 2, dots)) < seen)
+    factor = rng.normal(size=(len(view), 2, 2)) + 3 * np.eye(2)
+    target = Target(rows=3, columns=4, pitch_mm=(5.0, 5.0))
+    columns, rows = np.meshgrid(np.arange(4), np.arange(3))
+    nominal = np.stack([5.0 * columns.ravel(), 5.0 * rows.ravel(), 0 * rows.ravel()], -1)
+    return Problem(
+        tuple(cameras), target, tuple(f"{v:02}" for v in range(views)), np.arange(dots),
+        nominal, np.full((dots, 3), 0.02), view, camera, dot, rng.uniform(0, 900, (len(view), 2)),
+        0.01 * factor @ np.swapaxes(factor, -1, -2), rng.uniform(0.1, 1, len(view)),
+        (("scale_px_per_mm", *free), ("scale_px_per_mm", *free[: 1 + len(free) // 2])),
+        ((0, 11), 18.0, 0.001), np.zeros((views, 2)),
+    )  # fmt: skip
+
+
+def state_of(problem: Problem, values: dict[str, float], rng: Any) -> State:
+    state = nominal_state(problem)
+    cameras = [c.with_parameters(**values) for c in problem.cameras]
+    intrinsics = np.array([c.intrinsics for c in cameras])
+    intrinsics[1] *= 1.01
+    views = np.tile(np.eye(4), (len(problem.views), 1, 1))
+    views[:, :3, :3] = rotation_from_rotvec(0.4 * rng.normal(size=(len(views), 3)))
+    views[:, :3, 3] = rng.uniform(-6, 6, (len(views), 3)) + [0, 0, 60]
+    dots = problem.nominal_mm + 0.1 * rng.normal(size=problem.nominal_mm.shape)
+    return replace(state, intrinsics=intrinsics, rig_from_target=views, dots_mm=dots)
+
+
+def of_images(problem: Problem, state: State) -> tuple[Any, Any, float]:
+    """J^T J, -J^T r and r^T r of the images, from the whole Jacobian."""
+    system, obs = ArraySystem(problem, state), problem.observations()
+    full = whitened_residuals(state, obs, problem.rho_mm)
+    first = int(system.edges[-1])
+    dots = first + 6 * len(problem.views)
+    out = np.zeros((len(obs), 2, dots + problem.nominal_mm.size))
+    for m, (v, c, d) in enumerate(zip(obs.view, obs.camera, obs.dot)):
+        lens = full.by_intrinsics[m][:, system.free[c]] * system.unit[c]
+        out[m][:, system.intrinsics_of(int(c))] = lens
+        if c:
+            out[m][:, system.pose_of(int(c))] = full.by_camera[m]
+        out[m][:, first + 6 * v : first + 6 * v + 6] = full.by_view[m]
+        out[m][:, dots + 3 * d : dots + 3 * d + 3] = full.by_dot[m]
+    jacobian, value = out.reshape(-1, out.shape[-1]), full.value.ravel()
+    return jacobian.T @ jacobian, -jacobian.T @ value, float(value @ value)
+
+
+def without_images(problem: Problem, state: State) -> ArraySystem:
+    """Priors and gauge alone: every measurement is left out but for one of no weight at all."""
+    vague = 1e30 * np.broadcast_to(np.eye(2), problem.covariance_px2.shape)
+    return ArraySystem(replace(problem, covariance_px2=vague), state)
+
+
+def check(problem: Problem, state: State) -> None:
+    information, right, twice = of_images(problem, state)
+    ours = ArraySystem(problem, state).linearised(state)
+    priors = without_images(problem, state).linearised(state)
+    information = information + priors.information()
+    length = np.sqrt(np.maximum(np.diag(information), 1e-30))
+    difference = (ours.information() - information) / np.outer(length, length)
+    assert np.abs(difference).max() < 1e-11
+    expected = (right + priors.right) / length
+    np.testing.assert_allclose(ours.right / length, expected, atol=1e-11 * np.abs(expected).max())
+    assert ours.cost == pytest.approx(0.5 * twice + priors.cost, rel=1e-12)
+    assert ArraySystem(problem, state).cost(state) == pytest.approx(ours.cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("seen", [1.0, 0.9, 0.4])
+def test_every_lens(model: str, seen: float, rng: Any) -> None:
+    free = tuple(n for n in MODELS[model] if n != "scale_px_per_mm")
+    problem = problem_of(free, rng, seen)
+    check(problem, state_of(problem, MODELS[model], rng))
+
+
+@pytest.mark.parametrize("model", ["scale", "tilt", "kappa"])
+def test_free_but_zero(model: str, rng: Any) -> None:
+    """Steps that do nothing yet are left out of the value, not of the derivatives."""
+    free = tuple(n for n in MODELS[model] if n != "scale_px_per_mm")
+    problem = problem_of(free, rng)
+    check(problem, state_of(problem, {}, rng))
+
+
+@pytest.mark.parametrize("both", [False, True])
+@pytest.mark.parametrize("kappa", [0.0, 2e-3])
+def test_behind_walls(kappa: float, both: bool, rng: Any) -> None:
+    normal = np.array([0.05, -0.02, 1.0])
+    wall = Wall(normal / np.linalg.norm(normal), 20.0, 8.0, (1.0, 1.5, 1.33), 0.01)
+    walls = (wall if both else None, wall)
+    problem = problem_of(("wall_x_rad", "wall_y_rad", "kappa_per_mm"), rng, walls=walls)
+    values = {"kappa_per_mm": kappa, "wall_x_rad": 0.01, "wall_y_rad": -0.02, "k1": 0.01}
+    check(problem, state_of(problem, values, rng))
+
+
+def test_through_a_plate(rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    target = replace(problem.target, plate_thickness_mm=3.0, plate_index=1.5)
+    shift = rng.choice([-1.0, 0.0, 1.0], (5, 2))
+    problem = replace(problem, target=target, plate_shift=shift)
+    check(problem, state_of(problem, {"k1": 0.02}, rng))
+
+
+@pytest.mark.parametrize("seen", [1.0, 0.4])
+def test_chunks_of_any_size(seen: float, rng: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = problem_of(("k1",), rng, seen)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    whole = ArraySystem(problem, state).linearised(state)
+    monkeypatch.setattr(image_rows, "CHUNK", 15)
+    system = ArraySystem(problem, state)
+    assert len(system.chunks) >= 3
+    np.testing.assert_allclose(system.linearised(state).right, whole.right, rtol=1e-9, atol=1e-6)
+    check(problem, state)
+
+
+def test_every_measurement_is_in_one_chunk(rng: Any) -> None:
+    problem = problem_of((), rng, 0.3)
+    obs = problem.observations()
+    chunks = in_chunks(obs, len(problem.dot_ids), 40)
+    assert len(chunks) > 1
+    assert sum(int((rows.whitener[0, 0] > 0).sum()) for rows in chunks) == len(obs)
+    assert all(rows.dot.size <= 40 or len(rows.view) == 1 for rows in chunks)
+    assert set(PARAMETERS) >= set(problem.free[0])

@@ -63,6 +63,7 @@ def halves(problem: Problem, state: State) -> dict[str, Any]:
 
 def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
     half = problem.subset(np.isin(problem.view, views) & (problem.weight > 0))
+    half = replace(half, solver="schur")
     if half.scale is not None:
         pair, distance, _ = half.scale
         half = replace(half, scale=(pair, distance, _SCALE * distance))

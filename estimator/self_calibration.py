@@ -85,7 +85,7 @@ def self_calibrate(
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
-    problem = replace(problem, solver=solver)
+    problem = replace(problem, solver="schur" if solver == "auto" else solver)
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
@@ -100,7 +100,7 @@ def self_calibrate(
     if len(cameras) == 2:
         start, by, words_twin = _side(problem, start, nominal)
     start = tilt_signs.settle(problem, start)
-    fit = _fit(problem, start, model, progress)
+    fit = _fit(problem, start, model, solver, progress)
     if len(cameras) == 2 and by != PLATE:
         fit, by, words_twin = _settled_twin(fit, nominal)
     twin_cost = _twin_cost(fit)
@@ -179,8 +179,11 @@ def best_start(problem: Problem, dots_mm: Array) -> State:
     return min(fits, key=lambda f: f.cost).state
 
 
-def _fit(problem: Problem, start: State, model: str, progress: Progress | None) -> Any:
-    """Outliers and floor with a rich model, the ladder, then the chosen model to the end."""
+def _fit(problem: Problem, start: State, model: str, solver: str, progress: Progress | None) -> Any:
+    """Outliers and floor with a rich model, the ladder, then the chosen model to the end.
+
+    solver : of the last fit; the trials before it take ``problem.solver``.
+    """
     rungs: list[Rung] = []
     mono = len(problem.cameras) == 1
     if model == "auto":
@@ -202,7 +205,7 @@ def _fit(problem: Problem, start: State, model: str, progress: Progress | None) 
         begin = robust_solve(final, start).solution.state
     shift = eccentricity_px(final, begin)
     final = replace(final, uv_px=final.uv_px - shift)
-    robust = robust_solve(final, begin, progress=progress)
+    robust = robust_solve(replace(final, solver=solver), begin, progress=progress)
     return Fit(robust, np.nan, "", "", model, words, rungs, checks.PreCheck({}, ()), ())
 
 

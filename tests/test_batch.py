@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -44,12 +45,20 @@ def datasets(tmp_path_factory) -> list[Path]:
     return [_dataset(base / name, seed) for seed, name in enumerate(["monday", "tuesday"])]
 
 
+def _jobs(datasets: list[Path]) -> list[Job]:
+    """One of them with its report: drawing takes most of the time."""
+    return [
+        replace(job, report=job.kind == "smooth" and Path(job.dataset).name == "monday")
+        for job in jobs_of(datasets)
+    ]
+
+
 @pytest.fixture(scope="module")
 def first_run(datasets) -> tuple[Path, list[dict]]:
     """Both datasets done, by two workers."""
     out = datasets[0].parent / "out"
     with local_executor(2) as executor:
-        records = run_batch(jobs_of(datasets), executor, Journal(out))
+        records = run_batch(_jobs(datasets), executor, Journal(out))
     write_batch(records, out)
     return out, records
 
@@ -96,6 +105,7 @@ def test_all_is_done_and_summed_up(first_run, datasets):
     page = (out / "report.html").read_text()
     assert "2 of 2 runs done" in page
     assert 'href="../monday/results/rise/report.html"' in page
+    assert "../tuesday" not in page
 
 
 def test_what_is_done_is_not_done_again_until_an_input_changes(first_run, datasets):
@@ -103,34 +113,52 @@ def test_what_is_done_is_not_done_again_until_an_input_changes(first_run, datase
     before = [_tables(d) for d in datasets]
     stamps = [(d / "results" / name).stat().st_mtime_ns for d in datasets for name in RESULTS]
     with local_executor(2) as executor:
-        again = run_batch(jobs_of(datasets), executor, Journal(out))
+        again = run_batch(_jobs(datasets), executor, Journal(out))
     assert all(r["resumed"] for r in again)
     assert stamps == [
         (d / "results" / name).stat().st_mtime_ns for d in datasets for name in RESULTS
     ]
-    job = jobs_of(datasets)[4]
+    job = _jobs(datasets)[4]
     same = fingerprint(job)
     table = datasets[1] / "runs" / "rise" / "detections.csv"
     os.utime(table, ns=(1, 1))
     assert fingerprint(job) != same
     with local_executor(2) as executor:
-        third = run_batch(jobs_of(datasets), executor, Journal(out))
+        third = run_batch(_jobs(datasets), executor, Journal(out))
     assert [bool(r.get("resumed")) for r in third] == [True] * 4 + [False] * 2
     assert [_tables(d) for d in datasets] == before
 
 
-def test_a_failure_stops_only_what_needs_it(tmp_path, datasets):
+def test_a_failure_stops_only_what_needs_it(datasets, tmp_path, monkeypatch):
+    begun = []
+
+    def perform_but_fail_at_monday(job: Job) -> dict:
+        begun.append(job.name)
+        failed = job.kind == "calibrate" and Path(job.dataset).name == "monday"
+        return {"status": "failed" if failed else "done", "words": "no light", "figures": {}}
+
+    monkeypatch.setattr("telerig.estimator.batch.batch.perform", perform_but_fail_at_monday)
+    jobs = jobs_of(datasets)
+    with ThreadPoolExecutor(2) as executor:
+        records = run_batch(jobs, executor, Journal(tmp_path / "out"))
+    assert [r["status"] for r in records] == ["failed", "left out", "left out"] + ["done"] * 3
+    assert all(f"needs {jobs[0].name}, which was failed" in r["words"] for r in records[1:3])
+    assert sorted(begun) == sorted(j.name for j in [jobs[0], *jobs[3:]])
+
+
+def test_datasets_that_cannot_be_used_are_told_and_the_rest_is_done(tmp_path):
     broken = _dataset(tmp_path / "broken", 7)
     (broken / "calibration" / "dots.csv").write_text("view,camera,dot,u_px,v_px\n")
     no_rig = tmp_path / "no_rig"
     no_rig.mkdir()
     good = _dataset(tmp_path / "good", 8)
+    shutil.rmtree(good / "runs")
     out = tmp_path / "out"
     given = [str(place) for place in (no_rig, broken, good)]
     result = CliRunner().invoke(app, ["batch", *given, "--out", str(out)])
     assert result.exit_code == 1, result.output
     table = pd.read_csv(out / "batch.csv", keep_default_na=False)
-    assert list(table["status"]) == ["failed", "failed", "done", "done", "done"]
+    assert list(table["status"]) == ["failed", "failed", "done"]
     assert "rig.toml" in table["words"][0]
     assert "dots.csv" in table["words"][1]
     page = (out / "report.html").read_text()
@@ -140,7 +168,7 @@ def test_a_failure_stops_only_what_needs_it(tmp_path, datasets):
 def test_a_process_that_is_killed_fails_alone_and_is_done_the_next_time(tmp_path):
     """The work's process dies as when the system runs out of memory."""
     data = _dataset(tmp_path / "data", 3)
-    jobs = jobs_of([data])[:1]
+    jobs = jobs_of([data], report=False)[:1]
     killer = threading.Thread(target=_kill_the_first_child)
     killer.start()
     with ThreadPoolExecutor(1) as executor:

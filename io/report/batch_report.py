@@ -114,7 +114,7 @@ def _failure(job: Job) -> Row:
 
 def _calibration(job: Job, folder: Path) -> Line:
     found = job.get("figures") or {}
-    share = found.get("share_kept")
+    share: Any = found.get("share_kept")
     cells = (
         str(found.get("verdict") or job["status"]),
         str(found.get("lens_model") or ABSENT),

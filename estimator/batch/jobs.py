@@ -36,7 +36,6 @@ class Job:
     calibration: str = ""
     model: str = "auto"
     report: bool = True
-    min_diameter_px: float = 8.0
     needs: tuple[str, ...] = ()
 
     @property
@@ -78,7 +77,6 @@ def jobs_of(
     calibration: Path | None = None,
     model: str = "auto",
     report: bool = True,
-    min_diameter_px: float = 8.0,
     only: Sequence[str] = (),
     strict: bool = False,
 ) -> list[Job]:
@@ -94,8 +92,9 @@ def jobs_of(
     places = _checked(datasets)
     shared: dict[str, Any] = {
         "calibration": "" if calibration is None else str(Path(calibration).resolve()),
-        "model": model, "report": report, "min_diameter_px": min_diameter_px,
-    }  # fmt: skip
+        "model": model,
+        "report": report,
+    }
     jobs: list[Job] = []
     for place in places:
         try:

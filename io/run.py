@@ -59,13 +59,7 @@ def load_run(
     """
     folder = _run_folder(Path(path))
     rig = rig or _rig_above(folder)
-    names = list(cameras or (rig.cameras if rig else ()))
-    if not names:
-        raise InputError(
-            "there is no rig.toml two folders up, so the cameras are not known",
-            where=str(folder),
-            todo="put the run into DATASET/runs/, or give a calibration (--calibration FILE)",
-        )
+    names = list(cameras) if cameras else _cameras_of(rig, folder)
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()} if rig else {}
     sizes |= dict(image_sizes_px or {})
     notes: list[str] = []
@@ -77,6 +71,7 @@ def load_run(
     detections = None if images else _detections(folder, names, sizes, notes)
     t_s = _times(folder, names, count, detections, notes)
     stage = _table(folder / "stage.csv", read_stage_csv)
+    sensors = list(rig.accelerometers) if rig else None
     run = RunData(
         name=folder.name,
         path=folder,
@@ -89,8 +84,7 @@ def load_run(
         rig=rig,
         stage=stage,
         accelerometers=_table(
-            folder / "accelerometer.csv",
-            lambda file: read_accelerometer_csv(file, list(rig.accelerometers) if rig else None),
+            folder / "accelerometer.csv", lambda file: read_accelerometer_csv(file, sensors)
         ),
         references=_table(
             folder / "references.csv",
@@ -104,6 +98,16 @@ def load_run(
     )
     _look_at_ends(run)
     return run
+
+
+def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
+    if rig is None or not rig.cameras:
+        raise InputError(
+            "there is no rig.toml two folders up, so the cameras are not known",
+            where=str(folder),
+            todo="put the run into DATASET/runs/, or give a calibration (--calibration FILE)",
+        )
+    return list(rig.cameras)
 
 
 def _run_folder(path: Path) -> Path:

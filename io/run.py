@@ -96,8 +96,7 @@ def load_run(
         sources=sources,
         positions=positions,
     )
-    _look_at_ends(run)
-    return run
+    return _looked_at(run)
 
 
 def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
@@ -267,9 +266,10 @@ def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | N
     return read(file) if file.is_file() else None
 
 
-def _look_at_ends(run: RunData) -> None:
-    """Decode each camera's first and last image, so that wrong sizes and cuts show at once."""
+def _looked_at(run: RunData) -> RunData:
+    """Each camera's first and last image are decoded, so that wrong sizes and cuts show at once."""
     for name, positions in run.positions.items():
         present = np.flatnonzero(positions >= 0)
         for frame in present[[0, -1]] if present.size else ():
             run.image(name, int(frame))
+    return run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,7 @@ def _periodogram(series: Array, step_s: float) -> Array:
     """One-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
     from scipy.signal import periodogram
 
-    taper = np.hanning(len(series))
+    taper: Any = np.hanning(len(series))
     return np.asarray(periodogram(series, 1 / step_s, window=taper, detrend="linear")[1])
 
 

@@ -97,10 +97,10 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
 
 def _periodogram(series: Array, step_s: float) -> Array:
     """One-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
-    from scipy.signal import periodogram
+    from scipy.signal import detrend, periodogram
 
     taper: Any = np.hanning(len(series))
-    return np.asarray(periodogram(series, 1 / step_s, window=taper, detrend="linear")[1])
+    return np.asarray(periodogram(series, 1 / step_s, window=taper, detrend=detrend)[1])
 
 
 def _offsets(solution: Solution) -> Array:

@@ -3,7 +3,7 @@
 Usage: python benchmarks/make_gallery.py DATASET RUN [--out docs/pictures]
 
 For instance after `telerig demo`: python benchmarks/make_gallery.py telerig-demo rise. The pictures
-are the reports' own, as PNG with few colours: each below 150 kB, 1.2 MB in all.
+are the reports' own, as PNG with few colours.
 """
 
 from __future__ import annotations

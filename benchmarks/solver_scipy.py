@@ -83,7 +83,7 @@ class Flat:
         ]
 
     def jacobian(self, x: Array) -> Any:
-        """Sparse (R, D): by the right perturbation at the state, then by the tangent at the start."""
+        """Sparse (R, D): by the perturbation at the state, then by the tangent at the start."""
         problem, system, state = self.problem, self.system, self.state(x)
         full = whitened_residuals(state, self.obs, problem.rho_mm)
         blocks = []

@@ -142,11 +142,11 @@ def table(found: list[Figures]) -> str:
     rows = [
         ("dots, from images", "0.03 px", f"{mean('dots_px'):.4f} px", "RMS per coordinate"),
         ("space, dots and points of 0.03 px", "5 um", f"{space(0.03, 0):.2f} um",
-         f"RMS length ({space(0.03, 0) / length:.2f} um per axis); {space(0.03, 1):.2f} um with the "
-         "cameras known"),
+         f"RMS length ({space(0.03, 0) / length:.2f} um per axis); {space(0.03, 1):.2f} um with "
+         "the cameras known"),
         ("space, dots and points of 0.1 px", "10 um", f"{space(0.1, 0):.2f} um",
-         f"RMS length ({space(0.1, 0) / length:.2f} um per axis); {space(0.1, 1):.2f} um with the "
-         "cameras known"),
+         f"RMS length ({space(0.1, 0) / length:.2f} um per axis); {space(0.1, 1):.2f} um with "
+         "the cameras known"),
         ("bubble's centre, from images", "1.5 px", f"{mean('volume_px'):.3f} px",
          f"of volume, RMS per coordinate; {mean('centre_px'):.3f} px for the outline's centre"),
         ("bubble overall, arm accelerometers", "0.5 mm",

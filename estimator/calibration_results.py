@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.estimator.calibrate import CalibrationRun
-from telerig.estimator.uncertainty_map import uncertainty_map
 from telerig.io.atomic import atomic_folder, write_json_atomic
 from telerig.io.provenance import run_record
 from telerig.io.tables import write_table
@@ -68,6 +67,8 @@ def write_results(
 
 def write_uncertainty(calibration: Calibration, path: Path) -> None:
     """Covariances over the working volume, as docs/files.md lists them."""
+    from telerig.estimator.uncertainty_map import uncertainty_map
+
     found = uncertainty_map(calibration)
     with path.open("wb") as stream:
         np.savez_compressed(

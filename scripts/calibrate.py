@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from telerig.scripts.console import EXIT_REJECTED, checked_source, errors_in_words, progress, say
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration import Calibration
+    from telerig.estimator.compare_calibrations import RigComparison
 
 
 def calibrate(
@@ -49,13 +53,11 @@ def calibrate(
     """
     with errors_in_words():
         from telerig.estimator.calibrate import run_calibration
-        from telerig.estimator.calibration import load_calibration
         from telerig.estimator.calibration_results import write_results
-        from telerig.estimator.compare_calibrations import compare_calibrations
         from telerig.io.dataset import load_dataset
 
         begun = time.perf_counter()
-        earlier = None if compare is None else load_calibration(compare)
+        earlier = None if compare is None else _loaded(compare)
         data = load_dataset(dataset, source=checked_source(source))
         options = {"model": model, "solver": solver, "dots": dots, "medium": medium,
                    "compare": None if compare is None else str(compare), "from": source,
@@ -67,7 +69,7 @@ def calibrate(
                 stage=stage, pictures=True,
             )  # fmt: skip
         seconds = {"calibrate": time.perf_counter() - begun}
-        change = None if earlier is None else compare_calibrations(earlier, run.calibration)
+        change = None if earlier is None else _change(earlier, run.calibration)
         write_results(
             data, run, folder, command="calibrate", options=options, seconds=seconds,
             change=change, report=report,
@@ -78,6 +80,18 @@ def calibrate(
         say(f"written: {folder}" + ("/report.html" if report else ""))
         if run.calibration.verdict["status"] == "REJECTED":
             raise typer.Exit(EXIT_REJECTED)
+
+
+def _loaded(path: Path) -> Calibration:
+    from telerig.estimator.calibration import load_calibration
+
+    return load_calibration(path)
+
+
+def _change(earlier: Calibration, now: Calibration) -> RigComparison:
+    from telerig.estimator.compare_calibrations import compare_calibrations
+
+    return compare_calibrations(earlier, now)
 
 
 if __name__ == "__main__":

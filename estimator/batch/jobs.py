@@ -170,7 +170,7 @@ def check_run_name(run: Path) -> None:
 
 def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
     """Raise InputError for a calibration that is not there, an unknown lens model or medium."""
-    from telerig.estimator.behind_walls import checked_medium
+    from telerig.estimator.calibrate import checked_medium
     from telerig.estimator.problem import MODELS
 
     if calibration is not None and not Path(calibration).exists():

@@ -3,8 +3,8 @@
 Usage: python benchmarks/make_gallery.py DATASET RUN [--out docs/pictures]
 
 For instance after `telerig demo` and `telerig report telerig-demo/results/rise --film --format
-gif`: python benchmarks/make_gallery.py telerig-demo rise. The pictures are the reports' own and a frame
-of each film, as PNG with few colours. (report.png and batch.png are pages seen in a browser.)
+gif`: python benchmarks/make_gallery.py telerig-demo rise. The pictures are the reports' own and a
+frame of each film, as PNG with few colours. (report.png and batch.png are pages in a browser.)
 """
 
 from __future__ import annotations

@@ -42,7 +42,19 @@ def check_dataset(place: Path) -> Iterator[Check]:
         yield from _run(data, name)
     if not data.runs:
         yield Check("runs", "note", "none", "put recordings into runs/<name>/<camera>/")
+    yield from _left_over(data)
     yield _disk(data)
+
+
+def _left_over(data: Dataset) -> Iterator[Check]:
+    """What commands that were killed have left, or commands that still work are writing."""
+    found = sorted(p for p in data.results.rglob(".*.part*") if not p.parent.name.startswith("."))
+    if found:
+        words = ", ".join(str(p.relative_to(data.path)) for p in found[:4])
+        yield Check(
+            "left over", "note", f"{len(found)} half-written: {words}",
+            "remove them if no telerig command is working on this dataset",
+        )  # fmt: skip
 
 
 def _views(data: Dataset) -> Iterator[Check]:

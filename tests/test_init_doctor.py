@@ -198,6 +198,15 @@ def test_an_empty_dataset_is_told_what_to_put_where(tmp_path):
     assert "runs/<name>" in _of(checks, "runs", "note")
 
 
+def test_what_a_killed_command_left_is_named(tmp_path):
+    new_dataset(tmp_path / "tank")
+    assert not [c for c in check_dataset(tmp_path / "tank") if c.name == "left over"]
+    half = tmp_path / "tank" / "results" / ".rise.12-ab.part"
+    (half / "overlays").mkdir(parents=True)
+    said = _of(list(check_dataset(tmp_path / "tank")), "left over", "note")
+    assert "1 half-written: results/.rise.12-ab.part" in said
+
+
 def test_images_of_the_wrong_size_are_found(tmp_path):
     new_dataset(tmp_path / "tank", image_size_px=(64, 48))
     for camera in ("left", "right"):

@@ -200,7 +200,7 @@ def test_an_empty_dataset_is_told_what_to_put_where(tmp_path):
 
 def test_what_a_killed_command_left_is_named(tmp_path):
     new_dataset(tmp_path / "tank")
-    assert not [c for c in check_dataset(tmp_path / "tank") if c.name == "left over"]
+    assert not [c for c in check_dataset(tmp_path / "tank") if c.what == "left over"]
     half = tmp_path / "tank" / "results" / ".rise.12-ab.part"
     (half / "overlays").mkdir(parents=True)
     said = _of(list(check_dataset(tmp_path / "tank")), "left over", "note")

@@ -27,6 +27,9 @@ _HARMONIC = 0.12
 _REFIT_NATS = 40.0
 _ZIGZAG_MM = 0.3
 _ZIGZAG_HZ = (3.0, 12.0)
+_SHARES = np.linspace(0.0, 1.0, 6)
+_NEAR_HZ = 0.1
+_LEAST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -170,4 +173,34 @@ def shared(model: ShakeModel, found: Sequence[LineLabel]) -> ShakeModel:
     for label in found:
         if label.ambiguous and label.owner == "rig":
             model = moved_to_bubble(model, label.index, 0.5)
+    return model
+
+
+def doubted(
+    channels: Sequence[Channel], model: ShakeModel, pattern: Sequence[float], up: Array
+) -> ShakeModel:
+    """Beside a line of several bubbles, the rig given what of it the data leave open.
+
+    The bubbles' differences show their own line; a rig's line of the same frequency adds to what
+    they have in common, where a share of 1 / bubbles is theirs anyway, and a few cycles do not
+    tell it from none. Its RMS is the root of the posterior's mean square, under a flat prior up
+    to the bubbles' own. Wide swings across the vertical are the bubbles'.
+    """
+    for line in model.bubble.zigzags:
+        rivals = [m for m in model.modes if m.camera == CARRIAGE]
+        seen = any(abs(m.frequency_hz / line.frequency_hz - 1) < _NEAR_HZ for m in rivals)
+        if seen or not _lies_in(line.rms_mm, pattern) or is_zigzag(line, up):
+            continue
+        force = next((m.force_hz for m in model.modes), None)
+        options = [
+            RigMode(line.frequency_hz, line.damping, _times(line.rms_mm, s), force_hz=force)
+            for s in _SHARES
+        ]
+        trials = [replace(model, modes=(*model.modes, mode)) for mode in options[1:]]
+        found = np.array([evidence(channels, m) for m in (model, *trials)])
+        weight = np.exp(found - found.max())
+        share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
+        if share > _LEAST_SHARE:
+            mode = replace(options[0], rms_mm=_times(line.rms_mm, share))
+            model = replace(model, modes=(*model.modes, mode))
     return model

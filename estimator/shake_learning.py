@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel, channels_of, pooled
-from telerig.estimator.shake_labels import LineLabel, is_zigzag, labels, shared
+from telerig.estimator.shake_labels import LineLabel, doubted, is_zigzag, labels, shared
 from telerig.estimator.shake_likelihood import Fit, evidence, laplace_sigma, maximise
 from telerig.estimator.shake_parameters import names_of, value_of, with_values
 from telerig.estimator.shake_spectrum import Line, coarsening, coarser, faded, unexplained
@@ -152,6 +152,8 @@ def _learn_group(
     if not options.target:
         found = labels(coarse.fast, model, group.pattern, group.up)
         model = shared(model, [x for x in found if not _is_held(x, options)])
+        if max(int(c.moving.sum()) for c in group.channels) > 1:
+            model = doubted(coarse.fast, model, group.pattern, group.up)
     return model, dict(zip(names, sigma.tolist()))
 
 

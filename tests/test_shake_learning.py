@@ -12,13 +12,13 @@ from telerig.errors import InputError
 from telerig.estimator.shake_channels import channels_of, pooled, seen_channels
 from telerig.estimator.shake_evidence import channel_evidence, channel_posterior, position_sigma
 from telerig.estimator.shake_inflation import inflated
-from telerig.estimator.shake_labels import labels, moved_to_bubble, moved_to_rig
+from telerig.estimator.shake_labels import doubted, labels, moved_to_bubble, moved_to_rig
 from telerig.estimator.shake_learning import Learning, learn
 from telerig.estimator.shake_likelihood import evidence, laplace_sigma, maximise
 from telerig.estimator.shake_parameters import log_prior, names_of, value_of, with_values
 from telerig.estimator.shake_spectrum import coarsening, coarser, density, faded, unexplained
 from telerig.estimator.smoother.defaults import default_model
-from telerig.estimator.smoother.model import CARRIAGE, BroadBand, ShakeModel
+from telerig.estimator.smoother.model import CARRIAGE, BroadBand, ShakeModel, Zigzag
 from telerig.estimator.smoother.solve import Options, solve
 from telerig.factors.state_space import broad_band, driven_mode, oscillator
 
@@ -215,3 +215,24 @@ def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
     np.testing.assert_allclose(np.einsum("d,nde,e->n", offset, added, offset), step**2, atol=1e-9)
     plain = solve(problem, true_model(), Options(robust=False))
     assert inflated(plain) is plain
+
+
+def test_a_line_of_several_bubbles_leaves_room_for_the_rigs() -> None:
+    """The rig's line was missed: what five bubbles have in common at its frequency asks for it."""
+    problem, _, _ = run(np.random.default_rng(5), bubbles=5)
+    true = true_model()
+    common = true.modes[0]
+    bubble = replace(
+        true.bubble, zigzags=(*true.bubble.zigzags, Zigzag(COMMON_HZ, 0.03, (0.0, 0.17, 0.0)))
+    )
+    missed = replace(true, modes=true.modes[1:], bubble=bubble)
+    channels = pooled(channels_of(problem)[0])
+    found = doubted(channels, missed, (0, 1, 0), problem.up)
+    at = {round(m.frequency_hz): max(m.rms_mm) for m in found.modes if m.camera == CARRIAGE}
+    assert set(at) >= {round(COMMON_HZ)}
+    assert 0.6 * 0.17 < at[round(COMMON_HZ)] <= 0.17
+    # the bubbles' own line at 13 Hz is doubted too, by less; their wide swing is not
+    assert at.get(round(BUBBLE_HZ), 0.0) < 0.6 * 0.18
+    assert round(SWING_HZ) not in at
+    assert doubted(channels, replace(missed, modes=(*missed.modes, common)), (0, 1, 0),
+                   problem.up).modes[: len(true.modes)] == (*true.modes[1:], common)  # fmt: skip

@@ -69,6 +69,10 @@ class ArraySystem:
         """Everything at one state: images, then priors and gauge."""
         return _Sums(self, state).equations()
 
+    def priors(self, state: State) -> NormalEquations:
+        """What priors, gauge and known distance add to the normal equations."""
+        return _Sums(self, state).with_priors()
+
     def intrinsics_of(self, camera: int) -> slice:
         """Where a camera's free intrinsics stand."""
         return slice(int(self.edges[camera]), int(self.edges[camera + 1]))
@@ -133,11 +137,15 @@ class _Sums:
         for rows in system.chunks:
             blocks = image_blocks(self.state, rows, system.problem.rho_mm, system.any_free)
             self._add(rows, blocks)
+        return self.with_priors()
+
+    def with_priors(self) -> NormalEquations:
+        """With what has been summed so far."""
         row = self._add_priors()
         right = np.concatenate(
             [p.ravel() for p in (self.right_shared, self.right_views, self.right_dots.T)]
         )
-        cost = 0.5 * (self.twice + system.prior_cost(self.state))
+        cost = 0.5 * (self.twice + self.system.prior_cost(self.state))
         by_view = self.by_view.reshape(len(self.shared), -1)
         return NormalEquations(
             cost, self.shared, by_view, self.views, self.dots, self.cross, right, row

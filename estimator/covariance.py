@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
-from telerig.errors import CalibrationError
+from telerig.estimator.array_system import ArraySystem
 from telerig.estimator.graph import Solution
-from telerig.estimator.problem import Problem
-from telerig.factors.projection import whitened_residuals
+from telerig.estimator.problem import Problem, parameter_unit
+from telerig.estimator.schur import Posterior
 from telerig.rig.camera import Camera
 from telerig.rig.pose import hat
 from telerig.rig.projection import INDEX
@@ -22,16 +21,23 @@ Array = NDArray[np.float64]
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 
 
+WHOLE = 4000
+"""Numbers in a calibration up to which the covariance of all with all is kept."""
+
+
 @dataclass(frozen=True)
 class JointCovariance:
     """matrix : (D, D) in physical units; names : D strings, ``left.k1``, ``view 03.rx_rad``.
 
+    Of a calibration of more than `WHOLE` numbers, cameras and views only.
     Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
+    dots : (N, 3, 3) of each dot.
     effective_dof : degrees of freedom that are left to the residuals.
     """
 
     names: tuple[str, ...]
     matrix: Array
+    dots: Array
     rig: int
     effective_dof: float
 
@@ -41,39 +47,33 @@ class JointCovariance:
 
 
 def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
-    """Inverse of the information at the solution, equilibrated before it is factorised.
+    """Inverse of the information at the solution, from the solver's own factorisation.
 
     What no measurement touches (the pose of a view that was left out) is infinitely uncertain.
 
     Raises CalibrationError when it is singular to working precision.
     """
-    information = solution.information
-    untouched = np.diag(information) <= 0
-    information = information + np.diag(untouched.astype(float))
-    scale = 1 / np.sqrt(np.diag(information))
-    equilibrated = information * scale[:, None] * scale
-    try:
-        factor = cho_factor(equilibrated)
-    except np.linalg.LinAlgError as error:
-        raise CalibrationError(
-            "the measurements leave a direction of the calibration undetermined",
-            todo="add views with other tilts, or fix the model with --model",
-        ) from error
-    inverse = cho_solve(factor, np.eye(len(scale))) * scale[:, None] * scale
-    units = _units(problem, len(scale))
-    names = _names(problem)
+    size = solution.slots["dots"][0].stop
+    posterior = solution.equations.posterior(whole=size <= WHOLE)
+    matrix = posterior.common if posterior.whole is None else posterior.whole
+    matrix = matrix.copy()
+    untouched = posterior.untouched[: len(matrix)]
+    matrix[untouched, untouched] = np.inf
+    units = _units(problem, len(matrix))
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
-    dof = _effective_dof(problem, solution, inverse)
-    inverse[untouched, untouched] = np.inf
-    return JointCovariance(names, inverse * units[:, None] * units, rig, dof)
+    dof = _effective_dof(problem, solution, posterior)
+    names = _names(problem)[: len(matrix)]
+    matrix *= units[:, None] * units
+    return JointCovariance(names, matrix, posterior.dots, rig, dof)
 
 
 def _units(problem: Problem, size: int) -> Array:
     units = np.ones(size)
     at = 0
-    for unit in problem.keys().unit:
-        units[at : at + len(unit)] = unit
-        at += len(unit)
+    for c, camera in enumerate(problem.cameras):
+        free = problem.free_indices(c)
+        units[at : at + len(free)] = parameter_unit(camera)[free]
+        at += len(free)
     return units
 
 
@@ -85,35 +85,15 @@ def _names(problem: Problem) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _effective_dof(problem: Problem, solution: Solution, inverse: Array) -> float:
-    """E[sum of squared whitened residuals] = rows - trace(J C J^T)."""
-    leverages = hat_matrix_blocks(problem, solution, inverse)
-    return float(2 * len(leverages) - np.trace(leverages, axis1=-2, axis2=-1).sum())
+def _effective_dof(problem: Problem, solution: Solution, posterior: Posterior) -> float:
+    """E[sum of squared whitened residuals of the images] = rows - trace(J C J^T).
 
-
-def hat_matrix_blocks(problem: Problem, solution: Solution, inverse: Array) -> Array:
-    """(M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs."""
-    obs = problem.observations()
-    jac = whitened_residuals(solution.state, obs, problem.rho_mm)
-    keys, slots = problem.keys(), solution.slots
-    out = np.empty((len(obs), 2, 2))
-    image = obs.view * len(problem.cameras) + obs.camera
-    for k in np.unique(image):
-        rows = np.flatnonzero(image == k)
-        v, c = divmod(int(k), len(problem.cameras))
-        parts = [jac.by_intrinsics[rows][..., keys.free[c]] * keys.unit[c], jac.by_view[rows]]
-        where = [np.arange(len(inverse))[s] for s in (slots["intrinsics"][c], slots["view"][v])]
-        if c:
-            parts.append(jac.by_camera[rows])
-            where.append(np.arange(len(inverse))[slots["camera"][c]])
-        common = np.concatenate(parts, -1)
-        index = np.concatenate(where)
-        dots = slots["dots"][0].start + 3 * obs.dot[rows][:, None] + np.arange(3)
-        every = np.concatenate([np.broadcast_to(index, (len(rows), len(index))), dots], 1)
-        full = np.concatenate([common, jac.by_dot[rows]], -1)
-        block = inverse[every[:, :, None], every[:, None, :]]
-        out[rows] = full @ block @ np.swapaxes(full, -1, -2)
-    return out
+    The trace over images and priors together is the number of what is estimated.
+    """
+    priors = ArraySystem(problem, solution.state).priors(solution.state)
+    rows = 2 * int(np.sum(problem.weight > 0))
+    estimated = int(np.sum(~posterior.untouched))
+    return float(rows - estimated + priors.prior_share(posterior))
 
 
 def rig_jacobian(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.schur import Blocks, Reduced
+from telerig.estimator.schur import Blocks, Posterior, Reduced
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -82,6 +82,41 @@ class NormalEquations:
         """(S + 6 V + 3 N,) of the known distance."""
         assert self.distance is not None
         return np.concatenate([np.zeros(self.common), self.distance])
+
+    def posterior(self, whole: bool) -> Posterior:
+        """The inverse of J^T J from the factorisation that a step uses.
+
+        whole : all of it, dots with dots too.
+        """
+        untouched = np.concatenate([
+            np.diag(self.shared) <= 0, np.diagonal(self.views, 0, 1, 2).ravel() <= 0,
+            np.zeros(self.dots[0].size, bool),
+        ])  # fmt: skip
+        reduced = self.without_dots()
+        row = None if self.distance is None else self.distance_row()
+        along, denominator = np.zeros(len(self.right)), 1.0
+        if row is not None:
+            along = reduced.solve(row)
+            denominator = 1 + float(row @ along)
+        if whole:
+            inverse = reduced.inverse()
+            order = np.argsort(np.concatenate([reduced.kept, reduced.eliminated]))
+            inverse = inverse[np.ix_(order, order)]
+            inverse -= np.outer(along, along) / denominator
+            return Posterior.of(inverse, self.common, row, untouched)
+        of_common, of_dots = along[: self.common], along[self.common :].reshape(-1, 3)
+        common = reduced.inverse_kept() - np.outer(of_common, of_common) / denominator
+        dots = reduced.inverse_blocks() - of_dots[:, :, None] * of_dots[:, None] / denominator
+        return Posterior(common, dots, None, 1 - 1 / denominator, untouched)
+
+    def prior_share(self, posterior: Posterior) -> float:
+        """Trace of a posterior times these, the normal equations of its priors."""
+        s = len(self.shared)
+        at = s + np.arange(6 * len(self.views)).reshape(-1, 6)
+        share = float((posterior.common[:s, :s] * self.shared).sum())
+        share += float((posterior.common[at[:, :, None], at[:, None, :]] * self.views).sum())
+        share += float((np.moveaxis(self.dots, -1, 0) * posterior.dots).sum())
+        return share + posterior.distance_variance
 
     def without_dots(self, damping: float = 0.0) -> Reduced:
         """The damped system with the dots eliminated, the distance left out."""

@@ -108,3 +108,29 @@ class Reduced:
         out[np.ix_(self.eliminated, self.kept)] = across.T
         out[np.ix_(self.eliminated, self.eliminated)] = own
         return out
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The inverse of J^T J, or what was asked of it; C = intrinsics, camera poses and views.
+
+    common : (C, C).  dots : (N, 3, 3).  whole : (C + 3 N, C + 3 N) or None.
+    distance_variance : of the known distance, whitened; 0 where there is none.
+    untouched : (C + 3 N,) what no measurement or prior reaches; its variance here is 1.
+    """
+
+    common: Array
+    dots: Array
+    whole: Array | None
+    distance_variance: float
+    untouched: NDArray[np.bool_]
+
+    @staticmethod
+    def of(
+        whole: Array, common: int, distance: Array | None, untouched: NDArray[np.bool_]
+    ) -> Posterior:
+        """From all of the inverse; distance : (C + 3 N,) its row."""
+        at = common + np.arange(len(whole) - common).reshape(-1, 3)
+        dots = whole[at[:, :, None], at[:, None, :]]
+        variance = 0.0 if distance is None else float(distance @ whole @ distance)
+        return Posterior(whole[:common, :common], dots, whole, variance, untouched)

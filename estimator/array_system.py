@@ -7,6 +7,9 @@ normal equations in blocks. Cost, information and minimum are the graph's; tests
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +30,19 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+MANY = 40_000
+"""Measured dots from which loading compiled loops is worth its second."""
+
+
+@cache
+def compiled_loops() -> Any:
+    """The module `telerig.factors.image_loops`, or None where numba is not installed."""
+    try:
+        return import_module("telerig.factors.image_loops")
+    except ImportError:
+        return None
+
+
 class ArraySystem:
     """A problem without a graph; points are states. The interface is `graph.GraphSystem`'s."""
 
@@ -45,6 +61,7 @@ class ArraySystem:
         sizes = [len(f) for f in self.free] + [6] * (len(problem.cameras) - 1)
         self.edges = np.r_[0, np.cumsum(sizes)]
         self.dot_weight = np.ascontiguousarray(problem.dot_sigma_mm.T**-2.0)
+        self.loops = compiled_loops() if len(problem.view) >= MANY else None
         self.loose_mm = 10 * max(problem.rho_mm)
 
     def _pick(self, free: Ints, unit: Array) -> tuple[Ints, Array]:
@@ -62,7 +79,11 @@ class ArraySystem:
 
     def cost(self, state: State) -> float:
         """Half the sum of the squared residuals, without derivatives."""
-        twice = sum(squared_error(state, rows, self.problem.rho_mm) for rows in self.chunks)
+        twice = 0.0
+        for rows in self.chunks:
+            own = self.loops is not None and self.loops.handles(state, rows, self.any_free)
+            error = self.loops.squared_error if own else squared_error
+            twice += error(state, rows, self.problem.rho_mm)
         return 0.5 * (twice + self.prior_cost(state))
 
     def linearised(self, state: State) -> NormalEquations:
@@ -135,8 +156,11 @@ class _Sums:
     def equations(self) -> NormalEquations:
         system = self.system
         for rows in system.chunks:
-            blocks = image_blocks(self.state, rows, system.problem.rho_mm, system.any_free)
-            self._add(rows, blocks)
+            given = (self.state, rows, system.problem.rho_mm, system.any_free)
+            if system.loops is not None and system.loops.handles(self.state, rows, system.any_free):
+                self._add_compiled(rows, system.loops.image_columns(*given))
+            else:
+                self._add(rows, image_blocks(*given))
         return self.with_priors()
 
     def with_priors(self) -> NormalEquations:
@@ -159,6 +183,18 @@ class _Sums:
                 self._add_dots(camera, view, blocks.by_dot[images], turn)
             else:
                 self._add_entries(camera, view, blocks.by_dot[images], turn, rows.entries[k])
+
+    def _add_compiled(self, rows: ImageRows, blocks: Any) -> None:
+        count = self.dots.shape[-1]
+        for camera, images in rows.cameras:
+            moved = blocks.view_from_camera[images]
+            self._add_gram(camera, rows.view[images], blocks.gram[images], moved)
+            total = np.zeros((blocks.gram.shape[-1] - 3, 3, count))
+            turned = np.zeros((6 if camera else 0, 3, count))
+            self.system.loops.add_dots(blocks, images, rows, self.cross_views, total, turned)
+            self._add_totals(camera, total, slice(None))
+            if camera:
+                self.cross[self.system.pose_of(camera)] += turned
 
     def _add_gram(self, camera: int, view: Ints, gram: Array, moved: Array) -> None:
         """gram : (I, K, K) of the chunk's columns; moved : (I, 6, 6) of the camera's pose."""
@@ -186,7 +222,9 @@ class _Sums:
 
     def _add_dots(self, camera: int, view: Ints, by_dot: Array, moved: Array) -> None:
         """by_dot : (I, K, 3, N), a place for every dot."""
-        self.cross_views[view] += by_dot[:, :6]
+        # a slice is added in place, an index array by way of two copies
+        whole = view[-1] - view[0] + 1 == len(view)
+        self.cross_views[slice(view[0], view[-1] + 1) if whole else view] += by_dot[:, :6]
         self._add_totals(camera, by_dot[:, 3:].sum(0), slice(None))
         if camera:
             count = by_dot.shape[-1]

@@ -100,8 +100,6 @@ class NormalEquations:
             denominator = 1 + float(row @ along)
         if whole:
             inverse = reduced.inverse()
-            order = np.argsort(np.concatenate([reduced.kept, reduced.eliminated]))
-            inverse = inverse[np.ix_(order, order)]
             inverse -= np.outer(along, along) / denominator
             return Posterior.of(inverse, self.common, row, untouched)
         of_common, of_dots = along[: self.common], along[self.common :].reshape(-1, 3)

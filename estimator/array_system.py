@@ -61,7 +61,7 @@ class ArraySystem:
         sizes = [len(f) for f in self.free] + [6] * (len(problem.cameras) - 1)
         self.edges = np.r_[0, np.cumsum(sizes)]
         self.dot_weight = np.ascontiguousarray(problem.dot_sigma_mm.T**-2.0)
-        self.loops = compiled_loops() if len(problem.view) >= MANY else None
+        self.loops: Any = compiled_loops() if len(problem.view) >= MANY else None
         self.loose_mm = 10 * max(problem.rho_mm)
 
     def _pick(self, free: Ints, unit: Array) -> tuple[Ints, Array]:

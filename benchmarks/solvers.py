@@ -204,6 +204,7 @@ def main() -> None:
     parser.add_argument("--sizes", default=",".join(SIZES))
     parser.add_argument("--solvers", default=",".join(SOLVERS))
     parser.add_argument("--limit", type=float, default=600.0, help="seconds a run may take")
+    parser.add_argument("--records", type=Path, help="runs done before are kept here, as JSON")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--run", nargs=3, metavar=("KIND", "SOLVER", "SIZE"), help="one run")
     options = parser.parse_args()
@@ -211,13 +212,21 @@ def main() -> None:
         kind, name, size = options.run
         print(json.dumps((growth if kind == "growth" else one)(name, size)))
         return
-    names, runs = options.solvers.split(","), {}
+    names = options.solvers.split(",")
+    kept = options.records is not None and options.records.is_file()
+    runs: Any = json.loads(options.records.read_text(encoding="utf-8")) if kept else {}
     for size in options.sizes.split(","):
-        runs[size] = {}
+        of_size = runs.setdefault(size, {})
         for name in names:
-            runs[size][name] = in_process("one", name, size, options.limit)
-            print(size, name, runs[size][name], flush=True)
+            if name not in of_size:
+                of_size[name] = in_process("one", name, size, options.limit)
+                print(size, name, of_size[name], flush=True)
+            if options.records:
+                options.records.write_text(json.dumps(runs), encoding="utf-8")
     head = ["# Solvers of the calibration", "", *(__doc__ or "").strip().splitlines()[5:], ""]
+    if options.out is None:
+        print("\n".join(table(runs, names)))
+        return
     grown = WORDS.format(growth="\n".join(growth_table(options.limit)))
     lines = [*head, *table(runs, names), "", "How many times faster:", "", *ratios(runs), "", grown]
     text = "\n".join(lines)

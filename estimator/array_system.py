@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.normal_equations import NormalEquations
 from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem, parameter_unit, prior_sigma
+from telerig.estimator.schur import Group
 from telerig.factors.image_blocks import (
     ImageBlocks,
     image_blocks,
@@ -62,6 +63,7 @@ class ArraySystem:
         self.edges = np.r_[0, np.cumsum(sizes)]
         self.dot_weight = np.ascontiguousarray(problem.dot_sigma_mm.T**-2.0)
         self.loops: Any = compiled_loops() if len(problem.view) >= MANY else None
+        self.groups = seen_together(problem, int(self.edges[-1]))
         self.loose_mm = 10 * max(problem.rho_mm)
 
     def _pick(self, free: Ints, unit: Array) -> tuple[Ints, Array]:
@@ -172,7 +174,15 @@ class _Sums:
         cost = 0.5 * (self.twice + self.system.prior_cost(self.state))
         by_view = self.by_view.reshape(len(self.shared), -1)
         return NormalEquations(
-            cost, self.shared, by_view, self.views, self.dots, self.cross, right, row
+            cost,
+            self.shared,
+            by_view,
+            self.views,
+            self.dots,
+            self.cross,
+            right,
+            row,
+            self.system.groups,
         )
 
     def _add(self, rows: ImageRows, blocks: ImageBlocks) -> None:
@@ -279,6 +289,37 @@ class _Sums:
         value, jacobian = distance_residual(state.dots_mm, *problem.scale)
         self.right_dots -= (jacobian[0] * value[0]).reshape(-1, 3).T
         return np.asarray(jacobian[0])
+
+
+TOGETHER = 64
+"""Dots of a group: more are fewer products, fewer are seen by fewer views."""
+
+
+def seen_together(problem: Problem, shared: int) -> tuple[Group, ...]:
+    """Neighbouring dots with the rows of views that see any; () where that saves less than half."""
+    count, views = len(problem.dot_ids), len(problem.views)
+    used = problem.weight > 0
+    seen = np.zeros((count, views), bool)
+    seen[problem.dot[used], problem.view[used]] = True
+    if seen.mean() > 0.5 or 2 * views > count:
+        return ()
+    groups, work = [], 0.0
+    for dots in _halved(np.arange(count), problem.nominal_mm):
+        of_views = shared + 6 * np.flatnonzero(seen[dots].any(0))[:, None] + np.arange(6)
+        rows = np.concatenate([np.arange(shared), of_views.ravel()])
+        groups.append(Group(dots, rows))
+        work += len(dots) * len(rows) ** 2
+    return tuple(groups) if work < 0.5 * count * (shared + 6 * views) ** 2 else ()
+
+
+def _halved(dots: Ints, places: Array) -> list[Ints]:
+    """Neighbours in groups, by halving along the longer side."""
+    if len(dots) <= TOGETHER:
+        return [dots]
+    along = int(np.argmax(np.ptp(places[dots], axis=0)))
+    order = dots[np.argsort(places[dots, along], kind="stable")]
+    middle = len(order) // 2
+    return _halved(order[:middle], places) + _halved(order[middle:], places)
 
 
 def _retracted(pose: Array, tangent: Array) -> Array:

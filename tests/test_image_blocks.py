@@ -268,3 +268,25 @@ def test_a_large_calibration_keeps_cameras_and_views(
     assert np.abs(difference).max() < 1e-7
     np.testing.assert_allclose(parts.dots, whole.dots, rtol=1e-6, atol=1e-12)
     assert parts.effective_dof == pytest.approx(whole.effective_dof, rel=1e-9)
+
+
+def test_dots_seen_by_few_views_are_eliminated_in_groups(
+    rng: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A strip of which every view sees a part: the same solution and inverse, less work."""
+    problem = problem_of(("k1",), rng, 1.0)
+    problem = problem.subset(np.abs(problem.dot - 2.5 * problem.view) < 2)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    dense = ArraySystem(problem, state).linearised(state)
+    assert dense.groups == ()
+    monkeypatch.setattr(array_system, "TOGETHER", 3)
+    grouped = ArraySystem(problem, state).linearised(state)
+    assert len(grouped.groups) == 4
+    assert sorted(np.concatenate([g.blocks for g in grouped.groups])) == list(range(12))
+    one, other = (e.without_dots(0.1).solve(e.right) for e in (dense, grouped))
+    np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-10 * np.abs(one).max())
+    for whole in (True, False):
+        first, second = dense.posterior(whole), grouped.posterior(whole)
+        sd = np.sqrt(np.diag(first.common))
+        assert np.abs((first.common - second.common) / np.outer(sd, sd)).max() < 1e-6
+        np.testing.assert_allclose(first.dots, second.dots, rtol=1e-5, atol=1e-12)

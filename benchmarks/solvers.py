@@ -146,7 +146,7 @@ def table(runs: dict[str, dict[str, Any]], names: list[str]) -> list[str]:
 
 def cell(run: dict[str, Any] | None, least: float) -> str:
     if run is None:
-        return "beyond the limit"
+        return "-"
     if "error" in run:
         return str(run["error"])
     text = f"{run['seconds']:.3g} s, {run['iterations']} it., {run['peak_mb']:.0f} MB"

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from telerig.estimator.normal_equations import NormalEquations
 from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem, parameter_unit, prior_sigma
@@ -249,11 +250,10 @@ class _Sums:
         values = by_dot[entries.image, :, :, entries.slot]
         # an image sees a dot once, so that no two rows add to the same place
         self.cross_views[view[entries.image], :, :, entries.dot] += values[:, :6]
-        total = np.add.reduceat(values[:, 3:], entries.first, axis=0)
-        self._add_totals(camera, total.transpose(1, 2, 0), entries.distinct)
+        self._add_totals(camera, _by_dot(values[:, 3:], entries), entries.distinct)
         if camera:
             turned = np.swapaxes(moved[entries.image], -1, -2) @ values[:, :6]
-            total = np.add.reduceat(turned, entries.first, axis=0).transpose(1, 2, 0)
+            total = _by_dot(turned, entries)
             self.cross[self.system.pose_of(camera), :, entries.distinct] += total
 
     def _add_totals(self, camera: int, total: Array, at: Ints | slice) -> None:
@@ -310,6 +310,15 @@ def seen_together(problem: Problem, shared: int) -> tuple[Group, ...]:
         groups.append(Group(dots, rows))
         work += len(dots) * len(rows) ** 2
     return tuple(groups) if work < 0.5 * count * (shared + 6 * views) ** 2 else ()
+
+
+def _by_dot(values: Array, entries: Entries) -> Array:
+    """(r, k, 3) -> (k, 3, n) summed over the images that see each dot."""
+    count = len(values)
+    edges = np.append(entries.first, count)
+    summing = csr_array((np.ones(count), entries.order, edges), shape=(len(edges) - 1, count))
+    total = summing @ values.reshape(count, -1)
+    return np.asarray(total.reshape(-1, *values.shape[1:]).transpose(1, 2, 0))
 
 
 def _halved(dots: Ints, places: Array) -> list[Ints]:

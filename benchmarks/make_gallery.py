@@ -2,8 +2,9 @@
 
 Usage: python benchmarks/make_gallery.py DATASET RUN [--out docs/pictures]
 
-For instance after `telerig demo`: python benchmarks/make_gallery.py telerig-demo rise. The pictures
-are the reports' own, as PNG with few colours: each below 150 kB, 1.2 MB in all.
+For instance after `telerig demo` and `telerig report telerig-demo/results/rise --film --format
+gif`: python benchmarks/make_gallery.py telerig-demo rise. The pictures are the reports' own and a
+frame of each film, as PNG with few colours. (report.png and batch.png are pages in a browser.)
 """
 
 from __future__ import annotations
@@ -110,6 +111,11 @@ def main() -> None:
         overlay = min((folder / "overlays").glob("*/*"))
         total += save(Image.open(overlay), given.out / f"{name}.png")
         print(f"{name}: {overlay}")
+    for name, film, share in (("film", "path.gif", 0.1), ("film-views", "views.gif", 0.5)):
+        with Image.open(results / given.run / "film" / film) as frames:
+            frames.seek(int(share * frames.n_frames))
+            total += save(frames.copy(), given.out / f"{name}.png")
+        print(f"{name}: a frame of {film}")
     if total > ALL_BYTES:
         raise SystemExit(f"{total} bytes in all: more than {ALL_BYTES}")
     print(f"{total} bytes in all")

@@ -5,19 +5,19 @@ Same variables, units, priors and gauge as the product; poses are tangent vector
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, vstack
+from scipy.sparse import block_diag, csr_array
 
 from telerig.estimator.array_system import ArraySystem
 from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem
 from telerig.factors.priors import depth_gauge_residual, distance_residual
-from telerig.factors.projection import State, whitened_error, whitened_residuals
-from telerig.rig.pose import hat, rotation_from_rotvec
+from telerig.factors.projection import State, whitened_residuals
+from telerig.rig.pose import hat
 
 Array = NDArray[np.float64]
 
@@ -65,6 +65,8 @@ class Flat:
 
     def residuals(self, x: Array) -> Array:
         state = self.state(x)
+        from telerig.factors.projection import whitened_error
+
         images = whitened_error(state, self.obs, self.problem.rho_mm)
         parts = [images[rows].ravel() for rows in self.rows]
         return np.concatenate([*parts, *self._priors(state)])
@@ -81,7 +83,7 @@ class Flat:
         ]
 
     def jacobian(self, x: Array) -> Any:
-        """Sparse (R, D): by right perturbations at the state, then by tangents at the start."""
+        """Sparse (R, D): by the perturbation at the state, then by the tangent at the start."""
         problem, system, state = self.problem, self.system, self.state(x)
         full = whitened_residuals(state, self.obs, problem.rho_mm)
         blocks = []
@@ -97,8 +99,7 @@ class Flat:
         width = np.concatenate([np.full(len(v), v.shape[1]) for v, _ in blocks])
         start = np.concatenate([[0], np.cumsum(width)])
         images = csr_array((data, index, start), shape=(len(width), self.size))
-        every = vstack([images, self._prior_jacobian(state)], format="csr")
-        return csr_array(every @ self._chain(x).tocsr())
+        return _stack([images, self._prior_jacobian(state)]) @ self._chain(x)
 
     def _prior_jacobian(self, state: State) -> Any:
         problem, system = self.problem, self.system
@@ -107,22 +108,41 @@ class Flat:
         gauge = depth_gauge_residual(state.rig_from_camera[1], GAUGE_SIGMA_MM)[1]
         turn = state.rig_from_target[:, :3, :3] / system.loose_mm
         views = block_diag([np.concatenate([np.zeros((3, 3)), r], 1) for r in turn])
-        of_dots = diags_array(1 / problem.dot_sigma_mm.ravel())
+        dots = block_diag([np.diag(1 / problem.dot_sigma_mm.ravel())]) if False else None
+        del dots
+        weight = 1 / problem.dot_sigma_mm.ravel()
+        of_dots = csr_array(
+            (weight, (np.arange(len(weight)), np.arange(len(weight)))), shape=(len(weight),) * 2
+        )
         far = csr_array(distance_residual(state.dots_mm, *problem.scale)[1])
-        far = hstack([csr_array((1, self.dots_at)), far])
-        return vstack([block_diag([*lens, gauge, views, of_dots]), far])
+        common = block_diag([*lens, gauge, views, of_dots], format="csr")
+        pad = csr_array((1, self.dots_at))
+        from scipy.sparse import hstack
+
+        return _stack([csr_array(common), csr_array(hstack([pad, far]))])
 
     def _chain(self, x: Array) -> Any:
         """Block diagonal: right perturbation at the state per tangent at the start."""
+        from telerig.rig.pose import rotation_from_rotvec
+
         first = self.views_at - 6
         tangent = x[first : self.dots_at].reshape(-1, 6)
         blocks = np.zeros((len(tangent), 6, 6))
         blocks[:, :3, :3] = right_jacobian(tangent[:, :3])
         blocks[:, 3:, 3:] = np.swapaxes(rotation_from_rotvec(tangent[:, :3]), -1, -2)
-        return block_diag([eye_array(first), *blocks, eye_array(self.size - self.dots_at)])
+        ones = [csr_array(np.eye(first))]
+        rest = self.size - self.dots_at
+        tail = csr_array((np.ones(rest), (np.arange(rest), np.arange(rest))), shape=(rest, rest))
+        return csr_array(block_diag([*ones, *blocks, tail], format="csr"))
 
 
-def solve(problem: Problem, start: State, inner: float = 1e-10) -> tuple[State, int]:
+def _stack(parts: list[Any]) -> Any:
+    from scipy.sparse import vstack
+
+    return csr_array(vstack(parts, format="csr"))
+
+
+def solve(problem: Problem, start: State, inner: float = 1e-12) -> tuple[State, int]:
     """trf with lsmr, ended when nothing more is gained; the state and the Jacobians evaluated."""
     flat = Flat(problem, start)
     found: Any = least_squares(
@@ -130,4 +150,4 @@ def solve(problem: Problem, start: State, inner: float = 1e-10) -> tuple[State, 
         x_scale="jac", ftol=1e-11, xtol=1e-14, gtol=1e-14, max_nfev=100,
         tr_options={"atol": inner, "btol": inner, "maxiter": 20 * flat.size},
     )  # fmt: skip
-    return flat.state(found.x), int(found.njev)
+    return replace(flat.state(found.x)), int(found.njev)

@@ -121,6 +121,8 @@ def motion_correlation(
     t_s (N,), reading (N, 3); stage_t_s, position_mm (E,). None where the records overlap by less
     than 0.3 s or the encoder does not accelerate.
     """
+    from scipy.signal import savgol_coeffs
+
     t, stage_t = np.asarray(t_s, float), np.asarray(stage_t_s, float)
     low, high = max(t[0], stage_t[0]), min(t[-1], stage_t[-1])
     step = _SMOOTHED_S / 6
@@ -129,8 +131,7 @@ def motion_correlation(
     grid = np.arange(low, high, step)
     place = _averaged(stage_t, np.asarray(position_mm, float), grid, step)
     felt = np.stack([_averaged(t, a, grid, step) for a in np.asarray(reading, float).T], -1)
-    weights = _second_derivative(13)
-    bend = np.convolve(place, weights[::-1], "valid") / step**2
+    bend = np.convolve(place, savgol_coeffs(13, 3, deriv=2, delta=step), "valid")
     mean = np.hanning(15)[1:-1] / np.hanning(15)[1:-1].sum()
     smooth = np.stack([np.convolve(a, mean, "valid") for a in felt.T], -1)
     bend, smooth = bend - bend.mean(), smooth - smooth.mean(0)
@@ -156,12 +157,6 @@ def _averaged(t: Array, values: Array, grid: Array, step: float) -> Array:
     ends = [np.interp(grid + s * step / 2, t, integral) for s in (-1, 1)]
     width = np.clip(grid + step / 2, t[0], t[-1]) - np.clip(grid - step / 2, t[0], t[-1])
     return np.asarray((ends[1] - ends[0]) / width)
-
-
-def _second_derivative(count: int) -> Array:
-    """(count,) weights of a least-squares cubic's second derivative at its middle (Savitzky)."""
-    x = np.arange(count) - count // 2
-    return np.asarray(2 * np.linalg.pinv(np.stack([x**0, x, x**2, x**3], -1).astype(float))[2])
 
 
 def _angle_deg(a: Array, b: Array) -> float:

@@ -93,10 +93,6 @@ class ArraySystem:
         """Everything at one state: images, then priors and gauge."""
         return _Sums(self, state).equations()
 
-    def priors(self, state: State) -> NormalEquations:
-        """What priors, gauge and known distance add to the normal equations."""
-        return _Sums(self, state).with_priors()
-
     def intrinsics_of(self, camera: int) -> slice:
         """Where a camera's free intrinsics stand."""
         return slice(int(self.edges[camera]), int(self.edges[camera + 1]))

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.problem import prior_sigma, wall_freedom
 from telerig.estimator.truth import working_volume
@@ -21,16 +20,8 @@ from telerig.rig.walls import Wall
 
 Array = NDArray[np.float64]
 
-MEDIA = ("air", "water")
 _NOTABLE_UM = 0.1
 _STEP_MM = 10.0
-
-
-def checked_medium(medium: str) -> str:
-    """Raises InputError for anything but "air" and "water"."""
-    if medium not in MEDIA:
-        raise InputError(f"unknown medium {medium!r}", todo='give "air" or "water"')
-    return medium
 
 
 def stated_walls(rig: RigDescription) -> dict[str, Wall]:

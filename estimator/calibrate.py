@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from telerig.errors import CalibrationError
-from telerig.estimator.calibration import Calibration
+from telerig.errors import CalibrationError, InputError
 from telerig.estimator.problem import SOLVERS
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from telerig.estimator.calibration import Calibration
     from telerig.estimator.frontend.dataset_dots import DatasetDots
     from telerig.io.dataset import Dataset
     from telerig.io.rig_description import RigDescription
@@ -25,12 +25,22 @@ Stage = Callable[[str, int, int], None]
 """Progress: (what, done, of)."""
 
 
+MEDIA = ("air", "water")
+
+
 @dataclass(frozen=True)
 class CalibrationRun:
     """A calibration with the detections it came from; None when it came from dots.csv."""
 
     calibration: Calibration
     detected: DatasetDots | None
+
+
+def checked_medium(medium: str) -> str:
+    """Raises InputError for anything but "air" and "water"."""
+    if medium not in MEDIA:
+        raise InputError(f"unknown medium {medium!r}", todo='give "air" or "water"')
+    return medium
 
 
 def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
@@ -80,19 +90,17 @@ def run_calibration(
 
     pictures : draw what was found over each image, as `write_results` needs.
     """
-    from telerig.estimator.behind_walls import (
-        checked_medium,
-        put_behind_walls,
-        stated_walls,
-        wall_words,
-        with_walls,
-    )
-
     checked_medium(medium)
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     detected, table, notes = _measured(dataset, stage, pictures)
 
+    from telerig.estimator.behind_walls import (
+        put_behind_walls,
+        stated_walls,
+        wall_words,
+        with_walls,
+    )
     from telerig.estimator.self_calibration import self_calibrate
 
     rig = dataset.rig

@@ -16,6 +16,8 @@ from telerig.io.tables import write_table
 if TYPE_CHECKING:
     import pandas as pd
 
+    from telerig.estimator.calibration import Calibration
+    from telerig.estimator.compare_calibrations import RigComparison
     from telerig.estimator.frontend.dataset_dots import DatasetDots
     from telerig.io.dataset import Dataset
 
@@ -37,10 +39,12 @@ def write_results(
     command: str,
     options: Mapping[str, Any],
     seconds: Mapping[str, float],
+    change: RigComparison | None = None,
     report: bool = True,
 ) -> Path:
     """Fill ``folder`` with what docs/files.md lists; returns the report's path.
 
+    change : since an earlier calibration, for comparison.json.
     Files appear together at the end, so an interrupted command leaves the old ones.
     """
     from telerig.io.report.calibration_report import write_calibration_report
@@ -49,12 +53,28 @@ def write_results(
     with atomic_folder(folder) as staged:
         run.calibration.save(staged)
         write_json_atomic(staged / "run.json", record)
+        if change is not None:
+            write_json_atomic(staged / "comparison.json", change.as_dict())
+        if len(run.calibration.cameras) == 2:
+            write_uncertainty(run.calibration, staged / "uncertainty.npz")
         if run.detected is not None:
             write_detections(run.detected, staged)
             _write_example(dataset, run, staged / "dot_example.npz")
         if report:
             write_calibration_report(staged)
     return folder / "report.html"
+
+
+def write_uncertainty(calibration: Calibration, path: Path) -> None:
+    """Covariances over the working volume, as docs/files.md lists them."""
+    from telerig.estimator.uncertainty_map import uncertainty_map
+
+    found = uncertainty_map(calibration)
+    with path.open("wb") as stream:
+        np.savez_compressed(
+            stream, allow_pickle=False, points_mm=found.points_mm, sigma_px=found.sigma_px,
+            calibration_mm2=found.calibration_mm2, measurement_mm2=found.measurement_mm2,
+        )  # fmt: skip
 
 
 def write_detections(detected: DatasetDots, folder: Path) -> None:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.array_system import ArraySystem
 from telerig.estimator.graph import Solution
 from telerig.estimator.problem import Problem, parameter_unit
 from telerig.estimator.schur import Posterior
+from telerig.factors.projection import whitened_residuals
 from telerig.rig.camera import Camera
 from telerig.rig.pose import hat
 from telerig.rig.projection import INDEX
@@ -19,8 +19,6 @@ from telerig.rig.triangulation import stacked_jacobian
 Array = NDArray[np.float64]
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
-
-
 WHOLE = 4000
 """Numbers in a calibration up to which the covariance of all with all is kept."""
 
@@ -32,14 +30,19 @@ class JointCovariance:
     Of a calibration of more than `WHOLE` numbers, cameras and views only.
     Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
     dots : (N, 3, 3) of each dot.
-    effective_dof : degrees of freedom that are left to the residuals.
+    leverage : (M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs.
     """
 
     names: tuple[str, ...]
     matrix: Array
     dots: Array
     rig: int
-    effective_dof: float
+    leverage: Array
+
+    @property
+    def effective_dof(self) -> float:
+        """E[sum of squared whitened residuals] = rows - trace(J C J^T)."""
+        return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
         """Names and covariance of the cameras alone: intrinsics, then the second camera's pose."""
@@ -61,10 +64,10 @@ def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
     matrix[untouched, untouched] = np.inf
     units = _units(problem, len(matrix))
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
-    dof = _effective_dof(problem, solution, posterior)
+    leverage = hat_matrix_blocks(problem, solution, posterior)
     names = _names(problem)[: len(matrix)]
     matrix *= units[:, None] * units
-    return JointCovariance(names, matrix, posterior.dots, rig, dof)
+    return JointCovariance(names, matrix, posterior.dots, rig, leverage)
 
 
 def _units(problem: Problem, size: int) -> Array:
@@ -85,15 +88,28 @@ def _names(problem: Problem) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _effective_dof(problem: Problem, solution: Solution, posterior: Posterior) -> float:
-    """E[sum of squared whitened residuals of the images] = rows - trace(J C J^T).
-
-    The trace over images and priors together is the number of what is estimated.
-    """
-    priors = ArraySystem(problem, solution.state).priors(solution.state)
-    rows = 2 * int(np.sum(problem.weight > 0))
-    estimated = int(np.sum(~posterior.untouched))
-    return float(rows - estimated + priors.prior_share(posterior))
+def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior) -> Array:
+    """(M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs."""
+    obs = problem.observations()
+    slots, out = solution.slots, np.empty((len(obs), 2, 2))
+    every = np.arange(len(posterior.common))
+    image = obs.view * len(problem.cameras) + obs.camera
+    order = np.argsort(image, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(image[order])) + 1):
+        v, c, dot = int(obs.view[rows[0]]), int(obs.camera[rows[0]]), obs.dot[rows]
+        jac = whitened_residuals(solution.state, obs.subset(rows), problem.rho_mm)
+        free = problem.free_indices(c)
+        lens = jac.by_intrinsics[..., free] * parameter_unit(problem.cameras[c])[free]
+        pose = [jac.by_camera] if c else []
+        common, own = np.concatenate([lens, *pose, jac.by_view], -1), jac.by_dot
+        places = (slots["intrinsics"][c], slots["camera"][c], slots["view"][v])
+        index = np.concatenate([every[place] for place in places])
+        across = posterior.cross[index][:, dot].swapaxes(0, 1)
+        mixed = common @ across @ np.swapaxes(own, -1, -2)
+        alone = common @ posterior.common[np.ix_(index, index)] @ np.swapaxes(common, -1, -2)
+        of_dots = own @ posterior.dots[dot] @ np.swapaxes(own, -1, -2)
+        out[rows] = alone + mixed + np.swapaxes(mixed, -1, -2) + of_dots
+    return out
 
 
 def rig_jacobian(
@@ -124,7 +140,15 @@ def aligned_covariance(
     covariance: Array,
     points_mm: Array,
 ) -> Array:
-    """(3 N, 3 N) calibration covariance of rig points, their common rigid motion projected out.
+    """(3 N, 3 N) calibration covariance of rig points, their common rigid motion projected out."""
+    inner = aligned_shift(cameras, free, points_mm)
+    return np.asarray(inner @ covariance @ inner.T)
+
+
+def aligned_shift(
+    cameras: tuple[Camera, Camera], free: tuple[tuple[str, ...], ...], points_mm: Array
+) -> Array:
+    """(3 N, P): rig points by the rig block's parameters, their common rigid motion projected out.
 
     What is left is the error of shapes, distances and motions inside the rig; where the rig's own
     frame lies is a matter of definition (Baarda's S-transformation to the points' own frame).
@@ -135,8 +159,7 @@ def aligned_covariance(
     centred = points_mm - points_mm.mean(0)
     motion = np.concatenate([np.tile(np.eye(3), (len(points_mm), 1, 1)), -hat(centred)], -1)
     basis, _ = np.linalg.qr(motion.reshape(-1, 6))
-    inner = shift - basis @ (basis.T @ shift)
-    return np.asarray(inner @ covariance @ inner.T)
+    return np.asarray(shift - basis @ (basis.T @ shift))
 
 
 def point_shift_jacobian(

@@ -43,13 +43,12 @@ Progress = Callable[[int, float], None]
 class DenseEquations:
     """J^T J and -J^T r of the whole graph.
 
-    common : how many numbers come before the dots.  distance : row of the known distance or None.
+    common : how many numbers come before the dots.
     """
 
     matrix: Array
     gradient: Array
     common: int
-    distance: Array | None
 
     def information(self) -> Array:
         return self.matrix
@@ -75,7 +74,7 @@ class DenseEquations:
                 todo="add views with other tilts, or fix the model with --model",
             ) from error
         inverse = cho_solve(factor, np.eye(len(scale))) * scale[:, None] * scale
-        return Posterior.of(inverse, self.common, self.distance, untouched)
+        return Posterior.of(inverse, self.common, untouched)
 
 
 @dataclass(frozen=True)
@@ -207,14 +206,7 @@ class GraphSystem:
 
     def linearised(self, values: Any) -> DenseEquations:
         matrix, gradient = self.graph.linearize(values).hessian(self.ordering)
-        common = slots(self.problem)["dots"][0].start
-        row = None
-        if self.problem.scale is not None:
-            dots = values.atVector(self.keys.dots).reshape(-1, 3)
-            row = np.concatenate(
-                [np.zeros(common), distance_residual(dots, *self.problem.scale)[1][0]]
-            )
-        return DenseEquations(matrix, gradient, common, row)
+        return DenseEquations(matrix, gradient, slots(self.problem)["dots"][0].start)
 
     def moved(self, values: Any, step: Array) -> Any:
         return values.retract(_vector_values(step, self.keys, self.problem))

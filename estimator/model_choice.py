@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from telerig.estimator.graph import solve
 from telerig.estimator.model_start import model_start
 from telerig.estimator.problem import Problem
 from telerig.factors.projection import State, pixels, whitened_error, whitened_residuals
+from telerig.io.parallel import ordered_map, quick_workers
 from telerig.rig.pose import rotation_from_rotvec
 
 Array = NDArray[np.float64]
@@ -96,9 +98,11 @@ def climb(problem: Problem, start: State, models: tuple[str, ...] = LADDER) -> l
     A model whose own fit is `HOPELESS` times worse than the best is not asked to predict: its
     ``held_out`` is infinite.
     """
-    fits = [_fit(problem, start, model) for model in models]
+    # a copy of a process in which GTSAM has worked may wait for threads that it does not have
+    workers = 1 if problem.solver == "gtsam" else quick_workers(len(models))
+    fits = list(ordered_map(partial(_fit, problem, start), models, workers))
     best = min(cost for *_, cost in fits)
-    return [_rung(best, fit) for fit in fits]
+    return list(ordered_map(partial(_rung, best), fits, workers))
 
 
 def _fit(problem: Problem, start: State, model: str) -> Fit:

@@ -104,20 +104,13 @@ class NormalEquations:
         if whole:
             inverse = reduced.inverse()
             inverse -= np.outer(along, along) / denominator
-            return Posterior.of(inverse, self.common, row, untouched)
+            return Posterior.of(inverse, self.common, untouched)
         of_common, of_dots = along[: self.common], along[self.common :].reshape(-1, 3)
         common = reduced.inverse_kept() - np.outer(of_common, of_common) / denominator
         dots = reduced.inverse_blocks() - of_dots[:, :, None] * of_dots[:, None] / denominator
-        return Posterior(common, dots, None, 1 - 1 / denominator, untouched)
-
-    def prior_share(self, posterior: Posterior) -> float:
-        """Trace of a posterior times these, the normal equations of its priors."""
-        s = len(self.shared)
-        at = s + np.arange(6 * len(self.views)).reshape(-1, 6)
-        share = float((posterior.common[:s, :s] * self.shared).sum())
-        share += float((posterior.common[at[:, :, None], at[:, None, :]] * self.views).sum())
-        share += float((np.moveaxis(self.dots, -1, 0) * posterior.dots).sum())
-        return share + posterior.distance_variance
+        cross = reduced.inverse_cross().reshape(self.common, 3, -1).swapaxes(1, 2)
+        cross = cross - of_common[:, None, None] * of_dots / denominator
+        return Posterior(common, cross, dots, None, untouched)
 
     def without_dots(self, damping: float = 0.0) -> Reduced:
         """The damped system with the dots eliminated, the distance left out."""

@@ -134,6 +134,10 @@ class Reduced:
         half = dtrsm(1.0, self.factor, whitened, lower=1)
         return self.blocks.backward(np.ascontiguousarray(half))
 
+    def inverse_cross(self) -> Array:
+        """(K, E) block of the inverse."""
+        return np.asarray(-dtrsm(1.0, self.factor, self._through(), lower=1, trans_a=1))
+
     def inverse_blocks(self) -> Array:
         """(B, n, n) diagonal blocks of the inverse, of the eliminated side."""
         out = np.linalg.inv(self.blocks.matrix)
@@ -168,23 +172,22 @@ def _piece(coupling: Array, blocks: Blocks, group: Group) -> Piece:
 class Posterior:
     """The inverse of J^T J, or what was asked of it; C = intrinsics, camera poses and views.
 
-    common : (C, C).  dots : (N, 3, 3).  whole : (C + 3 N, C + 3 N) or None.
-    distance_variance : of the known distance, whitened; 0 where there is none.
+    common : (C, C).  cross : (C, N, 3) with each dot.  dots : (N, 3, 3).
+    whole : (C + 3 N, C + 3 N) or None.
     untouched : (C + 3 N,) what no measurement or prior reaches; its variance here is 1.
     """
 
     common: Array
+    cross: Array
     dots: Array
     whole: Array | None
-    distance_variance: float
     untouched: NDArray[np.bool_]
 
     @staticmethod
-    def of(
-        whole: Array, common: int, distance: Array | None, untouched: NDArray[np.bool_]
-    ) -> Posterior:
-        """From all of the inverse; distance : (C + 3 N,) its row."""
+    def of(whole: Array, common: int, untouched: NDArray[np.bool_]) -> Posterior:
+        """From all of the inverse."""
         at = common + np.arange(len(whole) - common).reshape(-1, 3)
-        dots = whole[at[:, :, None], at[:, None, :]]
-        variance = 0.0 if distance is None else float(distance @ whole @ distance)
-        return Posterior(whole[:common, :common], dots, whole, variance, untouched)
+        cross = whole[:common, common:].reshape(common, -1, 3)
+        return Posterior(
+            whole[:common, :common], cross, whole[at[:, :, None], at[:, None, :]], whole, untouched
+        )

@@ -13,17 +13,19 @@ from numpy.typing import NDArray
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator import checks, initial, model_choice, numbering, tilt_signs, twins
 from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import joint_covariance
+from telerig.estimator.covariance import JointCovariance, joint_covariance
 from telerig.estimator.eccentricity import eccentricity_px
 from telerig.estimator.graph import Progress, Solution, solve
+from telerig.estimator.halves import halves
 from telerig.estimator.initial_unknown import dots_from_images
 from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.model_choice import Rung
 from telerig.estimator.model_start import model_start
 from telerig.estimator.problem import MODELS, SOLVERS, Problem, held_at_nominal
+from telerig.estimator.residual_tests import residual_tests
 from telerig.estimator.results import calibration_from_fit
 from telerig.estimator.robust import RobustFit, robust_solve
-from telerig.factors.projection import State
+from telerig.factors.projection import State, whitened_error
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX
 from telerig.rig.target import Target
@@ -83,7 +85,7 @@ def self_calibrate(
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
-    problem = replace(problem, solver=solver)
+    problem = replace(problem, solver="schur" if solver == "auto" else solver)
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
@@ -98,7 +100,7 @@ def self_calibrate(
     if len(cameras) == 2:
         start, by, words_twin = _side(problem, start, nominal)
     start = tilt_signs.settle(problem, start)
-    fit = _fit(problem, start, model, progress)
+    fit = _fit(problem, start, model, solver, progress)
     if len(cameras) == 2 and by != PLATE:
         fit, by, words_twin = _settled_twin(fit, nominal)
     twin_cost = _twin_cost(fit)
@@ -107,7 +109,18 @@ def self_calibrate(
         notes=tuple(said),
     )  # fmt: skip
     joint = joint_covariance(done.robust.problem, done.robust.solution)
-    return calibration_from_fit(done, joint, nominal_rotvec_deg=nominal, name=name)
+    found = calibration_from_fit(done, joint, nominal_rotvec_deg=nominal, name=name)
+    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint)})
+
+
+def _trust(fit: RobustFit, joint: JointCovariance) -> dict[str, Any]:
+    """What the data themselves say of the covariance: repeatability, and structure in residuals."""
+    problem, state = fit.problem, fit.solution.state
+    whitened = whitened_error(state, problem.observations(), problem.rho_mm)
+    return {
+        "halves": halves(problem, state),
+        "structure": residual_tests(problem, whitened, joint.leverage),
+    }
 
 
 def dots_unknown(problem: Problem) -> bool:
@@ -166,8 +179,11 @@ def best_start(problem: Problem, dots_mm: Array) -> State:
     return min(fits, key=lambda f: f.cost).state
 
 
-def _fit(problem: Problem, start: State, model: str, progress: Progress | None) -> Any:
-    """Outliers and floor with a rich model, the ladder, then the chosen model to the end."""
+def _fit(problem: Problem, start: State, model: str, solver: str, progress: Progress | None) -> Any:
+    """Outliers and floor with a rich model, the ladder, then the chosen model to the end.
+
+    solver : of the last fit; the trials before it take ``problem.solver``.
+    """
     rungs: list[Rung] = []
     mono = len(problem.cameras) == 1
     if model == "auto":
@@ -189,7 +205,7 @@ def _fit(problem: Problem, start: State, model: str, progress: Progress | None) 
         begin = robust_solve(final, start).solution.state
     shift = eccentricity_px(final, begin)
     final = replace(final, uv_px=final.uv_px - shift)
-    robust = robust_solve(final, begin, progress=progress)
+    robust = robust_solve(replace(final, solver=solver), begin, progress=progress)
     return Fit(robust, np.nan, "", "", model, words, rungs, checks.PreCheck({}, ()), ())
 
 

@@ -20,7 +20,7 @@ from telerig.estimator.stage_axis_fit import (
     start,
 )
 from telerig.io.rig_description import suggestion
-from telerig.rig.pose import Pose
+from telerig.rig.pose import Pose, across
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -213,7 +213,7 @@ def _shown_sigma(
     if spare < 1:
         return sigma_mm
     axis = state.slope / np.linalg.norm(state.slope)
-    basis = np.linalg.svd(axis[None])[2][1:].T
+    basis = across(axis)
     out = []
     for directions, given in ((axis[:, None], sigma_mm[0]), (basis, sigma_mm[1])):
         shift = system.shift_mm[kept] @ directions
@@ -267,7 +267,7 @@ def _result(
     full = max(chi2_dof, 1.0) * inverse + felt @ calibration.covariance @ felt.T
     pace = float(np.linalg.norm(state.slope))
     axis = state.slope / pace
-    basis = np.linalg.svd(axis[None])[2][1:].T
+    basis = across(axis)
     turn = np.vstack([basis.T / pace, -axis / pace**2])
     joint = turn @ full[6:, 6:] @ turn.T
     return StageAxis(

@@ -42,6 +42,7 @@ def summary(calibration: Calibration) -> str:
             f"  in space: dots {s['space_rms_um']:.2f} um RMS from the fit; a point triangulated "
             f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um per axis"
         )
+    lines += _trust(calibration)
     t = calibration.twin
     lines.append(
         f"  mirror twin: cost {t['cost']:.9g} kept, {t['other_cost']:.9g} for the other; "
@@ -50,6 +51,15 @@ def summary(calibration: Calibration) -> str:
     lines += [f"  stage: {word}" for word in calibration.stage.get("notes", ())]
     lines += [f"  note: {n}" for n in (*calibration.notes, *calibration.diagnostics["weak"])]
     return "\n".join(lines)
+
+
+def _trust(calibration: Calibration) -> list[str]:
+    """What halves of the views and the residuals say of the stated uncertainty."""
+    halves = calibration.diagnostics.get("halves") or {}
+    structure = calibration.diagnostics.get("structure") or {}
+    lines = [f"  {'' if halves.get('agree', True) else '! '}{halves['words']}"] if halves else []
+    mark = "" if structure.get("sound", True) else "! "
+    return lines + [f"  {mark}{words}" for words in structure.get("words", ())]
 
 
 def _imported(calibration: Calibration) -> str:

@@ -22,6 +22,7 @@ from telerig.estimator.track_run import (
     add_counts,
     check_calibration,
     count_rows,
+    numbered_particles,
     stage_axis,
     summary_of,
     tracking_stream,
@@ -89,8 +90,11 @@ def write_tracking(
     """Track a run into ``folder``; returns the content of tracking.json.
 
     Detections made before an interruption are taken up again from ``.<folder>.work`` beside it.
-    Result files appear together at the end.
+    Result files appear together at the end. Raises InputError for bubbles that were given names
+    when there is to be a report: it numbers them.
     """
+    if report and run.detections is not None:
+        _check_ids(run.detections)
     work = folder.parent / f".{folder.name}.work"
     with atomic_folder(folder) as staged:
         stream = tracking_stream(run, calibration, work, options, stage)
@@ -118,6 +122,16 @@ def write_tracking(
         (folder / "references.csv").unlink(missing_ok=True)
     shutil.rmtree(work, ignore_errors=True)
     return summary
+
+
+def _check_ids(detections: pd.DataFrame) -> None:
+    names = numbered_particles(detections)[1]
+    if names:
+        raise InputError(
+            f"particle {names[0]!r} is no whole number, and the report needs numbers",
+            where="detections.csv",
+            todo="number the bubbles, or track with --no-report",
+        )
 
 
 def _write_rows(stream: TrackingStream, staged: Path) -> tuple[dict[str, Any], _Worst]:

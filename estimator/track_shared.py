@@ -37,7 +37,6 @@ _SHARPNESS = 0.08
 _BEHIND = 0.25
 """Sd of "behind that outline", as a share of the outline's semi-axis."""
 
-
 _CONFIDENCE = 0.95
 """Share of such points that are right, in simulated swarms."""
 
@@ -94,19 +93,17 @@ def shared_rows(
     wanted = {p for f in frames for p, _ in f.hidden()}
     out = []
     for particle in sorted(wanted):
-        for run in _runs(every, particle):
-            out += _rows(run, {f.number for f in frames}, particle, cameras, settings)
+        run = _unbroken(every, particle)
+        out += _rows(run, {f.number for f in frames}, particle, cameras, settings) if run else []
     return out
 
 
-def _runs(frames: Sequence[Frame], particle: int) -> list[list[Frame]]:
-    """Consecutive frames from the first in which both cameras see it; one list, none without."""
-    seen = [i for i, f in enumerate(frames) if _column(f, particle) >= 0]
-    if not seen:
-        return []
-    run = list(frames[seen[0] :])
+def _unbroken(frames: Sequence[Frame], particle: int) -> Sequence[Frame]:
+    """The frames from the first in which both cameras see it; none where one of them is missing."""
+    first = next((i for i, f in enumerate(frames) if _column(f, particle) >= 0), len(frames))
+    run = frames[first:]
     unbroken = all(b.number == a.number + 1 and b.motion is not None for a, b in pairwise(run))
-    return [run] if unbroken else []
+    return run if unbroken else []
 
 
 def _column(frame: Frame, particle: int) -> int:

@@ -12,6 +12,8 @@ from importlib.metadata import PackageNotFoundError, distributions, requires, ve
 from pathlib import Path
 from typing import Literal
 
+from telerig.io.recording.ports import NO_PERMISSION, found_ports
+
 Status = Literal["ok", "note", "warning", "failure"]
 
 _IMPORTS = {"opencv-python-headless": "cv2", "scikit-image": "skimage", "pyserial": "serial"}
@@ -100,20 +102,14 @@ def _version(name: str) -> str | None:
 
 def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
     """Every serial port: may it be opened, and how long does its adapter hold bytes back?"""
-    from serial.tools import list_ports
-
-    ports = sorted(list_ports.comports(), key=lambda p: str(p.device))
+    ports = found_ports()
     if not ports:
         words = "none found"
         yield Check("serial ports", "note", words, "plug the sensors in if you want to record")
-    for port in ports:
-        device = str(port.device)
-        said = device if port.description in (None, "n/a") else f"{device}: {port.description}"
+    for device, name in ports:
+        said = f"{device}: {name}" if name else device
         if not os.access(device, os.R_OK | os.W_OK):
-            yield Check(
-                device, "warning", f"{said}; you may not open it",
-                "sudo usermod -aG dialout $USER, then log in again",
-            )  # fmt: skip
+            yield Check(device, "warning", f"{said}; you may not open it", NO_PERMISSION)
         else:
             yield Check(device, "ok", said)
         yield from _latency(device, latency / Path(device).name / "latency_timer")

@@ -71,5 +71,9 @@ def _forked(workers: int) -> Pool:
 
 
 def _begin_work() -> None:
-    """An interrupt is this process's parent's to handle, which then ends it."""
+    """An interrupt is this process's parent's to handle, which then ends it by SIGTERM.
+
+    A handler of that signal that the parent has would keep the copy alive, and the parent waiting.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)

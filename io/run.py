@@ -59,13 +59,7 @@ def load_run(
     """
     folder = _run_folder(Path(path))
     rig = rig or _rig_above(folder)
-    names = list(cameras or (rig.cameras if rig else ()))
-    if not names:
-        raise InputError(
-            "there is no rig.toml two folders up, so the cameras are not known",
-            where=str(folder),
-            todo="put the run into DATASET/runs/, or give a calibration (--calibration FILE)",
-        )
+    names = list(cameras) if cameras else _cameras_of(rig, folder)
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()} if rig else {}
     sizes |= dict(image_sizes_px or {})
     notes: list[str] = []
@@ -77,6 +71,7 @@ def load_run(
     detections = None if images else _detections(folder, names, sizes, notes)
     t_s = _times(folder, names, count, detections, notes)
     stage = _table(folder / "stage.csv", read_stage_csv)
+    sensors = list(rig.accelerometers) if rig else None
     run = RunData(
         name=folder.name,
         path=folder,
@@ -89,8 +84,7 @@ def load_run(
         rig=rig,
         stage=stage,
         accelerometers=_table(
-            folder / "accelerometer.csv",
-            lambda file: read_accelerometer_csv(file, list(rig.accelerometers) if rig else None),
+            folder / "accelerometer.csv", lambda file: read_accelerometer_csv(file, sensors)
         ),
         references=_table(
             folder / "references.csv",
@@ -102,8 +96,17 @@ def load_run(
         sources=sources,
         positions=positions,
     )
-    _look_at_ends(run)
-    return run
+    return _looked_at(run)
+
+
+def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
+    if rig is None or not rig.cameras:
+        raise InputError(
+            "there is no rig.toml two folders up, so the cameras are not known",
+            where=str(folder),
+            todo="put the run into DATASET/runs/, or give a calibration (--calibration FILE)",
+        )
+    return list(rig.cameras)
 
 
 def _run_folder(path: Path) -> Path:
@@ -263,9 +266,10 @@ def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | N
     return read(file) if file.is_file() else None
 
 
-def _look_at_ends(run: RunData) -> None:
-    """Decode each camera's first and last image, so that wrong sizes and cuts show at once."""
+def _looked_at(run: RunData) -> RunData:
+    """Each camera's first and last image are decoded, so that wrong sizes and cuts show at once."""
     for name, positions in run.positions.items():
         present = np.flatnonzero(positions >= 0)
         for frame in present[[0, -1]] if present.size else ():
             run.image(name, int(frame))
+    return run

@@ -20,6 +20,11 @@ def hat(v: ArrayLike) -> Array:
     return out
 
 
+def across(direction: ArrayLike) -> Array:
+    """(3,) -> (3, 2) orthonormal vectors across it."""
+    return np.asarray(np.linalg.svd(np.asarray(direction, float)[None])[2][1:].T)
+
+
 def rotation_from_rotvec(rotvec_rad: ArrayLike) -> Array:
     """(..., 3) rotation vectors -> (..., 3, 3); Rodrigues' formula, exact near zero."""
     w = np.asarray(rotvec_rad, float)

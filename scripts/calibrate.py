@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from telerig.scripts.console import EXIT_REJECTED, checked_source, errors_in_words, progress, say
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration import Calibration
+    from telerig.estimator.compare_calibrations import RigComparison
 
 
 def calibrate(
@@ -27,6 +31,10 @@ def calibrate(
         str,
         typer.Option(help="air or water: where the target was. With [walls], runs are in water."),
     ] = "air",
+    compare: Annotated[
+        Path | None,
+        typer.Option(help="An earlier calibration of this rig: says what moved since then."),
+    ] = None,
     source: Annotated[
         str | None, typer.Option("--from", help="images or dots, when the dataset has both.")
     ] = None,
@@ -49,9 +57,11 @@ def calibrate(
         from telerig.io.dataset import load_dataset
 
         begun = time.perf_counter()
+        earlier = None if compare is None else _loaded(compare)
         data = load_dataset(dataset, source=checked_source(source))
         options = {"model": model, "solver": solver, "dots": dots, "medium": medium,
-                   "from": source, "seed": seed}  # fmt: skip
+                   "compare": None if compare is None else str(compare), "from": source,
+                   "seed": seed}  # fmt: skip
         folder = out or data.results / "calibration"
         with progress(quiet) as stage:
             run = run_calibration(
@@ -59,13 +69,29 @@ def calibrate(
                 stage=stage, pictures=True,
             )  # fmt: skip
         seconds = {"calibrate": time.perf_counter() - begun}
+        change = None if earlier is None else _change(earlier, run.calibration)
         write_results(
-            data, run, folder, command="calibrate", options=options, seconds=seconds, report=report
-        )
+            data, run, folder, command="calibrate", options=options, seconds=seconds,
+            change=change, report=report,
+        )  # fmt: skip
         say(run.calibration.report())
+        if change is not None:
+            say(f"since {compare}: {change.words()}")
         say(f"written: {folder}" + ("/report.html" if report else ""))
         if run.calibration.verdict["status"] == "REJECTED":
             raise typer.Exit(EXIT_REJECTED)
+
+
+def _loaded(path: Path) -> Calibration:
+    from telerig.estimator.calibration import load_calibration
+
+    return load_calibration(path)
+
+
+def _change(earlier: Calibration, now: Calibration) -> RigComparison:
+    from telerig.estimator.compare_calibrations import compare_calibrations
+
+    return compare_calibrations(earlier, now)
 
 
 if __name__ == "__main__":

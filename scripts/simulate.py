@@ -41,8 +41,7 @@ def simulate(
         float | None, typer.Option(help="The encoder reads so much too far, like 0.01.")
     ] = None,
     references: Annotated[
-        int | None,
-        typer.Option(help="Dots of a strip fixed to the tank that each camera sees [0: no strip]."),
+        int | None, typer.Option(help="Dots of a strip on the tank that each camera sees [0].")
     ] = None,
     devices: Annotated[
         bool,

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import tempfile
-import threading
 from pathlib import Path
 
 from numpy.random import Generator
 
 from telerig.errors import InputError
-from telerig.scripts.console import say
+from telerig.scripts.console import say, stopped_by_signals
 
 
 def simulate_devices(out: Path | None, seconds: float | None, rng: Generator) -> None:
@@ -41,12 +39,5 @@ def simulate_devices(out: Path | None, seconds: float | None, rng: Generator) ->
             say("\nfor rig.toml:\n" + "[devices" + rig_toml(rig).split("[devices", 1)[1])
         say("Ctrl-C ends the devices")
         sys.stdout.flush()
-        _wait(seconds)
-
-
-def _wait(seconds: float | None) -> None:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(number, lambda *_: stop.set())
-    stop.wait(seconds)
+        with stopped_by_signals() as stop:
+            stop.wait(seconds)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from run_files import LEFT, RIG, RIGHT, write_images
 
 from telerig.estimator.calibrate import nominal_cameras
 from telerig.estimator.calibration import Calibration
@@ -151,3 +152,21 @@ def paper_images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def paper_copy(paper_images: Path, tmp_path: Path) -> Path:
     """A copy of `paper_images` to spoil."""
     return Path(shutil.copytree(paper_images, tmp_path / "set"))
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    """An empty run of a dataset, at 100 frames a second."""
+    (tmp_path / "rig.toml").write_text(RIG)
+    folder = tmp_path / "runs" / "rise"
+    folder.mkdir(parents=True)
+    (folder / "run.toml").write_text("frame_rate_hz = 100.0\nstart_s = 2.0\n")
+    return folder
+
+
+@pytest.fixture
+def full_run(run_folder: Path) -> Path:
+    """The same with six frames of both cameras."""
+    write_images(run_folder / "left", LEFT)
+    write_images(run_folder / "right", RIGHT)
+    return run_folder

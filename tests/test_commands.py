@@ -83,6 +83,17 @@ def test_calibrate_writes_every_file_of_the_contract(calibrated):
     )
 
 
+def test_calibrate_says_what_moved_since_an_earlier_calibration(calibrated, small_copy):
+    earlier, _ = calibrated
+    text = run("calibrate", small_copy, "--quiet", "--compare", earlier, "--no-report")
+    out = small_copy / "results" / "calibration"
+    found = json.loads((out / "comparison.json").read_text())
+    assert found["verdict"] == "SAME"
+    assert found["words"] in text.replace("\n", " ")
+    text = run("calibrate", small_copy, "--quiet", "--compare", small_copy / "none", code=2)
+    assert "none" in text
+
+
 def test_residuals_are_measured_minus_predicted(calibrated, paper_images):
     out, _ = calibrated
     calibration = telerig.load_calibration(out)

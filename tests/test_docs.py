@@ -12,6 +12,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import docs_pages
 import numpy as np
 import pytest
 
@@ -19,10 +20,6 @@ import telerig
 from telerig.estimator.imported_calibration import calibration_from_cameras
 from telerig.io.run_presets import run_preset
 from telerig.io.simulation_scene import true_cameras
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import docs_pages
 
 ROOT = docs_pages.ROOT
 PAGES = [

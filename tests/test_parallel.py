@@ -3,6 +3,8 @@
 import math
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -39,6 +41,20 @@ def test_an_error_in_a_process_is_raised_here():
 @forks
 def test_the_processes_leave_an_interrupt_to_their_parent():
     assert list(ordered_map(_interrupted, [0, 1], 2)) == ["went on", "went on"]
+
+
+@forks
+def test_the_processes_end_though_the_parent_handles_their_signal():
+    script = (
+        "import signal, time; from telerig.io.parallel import ordered_map\n"
+        "signal.signal(signal.SIGTERM, lambda *_: None)\n"
+        "results = ordered_map(time.sleep, [0.05] * 40, 2)\n"
+        "next(results); results.close(); print('ended')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "ended\n"
 
 
 def test_short_work_stays_in_this_process_while_a_second_thread_runs():

@@ -110,7 +110,10 @@ def test_a_killed_recording_is_read_by_replay(dataset: Path) -> None:
 
 def test_simulated_devices_print_their_ports_and_end(tmp_path: Path) -> None:
     out = tmp_path / "practice"
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = [signal.getsignal(number) for number in numbers]
     said = run("simulate", "--devices", "--out", out, "--seconds", "0.2")
+    assert [signal.getsignal(number) for number in numbers] == handlers
     for device in read_rig_toml(out / "rig.toml").devices.values():
         assert f"{device.name}: {device.port}" in said
         assert not os.path.lexists(device.port), "the ports go with their simulator"

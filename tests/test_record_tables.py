@@ -131,6 +131,23 @@ def test_replay_gives_the_same_bytes_and_so_does_a_cut_log_up_to_its_cut(
     assert abs(done.rows["stage.csv"] - 0.8 * truths[0].sent) < 100
 
 
+def test_a_replay_in_place_keeps_sensors_that_were_imported(
+    recorded: tuple[Path, list[Truth]], tmp_path: Path
+) -> None:
+    log, _ = recorded
+    copy = tmp_path / "recording.raw"
+    copy.write_bytes(log.read_bytes())
+    write_tables(copy)
+    file = tmp_path / "accelerometer.csv"
+    before = file.read_bytes()
+    imported = b"0.5,carriage,1,2,3\n0.6,carriage,4,5,6"
+    file.write_bytes(before + imported)
+    write_tables(copy)
+    assert file.read_bytes() == before + imported + b"\n"
+    write_tables(copy)
+    assert file.read_bytes() == before + imported + b"\n"
+
+
 @pytest.mark.parametrize("protocol", ["stream", "packets"])
 def test_bad_bytes_cost_what_they_touch_and_nothing_else(tmp_path: Path, protocol: str) -> None:
     device = DeviceDescription("e", "encoder", "", counts_per_mm=1000.0, protocol=protocol)  # type: ignore[arg-type]

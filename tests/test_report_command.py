@@ -13,14 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
-from typer.testing import CliRunner
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from browser_check import BROWSER, look, print_pdf
+from filmed_run import FRAMES, SIZE_PX, write_run
+from PIL import Image
 from test_report_calibration import _write_folder as write_calibration
-from test_report_film import FRAMES, SIZE_PX, write_run
+from typer.testing import CliRunner
 
 from telerig.io.report.batch_report import write_batch_report
 from telerig.io.report.remake import results_folders

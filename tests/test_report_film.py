@@ -1,101 +1,42 @@
-"""Films: decoded again and compared with the geometry; the drawing of two rays."""
+"""The film of a run's path, and its geometry."""
 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
-import pandas as pd
 import pytest
+from filmed_run import (
+    FRAMES,
+    HALF_AXES_MM,
+    _ellipse,
+    decoded,
+    two_cameras,
+    write_run,
+)
 from PIL import Image
 
 from telerig.errors import GeometryError, InputError
 from telerig.estimator.imported_calibration import calibration_from_cameras
-from telerig.io.report import film_drawing, film_geometry, film_views
+from telerig.io.report import film_drawing, film_geometry
 from telerig.io.report.figures_rays import ray_pair, rays_of_row, two_rays, typical_row
 from telerig.io.report.film import write_path_film
 from telerig.io.report.film_drawing import draw_path, film_layout, project_px, view_matrix
-from telerig.io.report.film_files import write_film
 from telerig.io.report.film_geometry import (
     FilmPath,
     ellipsoids_from_outlines,
     film_axes,
     read_film_path,
 )
-from telerig.io.report.film_views import (
-    draw_views,
-    outlines_px,
-    read_outlines,
-    view_frames,
-    write_views_film,
-)
 from telerig.io.report.results_cameras import run_cameras
 from telerig.io.report.track_results import read_track_results
 from telerig.io.report.track_scene import scene_widening, track_scene_json
-from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose
-from telerig.rig.triangulation import triangulate
-
-SIZE_PX, SCALE, FRAMES = (320, 400), 12.0, 24
-HALF_AXES_MM = np.array([1.6, 1.0, 1.6])
-"""Oblate, its short axis along rig y, the vertical."""
 
 BLUE = (31, 95, 168)
-
-
-def _cameras(turn: float = np.pi / 2) -> tuple[Camera, Camera]:
-    turned = Pose.from_rotvec([0.0, turn, 0.0])
-    left = Camera.create("left", SIZE_PX, SCALE)
-    return left, Camera.create("right", SIZE_PX, SCALE, camera_from_rig=turned)
-
-
-def _ellipse(camera: Camera, quadric: np.ndarray) -> tuple[float, float, float]:
-    """Semi-axes and angle of an ellipsoid's outline: the lens of these cameras is a plain one."""
-    by_point = SCALE * camera.camera_from_rig.rotation[:2]
-    squares, axes = np.linalg.eigh(by_point @ quadric @ by_point.T)
-    return np.sqrt(squares[1]), np.sqrt(squares[0]), np.arctan2(axes[1, 1], axes[0, 1])
-
-
-def write_run(folder: Path, calibration: bool = True) -> Path:
-    """A bubble on a helix, tracked with noise, its outlines, and the calibration beside it."""
-    rng = np.random.default_rng(3)
-    frame = np.arange(FRAMES)
-    turn = 2 * np.pi * frame / 16
-    points = np.stack([2 + 3 * np.cos(turn), 8 - 0.7 * frame, 3 * np.sin(turn)], -1)
-    cameras = _cameras()
-    uv = [c.project(points) + 0.05 * rng.standard_normal((FRAMES, 2)) for c in cameras]
-    found = triangulate(cameras, (uv[0], uv[1]), 0.05)
-    table = pd.DataFrame({"frame": frame, "particle": 0, "t_s": frame / 100})
-    table[["x_mm", "y_mm", "z_mm"]] = found.points_mm
-    upper = found.covariance_mm2[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    table[[f"s{pair}_mm2" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")]] = upper
-    detections = []
-    for camera, pixels in zip(cameras, uv):
-        c = camera.name
-        table[[f"{c}_u_px", f"{c}_v_px"]] = pixels
-        table[[f"{c}_suu_px2", f"{c}_suv_px2", f"{c}_svv_px2"]] = 0.0025, 0.0, 0.0025
-        a, b, angle = _ellipse(camera, np.diag(HALF_AXES_MM**2))
-        detections.append(pd.DataFrame({
-            "frame": frame, "camera": c, "particle": 0, "u_px": pixels[:, 0], "v_px": pixels[:, 1],
-            "a_px": a, "b_px": b, "angle_rad": angle, "c3_px": 0.4, "flags": "", "reason": "",
-        }))  # fmt: skip
-    table["ray_miss_mm"], table["confidence"] = found.ray_miss_mm, 1.0
-    table["d_eq_mm"] = 2 * np.prod(HALF_AXES_MM) ** (1 / 3)
-    folder.mkdir(parents=True)
-    table.to_csv(folder / "tracks.csv", index=False)
-    pd.concat(detections).to_csv(folder / "detections.csv", index=False)
-    content = {"schema": 1, "kind": "telerig tracks", "run": "rise", "frames": FRAMES,
-               "image_size_px": {"left": SIZE_PX, "right": SIZE_PX}}  # fmt: skip
-    (folder / "tracking.json").write_text(json.dumps(content))
-    if calibration:
-        calibration_from_cameras(list(cameras)).save(folder.parent / "calibration")
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -112,11 +53,6 @@ def films(run: Path) -> Iterator[Path]:
             patch.setattr(film_drawing, name, getattr(film_drawing, name) // 4 * 2)
         write_path_film(run, [place / "path.mp4", place / "path.gif"])
         yield place
-
-
-def _decoded(file: Path) -> list[np.ndarray]:
-    with av.open(str(file)) as container:
-        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
 
 
 def _path(points: Any, **changes: Any) -> FilmPath:
@@ -137,8 +73,8 @@ def _is_blue(picture: np.ndarray, at: np.ndarray) -> bool:
 
 
 def test_the_film_goes_round_once_and_its_other_half_is_mirrored(run: Path, films: Path) -> None:
-    frames = _decoded(films / "path.mp4")
-    path = read_film_path(run, _cameras())
+    frames = decoded(films / "path.mp4")
+    path = read_film_path(run, two_cameras())
     layout = film_layout(path)
     assert len(frames) == 180
     assert {f.shape for f in frames} == {(layout.size_px[1], layout.size_px[0], 3)}
@@ -176,7 +112,7 @@ def test_axes_are_no_mirror_image() -> None:
 
 def test_the_film_shows_points_where_the_first_camera_sees_them(run: Path) -> None:
     """At angle 0 right on the screen is u of the first camera, and height is -v."""
-    path, camera = read_film_path(run, _cameras()), _cameras()[0]
+    path, camera = read_film_path(run, two_cameras()), two_cameras()[0]
     results = read_track_results(run)
     uv = camera.project(results.points_mm)
     screen = project_px(film_layout(path).panels[0], path.points_mm, 0.0)
@@ -187,7 +123,7 @@ def test_the_film_shows_points_where_the_first_camera_sees_them(run: Path) -> No
 
 
 def test_bodies_are_the_ellipsoids_that_were_seen(run: Path) -> None:
-    path = read_film_path(run, _cameras())
+    path = read_film_path(run, two_cameras())
     assert len(path.bodies) >= 4 and "ellipsoids" in path.notes[-1]
     expected = np.diag(HALF_AXES_MM[[0, 2, 1]] ** 2)
     np.testing.assert_allclose(path.quadrics_mm2 - expected, 0, atol=1e-6)
@@ -200,7 +136,7 @@ def test_bodies_are_the_ellipsoids_that_were_seen(run: Path) -> None:
 @pytest.mark.parametrize("turn", [1.2, np.pi / 2, 2.1])
 def test_any_ellipsoid_keeps_its_two_outlines_and_is_the_largest_such(turn: float) -> None:
     rng = np.random.default_rng(11)
-    cameras = _cameras(turn)
+    cameras = two_cameras(turn)
     roots = rng.standard_normal((5, 3, 3))
     truth = roots @ np.swapaxes(roots, 1, 2) + 0.5 * np.eye(3)
     ellipses = np.array([[_ellipse(c, q) for c in cameras] for q in truth])
@@ -249,7 +185,7 @@ def test_a_slender_path_has_a_second_panel_drawn_wider() -> None:
 
 def test_a_long_path_is_thinned_with_words(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film_geometry, "MOST_POINTS", 8)
-    path = read_film_path(run, _cameras())
+    path = read_film_path(run, two_cameras())
     assert len(path.points_mm) <= 9
     assert path.notes[0] == f"{len(path.points_mm)} of {FRAMES} positions drawn"
 
@@ -261,102 +197,6 @@ def test_no_track_no_film(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no bubble was followed"):
         write_path_film(folder, [tmp_path / "a.gif"])
     assert not (tmp_path / "a.gif").exists()
-
-
-def _few(count: int = 3) -> Iterator[np.ndarray]:
-    for k in range(count):
-        yield np.full((40, 60, 3), 60 * k, np.uint8)
-
-
-def test_without_pyav_the_error_names_the_extra_and_gifs_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError) as caught:
-        write_film(_few(), 3, [tmp_path / "a.mp4"])
-    assert "pip install 'telerig[video]'" in str(caught.value)
-    greys = [(0, 0, 0), (60, 60, 60), (120, 120, 120)]
-    write_film(_few(), 3, [tmp_path / "a.gif"], palette=greys)
-    with Image.open(tmp_path / "a.gif") as gif:
-        assert gif.n_frames == 3
-
-
-def test_a_broken_off_film_leaves_the_old_one(tmp_path: Path) -> None:
-    def fails() -> Iterator[np.ndarray]:
-        yield from _few(2)
-        raise KeyboardInterrupt
-
-    files = [tmp_path / "a.mp4", tmp_path / "a.gif"]
-    for file in files:
-        file.write_text("old")
-    with pytest.raises(KeyboardInterrupt):
-        write_film(fails(), 9, files)
-    assert sorted(tmp_path.iterdir()) == sorted(files)
-    assert {f.read_text() for f in files} == {"old"}
-    with pytest.raises(InputError, match=r"\.mp4 or \.gif"):
-        write_film(_few(), 3, [tmp_path / "a.mkv"])
-
-
-def test_progress_counts_every_picture(tmp_path: Path) -> None:
-    told: list[tuple[str, int, int]] = []
-    write_film(_few(), 3, [tmp_path / "a.gif"], what="x", stage=lambda *p: told.append(p))
-    assert told == [("x", 1, 3), ("x", 2, 3), ("x", 3, 3)]
-
-
-def _image(camera: str, frame: int) -> np.ndarray | None:
-    if camera == "right" and frame == 2:
-        return None
-    return np.full((SIZE_PX[1], SIZE_PX[0]), 150 if frame else 151, np.uint8)
-
-
-SIZES = {"left": SIZE_PX, "right": SIZE_PX}
-
-
-def test_both_views_film(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = [tmp_path / "v.mp4", tmp_path / "v.gif"]
-    write_views_film(run, files, images=_image, image_sizes_px=SIZES, frame_count=FRAMES)
-    frames = _decoded(files[0])
-    assert len(frames) == FRAMES
-    assert frames[0].shape[1] >= 2 * SIZE_PX[0] and frames[0].shape[0] >= SIZE_PX[1]
-    with Image.open(files[1]) as gif:
-        assert gif.n_frames == FRAMES and gif.info["loop"] == 0
-    monkeypatch.setattr(film_views, "MOST_FRAMES", 10)
-    notes = write_views_film(run, files[1:], images=_image, image_sizes_px=SIZES,
-                             frame_count=FRAMES)  # fmt: skip
-    assert notes == (f"both views: every 3. of {FRAMES} frames is shown",)
-    with Image.open(files[1]) as gif:
-        assert gif.n_frames == 8
-
-
-def test_outlines_and_tails_are_drawn_where_they_were_found(run: Path) -> None:
-    table = read_outlines(run / "detections.csv", ("left", "right"))
-    frames = list(view_frames(table, ("left", "right"), range(FRAMES), None))
-    tracks = read_track_results(run).tracks
-    np.testing.assert_allclose(
-        frames[5].found[1][0].tail_px, tracks[["right_u_px", "right_v_px"]].to_numpy()[:6]
-    )
-    shades = dict.fromkeys(SIZES, (0.0, 255.0))
-    page = draw_views(_image, SIZES, shades, frames[9]).astype(int)
-    ring = frames[9].found[0][0].outline_px
-    coloured = np.ptp(page, axis=2) > 50
-    top = page.shape[0] - SIZE_PX[1]
-    u, v = np.round(ring.T).astype(int)
-    assert coloured[v + top, u].mean() > 0.95
-    assert not coloured[top + 2 : top + 40].any()
-    assert np.ptp(draw_views(_image, SIZES, shades, frames[2])[-20:, -60:]) == 0
-
-
-def test_outline_is_the_documented_curve() -> None:
-    """At phi = 0 the normal is the long axis: c_k add up there; s_3 acts at phi = 30 degrees."""
-    row = dict.fromkeys(film_views._SHAPE, 0.0)
-    row |= {"u_px": 10, "v_px": 20, "a_px": 8, "b_px": 5, "angle_rad": np.pi / 2}
-    table = pd.DataFrame([row, row | {"c3_px": 0.5, "c4_px": 0.25}, row | {"s3_px": 1.0},
-                          row | {"a_px": np.nan}])  # fmt: skip
-    plain, bumpy, turned, bare = outlines_px(table, 72)
-    np.testing.assert_allclose(plain[[0, 18]], [[10, 28], [5, 20]], atol=1e-12)
-    np.testing.assert_allclose(bumpy[0], [10, 28.75], atol=1e-12)
-    assert np.linalg.norm(turned[6] - plain[6]) == pytest.approx(1.0)
-    np.testing.assert_allclose(np.linalg.norm(bare - [10, 20], axis=1), 6.0)
 
 
 def test_closest_points_are_the_least_squares_ones() -> None:
@@ -380,8 +220,8 @@ def test_the_drawn_pair_is_the_median_one_and_its_miss_that_of_the_table(run: Pa
     row = typical_row(results)
     assert row is not None
     assert np.sum(np.abs(miss) < abs(miss[row])) == FRAMES // 2
-    assert rays_of_row(results, _cameras(), row).miss_mm == pytest.approx(miss[row], abs=1e-9)
-    picture = two_rays(results, _cameras())
+    assert rays_of_row(results, two_cameras(), row).miss_mm == pytest.approx(miss[row], abs=1e-9)
+    picture = two_rays(results, two_cameras())
     assert picture is not None
     assert f"{1e3 * abs(miss[row]):.3g} µm" in picture.caption
 
@@ -391,7 +231,7 @@ def test_only_the_runs_own_calibration_counts(run: Path, tmp_path: Path) -> None
     assert why == "" and cameras is not None and cameras[1].name == "right"
     alone = write_run(tmp_path / "a" / "rise", calibration=False)
     assert "neither in this folder" in run_cameras(alone, read_track_results(alone))[1]
-    calibration_from_cameras(list(_cameras(1.4))).save(tmp_path / "a" / "calibration")
+    calibration_from_cameras(list(two_cameras(1.4))).save(tmp_path / "a" / "calibration")
     none, why = run_cameras(alone, read_track_results(alone))
     assert none is None and "not the one that the run was tracked with" in why
     (tmp_path / "a" / "calibration" / "calibration.json").write_text("{")

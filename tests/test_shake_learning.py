@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 from shake_learning_data import ARM_HZ, BUBBLE_HZ, COMMON_HZ, SWING_HZ, run, true_model
 
 from telerig.errors import InputError

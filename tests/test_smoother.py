@@ -186,17 +186,7 @@ def dense(given: SmoothingProblem, model: ShakeModel) -> tuple[Dense, Any, Any, 
             for i in range(len(shake))
         }
 
-    bubbles, means = [], []
-    for b in given.bubbles:
-        t = given.t_s[b.first : b.last + 1]
-        means.append(whole.add(np.zeros(3), 300.0**2 * np.eye(3)))
-        ids = []
-        for i, c in enumerate(frame.bubble.components):
-            mean = np.zeros(len(t) * c.size)
-            if i < 3:
-                mean[::2] = b.start_mm[i]
-            ids.append(whole.add(mean, path_covariance(c, t)))
-        bubbles.append(ids)
+    bubbles, means = _add_bubbles(given, whole, frame)
     bubble_sizes = np.r_[0, np.cumsum([c.size for c in frame.bubble.components])]
 
     def of_bubble(k: int, f: int, row: Any) -> dict[int, Any]:
@@ -236,6 +226,24 @@ def dense(given: SmoothingProblem, model: ShakeModel) -> tuple[Dense, Any, Any, 
         add_pixels(given.references, m, lambda line, which=which: {which: line})
     _add_sensors(given, model, whole, frame, of_shake)
     return whole, (frame, shake, sizes), (bubbles, means, of_bubble), sum(pixel_log_dets)
+
+
+def _add_bubbles(
+    given: SmoothingProblem, whole: Dense, frame: Any
+) -> tuple[list[list[int]], list[int]]:
+    """Ids of every bubble's components, and of its mean velocity."""
+    bubbles, means = [], []
+    for b in given.bubbles:
+        t = given.t_s[b.first : b.last + 1]
+        means.append(whole.add(np.zeros(3), 300.0**2 * np.eye(3)))
+        ids = []
+        for i, c in enumerate(frame.bubble.components):
+            mean = np.zeros(len(t) * c.size)
+            if i < 3:
+                mean[::2] = b.start_mm[i]
+            ids.append(whole.add(mean, path_covariance(c, t)))
+        bubbles.append(ids)
+    return bubbles, means
 
 
 def _add_sensors(given: Any, model: Any, whole: Dense, frame: Any, of_shake: Any) -> None:

@@ -115,20 +115,7 @@ def simulated(
     pair = pair or cameras()
     seen = [lab - UP * position[at, None] - offset[j, at] for j in range(2)]
     uv = [c.project(p) + SIGMA_PX * rng.normal(size=(FRAMES, 2)) for c, p in zip(pair, seen)]
-    marks = []
-    for j, camera in enumerate(pair):
-        for block in range(0, FRAMES, 150):
-            frames = np.arange(block, block + 150)
-            for m in range(4):
-                place = UP * (position[at[frames]].mean() + rng.uniform(-5, 5))
-                place = place + np.array([rng.uniform(-20, 20), 0, rng.uniform(-20, 20)])
-                rig = place - UP * position[at[frames], None] - offset[j, at[frames]]
-                pixels = camera.project(rig) + 0.1 * rng.normal(size=(150, 2))
-                name = f"{camera.name}-{block}-{m}"
-                marks.append(
-                    pd.DataFrame({"frame": frames, "camera": camera.name, "mark": name,
-                                  "u_px": pixels[:, 0], "v_px": pixels[:, 1], "sigma_px": 0.1})
-                )  # fmt: skip
+    marks = marks_seen(pair, position[at], offset[:, at], rng)
     sigma = 22.5 * 9.81e-6 * np.sqrt(1000)
     sensors = {
         f"arm_{c.name}": {
@@ -145,8 +132,27 @@ def simulated(
     )
     return Run(
         calibration, tracks_of(pair, uv, t), pd.DataFrame({"t_s": grid[::2], "position_mm": read}),
-        pd.concat(marks), sensors, lab, offset[:, at],
+        marks, sensors, lab, offset[:, at],
     )  # fmt: skip
+
+
+def marks_seen(pair: Any, position: Any, offset: Any, rng: np.random.Generator) -> pd.DataFrame:
+    """Four marks in each camera at unknown heights, other ones every 150 frames."""
+    marks = []
+    for j, camera in enumerate(pair):
+        for block in range(0, FRAMES, 150):
+            frames = np.arange(block, block + 150)
+            for m in range(4):
+                place = UP * (position[frames].mean() + rng.uniform(-5, 5))
+                place = place + np.array([rng.uniform(-20, 20), 0, rng.uniform(-20, 20)])
+                rig = place - UP * position[frames, None] - offset[j, frames]
+                pixels = camera.project(rig) + 0.1 * rng.normal(size=(150, 2))
+                name = f"{camera.name}-{block}-{m}"
+                marks.append(
+                    pd.DataFrame({"frame": frames, "camera": camera.name, "mark": name,
+                                  "u_px": pixels[:, 0], "v_px": pixels[:, 1], "sigma_px": 0.1})
+                )  # fmt: skip
+    return pd.concat(marks)
 
 
 def tracks_of(pair: Any, uv: Any, t: Any) -> pd.DataFrame:

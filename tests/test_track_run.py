@@ -96,6 +96,22 @@ def test_given_ids_pass_through(rise: Path, whole: Tracks) -> None:
         assert set(again.detections["particle"]) == {expected}
 
 
+def test_named_bubbles_are_tracked_but_not_reported_nor_smoothed(
+    rise: Path, whole: Tracks, tmp_path: Path
+) -> None:
+    table = whole.detections.drop(columns="particle").assign(particle="first")
+    run = replace(telerig.load_run(rise / "runs" / "rise"), detections=table, source="detections")
+    asked: dict[str, Any] = {"options": TrackOptions(), "record": {}}
+    with pytest.raises(InputError, match=r"'first' is no whole number.*\n.*--no-report"):
+        write_tracking(run, truth_calibration(), tmp_path / "out", **asked)
+    assert list(tmp_path.iterdir()) == []
+    write_tracking(run, truth_calibration(), tmp_path / "out", **asked, report=False)
+    tracks = telerig.load_tracks(tmp_path / "out")
+    assert set(tracks.table["particle"]) == {"first"}
+    with pytest.raises(InputError, match="'first' is no whole number"):
+        telerig.smooth(tracks, truth_calibration())
+
+
 def test_an_interrupted_run_goes_on_and_ends_alike(
     rise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,7 +206,7 @@ def test_the_command_writes_what_the_contract_names(rise: Path, tmp_path: Path) 
         app, ["track", str(rise / "runs" / "rise"), "--out", str(out), "--quiet"]
     )
     assert result.exit_code == 0, result.output
-    assert "1 tracks" in result.output or "1 track" in result.output
+    assert "1 track, " in result.output
     names = {"detections.csv", "tracks.csv", "events.csv", "tracking.json", "run.json"}
     assert names | {"report.html"} <= {p.name for p in out.iterdir()}
     summary = json.loads((out / "tracking.json").read_text(encoding="utf-8"))

@@ -38,7 +38,6 @@ class Job:
     model: str = "auto"
     medium: str = "air"
     report: bool = True
-    min_diameter_px: float = 8.0
     needs: tuple[str, ...] = ()
 
     @property
@@ -81,7 +80,6 @@ def jobs_of(
     model: str = "auto",
     medium: str = "air",
     report: bool = True,
-    min_diameter_px: float = 8.0,
     only: Sequence[str] = (),
     strict: bool = False,
 ) -> list[Job]:
@@ -97,8 +95,10 @@ def jobs_of(
     places = _checked(datasets)
     shared: dict[str, Any] = {
         "calibration": "" if calibration is None else str(Path(calibration).resolve()),
-        "model": model, "medium": medium, "report": report, "min_diameter_px": min_diameter_px,
-    }  # fmt: skip
+        "model": model,
+        "medium": medium,
+        "report": report,
+    }
     jobs: list[Job] = []
     for place in places:
         try:
@@ -170,7 +170,7 @@ def check_run_name(run: Path) -> None:
 
 def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
     """Raise InputError for a calibration that is not there, an unknown lens model or medium."""
-    from telerig.estimator.behind_walls import checked_medium
+    from telerig.estimator.calibrate import checked_medium
     from telerig.estimator.problem import MODELS
 
     if calibration is not None and not Path(calibration).exists():

@@ -159,12 +159,11 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
     run = Path(job.dataset) / "runs" / job.run
     check_run_name(run)
     calibration, files = calibration_for(run, _given(job))
-    record = {
-        "command": "run", "options": {"min_diameter_px": job.min_diameter_px}, "inputs": files
-    }  # fmt: skip
+    options = TrackOptions()
+    asked = {"min_diameter_px": options.min_diameter_px}
     summary = write_tracking(
-        load_run(run), calibration, job.results,
-        options=TrackOptions(min_diameter_px=job.min_diameter_px), record=record,
+        load_run(run), calibration, job.results, options=options,
+        record={"command": "run", "options": asked, "inputs": files},
         report=job.report, stage=stage,
     )  # fmt: skip
     figures = {name: summary[name] for name in ("frames", "detections", "points", "tracks")}

@@ -46,7 +46,6 @@ class Mark:
     number: int
     place_mm: Array
     epoch: int
-    first_frame: int
     last_frame: int
     low_px: Array
     high_px: Array
@@ -261,7 +260,7 @@ class Follower:
         out = []
         for i in chosen:
             uv = dots.uv_px[i]
-            mark = Mark(self._number, place[i], len(self.epoch_starts) - 1, frame, frame, uv, uv, 1)
+            mark = Mark(self._number, place[i], len(self.epoch_starts) - 1, frame, uv, uv, 1)
             self.marks.append(mark)
             out.append((i, mark.number))
             self._number += 1

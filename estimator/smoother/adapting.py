@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,11 +97,10 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
 
 def _periodogram(series: Array, step_s: float) -> Array:
     """One-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
-    x = np.linspace(-1, 1, len(series))
-    rest = series - np.polyval(np.polyfit(x, series, 1), x)
-    taper = np.hanning(len(series))
-    spectrum = np.abs(np.fft.rfft(rest * taper)) ** 2
-    return np.asarray(2 * step_s * spectrum / (taper @ taper))
+    from scipy.signal import detrend, periodogram
+
+    taper: Any = np.hanning(len(series))
+    return np.asarray(periodogram(series, 1 / step_s, window=taper, detrend=detrend)[1])
 
 
 def _offsets(solution: Solution) -> Array:

@@ -71,6 +71,13 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
             where="tracks",
             todo="give the tracks.csv that `telerig track` wrote with this calibration",
         )
+    names = [p for p in table["particle"].unique() if isinstance(p, str)]
+    if names:
+        raise InputError(
+            f"particle {names[0]!r} is no whole number",
+            where="tracks",
+            todo="number the bubbles in detections.csv and track them again",
+        )
     values = table[needed].to_numpy(float)
     bad = ~np.isfinite(values).all(1)
     if bad.any():

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.smoother.model import ShakeModel, Travel
 from telerig.estimator.smoother.solve import Solution
+from telerig.rig.pose import across
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
     if described is not None:
         axis, stated = np.asarray(described.axis, float), described.scale_sigma
     axis = axis / np.linalg.norm(axis)
-    basis = np.linalg.svd(axis[None])[2][1:].T
+    basis = across(axis)
     sigma = SCALE_SIGMA if stated is None else stated
     source: Literal["rig.toml", "assumed"] = "assumed" if stated is None else "rig.toml"
     return Travel(axis, basis, 0.0, np.diag([0.0, 0.0, sigma**2]), source)

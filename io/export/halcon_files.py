@@ -23,11 +23,12 @@ Array = NDArray[np.float64]
 _DAT = {
     "focus": ("Focus:foc", "DOUBLE:0.0:", "Focal length of the lens [meter]"),
     "kappa": ("Kappa:kappa", "DOUBLE::", "Radial distortion coefficient [1/(meter*meter)]"),
-    "k1": ("Poly1:poly1", "DOUBLE::", "1st polynomial distortion coefficient"),
-    "k2": ("Poly2:poly2", "DOUBLE::", "2nd polynomial distortion coefficient"),
-    "k3": ("Poly3:poly3", "DOUBLE::", "3rd polynomial distortion coefficient"),
-    "p1": ("Poly4:poly4", "DOUBLE::", "4th polynomial distortion coefficient"),
-    "p2": ("Poly5:poly5", "DOUBLE::", "5th polynomial distortion coefficient"),
+    **{
+        name: (f"Poly{i}:poly{i}", "DOUBLE::", f"{nth} polynomial distortion coefficient")
+        for i, name, nth in zip(
+            range(1, 6), ("k1", "k2", "k3", "p1", "p2"), ("1st", "2nd", "3rd", "4th", "5th")
+        )
+    },
     "sx": ("Sx:sx", "DOUBLE:0.0:", "Width of a cell on the sensor [meter]"),
     "sy": ("Sy:sy", "DOUBLE:0.0:", "Height of a cell on the sensor [meter]"),
     "cx": ("Cx:cx", "DOUBLE::", "X-coordinate of the image center [pixel]"),

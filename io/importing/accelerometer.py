@@ -210,7 +210,7 @@ def layout_from(options: dict[str, Any]) -> Layout:
     values = {key: value for key, value in options.items() if value is not None}
     if "channels" in values:
         words = [w.strip() for w in str(values["channels"]).split(",")]
-        values["channels"] = tuple(int(w) if w.isdigit() else w for w in words)
+        values["channels"] = tuple(int(w) if w.isdecimal() else w for w in words)
     if "scale_m_s2" in values:
         try:
             numbers = tuple(float(w) for w in str(values["scale_m_s2"]).split(","))

@@ -63,7 +63,11 @@ def read_opencv_cameras(
     shift = _one(joint, _TRANSLATION, 0, where).reshape(-1) * unit_mm
     size = image_size_px or _size(joint, where)
     if rotation.shape != (3, 3) or shift.shape != (3,) or any(m.shape != (3, 3) for m in matrices):
-        raise InputError("R, T or a camera matrix is not of its size", where=where)
+        raise InputError(
+            "R, T or a camera matrix is not of its size",
+            where=where,
+            todo="give R as (3, 3) or a rotation vector, T with 3 numbers, matrices (3, 3)",
+        )
     pinholes = [
         Pinhole(f"{where} camera {i + 1}", size, matrix, *pose, np.asarray(d, float).reshape(-1))
         for i, (matrix, pose, d) in enumerate(

@@ -14,17 +14,23 @@ WAIT_S = 0.1
 """How long a read waits for a byte before it looks whether to stop."""
 WRITE_S = 1.0
 """A port that takes no question for so long is lost."""
+NO_PERMISSION = "sudo usermod -a -G dialout $USER (uucp on some systems), then log in again"
+"""What to do about it."""
+
+
+def found_ports() -> list[tuple[str, str]]:
+    """(device file, what it calls itself or "") of the serial ports that the machine has now."""
+    from serial.tools import list_ports
+
+    return sorted(
+        (str(port.device), "" if port.description in (None, "n/a") else str(port.description))
+        for port in list_ports.comports()
+    )
 
 
 def known_ports() -> list[str]:
-    """The serial ports that the machine has now, each with what it calls itself."""
-    from serial.tools import list_ports
-
-    found = sorted(list_ports.comports(), key=lambda port: str(port.device))
-    return [
-        str(p.device) + (f" ({p.description})" if p.description not in (None, "n/a") else "")
-        for p in found
-    ]
+    """The same as one text each."""
+    return [device + (f" ({name})" if name else "") for device, name in found_ports()]
 
 
 def open_port(device: DeviceDescription) -> Any:
@@ -62,7 +68,7 @@ def _cannot_open(device: DeviceDescription, error: Exception) -> InputError:
         return InputError(
             "you have no permission to open it",
             where=place,
-            todo="sudo usermod -a -G dialout $USER (uucp on some systems), then log in again",
+            todo=NO_PERMISSION,
         )
     if local and (code == errno.ENOENT or not Path(device.port).exists()):
         ports = known_ports()

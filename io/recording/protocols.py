@@ -95,20 +95,35 @@ def xor_checksum(line: bytes) -> bytes:
     return b"*%02X" % total
 
 
-class LineParser:
-    """Lines that end in LF (CR before it is dropped), each matched whole against an expression."""
+class _Joined:
+    """Pieces put together; what is incomplete waits for the rest."""
 
-    def __init__(self, pattern: str, *, xor: bool = False) -> None:
-        self._match = re.compile(pattern.encode()).fullmatch
-        self._groups = list(re.compile(pattern.encode()).groupindex)
-        self._xor = xor
+    def __init__(self) -> None:
         self._tail = b""
         self._begun = False
 
-    def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
+    def _join(self, chunks: Sequence[tuple[int, bytes]]) -> tuple[bytes, Ints, Ints]:
+        """What waited and has come now; where each piece ends in it, and when it arrived (ns)."""
         data = self._tail + b"".join(piece for _, piece in chunks)
         ends = np.cumsum([len(self._tail), *(len(piece) for _, piece in chunks)])[1:]
-        stamps = np.array([stamp for stamp, _ in chunks], np.int64)
+        return data, ends, np.array([stamp for stamp, _ in chunks], np.int64)
+
+    def cut(self) -> int:
+        forgotten, self._tail, self._begun = len(self._tail), b"", False
+        return forgotten
+
+
+class LineParser(_Joined):
+    """Lines that end in LF (CR before it is dropped), each matched whole against an expression."""
+
+    def __init__(self, pattern: str, *, xor: bool = False) -> None:
+        super().__init__()
+        expression = re.compile(pattern.encode())
+        self._match, self._groups = expression.fullmatch, list(expression.groupindex)
+        self._xor = xor
+
+    def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
+        data, ends, stamps = self._join(chunks)
         lines = data.split(b"\n")
         self._tail = lines.pop()
         if len(self._tail) > LONGEST_LINE:
@@ -117,14 +132,10 @@ class LineParser:
         if not lines:
             return self._readings([], np.zeros(0, np.int64), [])
         last = np.cumsum([len(line) + 1 for line in lines]) - 1
-        arrived = stamps[np.minimum(np.searchsorted(ends, last, "right"), len(stamps) - 1)]
+        arrived = _arrival(last, ends, stamps)
         if not self._begun:
             self._begun, lines, arrived = True, *self._first(lines, arrived)
         return self._readings(lines, arrived, [self._found(line) for line in lines])
-
-    def cut(self) -> int:
-        forgotten, self._tail, self._begun = len(self._tail), b"", False
-        return forgotten
 
     def _first(self, lines: list[bytes], arrived: Ints) -> tuple[list[bytes], Ints]:
         """Without the first line if the connection began in its middle."""
@@ -170,18 +181,15 @@ def _number(cell: bytes | None) -> float:
         return float("nan")
 
 
-class PacketParser:
+class PacketParser(_Joined):
     """Binary packets: `SYNC`, fields, sum of bytes; found again after any garbage."""
 
     def __init__(self, fields: list[tuple[str, str]]) -> None:
+        super().__init__()
         self._type = np.dtype([("sync", "S2"), *fields, ("sum", "u1")])
-        self._tail = b""
-        self._begun = False
 
     def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
-        data = self._tail + b"".join(piece for _, piece in chunks)
-        ends = np.cumsum([len(self._tail), *(len(piece) for _, piece in chunks)])[1:]
-        stamps = np.array([stamp for stamp, _ in chunks], np.int64)
+        data, ends, stamps = self._join(chunks)
         size = self._type.itemsize
         starts = self._packets(data)
         done = max(int(starts[-1]) + size if starts.size else 0, len(data) - size + 1)
@@ -201,10 +209,6 @@ class PacketParser:
             sum(b - a for a, b in gaps),
             tuple(data[a:b] for a, b in gaps[:3]),
         )
-
-    def cut(self) -> int:
-        forgotten, self._tail, self._begun = len(self._tail), b"", False
-        return forgotten
 
     def _packets(self, data: bytes) -> Ints:
         """Where sound packets start; of overlapping ones the first."""

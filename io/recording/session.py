@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from telerig.errors import InputError
 from telerig.io.recording.damage import GAP_INTERVALS
 from telerig.io.recording.description import DeviceDescription
-from telerig.io.recording.log import END, FOUND, LOST, RECEIVED, Entry, LogHeader, RawLog
+from telerig.io.recording.log import END, LOST, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.ports import open_port
 from telerig.io.recording.protocols import Readings, parser
 from telerig.io.recording.reader import Reader
@@ -64,9 +64,7 @@ class DeviceStatus:
             self._count_gaps(found.values["t"], 2.0**device.time_bits if device.time_bits else 0.0)
 
     def _count_gaps(self, stamps: NDArray[np.float64], wrap: float) -> None:
-        steps = np.diff(np.concatenate([[self._last], stamps]))[
-            0 if self._last == self._last else 1 :
-        ]
+        steps = np.diff(np.concatenate([[self._last], stamps]))
         steps = np.mod(steps, wrap) if wrap else steps
         steps = steps[np.isfinite(steps) & (steps > 0)]
         self._last = float(stamps[-1])
@@ -193,16 +191,19 @@ class _Session:
             if entry.kind == RECEIVED:
                 chunks[entry.device].append((entry.time_ns, entry.data))
             elif entry.kind == LOST:
+                self._count(entry.device, chunks[entry.device])
+                chunks[entry.device] = []
                 self._parsers[entry.device].cut()
                 self._status[entry.device].unplugged += 1
-            elif entry.kind == FOUND:
-                self._parsers[entry.device].cut()
         self._log.flush()
-        for i, (device, status) in enumerate(zip(self._devices, self._status)):
-            status.byte_count += sum(len(data) for _, data in chunks[i])
-            status.add(device, self._parsers[i].feed(chunks[i]))
+        for i, status in enumerate(self._status):
+            self._count(i, chunks[i])
             status.rate_hz = (status.readings - before[i]) / elapsed_s
             status.connected = self._readers[i].connected
+
+    def _count(self, i: int, chunks: list[tuple[int, bytes]]) -> None:
+        self._status[i].byte_count += sum(len(data) for _, data in chunks)
+        self._status[i].add(self._devices[i], self._parsers[i].feed(chunks))
 
     def _check(self, elapsed_s: float) -> None:
         """Raises what ended a reader, and InputError for a line of garbage from the start."""

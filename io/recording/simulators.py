@@ -10,7 +10,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.random import Generator
@@ -19,6 +18,7 @@ from telerig.io.recording.description import DeviceDescription
 from telerig.io.recording.log import END, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.protocols import poll_command
 from telerig.io.recording.signals import (
+    Ints,
     SimulatedDevice,
     answer,
     damage,
@@ -124,15 +124,7 @@ class _Runner(threading.Thread):
     def _stream(self) -> None:
         pause = float(self._rng.uniform(0, self._sim.jitter_s))
         self._stop_asked.wait(max(pause, 0.5 / self._sim.rate_hz))
-        until = self._sim.first_after(self._elapsed_s())
-        number = np.arange(self.truth.sent, until)
-        number = number[~np.isin(number, self._sim.faults.skip)]
-        self.truth.sent = until
-        if not number.size:
-            return
-        pieces = messages(self._sim, number)
-        data, spoilt = damage(pieces, self._sim.faults, 1 / self._sim.rate_hz, self._rng)
-        self.truth.spoilt += number[spoilt].tolist()
+        number, pieces, data = _made(self._sim, self.truth, self._elapsed_s(), self._rng)
         written = self._port.write(data)
         if written < len(data):
             ends = np.cumsum([len(piece) for piece in pieces])
@@ -178,14 +170,23 @@ class SimulatedPorts:
             runner.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for runner in self._runners:
             runner.stop()
+
+
+def _made(
+    sim: SimulatedDevice, truth: Truth, host_s: float, rng: Generator
+) -> tuple[Ints, list[bytes], bytes]:
+    """Numbers of the readings since the last call, the bytes of each, and what the line makes."""
+    until = sim.first_after(host_s)
+    number = np.arange(truth.sent, until)
+    number = number[~np.isin(number, sim.faults.skip)]
+    truth.sent = until
+    pieces = messages(sim, number)
+    data, spoilt = damage(pieces, sim.faults, 1 / sim.rate_hz, rng)
+    truth.spoilt += number[spoilt].tolist()
+    return number, pieces, data
 
 
 def _at(sim: SimulatedDevice, folder: Path) -> SimulatedDevice:
@@ -205,13 +206,7 @@ def simulated_log(
         for flush_s in np.cumsum(rng.uniform(0, sim.jitter_s, count)):
             if flush_s > seconds:
                 break
-            until = sim.first_after(float(flush_s))
-            number = np.arange(truth.sent, until)
-            number = number[~np.isin(number, sim.faults.skip)]
-            truth.sent = until
-            pieces = messages(sim, number)
-            data, spoilt = damage(pieces, sim.faults, 1 / sim.rate_hz, rng)
-            truth.spoilt += number[spoilt].tolist()
+            _, _, data = _made(sim, truth, float(flush_s), rng)
             if data:
                 entries.append(Entry(RECEIVED, index, int(flush_s * 1e9), data))
     with RawLog(path, header) as log:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -36,8 +37,9 @@ class Recording:
 def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = None) -> Recording:
     """Write the tables that the log's devices give into ``folder`` (the log's own by default).
 
-    All are written beside and renamed at the end. Raises InputError for a file that is no log,
-    or a folder that cannot be written.
+    All are written beside and renamed at the end. Sensors that `accelerometer.csv` has from
+    elsewhere (`telerig import`) stay in it. Raises InputError for a file that is no log, or a
+    folder that cannot be written.
     """
     path = Path(log)
     out = Path(folder) if folder is not None else path.parent
@@ -50,7 +52,10 @@ def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = 
             if not records:
                 continue
             name, write = _WRITERS[kind]
-            rows[name] = _write(beside / name, write(records, frames), out / name)
+            text = write(records, frames)
+            if kind == "accelerometer":
+                text = chain(text, _of_others(out / name, {r.device.name for r in records}))
+            rows[name] = _write(beside / name, text, out / name)
         summary = _summary(found, frames, path, rows)
         write_json_atomic(beside / "recording.json", summary)
     return Recording(out, summary, rows)
@@ -81,6 +86,20 @@ def _accelerometers(records: Sequence[DeviceRecord], _: FrameTimes) -> Iterator[
         name = record.device.name.replace("%", "%%")
         columns = [record.t_s, *(unit * record.values[axis] for axis in ("ax", "ay", "az"))]
         yield from _rows(f"%.{TIME_DIGITS}f,{name},%.9g,%.9g,%.9g\n", columns)
+
+
+def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
+    """Rows of a table of before whose sensors are not recorded now."""
+    if not file.is_file():
+        return
+    with file.open(encoding="utf-8") as stream:
+        names = next(stream, "").strip().split(",")
+        if names[:2] != ["t_s", "sensor"]:
+            return
+        for line in stream:
+            cells = line.split(",", 2)
+            if len(cells) == 3 and cells[1] not in recorded:
+                yield line if line.endswith("\n") else line + "\n"
 
 
 def _frames(_: Sequence[DeviceRecord], frames: FrameTimes) -> Iterator[str]:

@@ -45,7 +45,7 @@ def write_batch_report(folder: Path, out: Path | None = None) -> Path:
     """
     file = Path(folder) / "batch.json"
     try:
-        jobs = json.loads(file.read_bytes())["jobs"]
+        jobs = [_checked(job) for job in json.loads(file.read_bytes())["jobs"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"holds no batch that can be read: {error}", where=str(file),
@@ -54,6 +54,15 @@ def write_batch_report(folder: Path, out: Path | None = None) -> Path:
     place = Path(folder) if out is None else Path(out)
     write_text_atomic(place / "report.html", render(jobs, place))
     return place / "report.html"
+
+
+def _checked(job: Any) -> Job:
+    for name in ("dataset", "run", "kind", "status", "words"):
+        if not isinstance(job[name], str):
+            raise ValueError(f"a job garbles {name!r}")
+    if not isinstance(job.get("figures") or {}, dict):
+        raise ValueError("a job garbles 'figures'")
+    return dict(job)
 
 
 def render(jobs: Sequence[Job], folder: Path) -> str:
@@ -105,12 +114,12 @@ def _failure(job: Job) -> Row:
 
 def _calibration(job: Job, folder: Path) -> Line:
     found = job.get("figures") or {}
-    share = found.get("share_kept")
+    share: Any = found.get("share_kept")
     cells = (
         str(found.get("verdict") or job["status"]),
         str(found.get("lens_model") or ABSENT),
         str(found.get("views") or ABSENT),
-        f"{100 * float(share):.1f}%" if share is not None else ABSENT,
+        f"{100 * share:.1f}%" if is_number(share) else ABSENT,
         _text(found.get("rms_px")),
     )
     link = _link(job, folder, "calibration")
@@ -163,7 +172,7 @@ def _drawings(jobs: Sequence[Job]) -> list[Callable[[], Picture | None]]:
         partial(_values, jobs, "calibrate", ("rms_px",), "Calibrations", "residual RMS / px",
                 "One point a dataset: a rig that was touched, or a bad target, stands out."),
         partial(_values, jobs, "smooth", ("sx_um", "sy_um", "sz_um"), "Smoothed runs",
-                "sd of position / um", "Median of each run, in the order of the batch: x, y, z."),
+                "sd of position / µm", "Median of each run, in the order of the batch: x, y, z."),
         partial(_times, jobs),
     ]  # fmt: skip
 

@@ -16,6 +16,7 @@ from telerig.io.report.figures_dot import dot_pictures
 from telerig.io.report.figures_residuals import residual_field, residual_histogram
 from telerig.io.report.figures_rig import rig_plan
 from telerig.io.report.figures_target import target_pictures
+from telerig.io.report.figures_trust import trust_pictures
 from telerig.io.report.page import drawn_over_cores, render_page
 from telerig.io.report.scene import dots_are_drawn, scene_json
 from telerig.io.report.words import ABSENT, flat_rows, is_number
@@ -67,8 +68,19 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "weak": (content.get("diagnostics") or {}).get("weak") or [],
         "notes": content.get("notes") or [],
         "absent": results.absent,
+        "trust_words": _trust_words(results),
+        "comparison": results.comparison,
         "dots_drawn": dots_are_drawn(results),
     }
+
+
+def _trust_words(results: CalibrationResults) -> list[str]:
+    """What halves and residuals say; nothing for folders of before."""
+    diagnostics = results.content.get("diagnostics") or {}
+    halves, structure = (diagnostics.get(k) or {} for k in ("halves", "structure"))
+    found = [str(halves["words"])] if "words" in halves else []
+    found += [str(words) for words in structure.get("words") or []]
+    return [words[0].upper() + words[1:] + "." for words in found if words]
 
 
 def _tables(results: CalibrationResults) -> dict[str, Any]:
@@ -83,6 +95,7 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
         "stage_words": (results.content.get("stage") or {}).get("notes") or [],
         "ladder": tables.ladder_rows(results),
         "worst": tables.worst_rows(results),
+        "changes": tables.change_rows(results),
         "left_out": int((~results.residuals["kept"]).sum()),
         "lowered": int((results.residuals["weight"] < 1).sum()),
         "measured": len(results.residuals),
@@ -103,6 +116,7 @@ def _pictures(results: CalibrationResults) -> dict[str, Any]:
         ("covered", partial(tilts, results)),
         ("spread", partial(residual_histogram, results)),
         ("plan", partial(rig_plan, results)),
+        ("trust", partial(trust_pictures, results)),
     ]
     drawn = drawn_over_cores([d for _, d in drawings])
     pictures: dict[str, Any] = {"fields": [], "covered": [], "spread": []}

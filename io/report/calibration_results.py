@@ -28,6 +28,7 @@ SCHEMA = 1
 KEPT_WEIGHT = 0.5
 """A dot counts as kept above this weight."""
 _AGAIN = "calibrate again (`telerig calibrate`), or name the right results folder"
+_UNCERTAINTY = ("points_mm", "calibration_mm2", "measurement_mm2", "sigma_px")
 _DOT_EXAMPLE = ("patch", "model", "u0", "v0", "u_px", "v_px", "a_px", "b_px", "angle_rad", "noise")
 
 
@@ -43,7 +44,8 @@ class CalibrationResults:
         ``whitened_v`` when dots.csv states every dot's covariance.
     component : name of a component -> its place in ``joint``, the whole covariance.
     overlays : (camera, view) -> picture.
-    dot_example : arrays of dot_example.npz, or empty.
+    dot_example, uncertainty : arrays of dot_example.npz and uncertainty.npz, or empty.
+    comparison : comparison.json with an earlier calibration, or empty.
     absent : what optional files are missing, in words.
     """
 
@@ -59,6 +61,8 @@ class CalibrationResults:
     run: Mapping[str, Any]
     overlays: Mapping[tuple[str, str], Path]
     dot_example: Mapping[str, Array]
+    uncertainty: Mapping[str, Array]
+    comparison: Mapping[str, Any]
     absent: tuple[str, ...]
 
     @property
@@ -74,7 +78,8 @@ def read_results(folder: Path) -> CalibrationResults:
     """Read a calibration's results folder.
 
     calibration.json and residuals.csv are needed; dots.csv, covariance.npz, run.json,
-    overlays/<camera>/<view>.jpg and dot_example.npz are used when they are there.
+    uncertainty.npz, comparison.json, overlays/<camera>/<view>.jpg and dot_example.npz are used
+    when they are there.
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
     content = _content(folder / "calibration.json")
@@ -89,13 +94,13 @@ def read_results(folder: Path) -> CalibrationResults:
     residuals = _residuals(folder, cameras, views, content)
     component, joint = _covariance(folder / "covariance.npz")
     example = _dot_example(folder / "dot_example.npz")
-    run = read_object(folder / "run.json", _AGAIN) if (folder / "run.json").is_file() else {}
+    run, comparison = (_optional(folder / name) for name in ("run.json", "comparison.json"))
     overlays = _overlays(folder / "overlays", cameras, views)
     absent = _absent(residuals, joint, run, overlays, example)
     rows = _row_column(residuals, dot_ids)
     return CalibrationResults(
         content, cameras, views, dot_ids, points, rows, residuals, component, joint, run,
-        overlays, example, absent,
+        overlays, example, _uncertainty(folder / "uncertainty.npz"), comparison, absent,
     )  # fmt: skip
 
 
@@ -220,6 +225,21 @@ def _dot_example(file: Path) -> dict[str, Array]:
     patch, model = arrays["patch"], arrays["model"]
     if patch.ndim != 2 or patch.shape != model.shape or min(patch.shape) < 3:
         raise _broken(file, f"patch {patch.shape} and model {model.shape} are no pair of images")
+    return arrays
+
+
+def _optional(file: Path) -> Mapping[str, Any]:
+    return read_object(file, _AGAIN) if file.is_file() else {}
+
+
+def _uncertainty(file: Path) -> dict[str, Array]:
+    if not file.is_file():
+        return {}
+    arrays = {name: np.asarray(a, float) for name, a in _arrays(file, _UNCERTAINTY).items()}
+    count = len(np.atleast_1d(arrays["points_mm"]))
+    shapes = [(count, 3), (count, 3, 3), (count, 3, 3), ()]
+    if [arrays[name].shape for name in _UNCERTAINTY] != shapes or count < 1:
+        raise _broken(file, "its arrays do not fit together")
     return arrays
 
 

@@ -20,6 +20,7 @@ from telerig.rig.projection import PARAMETERS
 Array = NDArray[np.float64]
 
 WORST = 15
+_MANY_SD = 3.0
 _WORDS = {
     "scale_px_per_mm": "scale, px/mm",
     "aspect": "aspect, v scale over u scale",
@@ -258,3 +259,17 @@ def worst_rows(results: CalibrationResults) -> list[Row]:
         )
         for dot in table.iloc[order[:WORST]].itertuples()
     ]  # fmt: skip
+
+
+def change_rows(results: CalibrationResults) -> list[Row]:
+    """Of comparison.json: each quantity, its change with standard deviation, in deviations."""
+    rows = []
+    for change in results.comparison.get("changes") or []:
+        deviations = change.get("deviations")
+        cells = (
+            str(change["quantity"]),
+            f"{with_sd(change['change'], change['sd'])} {change['unit']}",
+            f"{deviations:.1f}" if is_number(deviations) else ABSENT,
+        )
+        rows.append(Row(cells, strong=is_number(deviations) and abs(deviations) > _MANY_SD))
+    return rows

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from telerig.estimator.calibrate import calibrate as calibrate
     from telerig.estimator.calibration import Calibration as Calibration
     from telerig.estimator.calibration import load_calibration as load_calibration
+    from telerig.estimator.compare_calibrations import compare_calibrations as compare_calibrations
     from telerig.estimator.frontend.bubbles import detect_bubbles as detect_bubbles
     from telerig.estimator.frontend.dots import locate_dots as locate_dots
     from telerig.estimator.frontend.target_detection import detect_target as detect_target
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from telerig.estimator.track_run import track as track
     from telerig.estimator.tracks import Tracks as Tracks
     from telerig.estimator.tracks import load_tracks as load_tracks
+    from telerig.estimator.uncertainty_map import uncertainty_map as uncertainty_map
     from telerig.io.dataset import Dataset as Dataset
     from telerig.io.dataset import load_dataset as load_dataset
     from telerig.io.run import load_run as load_run
@@ -41,6 +43,7 @@ _WHERE = {
     "Triangulation": "telerig.rig.triangulation",
     "calibrate": "telerig.estimator.calibrate",
     "Tracks": "telerig.estimator.tracks",
+    "compare_calibrations": "telerig.estimator.compare_calibrations",
     "detect_bubbles": "telerig.estimator.frontend.bubbles",
     "detect_target": "telerig.estimator.frontend.target_detection",
     "load_calibration": "telerig.estimator.calibration",
@@ -51,6 +54,7 @@ _WHERE = {
     "simulate": "telerig.io.simulation",
     "smooth": "telerig.estimator.smoother.smooth",
     "track": "telerig.estimator.track_run",
+    "uncertainty_map": "telerig.estimator.uncertainty_map",
 }
 __all__ = ["__version__", *_WHERE]
 

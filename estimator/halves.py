@@ -1,0 +1,92 @@
+"""Cross-validation by halves: is the calibration as repeatable as its covariance says?
+
+Every second view calibrates the rig anew, and so do the others; the two rigs are compared over the
+working volume like two calibrations of one rig. The covariance does not know of errors that the
+views share (a wrong lens model), but two halves with other tilts feel them otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator.compare_calibrations import UNLIKELY, FieldDifference, Rig, field_difference
+from telerig.estimator.covariance import joint_covariance
+from telerig.estimator.graph import solve
+from telerig.estimator.problem import Problem
+from telerig.estimator.results import cameras_from_state
+from telerig.factors.projection import State
+
+Array = NDArray[np.float64]
+
+LEAST_VIEWS = 4
+"""In a half; with fewer, a half does not determine a rig."""
+_SCALE = 1e-7
+
+
+def halves(problem: Problem, state: State) -> dict[str, Any]:
+    """For `Calibration.diagnostics`: words, figures and the field of differences.
+
+    The known distance on the target is common to both halves and tells nothing about repeatability:
+    it is taken as exact in both.
+    """
+    if len(problem.cameras) != 2:
+        return {"words": "one camera: halves are compared in space, which takes two"}
+    used = np.unique(problem.view[problem.weight > 0])
+    parts = [used[0::2], used[1::2]]
+    if min(len(p) for p in parts) < LEAST_VIEWS:
+        return {
+            "words": f"{len(used)} views are too few to be calibrated by halves: take "
+            f"{2 * LEAST_VIEWS} or more"
+        }
+    try:
+        first, second = (_rig(problem, state, views) for views in parts)
+    except CalibrationError as error:
+        return {"words": f"a half of the views does not determine the rig: {error.what}"}
+    field = field_difference(first, second)
+    return {
+        "views": [len(p) for p in parts],
+        "rms_um": field.rms_um,
+        "predicted_um": field.predicted_um,
+        "p_value": field.p_value,
+        "agree": bool(field.p_value >= UNLIKELY),
+        "words": _words(field, [len(p) for p in parts]),
+        "points_mm": np.round(field.points_mm, 4).tolist(),
+        "shift_um": np.round(1e3 * field.shift_mm, 4).tolist(),
+        "sd_um": np.round(1e3 * field.sd_mm, 4).tolist(),
+    }
+
+
+def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
+    half = problem.subset(np.isin(problem.view, views) & (problem.weight > 0))
+    half = replace(half, solver="schur")
+    if half.scale is not None:
+        pair, distance, _ = half.scale
+        half = replace(half, scale=(pair, distance, _SCALE * distance))
+    solution = solve(half, state, max_iterations=30, relative=1e-7)
+    names, covariance = joint_covariance(half, solution).rig_block()
+    cameras = cameras_from_state(half, solution.state)
+    if not np.isfinite(covariance).all():
+        raise CalibrationError(
+            f"nothing determines {names[int(np.argmax(~np.isfinite(covariance)))]}"
+        )
+    return Rig((cameras[0], cameras[1]), half.free, covariance)
+
+
+def _words(field: FieldDifference, views: list[int]) -> str:
+    ratio = field.rms_um / max(field.predicted_um, 1e-12)
+    words = (
+        f"two halves of {views[0]} and {views[1]} views put the same pixels {field.rms_um:.2g} um "
+        f"RMS per axis apart in space; their covariances predict {field.predicted_um:.2g} um"
+    )
+    if field.p_value >= UNLIKELY:
+        return words + f" (ratio {ratio:.2f}): the covariance can be believed"
+    return (
+        words + f" (ratio {ratio:.2f}; chance {max(field.p_value, 1e-12):.0e}): the halves "
+        "disagree, so something that the model does not know acts; every stated standard "
+        "deviation is too small by about this ratio"
+    )

@@ -116,8 +116,8 @@ def growth(name: str, size: str) -> dict[str, Any]:
     return out
 
 
-def in_process(kind: str, name: str, size: str, limit_s: float) -> dict[str, Any] | None:
-    """The result of a run in a process of its own; None when it takes longer than the limit."""
+def in_process(kind: str, name: str, size: str, limit_s: float) -> dict[str, Any]:
+    """The result of a run in a process of its own, or the limit that it went beyond."""
     environment = os.environ | dict.fromkeys(
         ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
     )
@@ -127,7 +127,7 @@ def in_process(kind: str, name: str, size: str, limit_s: float) -> dict[str, Any
             command, env=environment, capture_output=True, text=True, timeout=limit_s, check=False
         )
     except subprocess.TimeoutExpired:
-        return None
+        return {"beyond": limit_s}
     if done.returncode:
         return {"error": done.stderr.strip().splitlines()[-1]}
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
@@ -138,7 +138,7 @@ def table(runs: dict[str, dict[str, Any]], names: list[str]) -> list[str]:
     """One line per size."""
     lines = ["| views x dots | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
     for size, found in runs.items():
-        least = min(r["cost"] for r in found.values() if r and "cost" in r)
+        least = min((r["cost"] for r in found.values() if "cost" in r), default=np.nan)
         cells = [cell(found.get(name), least) for name in names]
         lines.append(f"| {size} | {' | '.join(cells)} |")
     return lines
@@ -147,6 +147,8 @@ def table(runs: dict[str, dict[str, Any]], names: list[str]) -> list[str]:
 def cell(run: dict[str, Any] | None, least: float) -> str:
     if run is None:
         return "-"
+    if "beyond" in run:
+        return f"more than {run['beyond']:.0f} s"
     if "error" in run:
         return str(run["error"])
     text = f"{run['seconds']:.3g} s, {run['iterations']} it., {run['peak_mb']:.0f} MB"
@@ -172,7 +174,7 @@ def growth_table(limit_s: float) -> list[str]:
         "|---|---|---|---|---|---|---|---|",
     ]
     for size in GROWTH:
-        plain, loops = (in_process("growth", n, size, limit_s) or {} for n in ("numpy", "numba"))
+        plain, loops = (in_process("growth", n, size, limit_s) for n in ("numpy", "numba"))
         if "step" not in plain:
             continue
         cells = [plain["images"], plain["trial"], plain["step"], sum(plain.values())]

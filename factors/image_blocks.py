@@ -76,19 +76,34 @@ def view_from_camera_tangent(rotation: Array, offset: Array) -> Array:
     return out
 
 
+def view_gram(state: State, rows: ImageRows, rho_mm: tuple[float, ...]) -> Array:
+    """(I, 7, 7) products of the view's columns and the residual, for fits of views alone."""
+    return _gram(_all_columns(state, rows, rho_mm, ())[0])
+
+
 def image_blocks(
     state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int]
 ) -> ImageBlocks:
     """free : the intrinsics of interest, indices into `PARAMETERS`, the same for all cameras."""
-    rotation, offset = camera_from_target(state, rows)
-    at = placed(state, rows, rotation, offset)
-    columns = columns_of(at, planes.lens_of(state.intrinsics, rho_mm, rows), rows, free)
-    images, count, _, width = columns.shape
-    flat = columns.reshape(images, count, 2 * width)
+    columns, moved = _all_columns(state, rows, rho_mm, free)
     by_dot = columns[:, :, None, 0] * columns[:, None, 3:6, 0]
     by_dot += columns[:, :, None, 1] * columns[:, None, 3:6, 1]
-    gram = flat @ np.swapaxes(flat, -1, -2)
-    return ImageBlocks(gram, by_dot, view_from_camera_tangent(rotation, offset))
+    return ImageBlocks(_gram(columns), by_dot, moved)
+
+
+def _all_columns(
+    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int]
+) -> tuple[Array, Array]:
+    """`columns_of` and `view_from_camera_tangent`."""
+    rotation, offset = camera_from_target(state, rows)
+    at = placed(state, rows, rotation, offset)
+    lens = planes.lens_of(state.intrinsics, rho_mm, rows)
+    return columns_of(at, lens, rows, free), view_from_camera_tangent(rotation, offset)
+
+
+def _gram(columns: Array) -> Array:
+    flat = columns.reshape(*columns.shape[:2], -1)
+    return np.asarray(flat @ np.swapaxes(flat, -1, -2))
 
 
 def columns_of(at: Placed, lens: Lens, rows: ImageRows, free: Sequence[int]) -> Array:

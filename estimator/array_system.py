@@ -7,12 +7,17 @@ normal equations in blocks. Cost, information and minimum are the graph's; tests
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from telerig.estimator.normal_equations import NormalEquations
 from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem, parameter_unit, prior_sigma
+from telerig.estimator.schur import Group
 from telerig.factors.image_blocks import (
     ImageBlocks,
     image_blocks,
@@ -25,6 +30,19 @@ from telerig.rig.pose import rotation_from_rotvec
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+MANY = 40_000
+"""Measured dots from which loading compiled loops is worth its second."""
+
+
+@cache
+def compiled_loops() -> Any:
+    """The module `telerig.factors.image_loops`, or None where numba is not installed."""
+    try:
+        return import_module("telerig.factors.image_loops")
+    except ImportError:
+        return None
 
 
 class ArraySystem:
@@ -45,6 +63,8 @@ class ArraySystem:
         sizes = [len(f) for f in self.free] + [6] * (len(problem.cameras) - 1)
         self.edges = np.r_[0, np.cumsum(sizes)]
         self.dot_weight = np.ascontiguousarray(problem.dot_sigma_mm.T**-2.0)
+        self.loops: Any = compiled_loops() if len(problem.view) >= MANY else None
+        self.groups = seen_together(problem, int(self.edges[-1]))
         self.loose_mm = 10 * max(problem.rho_mm)
 
     def _pick(self, free: Ints, unit: Array) -> tuple[Ints, Array]:
@@ -62,7 +82,11 @@ class ArraySystem:
 
     def cost(self, state: State) -> float:
         """Half the sum of the squared residuals, without derivatives."""
-        twice = sum(squared_error(state, rows, self.problem.rho_mm) for rows in self.chunks)
+        twice = 0.0
+        for rows in self.chunks:
+            own = self.loops is not None and self.loops.handles(state, rows, self.any_free)
+            error = self.loops.squared_error if own else squared_error
+            twice += error(state, rows, self.problem.rho_mm)
         return 0.5 * (twice + self.prior_cost(state))
 
     def linearised(self, state: State) -> NormalEquations:
@@ -131,16 +155,31 @@ class _Sums:
     def equations(self) -> NormalEquations:
         system = self.system
         for rows in system.chunks:
-            blocks = image_blocks(self.state, rows, system.problem.rho_mm, system.any_free)
-            self._add(rows, blocks)
+            given = (self.state, rows, system.problem.rho_mm, system.any_free)
+            if system.loops is not None and system.loops.handles(self.state, rows, system.any_free):
+                self._add_compiled(rows, system.loops.image_columns(*given))
+            else:
+                self._add(rows, image_blocks(*given))
+        return self.with_priors()
+
+    def with_priors(self) -> NormalEquations:
+        """With what has been summed so far."""
         row = self._add_priors()
         right = np.concatenate(
             [p.ravel() for p in (self.right_shared, self.right_views, self.right_dots.T)]
         )
-        cost = 0.5 * (self.twice + system.prior_cost(self.state))
+        cost = 0.5 * (self.twice + self.system.prior_cost(self.state))
         by_view = self.by_view.reshape(len(self.shared), -1)
         return NormalEquations(
-            cost, self.shared, by_view, self.views, self.dots, self.cross, right, row
+            cost,
+            self.shared,
+            by_view,
+            self.views,
+            self.dots,
+            self.cross,
+            right,
+            row,
+            self.system.groups,
         )
 
     def _add(self, rows: ImageRows, blocks: ImageBlocks) -> None:
@@ -151,6 +190,18 @@ class _Sums:
                 self._add_dots(camera, view, blocks.by_dot[images], turn)
             else:
                 self._add_entries(camera, view, blocks.by_dot[images], turn, rows.entries[k])
+
+    def _add_compiled(self, rows: ImageRows, blocks: Any) -> None:
+        count = self.dots.shape[-1]
+        for camera, images in rows.cameras:
+            moved = blocks.view_from_camera[images]
+            self._add_gram(camera, rows.view[images], blocks.gram[images], moved)
+            total = np.zeros((blocks.gram.shape[-1] - 3, 3, count))
+            turned = np.zeros((6 if camera else 0, 3, count))
+            self.system.loops.add_dots(blocks, images, rows, self.cross_views, total, turned)
+            self._add_totals(camera, total, slice(None))
+            if camera:
+                self.cross[self.system.pose_of(camera)] += turned
 
     def _add_gram(self, camera: int, view: Ints, gram: Array, moved: Array) -> None:
         """gram : (I, K, K) of the chunk's columns; moved : (I, 6, 6) of the camera's pose."""
@@ -178,7 +229,9 @@ class _Sums:
 
     def _add_dots(self, camera: int, view: Ints, by_dot: Array, moved: Array) -> None:
         """by_dot : (I, K, 3, N), a place for every dot."""
-        self.cross_views[view] += by_dot[:, :6]
+        # a slice is added in place, an index array by way of two copies
+        whole = view[-1] - view[0] + 1 == len(view)
+        self.cross_views[slice(view[0], view[-1] + 1) if whole else view] += by_dot[:, :6]
         self._add_totals(camera, by_dot[:, 3:].sum(0), slice(None))
         if camera:
             count = by_dot.shape[-1]
@@ -193,11 +246,10 @@ class _Sums:
         values = by_dot[entries.image, :, :, entries.slot]
         # an image sees a dot once, so that no two rows add to the same place
         self.cross_views[view[entries.image], :, :, entries.dot] += values[:, :6]
-        total = np.add.reduceat(values[:, 3:], entries.first, axis=0)
-        self._add_totals(camera, total.transpose(1, 2, 0), entries.distinct)
+        self._add_totals(camera, _by_dot(values[:, 3:], entries), entries.distinct)
         if camera:
             turned = np.swapaxes(moved[entries.image], -1, -2) @ values[:, :6]
-            total = np.add.reduceat(turned, entries.first, axis=0).transpose(1, 2, 0)
+            total = _by_dot(turned, entries)
             self.cross[self.system.pose_of(camera), :, entries.distinct] += total
 
     def _add_totals(self, camera: int, total: Array, at: Ints | slice) -> None:
@@ -233,6 +285,46 @@ class _Sums:
         value, jacobian = distance_residual(state.dots_mm, *problem.scale)
         self.right_dots -= (jacobian[0] * value[0]).reshape(-1, 3).T
         return np.asarray(jacobian[0])
+
+
+TOGETHER = 64
+"""Dots of a group: more are fewer products, fewer are seen by fewer views."""
+
+
+def seen_together(problem: Problem, shared: int) -> tuple[Group, ...]:
+    """Neighbouring dots with the rows of views that see any; () where that saves less than half."""
+    count, views = len(problem.dot_ids), len(problem.views)
+    used = problem.weight > 0
+    seen = np.zeros((count, views), bool)
+    seen[problem.dot[used], problem.view[used]] = True
+    if seen.mean() > 0.5 or 2 * views > count:
+        return ()
+    groups, work = [], 0.0
+    for dots in _halved(np.arange(count), problem.nominal_mm):
+        of_views = shared + 6 * np.flatnonzero(seen[dots].any(0))[:, None] + np.arange(6)
+        rows = np.concatenate([np.arange(shared), of_views.ravel()])
+        groups.append(Group(dots, rows))
+        work += len(dots) * len(rows) ** 2
+    return tuple(groups) if work < 0.5 * count * (shared + 6 * views) ** 2 else ()
+
+
+def _by_dot(values: Array, entries: Entries) -> Array:
+    """(r, k, 3) -> (k, 3, n) summed over the images that see each dot."""
+    count = len(values)
+    edges = np.append(entries.first, count)
+    summing = csr_array((np.ones(count), entries.order, edges), shape=(len(edges) - 1, count))
+    total = summing @ values.reshape(count, -1)
+    return np.asarray(total.reshape(-1, *values.shape[1:]).transpose(1, 2, 0))
+
+
+def _halved(dots: Ints, places: Array) -> list[Ints]:
+    """Neighbours in groups, by halving along the longer side."""
+    if len(dots) <= TOGETHER:
+        return [dots]
+    along = int(np.argmax(np.ptp(places[dots], axis=0)))
+    order = dots[np.argsort(places[dots, along], kind="stable")]
+    middle = len(order) // 2
+    return _halved(order[:middle], places) + _halved(order[middle:], places)
 
 
 def _retracted(pose: Array, tangent: Array) -> Array:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
-from telerig.errors import CalibrationError
 from telerig.estimator.graph import Solution
-from telerig.estimator.problem import Problem
+from telerig.estimator.problem import Problem, parameter_unit
+from telerig.estimator.schur import Posterior
 from telerig.factors.projection import whitened_residuals
 from telerig.rig.camera import Camera
 from telerig.rig.pose import hat
@@ -20,18 +19,23 @@ from telerig.rig.triangulation import stacked_jacobian
 Array = NDArray[np.float64]
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
+WHOLE = 4000
+"""Numbers in a calibration up to which the covariance of all with all is kept."""
 
 
 @dataclass(frozen=True)
 class JointCovariance:
     """matrix : (D, D) in physical units; names : D strings, ``left.k1``, ``view 03.rx_rad``.
 
+    Of a calibration of more than `WHOLE` numbers, cameras and views only.
     Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
+    dots : (N, 3, 3) of each dot.
     leverage : (M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs.
     """
 
     names: tuple[str, ...]
     matrix: Array
+    dots: Array
     rig: int
     leverage: Array
 
@@ -46,39 +50,33 @@ class JointCovariance:
 
 
 def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
-    """Inverse of the information at the solution, equilibrated before it is factorised.
+    """Inverse of the information at the solution, from the solver's own factorisation.
 
     What no measurement touches (the pose of a view that was left out) is infinitely uncertain.
 
     Raises CalibrationError when it is singular to working precision.
     """
-    information = solution.information
-    untouched = np.diag(information) <= 0
-    information = information + np.diag(untouched.astype(float))
-    scale = 1 / np.sqrt(np.diag(information))
-    equilibrated = information * scale[:, None] * scale
-    try:
-        factor = cho_factor(equilibrated)
-    except np.linalg.LinAlgError as error:
-        raise CalibrationError(
-            "the measurements leave a direction of the calibration undetermined",
-            todo="add views with other tilts, or fix the model with --model",
-        ) from error
-    inverse = cho_solve(factor, np.eye(len(scale))) * scale[:, None] * scale
-    units = _units(problem, len(scale))
-    names = _names(problem)
+    size = solution.slots["dots"][0].stop
+    posterior = solution.equations.posterior(whole=size <= WHOLE)
+    matrix = posterior.common if posterior.whole is None else posterior.whole
+    matrix = matrix.copy()
+    untouched = posterior.untouched[: len(matrix)]
+    matrix[untouched, untouched] = np.inf
+    units = _units(problem, len(matrix))
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
-    leverage = hat_matrix_blocks(problem, solution, inverse)
-    inverse[untouched, untouched] = np.inf
-    return JointCovariance(names, inverse * units[:, None] * units, rig, leverage)
+    leverage = hat_matrix_blocks(problem, solution, posterior)
+    names = _names(problem)[: len(matrix)]
+    matrix *= units[:, None] * units
+    return JointCovariance(names, matrix, posterior.dots, rig, leverage)
 
 
 def _units(problem: Problem, size: int) -> Array:
     units = np.ones(size)
     at = 0
-    for unit in problem.keys().unit:
-        units[at : at + len(unit)] = unit
-        at += len(unit)
+    for c, camera in enumerate(problem.cameras):
+        free = problem.free_indices(c)
+        units[at : at + len(free)] = parameter_unit(camera)[free]
+        at += len(free)
     return units
 
 
@@ -90,28 +88,27 @@ def _names(problem: Problem) -> tuple[str, ...]:
     return tuple(names)
 
 
-def hat_matrix_blocks(problem: Problem, solution: Solution, inverse: Array) -> Array:
+def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior) -> Array:
     """(M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs."""
     obs = problem.observations()
-    jac = whitened_residuals(solution.state, obs, problem.rho_mm)
-    keys, slots = problem.keys(), solution.slots
-    out = np.empty((len(obs), 2, 2))
+    slots, out = solution.slots, np.empty((len(obs), 2, 2))
+    every = np.arange(len(posterior.common))
     image = obs.view * len(problem.cameras) + obs.camera
-    for k in np.unique(image):
-        rows = np.flatnonzero(image == k)
-        v, c = divmod(int(k), len(problem.cameras))
-        parts = [jac.by_intrinsics[rows][..., keys.free[c]] * keys.unit[c], jac.by_view[rows]]
-        where = [np.arange(len(inverse))[s] for s in (slots["intrinsics"][c], slots["view"][v])]
-        if c:
-            parts.append(jac.by_camera[rows])
-            where.append(np.arange(len(inverse))[slots["camera"][c]])
-        common = np.concatenate(parts, -1)
-        index = np.concatenate(where)
-        dots = slots["dots"][0].start + 3 * obs.dot[rows][:, None] + np.arange(3)
-        every = np.concatenate([np.broadcast_to(index, (len(rows), len(index))), dots], 1)
-        full = np.concatenate([common, jac.by_dot[rows]], -1)
-        block = inverse[every[:, :, None], every[:, None, :]]
-        out[rows] = full @ block @ np.swapaxes(full, -1, -2)
+    order = np.argsort(image, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(image[order])) + 1):
+        v, c, dot = int(obs.view[rows[0]]), int(obs.camera[rows[0]]), obs.dot[rows]
+        jac = whitened_residuals(solution.state, obs.subset(rows), problem.rho_mm)
+        free = problem.free_indices(c)
+        lens = jac.by_intrinsics[..., free] * parameter_unit(problem.cameras[c])[free]
+        pose = [jac.by_camera] if c else []
+        common, own = np.concatenate([lens, *pose, jac.by_view], -1), jac.by_dot
+        places = (slots["intrinsics"][c], slots["camera"][c], slots["view"][v])
+        index = np.concatenate([every[place] for place in places])
+        across = posterior.cross[index][:, dot].swapaxes(0, 1)
+        mixed = common @ across @ np.swapaxes(own, -1, -2)
+        alone = common @ posterior.common[np.ix_(index, index)] @ np.swapaxes(common, -1, -2)
+        of_dots = own @ posterior.dots[dot] @ np.swapaxes(own, -1, -2)
+        out[rows] = alone + mixed + np.swapaxes(mixed, -1, -2) + of_dots
     return out
 
 

@@ -16,12 +16,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.array_system import ArraySystem
+from telerig.estimator.normal_equations import NormalEquations
 from telerig.estimator.problem import (
     GAUGE_SIGMA_MM,
     Problem,
     parameter_unit,
     prior_sigma,
 )
+from telerig.estimator.schur import Posterior
 from telerig.factors.priors import (
     custom_factor,
     depth_gauge_residual,
@@ -38,14 +40,57 @@ Progress = Callable[[int, float], None]
 
 
 @dataclass(frozen=True)
+class DenseEquations:
+    """J^T J and -J^T r of the whole graph.
+
+    common : how many numbers come before the dots.
+    """
+
+    matrix: Array
+    gradient: Array
+    common: int
+
+    def information(self) -> Array:
+        return self.matrix
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """Damped step, and the decrease of the cost that it promises."""
+        return _damped_step(self.matrix, self.gradient, damping)
+
+    def posterior(self, whole: bool) -> Posterior:
+        """The inverse of J^T J, equilibrated before it is factorised; all of it in any case.
+
+        Raises CalibrationError when it is singular to working precision.
+        """
+        del whole
+        untouched = np.diag(self.matrix) <= 0
+        matrix = self.matrix + np.diag(untouched.astype(float))
+        scale = 1 / np.sqrt(np.diag(matrix))
+        try:
+            factor = cho_factor(matrix * scale[:, None] * scale)
+        except np.linalg.LinAlgError as error:
+            raise CalibrationError(
+                "the measurements leave a direction of the calibration undetermined",
+                todo="add views with other tilts, or fix the model with --model",
+            ) from error
+        inverse = cho_solve(factor, np.eye(len(scale))) * scale[:, None] * scale
+        return Posterior.of(inverse, self.common, untouched)
+
+
+@dataclass(frozen=True)
 class Solution:
     """State at the minimum; ``cost`` = half the sum of squared whitened residuals and priors."""
 
     state: State
     cost: float
     iterations: int
-    information: Array
+    equations: DenseEquations | NormalEquations
     slots: dict[str, list[slice]]
+
+    @property
+    def information(self) -> Array:
+        """(D, D) dense J^T J."""
+        return self.equations.information()
 
 
 def build(problem: Problem, start: State) -> tuple[Any, Any, ImageKeys]:
@@ -145,21 +190,6 @@ def _ordering(problem: Problem, keys: ImageKeys) -> Any:
     return ordering
 
 
-@dataclass(frozen=True)
-class DenseEquations:
-    """J^T J and -J^T r of the whole graph."""
-
-    matrix: Array
-    gradient: Array
-
-    def information(self) -> Array:
-        return self.matrix
-
-    def step(self, damping: float) -> tuple[Array, float]:
-        """Damped step, and the decrease of the cost that it promises."""
-        return _damped_step(self.matrix, self.gradient, damping)
-
-
 class GraphSystem:
     """A problem as GTSAM's graph; points are `gtsam.Values`."""
 
@@ -175,7 +205,8 @@ class GraphSystem:
         return float(self.graph.error(values))
 
     def linearised(self, values: Any) -> DenseEquations:
-        return DenseEquations(*self.graph.linearize(values).hessian(self.ordering))
+        matrix, gradient = self.graph.linearize(values).hessian(self.ordering)
+        return DenseEquations(matrix, gradient, slots(self.problem)["dots"][0].start)
 
     def moved(self, values: Any, step: Array) -> Any:
         return values.retract(_vector_values(step, self.keys, self.problem))
@@ -231,8 +262,7 @@ def solve(
             damping *= 10
             if damping > 1e12:
                 break
-    information = equations.information()
-    return Solution(system.state(point), float(cost), iteration, information, slots(problem))
+    return Solution(system.state(point), float(cost), iteration, equations, slots(problem))
 
 
 def _cost(system: Any, point: Any) -> float:

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from telerig.estimator.graph import solve
 from telerig.estimator.model_start import model_start
 from telerig.estimator.problem import Problem
-from telerig.factors.projection import State, pixels, whitened_error, whitened_residuals
+from telerig.factors.image_blocks import view_gram
+from telerig.factors.image_rows import in_chunks
+from telerig.factors.projection import State, pixels, whitened_error
 from telerig.io.parallel import ordered_map, quick_workers
 from telerig.rig.pose import rotation_from_rotvec
 
@@ -48,14 +50,16 @@ class Rung:
 
 def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
     """Refine every view's pose with cameras and dots held: Gauss-Newton on 6 unknowns a view."""
-    obs = problem.observations()
+    chunks = in_chunks(problem.observations(), len(problem.dot_ids))
     views = state.rig_from_target.copy()
     for _ in range(steps):
-        jac = whitened_residuals(replace(state, rig_from_target=views), obs, problem.rho_mm)
         normal = np.tile(1e-9 * np.eye(6), (len(views), 1, 1))
         right = np.zeros((len(views), 6))
-        np.add.at(normal, obs.view, np.swapaxes(jac.by_view, -1, -2) @ jac.by_view)
-        np.add.at(right, obs.view, -np.einsum("mij,mi->mj", jac.by_view, jac.value))
+        for rows in chunks:
+            gram = view_gram(replace(state, rig_from_target=views), rows, problem.rho_mm)
+            for _, images in rows.cameras:
+                normal[rows.view[images]] += gram[images, :6, :6]
+                right[rows.view[images]] -= gram[images, :6, 6]
         # a view seen by one telecentric camera has a depth that nothing moves
         normal += 1e-9 * np.trace(normal, axis1=-2, axis2=-1)[:, None, None] * np.eye(6)
         step = np.linalg.solve(normal, right[..., None])[..., 0]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.schur import Blocks, Reduced
+from telerig.estimator.schur import Blocks, Group, Posterior, Reduced
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -29,6 +29,8 @@ class NormalEquations:
     right : (S + 6 V + 3 N,).
     distance : (3 N,) row of the known distance, which couples two dots, or None; its share is in
     ``right`` but not in ``dots``.
+    groups : dots seen by the same few views, with their rows of ``cross``; none where most views
+    see most dots.
     """
 
     cost: float
@@ -39,6 +41,7 @@ class NormalEquations:
     cross: Array
     right: Array
     distance: Array | None
+    groups: tuple[Group, ...] = ()
 
     @property
     def common(self) -> int:
@@ -83,6 +86,32 @@ class NormalEquations:
         assert self.distance is not None
         return np.concatenate([np.zeros(self.common), self.distance])
 
+    def posterior(self, whole: bool) -> Posterior:
+        """The inverse of J^T J from the factorisation that a step uses.
+
+        whole : all of it, dots with dots too.
+        """
+        untouched = np.concatenate([
+            np.diag(self.shared) <= 0, np.diagonal(self.views, 0, 1, 2).ravel() <= 0,
+            np.zeros(self.dots[0].size, bool),
+        ])  # fmt: skip
+        reduced = self.without_dots()
+        row = None if self.distance is None else self.distance_row()
+        along, denominator = np.zeros(len(self.right)), 1.0
+        if row is not None:
+            along = reduced.solve(row)
+            denominator = 1 + float(row @ along)
+        if whole:
+            inverse = reduced.inverse()
+            inverse -= np.outer(along, along) / denominator
+            return Posterior.of(inverse, self.common, untouched)
+        of_common, of_dots = along[: self.common], along[self.common :].reshape(-1, 3)
+        common = reduced.inverse_kept() - np.outer(of_common, of_common) / denominator
+        dots = reduced.inverse_blocks() - of_dots[:, :, None] * of_dots[:, None] / denominator
+        cross = reduced.inverse_cross().reshape(self.common, 3, -1).swapaxes(1, 2)
+        cross = cross - of_common[:, None, None] * of_dots / denominator
+        return Posterior(common, cross, dots, None, untouched)
+
     def without_dots(self, damping: float = 0.0) -> Reduced:
         """The damped system with the dots eliminated, the distance left out."""
         size, count = self.common, self.dots.shape[-1]
@@ -90,19 +119,20 @@ class NormalEquations:
         dots[range(3), range(3)] *= 1 + damping
         whiten = _cholesky3(dots)
 
-        def forward(right: Array) -> Array:
-            shape = right.shape
-            return _forward(whiten, right.reshape(*shape[:-1], 3, count)).reshape(shape)
+        def forward(right: Array, some: Ints | slice = slice(None)) -> Array:
+            planes = right.reshape(*right.shape[:-1], 3, -1)
+            return _forward([w[some] for w in whiten], planes).reshape(right.shape)
 
-        def backward(right: Array) -> Array:
-            shape = right.shape
-            return _backward(whiten, right.reshape(*shape[:-1], 3, count)).reshape(shape)
+        def backward(right: Array, some: Ints | slice = slice(None)) -> Array:
+            planes = right.reshape(*right.shape[:-1], 3, -1)
+            return _backward([w[some] for w in whiten], planes).reshape(right.shape)
 
         matrix = self._common(_damped(self.shared, damping), _damped(self.views, damping))
         places = np.arange(count)[:, None] + count * np.arange(3)
         blocks = Blocks(forward, backward, places, dots.transpose(2, 0, 1))
         coupling = self.cross.reshape(size, -1)
-        return Reduced.of(np.arange(size), self._dot_places(), matrix, coupling, blocks)
+        kept = np.arange(size)
+        return Reduced.of(kept, self._dot_places(), matrix, coupling, blocks, self.groups)
 
     def _dot_places(self) -> Ints:
         """Where the dots' numbers stand in the graph's order, component by component."""
@@ -122,13 +152,14 @@ class NormalEquations:
         of_views = _damped(self.views, damping)
         inverse = np.linalg.inv(np.linalg.cholesky(of_views))
 
-        def forward(right: Array) -> Array:
-            columns = right.reshape(-1, views, 6).transpose(1, 2, 0)
-            return (inverse @ columns).transpose(2, 0, 1).reshape(right.shape)
+        def forward(right: Array, some: Ints | slice = slice(None)) -> Array:
+            columns = right.reshape(-1, right.shape[-1] // 6, 6).transpose(1, 2, 0)
+            return (inverse[some] @ columns).transpose(2, 0, 1).reshape(right.shape)
 
-        def backward(right: Array) -> Array:
-            columns = right.reshape(-1, views, 6).transpose(1, 2, 0)
-            return (np.swapaxes(inverse, -1, -2) @ columns).transpose(2, 0, 1).reshape(right.shape)
+        def backward(right: Array, some: Ints | slice = slice(None)) -> Array:
+            columns = right.reshape(-1, right.shape[-1] // 6, 6).transpose(1, 2, 0)
+            back = np.swapaxes(inverse[some], -1, -2)
+            return (back @ columns).transpose(2, 0, 1).reshape(right.shape)
 
         coupling = np.concatenate([self.by_view, self.cross[s:].reshape(6 * views, -1).T])
         kept = np.concatenate([np.arange(s), self._dot_places()])

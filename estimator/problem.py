@@ -104,13 +104,13 @@ class Problem:
     def observations(self) -> Observations:
         """The rows of positive weight, whitened with the square root of their weight."""
         keep = self.weight > 0
-        whitener = np.linalg.inv(np.linalg.cholesky(self.covariance_px2[keep]))
+        whitener = whitening(self.covariance_px2[keep])
         whitener = whitener * np.sqrt(self.weight[keep])[:, None, None]
         return self._rows(keep, whitener)
 
     def unweighted(self) -> Observations:
         """Every row, whitened by its covariance alone."""
-        whitener = np.linalg.inv(np.linalg.cholesky(self.covariance_px2))
+        whitener = whitening(self.covariance_px2)
         return self._rows(np.ones(len(self.view), bool), whitener)
 
     def _rows(self, keep: NDArray[np.bool_], whitener: Array) -> Observations:
@@ -161,6 +161,22 @@ class Problem:
             free=tuple(self.free_indices(i) for i in cameras),
             unit=tuple(parameter_unit(c)[self.free_indices(i)] for i, c in enumerate(self.cameras)),
         )
+
+
+def whitening(covariance: Array) -> Array:
+    """(M, 2, 2) covariances -> the inverses of their lower Cholesky factors.
+
+    Raises numpy.linalg.LinAlgError where one is not positive definite.
+    """
+    first, second, mixed = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 1, 0]
+    rest = second * first - mixed * mixed
+    if not (np.all(first > 0) and np.all(rest > 0)):
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    out = np.zeros_like(covariance)
+    out[:, 0, 0] = 1 / np.sqrt(first)
+    out[:, 1, 1] = np.sqrt(first / rest)
+    out[:, 1, 0] = -mixed / first * out[:, 1, 1]
+    return out
 
 
 def parameter_unit(camera: Camera) -> Array:

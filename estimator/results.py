@@ -218,8 +218,7 @@ def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dic
     leftover = dots - design @ affine
     rank = min(len(dots) - 3, len(dots))
     factor = np.sqrt(len(dots) / max(rank, 1))
-    start = joint.names.index(f"dot {problem.dot_ids[0]}.x_mm")
-    sd = np.sqrt(np.diag(joint.matrix)[start:]).reshape(-1, 3)
+    sd = np.sqrt(np.diagonal(joint.dots, 0, 1, 2))
     stretch = np.linalg.svd(affine[:2, :2], compute_uv=False)
     return {
         "target_rms_from_nominal_mm": float(np.sqrt(((dots - nominal)[:, :2] ** 2).mean())),

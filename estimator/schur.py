@@ -9,8 +9,9 @@ of the inverse: all of it, or one side and the diagonal blocks of the other.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +24,40 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+class Whiten(Protocol):
+    """W^-1 or W^-T on vectors (..., E), or on the numbers of some of the blocks alone."""
+
+    def __call__(self, right: Array, some: Ints | slice = ...) -> Array: ...
+
+
 @dataclass(frozen=True)
 class Blocks:
     """The block-diagonal side D = W W^T, its E numbers in any order.
 
-    forward, backward : W^-1 and W^-T on vectors (..., E).  places : (B, n) where the numbers of
-    each block stand.  matrix : (B, n, n), D itself.
+    forward : W^-1.  backward : W^-T.  places : (B, n) where the numbers of each block stand.
+    matrix : (B, n, n), D itself.
     """
 
-    forward: Callable[[Array], Array]
-    backward: Callable[[Array], Array]
+    forward: Whiten
+    backward: Whiten
     places: Ints
+    matrix: Array
+
+
+@dataclass(frozen=True)
+class Group:
+    """Some of the blocks, and the rows of E that are not zero there."""
+
+    blocks: Ints
+    rows: Ints
+
+
+@dataclass(frozen=True)
+class Piece:
+    """F where it is not zero: rows, columns, and the matrix there."""
+
+    rows: Ints | slice
+    columns: Ints | slice
     matrix: Array
 
 
@@ -41,40 +65,57 @@ class Blocks:
 class Reduced:
     """kept, eliminated : where the numbers of either side stand in the whole vector.
 
-    whitened : (K, E) F.  factor : lower Cholesky factor of S, in Fortran's order.
+    pieces : F.  factor : lower Cholesky factor of S, in Fortran's order.
     """
 
     kept: Ints
     eliminated: Ints
-    whitened: Array
+    pieces: list[Piece]
     factor: Array
     blocks: Blocks
 
     @staticmethod
-    def of(kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Blocks) -> Reduced:
-        """matrix : (K, K), which is overwritten.  coupling : (K, E).
+    def of(
+        kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Blocks,
+        groups: Sequence[Group] = (),
+    ) -> Reduced:  # fmt: skip
+        """matrix : (K, K), which is overwritten.  coupling : (K, E); groups : where it is not zero.
 
         Raises CalibrationError when the whole is not positive definite to working precision.
         """
-        whitened = blocks.forward(coupling)
-        # a C-ordered array is its transpose in Fortran's order, here that of a symmetric matrix
-        schur = dsyrk(-1.0, whitened.T, 1.0, matrix.T, trans=1, lower=1, overwrite_c=1)
+        every = slice(None)
+        if groups:
+            pieces = [_piece(coupling, blocks, group) for group in groups]
+            for piece in pieces:
+                share = piece.matrix @ piece.matrix.T
+                matrix[np.ix_(np.asarray(piece.rows), np.asarray(piece.rows))] -= share
+            schur = matrix.T
+        else:
+            pieces = [Piece(every, every, blocks.forward(coupling))]
+            whitened = pieces[0].matrix.T
+            # a C-ordered array is its transpose in Fortran's order, here of a symmetric matrix
+            schur = dsyrk(-1.0, whitened, 1.0, matrix.T, trans=1, lower=1, overwrite_c=1)
         factor, failed = dpotrf(schur, lower=1, overwrite_a=1, clean=0)
         if failed:
             raise CalibrationError(
                 "the measurements leave a direction of the calibration undetermined",
                 todo="add views with other tilts, or fix the model with --model",
             )
-        return Reduced(kept, eliminated, whitened, factor, blocks)
+        return Reduced(kept, eliminated, pieces, factor, blocks)
 
     def solve(self, right: Array) -> Array:
         """right : (D,) or (D, k)."""
         columns = right.reshape(len(right), -1)
         inner = self.blocks.forward(columns[self.eliminated].T)
-        first, _ = dpotrs(self.factor, columns[self.kept] - self.whitened @ inner.T, lower=1)
+        of_kept = columns[self.kept]
+        for piece in self.pieces:
+            of_kept[piece.rows] -= piece.matrix @ inner[:, piece.columns].T
+        first, _ = dpotrs(self.factor, of_kept, lower=1)
+        for piece in self.pieces:
+            inner[:, piece.columns] -= first[piece.rows].T @ piece.matrix
         out = np.empty_like(columns)
         out[self.kept] = first
-        out[self.eliminated] = self.blocks.backward(inner - first.T @ self.whitened).T
+        out[self.eliminated] = self.blocks.backward(inner).T
         return out.reshape(right.shape)
 
     def inverse_kept(self) -> Array:
@@ -85,15 +126,26 @@ class Reduced:
 
     def _through(self) -> Array:
         """(K, E) chol(S)^-1 F W^-1: D^-1 plus its square is the eliminated side's inverse."""
-        half = dtrsm(1.0, self.factor, self.whitened, lower=1)
+        whitened = np.zeros((len(self.kept), len(self.eliminated)))
+        for piece in self.pieces:
+            part = np.zeros((len(self.kept), piece.matrix.shape[1]))
+            part[piece.rows] = piece.matrix
+            whitened[:, piece.columns] = part
+        half = dtrsm(1.0, self.factor, whitened, lower=1)
         return self.blocks.backward(np.ascontiguousarray(half))
+
+    def inverse_cross(self) -> Array:
+        """(K, E) block of the inverse."""
+        return np.asarray(-dtrsm(1.0, self.factor, self._through(), lower=1, trans_a=1))
 
     def inverse_blocks(self) -> Array:
         """(B, n, n) diagonal blocks of the inverse, of the eliminated side."""
+        out = np.linalg.inv(self.blocks.matrix)
+        places = self.blocks.places
         through = self._through()
-        parts = [through[:, places] for places in self.blocks.places.T]
+        parts = [through[:, at] for at in places.T]
         square = np.array([[np.einsum("kb,kb->b", a, b) for b in parts] for a in parts])
-        return np.asarray(np.linalg.inv(self.blocks.matrix) + np.moveaxis(square, -1, 0))
+        return np.asarray(out + np.moveaxis(square, -1, 0))
 
     def inverse(self) -> Array:
         """(D, D) all of the inverse."""
@@ -108,3 +160,34 @@ class Reduced:
         out[np.ix_(self.eliminated, self.kept)] = across.T
         out[np.ix_(self.eliminated, self.eliminated)] = own
         return out
+
+
+def _piece(coupling: Array, blocks: Blocks, group: Group) -> Piece:
+    columns = blocks.places[group.blocks].T.ravel()
+    matrix = blocks.forward(coupling[np.ix_(group.rows, columns)], group.blocks)
+    return Piece(group.rows, columns, matrix)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The inverse of J^T J, or what was asked of it; C = intrinsics, camera poses and views.
+
+    common : (C, C).  cross : (C, N, 3) with each dot.  dots : (N, 3, 3).
+    whole : (C + 3 N, C + 3 N) or None.
+    untouched : (C + 3 N,) what no measurement or prior reaches; its variance here is 1.
+    """
+
+    common: Array
+    cross: Array
+    dots: Array
+    whole: Array | None
+    untouched: NDArray[np.bool_]
+
+    @staticmethod
+    def of(whole: Array, common: int, untouched: NDArray[np.bool_]) -> Posterior:
+        """From all of the inverse."""
+        at = common + np.arange(len(whole) - common).reshape(-1, 3)
+        cross = whole[:common, common:].reshape(common, -1, 3)
+        return Posterior(
+            whole[:common, :common], cross, whole[at[:, :, None], at[:, None, :]], whole, untouched
+        )

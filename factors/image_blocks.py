@@ -38,56 +38,72 @@ class ImageBlocks:
 
 @dataclass(frozen=True)
 class Placed:
-    """rotation, offset : (I, 3, 3), (I, 3, 1) camera from target.
-
-    target, camera : (I, 3, m) dots in either frame.
-    """
+    """rotation : (I, 3, 3) camera from target.  target, camera : (I, 3, m) dots in either frame."""
 
     rotation: Array
-    offset: Array
     target: Array
     camera: Array
 
 
-def placed(state: State, rows: ImageRows) -> Placed:
-    """The dots as `telerig.factors.projection.camera_points` has them."""
+def camera_from_target(state: State, rows: ImageRows) -> tuple[Array, Array]:
+    """(I, 3, 3) rotation and (I, 3, 1) translation of every image."""
     view, camera = state.rig_from_target[rows.view], state.rig_from_camera[rows.camera]
     camera_from_rig = np.swapaxes(camera[:, :3, :3], -1, -2)
     rotation = camera_from_rig @ view[:, :3, :3]
-    offset = camera_from_rig @ (view[:, :3, 3:] - camera[:, :3, 3:])
+    return rotation, camera_from_rig @ (view[:, :3, 3:] - camera[:, :3, 3:])
+
+
+def placed(state: State, rows: ImageRows, rotation: Array, offset: Array) -> Placed:
+    """The dots as `telerig.factors.projection.camera_points` has them."""
     dots = np.take(state.dots_mm.T, rows.dot, axis=1)
     if np.any(rows.plate_shift):
         shift, _ = apparent_shift_mm(np.abs(rotation[:, 2, 2]), *rows.plate)
         dots[2] += (rows.plate_shift * shift)[:, None]
     target = dots.transpose(1, 0, 2)
-    return Placed(rotation, offset, target, rotation @ target + offset)
+    return Placed(rotation, target, rotation @ target + offset)
 
 
-def view_from_camera_tangent(at: Placed) -> Array:
+def view_from_camera_tangent(rotation: Array, offset: Array) -> Array:
     """(I, 6, 6): the view's right perturbation that does to pixels what the camera's does.
 
     rig_from_camera exp(w) moves camera_from_target by exp(-w) on the left, which is minus the
     adjoint of target_from_camera on the right (GTSAM's order: rotation, translation).
     """
-    back = np.swapaxes(at.rotation, -1, -2)
+    back = np.swapaxes(rotation, -1, -2)
     out = np.zeros((len(back), 6, 6))
     out[:, :3, :3] = out[:, 3:, 3:] = -back
-    out[:, 3:, :3] = hat((back @ at.offset)[..., 0]) @ back
+    out[:, 3:, :3] = hat((back @ offset)[..., 0]) @ back
     return out
+
+
+def view_gram(state: State, rows: ImageRows, rho_mm: tuple[float, ...]) -> Array:
+    """(I, 7, 7) products of the view's columns and the residual, for fits of views alone."""
+    return _gram(_all_columns(state, rows, rho_mm, ())[0])
 
 
 def image_blocks(
     state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int]
 ) -> ImageBlocks:
     """free : the intrinsics of interest, indices into `PARAMETERS`, the same for all cameras."""
-    at = placed(state, rows)
-    columns = columns_of(at, planes.lens_of(state.intrinsics, rho_mm, rows), rows, free)
-    images, count, _, width = columns.shape
-    flat = columns.reshape(images, count, 2 * width)
+    columns, moved = _all_columns(state, rows, rho_mm, free)
     by_dot = columns[:, :, None, 0] * columns[:, None, 3:6, 0]
     by_dot += columns[:, :, None, 1] * columns[:, None, 3:6, 1]
-    gram = flat @ np.swapaxes(flat, -1, -2)
-    return ImageBlocks(gram, by_dot, view_from_camera_tangent(at))
+    return ImageBlocks(_gram(columns), by_dot, moved)
+
+
+def _all_columns(
+    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int]
+) -> tuple[Array, Array]:
+    """`columns_of` and `view_from_camera_tangent`."""
+    rotation, offset = camera_from_target(state, rows)
+    at = placed(state, rows, rotation, offset)
+    lens = planes.lens_of(state.intrinsics, rho_mm, rows)
+    return columns_of(at, lens, rows, free), view_from_camera_tangent(rotation, offset)
+
+
+def _gram(columns: Array) -> Array:
+    flat = columns.reshape(*columns.shape[:2], -1)
+    return np.asarray(flat @ np.swapaxes(flat, -1, -2))
 
 
 def columns_of(at: Placed, lens: Lens, rows: ImageRows, free: Sequence[int]) -> Array:
@@ -211,7 +227,8 @@ def _add_plate_slopes(out: Array, rotation: Array, rows: ImageRows) -> None:
 
 def squared_error(state: State, rows: ImageRows, rho_mm: tuple[float, ...]) -> float:
     """Sum of the squared whitened residuals of a chunk."""
-    at, lens = placed(state, rows), planes.lens_of(state.intrinsics, rho_mm, rows)
+    at = placed(state, rows, *camera_from_target(state, rows))
+    lens = planes.lens_of(state.intrinsics, rho_mm, rows)
     seen = planes.ideal(at.camera, lens, rows, derivatives=False)
     r2 = seen.x * seen.x + seen.y * seen.y
     xd, yd = planes.distorted(seen.x, seen.y, r2, lens)

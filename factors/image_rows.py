@@ -27,15 +27,16 @@ DENSE = 0.6
 
 @dataclass(frozen=True)
 class Entries:
-    """The measured dots of one camera in a chunk, sorted by dot: which of the camera's images,
-    slot and dot, (r,) each.
+    """The measured dots of one camera in a chunk, image by image.
 
-    distinct : the dots there are.  first : where each begins.
+    image, slot, dot : (r,) which of the camera's images, its column, its dot.
+    order : (r,) sorts them by dot.  distinct : the dots there are.  first : where each begins.
     """
 
     image: Ints
     slot: Ints
     dot: Ints
+    order: Ints
     distinct: Ints
     first: Ints
 
@@ -111,4 +112,4 @@ def _padded(
 def _entries(image: Ints, slot: Ints, dot: Ints) -> Entries:
     order = np.argsort(dot, kind="stable")
     distinct, first = np.unique(dot[order], return_index=True)
-    return Entries(image[order] - image.min(), slot[order], dot[order], distinct, first)
+    return Entries(image - image.min(), slot, dot, order, distinct, first)

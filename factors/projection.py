@@ -7,7 +7,7 @@ factor of one image reads its rows from an evaluation that all images share (`Im
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -57,6 +57,11 @@ class Observations:
     plate_shift: Array
     plate: tuple[float, float] = (0.0, 1.5)
     walls: tuple[Wall | None, ...] = ()
+
+    def subset(self, rows: Ints) -> Observations:
+        """Only some of the measurements."""
+        parts = {n: getattr(self, n)[rows] for n in ("view", "camera", "dot", "uv_px", "whitener")}
+        return replace(self, **parts)
 
     def wall(self, camera: int) -> Wall | None:
         return self.walls[camera] if self.walls else None

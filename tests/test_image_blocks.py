@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from telerig.estimator import array_system, covariance
 from telerig.estimator.array_system import ArraySystem
-from telerig.estimator.problem import Problem, nominal_state
+from telerig.estimator.covariance import joint_covariance
+from telerig.estimator.graph import Solution, slots
+from telerig.estimator.problem import Problem, nominal_state, whitening
 from telerig.factors import image_rows
 from telerig.factors.image_rows import in_chunks
 from telerig.factors.projection import State, whitened_residuals
@@ -101,8 +104,17 @@ def without_images(problem: Problem, state: State) -> ArraySystem:
 
 
 def check(problem: Problem, state: State) -> None:
+    """Arrays, and compiled loops where there are any."""
+    check_system(problem, state, ArraySystem(problem, state))
+    looped = ArraySystem(problem, state)
+    looped.loops = array_system.compiled_loops()
+    if looped.loops is not None:
+        check_system(problem, state, looped)
+
+
+def check_system(problem: Problem, state: State, system: ArraySystem) -> None:
     information, right, twice = of_images(problem, state)
-    ours = ArraySystem(problem, state).linearised(state)
+    ours = system.linearised(state)
     priors = without_images(problem, state).linearised(state)
     information = information + priors.information()
     length = np.sqrt(np.maximum(np.diag(information), 1e-30))
@@ -111,7 +123,7 @@ def check(problem: Problem, state: State) -> None:
     expected = (right + priors.right) / length
     np.testing.assert_allclose(ours.right / length, expected, atol=1e-11 * np.abs(expected).max())
     assert ours.cost == pytest.approx(0.5 * twice + priors.cost, rel=1e-12)
-    assert ArraySystem(problem, state).cost(state) == pytest.approx(ours.cost, rel=1e-12)
+    assert system.cost(state) == pytest.approx(ours.cost, rel=1e-12)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -169,3 +181,115 @@ def test_every_measurement_is_in_one_chunk(rng: Any) -> None:
     assert sum(int((rows.whitener[0, 0] > 0).sum()) for rows in chunks) == len(obs)
     assert all(rows.dot.size <= 40 or len(rows.view) == 1 for rows in chunks)
     assert set(PARAMETERS) >= set(problem.free[0])
+
+
+def test_compiled_loops_are_taken_for_many_dots(rng: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("numba")
+    problem = problem_of(("k1",), rng)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    assert ArraySystem(problem, state).loops is None
+    monkeypatch.setattr(array_system, "MANY", 10)
+    assert ArraySystem(problem, state).loops is not None
+
+
+def test_whitening_is_the_inverse_cholesky_factor(rng: Any) -> None:
+    factor = rng.normal(size=(20, 2, 2))
+    covariance = factor @ np.swapaxes(factor, -1, -2) + 0.1 * np.eye(2)
+    expected = np.linalg.inv(np.linalg.cholesky(covariance))
+    np.testing.assert_allclose(whitening(covariance), expected, rtol=1e-12, atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        whitening(np.array([[[1.0, 2.0], [2.0, 1.0]]]))
+
+
+@pytest.mark.parametrize("scale", [True, False])
+def test_either_side_may_be_eliminated(scale: bool, rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    if not scale:
+        problem = replace(problem, scale=None)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    ours = ArraySystem(problem, state).linearised(state)
+    right = np.stack([ours.right, rng.normal(size=len(ours.right))], -1)
+    one, other = (r.solve(right) for r in (ours.without_dots(0.1), ours.without_views(0.1)))
+    np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9 * np.abs(one).max())
+
+
+@pytest.mark.parametrize("scale", [True, False])
+def test_posterior_in_blocks_and_whole(scale: bool, rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    if not scale:
+        problem = replace(problem, scale=None)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    ours = ArraySystem(problem, state).linearised(state)
+    information = ours.information()
+    length = np.sqrt(np.diag(information))
+    inverse = np.linalg.inv(information / np.outer(length, length)) / np.outer(length, length)
+    sd = np.sqrt(np.diag(inverse))
+    whole, parts = ours.posterior(True), ours.posterior(False)
+    assert whole.whole is not None
+    assert parts.whole is None
+    for found in (whole.whole, parts.common):
+        n = len(found)
+        assert np.abs((found - inverse[:n, :n]) / np.outer(sd[:n], sd[:n])).max() < 1e-6
+    for found in (whole.dots, parts.dots):
+        for d, block in enumerate(found):
+            at = ours.common + 3 * d + np.arange(3)
+            expected = inverse[np.ix_(at, at)]
+            np.testing.assert_allclose(block, expected, atol=1e-6 * sd[at].max() ** 2)
+    across = inverse[: ours.common, ours.common :] / np.outer(sd[: ours.common], sd[ours.common :])
+    for found in (whole.cross, parts.cross):
+        mine = found.reshape(ours.common, -1) / np.outer(sd[: ours.common], sd[ours.common :])
+        assert np.abs(mine - across).max() < 1e-6
+
+
+def test_degrees_of_freedom_are_the_trace_of_the_residuals(rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    of_these, _, _ = of_images(problem, state)
+    system = ArraySystem(problem, state)
+    equations = system.linearised(state)
+    solution = Solution(state, equations.cost, 0, equations, slots(problem))
+    found = joint_covariance(problem, solution).effective_dof
+    inverse = np.linalg.inv(equations.information())
+    assert found == pytest.approx(2 * len(problem.view) - np.trace(inverse @ of_these), rel=1e-6)
+
+
+def test_a_large_calibration_keeps_cameras_and_views(
+    rng: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = problem_of(("k1",), rng)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    equations = ArraySystem(problem, state).linearised(state)
+    solution = Solution(state, equations.cost, 0, equations, slots(problem))
+    whole = joint_covariance(problem, solution)
+    monkeypatch.setattr(covariance, "WHOLE", 10)
+    parts = joint_covariance(problem, solution)
+    n = len(parts.names)
+    assert parts.names == whole.names[:n]
+    assert n == slots(problem)["dots"][0].start
+    sd = np.sqrt(np.diag(whole.matrix)[:n])
+    difference = (parts.matrix - whole.matrix[:n, :n]) / np.outer(sd, sd)
+    assert np.abs(difference).max() < 1e-7
+    np.testing.assert_allclose(parts.dots, whole.dots, rtol=1e-6, atol=1e-12)
+    assert parts.effective_dof == pytest.approx(whole.effective_dof, rel=1e-9)
+
+
+def test_dots_seen_by_few_views_are_eliminated_in_groups(
+    rng: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A strip of which every view sees a part: the same solution and inverse, less work."""
+    problem = problem_of(("k1",), rng, 1.0)
+    problem = problem.subset(np.abs(problem.dot - 2.5 * problem.view) < 2)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    dense = ArraySystem(problem, state).linearised(state)
+    assert dense.groups == ()
+    monkeypatch.setattr(array_system, "TOGETHER", 3)
+    grouped = ArraySystem(problem, state).linearised(state)
+    assert len(grouped.groups) == 4
+    assert sorted(np.concatenate([g.blocks for g in grouped.groups])) == list(range(12))
+    one, other = (e.without_dots(0.1).solve(e.right) for e in (dense, grouped))
+    np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-10 * np.abs(one).max())
+    for whole in (True, False):
+        first, second = dense.posterior(whole), grouped.posterior(whole)
+        sd = np.sqrt(np.diag(first.common))
+        assert np.abs((first.common - second.common) / np.outer(sd, sd)).max() < 1e-6
+        np.testing.assert_allclose(first.dots, second.dots, rtol=1e-5, atol=1e-12)

@@ -255,5 +255,5 @@ def test_a_calibration_carries_its_advice(scene: Any) -> None:
 def test_first_views_differ_and_keep_to_what_both_cameras_see() -> None:
     words = first_views(("left", "right"), 90.0)
     assert len(set(words)) == len(words) == 6
-    assert "turn it 15 degrees towards camera left" in words[3]
+    assert "turn it 10 degrees towards camera left" in words[3]
     assert "turn it" not in " ".join(first_views(("left", "right"), 125.0))

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from telerig.errors import InputError
-from telerig.scripts.console import errors_in_words, say
+from telerig.scripts.console import errors_in_words, say, stopped_by_signals
 
 if TYPE_CHECKING:
     from telerig.io.recording.description import DeviceDescription
@@ -89,7 +84,7 @@ def _recorded(
         )
     description = _rig(run, rig)
     devices = _devices(description, ports)
-    with _stopped_by_signals() as stop, display(quiet) as tell:
+    with stopped_by_signals() as stop, display(quiet) as tell:
         return record_run(
             devices, run, cameras=list(description.cameras), seconds=seconds, stop=stop, tell=tell
         )
@@ -141,25 +136,6 @@ def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
                     todo="give each device its own port",
                 )
     return devices
-
-
-@contextmanager
-def _stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set, so that the recording is closed."""
-    stop = threading.Event()
-
-    def asked(_: int, __: FrameType | None) -> None:
-        stop.set()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {s: signal.signal(s, asked) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _list_ports() -> None:

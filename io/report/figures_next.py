@@ -102,10 +102,12 @@ def _plan(results: CalibrationResults, pose: Array) -> Picture:
         axes.fill(*corners.T, color=MODEL, alpha=0.15, linewidth=0)
         axes.plot(*corners[[0, 1, 2, 3, 0]].T, color=MODEL, linewidth=1.4, label="next")
         axes.plot(*corners[:2].T, color=MODEL, linewidth=3.0, solid_capstyle="butt")
+        if plane[0, 0] < 0:  # left and right as in the first camera's image
+            axes.invert_xaxis()
         axes.legend(loc="upper right")
         source = svg(figure)
     caption = (
-        "The same in plan, seen along the common perpendicular of the optical axes; grey: the "
-        "views so far."
+        "The same in plan, seen along the common perpendicular of the optical axes, left and right "
+        f"as camera {results.cameras[0].name} sees them; grey: the views so far."
     )
     return Picture("Where to hold it next", source, caption)

@@ -56,17 +56,15 @@ class WatchedFolder:
     _said: str = ""
     _rig: bytes = b""
 
-    def poll(self, stop: Stop | None = None) -> bool:
-        """Look at the folder and detect what is new; whether anything changed."""
+    def poll(self, stop: Stop | None = None) -> None:
+        """Look at the folder and detect what is new, until ``stop`` is set."""
         dataset = self._listed()
         if dataset is None:
-            return False
+            return
         before, self._stamps = self._stamps, {}
         paths = {path for view in dataset.views for path in view.image_paths.values()}
-        gone = self._found.keys() - paths
-        for path in gone:
+        for path in self._found.keys() - paths:
             del self._found[path]
-        changed = bool(gone)
         for view in dataset.views:
             for camera, path in view.image_paths.items():
                 stamp = _stamp(path)
@@ -76,16 +74,14 @@ class WatchedFolder:
                 settled = stamp[0] > 0 and before.get(path) == stamp
                 if settled and self._found.get(path, (None,))[0] != stamp:
                     self._found[path] = stamp, self._detected(dataset, view, camera)
-                    changed = True
         self.dataset = replace(dataset, views=self._views(dataset))
-        return changed
 
     def _listed(self) -> Dataset | None:
         try:
             dataset = load_dataset(self.path, "images")
         except InputError as error:
-            waiting = "there are no views" in error.what
-            self._say_once("waiting for images" if waiting else str(error))
+            if "there are no views" not in error.what:
+                self._say_once(str(error))
             return None
         self._said = ""
         rig = (self.path / "rig.toml").read_bytes()
@@ -131,6 +127,11 @@ class WatchedFolder:
             good[image.view] = good.get(image.view, 0) + (not image.failure)
         return [name for name, count in good.items() if count == len(self.dataset.rig.cameras)]
 
+    def version(self) -> frozenset[tuple[Path, Stamp]]:
+        """The images of complete views, as they are now."""
+        complete = set(self.complete())
+        return frozenset((p, s) for p, (s, i) in self._found.items() if i.view in complete)
+
     def detected(self) -> DatasetDots:
         """All detections together.
 
@@ -171,15 +172,15 @@ def watch(
     """
     folder = WatchedFolder(dataset.path, tell)
     solve = {k: v for k, v in options.items() if k != "seed"}
-    known: list[str] | None = None
-    while not stop.is_set():
-        changed = folder.poll(stop)
-        complete = folder.complete()
-        if folder.dataset is not None and (changed or known is None) and complete != known:
-            known = complete
-            if _solved(folder, complete, tell, until_um, solve):
+    known: object = None
+    folder.poll(stop)
+    while not stop.wait(interval_s):
+        folder.poll(stop)
+        version = folder.version()
+        if version != known:
+            known = version
+            if _solved(folder, dataset, tell, until_um, solve):
                 break
-        stop.wait(interval_s)
     detected = folder.detected()
     assert folder.dataset is not None
     run = run_calibration(folder.dataset, detected=detected, **options)
@@ -188,24 +189,22 @@ def watch(
 
 def _solved(
     folder: WatchedFolder,
-    complete: list[str],
+    dataset: Dataset,
     tell: Tell,
     until_um: float | None,
     options: dict[str, Any],
 ) -> bool:
     """Solve and say how things stand; whether it is enough."""
-    assert folder.dataset is not None
-    count = len(complete)
+    count = len(folder.complete())
     if count < _FEWEST:
-        tell(_too_few(folder.dataset, count))
+        tell(_too_few(dataset, count))
         return False
     try:
-        detected = folder.detected()
-        calibration = solve_dots(folder.dataset, detected.dots, **options)
+        calibration = solve_dots(folder.dataset or dataset, folder.detected().dots, **options)
     except TelerigError as error:
-        tell(f"{count} views: {error}")
+        tell(f"{_views(count)}: {error}")
         return False
-    words, enough = standing(calibration, folder.dataset, count, until_um)
+    words, enough = standing(calibration, dataset, count, until_um)
     tell(words)
     return enough
 

@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.checks import RECOMMENDED_VIEWS
-from telerig.estimator.covariance import JointCovariance, aligned_shift
+from telerig.estimator.covariance import JointCovariance
 from telerig.estimator.problem import Problem
-from telerig.estimator.results import cameras_from_state
-from telerig.estimator.truth import working_volume
 from telerig.estimator.view_candidates import (
     Candidates,
     candidates,
@@ -28,10 +26,10 @@ from telerig.estimator.view_candidates import (
     joined,
     neighbours,
     new_cells,
-    observations,
 )
+from telerig.estimator.view_gain import ViewGain
 from telerig.estimator.view_words import hold_words, reason_words
-from telerig.factors.projection import State, whitened_residuals
+from telerig.factors.projection import State
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,7 +42,6 @@ _NOTABLE_SHARE = 0.5
 _FIRST, _NEAR, _SHOWN = 90, 30, 3
 _STEPS = ((0.1, 12.0), (0.1, 12.0), (0.05, 12.0), (0.05, 6.0), (0.05, 6.0))
 _FEW_DOTS, _MANY_DOTS = 25, 150
-_BATCH_ROWS = 4000
 
 
 @dataclass(frozen=True)
@@ -82,12 +79,10 @@ class NextView:
         """Share by which the best view lowers the standard deviation."""
         return 1 - self.after_um / self.before_um
 
-    def enough(self, until_um: float | None = None) -> bool:
-        """Whether another view is not worth it: little gain, or ``until_um`` is reached."""
-        if self.views < RECOMMENDED_VIEWS:
-            return False
-        reached = until_um is not None and self.before_um <= until_um
-        return reached or (bool(self.poses) and self.gain < ENOUGH_SHARE)
+    def enough(self) -> bool:
+        """Whether there are views enough and another one would bring little."""
+        many = self.views >= RECOMMENDED_VIEWS
+        return many and bool(self.poses) and self.gain < ENOUGH_SHARE
 
     def verdict(self) -> str:
         """What another view would bring."""
@@ -103,7 +98,7 @@ class NextView:
     def _floor(self) -> str:
         if self.size_um < _NOTABLE_SHARE * self.before_um:
             return ""
-        return f" ({self.size_um:.2g} of it: how well the target's size is known)"
+        return f" ({self.size_um:.2g} um stay: how well the target's size is known)"
 
     def words(self) -> str:
         """Verdict, and how to hold the target."""
@@ -130,14 +125,14 @@ class NextView:
 
 
 def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextView | None:
-    """The best ways to hold the target next; None for a single camera.
+    """The best ways to hold the target next; None for a single camera, or a rig left undetermined.
 
     The candidates' noise is the median of the dots so far. Of many dots some stand for all, which
     promises slightly too little, as the dots' own uncertainty is averaged over fewer of them.
     """
-    if len(problem.cameras) != 2:
+    if len(problem.cameras) != 2 or not np.isfinite(joint.rig_block()[1]).all():
         return None
-    gain = _Gain.of(problem, state, joint)
+    gain = ViewGain.of(problem, state, joint)
     used = [np.unique(problem.view[(problem.weight > 0) & (problem.camera == c)]) for c in (0, 1)]
     views = len(np.intersect1d(used[0], used[1]))
     found = candidates(problem, state)
@@ -166,136 +161,13 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
     return NextView(views, gain.before_um, poses, gain.size_um, marked)
 
 
-@dataclass(frozen=True)
-class _Gain:
-    """What views do to the covariance of cameras and dots.
-
-    covariance : (P + 3 N, P + 3 N).  root : (P, R), root root^T weighs the rig block by the
-    variance of points in space.  whitener : (2,) 1 / px.
-    """
-
-    problem: Problem
-    state: State
-    covariance: Array
-    root: Array
-    whitener: Array
-    points_mm: Array
-
-    @staticmethod
-    def of(problem: Problem, state: State, joint: JointCovariance) -> _Gain:
-        cameras = cameras_from_state(problem, state)
-        points = working_volume(cameras)
-        shift = aligned_shift((cameras[0], cameras[1]), problem.free, points)
-        dots = len(joint.names) - 3 * len(problem.dot_ids)
-        index = np.r_[: joint.rig, dots : len(joint.names)]
-        covariance = joint.matrix[np.ix_(index, index)]
-        triangle = np.asarray(np.linalg.qr(shift, mode="r")).T
-        noise = [_noise_px(problem, c) for c in (0, 1)]
-        return _Gain(problem, state, covariance, triangle, 1 / np.array(noise), points)
-
-    @property
-    def before_um(self) -> float:
-        return float(self._um(np.zeros(1))[0])
-
-    @property
-    def size_um(self) -> float:
-        """Of points that are all wrong by the factor that target and distance leave open."""
-        problem = self.problem
-        plane = (problem.nominal_mm - problem.nominal_mm.mean(0))[:, :2]
-        known = float(np.sum((plane / problem.dot_sigma_mm[:, :2]) ** 2))
-        if problem.scale is not None:
-            known += (problem.scale[1] / problem.scale[2]) ** 2
-        spread = (self.points_mm - self.points_mm.mean(0)).std()
-        return float(1e3 * spread / np.sqrt(known))
-
-    def _um(self, less: Array) -> Array:
-        rig = len(self.root)
-        whole = np.sum((self.covariance[:rig, :rig] @ self.root) * self.root)
-        return np.asarray(1e3 * np.sqrt(np.maximum(whole - less, 0) / self.points_mm.size))
-
-    def after_um(self, poses: Candidates, dots: Ints) -> Array:
-        """(K,) standard deviation per axis with each of the views added, seen at ``dots``."""
-        batch = max(1, _BATCH_ROWS // (4 * len(dots)))
-        parts = [
-            self._less(poses.some(np.arange(i, min(i + batch, len(poses)))), dots)
-            for i in range(0, len(poses), batch)
-        ]
-        return self._um(np.concatenate(parts))
-
-    def _less(self, poses: Candidates, dots: Ints) -> Array:
-        """(K,) by how much the summed variance of points falls.
-
-        With A the view's rows, its pose projected out, and C the covariance: the trace of
-        root^T C A^T (1 + A C A^T)^-1 A C root.
-        """
-        by_rig, by_dot, by_pose = self._rows(poses, dots)
-        rig, count = len(self.root), len(poses)
-        at = rig + (3 * dots[:, None] + np.arange(3)).ravel()
-        c_rr, c_rd = self.covariance[:rig, :rig], self.covariance[:rig, at]
-        c_dd = self.covariance[np.ix_(at, at)].reshape(len(dots), 3, -1)
-        flat = by_rig.reshape(count, -1, rig)
-        size = flat.shape[1]
-        # rows go dot by dot, four each, so that dots multiply block by block
-        left = by_dot @ c_dd
-        left = left.reshape(count, size, len(dots), 3).transpose(0, 2, 1, 3)
-        both = (left @ np.swapaxes(by_dot, -1, -2)).transpose(0, 2, 1, 3).reshape(count, size, size)
-        cross = flat @ c_rd
-        cross = cross.reshape(count, size, len(dots), 3).transpose(0, 2, 1, 3)
-        cross = (cross @ np.swapaxes(by_dot, -1, -2)).transpose(0, 2, 1, 3)
-        cross = cross.reshape(count, size, size)
-        both = both + cross + np.swapaxes(cross, -1, -2) + flat @ c_rr @ np.swapaxes(flat, -1, -2)
-        own = (by_dot @ (c_rd.T @ self.root).reshape(len(dots), 3, -1)).reshape(count, size, -1)
-        onto = own + flat @ (c_rr @ self.root)
-        basis, _ = np.linalg.qr(by_pose.reshape(count, size, 6))
-        back = np.swapaxes(basis, -1, -2)
-        half = both - basis @ (back @ both)
-        both = half - (half @ basis) @ back + np.eye(size)
-        onto = onto - basis @ (back @ onto)
-        return np.asarray(np.sum(onto * np.linalg.solve(both, onto), axis=(-1, -2)))
-
-    def _rows(self, poses: Candidates, dots: Ints) -> tuple[Array, Array, Array]:
-        """(K, n, 4, P), (K, n, 4, 3), (K, n, 4, 6) whitened derivatives, dot by dot."""
-        problem, count = self.problem, len(poses)
-        stand_for = np.sqrt(len(problem.dot_ids) / len(dots))
-        obs = observations(problem, poses.plate_shift, dots, stand_for * self.whitener)
-        visible, _ = dots_seen(problem, self.state, poses, dots)
-        obs.whitener[~visible.ravel()] = 0.0
-        state = State(
-            self.state.intrinsics, self.state.rig_from_camera, poses.rig_from_target,
-            self.state.dots_mm,
-        )  # fmt: skip
-        found = whitened_residuals(state, obs, problem.rho_mm)
-        by_rig = np.zeros((count, 2, len(dots), 2, len(self.root)))
-        full = found.by_intrinsics.reshape(count, 2, len(dots), 2, -1)
-        at = 0
-        for c in (0, 1):
-            free = problem.free_indices(c)
-            by_rig[:, c, ..., at : at + len(free)] = full[:, c][..., free]
-            at += len(free)
-        by_rig[:, 1, ..., at:] = found.by_camera.reshape(count, 2, len(dots), 2, 6)[:, 1]
-        parts = (by_rig, found.by_dot, found.by_view)
-        a, b, c_ = (
-            p.reshape(count, 2, len(dots), 2, -1)
-            .transpose(0, 2, 1, 3, 4)
-            .reshape(count, len(dots), 4, -1)
-            for p in parts
-        )
-        return a, b, c_
-
-
-def _noise_px(problem: Problem, camera: int) -> float:
-    kept = (problem.weight > 0.5) & (problem.camera == camera)
-    rows = problem.covariance_px2[kept if kept.any() else slice(None)]
-    return float(np.sqrt(np.median(np.trace(rows, axis1=-2, axis2=-1)) / 2))
-
-
 def _spread(problem: Problem, count: int) -> Ints:
     """Up to ``count`` dots, spread over the list of all."""
     whole = len(problem.dot_ids)
     return np.unique(np.linspace(0, whole - 1, min(count, whole)).round().astype(np.int64))
 
 
-def _search(gain: _Gain, found: Candidates, dots: Ints) -> Array:
+def _search(gain: ViewGain, found: Candidates, dots: Ints) -> Array:
     """(K,) standard deviation after each candidate; NaN where it was not computed.
 
     Some of the whole grid first, then all that share two of tilt, roll and place with the best.
@@ -312,7 +184,9 @@ def _search(gain: _Gain, found: Candidates, dots: Ints) -> Array:
     return after
 
 
-def _refined(gain: _Gain, one: Candidates, after_um: float, dots: Ints) -> tuple[Candidates, float]:
+def _refined(
+    gain: ViewGain, one: Candidates, after_um: float, dots: Ints
+) -> tuple[Candidates, float]:
     """A candidate moved between the points of the grid as long as that helps."""
     for share, step_deg in _STEPS:
         near = neighbours(gain.problem, gain.state, one, share * field_mm(gain.problem), step_deg)

@@ -17,7 +17,6 @@ from telerig.estimator.view_candidates import (
     volume_centre_mm,
 )
 from telerig.factors.projection import State
-from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
 
@@ -42,15 +41,17 @@ def hold_words(problem: Problem, state: State, rig_from_target: Array, facing: A
     if np.linalg.norm(np.cross(axes[0], axes[1])) < 0.1:
         to_first = along
     turn = np.degrees(np.arctan2(looks @ to_first, looks @ middle))
-    across = across * (-1.0 if -across[1] + 0.5 * across[0] < 0 else 1.0)
+    upright = abs(across[1]) >= abs(across[0])
+    across = across * np.sign(-across[1] if upright else across[0])
     lean = np.degrees(np.arcsin(np.clip(looks @ across, -1, 1)))
     parts = [_start_words(problem, facing)]
     if abs(turn) >= _NEARLY_DEG:
+        way = "towards" if facing[0] == facing[1] else "squarer to"
         parts.append(
-            f"turn it {abs(turn):.0f} degrees towards camera {first if turn > 0 else second}"
+            f"turn it {abs(turn):.0f} degrees {way} camera {first if turn > 0 else second}"
         )
     if abs(lean) >= _NEARLY_DEG:
-        edge = "top" if abs(across[1]) >= abs(across[0]) else "right edge"
+        edge = "top" if upright else "right edge"
         parts.append(f"tilt its {edge} {abs(lean):.0f} degrees {'back' if lean > 0 else 'forward'}")
     parts.append(_roll_words(problem, rig_from_target))
     parts.append(_place_words(problem, state, rig_from_target))
@@ -128,9 +129,11 @@ def _where(cells: Array) -> str:
     return "the empty " + " and ".join(names)
 
 
-def first_views(cameras: tuple[Camera, ...] | tuple[str, str], angle_deg: float) -> tuple[str, ...]:
-    """Words for the first views, before any calibration can say more; angle between the axes."""
-    first, second = (c if isinstance(c, str) else c.name for c in cameras)
+def first_views(first: str, second: str, angle_deg: float) -> tuple[str, ...]:
+    """Words for the first views, before any calibration can say more.
+
+    first, second : the cameras' names.  angle_deg : between their axes.
+    """
     turn = max(0, min(20, int(TILT_LIMIT_DEG - angle_deg / 2 - 5) // 5 * 5))
     aside = {
         c: f"turn it {turn} degrees towards camera {c}, " if turn else "" for c in (first, second)

@@ -181,6 +181,8 @@ def watch(
             known = version
             if _solved(folder, dataset, tell, until_um, solve):
                 break
+    if stop.is_set():
+        tell("stopped: the results are written now")
     detected = folder.detected()
     assert folder.dataset is not None
     run = run_calibration(folder.dataset, detected=detected, **options)
@@ -224,7 +226,7 @@ def _generic(dataset: Dataset, count: int) -> str:
     if len(names) < 2:
         return "tilt the target by 20 to 50 degrees, otherwise than before"
     angle = 90.0 if rotvec is None else float(np.linalg.norm(rotvec))
-    return first_views((names[0], names[1]), angle)[min(count, RECOMMENDED_VIEWS - 1)]
+    return first_views(names[0], names[1], angle)[min(count, RECOMMENDED_VIEWS - 1)]
 
 
 def standing(

@@ -1,18 +1,19 @@
 """What the bubbles' own pairs tell of a movement of the cameras against each other.
 
-The rays of a pair miss each other along the common perpendicular n of both lines of sight. The gap
-at a rig point p, when the second camera has moved by v and turned by w, is n . (v + w x p): a constant
-and a slope along both lines of sight, so of the six components of the pose between two telecentric
-cameras the gaps tell three, at any angle between them: the shift along n, and the two rotations about
-axes across n (roll about the second camera's own axis, pitch about the axis across that). The shifts
-in the plane of the lines of sight and the angle between them (rotation about n) move the point and
-leave no gap; they stay as calibrated. Perspective lenses tell more, and get it.
+The rays of a pair miss each other along the common perpendicular n of both lines of sight. The
+gap at a rig point p, when the second camera has moved by v and turned by w, is n . (v + w x p): a
+constant and a slope along both lines of sight, so of the six components of the pose between two
+telecentric cameras the gaps tell three, at any angle between them: the shift along n, and the two
+rotations about axes across n (roll about the second camera's own axis, pitch about the axis
+across that). The shifts in the plane of the lines of sight and the angle between them (rotation
+about n) move the point and leave no gap; they stay as calibrated. Perspective lenses tell more,
+and get it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ from telerig.estimator.covariance import POSE_COMPONENTS, rig_jacobian
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.triangulation import midpoint, stacked_jacobian
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration import Calibration
 
 Array = NDArray[np.float64]
 Free = tuple[tuple[str, ...], ...]
@@ -91,8 +95,8 @@ class RigChange:
         sigma, *spreads = (1e6 * s for s in self.sigmas)
         text = f"by {offset / 1000:+.3g} +- {sigma / 1000:.2g} um along the shared coordinate"
         told = self.sigmas[1:] < _NOT_SEEN * self.prior_sigmas[1:]
-        names = [f"{n} by {t:+.3g} +- {s:.2g} urad"
-                 for n, t, s, seen in zip(("rolled", "pitched"), turns, spreads, told) if seen]  # fmt: skip
+        each = zip(("rolled", "pitched"), turns, spreads, told)
+        names = [f"{n} by {t:+.3g} +- {s:.2g} urad" for n, t, s, seen in each if seen]
         return ", ".join([text, *names]) if names else text + " (its rotations are not seen)"
 
     def as_dict(self) -> dict[str, Any]:
@@ -151,7 +155,11 @@ class Gaps:
 
 
 def gaps_of(
-    cameras: Pair, free: Free, points_mm: Array, uv_px: Array | None = None, covariance_px2: Array | None = None
+    cameras: Pair,
+    free: Free,
+    points_mm: Array,
+    uv_px: Array | None = None,
+    covariance_px2: Array | None = None,
 ) -> Gaps:
     """Gaps of pixels (M, 2 cameras, 2) near rig points (M, 3); without pixels, derivatives alone.
 
@@ -200,7 +208,7 @@ def described(
     pairs: int,
     refined: Pose | None = None,
 ) -> RigChange:
-    """A movement (6,), its covariance and prior (6, 6) as offset, roll and pitch, and its chance."""
+    """A movement (6,), its covariance and prior (6, 6), as offset, roll and pitch."""
     rows = offset_roll_pitch(cameras, place_mm)
     sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
     return RigChange(
@@ -246,6 +254,20 @@ def free_directions(prior: Array) -> Array:
     return np.asarray(unit[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
 
+def rig_block(calibration: Calibration) -> tuple[Array, Free]:
+    """Covariance of the rig block and the free intrinsics; none for a calibration without."""
+    if calibration.covariance.size:
+        return calibration.covariance, calibration.free
+    return np.zeros((POSE, POSE)), ((), ())
+
+
+def with_drift(covariance: Array, drift: Array) -> Array:
+    """(P, P) covariance of the rig block, a movement of the second camera added."""
+    total = covariance.copy()
+    total[-POSE:, -POSE:] += drift
+    return total
+
+
 def share_of_drift(
     rig: Array, rig_covariance: Array, prior_rig: Array, drift: Array
 ) -> tuple[Array, Array]:
@@ -255,8 +277,7 @@ def share_of_drift(
     together; prior_rig : the calibration's covariance; drift : (6, 6) the movement's prior.
     Gaussian conditioning: the movement given the sum is K times the sum, plus what K leaves open.
     """
-    total = prior_rig.copy()
-    total[-POSE:, -POSE:] += drift
+    total = with_drift(prior_rig, drift)
     scale = np.sqrt(np.diagonal(total).clip(0))
     unit = np.where(scale > 0, scale, 1.0)
     inverse = np.linalg.pinv(total / unit[:, None] / unit, rcond=1e-13, hermitian=True)

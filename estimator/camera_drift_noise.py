@@ -1,10 +1,10 @@
 """The gaps' own noise: pixels, the cameras' shake against each other, the bubbles' changing shapes.
 
-A Gaussian process in time, its size learned from the gaps themselves: white noise of each pair; damped
-oscillations that all pairs of a frame share (shake); a slower motion of each bubble's own, as its
-outline's centre wanders about its centre of volume (Ornstein-Uhlenbeck). Only the density near
-frequency 0 limits what is constant, and an oscillation has little there: a plain mean over correlated
-gaps would be wrong in both directions.
+A Gaussian process in time, its size learned from the gaps themselves: white noise of each pair;
+damped oscillations that all pairs of a frame share (shake); a slower motion of each bubble's own,
+as its outline's centre wanders about its centre of volume (Ornstein-Uhlenbeck). Only the density
+near frequency 0 limits what is constant, and an oscillation has little there: a plain mean over
+correlated gaps would be wrong in both directions.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ _INDEPENDENT = 0.5
 """Neighbouring bins of a tapered spectrum tell the same thing."""
 _FIRST_BIN = 2
 _LEAST_FRAMES = 16
+_MOST_APART = 4
 
 
 @dataclass(frozen=True)
 class Series:
     """Gaps in time. frame, bubble (M,), t_s (M,), gap_mm (M,).
 
-    relative : (M,) variance of each over the typical one.  free : (M, K) derivatives by the unknowns,
-    of unit variance beforehand.
+    relative : (M,) variance of each over the typical one.  free : (M, K) derivatives by the
+    unknowns, of unit variance beforehand.
     """
 
     frame: Ints
@@ -110,7 +111,7 @@ class _Spectrum:
 
     def expected(self, noise: Noise) -> Array:
         """Of the periodogram at its frequencies: leakage and aliasing included."""
-        lag = np.arange(len(self.overlap)) * self.step_s
+        lag = np.asarray(np.arange(len(self.overlap)) * self.step_s, np.float64)
         covariance = self.common * noise.common(lag) + self.single * noise.own(lag)
         covariance[0] += self.single * noise.white_mm**2
         turned = covariance * self.overlap
@@ -182,7 +183,8 @@ def _spectra(part: Series) -> list[_Spectrum]:
     share = float((1 / count).mean())
     out = [_spectrum(t, mean, 1.0, share)]
     apart = left - mean[index]
-    for bubble in np.unique(part.bubble) if share < 1 else ():
+    bubbles, seen = np.unique(part.bubble, return_counts=True)
+    for bubble in bubbles[np.argsort(-seen)][:_MOST_APART] if share < 1 else ():
         mine = (part.bubble == bubble) & (count[index] > 1)
         if mine.sum() >= _LEAST_FRAMES:
             rest = float((1 - 1 / count[index[mine]]).mean())

@@ -89,7 +89,7 @@ def _halves(halves: Mapping[str, Any]) -> Picture:
     caption = (
         f"Arrows: how far {halves['views'][0]} views and the other {halves['views'][1]} put the "
         f"same pixels apart (longest {number(longest, 2)} um); grey: one standard deviation of "
-        "that difference. Arrows much longer than the circles are wide, or in a pattern, mean "
-        "that the covariance cannot be believed."
+        "that difference. They form a pattern by nature (a turn, a scale); arrows much longer than "
+        "the circles' radius in most places mean that the covariance cannot be believed."
     )
     return Picture("Two halves of the views", source, caption)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -85,30 +85,56 @@ def run_calibration(
     dots_free: str = "3d",
     stage: Stage | None = None,
     pictures: bool = False,
+    detected: DatasetDots | None = None,
 ) -> CalibrationRun:
     """Like `calibrate`, with progress, the choice of what dots may do, and the detections.
 
     pictures : draw what was found over each image, as `write_results` needs.
+    detected : made before, by `telerig.estimator.watch`; None detects now.
     """
     checked_medium(medium)
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
-    detected, table, notes = _measured(dataset, stage, pictures)
+    if detected is None:
+        detected, table, notes = _measured(dataset, stage, pictures)
+    else:
+        table, notes = detected.dots, [*dataset.notes, *detected.notes]
 
-    from telerig.estimator.behind_walls import (
-        put_behind_walls,
-        stated_walls,
-        wall_words,
-        with_walls,
-    )
+    from telerig.estimator.behind_walls import put_behind_walls, stated_walls, wall_words
+
+    rig, walls = dataset.rig, stated_walls(dataset.rig)
+    calibration = solve_dots(
+        dataset, table, model=model, solver=solver, medium=medium, dots_free=dots_free,
+        stage=stage, notes=notes,
+    )  # fmt: skip
+    calibration = replace(calibration, stage=_stage(dataset, calibration, stage), medium=medium)
+    if medium == "air":
+        calibration = put_behind_walls(calibration, walls)
+    words = wall_words(calibration, rig)
+    calibration = replace(calibration, notes=(*calibration.notes, *words))
+    return CalibrationRun(_with_measured(calibration, table, seed), detected)
+
+
+def solve_dots(
+    dataset: Dataset,
+    table: pd.DataFrame,
+    *,
+    model: str,
+    solver: str,
+    medium: str,
+    dots_free: str,
+    stage: Stage | None = None,
+    notes: Sequence[str] = (),
+) -> Calibration:
+    """The self-calibration of a table of dots, without the stage and walls that runs go through."""
+    from telerig.estimator.behind_walls import stated_walls, with_walls
     from telerig.estimator.self_calibration import self_calibrate
 
     rig = dataset.rig
-    walls = stated_walls(rig)
     cameras = nominal_cameras(rig)
-    calibration = self_calibrate(
+    return self_calibrate(
         table,
-        with_walls(cameras, walls) if medium == "water" else cameras,
+        with_walls(cameras, stated_walls(rig)) if medium == "water" else cameras,
         dataset.target,
         nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
         model=model,
@@ -118,12 +144,6 @@ def run_calibration(
         notes=notes,
         name=rig.name,
     )
-    calibration = replace(calibration, stage=_stage(dataset, calibration, stage), medium=medium)
-    if medium == "air":
-        calibration = put_behind_walls(calibration, walls)
-    words = wall_words(calibration, rig)
-    calibration = replace(calibration, notes=(*calibration.notes, *words))
-    return CalibrationRun(_with_measured(calibration, table, seed), detected)
 
 
 def _measured(

@@ -80,7 +80,7 @@ def write_uncertainty(calibration: Calibration, path: Path) -> None:
 def write_detections(detected: DatasetDots, folder: Path) -> None:
     """rejected.csv, and overlays/<camera>/<view>.jpg where they were drawn."""
     write_table(detected.rejected, folder / "rejected.csv")
-    for image in detected.images:
+    for image in (i for i in detected.images if i.overlay):
         target = folder / "overlays" / image.camera / f"{image.view}.jpg"
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(image.overlay)

@@ -21,6 +21,7 @@ from telerig.estimator.initial_unknown import dots_from_images
 from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.model_choice import Rung
 from telerig.estimator.model_start import model_start
+from telerig.estimator.next_view import next_view
 from telerig.estimator.problem import MODELS, SOLVERS, Problem, held_at_nominal
 from telerig.estimator.residual_tests import residual_tests
 from telerig.estimator.results import calibration_from_fit
@@ -114,12 +115,14 @@ def self_calibrate(
 
 
 def _trust(fit: RobustFit, joint: JointCovariance) -> dict[str, Any]:
-    """What the data themselves say of the covariance: repeatability, and structure in residuals."""
+    """What the data say of the covariance (repeatability, structure), and what would lower it."""
     problem, state = fit.problem, fit.solution.state
     whitened = whitened_error(state, problem.observations(), problem.rho_mm)
+    advice = next_view(problem, state, joint)
     return {
         "halves": halves(problem, state),
         "structure": residual_tests(problem, whitened, joint.leverage),
+        "next_view": {} if advice is None else advice.as_dict(),
     }
 
 

@@ -35,6 +35,7 @@ def smooth_run(
     folder: Path,
     *,
     model: str = "auto",
+    refine_rig: bool = False,
     inputs: Sequence[Path] = (),
     report: bool = True,
     stage: Stage | None = None,
@@ -42,6 +43,7 @@ def smooth_run(
     """Smooth and write trajectories.csv, shake.csv, smoothing.json, results.h5, run.json, report.
 
     tracks : `tracks.csv`, or the folder that `telerig track` wrote.
+    refine_rig : see `telerig.smooth`.
     Files appear together at the end. Raises InputError when there are no tracks.
     """
     begun = time.perf_counter()
@@ -49,11 +51,14 @@ def smooth_run(
     run, marks = with_followed_references(run, source.parent)
     warnings = check_sensors(run, tracks=followed, calibration=calibration)
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
-    found = smooth(followed, calibration, stage=run, model=model, progress=percent)
+    found = smooth(
+        followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig
+    )
     found = replace(found, summary={**found.summary, "warnings": warnings})
     tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
     record = run_record(
-        "smooth", run.path, [*tables, source, *marks, *inputs], {"model": model},
+        "smooth", run.path, [*tables, source, *marks, *inputs],
+        {"model": model, "refine_rig": refine_rig},
         {"smooth": time.perf_counter() - begun},
     )  # fmt: skip
     tracked = source.parent / "run.json"

@@ -61,5 +61,7 @@ def smoothing_words(found: Smoothing) -> str:
             + ", velocity to {:.2g}, {:.2g}, {:.2g} mm/s".format(*speed)
         )
     lines += _travel_words(found)
+    if "rig_change" in found.summary:
+        lines.append(f"  rig: {found.summary['rig_change']['words']}")
     lines += [f"  warning: {warning}" for warning in found.summary.get("warnings", [])]
     return "\n".join(lines)

@@ -43,6 +43,8 @@ def summary(calibration: Calibration) -> str:
             f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um per axis"
         )
     lines += _trust(calibration)
+    advice = calibration.diagnostics.get("next_view") or {}
+    lines += [f"  {advice['words']}"] if advice else []
     t = calibration.twin
     lines.append(
         f"  mirror twin: cost {t['cost']:.9g} kept, {t['other_cost']:.9g} for the other; "

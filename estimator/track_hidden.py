@@ -1,4 +1,4 @@
-"""Where a bubble is that one image hides behind another: by its track before and after.
+"""Where bubbles are in every frame, by all that is known of them before and after.
 
 One outline in one image may show two bubbles which the other image separates. The hidden one is
 seen exactly by one camera; what that camera cannot tell comes from the motion between the frames
@@ -18,58 +18,86 @@ from telerig.estimator.track_types import Motion, TrackerSettings
 
 Array = NDArray[np.float64]
 
+_ANYWHERE_MM = 100.0
+
 
 @dataclass(frozen=True)
-class Reading:
-    """What a frame says of a bubble: value (k,) of by_point (k, 3) @ point, covariance (k, k)."""
+class Readings:
+    """What F frames say of K bubbles: information (F, K, 3, 3) on their points (1/mm2), 0 where
+    nothing was seen, and pull (F, K, 3), information @ point (1/mm)."""
 
-    value: Array
-    covariance: Array
-    by_point: Array
+    information: Array
+    pull: Array
 
     @staticmethod
-    def point(point_mm: Array, covariance_mm2: Array) -> Reading:
-        return Reading(point_mm, covariance_mm2, np.eye(3))
+    def none(frames: int, bubbles: int) -> Readings:
+        return Readings(np.zeros((frames, bubbles, 3, 3)), np.zeros((frames, bubbles, 3)))
+
+    def add(
+        self, frame: int, bubble: int, value: Array, covariance: Array, by_point: Array
+    ) -> None:
+        """A value (k,) of by_point (k, 3) @ point, of covariance (k, k)."""
+        weighted = np.linalg.solve(covariance, by_point).T
+        self.information[frame, bubble] += weighted @ by_point
+        self.pull[frame, bubble] += weighted @ value
 
 
 def smooth_points(
-    readings: Sequence[Reading | None], motions: Sequence[Motion | None], settings: TrackerSettings
+    readings: Readings,
+    motions: Sequence[Motion | None],
+    settings: TrackerSettings,
 ) -> tuple[Array, Array]:
-    """(F, 3) points (mm, rig) and (F, 3, 3) covariances of one bubble in consecutive frames.
+    """(F, K, 3) points (mm, rig) and (F, K, 3, 3) covariances.
 
-    readings : None where it was not seen; the first is a point.  motions : into each frame, that
-    into the first is not used.
+    motions : into each frame, that into the first is not used.
     """
-    first = readings[0]
-    assert first is not None and len(first.value) == 3
-    p = birth_covariance(settings, first.covariance, encoder=False)
-    x = np.zeros(len(p))
-    x[:3] = first.value
-    filtered, predicted = [(x, p)], [(x, p)]
-    for reading, motion in zip(readings[1:], motions[1:]):
-        assert motion is not None
-        x = motion.matrix @ x + motion.offset
-        p = motion.matrix @ p @ motion.matrix.T + motion.noise
-        predicted.append((x, p))
-        x, p = _updated(x, p, reading)
-        filtered.append((x, p))
-    out = [(x[:3], p[:3, :3])]
+    filtered, predicted = _filtered(readings, motions, settings)
+    x, p = filtered[-1]
+    out = [(x[:, :3], p[:, :3, :3])]
     for k in range(len(filtered) - 2, -1, -1):
         motion, (xf, pf), (xp, pp) = motions[k + 1], filtered[k], predicted[k + 1]
         assert motion is not None
-        gain = np.linalg.solve(pp, motion.matrix @ pf).T
-        x, p = xf + gain @ (x - xp), pf + gain @ (p - pp) @ gain.T
-        out.append((x[:3], p[:3, :3]))
+        gain = np.swapaxes(np.linalg.solve(pp, motion.matrix @ pf), -1, -2)
+        x = xf + (gain @ (x - xp)[..., None])[..., 0]
+        p = pf + gain @ (p - pp) @ np.swapaxes(gain, -1, -2)
+        out.append((x[:, :3], p[:, :3, :3]))
     points, covariances = zip(*out[::-1])
     return np.array(points), np.array(covariances)
 
 
-def _updated(x: Array, p: Array, reading: Reading | None) -> tuple[Array, Array]:
-    if reading is None:
-        return x, p
-    h = np.zeros((len(reading.value), len(x)))
-    h[:, :3] = reading.by_point
-    gain = np.linalg.solve(h @ p @ h.T + reading.covariance, h @ p).T
-    keep = np.eye(len(x)) - gain @ h
-    left = reading.value - h @ x
-    return x + gain @ left, keep @ p @ keep.T + gain @ reading.covariance @ gain.T
+def _filtered(
+    readings: Readings,
+    motions: Sequence[Motion | None],
+    settings: TrackerSettings,
+) -> tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]:
+    """States (K, n) and covariances (K, n, n) after and before each frame's readings."""
+    bubbles = readings.information.shape[1]
+    prior = birth_covariance(settings, _ANYWHERE_MM**2 * np.eye(3), encoder=False)
+    p = np.tile(prior, (bubbles, 1, 1))
+    x = np.zeros((bubbles, len(prior)))
+    x[:, :3] = _somewhere(readings)
+    filtered, predicted = [], []
+    for k, motion in enumerate(motions):
+        if k:
+            assert motion is not None
+            x = x @ motion.matrix.T + motion.offset
+            p = motion.matrix @ p @ motion.matrix.T + motion.noise
+        predicted.append((x, p))
+        x, p = _updated(x, p, readings.information[k], readings.pull[k])
+        filtered.append((x, p))
+    return filtered, predicted
+
+
+def _somewhere(readings: Readings) -> Array:
+    """(K, 3) a point near each bubble's readings."""
+    total = readings.information.sum(0) + 1e-9 * np.eye(3)
+    return np.linalg.solve(total, readings.pull.sum(0)[..., None])[..., 0]
+
+
+def _updated(x: Array, p: Array, information: Array, pull: Array) -> tuple[Array, Array]:
+    mixed = np.eye(3) + information @ p[:, :3, :3]
+    gain = p[..., :3] @ np.linalg.inv(mixed)
+    left = pull - (information @ x[:, :3, None])[..., 0]
+    lost = gain @ information @ p[:, :3]
+    x = x + (gain @ left[..., None])[..., 0]
+    return x, p - (lost + np.swapaxes(lost, -1, -2)) / 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 import pandas as pd
@@ -13,13 +14,9 @@ from telerig.estimator.frontend.body import DEFAULT_SHAPE_SIGMA, Bodies, fit_bod
 from telerig.estimator.frontend.bubble_types import Prediction
 from telerig.estimator.frontend.matching import match_pairs
 from telerig.estimator.frontend.pair_types import PairModel
-from telerig.estimator.track_shared import (
-    FRAMES_AFTER,
-    FRAMES_BEFORE,
-    Frame,
-    Pairs,
-    shared_rows,
-)
+from telerig.estimator.track_back import follow_back
+from telerig.estimator.track_frames import Frame, Pairs, Pixels, given_ids
+from telerig.estimator.track_shared import FRAMES_AFTER, FRAMES_BEFORE, shared_rows
 from telerig.estimator.track_types import (
     NO_PARTICLE,
     FrameMeasurements,
@@ -77,10 +74,20 @@ class Linker:
         predicted = self.tracker.predict(t_s, position_mm)
         pairs = pair_frame(tables, self.cameras, self.model, predicted)
         lonely = _unpaired(tables, pairs)
-        measured = _measured(self.cameras, tables, pairs, lonely, self._wander)
+        pixels = _pixels(tables[0], self._wander), _pixels(tables[1], self._wander)
+        measured, offset_px = _measured(self.cameras, tables, pixels, pairs, lonely)
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
-            number, t_s, tables, pairs, lonely, measured, result.alone, result.motion
+            number,
+            t_s,
+            tables,
+            pixels,
+            offset_px,
+            pairs,
+            lonely,
+            measured,
+            result.alone,
+            result.motion,
         )
         self._settle(result)
         enough = self._waiting >= _PAIRS_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
@@ -103,7 +110,7 @@ class Linker:
         self.events.extend(result.events)
         for ids in result.settled:
             frame = self._open.pop(ids.frame)
-            frame.ids = ids
+            frame.settle(ids)
             self._closed.append(frame)
             self._waiting += 1 + len(frame.pairs.first)
 
@@ -111,7 +118,10 @@ class Linker:
         """Rows of all closed frames but the last few, which tell where hidden bubbles went."""
         done = self._closed[: len(self._closed) - ahead]
         self._closed, self._waiting = self._closed[len(done) :], 0
-        hidden = shared_rows(self._before, done, self._closed, self.cameras, self.tracker.settings)
+        window = (self._before, done, self._closed)
+        settings, changeable = self.tracker.settings, {f.number for f in (*done, *self._closed)}
+        follow_back([*chain(*window)], changeable, self.cameras, settings)
+        hidden = shared_rows(*window, self.cameras, settings)
         self._before = [*self._before, *done][-FRAMES_BEFORE:]
         found = self._tracks(done)
         if hidden:
@@ -137,7 +147,7 @@ class Linker:
         table = pd.DataFrame(
             {
                 "frame": np.repeat([f.number for f in frames], many),
-                "particle": np.concatenate([f.ids.particle for f in frames if f.ids is not None]),
+                "particle": np.concatenate([f.particle for f in frames]),
                 "t_s": np.repeat([f.t_s for f in frames], many),
             }
         )
@@ -181,7 +191,7 @@ def pair_frame(
     predicted: Prediction | None,
 ) -> Pairs:
     """Given ids pair up as they are; the rest is matched."""
-    ids = [_given(table) for table in tables]
+    ids = [given_ids(table) for table in tables]
     common = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1])
     rows = [np.array([np.flatnonzero(i == p)[0] for p in common], np.int64) for i in ids]
     free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
@@ -201,12 +211,6 @@ def pair_frame(
     )
 
 
-def _given(table: pd.DataFrame) -> Index:
-    if "particle" not in table:
-        return np.full(len(table), NO_PARTICLE)
-    return table["particle"].to_numpy(np.int64)
-
-
 def _unpaired(tables: tuple[pd.DataFrame, pd.DataFrame], pairs: Pairs) -> tuple[Index, Index]:
     first, second = (
         np.setdiff1d(np.arange(len(table)), taken)
@@ -215,7 +219,7 @@ def _unpaired(tables: tuple[pd.DataFrame, pd.DataFrame], pairs: Pairs) -> tuple[
     return first, second
 
 
-def _pixels(table: pd.DataFrame, wander: float) -> tuple[Array, Array]:
+def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
     """(N, 2) centres and (N, 2, 2) covariances, with the share of the unknown shape."""
     covariance = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
     radius = np.nan_to_num(table["d_eq_px"].to_numpy(float)) / 2
@@ -226,20 +230,25 @@ def _pixels(table: pd.DataFrame, wander: float) -> tuple[Array, Array]:
 def _measured(
     cameras: tuple[Camera, Camera],
     tables: tuple[pd.DataFrame, pd.DataFrame],
+    pixels: tuple[Pixels, Pixels],
     pairs: Pairs,
     lonely: tuple[Index, Index],
-    wander: float,
-) -> FrameMeasurements:
-    (uv_a, cov_a), (uv_b, cov_b) = (_pixels(table, wander) for table in tables)
+) -> tuple[FrameMeasurements, Array]:
+    """What the tracker gets, and (2, 2) how far off each camera shows what both see."""
+    (uv_a, cov_a), (uv_b, cov_b) = pixels
     found = triangulate(
         cameras, (uv_a[pairs.first], uv_b[pairs.second]), (cov_a[pairs.first], cov_b[pairs.second])
     )
+    expected, _, _ = stacked_jacobian(cameras, found.points_mm)
+    left = np.hstack([uv_a[pairs.first], uv_b[pairs.second]]) - expected
+    offset = np.zeros((2, 2)) if not len(left) else np.median(left, axis=0).reshape(2, 2)
+    offset = offset * len(left) / (len(left) + 1)
     singles = SingleMeasurements(
         np.repeat([0, 1], [len(i) for i in lonely]).astype(np.int64),
-        np.concatenate([uv_a[lonely[0]], uv_b[lonely[1]]]),
+        np.concatenate([uv_a[lonely[0]] - offset[0], uv_b[lonely[1]] - offset[1]]),
         np.concatenate([cov_a[lonely[0]], cov_b[lonely[1]]]),
     )
-    return FrameMeasurements.create(
+    measured = FrameMeasurements.create(
         found.points_mm,
         found.covariance_mm2,
         d_eq_mm=_diameter_mm(cameras, tables, pairs, found.points_mm),
@@ -247,6 +256,7 @@ def _measured(
         particle=pairs.particle,
         singles=singles,
     )
+    return measured, offset
 
 
 def _diameter_mm(
@@ -271,18 +281,11 @@ def _detections(frames: Sequence[Frame]) -> pd.DataFrame:
     """Every detection with the id of its track, blank where it has none."""
     tables = []
     for frame in frames:
-        assert frame.ids is not None
-        first = len(frame.singles[0])
-        singles = (frame.ids.single[:first], frame.ids.single[first:])
-        for c, rows in enumerate((frame.pairs.first, frame.pairs.second)):
-            particle = np.full(len(frame.tables[c]), NO_PARTICLE)
-            particle[rows] = frame.ids.particle
-            particle[frame.singles[c]] = singles[c]
-            given = _given(frame.tables[c])
-            particle = np.where(given != NO_PARTICLE, given, particle)
+        for c, table in enumerate(frame.tables):
+            particle = frame.owners(c)
             known = pd.array(particle, dtype="Int64")
             known[particle == NO_PARTICLE] = pd.NA
-            tables.append(frame.tables[c].assign(particle=known))
+            tables.append(table.assign(particle=known))
     joined = pd.concat(tables, ignore_index=True)
     leading = ["frame", "camera", "particle"]
     return joined[leading + [name for name in joined if name not in leading]]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.errors import InputError
+from telerig.estimator.camera_drift_pairs import PairCollector
 from telerig.estimator.frontend.bubbles import find_bubbles, outline_points
 from telerig.estimator.track_detect import Progress, Scene, make_scene
 from telerig.estimator.track_link import Linked
@@ -98,8 +99,10 @@ def write_tracking(
     work = folder.parent / f".{folder.name}.work"
     with atomic_folder(folder) as staged:
         stream = tracking_stream(run, calibration, work, options, stage)
-        counts, worst = _write_rows(stream, staged)
-        summary = summary_of(run, stream, counts) | {"worst_frames": worst.frames()}
+        pairs = PairCollector(calibration)
+        counts, worst = _write_rows(stream, staged, pairs)
+        summary = summary_of(run, calibration, stream, counts, pairs.found())
+        summary["worst_frames"] = worst.frames()
         write_json_atomic(staged / "tracking.json", summary)
         write_table(events_table(stream.events), staged / "events.csv")
         table = stream.followed.table if stream.followed is not None else None
@@ -134,7 +137,9 @@ def _check_ids(detections: pd.DataFrame) -> None:
         )
 
 
-def _write_rows(stream: TrackingStream, staged: Path) -> tuple[dict[str, Any], _Worst]:
+def _write_rows(
+    stream: TrackingStream, staged: Path, pairs: PairCollector
+) -> tuple[dict[str, Any], _Worst]:
     counts, worst, begun = count_rows([]), _Worst(), False
     for part in stream.rows:
         for name, table in (("tracks", part.tracks), ("detections", part.detections)):
@@ -143,6 +148,7 @@ def _write_rows(stream: TrackingStream, staged: Path) -> tuple[dict[str, Any], _
         begun = True
         add_counts(counts, part)
         worst.add(part)
+        pairs.add(part.tracks)
     return counts, worst
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.behind_walls import forgotten_walls
 from telerig.estimator.calibration import Calibration
+from telerig.estimator.camera_drift_pairs import PairCollector, with_change
 from telerig.estimator.frontend.body import estimate_shape_sigma
 from telerig.estimator.frontend.bubble_types import DETECTION_COLUMNS
 from telerig.estimator.frontend.matching import match_pairs
@@ -39,6 +40,7 @@ from telerig.io.run import RunData
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
+    from telerig.estimator.camera_drift import RigChange
     from telerig.estimator.track_types import TrackEvent
 
 Array = NDArray[np.float64]
@@ -92,7 +94,9 @@ def track(
     joined = pd.concat(tables, ignore_index=True)
     detections = pd.concat([p.detections for p in parts], ignore_index=True)
     counts = count_rows(parts)
-    summary = summary_of(run, stream, counts)
+    pairs = PairCollector(calibration)
+    pairs.add(joined)
+    summary = summary_of(run, calibration, stream, counts, pairs.found())
     return Tracks(run.name, detections, joined, events_table(stream.events), summary, marks)
 
 
@@ -306,8 +310,11 @@ def add_counts(counts: dict[str, Any], part: Linked) -> None:
     counts["ids"] |= set(part.tracks["particle"])
 
 
-def summary_of(run: RunData, stream: TrackingStream, counts: dict[str, Any]) -> dict[str, Any]:
-    """The content of tracking.json."""
+def summary_of(
+    run: RunData, calibration: Calibration, stream: TrackingStream, counts: dict[str, Any],
+    change: RigChange | None,
+) -> dict[str, Any]:  # fmt: skip
+    """The content of tracking.json; change : of the cameras since the calibration, if known."""
     model, kinds = stream.model, [e.kind for e in stream.events]
     if not counts["detections"]:
         raise InputError(
@@ -330,19 +337,14 @@ def summary_of(run: RunData, stream: TrackingStream, counts: dict[str, Any]) -> 
         "detections_without_partner_or_track": counts["unpaired"],
         "frames_without_bubbles": stream.frames_without,
         "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
-        "pairs": {
-            "bias_px": model.bias_px,
-            "scatter_px": model.scatter_px,
-            "frame_px": model.frame_px,
-            "rms_px": model.rms_px,
-            "calibration_problem": model.calibration_problem,
-            "words": model.words,
-        },
+        "pairs": with_change(model, change, calibration),
         "shape_sigma": stream.shape_sigma,
         "covariance": "of the measurement; the calibration's share, common to all points, is not "
         "in tracks.csv",
         "notes": list(run.notes),
     }
+    if change is not None:
+        content["rig_change"] = change.as_dict()
     if stream.followed is not None:
         content["references"] = stream.followed.summary
     return content

@@ -24,7 +24,7 @@ class TrackScore:
     in_view : (bubble, frame) pairs that both images show whole; right : of these, with a point;
     hidden, hidden_right : of these and of the right ones, those of which another bubble hides half
     of the outline or more in a view (silhouettes taken for circles of their area).
-    wrong : points that are no bubble; swaps : changes of the true bubble along a track.
+    wrong : points that are no bubble, or one that has a point already; swaps : changes of the true bubble along a track.
     centre_px, corrected_px : RMS per coordinate of the outlines' centres against the projected
     centre of volume, as measured and with the shape's correction; silhouette_px : against the
     centroid of the true silhouette.
@@ -62,7 +62,8 @@ def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) ->
     found = bubble["row"].notna().to_numpy()
     whole = _whole(truth, cameras)
     hidden = whole & (_hidden_share(truth, cameras) >= 0.5)
-    right = found & bubble["whole"].fillna(False).to_numpy(bool)
+    again = found & bubble["row"].duplicated().to_numpy()
+    right = found & ~again & bubble["whole"].fillna(False).to_numpy(bool)
     measured, shift, volume, silhouette = (
         _columns(table[right], cameras, name)
         for table, name in (
@@ -77,7 +78,7 @@ def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) ->
         int(right.sum()),
         int(hidden.sum()),
         int(hidden.to_numpy()[bubble["row"][right].astype(int)].sum()),
-        int((~found).sum()),
+        int((~found | again).sum()),
         len(tracks),
         _swaps(tracks.table["particle"].to_numpy()[found], bubble["particle"].to_numpy()[found]),
         int((tracks.events["kind"] == "break").sum()),

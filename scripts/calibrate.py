@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from telerig.scripts.console import EXIT_REJECTED, checked_source, errors_in_words, progress, say
+from telerig.errors import InputError
+from telerig.scripts.console import (
+    EXIT_REJECTED,
+    checked_source,
+    errors_in_words,
+    progress,
+    say,
+    stopped_by_signals,
+)
 
 if TYPE_CHECKING:
+    from telerig.estimator.calibrate import CalibrationRun
     from telerig.estimator.calibration import Calibration
     from telerig.estimator.compare_calibrations import RigComparison
+    from telerig.io.dataset import Dataset
 
 
 def calibrate(
@@ -38,6 +48,21 @@ def calibrate(
     source: Annotated[
         str | None, typer.Option("--from", help="images or dots, when the dataset has both.")
     ] = None,
+    watch: Annotated[
+        bool,
+        typer.Option(
+            "--watch",
+            help="Solve again as images arrive, say how to hold the target next, and "
+            "end when another view is not worth it (or at Ctrl-C).",
+        ),
+    ] = False,
+    until_um: Annotated[
+        float | None,
+        typer.Option(help="With --watch: enough when points in space are as good as this.", min=0),
+    ] = None,
+    poll: Annotated[
+        float, typer.Option(help="With --watch: seconds between looks at the folder.", min=0.02)
+    ] = 1.0,
     seed: Annotated[int, typer.Option(help="Recorded; the calibration draws nothing.")] = 0,
     report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
     quiet: Annotated[bool, typer.Option(help="Print only the summary.")] = False,
@@ -47,6 +72,9 @@ def calibrate(
     Finds and numbers the dots, calibrates both cameras, their pose, every target pose and the
     dots' own positions together, and writes calibration.json, covariance.npz, dots.csv,
     residuals.csv, run.json and report.html.
+
+    With --watch it looks into calibration/<camera>/ for new images until another view would bring
+    less than 5 %, or until Ctrl-C; the results are written then, once.
 
     Exit code 0: calibrated. 1: calibrated, but the verdict is REJECTED. 2: the input cannot be
     used, with what, where and what to do. 130: interrupted.
@@ -58,16 +86,22 @@ def calibrate(
 
         begun = time.perf_counter()
         earlier = None if compare is None else _loaded(compare)
-        data = load_dataset(dataset, source=checked_source(source))
-        options = {"model": model, "solver": solver, "dots": dots, "medium": medium,
+        options: dict[str, Any] = {"model": model, "solver": solver, "dots": dots, "medium": medium,
                    "compare": None if compare is None else str(compare), "from": source,
                    "seed": seed}  # fmt: skip
+        chosen: dict[str, Any] = {
+            "model": model, "solver": solver, "medium": medium, "seed": seed, "dots_free": dots,
+        }  # fmt: skip
+        if watch:
+            data, run = _watched(dataset, source, until_um, poll, chosen)
+            options |= {"watch": True, "until_um": until_um}
+        else:
+            if until_um is not None:
+                raise InputError("--until-um goes with --watch", todo="add --watch, or leave it")
+            data = load_dataset(dataset, source=checked_source(source))
+            with progress(quiet) as stage:
+                run = run_calibration(data, **chosen, stage=stage, pictures=True)
         folder = out or data.results / "calibration"
-        with progress(quiet) as stage:
-            run = run_calibration(
-                data, model=model, solver=solver, medium=medium, seed=seed, dots_free=dots,
-                stage=stage, pictures=True,
-            )  # fmt: skip
         seconds = {"calibrate": time.perf_counter() - begun}
         change = None if earlier is None else _change(earlier, run.calibration)
         write_results(
@@ -92,6 +126,21 @@ def _change(earlier: Calibration, now: Calibration) -> RigComparison:
     from telerig.estimator.compare_calibrations import compare_calibrations
 
     return compare_calibrations(earlier, now)
+
+
+def _watched(
+    dataset: Path, source: str | None, until_um: float | None, poll: float, chosen: dict[str, Any]
+) -> tuple[Dataset, CalibrationRun]:
+    """The images that arrived, and their calibration."""
+    from telerig.estimator.watch import watch
+    from telerig.io.dataset import load_dataset
+
+    if source == "dots":
+        raise InputError("--watch waits for images", todo="leave out --from dots")
+    data = load_dataset(dataset, need_views=False)
+    say(f"watching {data.path / 'calibration'}; Ctrl-C writes the results and ends")
+    with stopped_by_signals() as stop:
+        return watch(data, stop=stop, tell=say, interval_s=poll, until_um=until_um, **chosen)
 
 
 if __name__ == "__main__":

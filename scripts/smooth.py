@@ -24,6 +24,13 @@ def smooth(
     model: Annotated[
         str, typer.Option(help="auto (learns what no sensor tells) or default (fixed priors).")
     ] = "auto",
+    refine_rig: Annotated[
+        bool,
+        typer.Option(
+            "--refine-rig",
+            help="Estimate how the cameras have moved against each other since the calibration.",
+        ),
+    ] = False,
     report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
     quiet: Annotated[bool, typer.Option(help="Print only the summary.")] = False,
 ) -> None:
@@ -48,7 +55,7 @@ def smooth(
         with progress(quiet) as stage:
             found = smooth_run(
                 data, calibrated, tracks or folder, folder, model=model, inputs=files,
-                report=report, stage=stage,
+                refine_rig=refine_rig, report=report, stage=stage,
             )  # fmt: skip
         say(smoothing_words(found))
         say(f"written: {folder}" + ("/report.html" if report else ""))

@@ -89,6 +89,20 @@ def detect_dataset(
         found.append(image)
         if progress is not None:
             progress(done, len(tasks))
+    return detected_together(dataset, found)
+
+
+def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:
+    """The target in one image. Raises InputError for an image that cannot be read."""
+    return _one_of(dataset, overlay, (view, camera))
+
+
+def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
+    """Tables and notes of images that were detected one by one.
+
+    Raises DetectionError when none shows the target, or when they contradict each other's
+    handedness.
+    """
     failures = [i for i in found if i.failure]
     if len(failures) == len(found):
         raise DetectionError(

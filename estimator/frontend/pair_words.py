@@ -7,6 +7,7 @@ from dataclasses import replace
 from telerig.estimator.frontend.pair_types import PairModel
 
 LEAST_PROBLEM_PX = 0.5
+CALIBRATION_PROBLEM = "This is a calibration problem"
 _SIGNIFICANT = 4.0
 _FEW_PAIRS = 5.0
 _CLEAR_VOTE = 3.0
@@ -24,7 +25,7 @@ def describe(model: PairModel, votes: float) -> PairModel:
     ]
     if problem:
         words.append(
-            f"This is a calibration problem: the shared coordinate is off by {constant:+.2f} px; "
+            f"{CALIBRATION_PROBLEM}: the shared coordinate is off by {constant:+.2f} px; "
             f"with that constant removed {after_constant:.2f} px RMS remain. Matching removes it; "
             "positions keep it until the rig is calibrated again."
         )

@@ -239,10 +239,14 @@ class CalibrationShare:
 
     root : (P, r), covariance = root root^T up to what no pixel feels.
     free : per camera, names of the free intrinsics (the order of P, see `Calibration`).
+    covariance : (P, P) before the run, of which ``root`` is what is felt.
+    drift : (6, 6) of a movement of the second camera since, which is part of it; None: held.
     """
 
     root: Array
     free: tuple[tuple[str, ...], ...]
+    covariance: Array
+    drift: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -214,23 +214,31 @@ def _marks(
 
 
 def calibration_share(
-    calibration: Calibration, points_mm: Array, sigma_px: float
+    calibration: Calibration, points_mm: Array, sigma_px: float, drift: Array | None = None
 ) -> CalibrationShare | None:
     """The directions of the calibration's covariance that move the pixels of these rig points.
 
     A direction whose effect stays far below the noise of a mean over the run is left out.
+    drift : (6, 6) prior of a movement of the second camera since the calibration.
     """
+    from telerig.estimator.camera_drift import rig_block, with_drift
     from telerig.estimator.covariance import rig_jacobian
 
-    if not calibration.covariance.size or not len(points_mm):
+    covariance, free = calibration.covariance, calibration.free
+    if drift is not None:
+        covariance, free = rig_block(calibration)
+        covariance = with_drift(covariance, drift)
+    if not len(points_mm) or not covariance.size:
         return None
-    values, vectors = np.linalg.eigh(calibration.covariance)
+    values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.clip(values, 0, None))
-    rows = rig_jacobian(calibration.cameras, calibration.free, points_mm) @ root
+    rows = rig_jacobian(calibration.cameras, free, points_mm) @ root
     flat = rows.reshape(-1, root.shape[1])
     _, strength, turn = np.linalg.svd(flat, full_matrices=False)
     felt = strength / np.sqrt(len(flat)) > min(_FELT_PX, 0.02 * sigma_px)
-    return CalibrationShare(root @ turn[felt].T, calibration.free) if felt.any() else None
+    if not felt.any():
+        return None
+    return CalibrationShare(root @ turn[felt].T, free, covariance, drift)
 
 
 def _near(t: Array, t_s: Array) -> NDArray[np.bool_]:

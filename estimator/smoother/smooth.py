@@ -21,6 +21,14 @@ from telerig.estimator.smoother.model import (
     ShakeModel,
     SmoothingProblem,
 )
+from telerig.estimator.smoother.refined import (
+    Refinement,
+    change_words,
+    for_learning,
+    refined_change,
+    refinement_of,
+    with_wander,
+)
 from telerig.estimator.smoother.results import Smoothing, summary_of
 from telerig.estimator.smoother.sensors import (
     accelerometers_of,
@@ -37,6 +45,7 @@ from telerig.estimator.smoother.travel import travel_of
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration import Calibration
+    from telerig.estimator.camera_drift import DriftPrior
 
 Array = NDArray[np.float64]
 Learn = Callable[[SmoothingProblem], ShakeModel]
@@ -59,6 +68,7 @@ def smooth(
     t_s: ArrayLike | None = None,
     options: Options | None = None,
     progress: Progress | None = None,
+    refine_rig: bool | DriftPrior = False,
 ) -> Smoothing:
     """Smooth a run: every bubble in the lab, every camera's shake, with what is known of them.
 
@@ -74,15 +84,19 @@ def smooth(
     rig : the description in rig.toml: travel axis (where the calibration has no stage), how well
         the encoder's scale is known, sensors. t_s : (F,) frame times, else those of
         the tracks.
+    refine_rig : estimate with it how the cameras have moved against each other since the
+        calibration (``summary["rig_change"]``); a `DriftPrior` says how far they may have.
 
     Raises InputError for tables that cannot be used together.
     """
+    refinement = refinement_of(getattr(tracks, "table", tracks), calibration, refine_rig)
     problem, tracked, encoder_sigma = problem_of(
         tracks, calibration, stage=stage, accelerometers=accelerometers,
         references=references, rig=rig, t_s=t_s,
+        drift=None if refinement is None else refinement.drift,
     )  # fmt: skip
     options = options or Options()
-    chosen = choose_model(problem, model, encoder_sigma)
+    chosen = _chosen(problem, model, encoder_sigma, refinement)
     if isinstance(model, ShakeModel):
         solution = solve(problem, chosen, options, progress)
     else:
@@ -91,14 +105,31 @@ def smooth(
         if chosen.learned:
             solution = inflated(solution)
     verdict = judge(problem, chosen, solution) if problem.bubbles else {}
+    summary = summary_of(solution)
+    change = refined_change(solution, calibration)
+    if change is not None:
+        words = change_words(change, problem.cameras[0].name)
+        summary["rig_change"] = {**change.as_dict(), "words": words}
     return Smoothing(
         trajectories(solution, None if tracked is None else tracked.table),
         shake_table(solution),
         verdict,
-        summary_of(solution),
+        summary,
         chosen,
         solution,
     )
+
+
+def _chosen(
+    problem: SmoothingProblem,
+    model: ShakeModel | Learn | str,
+    encoder_sigma_mm: float,
+    refinement: Refinement | None,
+) -> ShakeModel:
+    if refinement is None or isinstance(model, ShakeModel):
+        return choose_model(problem, model, encoder_sigma_mm)
+    chosen = choose_model(for_learning(problem, refinement), model, encoder_sigma_mm)
+    return with_wander(chosen, refinement)
 
 
 def problem_of(
@@ -110,8 +141,12 @@ def problem_of(
     references: Any = None,
     rig: Any = None,
     t_s: ArrayLike | None = None,
+    drift: Array | None = None,
 ) -> tuple[SmoothingProblem, Tracked | None, float]:
-    """The smoothing problem of these tables, the tracks read, and the encoder's sd (mm)."""
+    """The smoothing problem of these tables, the tracks read, and the encoder's sd (mm).
+
+    drift : (6, 6) prior of a movement of the second camera since the calibration.
+    """
     if hasattr(stage, "frame_count"):
         run = stage
         stage, rig, t_s = run.stage, run.rig if rig is None else rig, run.t_s
@@ -145,7 +180,7 @@ def problem_of(
         points = tracked.table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         some = points[np.linspace(0, len(points) - 1, min(len(points), 200)).astype(int)]
         noise = np.median(np.sqrt(tracked.observations.covariance_px2[:, 0, 0]))
-        share = calibration_share(calibration, some, float(noise))
+        share = calibration_share(calibration, some, float(noise), drift)
     problem = SmoothingProblem(
         cameras, times, axis, up, bubbles,
         Observations.none() if tracked is None else tracked.observations,

@@ -13,6 +13,7 @@ from telerig.io.report.calibration_results import CalibrationResults, read_resul
 from telerig.io.report.contact_sheet import contact_sheet
 from telerig.io.report.figures_coverage import coverage, tilts
 from telerig.io.report.figures_dot import dot_pictures
+from telerig.io.report.figures_next import next_pictures
 from telerig.io.report.figures_residuals import residual_field, residual_histogram
 from telerig.io.report.figures_rig import rig_plan
 from telerig.io.report.figures_target import target_pictures
@@ -70,6 +71,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "absent": results.absent,
         "trust_words": _trust_words(results),
         "comparison": results.comparison,
+        "advice": (content.get("diagnostics") or {}).get("next_view") or {},
         "dots_drawn": dots_are_drawn(results),
     }
 
@@ -117,6 +119,7 @@ def _pictures(results: CalibrationResults) -> dict[str, Any]:
         ("spread", partial(residual_histogram, results)),
         ("plan", partial(rig_plan, results)),
         ("trust", partial(trust_pictures, results)),
+        ("next", partial(next_pictures, results)),
     ]
     drawn = drawn_over_cores([d for _, d in drawings])
     pictures: dict[str, Any] = {"fields": [], "covered": [], "spread": []}

@@ -70,6 +70,7 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Verdic
         word.upper(), (word.replace("_", " "), "usable", "") if word else _NOT_JUDGED
     )
     sentences = [meaning, *_by_axis(strings(content.get("words")))]
+    sentences += [f"Rig: {_micro(w)}." for w in strings(results.part("rig_change").get("words"))]
     if word.upper() in ("PARTIAL", "UNRESOLVED"):
         sentences += _remedy(content, " ".join(sentences))
     flags = {

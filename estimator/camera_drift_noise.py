@@ -1,0 +1,232 @@
+"""The gaps' own noise: pixels, the cameras' shake against each other, the bubbles' changing shapes.
+
+A Gaussian process in time, its size learned from the gaps themselves: white noise of each pair;
+damped oscillations that all pairs of a frame share (shake); a slower motion of each bubble's own,
+as its outline's centre wanders about its centre of volume (Ornstein-Uhlenbeck). Only the density
+near frequency 0 limits what is constant, and an oscillation has little there: a plain mean over
+correlated gaps would be wrong in both directions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky
+from scipy.optimize import minimize
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Prior = tuple[Array, Array]
+
+_PEAKS = 3
+_MOST_MODES = 2
+_BETTER_NATS = 3.0
+_WANDER_S = 0.1
+_CYCLES = 5.0
+_FACTOR_3, _FACTOR_10 = np.log(3.0), np.log(10.0)
+_INDEPENDENT = 0.5
+"""Neighbouring bins of a tapered spectrum tell the same thing."""
+_FIRST_BIN = 2
+_LEAST_FRAMES = 16
+_MOST_APART = 4
+
+
+@dataclass(frozen=True)
+class Series:
+    """Gaps in time. frame, bubble (M,), t_s (M,), gap_mm (M,).
+
+    relative : (M,) variance of each over the typical one.  free : (M, K) derivatives by the
+    unknowns, of unit variance beforehand.
+    """
+
+    frame: Ints
+    bubble: Ints
+    t_s: Array
+    gap_mm: Array
+    relative: Array
+    free: Array
+
+    def of(self, keep: NDArray[np.bool_]) -> Series:
+        return Series(
+            self.frame[keep], self.bubble[keep], self.t_s[keep], self.gap_mm[keep],
+            self.relative[keep], self.free[keep],
+        )  # fmt: skip
+
+    def left(self) -> Array:
+        """(M,) gaps less what the unknowns can explain at most."""
+        fit = np.linalg.lstsq(self.free, self.gap_mm, rcond=None)[0]
+        return np.asarray(self.gap_mm - self.free @ fit)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """white_mm : of one gap.  wander_mm, wander_s : Ornstein-Uhlenbeck, of each bubble.
+
+    shake : oscillations that all pairs share: RMS mm, correlation time s, frequency Hz.
+    """
+
+    white_mm: float
+    wander_mm: float
+    wander_s: float
+    shake: tuple[tuple[float, float, float], ...] = ()
+
+    def own(self, lag_s: Array) -> Array:
+        """Autocovariance of a bubble's wander."""
+        return np.asarray(self.wander_mm**2 * np.exp(-np.abs(lag_s) / self.wander_s))
+
+    def common(self, lag_s: Array) -> Array:
+        """Autocovariance of the shake: masses on damped springs, driven by white noise."""
+        out = np.zeros_like(lag_s)
+        for rms, decay, hz in self.shake:
+            lag, turn = np.abs(lag_s), 2 * np.pi * hz
+            wave = np.cos(turn * lag) + np.sin(turn * lag) / (turn * decay)
+            out += rms**2 * np.exp(-lag / decay) * wave
+        return out
+
+    def covariance(self, series: Series) -> Array:
+        """(M, M) of gaps without what is unknown."""
+        t, index = np.unique(series.t_s, return_inverse=True)
+        at = np.ix_(index, index)
+        lag = t[:, None] - t
+        same = series.bubble[:, None] == series.bubble
+        out = self.common(lag)[at] + np.where(same, self.own(lag)[at], 0.0)
+        out[np.diag_indices(len(out))] += self.white_mm**2 * series.relative
+        return np.asarray(out)
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """A tapered periodogram and what its expectation is made of.
+
+    common, single : shares of the shake's and of a single bubble's noise in this series.
+    """
+
+    power: Array
+    step_s: float
+    overlap: Array
+    common: float
+    single: float
+
+    def expected(self, noise: Noise) -> Array:
+        """Of the periodogram at its frequencies: leakage and aliasing included."""
+        lag = np.asarray(np.arange(len(self.overlap)) * self.step_s, np.float64)
+        covariance = self.common * noise.common(lag) + self.single * noise.own(lag)
+        covariance[0] += self.single * noise.white_mm**2
+        turned = covariance * self.overlap
+        both = np.concatenate([turned, [0.0], turned[:0:-1]])
+        density = np.fft.fft(both).real[: len(self.overlap) + 1 : 2]
+        return np.asarray(density[_FIRST_BIN : _FIRST_BIN + len(self.power)].clip(1e-18))
+
+    def cost(self, noise: Noise) -> float:
+        """Debiased Whittle likelihood (Sykulski et al., Biometrika 106:251, 2019)."""
+        density = self.expected(noise)
+        return float(_INDEPENDENT * (np.log(density) + self.power / density).sum())
+
+
+def learned_noise(parts: list[Series]) -> Noise:
+    """The most probable noise of stretches of a run, from the spectra of what the unknowns leave.
+
+    Oscillations are added while each is worth `_BETTER_NATS`, two at most (an arm for each camera).
+    """
+    spread = max(float(np.concatenate([p.left() for p in parts]).std()), 1e-7)
+    start = np.log([spread / 2, spread / 4, _WANDER_S])
+    spectra = [s for p in parts for s in _spectra(p)]
+    if not spectra:
+        return Noise(spread, spread / 4, _WANDER_S)
+    prior: Prior = (start, np.array([_FACTOR_10, _FACTOR_10, _FACTOR_3]))
+    best, score = _climbed(spectra, start, prior)
+    for _ in range(_MOST_MODES):
+        trials = []
+        for hz in _peaks(spectra[0], _noise(best)):
+            mode = np.log([spread / 2, _CYCLES / hz, hz])
+            richer = (
+                np.concatenate([prior[0], mode]),
+                np.concatenate([prior[1], [_FACTOR_10, _FACTOR_3, 0.1]]),
+            )
+            trials.append((*_climbed(spectra, np.concatenate([best, mode]), richer), richer))
+        if not trials:
+            break
+        found, worth, richer = min(trials, key=lambda t: t[1])
+        if worth > score - _BETTER_NATS:
+            break
+        best, score, prior = found, worth, richer
+    return _noise(best)
+
+
+def _climbed(spectra: list[_Spectrum], start: Array, prior: Prior) -> tuple[Array, float]:
+    def cost(log: Array) -> float:
+        noise = _noise(log)
+        pull = 0.5 * float((((log - prior[0]) / prior[1]) ** 2).sum())
+        return pull + sum(s.cost(noise) for s in spectra)
+
+    box = [(s - 8.0, s + 4.0) for s in start]
+    found = minimize(cost, start, method="L-BFGS-B", bounds=box, options={"maxiter": 60})
+    return np.asarray(found.x), float(found.fun)
+
+
+def _noise(log: Array) -> Noise:
+    white, wander, tau, *rest = (float(v) for v in np.exp(log))
+    modes = np.reshape(rest, (-1, 3))
+    return Noise(white, wander, tau, tuple((float(a), float(b), float(c)) for a, b, c in modes))
+
+
+def _spectra(part: Series) -> list[_Spectrum]:
+    """Of the mean gap of a frame, and of what bubbles do apart from it."""
+    left = part.left()
+    t, index = np.unique(part.t_s, return_inverse=True)
+    if len(t) < _LEAST_FRAMES:
+        return []
+    count = np.bincount(index)
+    mean = np.bincount(index, left) / count
+    share = float((1 / count).mean())
+    out = [_spectrum(t, mean, 1.0, share)]
+    apart = left - mean[index]
+    bubbles, seen = np.unique(part.bubble, return_counts=True)
+    for bubble in bubbles[np.argsort(-seen)][:_MOST_APART] if share < 1 else ():
+        mine = (part.bubble == bubble) & (count[index] > 1)
+        if mine.sum() >= _LEAST_FRAMES:
+            rest = float((1 - 1 / count[index[mine]]).mean())
+            out.append(_spectrum(part.t_s[mine], apart[mine], 0.0, rest))
+    return out
+
+
+def _spectrum(t_s: Array, values: Array, common: float, single: float) -> _Spectrum:
+    step = float(np.median(np.diff(t_s)))
+    even = np.arange(t_s[0], t_s[-1] + step / 2, step)
+    series = np.interp(even, t_s, values)
+    taper = np.hanning(len(even) + 2)[1:-1]
+    taper /= np.sqrt((taper**2).sum())
+    power = np.abs(np.fft.rfft(series * taper)) ** 2
+    overlap = np.correlate(taper, taper, "full")[len(taper) - 1 :]
+    last = (len(even) - 1) // 2
+    return _Spectrum(power[_FIRST_BIN : last + 1], step, np.asarray(overlap), common, single)
+
+
+def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
+    """Frequencies (Hz) that stand out most, over what is explained already, well apart."""
+    ratio = spectrum.power / spectrum.expected(noise)
+    length = len(spectrum.overlap) * spectrum.step_s
+    hz = np.arange(_FIRST_BIN, _FIRST_BIN + len(ratio)) / length
+    picked: list[float] = []
+    for i in np.argsort(-ratio * spectrum.power):
+        if all(abs(hz[i] - p) > 0.15 * p for p in picked):
+            picked.append(float(hz[i]))
+        if len(picked) == _PEAKS:
+            break
+    return picked
+
+
+def information(series: Series, noise: Noise) -> tuple[Array, Array, Array]:
+    """Of the unknowns (K, K), (K,), and each gap's residual in sigmas given all others (M,).
+
+    The last without the unknowns' own uncertainty, at their best values for this stretch.
+    """
+    lower = cholesky(noise.covariance(series), lower=True, check_finite=False)
+    inverse = cho_solve((lower, True), np.eye(len(lower)), check_finite=False)
+    matrix = series.free.T @ inverse @ series.free
+    right = series.free.T @ (inverse @ series.gap_mm)
+    best = np.linalg.solve(matrix + np.eye(len(matrix)), right)
+    off = inverse @ (series.gap_mm - series.free @ best)
+    return matrix, right, off / np.sqrt(np.diagonal(inverse))

@@ -38,7 +38,7 @@ from telerig.estimator.problem import Problem
 from telerig.factors.projection import State
 
 SIZES = ("12x15", "12x100", "50x400", "200x400", "200x2000")
-GROWTH = ("50x100", "50x400", "50x2000", "12x400", "100x400", "200x400")
+GROWTH = ("50x100", "50x400", "50x2000", "12x400", "200x400")
 SOLVERS = ("numpy", "numba", "scipy", "ceres", "gtsam")
 SHORT_S = 2.0
 """Runs shorter than this are repeated."""
@@ -107,7 +107,7 @@ def growth(name: str, size: str) -> dict[str, Any]:
     }
     out = {}
     for part, work in parts.items():
-        best, until = np.inf, time.process_time() + 1.0
+        best, until = np.inf, time.process_time() + 0.6
         while time.process_time() < until:
             began = time.process_time()
             work()
@@ -191,11 +191,16 @@ Per iteration, measured dot and CPU core, in nanoseconds ("images": all derivati
 
 {growth}
 
-At fixed views the sum does not grow with the dots. The images' share is the same at any size. The
-step grows with the views V while the dots are many: each dot adds an outer product to the matrix
-of all views, (6 V)^2 x 3 / (2 V) = 54 V multiply-adds a measured dot (10,800 at 200 views, at
-some 16 a nanosecond in the BLAS), and one factorisation of (6 V)^3 / 3 is shared by all of them;
-where dots are fewer than twice the views, the views are eliminated instead.
+At 50 views the sum is the same within 20 % from 400 to 2,000 dots; below, and with few views,
+calls into NumPy weigh more. The images' share does not grow with the views. The step does while
+the dots are many: each dot adds an outer product to the matrix of all V views, (6 V)^2 x 3 / (2 V)
+= 54 V multiply-adds a measured dot (10,800 at 200 views, at some 16 a nanosecond in the BLAS), and
+one factorisation of (6 V)^3 / 3 is shared by all of them. Where dots are fewer than twice the
+views, the views are eliminated instead; where each view sees a part of the dots, the outer
+products are of the views that do.
+
+A limit is of wall time, on a machine shared with other work; "-" was not run. Where nothing but
+the product finished, its cost has no independent witness.
 """
 
 

@@ -20,6 +20,7 @@ from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem, parameter_unit, p
 from telerig.estimator.schur import Group
 from telerig.factors.image_blocks import (
     ImageBlocks,
+    Scratch,
     image_blocks,
     squared_error,
 )
@@ -65,6 +66,7 @@ class ArraySystem:
         self.dot_weight = np.ascontiguousarray(problem.dot_sigma_mm.T**-2.0)
         self.loops: Any = compiled_loops() if len(problem.view) >= MANY else None
         self.groups = seen_together(problem, int(self.edges[-1]))
+        self.scratch = Scratch()
         self.loose_mm = 10 * max(problem.rho_mm)
 
     def _pick(self, free: Ints, unit: Array) -> tuple[Ints, Array]:
@@ -155,7 +157,7 @@ class _Sums:
     def equations(self) -> NormalEquations:
         system = self.system
         for rows in system.chunks:
-            given = (self.state, rows, system.problem.rho_mm, system.any_free)
+            given = (self.state, rows, system.problem.rho_mm, system.any_free, system.scratch)
             if system.loops is not None and system.loops.handles(self.state, rows, system.any_free):
                 self._add_compiled(rows, system.loops.image_columns(*given))
             else:

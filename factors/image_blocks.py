@@ -76,29 +76,51 @@ def view_from_camera_tangent(rotation: Array, offset: Array) -> Array:
     return out
 
 
+class Scratch:
+    """Memory that is used again for the next chunk: a fresh megabyte costs more than its use."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, Array] = {}
+
+    def empty(self, name: str, *shape: int) -> Array:
+        """What was kept under the name, if it is of this shape; its content is lost."""
+        if name not in self._kept or self._kept[name].shape != shape:
+            self._kept[name] = np.empty(shape)
+        return self._kept[name]
+
+
 def view_gram(state: State, rows: ImageRows, rho_mm: tuple[float, ...]) -> Array:
     """(I, 7, 7) products of the view's columns and the residual, for fits of views alone."""
-    return _gram(_all_columns(state, rows, rho_mm, ())[0])
+    return _gram(_all_columns(state, rows, rho_mm, (), Scratch())[0])
 
 
 def image_blocks(
-    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int]
+    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int], scratch: Scratch
 ) -> ImageBlocks:
-    """free : the intrinsics of interest, indices into `PARAMETERS`, the same for all cameras."""
-    columns, moved = _all_columns(state, rows, rho_mm, free)
-    by_dot = columns[:, :, None, 0] * columns[:, None, 3:6, 0]
-    by_dot += columns[:, :, None, 1] * columns[:, None, 3:6, 1]
+    """Valid until ``scratch`` is used again.
+
+    free : the intrinsics of interest, indices into `PARAMETERS`, the same for all cameras.
+    """
+    columns, moved = _all_columns(state, rows, rho_mm, free, scratch)
+    images, count, _, width = columns.shape
+    by_dot = scratch.empty("by dot", images, count, 3, width)
+    other = scratch.empty("other", images, count, 3, width)
+    np.multiply(columns[:, :, None, 0], columns[:, None, 3:6, 0], out=by_dot)
+    np.multiply(columns[:, :, None, 1], columns[:, None, 3:6, 1], out=other)
+    by_dot += other
     return ImageBlocks(_gram(columns), by_dot, moved)
 
 
 def _all_columns(
-    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int]
+    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int], scratch: Scratch
 ) -> tuple[Array, Array]:
-    """`columns_of` and `view_from_camera_tangent`."""
+    """`fill_columns` and `view_from_camera_tangent`."""
     rotation, offset = camera_from_target(state, rows)
     at = placed(state, rows, rotation, offset)
     lens = planes.lens_of(state.intrinsics, rho_mm, rows)
-    return columns_of(at, lens, rows, free), view_from_camera_tangent(rotation, offset)
+    out = scratch.empty("columns", len(rows.view), 7 + len(free), 2, rows.dot.shape[1])
+    fill_columns(out, at, lens, rows, free)
+    return out, view_from_camera_tangent(rotation, offset)
 
 
 def _gram(columns: Array) -> Array:
@@ -106,9 +128,8 @@ def _gram(columns: Array) -> Array:
     return np.asarray(flat @ np.swapaxes(flat, -1, -2))
 
 
-def columns_of(at: Placed, lens: Lens, rows: ImageRows, free: Sequence[int]) -> Array:
+def fill_columns(out: Array, at: Placed, lens: Lens, rows: ImageRows, free: Sequence[int]) -> None:
     """(I, 7 + F, 2, m) whitened derivatives by view and free intrinsics, and the residual."""
-    out = np.empty((len(rows.view), 7 + len(free), 2, rows.dot.shape[1]))
     seen = planes.ideal(at.camera, lens, rows, derivatives=True)
     r2 = seen.x * seen.x + seen.y * seen.y
     xd, yd = planes.distorted(seen.x, seen.y, r2, lens)
@@ -145,7 +166,6 @@ def columns_of(at: Placed, lens: Lens, rows: ImageRows, free: Sequence[int]) -> 
             _apply(by_ideal, *_pair(seen.by_turn[:, p - planes.WALL.start]), column)
         else:
             column[:] = 0.0
-    return out
 
 
 def _white_by_sensor(white: Array, lens: Lens) -> Array:

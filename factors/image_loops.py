@@ -15,7 +15,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from telerig.factors import lens_planes as planes
-from telerig.factors.image_blocks import camera_from_target, view_from_camera_tangent
+from telerig.factors.image_blocks import (
+    Scratch,
+    camera_from_target,
+    view_from_camera_tangent,
+)
 from telerig.factors.image_rows import ImageRows
 from telerig.factors.projection import State
 
@@ -110,7 +114,7 @@ def _columns(
     dots: Array, index: Any, rotation: Array, offset: Array, lens: Array, rho: Array,
     uv: Array, white: Array, free: Any, out: Array,
 ) -> None:  # fmt: skip
-    """Fills (I, 7 + F, 2, m) as `image_blocks.columns_of` does."""
+    """Fills (I, 7 + F, 2, m) as `image_blocks.fill_columns` does."""
     last = out.shape[1] - 1
     for i in range(index.shape[0]):
         r, t, k, half = rotation[i], offset[i], lens[i], rho[i]
@@ -224,12 +228,12 @@ class ImageColumns:
 
 
 def image_columns(
-    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int]
+    state: State, rows: ImageRows, rho_mm: tuple[float, ...], free: Sequence[int], scratch: Scratch
 ) -> ImageColumns:
     """`telerig.factors.image_blocks.image_blocks` before its products with the dots."""
     rotation, offset = camera_from_target(state, rows)
     images, width = rows.dot.shape
-    columns = np.empty((images, 7 + len(free), 2, width))
+    columns = scratch.empty("columns", images, 7 + len(free), 2, width)
     lens, rho = state.intrinsics[rows.camera], np.asarray(rho_mm)[rows.camera]
     _columns(
         state.dots_mm, rows.dot, rotation, offset[..., 0], lens, rho, rows.uv_px, rows.whitener,

@@ -24,7 +24,8 @@ class TrackScore:
     in_view : (bubble, frame) pairs that both images show whole; right : of these, with a point;
     hidden, hidden_right : of these and of the right ones, those of which another bubble hides half
     of the outline or more in a view (silhouettes taken for circles of their area).
-    wrong : points that are no bubble, or one that has a point already; swaps : changes of the true bubble along a track.
+    wrong : points that are no bubble, or one that has a point already; swaps : changes of the true
+    bubble along a track.
     centre_px, corrected_px : RMS per coordinate of the outlines' centres against the projected
     centre of volume, as measured and with the shape's correction; silhouette_px : against the
     centroid of the true silhouette.

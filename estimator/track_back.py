@@ -33,6 +33,7 @@ _REACH_FRAMES = 4
 _VAGUE = 0.5
 """Largest sd of a foretold pixel, as a share of the bubble's diameter."""
 
+_NOTHING = 1e-6
 _CONFIDENCE = 0.95
 _DOUBTFUL = {"overlap", "merged", "border"}
 
@@ -63,6 +64,7 @@ def follow_back(
     for frame in frames:
         if frame.number in changeable:
             _reconsider(frame, sizes)
+    _release_wrong(frames, changeable, sizes, cameras, settings)
     for _ in range(_PASSES):
         missing = _missing(frames, changeable, everyone)
         particles = sorted({p for found in missing for p in found})
@@ -100,6 +102,68 @@ def _reconsider(frame: Frame, sizes: dict[int, float]) -> None:
     for particle in {s.particle for s in frame.singles if len(frame.of(s.particle)) > 1}:
         if particle in sizes:
             frame.release(particle)
+
+
+def _release_wrong(
+    frames: Sequence[Frame],
+    changeable: set[int],
+    sizes: dict[int, float],
+    cameras: tuple[Camera, Camera],
+    settings: TrackerSettings,
+) -> None:
+    """Pairs with a doubtful outline where the bubble cannot be go on as the other one alone."""
+    doubtful = [_doubtful(f) if f.number in changeable else np.zeros((0, 2), bool) for f in frames]
+    ids = {int(p) for f, d in zip(frames, doubtful) for p in f.particle[: len(d)][d.any(1)]}
+    place = {p: k for k, p in enumerate(sorted(ids & set(sizes)))}
+    if not place:
+        return
+    motions = [f.motion for f in frames]
+    smoothed = smooth_points(readings_of(frames, list(place), cameras), motions, settings)
+    for i, (frame, doubt) in enumerate(zip(frames, doubtful)):
+        columns = [int(c) for c in np.flatnonzero(doubt.any(1)) if frame.particle[c] in place]
+        k = [place[int(frame.particle[c])] for c in columns]
+        found = _left_out(frame, columns, smoothed[0][i, k], smoothed[1][i, k])
+        for column, point, covariance in zip(columns, *found):
+            particle = int(frame.particle[column])
+            told = Foretold([particle], point[None], covariance[None], np.array([sizes[particle]]))
+            agrees = [_agrees(frame, c, column, told, cameras[c], settings) for c in (0, 1)]
+            camera = int(agrees[1])
+            if agrees[0] != agrees[1] and doubt[column, 1 - camera]:
+                row = int(frame.pairs.rows(camera)[column])
+                frame.particle[column] = NO_PARTICLE
+                _claim_single(frame, particle, camera, row, told, 0)
+
+
+def _doubtful(frame: Frame) -> NDArray[np.bool_]:
+    """(M, 2) whether the outlines of each pair may be off: only a part of them was seen."""
+    out = [
+        [bool(_DOUBTFUL & set(str(word).split("|"))) for word in table["flags"].to_numpy()[rows]]
+        for table, rows in zip(frame.tables, (frame.pairs.first, frame.pairs.second))
+    ]
+    return np.array(out, bool).reshape(2, -1).T
+
+
+def _left_out(
+    frame: Frame, columns: Sequence[int], points: Array, covariances: Array
+) -> tuple[Array, Array]:
+    """The smoothed points and their covariances without what the frame itself says of them."""
+    own = np.linalg.inv(frame.covariance_mm2[columns])
+    all_of_it = np.linalg.inv(covariances)
+    pull = all_of_it @ points[..., None] - own @ frame.points_mm[columns][..., None]
+    covariance: Array = np.linalg.inv(all_of_it - own + _NOTHING * np.eye(3))
+    return np.asarray(covariance @ pull, float)[..., 0], covariance
+
+
+def _agrees(
+    frame: Frame, camera: int, column: int, told: Foretold, view: Camera, settings: TrackerSettings
+) -> bool:
+    """Whether a pair's outline is where the bubble is foretold; also when that is too vague."""
+    row = int(frame.pairs.rows(camera)[column])
+    uv, by_point, _ = stacked_jacobian((view,), told.points_mm)
+    spread = by_point[0] @ told.covariance_mm2[0] @ by_point[0].T
+    measured, noise = frame.pixels[camera]
+    left = measured[row] - uv[0] - frame.offset_px[camera]
+    return bool(left @ np.linalg.solve(spread + noise[row], left) <= gate2(settings, 2))
 
 
 def _missing(

@@ -35,6 +35,7 @@ COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 _PER_CAMERA = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 _PAIRS_AT_ONCE = 512
+_LEAST_FOR_OFFSET = 3
 
 WANDER = (21 / 8) ** 0.5
 """Shift of an outline's centre, as a share of the radius, by a body's third harmonics of unit
@@ -241,8 +242,9 @@ def _measured(
     )
     expected, _, _ = stacked_jacobian(cameras, found.points_mm)
     left = np.hstack([uv_a[pairs.first], uv_b[pairs.second]]) - expected
-    offset = np.zeros((2, 2)) if not len(left) else np.median(left, axis=0).reshape(2, 2)
-    offset = offset * len(left) / (len(left) + 1)
+    offset = np.zeros((2, 2))
+    if len(left) >= _LEAST_FOR_OFFSET:
+        offset = np.median(left, axis=0).reshape(2, 2)
     singles = SingleMeasurements(
         np.repeat([0, 1], [len(i) for i in lonely]).astype(np.int64),
         np.concatenate([uv_a[lonely[0]] - offset[0], uv_b[lonely[1]] - offset[1]]),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.track_frames import Frame, Single, readings_of
 from telerig.estimator.track_hidden import smooth_points
-from telerig.estimator.track_types import TrackerSettings
+from telerig.estimator.track_types import NO_PARTICLE, TrackerSettings
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 
@@ -23,8 +23,11 @@ FRAMES_BEFORE, FRAMES_AFTER = 15, 40
 """Frames around a hidden one that tell where its bubble is."""
 
 FLAG = "shared"
-_SHARPNESS = 0.08
-"""Largest sd of a hidden centre, as a share of the bubble's diameter."""
+_SHARPNESS, _SHARPNESS_PX = 0.1, 3.0
+"""Largest sd of a hidden centre, as a share of the bubble's diameter and in px."""
+
+_APART = 0.5
+"""Least distance of two bubbles' centres, as a share of what it is when they touch."""
 
 _BEHIND = 0.25
 """Sd of "behind that outline", as a share of the outline's semi-axis."""
@@ -57,12 +60,26 @@ def shared_rows(
     place = {p: k for k, p in enumerate(particles)}
     out = []
     for i, frame in enumerate(frames, len(before)):
-        for single in frame.hidden():
-            k = place.get(single.particle, -1)
-            if k >= 0:
-                row = _row(frame, single, points[i, k], covariances[i, k], cameras)
-                out += [] if row is None else [row]
+        known = frame.particle != NO_PARTICLE
+        where, sizes = [*frame.points_mm[known]], frame.d_eq_mm[known].tolist()
+        singles = [s for s in frame.hidden() if s.particle in place]
+        for single in sorted(singles, key=lambda s: np.trace(covariances[i, place[s.particle]])):
+            k = place[single.particle]
+            point, covariance = points[i, k], covariances[i, k]
+            row = _row(frame, single, point, covariance, cameras)
+            if row is not None and not _taken(single, point, where, sizes):
+                out.append(row)
+                where.append(point)
+                sizes.append(single.d_eq_mm)
     return out
+
+
+def _taken(
+    single: Single, point_mm: Array, others_mm: Sequence[Array], sizes_mm: Sequence[float]
+) -> bool:
+    """Whether another track's bubble is where this one would be."""
+    away = np.linalg.norm(np.reshape(others_mm, (-1, 3)) - point_mm, axis=1)
+    return bool((away < _APART * (np.array(sizes_mm) + single.d_eq_mm) / 2).any())
 
 
 def _row(
@@ -83,7 +100,7 @@ def _row(
     diameter = single.d_eq_mm * px_per_mm
     sd = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
     reach = _outline_over(frame.tables[1 - seen], uv[0], diameter / 2)
-    if not (sd <= _SHARPNESS * diameter and reach > 0):
+    if not (sd <= min(_SHARPNESS * diameter, _SHARPNESS_PX) and reach > 0):
         return None
     behind = spread + (_BEHIND * reach) ** 2 * np.eye(2)
     per_camera = {

@@ -220,6 +220,12 @@ class Motion:
     noise: Array
     offset: Array
 
+    def shifted(self, shift: Array, covariance_mm2: Array) -> Motion:
+        """With what was found to be common to all, shift (n,), and how sure its place is (3, 3)."""
+        noise = self.noise.copy()
+        noise[:3, :3] += covariance_mm2
+        return Motion(self.matrix, noise, self.offset + shift)
+
 
 @dataclass(frozen=True)
 class FrameResult:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -117,7 +116,7 @@ class Tracker:
         scan = Scan(frame, t_s, measured, free, self.settings)
         grown, common, gain = advance(self.clusters, scan, self.common, gains)
         claimed = self._decide(grown, scan, events)
-        moved = None if motion is None else replace(motion, offset=motion.offset + common.shift)
+        moved = None if motion is None else motion.shifted(common.shift, common.covariance_mm2)
         alone = self._single(scan, common)
         self._births(scan, np.setdiff1d(free, claimed), common, gain, events)
         self._deaths(scan, events)

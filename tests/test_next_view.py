@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +22,9 @@ from telerig.estimator.view_candidates import Candidates, candidates, dots_seen
 from telerig.estimator.view_words import first_views, hold_words
 from telerig.factors.projection import State, pixels
 from telerig.io.plate_view import Plate, pixel_from_plate
+from telerig.io.report.calibration_report import write_calibration_report
+from telerig.io.report.calibration_results import read_results
+from telerig.io.report.figures_next import next_pictures
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
@@ -289,3 +294,29 @@ def test_first_views_differ_and_keep_to_what_both_cameras_see() -> None:
     assert len(set(words)) == len(words) == 6
     assert "turn it 10 degrees towards camera left" in words[3]
     assert "turn it" not in " ".join(first_views("left", "right", 125.0))
+
+
+def test_the_report_draws_it(scene: Any, tmp_path: Path) -> None:
+    """In words and two pictures; every dot of the plate is inside both."""
+    found = scene("paper", 1, views=6).calibrate()
+    found.save(tmp_path)
+    page = write_calibration_report(tmp_path).read_text()
+    advice = found.diagnostics["next_view"]
+    assert '<section id="next">' in page and advice["poses"][0]["words"] in page
+    for title in ("How to hold it next", "Where to hold it next"):
+        assert page.count(f"<h3>{title}</h3>") == 1
+    first, plan = next_pictures(read_results(tmp_path))
+    assert "camera left" in plan.caption
+    drawn = base64.b64decode(first.source.split(",")[1]).decode()
+    assert all(f"camera {name} sees" in drawn for name in ("left", "right"))
+    pose = np.array(advice["poses"][0]["rig_from_target"])
+    points = found.target_points_mm @ pose[:3, :3].T + pose[:3, 3]
+    for camera in found.cameras:
+        assert np.all(np.abs(camera.project(points) - 255.5) < 256)
+
+
+def test_folders_of_before_have_no_such_section(scene: Any, tmp_path: Path) -> None:
+    found = scene("paper", 1, views=6).calibrate()
+    kept = {k: v for k, v in found.diagnostics.items() if k != "next_view"}
+    replace(found, diagnostics=kept).save(tmp_path)
+    assert '<section id="next">' not in write_calibration_report(tmp_path).read_text()

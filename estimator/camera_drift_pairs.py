@@ -138,7 +138,8 @@ def _sure(tracks: pd.DataFrame) -> pd.DataFrame:
     spread = 1.4826 * np.median(np.abs(miss - middle))
     near = np.abs(miss - middle) <= _FAR_SIGMAS * max(float(spread), 1e-6)
     bubble = np.unique(table["particle"], return_inverse=True)[1].astype(np.int64)
-    return table.assign(particle=bubble).loc[near]
+    kept: pd.DataFrame = table.assign(particle=bubble).loc[near]
+    return kept
 
 
 def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:

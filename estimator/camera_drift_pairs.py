@@ -36,7 +36,7 @@ _LEAST_CONFIDENCE = 0.9
 _DOUBTFUL = "shared|ambiguous|merged|border"
 _FAR_SIGMAS = 6.0
 _OUTLIER_SIGMAS = 4.5
-_MOST_ROWS = 450
+_MOST_ROWS = 520
 _MOST_STRETCHES = 10
 _STRETCH_S = 2.0
 _LEARNED_FROM = 2
@@ -99,7 +99,7 @@ def rig_change(
         typical = float(np.median(gaps.variance_mm2))
         return Series(
             part["frame"].to_numpy(np.int64),
-            np.unique(part["particle"], return_inverse=True)[1].astype(np.int64),
+            part["particle"].to_numpy(np.int64),
             part["t_s"].to_numpy(float), gaps.gap_mm,
             gaps.variance_mm2 / typical, gaps.by_rig @ root,
         )  # fmt: skip
@@ -130,13 +130,16 @@ def _believed(tracks: pd.DataFrame) -> NDArray[np.bool_]:
 
 def _sure(tracks: pd.DataFrame) -> pd.DataFrame:
     """Believed rows without gaps that are far from all others."""
-    table = tracks[_believed(tracks)]
+    table: pd.DataFrame = tracks.loc[_believed(tracks)]
     miss = table["ray_miss_mm"].to_numpy(float)
     if not len(miss):
         return table
     middle = np.median(miss)
     spread = 1.4826 * np.median(np.abs(miss - middle))
-    return table.loc[np.abs(miss - middle) <= _FAR_SIGMAS * max(float(spread), 1e-6)]
+    near = np.abs(miss - middle) <= _FAR_SIGMAS * max(float(spread), 1e-6)
+    bubble = np.unique(table["particle"], return_inverse=True)[1].astype(np.int64)
+    kept: pd.DataFrame = table.assign(particle=bubble).loc[near]
+    return kept
 
 
 def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
@@ -200,7 +203,7 @@ def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
     thin = max(1, int(np.ceil(min(_STRETCH_S, float(np.ptp(first))) / step / most)))
     used = frames[::thin]
     parts = min(max(1, round(len(used) / most)), _MOST_STRETCHES)
-    length = min(most, int(np.ceil(len(used) / parts)))
+    length = min(most, len(used) // parts)
     starts = np.linspace(0, len(used) - length, parts).astype(int)
     by_frame = table.set_index("frame", drop=False)
     by_frame.index.name = None

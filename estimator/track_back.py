@@ -150,7 +150,7 @@ def _left_out(
     own = np.linalg.inv(frame.covariance_mm2[columns])
     all_of_it = np.linalg.inv(covariances)
     pull = all_of_it @ points[..., None] - own @ frame.points_mm[columns][..., None]
-    covariance: Array = np.linalg.inv(all_of_it - own + _NOTHING * np.eye(3))
+    covariance = np.asarray(np.linalg.inv(all_of_it - own + _NOTHING * np.eye(3)), np.float64)
     return np.asarray(covariance @ pull, float)[..., 0], covariance
 
 

@@ -150,8 +150,8 @@ def _left_out(
     own = np.linalg.inv(frame.covariance_mm2[columns])
     all_of_it = np.linalg.inv(covariances)
     pull = all_of_it @ points[..., None] - own @ frame.points_mm[columns][..., None]
-    covariance: Array = np.linalg.inv(all_of_it - own + _NOTHING * np.eye(3))
-    return np.asarray(covariance @ pull, float)[..., 0], covariance
+    covariance = np.asarray(np.linalg.inv(all_of_it - own + _NOTHING * np.eye(3)), float)
+    return (covariance @ pull)[..., 0], covariance
 
 
 def _agrees(

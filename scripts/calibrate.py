@@ -86,7 +86,7 @@ def calibrate(
 
         begun = time.perf_counter()
         earlier = None if compare is None else load_calibration(compare)
-        options = {"model": model, "solver": solver, "dots": dots, "medium": medium,
+        options: dict[str, Any] = {"model": model, "solver": solver, "dots": dots, "medium": medium,
                    "compare": None if compare is None else str(compare), "from": source,
                    "seed": seed}  # fmt: skip
         chosen: dict[str, Any] = {

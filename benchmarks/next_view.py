@@ -8,6 +8,8 @@ from the same six hand-held views. Six more are held as advised, one by one, wit
 error per axis over the working volume, its common rigid motion removed; "sd" is what the
 calibration states. The known distance on the target (0.3 um in 10 mm) limits both, whatever the
 views: "without size" sets the common factor aside.
+Calibrated with the model "radial", though the true image centres are some pixels off and
+would need tangential terms: that error of the model is in "true", in no sd, and no view mends it.
 """
 
 from __future__ import annotations

@@ -30,6 +30,8 @@ _INDEPENDENT = 0.5
 """Neighbouring bins of a tapered spectrum tell the same thing."""
 _FIRST_BIN = 2
 _LEAST_FRAMES = 16
+_LEAST_CYCLES = 4.0
+"""In fewer a slow wander could pass for an oscillation, which has little that is constant."""
 _MOST_APART = 4
 
 
@@ -211,7 +213,7 @@ def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
     hz = np.arange(_FIRST_BIN, _FIRST_BIN + len(ratio)) / length
     picked: list[float] = []
     for i in np.argsort(-ratio * spectrum.power):
-        if all(abs(hz[i] - p) > 0.15 * p for p in picked):
+        if hz[i] * length >= _LEAST_CYCLES and all(abs(hz[i] - p) > 0.15 * p for p in picked):
             picked.append(float(hz[i]))
         if len(picked) == _PEAKS:
             break

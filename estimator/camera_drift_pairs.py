@@ -31,7 +31,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LEAST_PAIRS = 30
+LEAST_PAIRS = 20
+LEAST_SEEN_S = 0.5
+"""In less, all bubbles together, their centres' wander is not seen for what it is: no verdict."""
+
 _LEAST_CONFIDENCE = 0.9
 _DOUBTFUL = "shared|ambiguous|merged|border"
 _FAR_SIGMAS = 6.0
@@ -114,7 +117,15 @@ def rig_change(
         share_of_drift(rig, root @ spread @ root.T, covariance, drift) for spread in spreads
     )
     change = described(cameras, tangent, own, drift, points.mean(0), used)
-    return replace(change, chance=chance_of(tangent, careful, drift)), noise
+    long = _seen_s(table) >= LEAST_SEEN_S
+    chance = chance_of(tangent, careful, drift) if long else 1.0
+    return replace(change, chance=chance), noise
+
+
+def _seen_s(table: pd.DataFrame) -> float:
+    """How long bubbles were seen, added up."""
+    t = np.unique(table["t_s"].to_numpy(float))
+    return float(np.median(np.diff(t)) * len(table))
 
 
 def _believed(tracks: pd.DataFrame) -> NDArray[np.bool_]:

@@ -38,7 +38,7 @@ def _results() -> CalibrationResults:
         content={}, cameras=(left, right), views=views, dot_ids=np.arange(15), points_mm=points,
         row_column=lattice, residuals=pd.DataFrame(seen, columns=["view", "camera"]),
         component={f"dot {i // 3}.{'xyz'[i % 3]}_mm": i for i in range(45)}, joint=root @ root.T,
-        run={}, overlays={}, dot_example={}, absent=(),
+        run={}, overlays={}, dot_example={}, uncertainty={}, comparison={}, absent=(),
     )  # fmt: skip
 
 

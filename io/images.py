@@ -70,7 +70,7 @@ def list_images(folder: str | PathLike[str]) -> list[Path]:
 def natural(name: str) -> tuple[Any, ...]:
     """Sorting key in which runs of digits count as numbers."""
     parts = re.split(r"(\d+)", name)
-    return (*(int(p) if i % 2 else p.lower() for i, p in enumerate(parts)), name)
+    return tuple(int(p) if i % 2 else p.lower() for i, p in enumerate(parts)), name
 
 
 def effective_bits(image: Image) -> int:

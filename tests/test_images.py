@@ -319,3 +319,10 @@ def test_png_checksums_are_those_of_the_standard(tmp_path: Path) -> None:
     file = tmp_path / "a.png"
     file.write_bytes(b"\x89PNG\r\n\x1a\n" + head + body + chunk(b"IEND", b""))
     assert read_image(file).tolist() == [[123]]
+
+
+def test_natural_order_of_names_that_begin_alike() -> None:
+    names = ["rise10", "rise", "Rise2", "rise2b", "10", "9", "rise-1", "a1b2", "a1"]
+    assert sorted(names, key=natural) == [
+        "9", "10", "a1", "a1b2", "rise", "Rise2", "rise2b", "rise10", "rise-1"
+    ]  # fmt: skip

@@ -96,6 +96,7 @@ def test_the_promise_is_the_covariance_of_a_fit_with_that_view(scene: Any, model
         assert after < advice.before_um
 
 
+@pytest.mark.slow
 def test_the_advice_beats_views_at_random(scene: Any) -> None:
     """Against the 60 random views of six other datasets of the same rig."""
     problem, state, joint = fitted(scene("paper", 3, views=6))

@@ -118,6 +118,7 @@ def test_views_are_solved_as_they_arrive_and_enough_ends_it(
     assert all(image.overlay for image in run.detected.images)
 
 
+@pytest.mark.slow
 def test_what_was_watched_is_what_a_plain_calibration_finds(
     paper_images: Path, empty: Path
 ) -> None:
@@ -180,6 +181,7 @@ def test_only_new_images_are_detected_and_one_being_written_is_waited_for(
     assert not said
 
 
+@pytest.mark.slow
 def test_a_bad_image_is_named_and_the_rest_goes_on(paper_images: Path, empty: Path) -> None:
     names = views(paper_images)
     with watching(empty) as it:

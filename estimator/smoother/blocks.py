@@ -1,7 +1,8 @@
-"""Arrays of linear factors of one shape."""
+"""Arrays of linear factors of one shape, and of covariances."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,15 @@ class Linear:
     log_det: Array
     weight: Array | None = None
 
+    def squared(self, increments: Callable[[ArrayLike, int], Array]) -> float:
+        """Sum of squares at increments, which are given for keys (M,) of some size."""
+        error = -self.rhs
+        for key, block in zip(self.keys, self.blocks):
+            if block.shape[-1]:
+                step = increments(key, block.shape[-1])
+                error = error + np.einsum("...ij,...j->...i", block, step)
+        return float((error**2).sum())
+
     def log_norm(self) -> float:
         """log of the factors' normalisation, residuals apart."""
         share = np.ones(len(self.rhs)) if self.weight is None else self.weight
@@ -37,3 +47,15 @@ def log_det_of(whitener: Array) -> Array:
 
 def repeated(block: Array, count: int) -> Array:
     return np.broadcast_to(block, (count, *block.shape))
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Covariances of increments, in their bases.
+
+    own : of each family of keys, (n, d, d); the shake's at the frames.
+    cross : (rows, Ds, Db) of the shake with each bubble at the same frame.
+    """
+
+    own: list[Array]
+    cross: Array

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import CalibrationError
-from telerig.estimator.smoother.blocks import Linear
+from telerig.estimator.smoother import chain, elimination
+from telerig.estimator.smoother.blocks import Blocks, Linear
 from telerig.estimator.smoother.clocks import late, restamped
 from telerig.estimator.smoother.linear import all_factors, pixel_residuals
-from telerig.estimator.smoother.marginals import marginal_covariances
 from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
 from telerig.estimator.smoother.state import Frame, State, first_guess, frame_of, moved, times
 from telerig.estimator.smoother.threads import in_large_stack
 from telerig.estimator.smoother.truncation import Truncation
-from telerig.factors.motion import add_linear_factors
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-_NOTHING = np.zeros(0, np.int64)
 _CLOCK_PASSES = 6
 
 
@@ -128,8 +126,9 @@ def _solve(
             break
         progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
         last = made = _linear_solve(frame, state, weights)
-        state = moved(frame, state, made.step)
-        fresh, changed = robust.update(weights, pixel_residuals(frame, state))
+        state = moved(frame, state, made.done.vector)
+        residuals = pixel_residuals(frame, state)
+        fresh, changed = robust.update(weights, residuals)
         settled = (made.largest_px < options.tolerance_px and not late(frame, state)) or exact
         if settled and not changed and (done > 1 or start is not None or exact):
             break
@@ -139,8 +138,9 @@ def _solve(
     if last is None:
         weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
         last = _linear_solve(frame, state, weights)
-        state = moved(frame, state, last.step)
-    return _finish(frame, state, weights, last, options, done, progress)
+        state = moved(frame, state, last.done.vector)
+        residuals = pixel_residuals(frame, state)
+    return _finish(frame, state, (weights, residuals), last, options, done, progress)
 
 
 def _warm(frame: Frame, state: State, start: Solution) -> State:
@@ -170,71 +170,61 @@ def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
     return flat and not any(held) and model.bubble.speed_sigma_mm_s is None and not model.pitches
 
 
+class Eliminated(Protocol):
+    """The factors of one pass, solved, by GTSAM or by arrays."""
+
+    @property
+    def vector(self) -> Array:
+        """Increments of all keys in their order."""
+
+    def log_det(self) -> float:
+        """log |R| of the square root of the information."""
+
+    def blocks(self) -> Blocks:
+        """Marginal covariances of the increments."""
+
+
 @dataclass(frozen=True)
 class _Pass:
-    net: Any
-    step: Array
+    done: Eliminated
     largest_px: float
     log_norm: float
     squared: float
 
 
 def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _Pass:
-    import gtsam
-
     factors = all_factors(frame, state, weights)
-    graph = gtsam.GaussianFactorGraph()
-    for linear in factors:
-        add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
-    _add_bonds(graph, frame)
-    net, solution = _eliminated(graph, frame)
-    vector = solution.vector()
-    if not np.all(np.isfinite(vector)):
+    done = _eliminated(frame, factors)
+    if not np.all(np.isfinite(done.vector)):
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
-    largest = _largest_shift_px(factors, frame, vector)
-    return _Pass(net, vector, largest, _log_norm(frame, factors), 2 * graph.error(solution))
+    largest = _largest_shift_px(frame, done.vector)
+    squared = _squared(frame, factors, done.vector)
+    return _Pass(done, largest, _log_norm(frame, factors), squared)
 
 
-def _add_bonds(graph: Any, frame: Frame) -> None:
-    """Empty factors between shake and bubbles where no image joins them.
-
-    Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
-    its first row on would share none.
-    """
-    size = frame.counts()[0][1]
-    seen = frame.row(frame.problem.observations.item, frame.problem.observations.frame)
-    alone = np.setdiff1d(np.arange(frame.rows), seen)
-    if not size or not len(alone):
-        return
-    keys = (frame.node_of_row[alone], frame.base()[1] + alone)
-    blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, frame.bubble.size))
-    add_linear_factors(graph, keys, blocks, np.zeros((len(alone), 1)))
+def _eliminated(frame: Frame, factors: list[Linear]) -> Eliminated:
+    if chain.suits(frame) and not frame.model.broad_bands:
+        places = chain.places_of(frame)
+        try:
+            return chain.eliminate(places, chain.normal_equations(places, factors))
+        except chain.NotPositiveError:
+            pass
+    return elimination.eliminate(frame, factors)
 
 
-def _eliminated(graph: Any, frame: Frame) -> tuple[Any, Any]:
-    """Bayes net and solution: by Cholesky, or by QR, four times slower, where digits are short.
+def _squared(frame: Frame, factors: list[Linear], vector: Array) -> float:
+    """Sum of squares of all factors after the step."""
+    base, counts = np.array(frame.base()), frame.counts()
+    sizes = [n * d for n, d in counts]
+    starts = np.r_[0, np.cumsum(sizes)]
 
-    The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
-    good to 3e-6), and more than double precision has with steps as short as a sensor's. Else QR
-    is for what Cholesky refuses.
-    """
-    import gtsam
+    def of_keys(keys: ArrayLike, size: int) -> Array:
+        key = np.asarray(keys)
+        family = int(np.searchsorted(base, key.flat[0], "right")) - 1
+        part = vector[starts[family] : starts[family + 1]].reshape(-1, size)
+        return np.asarray(part[key - base[family]])
 
-    ordering = _ordering(frame)
-    try:
-        if len(frame.nodes.t_s) == len(frame.problem.t_s) and not frame.model.broad_bands:
-            try:
-                net = graph.eliminateSequential(ordering)
-                return net, net.optimize()
-            except RuntimeError:
-                pass
-        net = graph.eliminateSequential(ordering, gtsam.EliminateQR)
-        return net, net.optimize()
-    except RuntimeError as error:
-        raise CalibrationError(
-            f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
-            todo="check the priors: every component needs a positive intensity",
-        ) from error
+    return sum(f.squared(of_keys) for f in factors)
 
 
 def _log_norm(frame: Frame, factors: list[Linear]) -> float:
@@ -245,36 +235,7 @@ def _log_norm(frame: Frame, factors: list[Linear]) -> float:
     return float(of_nodes.sum() + of_rows.sum()) + sum(f.log_norm() for f in factors)
 
 
-def _ordering(frame: Frame) -> Any:
-    """Time order; what ends (a bubble's mean, a mark) right after it was last seen; rest last."""
-    import gtsam
-
-    base, problem = frame.base(), frame.problem
-    nodes = np.arange(len(frame.nodes.t_s)) if frame.shake.size else np.zeros(0, np.int64)
-    rows = np.arange(frame.rows)
-    last_row = frame.node_of_row[frame.first_row[1:] - 1] if len(problem.bubbles) else _NOTHING
-    last_mark = np.zeros(len(problem.marks), np.int64)
-    seen = frame.nodes.of_frame[problem.references.frame]
-    np.maximum.at(last_mark, problem.references.item, seen)
-    keys = [nodes, base[1] + rows, base[2] + np.arange(len(problem.bubbles))]
-    when = [nodes, frame.node_of_row, last_row]
-    keys.append(base[5] + np.arange(len(problem.marks)))
-    when.append(last_mark)
-    rank = np.repeat(np.arange(4), [len(k) for k in keys])
-    joined = np.concatenate(keys).astype(np.int64)
-    order = np.lexsort((joined, rank, np.concatenate(when)))
-    out = gtsam.Ordering()
-    for key in joined[order].tolist():
-        out.push_back(key)
-    counts = frame.counts()
-    for family in (3, 4, 6):
-        number, size = counts[family]
-        for key in range(base[family], base[family] + number * (size > 0)):
-            out.push_back(key)
-    return out
-
-
-def _largest_shift_px(factors: list[Linear], frame: Frame, vector: Array) -> float:
+def _largest_shift_px(frame: Frame, vector: Array) -> float:
     """How far bubbles moved in this pass, in pixels of the finest camera."""
     layout, (nodes, size) = frame.bubble, frame.counts()[0]
     start = nodes * size
@@ -287,69 +248,39 @@ def _largest_shift_px(factors: list[Linear], frame: Frame, vector: Array) -> flo
 def _finish(
     frame: Frame,
     state: State,
-    weights: tuple[Array, Array],
+    fitted: tuple[tuple[Array, Array], tuple[Array, Array]],
     last: _Pass,
     options: Options,
     done: int,
     progress: Progress,
 ) -> Solution:
-    """Covariances and evidence from the last pass, whose linearisation is within the tolerance."""
+    """Covariances and evidence from the last pass, whose linearisation is within the tolerance.
+
+    fitted : weights and residuals, of bubbles and of marks.
+    """
     dimension = sum(n * d for n, d in frame.counts())
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
+    evidence -= last.done.log_det()
     found = None
     if options.covariances:
-        found, log_det = _covariances(frame, last.net, progress)
-    else:
-        log_det = _log_det(last.net)
-    evidence -= log_det
+        progress("covariances", 0.0)
+        found = _covariances(frame, last.done.blocks())
     progress("smoothing", 1.0)
-    return Solution(
-        frame, state, found, weights, pixel_residuals(frame, state), float(evidence), done
-    )
+    return Solution(frame, state, found, *fitted, float(evidence), done)
 
 
-def _log_det(net: Any) -> float:
-    """log |R|; QR leaves signs on the diagonal."""
-    diagonals = (np.diagonal(net.at(i).R()) for i in range(net.size()))
-    return float(sum(np.log(np.abs(d)).sum() for d in diagonals))
-
-
-def _covariances(frame: Frame, net: Any, progress: Progress) -> tuple[Covariances, float]:
-    """Marginals in physical units, and log |R| of the net."""
-    base, counts = frame.base(), frame.counts()
-    progress("covariances", 0.0)
-    families = [range(base[i], base[i] + n * (d > 0)) for i, (n, d) in enumerate(counts)]
-    at_frames = frame.nodes.of_frame.tolist() if counts[0][1] else []
-    wanted = set(at_frames).union(*families[1:])
-    sizes = [d for n, d in counts for _ in range(n)]
-    rows = base[1] + np.arange(frame.rows)
-    pairs = list(zip(frame.node_of_row.tolist(), rows.tolist())) if counts[0][1] else []
-    marginals = marginal_covariances(net, sizes, wanted, pairs)
-    found, crossed = marginals.own, marginals.cross
-
-    def of(keys: Sequence[int], i: int) -> Array:
-        number, size = len(problem_frames) if i == 0 else counts[i][0], counts[i][1]
-        return np.array([found[key] for key in keys]).reshape(number, size, size)
-
-    problem_frames = frame.nodes.of_frame
-    blocks = [of(keys, i) for i, keys in enumerate([at_frames, *families[1:]])]
-    shake_basis = frame.shake_basis(problem_frames)
+def _covariances(frame: Frame, blocks: Blocks) -> Covariances:
+    """Marginals in physical units."""
+    own = blocks.own
+    shake_basis = frame.shake_basis(frame.nodes.of_frame)
     if frame.to_frames is not None:
         shake_basis = frame.to_frames @ shake_basis
     bubble_basis = frame.bubble_basis(np.arange(frame.rows))
-    shake = shake_basis @ blocks[0] @ np.swapaxes(shake_basis, -1, -2)
-    bubbles = bubble_basis @ blocks[1] @ np.swapaxes(bubble_basis, -1, -2)
-    cross = np.array([crossed[pair] for pair in pairs])
-    cross = cross.reshape(frame.rows, counts[0][1], counts[1][1])
-    cross = shake_basis[frame.frame_of_row] @ cross @ np.swapaxes(bubble_basis, -1, -2)
-    covariances = Covariances(
-        shake,
-        bubbles,
-        cross,
-        blocks[2],
-        blocks[3],
-        blocks[4][0, : frame.encoder_size, : frame.encoder_size],
-        blocks[4][0, frame.encoder_size :, frame.encoder_size :],
-        *blocks[5:],
-    )
-    return covariances, marginals.log_det
+    shake = shake_basis @ own[0] @ np.swapaxes(shake_basis, -1, -2)
+    bubbles = bubble_basis @ own[1] @ np.swapaxes(bubble_basis, -1, -2)
+    cross = shake_basis[frame.frame_of_row] @ blocks.cross @ np.swapaxes(bubble_basis, -1, -2)
+    encoder = frame.encoder_size
+    return Covariances(
+        shake, bubbles, cross, own[2], own[3], own[4][0, :encoder, :encoder],
+        own[4][0, encoder:, encoder:], *own[5:],
+    )  # fmt: skip

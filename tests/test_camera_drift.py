@@ -162,7 +162,7 @@ def test_offset_roll_and_pitch_are_those_of_the_body() -> None:
     assert shift @ n / np.linalg.norm(n) == pytest.approx(0.02, abs=1e-4)
 
 
-@pytest.mark.parametrize("shake_mm", [0.0, 0.1])
+@pytest.mark.parametrize("shake_mm", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_coverage_with_and_without_shake(shake_mm: float) -> None:
     """20 um and 50 urad come back with errors that their covariance says; 8 runs each."""
     rng = np.random.default_rng(5)

@@ -169,7 +169,7 @@ def is_right(
 )
 def test_random_views_are_numbered_right(target: Target, view: View) -> None:
     wrong = []
-    for seed in range(40):
+    for seed in range(20):
         dots, truth = photograph(target, view, np.random.default_rng([11, seed]))
         numbering = number_dots(dots, target)
         good = is_right(numbering, truth) and not numbering.ambiguous

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Stage = Callable[[str, int, int], None]
 
-_TRACKED = ("tracks.csv", "detections.csv", "events.csv", "tracking.json")
+_TRACKED = ("tracks.csv", "detections.csv", "events.csv", "references.csv", "tracking.json")
 
 
 def smooth_run(

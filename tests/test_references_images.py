@@ -140,13 +140,15 @@ def test_smoothing_uses_the_marks_that_were_followed(data: Path, tmp_path: Path)
     (bare / "references.csv").unlink()
     errors = {}
     for name, tracks in (("marks", data / "results" / "rise"), ("none", bare)):
-        found = smooth_run(run, calibration, tracks, tmp_path / name, report=False)
+        found = smooth_run(run, calibration, tracks, tmp_path / name, report=name == "marks")
         joined = found.trajectories.merge(truth(data, "bubbles"), on="frame", suffixes=("", "_t"))
         errors[name] = float((joined["y_mm"] - joined["y_lab_mm"]).std())
         if name == "marks":
             assert found.verdict["axes"]["y"]["verdict"] == "RESOLVED"
             assert found.verdict["verdict"] == "RESOLVED"
     assert errors["marks"] < 0.5 * errors["none"]
+    page = (tmp_path / "marks" / "report.html").read_text(encoding="utf-8")
+    assert "Marks fixed to the tank, left" in page
     record = json.loads((tmp_path / "marks" / "run.json").read_text(encoding="utf-8"))
     assert any(name.endswith("references.csv") for name in record["inputs_sha256"])
 

@@ -20,6 +20,7 @@ from tracked_folder import SCALE, SIGMA_PX, WORST, write_folder
 from telerig.errors import InputError
 from telerig.io.report import contact_sheet as sheets
 from telerig.io.report.track_figures import time_series
+from telerig.io.report.track_figures_marks import marks_followed
 from telerig.io.report.track_figures_rays import ray_miss_in_space, seen_where
 from telerig.io.report.track_numbers import learnt_sd_mm, per_frame, ray_miss_ratio, ray_miss_sd_mm
 from telerig.io.report.track_report import write_track_report
@@ -307,3 +308,27 @@ def test_a_hundred_thousand_rows_are_thinned(folder: Path) -> None:
     page = write_track_report(folder)
     assert page.stat().st_size < 8e6
     assert "are drawn" in page.read_text(encoding="utf-8")
+
+
+def test_marks_fixed_to_the_tank_are_drawn_where_there_are_some(folder: Path) -> None:
+    write_track_report(folder)
+    assert "Marks fixed" not in (folder / "report.html").read_text(encoding="utf-8")
+    content = json.loads((folder / "tracking.json").read_text())
+    camera, other = list(content["frames_without_bubbles"])
+    frames = np.arange(40)
+    marks = [
+        pd.DataFrame({"frame": f, "camera": camera, "mark": f"m{i}", "u_px": 100.0,
+                      "v_px": 400.0 - 4 * f + 60 * i, "sigma_px": 0.05})
+        for i, f in enumerate((frames, frames[5:35], frames[[3, 4, 5, 20, 21]]))
+    ]  # fmt: skip
+    pd.concat(marks).to_csv(folder / "references.csv", index=False)
+    found = read_track_results(folder)
+    assert marks_followed(found, found.cameras.index(other)) is None
+    picture = marks_followed(found, found.cameras.index(camera))
+    assert picture is not None and "3 marks, 2 in a frame and each in 30 frames" in picture.caption
+    assert "0.0500 px" in picture.caption
+    page = write_track_report(folder).read_text(encoding="utf-8")
+    assert f"Marks fixed to the tank, {camera}" in page and 'id="marks"' in page
+    (folder / "references.csv").write_text("frame,camera\n0,left\n")
+    with pytest.raises(InputError, match="mark"):
+        write_track_report(folder)

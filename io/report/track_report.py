@@ -23,6 +23,7 @@ from telerig.io.report.track_figures import (
     sizes,
     time_series,
 )
+from telerig.io.report.track_figures_marks import marks_followed
 from telerig.io.report.track_figures_rays import (
     ray_miss_histogram,
     ray_miss_in_space,
@@ -49,7 +50,7 @@ def write_track_report(results_folder: Path, out: Path | None = None) -> Path:
 
     It reads nothing but that folder, and the calibration beside it (`results_cameras`) for the
     drawing of two rays: tracking.json and tracks.csv, and if they are there
-    detections.csv, events.csv, run.json, overlays/<camera>/<frame>.jpg and
+    detections.csv, events.csv, references.csv, run.json, overlays/<camera>/<frame>.jpg and
     binary/<camera>/<frame>.png. Where smoothing.json is there, with trajectories.csv and shake.csv,
     the page begins with the smoothing. It is written whole or not at all. Raises InputError for a
     folder that holds no tracks, or files that cannot be read or do not fit together.
@@ -139,6 +140,7 @@ def _pictures(
     every = range(len(results.cameras))
     drawings: list[tuple[str, Callable[[], Any]]] = [
         *(("seen", partial(seen_where, results, i)) for i in every),
+        *(("marks", partial(marks_followed, results, i)) for i in every),
         *(("series", partial(time_series, results, axis)) for axis in range(3)),
         ("rays", partial(ray_miss_histogram, results)),
         *(("rays", partial(ray_miss_in_space, results, *how)) for how in shared_pictures(results)),

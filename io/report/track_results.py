@@ -36,8 +36,8 @@ class TrackResults:
     """A results folder in memory.
 
     content : tracking.json as it stands. cameras : names, in the rig's order.
-    tracks, detections, events : the tables; rows of detections.csv that only say why a frame has
-        no bubble are left out (tracking.json counts them).
+    tracks, detections, events, references : the tables; rows of detections.csv that only say why
+        a frame has no bubble are left out (tracking.json counts them).
     up : (3,) unit vector in the rig frame.
     pictures : (camera or "camera, binary", frame as six digits) -> file.
     absent : what optional files are missing, in words.
@@ -48,6 +48,7 @@ class TrackResults:
     tracks: pd.DataFrame
     detections: pd.DataFrame
     events: pd.DataFrame
+    references: pd.DataFrame
     run: Mapping[str, Any]
     up: Array
     pictures: Mapping[tuple[str, str], Path]
@@ -82,7 +83,7 @@ class TrackResults:
 def read_track_results(folder: Path) -> TrackResults:
     """Read a tracked run's results folder.
 
-    tracking.json and tracks.csv are needed; detections.csv, events.csv, run.json,
+    tracking.json and tracks.csv are needed; detections.csv, events.csv, references.csv, run.json,
     overlays/<camera>/<frame>.jpg and binary/<camera>/<frame>.png are used when they are there.
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
@@ -91,6 +92,7 @@ def read_track_results(folder: Path) -> TrackResults:
     tracks = read_columns(folder / "tracks.csv", _track_columns(cameras))
     detections = _detections(folder / "detections.csv", cameras)
     events = optional_columns(folder / "events.csv", _EVENTS)
+    references = optional_columns(folder / "references.csv", _REFERENCES)
     run = read_object(folder / "run.json", _AGAIN) if (folder / "run.json").is_file() else {}
     pictures = _pictures(folder, cameras)
     absent = {
@@ -100,7 +102,8 @@ def read_track_results(folder: Path) -> TrackResults:
         "overlays/ and binary/ (no pictures of the bubbles that were found)": bool(pictures),
     }
     return TrackResults(
-        content, cameras, tracks, detections, events, run, _up(content, folder), pictures,
+        content, cameras, tracks, detections, events, references, run, _up(content, folder),
+        pictures,
         tuple(text for text, present in absent.items() if not present),
     )  # fmt: skip
 
@@ -171,6 +174,13 @@ _DETECTIONS = [
     *_numbers(["u_px", "v_px"]),
     *_numbers(["a_px", "b_px", "d_eq_px", "edge_px", "chi2_dof"], required=False),
     *(Column(name, "text", required=False, blank=True) for name in ("flags", "reason")),
+]
+_REFERENCES = [
+    Column("frame", "whole"),
+    Column("camera", "text"),
+    Column("mark", "text"),
+    *_numbers(["u_px", "v_px"]),
+    *_numbers(["sigma_px"], required=False),
 ]
 _EVENTS = [
     Column("frame", "whole"),

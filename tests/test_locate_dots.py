@@ -95,7 +95,7 @@ def test_every_dot_where_it_is(
     assert len(measured.dots) == len(truth.centres_px)
     gap, table = errors(measured.dots, truth.centres_px)
     bound = renderer.centre_bound_px(truth, np.hypot(noise, np.sqrt(1 / 12)))
-    assert np.sqrt(np.mean((gap / bound) ** 2)) < (1.6 if tilt * blur > 80 else 1.25)
+    assert np.sqrt(np.mean((gap / bound) ** 2)) < 1.25
     assert normalised(gap, table) == pytest.approx(1.0, abs=0.25)
     assert table.chi2_dof.mean() == pytest.approx(1.0, abs=0.1)
     assert table.a_px.median() == pytest.approx(radius, rel=0.02)

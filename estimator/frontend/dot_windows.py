@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,12 +32,16 @@ def dot_window(
     start: Start,
     *,
     coarse: bool = False,
+    known: Sequence[int] = (),
 ) -> Window:
     """Crop and mask round one dot: its edge, what is inside, background as far as it is free.
 
     Pixels nearer to another blob than to this dot, or near a hole in it, are left out. Of a large
     dot, only the surroundings of its edge count, and one in four of those beyond its blur
     (``coarse``: one in four everywhere, for a first look).
+
+    known : labels of blobs whose light will be taken away: what they share with this dot's blur
+        stays. Left out, it costs a third of the precision where blurs overlap.
     """
     a, b = semi_axes(start.shape_px)
     reach = 4.0 * start.sigma_px + 2.0
@@ -49,9 +55,15 @@ def dot_window(
     distance = approximate_distance_px(start.shape_px, du[None, :], dv[:, None])
     mask: Mask = (distance < outer) & (distance > -max(8.0, reach))
     clear = CLEAR_SIGMA * start.sigma_px
-    gap = _distance_to_others(labels, blob.label, low, high, int(np.ceil(max(clear, outer))) + 1)
+    around = (low, high, int(np.ceil(max(clear, outer))) + 1)
+    gap = _distance_to_others(labels, (blob.label,), *around)
     if gap is not None:
-        mask &= (gap > clear) | (distance < gap)
+        free = (gap > clear) | (distance < gap)
+        if known:
+            strange = _distance_to_others(labels, (blob.label, *known), *around)
+            alone = True if strange is None else (strange > clear) | (distance < strange)
+            free |= (distance < clear) & alone
+        mask &= free
     if blob.holes:
         mask &= _distance_to(_holes(blob, low, mask.shape)) > clear + 0.5
     if np.count_nonzero(mask) > (_COARSE_ABOVE_PIXELS if coarse else _THIN_ABOVE_PIXELS):
@@ -70,15 +82,17 @@ def _distance_to(marked: Mask) -> Array:
 
 def _distance_to_others(
     labels: NDArray[np.int32],
-    label: int,
+    own: Sequence[int],
     low: NDArray[np.int_],
     high: NDArray[np.int_],
     reach: int,
 ) -> Array | None:
-    """Distance to other blobs, also those just outside the crop; None where there is none."""
+    """Distance to all blobs but ``own``, also just outside the crop; None where there is none."""
     first = np.maximum(low - reach, 0)
     wide = labels[first[1] : high[1] + reach, first[0] : high[0] + reach]
-    others = (wide != 0) & (wide != label)
+    others = wide != 0
+    for label in own:
+        others &= wide != label
     if not np.any(others):
         return None
     inner = low - first

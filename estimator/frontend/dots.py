@@ -225,7 +225,8 @@ def _second_pass(
         known, updated = list(fits), []
         for blob, fit, prior, near in zip(blobs, known, priors, neighbours):
             start = Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
-            window = dot_window(grey, found.labels, blob, start)
+            sure = [blobs[k].label for k in near if known[k].converged and not blobs[k].holes]
+            window = dot_window(grey, found.labels, blob, start, known=sure)
             window = without_neighbours(window, [known[k] for k in near])
             lost = np.count_nonzero(window.mask) < _FEWEST_PIXELS
             updated.append(fit if lost else fit_dot(window, start, noise, prior))

@@ -111,6 +111,18 @@ def test_a_chain_without_pivots_is_named(rng: np.random.Generator) -> None:
         chain.eliminate(places, equations)
 
 
+def test_a_chain_that_keeps_too_few_digits_is_refused() -> None:
+    frame = solving.frame_of(*scene("five"), np.zeros(0))
+    places = chain.places_of(frame)
+    count, width, constants = len(frame.nodes.t_s), places.width, places.constants
+    joined = np.zeros((count, 1 + constants + width, width))
+    joined[0, 1 + constants :] = np.sqrt(1 - 1e-12) * np.eye(width)
+    own = np.tile(np.eye(width), (count, 1, 1))
+    equations = chain.NormalEquations(own, joined, np.eye(constants, constants + 1))
+    with pytest.raises(chain.NotPositiveError, match="digits"):
+        chain.eliminate(places, equations)
+
+
 def test_slots_are_shared_by_bubbles_that_do_not_meet() -> None:
     frame = solving.frame_of(*scene("five"), np.zeros(0))
     places = chain.places_of(frame)

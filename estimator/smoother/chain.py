@@ -29,11 +29,14 @@ Ints = NDArray[np.int64]
 MOST_CONSTANTS = 60
 """Columns for what is constant ride along in every frame; with more GTSAM drops what has ended."""
 
+LEAST_PIVOT = 1e-9
+"""Of a diagonal, what elimination leaves of it; covariances then are good to 1e-5."""
+
 _CHUNK = 1000
 
 
 class NotPositiveError(ArithmeticError):
-    """The normal equations are not positive definite in double precision."""
+    """The normal equations are not positive definite, or barely so in double precision."""
 
 
 @dataclass(frozen=True)
@@ -261,6 +264,7 @@ def eliminate(places: Places, equations: NormalEquations) -> EliminatedChain:
     """
     own, joined, constants = equations.own, equations.joined, places.constants
     after = 1 + constants
+    before = np.diagonal(own, axis1=-2, axis2=-1).copy()
     product = np.empty((joined.shape[1], places.width))
     last = len(own) - 1
     for t in range(last + 1):
@@ -273,6 +277,8 @@ def eliminate(places: Places, equations: NormalEquations) -> EliminatedChain:
             np.matmul(rows, rows[after:].T, out=product)
             own[t + 1] -= product[after:]
             joined[t + 1, :after] -= product[:after]
+    if np.min(np.diagonal(own, axis1=-2, axis2=-1) ** 2 / before) < LEAST_PIVOT:
+        raise NotPositiveError("too few digits are left")
     rows = joined[:, :after].transpose(1, 0, 2).reshape(after, -1)
     reduced = equations.constant - rows[1:] @ np.roll(rows, -1, 0).T
     root, fault = dpotrf(reduced[:, :-1], lower=1, clean=1) if constants else (np.eye(0), 0)

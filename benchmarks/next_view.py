@@ -1,15 +1,14 @@
-"""Does the advice on the next view help? Six advised views against six random ones.
+"""Does the advice on the next view help? Advised views against as many random ones.
 
-Usage: python benchmarks/next_view.py [--rigs 16] [--out FILE.md]
+Usage: python benchmarks/next_view.py [--rigs 24] [--draws 6] [--model tangential] [--out FILE.md]
 
 Rigs like the preset `paper`, each with another angle, mounting, lenses, target and noise, start
 from the same six hand-held views. Six more are held as advised, one by one, within 3 degrees and
 2 mm (standard deviations) of the advice; or six more are drawn at random. "true" is the 3-D RMS
-error per axis over the working volume, its common rigid motion removed; "sd" is what the
-calibration states. The known distance on the target (0.3 um in 10 mm) limits both, whatever the
-views: "without size" sets the common factor aside.
-Calibrated with the model "radial", though the true image centres are some pixels off and
-would need tangential terms: that error of the model is in "true", in no sd, and no view mends it.
+error per axis over the working volume, its common rigid motion removed, over six datasets with
+these views (target, known distance and image noise drawn anew); "sd" is what their calibrations
+state. The known distance on the target (0.3 um in 10 mm) limits both, whatever the views: "without
+size" sets the common factor aside.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from calibration_scene import Scene, make_scene
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration import Calibration
+from telerig.estimator.covariance import aligned_covariance
 from telerig.estimator.self_calibration import self_calibrate
 from telerig.estimator.truth import space_error, working_volume
 from telerig.io.simulation_presets import SimulationConfig, preset
@@ -33,36 +33,64 @@ Array = NDArray[np.float64]
 
 START, MORE = 6, 6
 HELD_DEG, HELD_MM = 3.0, 2.0
+JUDGED = (0, 2, 4, 6)
+NUMBERS = ("true_um", "sd_um", "shape_um", "shape_sd_um")
+ROWS = (
+    ("6 views, to start", "random", 0), ("+ 2 random", "random", 2), ("+ 2 advised", "advised", 2),
+    ("+ 4 random", "random", 4), ("+ 4 advised", "advised", 4),
+    ("+ 6 random", "random", 6), ("+ 6 advised", "advised", 6),
+)  # fmt: skip
 
 
 @dataclass
 class Path3D:
-    """After 6, 7, ... views: true RMS, the same without size, stated sd, promised sd (um)."""
+    """By number of added views: true RMS, the same without size, stated sd, the same (um).
 
-    true_um: list[float] = field(default_factory=list)
-    shape_um: list[float] = field(default_factory=list)
-    sd_um: list[float] = field(default_factory=list)
-    shape_sd_um: list[float] = field(default_factory=list)
+    reached, promised : sd after a view, and as promised before it.
+    """
+
+    true_um: dict[int, float] = field(default_factory=dict)
+    shape_um: dict[int, float] = field(default_factory=dict)
+    sd_um: dict[int, float] = field(default_factory=dict)
+    shape_sd_um: dict[int, float] = field(default_factory=dict)
+    advised_sd_um: list[float] = field(default_factory=list)
     promised_um: list[float] = field(default_factory=list)
     enough_after: int | None = None
 
-    def add(self, scene: Scene, calibration: Calibration) -> None:
-        """Judge one calibration."""
-        cameras = tuple(scene.cameras.values())
-        points = working_volume(cameras)
-        error = space_error(calibration, cameras, points).errors_mm.ravel()
-        size = (points - points.mean(0)).ravel()
-        size /= np.linalg.norm(size)
-        shape = error - size * (size @ error)
+    def judge(self, config: SimulationConfig, views: list[View], draws: range, model: str) -> None:
+        """Calibrate with these views, the target and the noise drawn anew each time."""
+        found = []
+        for draw in draws:
+            scene = make_scene(config, np.random.default_rng([draw, 3]), views=views)
+            found.append(errors_um(scene, calibrated(scene, model)))
+        added = len(views) - START
+        numbers = (self.true_um, self.shape_um, self.sd_um, self.shape_sd_um)
+        for into, values in zip(numbers, np.transpose(found)):
+            into[added] = rms(values.tolist())
+
+    def follow(self, calibration: Calibration) -> None:
+        """What is advised next."""
         advice = calibration.diagnostics["next_view"]
-        sd, known = advice["before_um"], advice["size_um"]
-        self.true_um.append(float(1e3 * np.sqrt(np.mean(error**2))))
-        self.shape_um.append(float(1e3 * np.sqrt(np.mean(shape**2))))
-        self.sd_um.append(sd)
-        self.shape_sd_um.append(float(np.sqrt(max(sd**2 - known**2, 0.0))))
+        self.advised_sd_um.append(advice["before_um"])
         self.promised_um.append(advice["after_um"])
         if advice["enough"] and self.enough_after is None:
             self.enough_after = advice["views"]
+
+
+def errors_um(scene: Scene, calibration: Calibration) -> tuple[float, float, float, float]:
+    """True RMS, without size, stated sd, without size."""
+    cameras = tuple(scene.cameras.values())
+    points = working_volume(cameras)
+    error = space_error(calibration, cameras, points).errors_mm.ravel()
+    size = (points - points.mean(0)).ravel()
+    size /= np.linalg.norm(size)
+    shape = error - size * (size @ error)
+    pair = (calibration.cameras[0], calibration.cameras[1])
+    covariance = aligned_covariance(pair, calibration.free, calibration.covariance, points)
+    total = np.trace(covariance)
+    parts = np.array([error @ error, shape @ shape, total, total - size @ covariance @ size])
+    true, without, sd, shape_sd = 1e3 * np.sqrt(parts / error.size)
+    return float(true), float(without), float(sd), float(shape_sd)
 
 
 def rig(seed: int) -> SimulationConfig:
@@ -85,10 +113,10 @@ def rig(seed: int) -> SimulationConfig:
     )  # fmt: skip
 
 
-def calibrated(scene: Scene) -> Calibration:
+def calibrated(scene: Scene, model: str) -> Calibration:
     return self_calibrate(
         scene.dots, scene.nominal, scene.target, nominal_rotvec_deg=scene.nominal_rotvec_deg,
-        model="radial",
+        model=model,
     )  # fmt: skip
 
 
@@ -102,22 +130,22 @@ def held(calibration: Calibration, name: str, rng: np.random.Generator) -> View:
     return View(name, Pose(rotation, place - rotation @ middle), ("left", "right"))
 
 
-def run(seed: int) -> tuple[SimulationConfig, Path3D, Path3D]:
+def run(seed: int, draws: int, model: str) -> tuple[SimulationConfig, Path3D, Path3D]:
     """(rig, advised, random)."""
     config = rig(seed)
     rng = np.random.default_rng([seed, 2])
     cameras, target = true_cameras(config), true_target(config, np.random.default_rng(seed))
     drawn = hand_held_views(config, cameras, target, rng)
     advised, random = Path3D(), Path3D()
-    views = drawn[:START]
+    views, again = drawn[:START], range(1000 * seed, 1000 * seed + draws)
     for count in range(START, START + MORE + 1):
+        if count - START in JUDGED:
+            advised.judge(config, views, again, model)
+            random.judge(config, drawn[:count], again, model)
         scene = make_scene(config, np.random.default_rng(seed), views=views)
-        found = calibrated(scene)
-        advised.add(scene, found)
+        found = calibrated(scene, model)
+        advised.follow(found)
         views = [*views, held(found, f"view{count:02d}", rng)]
-    for count in (START, START + MORE):
-        scene = make_scene(config, np.random.default_rng(seed), views=drawn[:count])
-        random.add(scene, calibrated(scene))
     return config, advised, random
 
 
@@ -127,35 +155,24 @@ def rms(values: list[float]) -> float:
 
 def summary(paths: list[tuple[SimulationConfig, Path3D, Path3D]]) -> list[str]:
     advised, random = [a for _, a, _ in paths], [r for _, _, r in paths]
-    rows = [
-        ("6 views, to start", [a.true_um[0] for a in advised], [a.sd_um[0] for a in advised],
-         [a.shape_um[0] for a in advised], [a.shape_sd_um[0] for a in advised]),
-        ("+ 6 random", [r.true_um[-1] for r in random], [r.sd_um[-1] for r in random],
-         [r.shape_um[-1] for r in random], [r.shape_sd_um[-1] for r in random]),
-    ]  # fmt: skip
-    rows += [
-        (f"+ {n} as advised", [a.true_um[n] for a in advised], [a.sd_um[n] for a in advised],
-         [a.shape_um[n] for a in advised], [a.shape_sd_um[n] for a in advised])
-        for n in (1, 2, 3, 4, 6)
-    ]  # fmt: skip
-    lines = [
-        "| views | true, um | sd, um | true without size | sd without size |",
-        "|---|---|---|---|---|",
-        *(f"| {row[0]} | " + " | ".join(f"{rms(v):.3f}" for v in row[1:]) + " |" for row in rows),
-        "",
-    ]
-    better = sum(a.shape_sd_um[-1] < r.shape_sd_um[-1] for a, r in zip(advised, random))
-    truly = sum(a.shape_um[-1] < r.shape_um[-1] for a, r in zip(advised, random))
-    ratio = np.concatenate([np.array(a.sd_um[1:]) / a.promised_um[:-1] for a in advised])
+    lines = ["| views | true, um | sd, um | true without size | sd without size |",
+             "|---|---|---|---|---|"]  # fmt: skip
+    for label, kind, added in ROWS:
+        some = advised if kind == "advised" else random
+        columns = [[getattr(p, n)[added] for p in some] for n in NUMBERS]
+        lines.append(f"| {label} | " + " | ".join(f"{rms(c):.3f}" for c in columns) + " |")
+    lines.append("")
+    for added in JUDGED[1:]:
+        lines.append(f"- {added} advised views against {added} random ones: " + versus(
+            advised, random, added))  # fmt: skip
+    ratio = np.concatenate([np.array(a.advised_sd_um[1:]) / a.promised_um[:-1] for a in advised])
     fall = np.concatenate(
-        [(np.array(a.sd_um[:-1]) - a.sd_um[1:]) / (np.array(a.sd_um[:-1]) - a.promised_um[:-1])
-         for a in advised]
+        [(np.array(a.advised_sd_um[:-1]) - a.advised_sd_um[1:])
+         / (np.array(a.advised_sd_um[:-1]) - a.promised_um[:-1]) for a in advised]
     )  # fmt: skip
     stops = [a.enough_after for a in advised if a.enough_after is not None]
     return [
         *lines,
-        f"- {len(paths)} rigs. After 12 views the advised ones have the smaller stated sd in "
-        f"{better}, the smaller true error in {truly} (without size).",
         f"- sd reached over sd promised, one view ahead: median {np.median(ratio):.3f}, "
         f"5-95 % {np.quantile(ratio, 0.05):.3f} to {np.quantile(ratio, 0.95):.3f}; share of the "
         f"promised fall that came: median {np.median(fall):.2f}.",
@@ -165,24 +182,48 @@ def summary(paths: list[tuple[SimulationConfig, Path3D, Path3D]]) -> list[str]:
     ]
 
 
+def versus(advised: list[Path3D], random: list[Path3D], added: int) -> str:
+    """Ratios with their standard errors over rigs (of the mean of the logarithm), and who wins."""
+    words = []
+    for name, label in (("shape_um", "true error"), ("shape_sd_um", "stated sd")):
+        ratio = np.array([getattr(a, name)[added] / getattr(r, name)[added]
+                          for a, r in zip(advised, random)])  # fmt: skip
+        mean = np.exp(np.log(ratio).mean())
+        error = mean * np.log(ratio).std() / np.sqrt(len(ratio))
+        words.append(
+            f"{label} without size {mean:.3f} +- {error:.3f} times as large, smaller in "
+            f"{np.count_nonzero(ratio < 1)} of {len(ratio)} rigs"
+        )
+    return "; ".join(words) + "."
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rigs", type=int, default=16)
+    parser.add_argument("--rigs", type=int, default=24)
+    parser.add_argument("--draws", type=int, default=6)
+    parser.add_argument("--model", default="tangential")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     paths = []
-    each = ["| rig | angle, deg | noise, px | sd of 6 | + 6 random | + 6 advised |",
-            "|---|---|---|---|---|---|"]  # fmt: skip
+    each = [
+        "| rig | angle, deg | noise, px | sd of 6 | 4 random, true | sd | 4 advised, true | sd |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for seed in range(options.rigs):
-        config, advised, random = run(seed)
+        config, advised, random = run(seed, options.draws, options.model)
         paths.append((config, advised, random))
+        numbers = [random.shape_sd_um[0], random.shape_um[4], random.shape_sd_um[4],
+                   advised.shape_um[4], advised.shape_sd_um[4]]  # fmt: skip
         each.append(
-            f"| {seed} | {config.angle_deg:.0f} | {config.sigma_px:g} | {advised.sd_um[0]:.3f} | "
-            f"{random.sd_um[-1]:.3f} | {advised.sd_um[-1]:.3f} |"
-        )
+            f"| {seed} | {config.angle_deg:.0f} | {config.sigma_px:g} | "
+            + " | ".join(f"{n:.3f}" for n in numbers) + " |"
+        )  # fmt: skip
         print(each[-1], flush=True)
     words = (__doc__ or "").strip().splitlines()
-    text = "\n".join(["# Next best view", "", *words[4:], "", *summary(paths), *each, ""])
+    text = "\n".join(
+        ["# Next best view", "", *words[4:], "", f"Model `{options.model}`, {len(paths)} rigs.", "",
+         *summary(paths), "Without size:", "", *each, ""]
+    )  # fmt: skip
     print(text)
     if options.out:
         options.out.write_text(text, encoding="utf-8")

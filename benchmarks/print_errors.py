@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 from calibration_scene import Scene, make_scene
-from covariance import aligned, volume
 from numpy.typing import NDArray
+from rig_truth import aligned, volume
 
 from telerig.estimator.self_calibration import self_calibrate
 from telerig.io.simulation_presets import preset

@@ -27,7 +27,9 @@ Array = NDArray[np.float64]
 
 UNLIKELY = 1e-3
 """A difference that chance gives less often than this is called a movement."""
-_RANK = 1e-5
+_RANK = 1e-3
+"""Directions with a smaller share of the largest standard deviation are not judged: there the
+second order of the others is larger than what is predicted."""
 
 
 @dataclass(frozen=True)

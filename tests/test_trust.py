@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.compare_calibrations import compare_calibrations
+from telerig.estimator.compare_calibrations import _chance, compare_calibrations
 from telerig.estimator.residual_tests import residual_tests
 from telerig.estimator.uncertainty_map import uncertainty_map
 
@@ -51,6 +51,13 @@ def test_a_movement_is_found_with_its_size(scene: Any, at_rest: list[Any]) -> No
     shift = found.changes[3]
     assert abs(abs(shift.change) - 12.0) < 4 * shift.sd
     assert "the rig moved: 1" in found.words()
+
+
+def test_chance_does_not_judge_what_the_second_order_fills() -> None:
+    """A direction ten thousand times better known than the largest error is no evidence."""
+    root = np.diag([1.0, 0.2, 1e-4])
+    assert _chance(np.array([0.5, 0.1, 0.01]), root) > 0.3
+    assert _chance(np.array([0.5, 1.1, 0.01]), root) < 1e-3
 
 
 def test_other_rigs_are_refused(at_rest: list[Any], scene: Any) -> None:

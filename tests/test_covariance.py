@@ -1,0 +1,76 @@
+"""The joint covariance against GTSAM's own Marginals of the same graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from telerig.estimator import graph, initial
+from telerig.estimator.covariance import joint_covariance
+from telerig.estimator.measurements import problem_from_dots
+from telerig.estimator.problem import Problem, held_at_nominal, parameter_unit
+from telerig.estimator.self_calibration import with_plate
+
+
+def by_marginals(problem: Problem, state: Any) -> Any:
+    """Covariance of all variables, in the order and units of `JointCovariance`."""
+    factors, values, keys = graph.build(problem, state)
+    marginals = gtsam.Marginals(factors, values)
+    ordered = [k for c, k in enumerate(keys.intrinsics) if problem.free[c]]
+    ordered += [*keys.camera[1:], *keys.view, keys.dots]
+    joint = marginals.jointMarginalCovariance(ordered)
+    blocks = [[joint.at(a, b) for b in ordered] for a in ordered]
+    unit = np.ones(sum(b.shape[1] for b in blocks[0]))
+    lens = [parameter_unit(c)[problem.free_indices(i)] for i, c in enumerate(problem.cameras)]
+    unit[: sum(map(len, lens))] = np.concatenate(lens)
+    return np.block(blocks) * unit[:, None] * unit
+
+
+@pytest.mark.parametrize("solver", ["gtsam", "schur"])
+@pytest.mark.parametrize(
+    ("preset", "model"),
+    [
+        ("paper", "none"),
+        ("paper", "tangential"),
+        ("near_telecentric", "kappa+radial"),
+        ("scheimpflug", "affine+radial"),
+        ("two_sided", "radial"),
+    ],
+)
+def test_it_is_that_of_gtsams_marginals(preset: str, model: str, solver: str, scene: Any) -> None:
+    """To 1e-6 of the standard deviations, element by element."""
+    made = scene(preset, 2)
+    problem = with_plate(problem_from_dots(made.dots, made.cameras, made.target))
+    problem = problem.with_model(model)
+    start = initial.stereo_states(problem, problem.nominal_mm)[0]
+    problem = replace(problem, solver=solver)
+    solution = graph.solve(problem, held_at_nominal(problem, start))
+    ours = joint_covariance(problem, solution)
+    theirs = by_marginals(problem, solution.state)
+    sd = np.sqrt(np.diag(theirs))
+    assert ours.matrix.shape == theirs.shape == (len(ours.names),) * 2
+    assert np.abs((ours.matrix - theirs) / np.outer(sd, sd)).max() < 1e-6
+
+
+def test_a_large_problem_keeps_the_same_blocks(scene: Any, monkeypatch: Any) -> None:
+    """Above `WHOLE` numbers only cameras, views and each dot's own block are kept."""
+    made = scene("paper", 4)
+    problem = problem_from_dots(made.dots, made.cameras, made.target).with_model("radial")
+    problem = replace(problem, solver="schur")
+    start = initial.stereo_states(problem, problem.nominal_mm)[0]
+    solution = graph.solve(problem, held_at_nominal(problem, start))
+    monkeypatch.setattr("telerig.estimator.covariance.WHOLE", 10)
+    ours = joint_covariance(problem, solution)
+    theirs = by_marginals(problem, solution.state)
+    sd = np.sqrt(np.diag(theirs))
+    common = len(ours.names)
+    assert common == len(theirs) - problem.nominal_mm.size
+    apart = ours.matrix - theirs[:common, :common]
+    assert np.abs(apart / np.outer(sd[:common], sd[:common])).max() < 1e-6
+    at = common + np.arange(problem.nominal_mm.size).reshape(-1, 3)
+    own = theirs[at[:, :, None], at[:, None, :]]
+    assert np.abs(ours.dots - own).max() < 1e-6 * own.max()

@@ -7,6 +7,7 @@ uses that as a prior for each dot's own contrast gradient and removes the neighb
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -56,7 +57,8 @@ Array = NDArray[np.float64]
 _FIRST_SIGMA_PX = 1.0
 _FEWEST_PIXELS = 25
 """A first fit that ran out of the image leaves no window for a second one."""
-_ROUNDS = 2
+_ROUNDS = 10
+_SETTLED_SD = 0.1
 
 
 @dataclass(frozen=True)
@@ -218,19 +220,31 @@ def _second_pass(
     fits: list[DotFit],
     noise: NoiseModel,
 ) -> list[DotFit]:
-    """Every dot again, knowing the light and its neighbours."""
+    """Every dot again, knowing the light and its neighbours.
+
+    Dots that share pixels are fitted in turn, each beside the last fits of the others, until none
+    moves (Gauss-Seidel: the limit is the fit of all together).
+    """
     priors = with_common_blur(contrast_gradients(fits, grey.shape), fits)
     neighbours = close_neighbours(fits)
-    for _ in range(_ROUNDS if any(neighbours) else 1):
-        known, updated = list(fits), []
-        for blob, fit, prior, near in zip(blobs, known, priors, neighbours):
+    fits = list(fits)
+    again: Sequence[int] = range(len(fits))
+    for _ in range(_ROUNDS):
+        moved = []
+        for i in again:
+            fit, near = fits[i], neighbours[i]
             start = Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
-            sure = [blobs[k].label for k in near if known[k].converged and not blobs[k].holes]
-            window = dot_window(grey, found.labels, blob, start, known=sure)
-            window = without_neighbours(window, [known[k] for k in near])
-            lost = np.count_nonzero(window.mask) < _FEWEST_PIXELS
-            updated.append(fit if lost else fit_dot(window, start, noise, prior))
-        fits = updated
+            sure = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
+            window = dot_window(grey, found.labels, blobs[i], start, known=sure)
+            window = without_neighbours(window, [fits[k] for k in near])
+            if np.count_nonzero(window.mask) >= _FEWEST_PIXELS:
+                fits[i] = fit_dot(window, start, noise, priors[i])
+            step = float(np.linalg.norm(fits[i].centre_px - fit.centre_px))
+            if near and step > _SETTLED_SD * np.sqrt(np.trace(fits[i].covariance_px2)):
+                moved.append(i)
+        again = sorted({k for i in moved for k in (i, *neighbours[i])})
+        if not again:
+            break
     return fits
 
 

@@ -203,7 +203,8 @@ def _trades(names: tuple[str, ...], covariance: Array) -> list[str]:
             a, b = (_spoken_full(names[k]) for k in (i, j))
             out.append(
                 f"{a} and {b} trade against each other (correlation {correlation[i, j]:+.3f}): "
-                "their sum is known far better than either"
+                f"a {'rise of both' if correlation[i, j] > 0 else 'rise of one and fall of the other'} "
+                "hardly changes the images"
             )
     return out
 

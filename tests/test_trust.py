@@ -53,11 +53,38 @@ def test_a_movement_is_found_with_its_size(scene: Any, at_rest: list[Any]) -> No
     assert "the rig moved: 1" in found.words()
 
 
+def test_a_calibration_beside_itself_says_nothing_of_the_rig(at_rest: list[Any]) -> None:
+    assert "same views" in compare_calibrations(at_rest[0], at_rest[0]).words()
+
+
+def test_exchanged_cameras_and_other_lenses_are_named(scene: Any, at_rest: list[Any]) -> None:
+    made = scene("paper", 41)
+    names = made.dots["camera"].map({"left": "right", "right": "left"})
+    exchanged = made.with_dots(made.dots.assign(camera=names)).calibrate()
+    assert "exchanged" in compare_calibrations(at_rest[0], exchanged).words()
+    larger = at_rest[1].cameras[0]["scale_px_per_mm"] * 1.001
+    zoomed = at_rest[1].cameras[0].with_parameters(scale_px_per_mm=larger)
+    after = replace(at_rest[1], cameras=(zoomed, at_rest[1].cameras[1]))
+    words = compare_calibrations(at_rest[0], after).words()
+    assert "the magnification changed" in words and "scale of camera left" in words
+    assert "exchanged" not in words
+
+
+def test_media_that_differ_are_said(at_rest: list[Any]) -> None:
+    wet = replace(at_rest[1], medium="water")
+    assert "earlier one was made in air, this one in the water" in (
+        compare_calibrations(at_rest[0], wet).words()
+    )
+
+
 def test_other_rigs_are_refused(at_rest: list[Any], scene: Any) -> None:
     one = at_rest[0]
     renamed = replace(one, cameras=(one.cameras[0], replace(one.cameras[1], name="top")))
     with pytest.raises(InputError, match=r"different rigs.*right 512x512.*top 512x512"):
         compare_calibrations(one, renamed)
+    turned = replace(one, cameras=one.cameras[::-1])
+    with pytest.raises(InputError, match="same order in rig.toml"):
+        compare_calibrations(one, turned)
     alone = replace(one, cameras=one.cameras[:1])
     with pytest.raises(InputError, match="one camera"):
         compare_calibrations(alone, alone)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
+from telerig.estimator.behind_walls import forgotten_walls
 from telerig.estimator.sensor_checks import check_sensors
 from telerig.estimator.smoother.smooth import smooth
 from telerig.estimator.track_detect import read_batch
@@ -49,7 +50,10 @@ def smooth_run(
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
     run, marks = with_followed_references(run, source.parent)
-    warnings = check_sensors(run, tracks=followed, calibration=calibration)
+    warnings = [
+        *forgotten_walls(run.rig, calibration),
+        *check_sensors(run, tracks=followed, calibration=calibration),
+    ]
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
     found = smooth(
         followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig

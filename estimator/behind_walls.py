@@ -230,7 +230,7 @@ def _without_distance(camera: Camera) -> list[str]:
     moved = replace(camera, wall=farther).project(points) - camera.project(points)
     moved = moved / camera["scale_px_per_mm"] * 1e3
     common = moved.mean(0)
-    shift, rest = np.linalg.norm(common), np.abs(moved - common).max()
+    shift, rest = float(np.linalg.norm(common)), float(np.abs(moved - common).max())
     if max(shift, rest) < _NOTABLE_UM:
         return []
     return [
@@ -255,7 +255,7 @@ def forgotten_walls(rig: RigDescription | None, calibration: Calibration) -> lis
     if error < _NOTABLE_UM:
         return []
     return [
-        f"rig.toml states walls for {', '.join(missing)} that the calibration does not have: "
+        f"the walls that rig.toml states for {', '.join(missing)} are not in the calibration: "
         f"points are {_um(error)} wrong over the working volume; calibrate again"
     ]
 

@@ -31,8 +31,8 @@ _SCALE = 1e-7
 def halves(problem: Problem, state: State) -> dict[str, Any]:
     """For `Calibration.diagnostics`: words, figures and the field of differences.
 
-    The known distance on the target is common to both halves and tells nothing about repeatability:
-    it is taken as exact in both.
+    The target's size is common to both halves and tells nothing about repeatability: the known
+    distance, or without one that of two dots far apart, is taken as exact in both.
     """
     if len(problem.cameras) != 2:
         return {"words": "one camera: halves are compared in space, which takes two"}
@@ -43,6 +43,7 @@ def halves(problem: Problem, state: State) -> dict[str, Any]:
             "words": f"{len(used)} views are too few to be calibrated by halves: take "
             f"{2 * LEAST_VIEWS} or more"
         }
+    problem = replace(problem, scale=problem.scale or _size(problem, state, parts))
     try:
         first, second = (_rig(problem, state, views) for views in parts)
     except CalibrationError as error:
@@ -59,6 +60,22 @@ def halves(problem: Problem, state: State) -> dict[str, Any]:
         "shift_um": np.round(1e3 * field.shift_mm, 4).tolist(),
         "sd_um": np.round(1e3 * field.sd_mm, 4).tolist(),
     }
+
+
+def _size(
+    problem: Problem, state: State, parts: list[NDArray[np.int64]]
+) -> tuple[tuple[int, int], float, float] | None:
+    """The estimated distance of two dots far apart that both halves see, as a known one."""
+    weighed = problem.weight > 0
+    one, other = (problem.dot[weighed & np.isin(problem.view, views)] for views in parts)
+    both = np.intersect1d(one, other)
+    if len(both) < 2:
+        return None
+    points = state.dots_mm[both]
+    first = int(np.argmax(np.linalg.norm(points - points.mean(0), axis=-1)))
+    distance = np.linalg.norm(points - points[first], axis=-1)
+    second = int(np.argmax(distance))
+    return (int(both[first]), int(both[second])), float(distance[second]), 0.0
 
 
 def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:

@@ -52,6 +52,7 @@ def smooth_run(
     run, marks = with_followed_references(run, source.parent)
     warnings = [
         *forgotten_walls(run.rig, calibration),
+        *([] if refine_rig else _moved(followed)),
         *check_sensors(run, tracks=followed, calibration=calibration),
     ]
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
@@ -75,6 +76,18 @@ def smooth_run(
         if report:
             _report(staged, folder, source.parent)
     return found
+
+
+def _moved(tracks: Tracks | Any) -> list[str]:
+    """What `telerig track` found of a movement of the cameras, for trajectories that keep it."""
+    change = getattr(tracks, "summary", {}).get("rig_change") or {}
+    if not change.get("moved"):
+        return []
+    return [
+        f"camera {change['camera']!r} had moved since the calibration by which the run was tracked "
+        f"(by {1e3 * change['offset_mm']:+.0f} um along the shared coordinate): positions are off "
+        "by it; calibrate again and track again, or smooth with --refine-rig"
+    ]
 
 
 def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:

@@ -39,9 +39,11 @@ def subtables(raw: Any, table: str, problems: list[Problem]) -> dict[str, Any]:
         if stray:
             problems.append(
                 Problem(
-                    table, "", f"holds {', '.join(stray)}, but must hold a table for each name",
+                    table,
+                    "",
+                    f"holds {', '.join(stray)}, but must hold a table for each name",
                     f"write [{table}.<name>] above them, with the name filled in",
-                )  # fmt: skip
+                )
             )
         return {name: content for name, content in raw.items() if name not in stray}
     problems.append(

@@ -126,6 +126,7 @@ def _plain_lines() -> Callable[[str, int, int], None]:
         now = time.monotonic()
         if (of and done == of) or now - last["time"] > 2:
             last["time"] = now
-            typer.echo(f"{what}: {done}" + (f" of {of}" if of else ""), err=True)
+            counted = f": {done} of {of}" if of else f": {done}" if done else ""
+            typer.echo(what + counted, err=True)
 
     return update

@@ -145,7 +145,7 @@ def test_the_warnings_say_how_large_the_error_would_be(tank: Path, in_air: Calib
 
     run = telerig.load_run(tank / "runs" / "rise")
     found = telerig.track(run, in_air.in_air())
-    warning = next(n for n in found.summary["warnings"] if "rig.toml states walls for left" in n)
+    warning = next(n for n in found.summary["warnings"] if "rig.toml states for left" in n)
     assert float(warning.split("up to ")[1].split(" um")[0]) == pytest.approx(stated, rel=0.05)
     assert not forgotten_walls(run.rig, in_air)
     assert not forgotten_walls(run.rig, replace(in_air.in_air(), medium="water"))

@@ -241,13 +241,23 @@ def _without_distance(camera: Camera) -> list[str]:
 
 
 def forgotten_walls(rig: RigDescription | None, calibration: Calibration) -> list[str]:
-    """Warnings where `rig.toml` has walls that the calibration does not model.
+    """Warnings where `rig.toml` has walls that the calibration does not model, or the reverse.
 
     A calibration made in water without walls holds them in its scales and axes, but for what
     perspective does.
     """
-    stated = {} if rig is None else stated_walls(rig)
+    if rig is None:
+        return []
+    stated = stated_walls(rig)
     have = {c.name: c.wall for c in calibration.cameras}
+    gone = [name for name, wall in have.items() if wall is not None and name not in stated]
+    if gone:
+        bare = [replace(c, wall=None) if c.name in gone else c for c in calibration.cameras]
+        much = _um(model_error_um(calibration.cameras, bare))
+        return [
+            f"the calibration has walls for {', '.join(gone)} that rig.toml does not state: if "
+            f"they are gone, points are {much} wrong over the working volume; calibrate again"
+        ]
     missing = [name for name, wall in stated.items() if not _same(have.get(name), wall)]
     if not missing or calibration.medium == "water":
         return []
@@ -255,8 +265,8 @@ def forgotten_walls(rig: RigDescription | None, calibration: Calibration) -> lis
     if error < _NOTABLE_UM:
         return []
     return [
-        f"the walls that rig.toml states for {', '.join(missing)} are not in the calibration: "
-        f"points are {_um(error)} wrong over the working volume; calibrate again"
+        f"the walls that rig.toml states for {', '.join(missing)} are not in the calibration as "
+        f"stated: points are {_um(error)} wrong over the working volume; calibrate again"
     ]
 
 

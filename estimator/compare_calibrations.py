@@ -19,7 +19,7 @@ from telerig.errors import InputError
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import aligned_shift
 from telerig.estimator.truth import working_volume
-from telerig.io.report.words import with_sd
+from telerig.io.report.words import number, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
 from telerig.rig.triangulation import triangulate
@@ -124,9 +124,10 @@ class RigComparison:
             else f"no movement of the cameras against each other is seen ({size})"
         )
         field = self.field
+        apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
         second = (
-            f"the same pixels lie {field.rms_um:.2g} um RMS per axis apart in space, where the two "
-            f"calibrations' uncertainty explains {field.predicted_um:.2g} um"
+            f"the same pixels lie {apart} um RMS per axis apart in space, where the two "
+            f"calibrations' uncertainty explains {expected} um"
         )
         if self.differs:
             chance = f"chance: {max(field.p_value, 1e-12):.0e}"
@@ -138,7 +139,9 @@ class RigComparison:
     def _scale_words(self) -> list[str]:
         """Of scales that changed by more than chance."""
         if self.exchanged:
-            return ["each camera has the other's scale: were their images or cables exchanged?"]
+            return [
+                "each camera has the other's scale, as if their images or cables were exchanged"
+            ]
         changed = [c for c in self.changes[4:] if chdtrc(1, c.deviations**2) < UNLIKELY]
         if not changed:
             return []

@@ -20,6 +20,7 @@ from telerig.estimator.graph import solve
 from telerig.estimator.problem import Problem
 from telerig.estimator.results import cameras_from_state
 from telerig.factors.projection import State
+from telerig.io.report.words import number
 
 Array = NDArray[np.float64]
 
@@ -96,9 +97,10 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
 
 def _words(field: FieldDifference, views: list[int]) -> str:
     ratio = field.rms_um / max(field.predicted_um, 1e-12)
+    apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
     words = (
-        f"two halves of {views[0]} and {views[1]} views put the same pixels {field.rms_um:.2g} um "
-        f"RMS per axis apart in space; their covariances predict {field.predicted_um:.2g} um"
+        f"two halves of {views[0]} and {views[1]} views put the same pixels {apart} um "
+        f"RMS per axis apart in space; their covariances predict {expected} um"
     )
     if field.p_value >= UNLIKELY:
         return words + f" (ratio {ratio:.2f}): the covariance can be believed"

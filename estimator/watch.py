@@ -27,7 +27,7 @@ from telerig.estimator.frontend.dataset_dots import (
     detected_together,
 )
 from telerig.estimator.frontend.target_detection import REJECTED
-from telerig.estimator.next_view import ENOUGH_SHARE
+from telerig.estimator.next_view import ENOUGH_SHARE, rounded_um
 from telerig.estimator.view_words import first_views
 from telerig.io.dataset import Dataset, View, load_dataset
 
@@ -276,7 +276,7 @@ def standing(
         residual = calibration.statistics["rms_px"]
         return f"{words}: residual {residual:.3g} px. Next: {_generic(dataset, count)}", False
     sd = advice["before_um"]
-    words += f": {sd:.2g} um in space"
+    words += f": {rounded_um(sd)} um in space"
     if count < RECOMMENDED_VIEWS:
         missing = RECOMMENDED_VIEWS - count
         return f"{words}, {missing} more to begin with. Next: {_generic(dataset, count)}", False
@@ -290,4 +290,4 @@ def standing(
         return f"{words}: enough, {gain}{unmet}", True
     if not advice["poses"]:
         return f"{words}. {advice['verdict']}", False
-    return f"{words}, {advice['after_um']:.2g} with: {advice['poses'][0]['words']}", False
+    return f"{words}, {rounded_um(advice['after_um'])} with: {advice['poses'][0]['words']}", False

@@ -150,6 +150,9 @@ def test_the_warnings_say_how_large_the_error_would_be(tank: Path, in_air: Calib
     assert not forgotten_walls(run.rig, in_air)
     assert not forgotten_walls(run.rig, replace(in_air.in_air(), medium="water"))
     assert not forgotten_walls(None, in_air)
+    (gone,) = forgotten_walls(replace(run.rig, walls={}), in_air)
+    assert "walls for left, right that rig.toml does not state" in gone
+    assert float(gone.split("up to ")[1].split(" um")[0]) == pytest.approx(stated, rel=0.05)
 
 
 def test_words_on_walls_are_right(in_air: Calibration) -> None:

@@ -117,8 +117,9 @@ def test_a_calibration_of_another_rig_is_refused_before_anything_is_solved(
 
 
 def test_a_reader_that_has_gone_is_no_fault():
-    code = "import sys; from telerig.scripts.console import errors_in_words, say\n"
-    code += "with errors_in_words():\n    [say('x' * 1000) for _ in range(1000)]"
+    code = "import typer\nfrom telerig.scripts.console import errors_in_words, say\n"
+    code += "def long():\n  with errors_in_words():\n    [say('x' * 1000) for _ in range(1000)]\n"
+    code += "typer.run(long)"
     done = subprocess.run(
         ["bash", "-c", '"$0" -c "$1" | head -1; echo "${PIPESTATUS[0]}"', sys.executable, code],
         capture_output=True, text=True, check=False,

@@ -31,6 +31,7 @@ UNLIKELY = 1e-3
 _RANK = 1e-5
 _ROUNDING = 1e-6
 _FAR = 5.0
+_LEAST_CHANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ class RigComparison:
             f"calibrations' uncertainty explains {expected} um"
         )
         if self.differs:
-            chance = f"chance: {max(field.p_value, 1e-12):.0e}"
+            chance = chance_words(field.p_value)
             second += (
                 f": more than chance where both know it well ({chance}); do not mix their runs"
             )
@@ -243,6 +244,10 @@ def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
     return left and all(
         abs(1e6 * (after[i] / before[1 - i] - 1)) < _FAR * scales[i].sd for i in range(2)
     )
+
+
+def chance_words(p_value: float) -> str:
+    return f"chance {p_value:.0e}" if p_value >= _LEAST_CHANCE else "chance below 1e-12"
 
 
 def _of(medium: str) -> str:

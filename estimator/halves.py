@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
-from telerig.estimator.compare_calibrations import UNLIKELY, FieldDifference, Rig, field_difference
+from telerig.estimator.compare_calibrations import (
+    UNLIKELY,
+    FieldDifference,
+    Rig,
+    chance_words,
+    field_difference,
+)
 from telerig.estimator.covariance import joint_covariance
 from telerig.estimator.graph import solve
 from telerig.estimator.problem import Problem
@@ -105,7 +111,7 @@ def _words(field: FieldDifference, views: list[int]) -> str:
     if field.p_value >= UNLIKELY:
         return words + f" (ratio {ratio:.2f}): the covariance can be believed"
     return (
-        words + f" (ratio {ratio:.2f}; chance {max(field.p_value, 1e-12):.0e}): the halves "
+        words + f" (ratio {ratio:.2f}; {chance_words(field.p_value)}): the halves "
         "disagree, so something that the model does not know acts; every stated standard "
         "deviation is too small by about this ratio"
     )

@@ -90,7 +90,7 @@ def test_calibrate_says_what_moved_since_an_earlier_calibration(calibrated, smal
     text = run("calibrate", small_copy, "--quiet", "--compare", earlier, "--no-report")
     out = small_copy / "results" / "calibration"
     found = json.loads((out / "comparison.json").read_text())
-    assert found["verdict"] == "SAME"
+    assert found["verdict"] == "SAME" and found["earlier"] == str(earlier)
     assert found["words"] in text.replace("\n", " ")
     text = run("calibrate", small_copy, "--quiet", "--compare", small_copy / "none", code=2)
     assert "none" in text

@@ -45,10 +45,12 @@ def smooth_run(
 
     tracks : `tracks.csv`, or the folder that `telerig track` wrote.
     refine_rig : see `telerig.smooth`.
-    Files appear together at the end. Raises InputError when there are no tracks.
+    Files appear together at the end. Raises InputError when there are no tracks, or
+    not all of their cameras are in the calibration.
     """
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
+    _check_cameras(followed, calibration)
     run, marks = with_followed_references(run, source.parent)
     warnings = [
         *forgotten_walls(run.rig, calibration),
@@ -76,6 +78,18 @@ def smooth_run(
         if report:
             _report(staged, folder, source.parent)
     return found
+
+
+def _check_cameras(tracks: Tracks | Any, calibration: Calibration) -> None:
+    """Raises InputError when a camera by which the run was tracked is not in the calibration."""
+    used = list(getattr(tracks, "summary", {}).get("image_size_px") or [])
+    have = [camera.name for camera in calibration.cameras]
+    if set(used) - set(have):
+        raise InputError(
+            f"the run was tracked with cameras {', '.join(used)}, the calibration has "
+            f"{', '.join(have)}",
+            todo="give the calibration that the run was tracked with, or track again",
+        )
 
 
 def _moved(tracks: Tracks | Any) -> list[str]:

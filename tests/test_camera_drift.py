@@ -319,6 +319,17 @@ def test_smoothing_without_refinement_warns_of_a_movement() -> None:
     assert not _moved(SimpleNamespace(summary={})) and not _moved(object())
 
 
+def test_smoothing_refuses_the_calibration_of_fewer_cameras() -> None:
+    from telerig.estimator.smooth_run import _check_cameras
+
+    known = calibration(rig())
+    tracks = SimpleNamespace(summary={"image_size_px": {"left": [1, 1], "right": [1, 1]}})
+    _check_cameras(tracks, known)
+    _check_cameras(object(), known)
+    with pytest.raises(InputError, match="tracked with cameras left, right, the calibration has"):
+        _check_cameras(tracks, replace(known, cameras=known.cameras[:1]))
+
+
 def test_refused() -> None:
     with pytest.raises(InputError, match="drift prior"):
         DriftPrior(rotation_rad=0.0)

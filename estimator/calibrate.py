@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.problem import SOLVERS
+from telerig.estimator.problem import DOTS_FREE, MODELS, SOLVERS
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -39,8 +39,30 @@ class CalibrationRun:
 def checked_medium(medium: str) -> str:
     """Raises InputError for anything but "air" and "water"."""
     if medium not in MEDIA:
-        raise InputError(f"unknown medium {medium!r}", todo='give "air" or "water"')
+        raise InputError(f"unknown medium {medium!r}", todo=f"known: {', '.join(MEDIA)}")
     return medium
+
+
+def check_options(
+    *,
+    model: str = "auto",
+    solver: str = "auto",
+    medium: str = "air",
+    dots_free: str = "3d",
+    **_: object,
+) -> None:
+    """Before any image is looked at.
+
+    Raises InputError or CalibrationError for a word that is none of those known.
+    """
+    checked_medium(medium)
+    for what, word, known in (
+        ("model", model, ("auto", *MODELS)),
+        ("solver", solver, SOLVERS),
+        ("choice", dots_free, DOTS_FREE),
+    ):
+        if word not in known:
+            raise CalibrationError(f"unknown {what} {word!r}", todo=f"known: {', '.join(known)}")
 
 
 def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
@@ -92,9 +114,7 @@ def run_calibration(
     pictures : draw what was found over each image, as `write_results` needs.
     detected : made before, by `telerig.estimator.watch`; None detects now.
     """
-    checked_medium(medium)
-    if solver not in SOLVERS:
-        raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
+    check_options(model=model, solver=solver, medium=medium, dots_free=dots_free)
     if detected is None:
         detected, table, notes = _measured(dataset, stage, pictures)
     else:

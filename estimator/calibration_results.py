@@ -54,7 +54,8 @@ def write_results(
         run.calibration.save(staged)
         write_json_atomic(staged / "run.json", record)
         if change is not None:
-            write_json_atomic(staged / "comparison.json", change.as_dict())
+            compared = {"earlier": options.get("compare"), **change.as_dict()}
+            write_json_atomic(staged / "comparison.json", compared)
         if len(run.calibration.cameras) == 2:
             write_uncertainty(run.calibration, staged / "uncertainty.npz")
         if run.detected is not None:

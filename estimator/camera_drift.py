@@ -12,6 +12,7 @@ and get it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -93,10 +94,10 @@ class RigChange:
         """The movement in numbers, what the run does not tell left out."""
         offset, *turns = (1e6 * v for v in self.values)
         sigma, *spreads = (1e6 * s for s in self.sigmas)
-        text = f"by {offset / 1000:+.3g} +- {sigma / 1000:.2g} um along the shared coordinate"
+        text = f"by {_rounded(offset / 1000, sigma / 1000)} um along the shared coordinate"
         told = self.sigmas[1:] < _NOT_SEEN * self.prior_sigmas[1:]
         each = zip(("rolled", "pitched"), turns, spreads, told)
-        names = [f"{n} by {t:+.3g} +- {s:.2g} urad" for n, t, s, seen in each if seen]
+        names = [f"{n} by {_rounded(t, s)} urad" for n, t, s, seen in each if seen]
         return ", ".join([text, *names]) if names else text + " (its rotations are not seen)"
 
     def as_dict(self) -> dict[str, Any]:
@@ -120,6 +121,12 @@ class RigChange:
                 "translation_mm": self.refined.translation_mm.tolist(),
             }
         return out
+
+
+def _rounded(value: float, sd: float) -> str:
+    """Both cut where the standard deviation has two digits."""
+    digits = max(0, 1 - math.floor(math.log10(sd))) if sd > 0 else 2
+    return f"{value:+.{digits}f} +- {sd:.{digits}f}"
 
 
 def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:

@@ -189,7 +189,7 @@ def with_change(
         words.append(
             f"Calibration: camera {change.camera!r} has moved against {first!r} since{unsure}, "
             f"{change.size_words()}. Calibrate again, or smooth with --refine-rig; until then "
-            "positions keep it."
+            "positions are off by it."
         )
     return {
         "bias_px": model.bias_px,

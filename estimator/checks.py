@@ -201,9 +201,10 @@ def _trades(names: tuple[str, ...], covariance: Array) -> list[str]:
     for i, j in zip(*np.triu_indices(len(names), 1)):
         if abs(correlation[i, j]) > 0.98:
             a, b = (_spoken_full(names[k]) for k in (i, j))
+            together = "both" if correlation[i, j] > 0 else "one and a fall of the other"
             out.append(
                 f"{a} and {b} trade against each other (correlation {correlation[i, j]:+.3f}): "
-                "their sum is known far better than either"
+                f"a rise of {together} hardly changes the images"
             )
     return out
 

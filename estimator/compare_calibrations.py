@@ -7,8 +7,9 @@ pair of pixels triangulates apart over the working volume after the best rigid m
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from telerig.errors import InputError
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import aligned_shift
 from telerig.estimator.truth import working_volume
-from telerig.io.report.words import with_sd
+from telerig.io.report.words import number, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
 from telerig.rig.triangulation import triangulate
@@ -30,6 +31,9 @@ UNLIKELY = 1e-3
 _RANK = 1e-3
 """Directions with a smaller share of the largest standard deviation are not judged: there the
 second order of the others is larger than what is predicted."""
+_ROUNDING = 1e-6
+_FAR = 5.0
+_LEAST_CHANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -81,11 +85,21 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class RigComparison:
-    """changes : between the cameras, then scales.  p_moved : of the pose between the cameras."""
+    """changes : between the cameras, then scales.  p_moved : of the pose between the cameras.
+
+    exchanged : each camera now has the scale that the other had.  media : of first and second.
+    """
 
     changes: tuple[Change, ...]
     field: FieldDifference
     p_moved: float
+    exchanged: bool = False
+    media: tuple[str, str] = ("air", "air")
+
+    @property
+    def identical(self) -> bool:
+        """The same to rounding, as no two independent sets of views are."""
+        return self.field.rms_um < _ROUNDING * self.field.predicted_um
 
     @property
     def moved(self) -> bool:
@@ -97,6 +111,11 @@ class RigComparison:
 
     def words(self) -> str:
         """The verdict for a reader."""
+        if self.identical:
+            return (
+                "both calibrations are the same to rounding, so they come from the same views: "
+                "compare with one from other views to learn whether the rig moved"
+            )
         shift, turn = self.changes[3], _norm(self.changes[:3])
         size = (
             f"{with_sd(abs(shift.change), shift.sd)} um and {with_sd(turn.change, turn.sd)} urad "
@@ -108,16 +127,37 @@ class RigComparison:
             else f"no movement of the cameras against each other is seen ({size})"
         )
         field = self.field
+        apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
         second = (
-            f"the same pixels lie {field.rms_um:.2g} um RMS per axis apart in space, where the two "
-            f"calibrations' uncertainty explains {field.predicted_um:.2g} um"
+            f"the same pixels lie {apart} um RMS per axis apart in space, where the two "
+            f"calibrations' uncertainty explains {expected} um"
         )
         if self.differs:
-            chance = f"chance: {max(field.p_value, 1e-12):.0e}"
+            chance = chance_words(field.p_value)
             second += (
                 f": more than chance where both know it well ({chance}); do not mix their runs"
             )
-        return f"{first}; {second}"
+        return "; ".join([first, *self._scale_words(), second, *self._medium_words()])
+
+    def _scale_words(self) -> list[str]:
+        """Of scales that changed by more than chance."""
+        if self.exchanged:
+            return [
+                "each camera has the other's scale, as if their images or cables were exchanged"
+            ]
+        changed = [c for c in self.changes[4:] if chdtrc(1, c.deviations**2) < UNLIKELY]
+        if not changed:
+            return []
+        said = (f"{with_sd(c.change, c.sd)} ppm ({c.quantity})" for c in changed)
+        return [f"the magnification changed: {', '.join(said)}"]
+
+    def _medium_words(self) -> list[str]:
+        if self.media[0] == self.media[1]:
+            return []
+        return [
+            f"the earlier one was made in {_of(self.media[0])}, this one in {_of(self.media[1])}: "
+            "windows that [walls] does not state count as changes"
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """For comparison.json."""
@@ -142,21 +182,38 @@ def compare_calibrations(first: Calibration, second: Calibration) -> RigComparis
 
     Raises InputError for rigs with other cameras, image sizes, or a single camera.
     """
-    return compare_rigs(_rig(first, second), _rig(second, first))
+    check_same_rig(first.cameras, second.cameras)
+    found = compare_rigs(_rig(first), _rig(second))
+    return replace(found, media=(first.medium, second.medium))
 
 
-def _rig(calibration: Calibration, other: Calibration) -> Rig:
-    mine, theirs = ([(c.name, tuple(c.image_size_px)) for c in k.cameras]
-                    for k in (calibration, other))  # fmt: skip
-    if mine != theirs:
-        raise InputError(
-            f"these are calibrations of different rigs: {_named(mine)} and {_named(theirs)}",
-            todo="compare calibrations with the same camera names, order and image sizes",
-        )
-    if len(mine) != 2:
+class Named(Protocol):
+    """A camera, calibrated or of `rig.toml`."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def image_size_px(self) -> tuple[int, int]: ...
+
+
+def check_same_rig(first: Sequence[Named], second: Sequence[Named]) -> None:
+    """Raises InputError for other cameras, another order, other image sizes, or a single camera."""
+    mine, theirs = ([(c.name, tuple(c.image_size_px)) for c in k] for k in (first, second))
+    if len(mine) < 2 and len(theirs) < 2:
         raise InputError(
             "one camera has no pose to another", todo="compare calibrations of two cameras"
         )
+    if mine == theirs:
+        return
+    todo = "compare calibrations with the same camera names, order and image sizes"
+    if sorted(mine) == sorted(theirs):
+        todo = "give the cameras in the same order in rig.toml: the first one is the rig's frame"
+    raise InputError(
+        f"these are calibrations of different rigs: {_named(mine)} and {_named(theirs)}", todo=todo
+    )
+
+
+def _rig(calibration: Calibration) -> Rig:
     bare = calibration.in_air()
     return Rig((bare.cameras[0], bare.cameras[1]), bare.free, bare.covariance)
 
@@ -178,7 +235,25 @@ def compare_rigs(first: Rig, second: Rig) -> RigComparison:
     ]
     changes += [_scale_change(first, second, i) for i in range(2)]
     moved = _chance(pose, _root(covariance))
-    return RigComparison(tuple(changes), field_difference(first, second), moved)
+    field = field_difference(first, second)
+    return RigComparison(tuple(changes), field, moved, _exchanged(first, second, changes[4:]))
+
+
+def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
+    """Whether each scale left its camera by far and came to where the other's was."""
+    before, after = ([c["scale_px_per_mm"] for c in r.cameras] for r in (first, second))
+    left = min(abs(c.deviations) for c in scales) > _FAR
+    return left and all(
+        abs(1e6 * (after[i] / before[1 - i] - 1)) < _FAR * scales[i].sd for i in range(2)
+    )
+
+
+def chance_words(p_value: float) -> str:
+    return f"chance {p_value:.0e}" if p_value >= _LEAST_CHANCE else "chance below 1e-12"
+
+
+def _of(medium: str) -> str:
+    return "the water" if medium == "water" else medium
 
 
 def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:

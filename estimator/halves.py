@@ -14,12 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
-from telerig.estimator.compare_calibrations import UNLIKELY, FieldDifference, Rig, field_difference
+from telerig.estimator.compare_calibrations import (
+    UNLIKELY,
+    FieldDifference,
+    Rig,
+    chance_words,
+    field_difference,
+)
 from telerig.estimator.covariance import joint_covariance
 from telerig.estimator.graph import solve
 from telerig.estimator.problem import Problem
 from telerig.estimator.results import cameras_from_state
 from telerig.factors.projection import State
+from telerig.io.report.words import number
 
 Array = NDArray[np.float64]
 
@@ -31,8 +38,8 @@ _SCALE = 1e-7
 def halves(problem: Problem, state: State) -> dict[str, Any]:
     """For `Calibration.diagnostics`: words, figures and the field of differences.
 
-    The known distance on the target is common to both halves and tells nothing about repeatability:
-    it is taken as exact in both.
+    The target's size is common to both halves and tells nothing about repeatability: the known
+    distance, or without one that of two dots far apart, is taken as exact in both.
     """
     if len(problem.cameras) != 2:
         return {"words": "one camera: halves are compared in space, which takes two"}
@@ -43,6 +50,7 @@ def halves(problem: Problem, state: State) -> dict[str, Any]:
             "words": f"{len(used)} views are too few to be calibrated by halves: take "
             f"{2 * LEAST_VIEWS} or more"
         }
+    problem = replace(problem, scale=problem.scale or _size(problem, state, parts))
     try:
         first, second = (_rig(problem, state, views) for views in parts)
     except CalibrationError as error:
@@ -59,6 +67,22 @@ def halves(problem: Problem, state: State) -> dict[str, Any]:
         "shift_um": np.round(1e3 * field.shift_mm, 4).tolist(),
         "sd_um": np.round(1e3 * field.sd_mm, 4).tolist(),
     }
+
+
+def _size(
+    problem: Problem, state: State, parts: list[NDArray[np.int64]]
+) -> tuple[tuple[int, int], float, float] | None:
+    """The estimated distance of two dots far apart that both halves see, as a known one."""
+    weighed = problem.weight > 0
+    one, other = (problem.dot[weighed & np.isin(problem.view, views)] for views in parts)
+    both = np.intersect1d(one, other)
+    if len(both) < 2:
+        return None
+    points = state.dots_mm[both]
+    first = int(np.argmax(np.linalg.norm(points - points.mean(0), axis=-1)))
+    distance = np.linalg.norm(points - points[first], axis=-1)
+    second = int(np.argmax(distance))
+    return (int(both[first]), int(both[second])), float(distance[second]), 0.0
 
 
 def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
@@ -79,14 +103,15 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
 
 def _words(field: FieldDifference, views: list[int]) -> str:
     ratio = field.rms_um / max(field.predicted_um, 1e-12)
+    apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
     words = (
-        f"two halves of {views[0]} and {views[1]} views put the same pixels {field.rms_um:.2g} um "
-        f"RMS per axis apart in space; their covariances predict {field.predicted_um:.2g} um"
+        f"two halves of {views[0]} and {views[1]} views put the same pixels {apart} um "
+        f"RMS per axis apart in space; their covariances predict {expected} um"
     )
     if field.p_value >= UNLIKELY:
         return words + f" (ratio {ratio:.2f}): the covariance can be believed"
     return (
-        words + f" (ratio {ratio:.2f}; chance {max(field.p_value, 1e-12):.0e}): the halves "
+        words + f" (ratio {ratio:.2f}; {chance_words(field.p_value)}): the halves "
         "disagree, so something that the model does not know acts; every stated standard "
         "deviation is too small by about this ratio"
     )

@@ -41,6 +41,7 @@ ALIKE_SHARE = 0.75
 _NOTABLE_SHARE = 0.5
 _FIRST, _NEAR, _SHOWN = 90, 30, 3
 _STEPS = ((0.1, 12.0), (0.1, 12.0), (0.05, 12.0), (0.05, 6.0), (0.05, 6.0))
+_WHOLE_UM = 100.0
 _FEW_DOTS, _MANY_DOTS = 25, 150
 
 
@@ -87,18 +88,19 @@ class NextView:
     def verdict(self) -> str:
         """What another view would bring."""
         if not self.poses:
-            return f"{self.views} views, good to {self.before_um:.2g} um; no pose was found to add"
+            good = rounded_um(self.before_um)
+            return f"{self.views} views, good to {good} um; no pose was found to add"
         worth = ": enough" if self.enough() else ""
         return (
             f"{self.views} views; one more would bring the calibration's share of errors in space "
-            f"from {_um(self.before_um, self.after_um)} to "
-            f"{_um(self.after_um, self.before_um)} um{self._floor()}{worth}"
+            f"from {rounded_um(self.before_um, self.after_um)} to "
+            f"{rounded_um(self.after_um, self.before_um)} um{self._floor()}{worth}"
         )
 
     def _floor(self) -> str:
         if self.size_um < _NOTABLE_SHARE * self.before_um:
             return ""
-        return f" ({self.size_um:.2g} um stay: how well the target's size is known)"
+        return f" ({rounded_um(self.size_um)} um stay: how well the target's size is known)"
 
     def words(self) -> str:
         """Verdict, and how to hold the target."""
@@ -223,8 +225,10 @@ def _preferred(
     return np.array(chosen)
 
 
-def _um(value: float, other: float) -> str:
-    """Digits enough to tell the two apart."""
+def rounded_um(value: float, other: float = np.nan) -> str:
+    """Digits enough to tell the two apart, and no powers of ten."""
+    if value >= _WHOLE_UM:
+        return f"{value:.0f}"
     digits = 2
     while digits < 4 and f"{value:.{digits}g}" == f"{other:.{digits}g}":
         digits += 1

@@ -54,6 +54,7 @@ image and p1, p2 carry a decentred lens (docs/decisions/003).
 """
 
 SOLVERS = ("auto", "gtsam", "schur")
+DOTS_FREE = ("3d", "plane", "nominal")
 
 PRIOR_SIGMA = {
     "scale_px_per_mm": 0.5,  # relative

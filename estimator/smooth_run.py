@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
+from telerig.estimator.behind_walls import forgotten_walls
 from telerig.estimator.sensor_checks import check_sensors
 from telerig.estimator.smoother.smooth import smooth
 from telerig.estimator.track_detect import read_batch
@@ -44,12 +45,18 @@ def smooth_run(
 
     tracks : `tracks.csv`, or the folder that `telerig track` wrote.
     refine_rig : see `telerig.smooth`.
-    Files appear together at the end. Raises InputError when there are no tracks.
+    Files appear together at the end. Raises InputError when there are no tracks, or
+    not all of their cameras are in the calibration.
     """
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
+    _check_cameras(followed, calibration)
     run, marks = with_followed_references(run, source.parent)
-    warnings = check_sensors(run, tracks=followed, calibration=calibration)
+    warnings = [
+        *forgotten_walls(run.rig, calibration),
+        *([] if refine_rig else _moved(followed)),
+        *check_sensors(run, tracks=followed, calibration=calibration),
+    ]
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
     found = smooth(
         followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig
@@ -71,6 +78,30 @@ def smooth_run(
         if report:
             _report(staged, folder, source.parent)
     return found
+
+
+def _check_cameras(tracks: Tracks | Any, calibration: Calibration) -> None:
+    """Raises InputError when a camera by which the run was tracked is not in the calibration."""
+    used = list(getattr(tracks, "summary", {}).get("image_size_px") or [])
+    have = [camera.name for camera in calibration.cameras]
+    if set(used) - set(have):
+        raise InputError(
+            f"the run was tracked with cameras {', '.join(used)}, the calibration has "
+            f"{', '.join(have)}",
+            todo="give the calibration that the run was tracked with, or track again",
+        )
+
+
+def _moved(tracks: Tracks | Any) -> list[str]:
+    """What `telerig track` found of a movement of the cameras, for trajectories that keep it."""
+    change = getattr(tracks, "summary", {}).get("rig_change") or {}
+    if not change.get("moved"):
+        return []
+    return [
+        f"camera {change['camera']!r} had moved since the calibration by which the run was tracked "
+        f"(by {1e3 * change['offset_mm']:+.0f} um along the shared coordinate): positions are off "
+        "by it; calibrate again and track again, or smooth with --refine-rig"
+    ]
 
 
 def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:

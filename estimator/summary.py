@@ -51,7 +51,9 @@ def summary(calibration: Calibration) -> str:
         f"decided by {t['decided_by']}: {t['words']}"
     )
     lines += [f"  stage: {word}" for word in calibration.stage.get("notes", ())]
-    lines += [f"  note: {n}" for n in (*calibration.notes, *calibration.diagnostics["weak"])]
+    said = calibration.verdict.get("reasons", [])
+    notes = (*calibration.notes, *calibration.diagnostics["weak"])
+    lines += [f"  note: {note}" for note in notes if note not in said]
     return "\n".join(lines)
 
 

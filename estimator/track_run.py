@@ -110,7 +110,6 @@ def tracking_stream(
     """Detect (keeping what is found in ``work``), learn how pairs look, then link lazily."""
     chosen = options or TrackOptions()
     cameras = check_calibration(run, calibration)
-    run.notes.extend(n for n in forgotten_walls(run.rig, calibration) if n not in run.notes)
     axis = stage_axis(run, calibration)
     first_id, labels, scene, followed = 0, None, None, None
     batches: Callable[[], Iterator[pd.DataFrame]]
@@ -341,6 +340,7 @@ def summary_of(
         "shape_sigma": stream.shape_sigma,
         "covariance": "of the measurement; the calibration's share, common to all points, is not "
         "in tracks.csv",
+        "warnings": forgotten_walls(run.rig, calibration),
         "notes": list(run.notes),
     }
     if change is not None:

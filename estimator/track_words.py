@@ -26,5 +26,6 @@ def tracking_words(summary: Mapping[str, Any], seconds: float) -> str:
         lines.append("  " + ", ".join(f"{n} x {kind}" for kind, n in kinds.items()))
     lines += [f"  {word}" for word in summary["pairs"]["words"]]
     lines += [f"  {word}" for word in summary.get("references", {}).get("words", [])]
+    lines += [f"  warning: {warning}" for warning in summary.get("warnings", [])]
     lines += [f"  note: {note}" for note in summary["notes"]]
     return "\n".join(lines)

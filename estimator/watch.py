@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,12 @@ import numpy as np
 import pandas as pd
 
 from telerig.errors import CalibrationError, InputError, TelerigError
-from telerig.estimator.calibrate import CalibrationRun, run_calibration, solve_dots
+from telerig.estimator.calibrate import (
+    CalibrationRun,
+    check_options,
+    run_calibration,
+    solve_dots,
+)
 from telerig.estimator.checks import RECOMMENDED_VIEWS
 from telerig.estimator.frontend.dataset_dots import (
     NO_DOTS,
@@ -21,7 +27,7 @@ from telerig.estimator.frontend.dataset_dots import (
     detected_together,
 )
 from telerig.estimator.frontend.target_detection import REJECTED
-from telerig.estimator.next_view import ENOUGH_SHARE
+from telerig.estimator.next_view import ENOUGH_SHARE, rounded_um
 from telerig.estimator.view_words import first_views
 from telerig.io.dataset import Dataset, View, load_dataset
 
@@ -31,6 +37,7 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 Stamp = tuple[int, int]
 _FEWEST = 2
+_NAMED = 5
 
 
 class Stop(Protocol):
@@ -45,16 +52,19 @@ class WatchedFolder:
     """The images of a dataset as they arrive; each is detected once.
 
     An image counts as written when its size and time were the same at two polls. One that changes
-    later is detected again, one that is removed is forgotten.
+    later is detected again, one that is removed is forgotten. A view that lacks a camera's image
+    for longer than ``patience_s`` is named, once.
     """
 
     path: Path
     tell: Tell
     dataset: Dataset | None = None
+    patience_s: float = 5.0
     _stamps: dict[Path, Stamp] = field(default_factory=dict)
     _found: dict[Path, tuple[Stamp, ImageDots]] = field(default_factory=dict)
     _said: str = ""
     _rig: bytes = b""
+    _alone: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def poll(self, stop: Stop | None = None) -> None:
         """Look at the folder and detect what is new, until ``stop`` is set."""
@@ -75,6 +85,22 @@ class WatchedFolder:
                 if settled and self._found.get(path, (None,))[0] != stamp:
                     self._found[path] = stamp, self._detected(dataset, view, camera)
         self.dataset = replace(dataset, views=self._views(dataset))
+        self._remind(dataset, time.monotonic())
+
+    def _remind(self, dataset: Dataset, now_s: float) -> None:
+        """Name the views that wait for a camera; infinite once named."""
+        waiting = [
+            (view.name, camera)
+            for view in dataset.views
+            for camera in dataset.rig.cameras
+            if camera not in view.image_paths
+        ]
+        self._alone = {key: self._alone.get(key, now_s) for key in waiting}
+        late = [key for key, since_s in self._alone.items() if now_s - since_s > self.patience_s]
+        self._alone |= dict.fromkeys(late, float("inf"))
+        for camera in dataset.rig.cameras:
+            if names := [view for view, lacking in late if lacking == camera]:
+                self.tell(_missing(names, camera))
 
     def _listed(self) -> Dataset | None:
         try:
@@ -146,6 +172,15 @@ class WatchedFolder:
         return detected_together(self.dataset, images)
 
 
+def _missing(views: list[str], camera: str) -> str:
+    some = ", ".join(views[:_NAMED]) + (", ..." if len(views) > _NAMED else "")
+    what = f"view {some} has" if len(views) == 1 else f"{len(views)} views ({some}) have"
+    return (
+        f"{what} no image of camera {camera}; the images of a view have the same name in every "
+        f"calibration/<camera>/"
+    )
+
+
 def _stamp(path: Path) -> Stamp | None:
     try:
         status = path.stat()
@@ -170,6 +205,7 @@ def watch(
 
     Raises CalibrationError or DetectionError when stopped with too little to calibrate.
     """
+    check_options(**options)
     folder = WatchedFolder(dataset.path, tell)
     solve = {k: v for k, v in options.items() if k != "seed"}
     known: object = None
@@ -182,7 +218,7 @@ def watch(
             if _solved(folder, dataset, tell, until_um, solve):
                 break
     if stop.is_set():
-        tell("stopped: the results are written now")
+        tell("stopped; calibrating with what has arrived")
     detected = folder.detected()
     assert folder.dataset is not None
     run = run_calibration(folder.dataset, detected=detected, **options)
@@ -240,7 +276,7 @@ def standing(
         residual = calibration.statistics["rms_px"]
         return f"{words}: residual {residual:.3g} px. Next: {_generic(dataset, count)}", False
     sd = advice["before_um"]
-    words += f": {sd:.2g} um in space"
+    words += f": {rounded_um(sd)} um in space"
     if count < RECOMMENDED_VIEWS:
         missing = RECOMMENDED_VIEWS - count
         return f"{words}, {missing} more to begin with. Next: {_generic(dataset, count)}", False
@@ -254,4 +290,4 @@ def standing(
         return f"{words}: enough, {gain}{unmet}", True
     if not advice["poses"]:
         return f"{words}. {advice['verdict']}", False
-    return f"{words}, {advice['after_um']:.2g} with: {advice['poses'][0]['words']}", False
+    return f"{words}, {rounded_um(advice['after_um'])} with: {advice['poses'][0]['words']}", False

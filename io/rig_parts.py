@@ -35,7 +35,17 @@ _GRAZING = np.cos(np.deg2rad(85.0))
 
 def subtables(raw: Any, table: str, problems: list[Problem]) -> dict[str, Any]:
     if isinstance(raw, dict):
-        return raw
+        stray = [name for name, content in raw.items() if not isinstance(content, dict)]
+        if stray:
+            problems.append(
+                Problem(
+                    table,
+                    "",
+                    f"holds {', '.join(stray)}, but must hold a table for each name",
+                    f"write [{table}.<name>] above them, with the name filled in",
+                )
+            )
+        return {name: content for name, content in raw.items() if name not in stray}
     problems.append(
         Problem(
             "", table, f"is {raw!r}, must be tables", f"write a table [{table}.<name>] for each"

@@ -80,18 +80,19 @@ def calibrate(
     used, with what, where and what to do. 130: interrupted.
     """
     with errors_in_words():
-        from telerig.estimator.calibrate import run_calibration
+        from telerig.estimator.calibrate import check_options, run_calibration
         from telerig.estimator.calibration_results import write_results
         from telerig.io.dataset import load_dataset
 
         begun = time.perf_counter()
-        earlier = None if compare is None else _loaded(compare)
         options: dict[str, Any] = {"model": model, "solver": solver, "dots": dots, "medium": medium,
                    "compare": None if compare is None else str(compare), "from": source,
                    "seed": seed}  # fmt: skip
         chosen: dict[str, Any] = {
             "model": model, "solver": solver, "medium": medium, "seed": seed, "dots_free": dots,
         }  # fmt: skip
+        check_options(**chosen)
+        earlier = None if compare is None else _earlier(compare, dataset)
         if watch:
             data, run = _watched(dataset, source, until_um, poll, chosen)
             options |= {"watch": True, "until_um": until_um}
@@ -116,10 +117,17 @@ def calibrate(
             raise typer.Exit(EXIT_REJECTED)
 
 
-def _loaded(path: Path) -> Calibration:
+def _earlier(path: Path, dataset: Path) -> Calibration:
+    """The calibration to compare with, checked to be of this rig before anything is solved."""
     from telerig.estimator.calibration import load_calibration
+    from telerig.estimator.compare_calibrations import check_same_rig
+    from telerig.io.dataset import load_dataset
 
-    return load_calibration(path)
+    kept = path / "results" / "calibration"
+    earlier = load_calibration(kept if (kept / "calibration.json").is_file() else path)
+    rig = load_dataset(dataset, need_views=False).rig
+    check_same_rig(earlier.cameras, tuple(rig.cameras.values()))
+    return earlier
 
 
 def _change(earlier: Calibration, now: Calibration) -> RigComparison:

@@ -20,6 +20,8 @@ EXIT_REJECTED = 1
 EXIT_BAD_INPUT = 2
 EXIT_FAULT = 3
 EXIT_INTERRUPTED = 130
+EXIT_CLOSED_PIPE = 141
+"""What a shell gives a program whose reader (`| head`) is gone: 128 + SIGPIPE."""
 
 
 def say(text: str) -> None:
@@ -48,6 +50,9 @@ def errors_in_words() -> Iterator[None]:
         raise typer.Exit(EXIT_BAD_INPUT) from error
     except typer.Exit:
         raise
+    except BrokenPipeError:
+        _leave_closed_pipe()
+        raise typer.Exit(EXIT_CLOSED_PIPE) from None
     except Exception as error:
         if os.environ.get("TELERIG_DEBUG"):
             raise
@@ -60,6 +65,13 @@ def errors_in_words() -> Iterator[None]:
     except KeyboardInterrupt:
         typer.echo("telerig: interrupted; nothing was half-written", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _leave_closed_pipe() -> None:
+    """Let the interpreter flush into nothing at its end, instead of complaining once more."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, sys.stdout.fileno())
+    os.close(nothing)
 
 
 @contextmanager
@@ -114,6 +126,7 @@ def _plain_lines() -> Callable[[str, int, int], None]:
         now = time.monotonic()
         if (of and done == of) or now - last["time"] > 2:
             last["time"] = now
-            typer.echo(f"{what}: {done}" + (f" of {of}" if of else ""), err=True)
+            counted = f": {done} of {of}" if of else f": {done}" if done else ""
+            typer.echo(what + counted, err=True)
 
     return update

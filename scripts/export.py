@@ -99,6 +99,12 @@ def _export(
     if to in CAMERA_FORMATS:
         place = out or folder / f"{to}{SUFFIXES.get(to, '')}"
         words = export_cameras(cameras, to, place, volume=volume, **polynomial)
+        behind = [c.name for c in cameras if c.wall is not None]
+        if behind and to != "halcon":
+            words.append(
+                f"for points in the water: what the walls of {', '.join(behind)} do is fitted with "
+                "the rest"
+            )
     else:
         results = read_results(run_folder(source, run))
         place = out or folder / f"{results.name}{SUFFIXES[to]}"

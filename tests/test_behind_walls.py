@@ -145,11 +145,48 @@ def test_the_warnings_say_how_large_the_error_would_be(tank: Path, in_air: Calib
 
     run = telerig.load_run(tank / "runs" / "rise")
     found = telerig.track(run, in_air.in_air())
-    warning = next(n for n in found.summary["notes"] if "rig.toml states walls for left" in n)
+    warning = next(n for n in found.summary["warnings"] if "rig.toml states for left" in n)
     assert float(warning.split("up to ")[1].split(" um")[0]) == pytest.approx(stated, rel=0.05)
     assert not forgotten_walls(run.rig, in_air)
     assert not forgotten_walls(run.rig, replace(in_air.in_air(), medium="water"))
     assert not forgotten_walls(None, in_air)
+    (gone,) = forgotten_walls(replace(run.rig, walls={}), in_air)
+    assert "walls for left, right that rig.toml does not state" in gone
+    assert float(gone.split("up to ")[1].split(" um")[0]) == pytest.approx(stated, rel=0.05)
+
+
+def test_words_on_walls_are_right(in_air: Calibration) -> None:
+    dry = replace(in_air.in_air(), free=in_air.free)
+
+    def said(glass: Wall) -> str:
+        calibration = put_behind_walls(dry, {"left": glass})
+        described = WallDescription("left", (0.0, 0.0, 1.0), INDICES, 10.0, -60.0)
+        return " ".join(wall_words(calibration, SimpleNamespace(walls={"left": described})))
+
+    assert "less than 0.1 um wrong" in said(wall(0.0))
+    assert "denser medium" not in said(wall(1.0)) and "leans" not in said(wall(1.0))
+    assert "denser medium" in said(replace(wall(1.0), indices=INDICES[::-1]))
+    assert "leans 79 degrees" in said(wall(79.0))
+    assert "calibrate with the target in the water" in said(wall(0.0, sigma_deg=0.5))
+    assert not wall_words(dry, SimpleNamespace(walls={}))
+    wet = wall_words(replace(dry, medium="water"), SimpleNamespace(walls={}))
+    assert len(wet) == 1 and "without [walls]" in wet[0]
+
+
+def test_the_errors_in_space_hold_the_walls_share(in_air: Calibration) -> None:
+    """The normal's two tilts bend rays by b = sigma (1 - 1 / n), and shear depth into x and y.
+
+    Half of a shear is a turn. Of x the whole is seen, b^2 / 2; of y, which both cameras see, the
+    mean: b^2 / 8.
+    """
+    dry = replace(in_air.in_air(), free=in_air.free)
+    sd = {s: put_behind_walls(dry, {"left": wall(0.0, sigma_deg=s)}).statistics for s in (0.0, 0.5)}
+    assert sd[0.0]["space_sd_um"] == dry.statistics["space_sd_um"]
+    share = np.sqrt(sd[0.5]["space_sd_um"] ** 2 - sd[0.0]["space_sd_um"] ** 2)
+    assert share == pytest.approx(sd[0.5]["space_sd_walls_um"])
+    bend = np.radians(0.5) * (1 - 1 / INDICES[2])
+    depth_sd_um = 1e3 * 0.6 * 51.2 / np.sqrt(8.0)  # of five steps
+    assert share == pytest.approx(bend * depth_sd_um * np.sqrt((1 / 2 + 1 / 8) / 3), rel=0.02)
 
 
 def test_files_keep_walls_and_medium(tank: Path, in_air: Calibration, tmp_path: Path) -> None:

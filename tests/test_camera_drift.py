@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.camera_drift import (
     DriftPrior,
+    RigChange,
     drift_covariance,
     free_directions,
     gaps_of,
@@ -291,9 +293,41 @@ def test_words_say_it_once() -> None:
     assert said["calibration_problem"]
     assert said["words"][0] == "More." and len(said["words"]) == 2
     assert "'right' has moved against 'left'" in said["words"][1]
-    assert "--refine-rig" in said["words"][1]
+    assert "--refine-rig" in said["words"][1] and "positions are off by it" in said["words"][1]
     assert with_change(model, still.found(), known)["words"] == list(model.words)
     assert PairCollector(known).found() is None
+
+
+def test_numbers_are_cut_where_their_deviation_has_two_digits() -> None:
+    values, sigmas = np.array([0.0885, -2.0249e-3, 5.04e-5]), np.array([9.51e-4, 5e-5, 5.4e-5])
+    six = np.zeros(6)
+    change = RigChange(
+        "right", six, np.diag(six), six[:3], values, sigmas, np.array([0.2, 5e-3, 5e-3]), 0.0, 100
+    )
+    assert change.size_words() == (
+        "by +88.50 +- 0.95 um along the shared coordinate, rolled by -2025 +- 50 urad, "
+        "pitched by +50 +- 54 urad"
+    )
+
+
+def test_smoothing_without_refinement_warns_of_a_movement() -> None:
+    from telerig.estimator.smooth_run import _moved
+
+    summary = {"rig_change": {"camera": "right", "moved": True, "offset_mm": 0.0885}}
+    (words,) = _moved(SimpleNamespace(summary=summary))
+    assert "'right' had moved" in words and "by +88 um" in words and "--refine-rig" in words
+    assert not _moved(SimpleNamespace(summary={})) and not _moved(object())
+
+
+def test_smoothing_refuses_the_calibration_of_fewer_cameras() -> None:
+    from telerig.estimator.smooth_run import _check_cameras
+
+    known = calibration(rig())
+    tracks = SimpleNamespace(summary={"image_size_px": {"left": [1, 1], "right": [1, 1]}})
+    _check_cameras(tracks, known)
+    _check_cameras(object(), known)
+    with pytest.raises(InputError, match="tracked with cameras left, right, the calibration has"):
+        _check_cameras(tracks, replace(known, cameras=known.cameras[:1]))
 
 
 def test_refused() -> None:

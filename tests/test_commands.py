@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -88,10 +90,42 @@ def test_calibrate_says_what_moved_since_an_earlier_calibration(calibrated, smal
     text = run("calibrate", small_copy, "--quiet", "--compare", earlier, "--no-report")
     out = small_copy / "results" / "calibration"
     found = json.loads((out / "comparison.json").read_text())
-    assert found["verdict"] == "SAME"
+    assert found["verdict"] == "SAME" and found["earlier"] == str(earlier)
     assert found["words"] in text.replace("\n", " ")
     text = run("calibrate", small_copy, "--quiet", "--compare", small_copy / "none", code=2)
     assert "none" in text
+
+
+def test_a_dataset_to_compare_with_stands_for_its_own_results(calibrated, small_copy, tmp_path):
+    earlier, _ = calibrated
+    other = tmp_path / "last-year"
+    shutil.copytree(earlier, other / "results" / "calibration")
+    text = run("calibrate", small_copy, "--quiet", "--compare", other, "--no-report")
+    assert f"since {other}: " in text.replace("\n", "")
+
+
+def test_a_calibration_of_another_rig_is_refused_before_anything_is_solved(
+    calibrated, small_copy, monkeypatch
+):
+    earlier, _ = calibrated
+    rig = small_copy / "rig.toml"
+    rig.write_text(rig.read_text().replace("right", "top"))
+    (small_copy / "calibration" / "right").rename(small_copy / "calibration" / "top")
+    monkeypatch.setattr("telerig.estimator.calibrate.run_calibration", None)
+    text = run("calibrate", small_copy, "--quiet", "--compare", earlier, code=2)
+    assert "calibrations of different rigs" in text.replace("\n", " ")
+
+
+def test_a_reader_that_has_gone_is_no_fault():
+    code = "import typer\nfrom telerig.scripts.console import errors_in_words, say\n"
+    code += "def long():\n  with errors_in_words():\n    [say('x' * 1000) for _ in range(1000)]\n"
+    code += "typer.run(long)"
+    done = subprocess.run(
+        ["bash", "-c", '"$0" -c "$1" | head -1; echo "${PIPESTATUS[0]}"', sys.executable, code],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "fault" not in done.stderr and "Traceback" not in done.stderr
+    assert done.stdout.split()[-1] == "141"
 
 
 def test_residuals_are_measured_minus_predicted(calibrated, paper_images):

@@ -124,7 +124,7 @@ def test_code_of_the_page(place: Path) -> None:
     pytest.importorskip("xarray")
     names: dict[str, object] = {}
     code = blocks("python")
-    assert len(code) == 4
+    assert len(code) == 5
     for block in code:
         exec(compile(block, str(PAGE), "exec"), names)
     assert Path("soloff_right.csv").is_file() and Path("rise.nc").is_file()

@@ -136,6 +136,13 @@ def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> Non
     assert "do not say whose it is" in told.warnings[0] and "odd one" in told.warnings[1]
 
 
+def test_warnings_of_the_file_stand_beside_the_verdict(folder: Path) -> None:
+    changed(folder, warnings=["points are up to 79 um wrong; calibrate again"])
+    told = _judged(folder)
+    assert told.colour == "usable"
+    assert told.warnings == ("Points are up to 79 µm wrong; calibrate again.",)
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_nothing_judged_and_nothing_optional(folder: Path) -> None:
     changed(folder, "verdict", "axes", "words", "model", "residuals", "unseen", "cameras", "schema",

@@ -61,6 +61,7 @@ BAD = [
     ('mounted_on = "left"', 'mounted_on = "lft"', "[accelerometers.arm_left] mounted_on",
      "neither a camera nor", "did you mean left?"),
     ("[0,0,3]", "[1,1,0]", "[accelerometers.arm_left] axes", "in one plane", "three directions"),
+    ("[walls.left]", "[walls]", "[walls]", "holds normal, indices, thickness_mm", "[walls.<name>]"),
     ("[walls.left]", "[walls.lef]", "[walls.lef]", "no camera 'lef'", "did you mean left?"),
     ("[0.0, 0.3, -0.4]", "[0.0, 1.0, 0.0]", "[walls.left] normal", "along the wall", "z points"),
     ("telecentricity_per_mm = 0.0", "telecentricity_per_mm = 0.005", "[walls.left] distance_mm",

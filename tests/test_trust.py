@@ -60,11 +60,38 @@ def test_chance_does_not_judge_what_the_second_order_fills() -> None:
     assert _chance(np.array([0.5, 1.1, 0.01]), root) < 1e-3
 
 
+def test_a_calibration_beside_itself_says_nothing_of_the_rig(at_rest: list[Any]) -> None:
+    assert "same views" in compare_calibrations(at_rest[0], at_rest[0]).words()
+
+
+def test_exchanged_cameras_and_other_lenses_are_named(scene: Any, at_rest: list[Any]) -> None:
+    made = scene("paper", 41)
+    names = made.dots["camera"].map({"left": "right", "right": "left"})
+    exchanged = made.with_dots(made.dots.assign(camera=names)).calibrate()
+    assert "exchanged" in compare_calibrations(at_rest[0], exchanged).words()
+    larger = at_rest[1].cameras[0]["scale_px_per_mm"] * 1.001
+    zoomed = at_rest[1].cameras[0].with_parameters(scale_px_per_mm=larger)
+    after = replace(at_rest[1], cameras=(zoomed, at_rest[1].cameras[1]))
+    words = compare_calibrations(at_rest[0], after).words()
+    assert "the magnification changed" in words and "scale of camera left" in words
+    assert "exchanged" not in words
+
+
+def test_media_that_differ_are_said(at_rest: list[Any]) -> None:
+    wet = replace(at_rest[1], medium="water")
+    assert "earlier one was made in air, this one in the water" in (
+        compare_calibrations(at_rest[0], wet).words()
+    )
+
+
 def test_other_rigs_are_refused(at_rest: list[Any], scene: Any) -> None:
     one = at_rest[0]
     renamed = replace(one, cameras=(one.cameras[0], replace(one.cameras[1], name="top")))
     with pytest.raises(InputError, match=r"different rigs.*right 512x512.*top 512x512"):
         compare_calibrations(one, renamed)
+    turned = replace(one, cameras=one.cameras[::-1])
+    with pytest.raises(InputError, match=r"same order in rig\.toml"):
+        compare_calibrations(one, turned)
     alone = replace(one, cameras=one.cameras[:1])
     with pytest.raises(InputError, match="one camera"):
         compare_calibrations(alone, alone)
@@ -77,6 +104,17 @@ def test_halves_agree_when_the_model_is_right(at_rest: list[Any]) -> None:
     assert sum(h["agree"] for h in found) >= len(found) - 1
     assert found[0]["views"] == [6, 6]
     assert np.shape(found[0]["points_mm"]) == np.shape(found[0]["shift_um"])
+
+
+def test_halves_know_that_the_targets_size_is_common_to_both(scene: Any) -> None:
+    """The pitch alone sets the scale: a print error of 20 um that no half can see as its own."""
+    ratio = []
+    for seed in range(30, 34):
+        made = scene("paper", seed)
+        target = replace(made.target, scale_dots=None, scale_distance_mm=None)
+        halves = replace(made, target=target).calibrate().diagnostics["halves"]
+        ratio.append(halves["rms_um"] / halves["predicted_um"])
+    assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.6
 
 
 def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:

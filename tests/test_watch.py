@@ -206,6 +206,28 @@ def test_a_bad_image_is_named_and_the_rest_goes_on(paper_images: Path, empty: Pa
     assert run.calibration.statistics["views"] >= 4
 
 
+def test_a_view_that_one_camera_lacks_is_named_once(paper_images: Path, empty: Path) -> None:
+    said: list[str] = []
+    names = views(paper_images)
+    folder = WatchedFolder(empty, said.append, patience_s=60.0)
+    for name in names[:2]:
+        arrive(paper_images, empty, name, ("left",))
+    folder.poll()
+    assert not said
+    folder.patience_s = -1.0
+    folder.poll()
+    folder.poll()
+    arrive(paper_images, empty, names[2], ("right",))
+    folder.poll()
+    arrive(paper_images, empty, names[2], ("left",))
+    folder.poll()
+    first, last = (Path(names[i]).stem for i in (0, 2))
+    assert len(said) == 2
+    assert said[0].startswith(f"2 views ({first}, ") and "no image of camera right" in said[0]
+    assert said[1].startswith(f"view {last} has no image of camera left; ")
+    assert "same name" in said[0]
+
+
 def test_stopped_too_early_says_what_is_missing(paper_images: Path, empty: Path) -> None:
     with watching(empty) as it:
         it.wait_for("0 complete")
@@ -284,3 +306,7 @@ def test_options_of_watching(empty: Path) -> None:
     assert result.exit_code == 2 and "--until-um goes with --watch" in result.stderr
     result = runner.invoke(app, ["calibrate", str(empty), "--watch", "--from", "dots"])
     assert result.exit_code == 2 and "waits for images" in result.stderr
+    for option in ("model", "solver", "medium", "dots"):
+        result = runner.invoke(app, ["calibrate", str(empty), "--watch", f"--{option}", "nonsense"])
+        assert result.exit_code == 2 and "unknown" in result.stderr and "known: " in result.stderr
+        assert "watching" not in result.stdout

@@ -120,5 +120,5 @@ def change_words(change: RigChange, first: str) -> str:
         )
     return (
         f"camera {change.camera!r} has moved against {first!r} since the calibration, "
-        f"{change.size_words()}; the trajectories hold it"
+        f"{change.size_words()}; the trajectories are corrected for it"
     )

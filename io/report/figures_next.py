@@ -102,8 +102,6 @@ def _plan(results: CalibrationResults, pose: Array) -> Picture:
         axes.fill(*corners.T, color=MODEL, alpha=0.15, linewidth=0)
         axes.plot(*corners[[0, 1, 2, 3, 0]].T, color=MODEL, linewidth=1.4, label="next")
         axes.plot(*corners[:2].T, color=MODEL, linewidth=3.0, solid_capstyle="butt")
-        if plane[0, 0] < 0:  # left and right as in the first camera's image
-            axes.invert_xaxis()
         axes.legend(loc="upper right")
         source = svg(figure)
     caption = (

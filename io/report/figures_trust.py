@@ -75,8 +75,8 @@ def _halves(halves: Mapping[str, Any]) -> Picture:
     flat = level <= level.min() + 1e-6
     x, z = points[flat][:, [0, 2]].T
     spacing = np.ptp(x) / max(len(np.unique(x)) - 1, 1)
-    longest = max(float(np.hypot(*shift[flat][:, [0, 2]].T).max()), float(sd.max()), 1e-9)
-    factor = 0.7 * spacing / longest
+    longest = float(np.hypot(*shift[flat][:, [0, 2]].T).max())
+    factor = 0.7 * spacing / max(longest, float(sd.max()), 1e-9)
     with drawing(3.9) as (figure, axes):
         for a, b, s in zip(x, z, sd[flat]):
             radius = factor * float(np.sqrt(np.mean(s[[0, 2]] ** 2)))

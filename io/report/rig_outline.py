@@ -57,13 +57,16 @@ def rig_outline(results: CalibrationResults) -> RigOutline:
 def common_plane(results: CalibrationResults) -> Array:
     """(2, 3) unit vectors, across and along the first optical axis, of the plane of both axes.
 
-    One camera, or parallel axes: the first camera's x and z.
+    Across is to the right in the first camera's image where it can be. One camera, or parallel
+    axes: the first camera's x and z.
     """
     along = results.cameras[0].camera_from_rig.rotation[2]
     across = results.cameras[-1].camera_from_rig.rotation[2]
     across = across - (across @ along) * along
     if np.linalg.norm(across) < 0.05:
         across = results.cameras[0].camera_from_rig.rotation[0]
+    if across @ results.cameras[0].camera_from_rig.rotation[0] < 0:
+        across = -across
     return np.array([across / np.linalg.norm(across), along])
 
 

@@ -11,7 +11,7 @@ from telerig.io.report.smoothing_numbers import axis_sd, shake_rms_um, taken_awa
 from telerig.io.report.smoothing_results import AXES, SPEED, SmoothingResults
 from telerig.io.report.track_results import TrackResults
 from telerig.io.report.track_tables import Verdict
-from telerig.io.report.words import ABSENT, is_number, number, share
+from telerig.io.report.words import ABSENT, is_number, number, sentence, share
 
 REMEDY = (
     "fix a strip of dots to the tank where both cameras see it, or put one accelerometer on each "
@@ -79,6 +79,7 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Verdic
     }
     sentences += [text for flag, text in flags.items() if flag in _HARMLESS]
     warnings = [text for flag, text in flags.items() if flag not in _HARMLESS]
+    warnings += [_micro(sentence(w)) for w in strings(content.get("warnings"))]
     warnings += _stale(results, tracks)
     if warnings and colour == "good":
         colour = "usable"

@@ -42,7 +42,7 @@ _SMALL_WIDTH_PX = 560
 _BASE64 = 1.34
 _MOST_ROWS = 150
 _SHOWN = {"schema", "kind", "run", "notes", "worst_frames", "pairs", "covariance", "events",
-          "rig_change"}  # fmt: skip
+          "rig_change", "warnings"}  # fmt: skip
 
 
 def write_track_report(results_folder: Path, out: Path | None = None) -> Path:

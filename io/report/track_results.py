@@ -115,7 +115,7 @@ def _content(file: Path) -> Mapping[str, Any]:
     check_kind(content, file, "tracks", SCHEMA, _AGAIN)
     expected = {
         "frames": int, "frames_without_bubbles": dict, "events": dict, "pairs": dict,
-        "notes": list, "worst_frames": list, "image_size_px": dict,
+        "notes": list, "warnings": list, "worst_frames": list, "image_size_px": dict,
     }  # fmt: skip
     for name, kind in expected.items():
         if content.get(name) is not None and not isinstance(content[name], kind):

@@ -22,7 +22,7 @@ from telerig.io.report.track_numbers import (
     track_lengths,
 )
 from telerig.io.report.track_results import TrackResults
-from telerig.io.report.words import ABSENT, is_number, number, share
+from telerig.io.report.words import ABSENT, is_number, number, sentence, share
 
 Array = NDArray[np.float64]
 
@@ -133,7 +133,8 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
             "More than half of the bubbles have no partner in the other camera or no track: look "
             "at the worst frames below."
         )
-    return tuple(words)
+    stated = [sentence(str(text)) for text in results.content.get("warnings") or []]
+    return (*stated, *words)
 
 
 def key_numbers(results: TrackResults) -> list[Figure]:

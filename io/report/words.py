@@ -54,6 +54,11 @@ def share(part: Any, whole: Any) -> str:
     return "100 %" if part == whole else f"{min(percent, 99.9):.1f} %"
 
 
+def sentence(text: str) -> str:
+    """``text`` with a capital and a full stop."""
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+
+
 def nice_below(value: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not above ``value`` (1 for 0)."""
     if not is_number(value) or value <= 0:

@@ -8,9 +8,9 @@ cube of 30 mm, triangulated from their true pixels, RMS per axis after the rotat
 fit best. The bound is that of the true rig and of the sound dots. Most of it is the known distance
 on the target, one number per dataset, so that the ratio of 20 datasets scatters by up to 16 %
 (standard deviation); "without size" sets the common factor aside. NEES: the error of the points
-against the calibration's covariance, per direction in which
-its sd is more than a hundredth of the largest (1 expected). "shown" is how many
-of the target's dots an image shows; "wrong / missed": sound dots left out, and gross ones kept.
+against the calibration's covariance, per direction in which its sd is more than a hundredth of the
+largest (1 expected). "shown" is how many of the target's dots an image shows; "wrong / missed":
+sound dots left out, and gross ones kept. Rows with model auto have fewer datasets (--auto).
 """
 
 from __future__ import annotations

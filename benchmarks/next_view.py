@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from calibration_scene import Scene, make_scene
 from numpy.typing import NDArray
+from rig_truth import without_advice
 
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import aligned_covariance
@@ -33,10 +34,10 @@ Array = NDArray[np.float64]
 
 START, MORE = 6, 6
 HELD_DEG, HELD_MM = 3.0, 2.0
-JUDGED = (0, 2, 4, 6)
+JUDGED = (0, 4, 6)
 NUMBERS = ("true_um", "sd_um", "shape_um", "shape_sd_um")
 ROWS = (
-    ("6 views, to start", "random", 0), ("+ 2 random", "random", 2), ("+ 2 advised", "advised", 2),
+    ("6 views, to start", "random", 0),
     ("+ 4 random", "random", 4), ("+ 4 advised", "advised", 4),
     ("+ 6 random", "random", 6), ("+ 6 advised", "advised", 6),
 )  # fmt: skip
@@ -62,7 +63,8 @@ class Path3D:
         found = []
         for draw in draws:
             scene = make_scene(config, np.random.default_rng([draw, 3]), views=views)
-            found.append(errors_um(scene, calibrated(scene, model)))
+            with without_advice():
+                found.append(errors_um(scene, calibrated(scene, model)))
         added = len(views) - START
         numbers = (self.true_um, self.shape_um, self.sd_um, self.shape_sd_um)
         for into, values in zip(numbers, np.transpose(found)):
@@ -139,8 +141,9 @@ def run(seed: int, draws: int, model: str) -> tuple[SimulationConfig, Path3D, Pa
     advised, random = Path3D(), Path3D()
     views, again = drawn[:START], range(1000 * seed, 1000 * seed + draws)
     for count in range(START, START + MORE + 1):
-        if count - START in JUDGED:
+        if count - START in JUDGED[1:]:
             advised.judge(config, views, again, model)
+        if count - START in JUDGED:
             random.judge(config, drawn[:count], again, model)
         scene = make_scene(config, np.random.default_rng(seed), views=views)
         found = calibrated(scene, model)

@@ -43,6 +43,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "kappa+prism+centre": ("kappa_per_mm", "k1", "k2", "p1", "p2", "s1", "s3", *_CENTRE),
     "affine": ("aspect", "skew"),
     "affine+radial": ("aspect", "skew", "k1"),
+    "affine+tangential": ("aspect", "skew", "k1", "p1", "p2"),
     "tilt": ("tilt_x", "tilt_y", "image_convergence_per_mm"),
     "tilt+radial": ("tilt_x", "tilt_y", "image_convergence_per_mm", "k1"),
 }

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.lens_models import AUTO, Model
 from telerig.estimator.problem import SOLVERS
 from telerig.rig.camera import Camera
 
@@ -57,14 +58,15 @@ def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
 def calibrate(
     dataset: Dataset,
     *,
-    model: str = "auto",
+    model: Model = AUTO,
     solver: str = "auto",
     medium: str = "air",
     seed: int = 0,
 ) -> Calibration:
     """Calibrate a rig from the images or the dots of a dataset.
 
-    model : "auto" or a name of `telerig.estimator.problem.MODELS`.
+    model : "auto" (chosen for each camera), the name of a lens model (none, radial, brown,
+        kappa+radial, ...), or one by camera: {"left": "brown"}, "left=brown,right=auto".
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     medium : "air" or "water", of the target; with `[walls]` in `rig.toml` runs are in water.
     seed : recorded with the result; the calibration itself draws no random numbers.
@@ -78,7 +80,7 @@ def calibrate(
 def run_calibration(
     dataset: Dataset,
     *,
-    model: str = "auto",
+    model: Model = AUTO,
     solver: str = "auto",
     medium: str = "air",
     seed: int = 0,
@@ -119,7 +121,7 @@ def solve_dots(
     dataset: Dataset,
     table: pd.DataFrame,
     *,
-    model: str,
+    model: Model,
     solver: str,
     medium: str,
     dots_free: str,

@@ -179,7 +179,8 @@ def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) 
 def possible(rich: Lens) -> list[Lens]:
     """Every lens that a rich one contains: k2 goes with k1, a tilt in place of aspect and skew.
 
-    A tilt leaves out s, with which its homography would be spanned twice.
+    A tilt leaves out s, with which its homography would be spanned twice. Where the centre is free,
+    it and kappa always are.
     """
     shapes = [Lens()]
     if "affine" in rich:
@@ -187,7 +188,7 @@ def possible(rich: Lens) -> list[Lens]:
         shapes += [Lens({"tilt"})] if {"p", "s"} <= rich else []
     radial = [Lens(), Lens({"k1"}), Lens({"k1", "k2"})]
     choices = [[Lens(), Lens({g})] for g in ("kappa", "p", "s")]
-    always = rich & {"centre"}
+    always = rich & ({"centre", "kappa"} if "centre" in rich else set())
     found = {
         frozenset.union(always, shape, *parts)
         for shape, *parts in product(shapes, radial, *choices)
@@ -220,7 +221,7 @@ def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Add
         for lens in options:
             more = lens - lenses[c]
             if lenses[c] < lens and len(more) == 1:
-                yield c, *more, (*lenses[:c], lens, *lenses[c + 1 :])
+                yield c, min(more), (*lenses[:c], lens, *lenses[c + 1 :])
 
 
 def steps_to(landscape: Landscape, chosen: Lenses, least: Lenses) -> list[Addition]:

@@ -78,7 +78,7 @@ class Step:
     camera, added : index of the camera whose model has these parameters more than the step before;
         -1 and () for the first.
     gain : chi-square that it takes away, in units of the noise.  worth : gain less price.
-    fit : None where the gain alone decides.
+    fit : None where the gain alone decides.  vague : these views do not determine it.
     """
 
     camera: int
@@ -89,6 +89,7 @@ class Step:
     taken: bool
     words: str
     fit: Fit | None
+    vague: bool = False
 
     @property
     def p_value(self) -> float:
@@ -108,11 +109,13 @@ class Choice:
 def rich_lens(*, mono: bool, strong: bool) -> Lens:
     """What is tried of a camera.
 
-    strong : perspective; the centre is then free, and with it the image on a tilted sensor is
-        that of a turned camera, so that nothing tells s (or a tilt) from a turn.
+    strong : perspective; kappa and the centre are then free in any case. With the centre free the
+        image on a tilted sensor is that of a turned camera, so that s or a tilt cannot be told
+        from a turn, and aspect+skew hardly from the target's own stretch (docs/decisions/014).
     """
-    out = {"affine", "k1", "k2", "p"} | (set() if mono else {"kappa"})
-    return Lens(out | ({"centre"} if strong else {"s"}))
+    if strong:
+        return Lens({"kappa", "k1", "k2", "p", "centre"})
+    return Lens({"affine", "k1", "k2", "p", "s"} | (set() if mono else {"kappa"}))
 
 
 def climb(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
@@ -137,7 +140,8 @@ def climb(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
         wanted = better
     steps = _with_held_out(_taken(landscape, path, fitted))
     chosen = [step.fit for step in steps if step.taken and step.fit is not None][-1]
-    steps += _not_taken(landscape, chosen.lenses, allowed)
+    refused = [step for step in steps if not step.taken]
+    steps += _not_taken(landscape, chosen.lenses, allowed, refused)
     return Choice(tuple(steps), chosen, _words(problem, steps, chosen, others))
 
 
@@ -168,17 +172,12 @@ def _rivals(landscape: Landscape, wanted: Lenses, allowed: list[list[Lens]]) -> 
         flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
         out.append(_determined(landscape, flat))
     if any("kappa" in lens and len(options) > 1 for lens, options in zip(wanted, allowed)):
-        flat = [
-            [lens for lens in options if not lens & {"kappa", "tilt"}] or options
-            for options in (_uncentred(options) for options in allowed)
-        ]
-        out.append(tuple(max(options, key=len) for options in flat))
+        richest = (max(options, key=len) for options in allowed)
+        out.append(tuple(
+            lens - {"kappa", "centre"} if len(options) > 1 else lens
+            for lens, options in zip(richest, allowed)
+        ))  # fmt: skip
     return out
-
-
-def _uncentred(options: list[Lens]) -> list[Lens]:
-    """Without kappa the centre is a matter of gauge."""
-    return [lens if "kappa" in lens or len(options) == 1 else lens - {"centre"} for lens in options]
 
 
 def _fits(problem: Problem, rich: Solution, path: list[Lenses], rivals: list[Lenses]) -> list[Fit]:
@@ -252,35 +251,35 @@ def _with_held_out(steps: list[Step]) -> list[Step]:
     return steps
 
 
-def _not_taken(landscape: Landscape, chosen: Lenses, allowed: list[list[Lens]]) -> list[Step]:
-    """What one more group would have brought."""
+def _not_taken(
+    landscape: Landscape, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
+) -> list[Step]:
+    """What one more group would have brought, but for those that were tried and refused.
+
+    A tilt is not asked for by itself: where aspect and skew bring nothing, it does not either.
+    """
+    known = {(step.camera, step.added) for step in refused}
     out = []
     for camera, group, lenses in additions(chosen, allowed):
+        if group == "tilt" or (camera, GROUPS[group]) in known:
+            continue
         gain = max(landscape.rise(chosen) - landscape.rise(lenses), 0.0)
-        price = landscape.price_of(Lens({group}))
+        worth = gain - landscape.price_of(Lens({group}))
         share = landscape.sd_over_prior(lenses, camera, group)
-        words = f"held: chi-square would fall by {gain:.1f}, less than the price of {price:.1f}"
+        words = f"held: its price is {gain - worth:.1f}"
         if share > UNDETERMINED:
-            words = f"held: these views do not determine it (sd {share:.0%} of the prior's)"
-        if group != "tilt":
-            out.append(Step(camera, GROUPS[group], lenses, gain, gain - price, False, words, None))
+            words = f"held: not determined by these views (sd {share:.0%} of the prior's)"
+        out.append(
+            Step(camera, GROUPS[group], lenses, gain, worth, False, words, None,
+                 share > UNDETERMINED)
+        )  # fmt: skip
     return out
 
 
 def _words(problem: Problem, steps: list[Step], chosen: Fit, others: list[Fit]) -> str:
     cameras = [c.name for c in problem.cameras]
     name = joint_name(chosen.names, cameras)
-    words = f"{name}: no richer model predicts left-out views better"
-    taken = [step.fit for step in steps if step.taken and step.fit is not None]
-    finite = [fit for fit in taken[:-1] if np.isfinite(fit.held_out)]
-    if not np.isfinite(chosen.held_out):
-        words = f"{name}: lowest information criterion; too few views to leave out"
-    elif finite:
-        nearest = min(finite, key=lambda fit: fit.held_out)
-        words = (
-            f"{name}: left-out views are predicted {nearest.held_out / chosen.held_out:.3g} times "
-            f"better (mean square) than by {joint_name(nearest.names, cameras)}"
-        )
+    words = f"{name}: {_prediction_words(steps, chosen, cameras)}"
     without = [fit for fit in others if not any("kappa" in lens for lens in fit.lenses)]
     if any("kappa" in lens for lens in chosen.lenses) and without:
         words += (
@@ -291,14 +290,40 @@ def _words(problem: Problem, steps: list[Step], chosen: Fit, others: list[Fit]) 
     for camera, lens, intrinsics in zip(cameras, chosen.lenses, chosen.state.intrinsics):
         if "affine" in lens:
             words += f"; {_stretch_words(camera, intrinsics)}"
+    vague = [
+        f"{', '.join(step.added)} of camera {cameras[step.camera]!r}"
+        for step in steps if step.vague
+    ]  # fmt: skip
+    return words + (f"; these views do not determine {', '.join(vague)}: held" if vague else "")
+
+
+def _prediction_words(steps: list[Step], chosen: Fit, cameras: list[str]) -> str:
+    """What the ladder as a whole and its last step did for the prediction of left-out views."""
+    taken = [step for step in steps if step.taken]
+    fits = [step.fit for step in taken if step.fit is not None]
+    simpler = [fit for fit in fits[:-1] if np.isfinite(fit.held_out)]
+    if not np.isfinite(chosen.held_out):
+        return "lowest information criterion; too few views to leave out"
+    if not simpler:
+        return "no richer model predicts left-out views better"
+    words = (
+        f"left-out views are predicted {simpler[0].held_out / chosen.held_out:.3g} times better "
+        f"(mean square) than by {joint_name(simpler[0].names, cameras)}"
+    )
+    if len(simpler) > 1:
+        last = ", ".join(taken[-1].added)
+        words += (
+            f", {simpler[-1].held_out / chosen.held_out:.4g} times better than without the last "
+            f"step ({last} of camera {cameras[taken[-1].camera]!r})"
+        )
     return words
 
 
 def _stretch_words(camera: str, intrinsics: Array) -> str:
     aspect, skew = intrinsics[[INDEX["aspect"], INDEX["skew"]]]
-    stretch = np.linalg.svd(np.array([[1.0, skew], [0.0, aspect]]), compute_uv=False)
+    axes = np.linalg.svd(np.array([[1.0, skew], [0.0, aspect]]), compute_uv=False)
     return (
-        f"the image of camera {camera!r} is stretched by {stretch[0] / stretch[1] - 1:.2%}: by "
+        f"the image of camera {camera!r} is stretched by {100 * (axes[0] / axes[1] - 1):.2g} %: by "
         "pixels that are not square, or by a tilted sensor behind a lens that is telecentric on "
         "both sides; no image can tell which"
     )

@@ -266,7 +266,7 @@ def _not_taken(
         gain = max(landscape.rise(chosen) - landscape.rise(lenses), 0.0)
         worth = gain - landscape.price_of(Lens({group}))
         share = landscape.sd_over_prior(lenses, camera, group)
-        words = f"held: its price is {gain - worth:.1f}"
+        words = f"held: price {gain - worth:.1f}"
         if share > UNDETERMINED:
             words = f"held: not determined by these views (sd {share:.0%} of the prior's)"
         out.append(

@@ -30,7 +30,7 @@ from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.model_choice import Choice
 from telerig.estimator.model_start import model_start
 from telerig.estimator.next_view import next_view
-from telerig.estimator.problem import SOLVERS, Problem, held_at_nominal
+from telerig.estimator.problem import SOLVERS, Problem, held_at_nominal, parameter_unit
 from telerig.estimator.residual_tests import residual_tests
 from telerig.estimator.results import calibration_from_fit
 from telerig.estimator.robust import RobustFit, robust_solve
@@ -43,8 +43,6 @@ Array = NDArray[np.float64]
 
 PLATE = "refraction in the plate"
 """What decides the mirror twin of a two-sided target when no nominal rotation is given."""
-RICH = "kappa+tangential"
-"""The model that finds outliers and the noise floor before a model is chosen."""
 
 
 @dataclass(frozen=True)
@@ -255,21 +253,37 @@ def _rich(
 ) -> RobustFit:
     """Outliers and noise floor from the richest model, so that no lens is taken for either."""
     mono = len(problem.cameras) == 1
-    rough = "tangential" if mono else RICH
-    first = problem.with_model([rough if m == AUTO else m for m in models])
-    state = solve(first, start, max_iterations=20, relative=1e-4).state
-    strong = _strong(state, problem)
-    names = [
-        name_of(model_choice.rich_lens(mono=mono, strong=s)) if m == AUTO else m
-        for s, m in zip(strong, models)
-    ]
+    auto = np.array([m == AUTO for m in models])
+    plain = name_of(model_choice.rich_lens(mono=mono, strong=False))
+    whole = problem.with_model([plain if m == AUTO else m for m in models])
+    first = robust_solve(whole, model_start(whole, start), progress=progress)
+    strong = auto & _strong(first)
+    if mono or not strong.any():
+        return first
+    perspective = name_of(model_choice.rich_lens(mono=mono, strong=True))
+    names = [perspective if s else plain if m == AUTO else m for s, m in zip(strong, models)]
     whole = problem.with_model(names)
-    return robust_solve(whole, held_at_nominal(whole, state), progress=progress)
+    return robust_solve(whole, model_start(whole, first.solution.state), progress=progress)
 
 
-def _strong(state: State, problem: Problem) -> list[bool]:
-    strength = np.abs(state.intrinsics[:, INDEX["kappa_per_mm"]]) * np.array(problem.rho_mm)
-    return [bool(s > twins.ENTOCENTRIC) for s in strength]
+_SURE = 5.0
+"""Standard deviations by which a perspective must differ from none to be one."""
+
+
+def _strong(fit: RobustFit) -> NDArray[np.bool_]:
+    """(C,) whether a camera's perspective is that of no telecentric lens."""
+    problem, kappa = fit.problem, INDEX["kappa_per_mm"]
+    strength = np.abs(fit.solution.state.intrinsics[:, kappa]) * np.array(problem.rho_mm)
+    out = strength > twins.ENTOCENTRIC
+    if not out.any():
+        return out
+    variance = iter(np.diag(fit.solution.equations.posterior(whole=False).common))
+    for c, camera in enumerate(problem.cameras):
+        for parameter in problem.free_indices(c):
+            sd = np.sqrt(next(variance)) * parameter_unit(camera)[parameter]
+            if parameter == kappa:
+                out[c] &= strength[c] > _SURE * sd * camera.rho_mm
+    return out
 
 
 def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from telerig.estimator import checks
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import JointCovariance, aligned_covariance
-from telerig.estimator.lens_models import joint_name, name_of
+from telerig.estimator.model_rows import model_rows
 from telerig.estimator.problem import Problem
 from telerig.estimator.robust import LIMIT, lost_views, pixel_residuals, squared_distance
 from telerig.factors.projection import State
@@ -20,7 +20,6 @@ from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.triangulation import triangulate
 
 if TYPE_CHECKING:
-    from telerig.estimator.model_choice import Step
     from telerig.estimator.self_calibration import Fit
 
 Array = NDArray[np.float64]
@@ -58,7 +57,7 @@ def calibration_from_fit(
         verdict=_verdict(fit, statistics),
         statistics=statistics,
         twin=_twin(fit, nominal_rotvec_deg),
-        model=_model(fit),
+        model=model_rows(fit),
         diagnostics={
             "gauge": GAUGE,
             "weak": weak,
@@ -324,42 +323,3 @@ def _twin(fit: Fit, nominal_rotvec_deg: Array | None) -> dict[str, Any]:
         "words": fit.twin_words,
         "nominal_rotvec_deg": None if nominal_rotvec_deg is None else list(nominal_rotvec_deg),
     }
-
-
-def _model(fit: Fit) -> dict[str, Any]:
-    """The chosen model, why, and a row for each step of the ladder, taken or not."""
-    cameras = [c.name for c in fit.robust.problem.cameras]
-    steps = fit.choice.steps if fit.choice is not None else ()
-    return {
-        "name": fit.model,
-        "by_camera": dict(zip(cameras, fit.models)),
-        "words": fit.model_words,
-        "ladder": [_step(step, steps[max(k - 1, 0)], cameras) for k, step in enumerate(steps)],
-    }
-
-
-def _step(step: Step, before: Step, cameras: list[str]) -> dict[str, Any]:
-    """What was not fitted, or did not have to predict, is None."""
-    row: dict[str, Any] = {
-        "model": joint_name([name_of(lens) for lens in step.lenses], cameras),
-        "camera": cameras[step.camera] if step.camera >= 0 else "",
-        "added": list(step.added),
-        "taken": step.taken,
-        "chi2_gain": _finite(step.gain),
-        "bic_gain": _finite(step.worth),
-        "p_value": _finite(step.p_value),
-        "words": step.words,
-    }
-    fit, earlier = step.fit, before.fit
-    if fit is None:
-        return row
-    return row | {
-        "parameters": fit.parameters, "chi2_dof": 2 * fit.cost / fit.rows,
-        "bic": 2 * fit.cost + fit.parameters * float(np.log(fit.rows)), "rms_px": fit.rms_px,
-        "held_out": _finite(fit.held_out),
-        "held_out_before": None if earlier is None else _finite(earlier.held_out),
-    }  # fmt: skip
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

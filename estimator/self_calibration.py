@@ -274,7 +274,7 @@ def _strong(fit: RobustFit) -> NDArray[np.bool_]:
     """(C,) whether a camera's perspective is that of no telecentric lens."""
     problem, kappa = fit.problem, INDEX["kappa_per_mm"]
     strength = np.abs(fit.solution.state.intrinsics[:, kappa]) * np.array(problem.rho_mm)
-    out = strength > twins.ENTOCENTRIC
+    out = np.asarray(strength > twins.ENTOCENTRIC)
     if not out.any():
         return out
     variance = iter(np.diag(fit.solution.equations.posterior(whole=False).common))

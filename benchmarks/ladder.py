@@ -256,6 +256,8 @@ def main() -> None:
     begun, first, rungs = time.perf_counter(), options.first, options.rungs.split(",")
     lines = ["# The ladder of lens models", "", *(__doc__ or "").strip().splitlines()[4:]]
     for weak, count in ((False, options.seeds), (True, options.weak_seeds)):
+        if count == 0:
+            continue
         title = "near the limit" if weak else "three times detectable and more"
         heading = ["", f"## Sizes {title}: seeds {first} to {first + count - 1}", "", *HEAD]
         print("\n".join(heading))

@@ -125,8 +125,9 @@ class Landscape:
         return 2 * fit.cost / self.variance - self.least + prices
 
     def price_of(self, lens: Lens) -> float:
-        groups = lens - {"centre"}
-        return sum(self.price * len(GROUPS[g]) + self.group_price for g in groups)
+        """A tilt pays for two groups: the stretch, and the homography that it adds."""
+        free = sum(len(GROUPS[g]) for g in lens - {"centre"})
+        return self.price * free + self.group_price * len((lens - {"centre"}) | _also(lens))
 
     def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
         """The largest standard deviation of a group's parameters in a model, over the prior's."""
@@ -143,6 +144,10 @@ class Landscape:
             i for i, (camera, parameter) in enumerate(self.names)
             if parameter in _held_by(lenses[camera])
         ]  # fmt: skip
+
+
+def _also(lens: Lens) -> Lens:
+    return Lens({"affine"}) if "tilt" in lens else Lens()
 
 
 @cache

@@ -37,6 +37,9 @@ _HOMOGRAPHY = (("p1", "s3"), ("p2", "s1"))
 _PLAIN = ("kappa", "affine", "k1", "k2", "p", "s")
 UNDETERMINED = 0.5
 """Standard deviation over the prior's beyond which the data say little of a parameter."""
+CAUTION = 4.0
+"""Price of a group, over the logarithm of how many there are: 2 would be Chen and Chen's gamma = 1;
+twice that lets one group in about 20 000 in by chance (docs/decisions/014)."""
 BELIEF = 20.0
 """Degrees of freedom that the stated noise is worth beside the residuals."""
 
@@ -104,7 +107,7 @@ class Landscape:
             (*names, *(m[0] for m in more)), extend @ offset, extend @ covariance @ extend.T,
             np.r_[prior / unit, np.ones(len(more))],
             2 * (solution.cost - still) / variance, variance,
-            float(np.log(rows)), float(2 * np.log(max(groups, 1))),
+            float(np.log(rows)), float(CAUTION * np.log(max(groups, 1))),
         )  # fmt: skip
 
     def rise(self, lenses: Lenses) -> float:

@@ -1,6 +1,6 @@
 """Does the ladder of lens models find the right one? Random rigs of every rung.
 
-Usage: python benchmarks/ladder.py [--first 0] [--seeds 100] [--rungs none,brown] [--out FILE.md]
+Usage: python benchmarks/ladder.py [--first 200] [--seeds 100] [--weak-seeds 15] [--rungs none,brown] [--out FILE.md]
 
 A rig of seed s and a rung is drawn: 10 to 24 hand-held views, 15 to 100 dots, axes 50 to 100
 degrees apart, image noise 0.005 to 0.02 px, target printed to 20 um, image centres on the axes.
@@ -14,6 +14,8 @@ aspect+skew has the same pixels and is counted as right. "mixed" has another run
 Right: in both cameras exactly the parameters of the truth. Over: some besides. Under: some lack.
 Space: 200 fresh points in a cube of 30 mm, triangulated from their true pixels, RMS distance from
 the truth after the rigid motion that fits best; of the chosen model over that of the true one.
+
+Seeds from 1000 on served to develop; seeds below 200 to set the price of a group (decision 014).
 """
 
 from __future__ import annotations
@@ -246,9 +248,9 @@ def table(rungs: list[str], seeds: range, weak: bool, verbose: bool) -> list[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--first", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--weak-seeds", type=int, default=30)
+    parser.add_argument("--weak-seeds", type=int, default=15)
     parser.add_argument("--rungs", default=",".join([*RUNGS, "mixed"]))
     parser.add_argument("--verbose", action="store_true")
     parser.add_argument("--out", type=Path)

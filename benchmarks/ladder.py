@@ -1,6 +1,6 @@
 """Does the ladder of lens models find the right one? Random rigs of every rung.
 
-Usage: python benchmarks/ladder.py [--first 200] [--seeds 100] [--weak-seeds 15] [--rungs none,brown] [--out FILE.md]
+Usage: python benchmarks/ladder.py [--first 200] [--seeds 100] [--weak-seeds 15] [--out FILE.md]
 
 A rig of seed s and a rung is drawn: 10 to 24 hand-held views, 15 to 100 dots, axes 50 to 100
 degrees apart, image noise 0.005 to 0.02 px, target printed to 20 um, image centres on the axes.

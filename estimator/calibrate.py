@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.problem import DOTS_FREE, MODELS, SOLVERS
+from telerig.estimator.lens_models import AUTO, Model, checked_model, models_by_camera
+from telerig.estimator.problem import DOTS_FREE, SOLVERS
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -45,22 +46,23 @@ def checked_medium(medium: str) -> str:
 
 def check_options(
     *,
-    model: str = "auto",
+    model: Model = AUTO,
     solver: str = "auto",
     medium: str = "air",
     dots_free: str = "3d",
+    cameras: Sequence[str] = (),
     **_: object,
 ) -> None:
-    """Before any image is looked at.
+    """Before any image is looked at. cameras : the rig's, where they are known already.
 
     Raises InputError or CalibrationError for a word that is none of those known.
     """
     checked_medium(medium)
-    for what, word, known in (
-        ("model", model, ("auto", *MODELS)),
-        ("solver", solver, SOLVERS),
-        ("choice", dots_free, DOTS_FREE),
-    ):
+    if cameras:
+        models_by_camera(model, cameras)
+    elif isinstance(model, str):
+        checked_model(model)
+    for what, word, known in (("solver", solver, SOLVERS), ("choice", dots_free, DOTS_FREE)):
         if word not in known:
             raise CalibrationError(f"unknown {what} {word!r}", todo=f"known: {', '.join(known)}")
 
@@ -79,14 +81,15 @@ def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
 def calibrate(
     dataset: Dataset,
     *,
-    model: str = "auto",
+    model: Model = AUTO,
     solver: str = "auto",
     medium: str = "air",
     seed: int = 0,
 ) -> Calibration:
     """Calibrate a rig from the images or the dots of a dataset.
 
-    model : "auto" or a name of `telerig.estimator.problem.MODELS`.
+    model : "auto" (chosen for each camera), the name of a lens model (none, radial, brown,
+        kappa+radial, ...), or one by camera: {"left": "brown"}, "left=brown,right=auto".
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     medium : "air" or "water", of the target; with `[walls]` in `rig.toml` runs are in water.
     seed : recorded with the result; the calibration itself draws no random numbers.
@@ -100,7 +103,7 @@ def calibrate(
 def run_calibration(
     dataset: Dataset,
     *,
-    model: str = "auto",
+    model: Model = AUTO,
     solver: str = "auto",
     medium: str = "air",
     seed: int = 0,
@@ -114,7 +117,10 @@ def run_calibration(
     pictures : draw what was found over each image, as `write_results` needs.
     detected : made before, by `telerig.estimator.watch`; None detects now.
     """
-    check_options(model=model, solver=solver, medium=medium, dots_free=dots_free)
+    check_options(
+        model=model, solver=solver, medium=medium, dots_free=dots_free,
+        cameras=list(dataset.rig.cameras),
+    )  # fmt: skip
     if detected is None:
         detected, table, notes = _measured(dataset, stage, pictures)
     else:
@@ -139,7 +145,7 @@ def solve_dots(
     dataset: Dataset,
     table: pd.DataFrame,
     *,
-    model: str,
+    model: Model,
     solver: str,
     medium: str,
     dots_free: str,

@@ -1,7 +1,7 @@
 """One description of a self-calibration problem, for every solver.
 
 A `Problem` holds the measurements, what is known beforehand (priors, gauge), and which intrinsics
-are free. `models` names the sets of free intrinsics.
+are free; `telerig.estimator.lens_models` names the sets of free intrinsics.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import CalibrationError
+from telerig.estimator.lens_models import parameters_of
 from telerig.factors.projection import ImageKeys, Observations, State
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX, PARAMETERS
@@ -26,33 +26,6 @@ GAUGE_SIGMA_MM = 1e-4
 
 _CENTRE = ("centre_u_px", "centre_v_px")
 _WALL = ("wall_x_rad", "wall_y_rad")
-MODELS: dict[str, tuple[str, ...]] = {
-    "none": (),
-    "radial": ("k1",),
-    "tangential": ("k1", "p1", "p2"),
-    "brown": ("k1", "k2", "p1", "p2"),
-    "prism": ("k1", "k2", "p1", "p2", "s1", "s3"),
-    "kappa": ("kappa_per_mm",),
-    "kappa+radial": ("kappa_per_mm", "k1"),
-    "kappa+tangential": ("kappa_per_mm", "k1", "p1", "p2"),
-    "kappa+brown": ("kappa_per_mm", "k1", "k2", "p1", "p2"),
-    "kappa+radial+centre": ("kappa_per_mm", "k1", *_CENTRE),
-    "kappa+tangential+centre": ("kappa_per_mm", "k1", "p1", "p2", *_CENTRE),
-    "kappa+brown+centre": ("kappa_per_mm", "k1", "k2", "p1", "p2", *_CENTRE),
-    "kappa+prism": ("kappa_per_mm", "k1", "k2", "p1", "p2", "s1", "s3"),
-    "kappa+prism+centre": ("kappa_per_mm", "k1", "k2", "p1", "p2", "s1", "s3", *_CENTRE),
-    "affine": ("aspect", "skew"),
-    "affine+radial": ("aspect", "skew", "k1"),
-    "affine+tangential": ("aspect", "skew", "k1", "p1", "p2"),
-    "tilt": ("tilt_x", "tilt_y", "image_convergence_per_mm"),
-    "tilt+radial": ("tilt_x", "tilt_y", "image_convergence_per_mm", "k1"),
-}
-"""Free intrinsics besides the scale, by the name that ``--model`` takes.
-
-Without kappa the image centre acts through the distortion alone, where it is the same as the
-tangential terms to first order and otherwise a gauge freedom, so it is held at the middle of the
-image and p1, p2 carry a decentred lens (docs/decisions/003).
-"""
 
 SOLVERS = ("auto", "gtsam", "schur")
 DOTS_FREE = ("3d", "plane", "nominal")
@@ -125,16 +98,12 @@ class Problem:
     def with_model(self, model: str | Sequence[str]) -> Problem:
         """The same problem with another set of free intrinsics: one name for all, or per camera.
 
-        Raises CalibrationError for an unknown model.
+        Names are those of `telerig.estimator.lens_models`. Raises CalibrationError for others.
         """
         names = [model] * len(self.cameras) if isinstance(model, str) else list(model)
-        for name in names:
-            if name not in MODELS:
-                raise CalibrationError(
-                    f"unknown model {name!r}", todo=f"known: auto, {', '.join(MODELS)}"
-                )
         free = (
-            ("scale_px_per_mm", *MODELS[n], *wall_freedom(c)) for n, c in zip(names, self.cameras)
+            ("scale_px_per_mm", *parameters_of(n), *wall_freedom(c))
+            for n, c in zip(names, self.cameras)
         )
         return replace(self, free=tuple(free))
 

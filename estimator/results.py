@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from telerig.estimator import checks
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import JointCovariance, aligned_covariance
+from telerig.estimator.model_rows import model_rows
 from telerig.estimator.problem import Problem
 from telerig.estimator.robust import LIMIT, lost_views, pixel_residuals, squared_distance
 from telerig.factors.projection import State
@@ -56,7 +57,7 @@ def calibration_from_fit(
         verdict=_verdict(fit, statistics),
         statistics=statistics,
         twin=_twin(fit, nominal_rotvec_deg),
-        model=_model(fit),
+        model=model_rows(fit),
         diagnostics={
             "gauge": GAUGE,
             "weak": weak,
@@ -204,10 +205,9 @@ def _angle_systematic(fit: Fit, angle_rad: float) -> float:
     With strong perspective the angle trades with the centres; the centres come from the
     perspective alone only as far as the distortion model is right. 0 when they are held anyway.
     """
-    held = [r for r in fit.rungs if f"{r.model}+centre" == fit.model]
-    if not held:
+    if fit.centre_held is None:
         return 0.0
-    return float(angle_rad - np.arccos(held[0].state.rig_from_camera[1, 2, 2]))
+    return float(angle_rad - np.arccos(fit.centre_held[1, 2, 2]))
 
 
 def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dict[str, Any]:
@@ -323,14 +323,3 @@ def _twin(fit: Fit, nominal_rotvec_deg: Array | None) -> dict[str, Any]:
         "words": fit.twin_words,
         "nominal_rotvec_deg": None if nominal_rotvec_deg is None else list(nominal_rotvec_deg),
     }
-
-
-def _model(fit: Fit) -> dict[str, Any]:
-    ladder = [
-        {
-            "model": r.model, "parameters": r.parameters, "chi2_dof": r.chi2_dof, "bic": r.bic,
-            "rms_px": r.rms_px, "held_out": r.held_out,
-        }
-        for r in fit.rungs
-    ]  # fmt: skip
-    return {"name": fit.model, "words": fit.model_words, "ladder": ladder}

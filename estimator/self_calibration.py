@@ -18,11 +18,19 @@ from telerig.estimator.eccentricity import eccentricity_px
 from telerig.estimator.graph import Progress, Solution, solve
 from telerig.estimator.halves import halves
 from telerig.estimator.initial_unknown import dots_from_images
+from telerig.estimator.lens_models import (
+    AUTO,
+    Model,
+    groups_of,
+    joint_name,
+    models_by_camera,
+    name_of,
+)
 from telerig.estimator.measurements import problem_from_dots
-from telerig.estimator.model_choice import Rung
+from telerig.estimator.model_choice import Choice
 from telerig.estimator.model_start import model_start
 from telerig.estimator.next_view import next_view
-from telerig.estimator.problem import MODELS, SOLVERS, Problem, held_at_nominal
+from telerig.estimator.problem import SOLVERS, Problem, held_at_nominal, parameter_unit
 from telerig.estimator.residual_tests import residual_tests
 from telerig.estimator.results import calibration_from_fit
 from telerig.estimator.robust import RobustFit, robust_solve
@@ -35,23 +43,31 @@ Array = NDArray[np.float64]
 
 PLATE = "refraction in the plate"
 """What decides the mirror twin of a two-sided target when no nominal rotation is given."""
-RICH = "kappa+tangential"
-"""The model that finds outliers and the noise floor before a model is chosen."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Everything that a finished self-calibration knows, before it is put into words."""
+    """Everything that a finished self-calibration knows, before it is put into words.
+
+    models : the chosen one of each camera.  choice : None when they were given.
+    centre_held : the cameras' poses with the image centres held, when perspective frees them.
+    """
 
     robust: RobustFit
     twin_cost: float
     twin_by: str
     twin_words: str
-    model: str
+    models: tuple[str, ...]
     model_words: str
-    rungs: list[Rung]
+    choice: Choice | None
+    centre_held: Array | None
     pre: checks.PreCheck
     notes: tuple[str, ...]
+
+    @property
+    def model(self) -> str:
+        """In one name."""
+        return joint_name(self.models, [c.name for c in self.robust.problem.cameras])
 
 
 def self_calibrate(
@@ -60,7 +76,7 @@ def self_calibrate(
     target: Target,
     *,
     nominal_rotvec_deg: Sequence[float] | None = None,
-    model: str = "auto",
+    model: Model = AUTO,
     dots_free: str = "3d",
     solver: str = "auto",
     progress: Progress | None = None,
@@ -72,7 +88,7 @@ def self_calibrate(
     dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
     cameras : nominal, the first defines the rig frame.
     nominal_rotvec_deg : of second_from_first; decides the mirror twin.
-    model : a name of `telerig.estimator.problem.MODELS`, or "auto".
+    model : a name of `telerig.estimator.lens_models`, or "auto"; for all cameras, or by camera.
     dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
     solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
 
@@ -80,8 +96,7 @@ def self_calibrate(
     """
     if len(cameras) not in (1, 2):
         raise InputError(f"{len(cameras)} cameras", todo="a rig has one camera or two")
-    if model != "auto" and model not in MODELS:
-        raise CalibrationError(f"unknown model {model!r}", todo=f"known: auto, {', '.join(MODELS)}")
+    models = models_by_camera(model, [c.name for c in cameras])
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
@@ -101,7 +116,7 @@ def self_calibrate(
     if len(cameras) == 2:
         start, by, words_twin = _side(problem, start, nominal)
     start = tilt_signs.settle(problem, start)
-    fit = _fit(problem, start, model, solver, progress)
+    fit = _fit(problem, start, models, solver, progress)
     if len(cameras) == 2 and by != PLATE:
         fit, by, words_twin = _settled_twin(fit, nominal)
     twin_cost = _twin_cost(fit)
@@ -182,47 +197,99 @@ def best_start(problem: Problem, dots_mm: Array) -> State:
     return min(fits, key=lambda f: f.cost).state
 
 
-def _fit(problem: Problem, start: State, model: str, solver: str, progress: Progress | None) -> Any:
+def _fit(
+    problem: Problem,
+    start: State,
+    models: tuple[str, ...],
+    solver: str,
+    progress: Progress | None,
+) -> Fit:
     """Outliers and floor with a rich model, the ladder, then the chosen model to the end.
 
     solver : of the last fit; the trials before it take ``problem.solver``.
     """
-    rungs: list[Rung] = []
-    mono = len(problem.cameras) == 1
-    if model == "auto":
-        rich = "tangential" if mono else RICH
-        first = robust_solve(problem.with_model(rich), start, progress=progress)
-        ladder = tuple(m for m in model_choice.LADDER if not (mono and "kappa" in m))
-        rungs = model_choice.climb(first.problem, first.solution.state, ladder)
-        chosen, words = model_choice.choose(rungs)
-        model, start = chosen.model, chosen.state
-        if model.startswith("kappa") and _strong(start, problem):
-            model, more = _with_centre(model)
-            words += more
-    else:
-        words = f"{model}: as asked"
-    final = problem.with_model(model)
-    start = held_at_nominal(final, start) if rungs else model_start(final, start)
-    begin = solve(final, start, max_iterations=15, relative=1e-5).state if rungs else start
-    if not rungs:
+    choice, held = None, None
+    words = f"{joint_name(models, [c.name for c in problem.cameras])}: as asked"
+    if AUTO in models:
+        first, choice = choose_model(problem, start, models, progress)
+        models, start, words = choice.chosen.names, choice.chosen.state, choice.words
+        if any("centre" in name for name in models):
+            words += _CENTRE_WORDS
+            held = _centre_held(first.problem, start, models)
+    final = problem.with_model(models)
+    start = held_at_nominal(final, start) if choice else model_start(final, start)
+    begin = solve(final, start, max_iterations=15, relative=1e-5).state if choice else start
+    if choice is None:
         begin = robust_solve(final, start).solution.state
     shift = eccentricity_px(final, begin)
     final = replace(final, uv_px=final.uv_px - shift)
     robust = robust_solve(replace(final, solver=solver), begin, progress=progress)
-    return Fit(robust, np.nan, "", "", model, words, rungs, checks.PreCheck({}, ()), ())
+    none = checks.PreCheck({}, ())
+    return Fit(robust, np.nan, "", "", models, words, choice, held, none, ())
 
 
-def _strong(state: State, problem: Problem) -> bool:
-    strength = np.abs(state.intrinsics[:, INDEX["kappa_per_mm"]]) * np.array(problem.rho_mm)
-    return bool(np.any(strength > twins.ENTOCENTRIC))
+def choose_model(
+    problem: Problem,
+    start: State,
+    models: tuple[str, ...],
+    progress: Progress | None = None,
+) -> tuple[RobustFit, Choice]:
+    """The robust fit of the richest model, and what of it each camera needs.
+
+    models : per camera, "auto" or a model that stays.
+    """
+    first = _rich(problem, start, models, progress)
+    return first, model_choice.climb(first.problem, first.solution, models)
 
 
-def _with_centre(model: str) -> tuple[str, str]:
-    freed = f"{'kappa+tangential' if model in ('kappa', 'kappa+radial') else model}+centre"
-    return freed, (
-        "; the perspective is strong, so the image centre (where the axis meets the image) is "
-        "free too, and the inter-camera angle is as uncertain as it makes it"
-    )
+_CENTRE_WORDS = (
+    "; the perspective is strong, so the image centre (where the axis meets the image) is "
+    "free too, and the inter-camera angle is as uncertain as it makes it"
+)
+
+
+def _rich(
+    problem: Problem, start: State, models: tuple[str, ...], progress: Progress | None
+) -> RobustFit:
+    """Outliers and noise floor from the richest model, so that no lens is taken for either."""
+    mono = len(problem.cameras) == 1
+    auto = np.array([m == AUTO for m in models])
+    plain = name_of(model_choice.rich_lens(mono=mono, strong=False))
+    whole = problem.with_model([plain if m == AUTO else m for m in models])
+    first = robust_solve(whole, model_start(whole, start), progress=progress)
+    strong = auto & _strong(first)
+    if mono or not strong.any():
+        return first
+    perspective = name_of(model_choice.rich_lens(mono=mono, strong=True))
+    names = [perspective if s else plain if m == AUTO else m for s, m in zip(strong, models)]
+    whole = problem.with_model(names)
+    return robust_solve(whole, model_start(whole, first.solution.state), progress=progress)
+
+
+_SURE = 5.0
+"""Standard deviations by which a perspective must differ from none to be one."""
+
+
+def _strong(fit: RobustFit) -> NDArray[np.bool_]:
+    """(C,) whether a camera's perspective is that of no telecentric lens."""
+    problem, kappa = fit.problem, INDEX["kappa_per_mm"]
+    strength = np.abs(fit.solution.state.intrinsics[:, kappa]) * np.array(problem.rho_mm)
+    out = np.asarray(strength > twins.ENTOCENTRIC)
+    if not out.any():
+        return out
+    variance = iter(np.diag(fit.solution.equations.posterior(whole=False).common))
+    for c, camera in enumerate(problem.cameras):
+        for parameter in problem.free_indices(c):
+            sd = np.sqrt(next(variance)) * parameter_unit(camera)[parameter]
+            if parameter == kappa:
+                out[c] &= strength[c] > _SURE * sd * camera.rho_mm
+    return out
+
+
+def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Array:
+    """(C, 4, 4) rig_from_camera of the same models with the image centres held."""
+    held = problem.with_model([name_of(set(groups_of(m)) - {"centre"}) for m in models])
+    return solve(held, held_at_nominal(held, state), relative=1e-7).state.rig_from_camera
 
 
 def _side(problem: Problem, start: State, nominal: Array | None) -> tuple[State, str, str]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.graph import solve
-from telerig.estimator.model_choice import pose_only
+from telerig.estimator.held_out import pose_only
 from telerig.estimator.problem import Problem
 from telerig.estimator.robust import robust_solve
 from telerig.factors.projection import State, whitened_error, whitened_residuals

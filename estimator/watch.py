@@ -205,7 +205,7 @@ def watch(
 
     Raises CalibrationError or DetectionError when stopped with too little to calibrate.
     """
-    check_options(**options)
+    check_options(**options, cameras=list(dataset.rig.cameras))
     folder = WatchedFolder(dataset.path, tell)
     solve = {k: v for k, v in options.items() if k != "seed"}
     known: object = None

@@ -31,7 +31,11 @@ def calibrate(
         Path | None, typer.Option(help="Results folder [DATASET/results/calibration].")
     ] = None,
     model: Annotated[
-        str, typer.Option(help="auto, or a lens model: none, radial, tangential, kappa, ...")
+        str,
+        typer.Option(
+            help="auto, or a lens model: none, radial, k1+k2, tangential, brown, prism, kappa, "
+            "affine, tilt, or some joined by +; left=brown,right=auto for each camera its own."
+        ),
     ] = "auto",
     solver: Annotated[str, typer.Option(help="auto, gtsam or schur.")] = "auto",
     dots: Annotated[

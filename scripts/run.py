@@ -24,7 +24,10 @@ def run(
         list[str] | None, typer.Option(help="Name of a run; may be given again [all runs].")
     ] = None,
     model: Annotated[
-        str, typer.Option(help="Lens model: auto, none, radial, tangential, kappa, ...")
+        str,
+        typer.Option(
+            help="Lens model: auto, none, radial, brown, kappa, ..., or left=brown,right=auto."
+        ),
     ] = "auto",
     medium: Annotated[
         str,

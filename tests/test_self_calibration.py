@@ -29,7 +29,7 @@ def paper(scene: Any) -> Any:
     [
         ("paper", "auto", {"radial"}, 1.0),
         ("near_telecentric", "auto", {"kappa+radial", "kappa+tangential"}, 1.2),
-        ("scheimpflug", "auto", {"tilt+radial"}, 1.2),
+        ("scheimpflug", "auto", {"left=tilt+radial,right=affine+radial"}, 1.2),
         ("symmetric", "radial", {"radial"}, 1.0),
         ("two_sided", "radial", {"radial"}, 1.5),
     ],

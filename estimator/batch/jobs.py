@@ -170,16 +170,19 @@ def check_run_name(run: Path) -> None:
 
 def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
     """Raise InputError for a calibration that is not there, an unknown lens model or medium."""
+    from telerig.errors import CalibrationError
     from telerig.estimator.calibrate import checked_medium
-    from telerig.estimator.problem import MODELS
+    from telerig.estimator.lens_models import checked_model
 
     if calibration is not None and not Path(calibration).exists():
         raise InputError(
             "there is no such calibration", where=str(calibration),
             todo="give the calibration.json that `telerig calibrate` wrote",
         )  # fmt: skip
-    if model != "auto" and model not in MODELS:
-        raise InputError(f"--model {model}", todo=f"known: auto, {', '.join(MODELS)}")
+    try:
+        checked_model(model)
+    except CalibrationError as error:
+        raise InputError(f"--model {model}", todo=error.todo) from error
     checked_medium(medium)
 
 

@@ -220,25 +220,49 @@ def _fixed(values: Any, decimals: int) -> str:
 
 
 def ladder_rows(results: CalibrationResults) -> list[Row]:
-    """The models that were tried; empty when one was fixed."""
+    """The steps of the ladder of lens models, taken or not; empty when the model was given."""
     model = results.content.get("model") or {}
-    ladder = model.get("ladder") or []
-    bics = [rung["bic"] for rung in ladder if is_number(rung.get("bic"))]
     return [
         Row(
             (
-                str(rung.get("model")), number(rung.get("parameters")),
-                number(rung.get("rms_px"), 4), number(rung.get("chi2_dof")),
-                _above(rung.get("bic"), bics), number(rung.get("held_out")),
+                _step_name(rung), *(_or_blank(rung.get(key), digits) for key, digits in _STEP),
+                _chance(rung.get("p_value")), _held_out(rung), _said(rung),
             ),
             strong=rung.get("model") == model.get("name"),
+            faint=not rung.get("taken", True),
         )
-        for rung in ladder
+        for rung in model.get("ladder") or []
     ]  # fmt: skip
 
 
-def _above(bic: Any, bics: list[float]) -> str:
-    return f"{bic - min(bics):.1f}" if is_number(bic) else ABSENT
+_STEP = (("parameters", 3), ("rms_px", 4), ("chi2_dof", 3), ("chi2_gain", 3), ("bic_gain", 3))
+
+
+def _step_name(rung: Mapping[str, Any]) -> str:
+    added = ", ".join(rung.get("added") or [])
+    return f"+ {added} ({rung.get('camera')})" if added else str(rung.get("model"))
+
+
+def _or_blank(value: Any, digits: int) -> str:
+    return number(value, digits) if is_number(value) else ""
+
+
+def _chance(p_value: Any) -> str:
+    if not is_number(p_value):
+        return ""
+    return "< 10⁻¹²" if p_value < 1e-12 else number(p_value, 2)
+
+
+def _held_out(rung: Mapping[str, Any]) -> str:
+    after, before = rung.get("held_out"), rung.get("held_out_before")
+    if not is_number(after):
+        return ""
+    started = is_number(before) and bool(rung.get("added"))
+    return f"{number(before)} → {number(after)}" if started else number(after)
+
+
+def _said(rung: Mapping[str, Any]) -> str:
+    return str(rung.get("words") or ("taken" if rung.get("added") else ""))
 
 
 def worst_rows(results: CalibrationResults) -> list[Row]:

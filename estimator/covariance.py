@@ -59,9 +59,9 @@ class JointCovariance:
         scaled = across[known] / sd[:, None]
         own = (scaled.T @ np.linalg.solve(correlation, scaled)).reshape(len(dots), 3, -1, 3)
         own[np.arange(len(dots)), :, np.arange(len(dots))] = self.dots[dots]
-        own = own.reshape(3 * len(dots), -1)
         _, rig = self.rig_block()
-        return np.block([[rig, across[: self.rig]], [across[: self.rig].T, own]])
+        with_rig = across[: self.rig]
+        return np.block([[rig, with_rig], [with_rig.T, own.reshape(3 * len(dots), -1)]])
 
     @property
     def effective_dof(self) -> float:

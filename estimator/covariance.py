@@ -17,6 +17,7 @@ from telerig.rig.projection import INDEX
 from telerig.rig.triangulation import stacked_jacobian
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 WHOLE = 4000
@@ -29,15 +30,38 @@ class JointCovariance:
 
     Of a calibration of more than `WHOLE` numbers, cameras and views only.
     Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
-    dots : (N, 3, 3) of each dot.
+    dots : (N, 3, 3) of each dot.  cross : (C, N, 3) of each dot with cameras and views.
     leverage : (M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs.
     """
 
     names: tuple[str, ...]
     matrix: Array
     dots: Array
+    cross: Array
     rig: int
     leverage: Array
+
+    def of_rig_and(self, dots: Ints) -> Array:
+        """(P + 3 n, P + 3 n) of the rig block and some of the dots.
+
+        Without the matrix of all with all, from the dots' independence given cameras and views;
+        only the two dots of a known distance depend on each other besides.
+        """
+        common = len(self.cross)
+        if len(self.names) > common:
+            at = common + (3 * dots[:, None] + np.arange(3)).ravel()
+            index = np.concatenate([np.arange(self.rig), at])
+            return np.asarray(self.matrix[np.ix_(index, index)])
+        known = np.isfinite(np.diag(self.matrix))
+        sd = np.sqrt(np.diag(self.matrix)[known])
+        correlation = self.matrix[np.ix_(known, known)] / np.outer(sd, sd)
+        across = self.cross[:, dots].reshape(common, -1)
+        scaled = across[known] / sd[:, None]
+        own = (scaled.T @ np.linalg.solve(correlation, scaled)).reshape(len(dots), 3, -1, 3)
+        own[np.arange(len(dots)), :, np.arange(len(dots))] = self.dots[dots]
+        _, rig = self.rig_block()
+        with_rig = across[: self.rig]
+        return np.block([[rig, with_rig], [with_rig.T, own.reshape(3 * len(dots), -1)]])
 
     @property
     def effective_dof(self) -> float:
@@ -67,7 +91,8 @@ def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
     leverage = hat_matrix_blocks(problem, solution, posterior)
     names = _names(problem)[: len(matrix)]
     matrix *= units[:, None] * units
-    return JointCovariance(names, matrix, posterior.dots, rig, leverage)
+    cross = posterior.cross * units[: len(posterior.cross), None, None]
+    return JointCovariance(names, matrix, posterior.dots, cross, rig, leverage)
 
 
 def _units(problem: Problem, size: int) -> Array:

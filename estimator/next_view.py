@@ -134,18 +134,17 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
     """
     if len(problem.cameras) != 2 or not np.isfinite(joint.rig_block()[1]).all():
         return None
-    gain = ViewGain.of(problem, state, joint)
+    few, many = _spread(problem, _FEW_DOTS), _spread(problem, _MANY_DOTS)
+    gain = ViewGain.of(problem, state, joint, np.union1d(few, many))
     used = [np.unique(problem.view[(problem.weight > 0) & (problem.camera == c)]) for c in (0, 1)]
     views = len(np.intersect1d(used[0], used[1]))
     found = candidates(problem, state)
     if not len(found):
         return NextView(views, gain.before_um, (), gain.size_um)
-    few = _spread(problem, _FEW_DOTS)
     best = _search(gain, found, few)
     order = _preferred(problem, state, found, gain.before_um - best, few)
     first, first_um = _refined(gain, found.some(order[:1]), float(best[order[0]]), few)
     chosen = joined(first, found.some(order[1:]))
-    many = _spread(problem, _MANY_DOTS)
     after = np.r_[first_um, best[order[1:]]]
     if len(many) > len(few):
         after = gain.after_um(chosen, many)

@@ -24,28 +24,28 @@ _BATCH_ROWS = 4000
 class ViewGain:
     """What views do to the covariance of cameras and dots.
 
-    covariance : (P + 3 N, P + 3 N).  root : (P, R), root root^T weighs the rig block by the
-    variance of points in space.  whitener : (2,) 1 / px.
+    covariance : (P + 3 n, P + 3 n) of the rig block and of ``dots``, (n,) sorted, which alone can
+    be asked for.  root : (P, R), root root^T weighs the rig block by the variance of points in
+    space.  whitener : (2,) 1 / px.
     """
 
     problem: Problem
     state: State
     covariance: Array
+    dots: Ints
     root: Array
     whitener: Array
     points_mm: Array
 
     @staticmethod
-    def of(problem: Problem, state: State, joint: JointCovariance) -> ViewGain:
+    def of(problem: Problem, state: State, joint: JointCovariance, dots: Ints) -> ViewGain:
         cameras = cameras_from_state(problem, state)
         points = working_volume(cameras)
         shift = aligned_shift((cameras[0], cameras[1]), problem.free, points)
-        dots = len(joint.names) - 3 * len(problem.dot_ids)
-        index = np.r_[: joint.rig, dots : len(joint.names)]
-        covariance = joint.matrix[np.ix_(index, index)]
+        covariance, dots = joint.of_rig_and(np.unique(dots)), np.unique(dots)
         triangle = np.asarray(np.linalg.qr(shift, mode="r")).T
         noise = [_noise_px(problem, c) for c in (0, 1)]
-        return ViewGain(problem, state, covariance, triangle, 1 / np.array(noise), points)
+        return ViewGain(problem, state, covariance, dots, triangle, 1 / np.array(noise), points)
 
     @property
     def before_um(self) -> float:
@@ -84,7 +84,7 @@ class ViewGain:
         """
         by_rig, by_dot, by_pose = self._rows(poses, dots)
         rig, count = len(self.root), len(poses)
-        at = rig + (3 * dots[:, None] + np.arange(3)).ravel()
+        at = rig + (3 * np.searchsorted(self.dots, dots)[:, None] + np.arange(3)).ravel()
         c_rr, c_rd = self.covariance[:rig, :rig], self.covariance[:rig, at]
         c_dd = self.covariance[np.ix_(at, at)].reshape(len(dots), 3, -1)
         flat = by_rig.reshape(count, -1, rig)

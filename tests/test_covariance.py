@@ -75,6 +75,21 @@ def test_a_large_problem_keeps_the_same_blocks(scene: Any, monkeypatch: Any) -> 
     at = common + np.arange(problem.nominal_mm.size).reshape(-1, 3)
     own = theirs[at[:, :, None], at[:, None, :]]
     assert np.abs(ours.dots - own).max() < 1e-6 * own.max()
+    some = np.array([1, 5, 6, 13])
+    rig = np.arange(ours.rig)
+    index = np.concatenate([rig, at[some].ravel()])
+    apart = ours.of_rig_and(some) - theirs[np.ix_(index, index)]
+    assert np.abs(apart / np.outer(sd[index], sd[index])).max() < 1e-6
+
+
+def test_a_large_problem_is_advised_too(scene: Any, monkeypatch: Any) -> None:
+    """The same advice with and without the covariance of all with all."""
+    made = scene("paper", 4, views=8)
+    whole = made.calibrate("radial").diagnostics["next_view"]
+    monkeypatch.setattr("telerig.estimator.covariance.WHOLE", 10)
+    part = made.calibrate("radial").diagnostics["next_view"]
+    assert part["before_um"] == pytest.approx(whole["before_um"], rel=1e-9)
+    assert part["after_um"] == pytest.approx(whole["after_um"], rel=1e-3)
 
 
 def test_a_decentred_lens_with_tangential_distortion_stretches_its_image(scene: Any) -> None:

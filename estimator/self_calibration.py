@@ -209,18 +209,22 @@ def _fit(
     solver : of the last fit; the trials before it take ``problem.solver``.
     """
     choice, held = None, None
+    weighed = problem
     words = f"{joint_name(models, [c.name for c in problem.cameras])}: as asked"
     if AUTO in models:
         first, choice = choose_model(problem, start, models, progress)
+        weighed = first.problem
         models, start, words = choice.chosen.names, choice.chosen.state, choice.words
         if any("centre" in name for name in models):
             words += _CENTRE_WORDS
             held = _centre_held(first.problem, start, models)
     final = problem.with_model(models)
-    start = held_at_nominal(final, start) if choice else model_start(final, start)
-    begin = solve(final, start, max_iterations=15, relative=1e-5).state if choice else start
     if choice is None:
-        begin = robust_solve(final, start).solution.state
+        begin = robust_solve(final, model_start(final, start)).solution.state
+    else:  # without the outliers that are known by now
+        sound = replace(final, weight=weighed.weight, covariance_px2=weighed.covariance_px2)
+        start = held_at_nominal(final, start)
+        begin = solve(sound, start, max_iterations=15, relative=1e-5).state
     shift = eccentricity_px(final, begin)
     final = replace(final, uv_px=final.uv_px - shift)
     robust = robust_solve(replace(final, solver=solver), begin, progress=progress)

@@ -323,9 +323,9 @@ def test_marks_fixed_to_the_tank_are_drawn_where_there_are_some(folder: Path) ->
     ]  # fmt: skip
     pd.concat(marks).to_csv(folder / "references.csv", index=False)
     found = read_track_results(folder)
-    assert marks_followed(found, found.cameras.index(other)) is None
+    assert not found.marked(found.cameras.index(other))
     picture = marks_followed(found, found.cameras.index(camera))
-    assert picture is not None and "3 marks, 2 in a frame and each in 30 frames" in picture.caption
+    assert "3 marks, 2 in a frame and each in 30 frames" in picture.caption
     assert "0.0500 px" in picture.caption
     page = write_track_report(folder).read_text(encoding="utf-8")
     assert f"Marks fixed to the tank, {camera}" in page and 'id="marks"' in page

@@ -15,12 +15,10 @@ from telerig.io.report.words import number
 _MOST_POINTS = 8_000
 
 
-def marks_followed(results: TrackResults, camera: int) -> Picture | None:
-    """Where each mark is in the images of one camera, frame by frame; None without marks."""
+def marks_followed(results: TrackResults, camera: int) -> Picture:
+    """Where each mark is in the images of one camera that sees some, frame by frame."""
     name = results.cameras[camera]
     table = results.references[results.references["camera"] == name]
-    if not len(table):
-        return None
     along = max(("u_px", "v_px"), key=lambda c: float(np.ptp(table[c])))
     every = -(-len(table) // _MOST_POINTS)
     lines = [group.iloc[::every] for _, group in table.groupby("mark", sort=True)]

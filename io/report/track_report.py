@@ -140,7 +140,7 @@ def _pictures(
     every = range(len(results.cameras))
     drawings: list[tuple[str, Callable[[], Any]]] = [
         *(("seen", partial(seen_where, results, i)) for i in every),
-        *(("marks", partial(marks_followed, results, i)) for i in every),
+        *(("marks", partial(marks_followed, results, i)) for i in every if results.marked(i)),
         *(("series", partial(time_series, results, axis)) for axis in range(3)),
         ("rays", partial(ray_miss_histogram, results)),
         *(("rays", partial(ray_miss_in_space, results, *how)) for how in shared_pictures(results)),
@@ -149,7 +149,7 @@ def _pictures(
         ("quality", partial(sizes, results)),
         ("quality", partial(confidence, results)),
     ]
-    pictures: dict[str, Any] = {place: [] for place in (*dict(drawings), *PLACES)}
+    pictures: dict[str, Any] = {place: [] for place in (*dict(drawings), "marks", *PLACES)}
     if cameras is not None:
         drawings.append(("rays", partial(two_rays, results, cameras)))
     if smoothing is not None:

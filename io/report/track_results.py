@@ -70,6 +70,10 @@ class TrackResults:
         variances = self.tracks[["sxx_mm2", "syy_mm2", "szz_mm2"]].to_numpy(float)
         return 1e3 * np.sqrt(np.where(variances >= 0, variances, np.nan))
 
+    def marked(self, camera: int) -> bool:
+        """Whether marks fixed to the tank were followed in a camera's images."""
+        return bool((self.references["camera"] == self.cameras[camera]).any())
+
     @property
     def pairs(self) -> Mapping[str, Any]:
         return dict(self.content.get("pairs") or {})

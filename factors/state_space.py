@@ -189,30 +189,42 @@ def driven_mode(
 
 
 def broad_band(
-    rms_mm: float, *, low_hz: float = 8.0, high_hz: float = 60.0, floor: float = 0.0
+    rms_mm: float,
+    *,
+    low_hz: float = 8.0,
+    high_hz: float = 60.0,
+    floor: float = 0.0,
+    tail: int = 2,
 ) -> Component:
-    """Shake of unknown modes: (s + floor a) / ((s + a)^3 (s + b)^2) of white noise, of given RMS.
+    """Shake of unknown modes: (s + floor a) / ((s + a)^3 (s + b)^tail) of white noise, given RMS.
 
     A density that falls from low_hz (a) on and steeply from high_hz (b) on: accelerations as
     smooth as a force through two poles makes them, without which accelerometers are of no use.
     Below low_hz it falls too, to floor^2 of about the peak: to nothing at floor 0, while a mode of
-    little damping keeps a compliance there. Five states, one for each pole.
+    little damping keeps a compliance there. Three states and ``tail``, one for each pole.
     """
     _positive(rms_mm=rms_mm, low_hz=low_hz, high_hz=high_hz)
     a, b = 2 * np.pi * low_hz, 2 * np.pi * high_hz
-    chain = np.diag([-a, -a, -a, -b, -b]) + np.diag([1.0, 1.0, 1.0, 1.0], 1)
-    return _scaled("broad_band", chain, chain[0] + floor * a * np.eye(5)[0], rms_mm)
+    size = 3 + tail
+    chain = np.diag([-a] * 3 + [-b] * tail) + np.eye(size, k=1)
+    return _scaled("broad_band", chain, chain[0] + floor * a * np.eye(size)[0], rms_mm)
 
 
 def broad_band_density(
-    frequency_hz: Array, rms_mm: float, *, low_hz: float, high_hz: float, floor: float
+    frequency_hz: Array,
+    rms_mm: float,
+    *,
+    low_hz: float,
+    high_hz: float,
+    floor: float,
+    tail: int = 2,
 ) -> Array:
     """(N,) one-sided density (mm^2 / Hz) of `broad_band` at the frequencies (N,)."""
     a, b = low_hz, high_hz
 
     def shape(f: Array) -> Array:
         f2 = f * f
-        return (f2 + (floor * a) ** 2) / ((f2 + a * a) ** 3 * (f2 + b * b) ** 2)
+        return (f2 + (floor * a) ** 2) / ((f2 + a * a) ** 3 * (f2 + b * b) ** tail)
 
     whole = np.concatenate([[0.0], np.geomspace(1e-3 * a, 1e2 * b, 2000)])
     density: Array = rms_mm**2 * shape(frequency_hz) / np.trapezoid(shape(whole), whole)

@@ -1,11 +1,13 @@
 """What the second pass of a default smoothing takes from the first: the shake's spectrum."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from telerig.estimator.smoother.adapting import fitted_floor
-from telerig.estimator.smoother.defaults import DEFAULT_FLOOR
-from telerig.estimator.smoother.model import CARRIAGE, BroadBand
+from telerig.estimator.smoother.defaults import DEFAULT_FLOOR, rescaled
+from telerig.estimator.smoother.model import CARRIAGE, BroadBand, ShakeModel
 from telerig.factors.state_space import broad_band, broad_band_density, discretise
 
 RATE_HZ, RMS_MM = 500.0, 0.3
@@ -32,9 +34,9 @@ def _bands(floor: float = DEFAULT_FLOOR) -> tuple[BroadBand, ...]:
     return tuple(BroadBand((RMS_MM,) * 3, camera, floor=floor, **BAND) for camera in range(2))
 
 
-@pytest.mark.parametrize("floor", [0.0, 0.05, 0.3])
-def test_the_density_is_that_of_the_state_space(floor):
-    component = broad_band(RMS_MM, floor=floor, **BAND)
+@pytest.mark.parametrize(("floor", "tail"), [(0.0, 2), (0.05, 2), (0.3, 3)])
+def test_the_density_is_that_of_the_state_space(floor, tail):
+    component = broad_band(RMS_MM, floor=floor, tail=tail, **BAND)
     frequency = np.array([0.2, 3.0, 12.0, 70.0])
     identity = np.eye(component.size)
     gain = [
@@ -43,9 +45,8 @@ def test_the_density_is_that_of_the_state_space(floor):
         for f in frequency
     ]
     expected = 2 * (np.abs(gain) ** 2).sum(-1)
-    assert broad_band_density(frequency, RMS_MM, floor=floor, **BAND) == pytest.approx(
-        expected, rel=1e-4
-    )
+    density = broad_band_density(frequency, RMS_MM, floor=floor, tail=tail, **BAND)
+    assert density == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_density_holds_the_variance():
@@ -74,3 +75,17 @@ def test_uneven_times_are_evened_out():
     keep = np.sort(rng.choice(len(t), int(0.9 * len(t)), replace=False))
     whole, part = fitted_floor(t, offsets, _bands()), fitted_floor(t[keep], offsets[keep], _bands())
     assert part == pytest.approx(whole, rel=0.15)
+
+
+@pytest.mark.parametrize(("frequency_hz", "tail", "high_hz"), [(12.0, 2, 60.0), (40.0, 3, 80.0)])
+def test_strong_shake_has_a_steeper_tail(frequency_hz, tail, high_hz):
+    """Accelerations of 2 and 19 m/s^2."""
+    model = ShakeModel(broad_bands=_bands())
+    for band in rescaled(model, np.full((2, 3), RMS_MM), frequency_hz).broad_bands:
+        assert (band.tail, band.high_hz, band.low_hz) == (tail, high_hz, frequency_hz)
+
+
+def test_the_floor_of_strong_shake_is_not_taken_from_what_the_prior_has_shrunk():
+    strong = tuple(replace(b, tail=3) for b in _bands())
+    assert fitted_floor(*_offsets(0.1, 4.0, 0), _bands()) is not None
+    assert fitted_floor(*_offsets(0.1, 4.0, 0), strong) is None

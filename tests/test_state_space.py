@@ -34,6 +34,7 @@ ALL = [
     broad_band(0.14),
     slow_ou(0.02, 0.3),
 ]
+STEEP = broad_band(0.3, low_hz=40.0, high_hz=80.0, floor=0.12, tail=3)
 SETTLING = [c for c in ALL if c.name not in ("ou_velocity", "white_jerk", "forced_mass")]
 
 
@@ -48,8 +49,12 @@ def quadrature(component: Component, dt: float) -> tuple[Any, Any]:
     return expm(component.drift * dt), covariance
 
 
-@pytest.mark.parametrize("component", ALL, ids=lambda c: c.name)
-@pytest.mark.parametrize("dt", [5e-4, 2e-3, 0.1])
+@pytest.mark.parametrize(
+    ("component", "dt"),
+    # the quadrature has too few digits for six integrations in half a millisecond
+    [*((c, dt) for dt in (5e-4, 2e-3, 0.1) for c in ALL), (STEEP, 4e-3), (STEEP, 0.1)],
+    ids=lambda v: getattr(v, "name", v),
+)
 def test_steps_are_exact(component: Component, dt: float) -> None:
     steps = discretise(component, [dt])
     transition, covariance = quadrature(component, dt)
@@ -97,7 +102,7 @@ def test_rms_is_the_one_asked_for(component: Component, rms: float) -> None:
     assert np.sqrt(row @ component.start_covariance @ row) == pytest.approx(rms, rel=1e-9)
 
 
-@pytest.mark.parametrize("component", [ALL[1], ALL[2], ALL[4], ALL[5]], ids=lambda c: c.name)
+@pytest.mark.parametrize("component", [*ALL[1:3], *ALL[4:6], STEEP], ids=lambda c: c.name)
 def test_rows_are_derivatives_of_one_another(component: Component) -> None:
     """No white noise enters position or velocity, and each row's rate of change is the next."""
     for row, following in (

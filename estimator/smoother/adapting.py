@@ -68,10 +68,11 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
     How far a mode yields to slow forces, its damping, decides how well the slow motion of a bubble
     is known. Whittle's likelihood of the low end of the spectra (Whittle, Arkiv foer Matematik 2,
     1953), with a prior of a factor of two about `DEFAULT_FLOOR`. None where the run is too short
-    to see it, or where a band is common to the cameras, so that the offsets are not its own.
+    to see it, where a band is common to the cameras, so that the offsets are not its own, and where
+    the shake is so strong that the first solution's offsets are the prior's as much as the data's.
     """
     t = np.asarray(t_s, float)
-    if any(b.camera == CARRIAGE for b in bands) or not bands[0].floor or len(t) < 2:
+    if any(b.camera == CARRIAGE or b.tail > 2 for b in bands) or not bands[0].floor or len(t) < 2:
         return None
     step = float(np.median(np.diff(t)))
     even = np.arange(t[0], t[-1] + step / 2, step)
@@ -89,7 +90,7 @@ def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) ->
             for i, floor in enumerate(_FLOORS):
                 density = broad_band_density(
                     frequency[low], band.rms_mm[axis], low_hz=band.low_hz, high_hz=band.high_hz,
-                    floor=float(floor),
+                    floor=float(floor), tail=band.tail,
                 )  # fmt: skip
                 score[i] -= _INDEPENDENT * float(np.sum(np.log(density) + seen / density))
     return float(_FLOORS[np.argmax(score)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,8 @@ _HARMONIC_RMS_MM = 0.15
 _INTERPOLATION_SHARE = 0.3
 _CLEAR = 0.2
 _SHAKE_HZ = (4.0, 60.0)
+STRONG_MM_S2 = 5000.0
+"""Shake whose accelerations are larger gets a steeper tail; see docs/decisions/010."""
 DEFAULT_FLOOR = 0.12
 """Of the band. A mode of damping z has 4 z / (pi f) RMS^2 per Hz below it; this is z = 0.05."""
 
@@ -87,13 +90,12 @@ def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeMode
     factor = rms_mm / np.sqrt(np.where(before > 0, before, 1.0))
     factor = np.clip(factor, 0.05, 20.0)
     frequency = float(np.clip(frequency_hz, *_SHAKE_HZ))
+    strong = float(rms_mm.max()) * (2 * np.pi * frequency) ** 2 > STRONG_MM_S2
+    shape: dict[str, Any] = {"low_hz": frequency, "high_hz": max(60.0, 1.25 * frequency)}
+    if strong:
+        shape = {"low_hz": frequency, "high_hz": max(60.0, 2.0 * frequency), "tail": 3}
     bands = [
-        replace(
-            b,
-            rms_mm=_triple(np.asarray(b.rms_mm) * _factor(factor, b.camera)),
-            low_hz=frequency,
-            high_hz=max(60.0, 1.25 * frequency),
-        )
+        replace(b, rms_mm=_triple(np.asarray(b.rms_mm) * _factor(factor, b.camera)), **shape)
         for b in model.broad_bands
     ]
     return replace(model, broad_bands=tuple(bands))

@@ -187,7 +187,9 @@ def _offsets(cameras: Sequence[Camera], model: ShakeModel) -> list[_Placed]:
             placed.append(_Placed(part, label, direction, where))
     for band in model.broad_bands:
         for direction, rms in _directed(band.rms_mm, band.camera, cameras):
-            part = broad_band(rms, low_hz=band.low_hz, high_hz=band.high_hz, floor=band.floor)
+            part = broad_band(
+                rms, low_hz=band.low_hz, high_hz=band.high_hz, floor=band.floor, tail=band.tail
+            )
             placed.append(_Placed(part, "broad band", direction, band.camera))
             if band.slow_rms_mm > 0:
                 slow = slow_ou(band.slow_rms_mm, band.slow_tau_s)

@@ -68,7 +68,7 @@ class RigMode:
 class BroadBand:
     """Shake without modal knowledge, of each camera or (CARRIAGE) of all alike.
 
-    low_hz, high_hz, floor : see `telerig.factors.state_space.broad_band`.  slow_rms_mm,
+    low_hz, high_hz, floor, tail : see `telerig.factors.state_space.broad_band`.  slow_rms_mm,
     slow_tau_s : an Ornstein-Uhlenbeck offset besides, which accelerometers do not feel.
     """
 
@@ -79,6 +79,7 @@ class BroadBand:
     floor: float = 0.0
     slow_rms_mm: float = 0.0
     slow_tau_s: float = 0.1
+    tail: int = 2
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,8 @@ def _warm(frame: Frame, state: State, start: Solution) -> State:
         for name, value in vars(start.state).items()
         if value.shape == getattr(state, name).shape and name not in ("shake", "clocks")
     }
-    if frame.shake.labels == start.frame.shake.labels:
+    alike = frame.shake.labels == start.frame.shake.labels
+    if alike and frame.shake.size == start.frame.shake.size:
         t = start.frame.nodes.t_s
         columns = [np.interp(frame.nodes.t_s, t, c) for c in start.state.shake.T]
         same["shake"] = np.stack(columns, -1) if columns else state.shake

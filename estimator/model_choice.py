@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from telerig.estimator.graph import Solution, solve
 from telerig.estimator.held_out import held_out_chi2
@@ -94,7 +94,7 @@ class Step:
     @property
     def p_value(self) -> float:
         """Chance of such a gain without any reason for it; NaN for the first step."""
-        return float(chi2.sf(self.gain, len(self.added))) if self.added else float("nan")
+        return float(chdtrc(len(self.added), self.gain)) if self.added else float("nan")
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def test_states_covariances_and_evidence_equal_gtsams(
 def test_the_chain_is_taken_where_only_frames_have_states(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def refuse(*_: Any) -> Any:
+    def refuse(*_: Any, **__: Any) -> Any:
         raise AssertionError("GTSAM was asked")
 
     monkeypatch.setattr(elimination, "eliminate", refuse)
@@ -87,14 +87,22 @@ def test_the_chain_is_taken_where_only_frames_have_states(
         solve(problem(sensed, "arms", runs), true_model(sensed, "arms"))
 
 
-def test_what_cholesky_refuses_goes_to_gtsam(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cholesky_refuses_goes_to_qr(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = solve(*scene("five"))
+    asked = []
 
     def refuse(*_: Any) -> Any:
         raise chain.NotPositiveError("frame 3")
 
-    monkeypatch.setattr(solving.chain, "eliminate", refuse)
+    def by_gtsam(*given: Any, cholesky: bool) -> Any:
+        asked.append(cholesky)
+        return of_gtsam(*given, cholesky=cholesky)
+
+    of_gtsam = elimination.eliminate
+    monkeypatch.setattr(chain, "eliminate", refuse)
+    monkeypatch.setattr(elimination, "eliminate", by_gtsam)
     found = solve(*scene("five"))
+    assert asked and not any(asked)
     assert np.allclose(found.state.bubbles, expected.state.bubbles, rtol=1e-7, atol=1e-7)
 
 

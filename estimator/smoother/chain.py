@@ -70,10 +70,9 @@ class Places:
 
 
 def suits(frame: Frame) -> bool:
-    """Whether the graph is such a chain, with few constants."""
-    same_nodes = len(frame.nodes.t_s) == len(frame.problem.t_s)
+    """Whether a graph of frames alone has states to chain, and few constants."""
     constants = sum(n * d for n, d in frame.counts()[2:])
-    return same_nodes and frame.shake.size > 0 and constants <= MOST_CONSTANTS
+    return frame.shake.size > 0 and constants <= MOST_CONSTANTS
 
 
 def places_of(frame: Frame) -> Places:

@@ -51,15 +51,18 @@ class EliminatedGraph:
         return Blocks(own, cross.reshape(frame.rows, counts[0][1], counts[1][1]))
 
 
-def eliminate(frame: Frame, factors: list[Linear]) -> EliminatedGraph:
-    """The graph of all factors, solved. Raises CalibrationError where it is undetermined."""
+def eliminate(frame: Frame, factors: list[Linear], *, cholesky: bool) -> EliminatedGraph:
+    """The graph of all factors, solved: by QR, or by Cholesky where that does not refuse.
+
+    Raises CalibrationError where it is undetermined.
+    """
     import gtsam
 
     graph = gtsam.GaussianFactorGraph()
     for linear in factors:
         add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
     _add_bonds(graph, frame)
-    net, solution = _eliminated(graph, frame)
+    net, solution = _eliminated(graph, _ordering(frame), cholesky)
     return EliminatedGraph(frame, net, solution.vector())
 
 
@@ -79,18 +82,12 @@ def _add_bonds(graph: Any, frame: Frame) -> None:
     add_linear_factors(graph, keys, blocks, np.zeros((len(alone), 1)))
 
 
-def _eliminated(graph: Any, frame: Frame) -> tuple[Any, Any]:
-    """Bayes net and solution: by Cholesky, or by QR, four times slower, where digits are short.
-
-    The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
-    good to 3e-6), and more than double precision has with steps as short as a sensor's. Else QR
-    is for what Cholesky refuses.
-    """
+def _eliminated(graph: Any, ordering: Any, cholesky: bool) -> tuple[Any, Any]:
+    """Bayes net and solution."""
     import gtsam
 
-    ordering = _ordering(frame)
     try:
-        if len(frame.nodes.t_s) == len(frame.problem.t_s) and not frame.model.broad_bands:
+        if cholesky:
             try:
                 net = graph.eliminateSequential(ordering)
                 return net, net.optimize()

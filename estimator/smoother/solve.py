@@ -204,13 +204,21 @@ def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _
 
 
 def _eliminated(frame: Frame, factors: list[Linear]) -> Eliminated:
-    if chain.suits(frame) and not frame.model.broad_bands:
+    """By normal equations, or by QR, four times slower, where digits are short.
+
+    The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
+    good to 3e-6), and more than double precision has with steps as short as a sensor's. Else QR
+    is for what Cholesky refuses.
+    """
+    only_frames = len(frame.nodes.t_s) == len(frame.problem.t_s)
+    cholesky = only_frames and not frame.model.broad_bands
+    if cholesky and chain.suits(frame):
         places = chain.places_of(frame)
         try:
             return chain.eliminate(places, chain.normal_equations(places, factors))
         except chain.NotPositiveError:
-            pass
-    return elimination.eliminate(frame, factors)
+            cholesky = False
+    return elimination.eliminate(frame, factors, cholesky=cholesky)
 
 
 def _squared(frame: Frame, factors: list[Linear], vector: Array) -> float:

@@ -270,3 +270,15 @@ def test_strong_perspective_decides_and_contradicts(scene: Any) -> None:
     telecentric = lens.calibrate("radial")
     assert telecentric.verdict["status"] == "REJECTED"
     assert any("does not describe" in r for r in telecentric.verdict["reasons"])
+
+
+def test_outliers_leave_no_trace_in_the_dots_eccentricity(scene: Any) -> None:
+    """The correction comes from a fit of its own, which must not see them either."""
+    made = scene("paper", 3, outlier_share=0.05)
+    sound = made.with_dots(made.dots[~made.outlier])
+    found, expected = made.calibrate("auto"), sound.calibrate("auto")
+    for camera in ("left", "right"):
+        for name in ("scale_px_per_mm", "k1"):
+            key = f"{camera}.{name}"
+            pair = [next(c for c in k.cameras if c.name == camera)[name] for k in (found, expected)]
+            assert abs(pair[0] - pair[1]) < 0.2 * expected.sd(key), key

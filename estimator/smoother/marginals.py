@@ -22,14 +22,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Marginals:
-    """own : (d, d) covariance of each wanted key.  cross : (d, e) of each wanted pair.
-
-    log_det : log |R| of the whole net.
-    """
+    """own : (d, d) covariance of each wanted key.  cross : (d, e) of each wanted pair."""
 
     own: dict[int, Array]
     cross: dict[tuple[int, int], Array]
-    log_det: float
 
 
 def marginal_covariances(
@@ -54,11 +50,9 @@ def marginal_covariances(
     patterns: dict[tuple[Any, ...], NDArray[np.int64]] = {}
     own_of: dict[int, Array] = {}
     cross_of: dict[tuple[int, int], Array] = {}
-    log_det = 0.0
     for conditional, clique, parent in zip(conditionals[::-1], keys[::-1], parents[::-1]):
         own, size = clique[0], sizes[clique[0]]
         inverse, _ = dtrtri(conditional.R())
-        log_det -= float(np.log(np.abs(inverse.diagonal())).sum())
         block = inverse @ inverse.T
         if parent >= 0:
             block = _joined(
@@ -74,7 +68,7 @@ def marginal_covariances(
             cross_of[own, other] = block[:size, at : at + sizes[other]].copy()
         if children[own]:
             joint[own] = (clique, block)
-    return Marginals(own_of, cross_of, log_det)
+    return Marginals(own_of, cross_of)
 
 
 def _joined(own: Array, gain: Array, above: Array) -> Array:

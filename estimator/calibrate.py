@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -184,21 +183,16 @@ def _measured(
         dataset,
         progress=None if stage is None else lambda i, n: stage("images", i, n),
         overlays=pictures,
-        meanwhile=partial(_load_libraries, pictures),
+        meanwhile=_load_libraries,
     )
     return detected, detected.dots, [*dataset.notes, *detected.notes]
 
 
-def _load_libraries(pictures: bool) -> None:
+def _load_libraries() -> None:
     """Load what comes after the detection while other processes detect."""
     import gtsam  # noqa: F401
 
     import telerig.estimator.self_calibration  # noqa: F401
-
-    if pictures:
-        from telerig.io.report.page import prepare_page
-
-        prepare_page()
 
 
 def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +12,7 @@ import numpy as np
 
 from telerig.estimator.calibrate import CalibrationRun
 from telerig.io.atomic import atomic_folder, write_json_atomic
+from telerig.io.parallel import assistant
 from telerig.io.provenance import run_record
 from telerig.io.tables import write_table
 
@@ -31,6 +34,33 @@ def input_files(dataset: Dataset) -> list[Path]:
     return files + [path for view in dataset.views for path in view.image_paths.values()]
 
 
+def write_report(folder: Path) -> Path:
+    """The report of a results folder, whose path is returned."""
+    from telerig.io.report.calibration_report import write_calibration_report
+
+    return write_calibration_report(folder)
+
+
+@contextmanager
+def report_beside(wanted: bool) -> Iterator[Callable[[Path], object] | None]:
+    """`write_report` in a process that loads its libraries while this one calibrates.
+
+    None where no report is wanted.
+    """
+    if not wanted:
+        yield None
+        return
+    with assistant(_prepare_report) as call:
+        yield partial(call, write_report)
+
+
+def _prepare_report() -> None:
+    import telerig.io.report.calibration_report  # noqa: F401
+    from telerig.io.report.page import prepare_page
+
+    prepare_page()
+
+
 def write_results(
     dataset: Dataset,
     run: CalibrationRun,
@@ -40,15 +70,14 @@ def write_results(
     options: Mapping[str, Any],
     seconds: Mapping[str, float],
     change: RigComparison | None = None,
-    report: bool = True,
+    report: Callable[[Path], object] | None = write_report,
 ) -> Path:
     """Fill ``folder`` with what docs/files.md lists; returns the report's path.
 
     change : since an earlier calibration, for comparison.json.
+    report : writes the report of a folder; None leaves it out.
     Files appear together at the end, so an interrupted command leaves the old ones.
     """
-    from telerig.io.report.calibration_report import write_calibration_report
-
     record = run_record(command, dataset.path, input_files(dataset), options, seconds)
     with atomic_folder(folder) as staged:
         run.calibration.save(staged)
@@ -61,8 +90,8 @@ def write_results(
         if run.detected is not None:
             write_detections(run.detected, staged)
             _write_example(dataset, run, staged / "dot_example.npz")
-        if report:
-            write_calibration_report(staged)
+        if report is not None:
+            report(staged)
     return folder / "report.html"
 
 

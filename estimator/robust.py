@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from telerig.estimator.graph import Progress, Solution, solve
 from telerig.estimator.problem import Problem
@@ -62,6 +61,8 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float)
 
     if excess(0.0) < 5 * 1.44 / np.sqrt(len(residual_px)):
         return 0.0
+    from scipy.optimize import brentq
+
     top = 2 * float(np.abs(residual_px).max()) + 1e-9
     return float(brentq(excess, 0.0, top, xtol=1e-7)) if excess(top) < 0 else top
 

@@ -7,10 +7,13 @@ import os
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
 from multiprocessing.pool import Pool
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -63,11 +66,81 @@ def quick_workers(tasks: int) -> int:
     return min(cores(), tasks) if can_fork() else 1
 
 
+@contextmanager
+def assistant(prepare: Callable[[], object]) -> Iterator[Callable[..., Any]]:
+    """A copy of this process that calls ``prepare`` at once, and functions when it is asked to.
+
+    Libraries that only the end of a command needs are loaded in it while this process, whose
+    start leaves the other cores idle, gets on. Yields ``call(function, *arguments)``: it returns
+    or raises what a module's function does. Where a copy does not pay, or it died, functions are
+    called in this process.
+    """
+    if cores() < 2 or not can_fork():
+        yield _call
+        return
+    ours, theirs = multiprocessing.Pipe()
+    with _without_fork_warning():
+        process = multiprocessing.get_context("fork").Process(
+            target=_assist, args=(ours, theirs, prepare)
+        )
+        process.start()
+    theirs.close()
+
+    def call(function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            ours.send((function, arguments))
+            failed, result = ours.recv()
+        except (EOFError, OSError):
+            return function(*arguments)
+        if failed:
+            raise result
+        return result
+
+    try:
+        yield call
+    finally:
+        ours.close()
+        process.terminate()
+        process.join()
+
+
+def _assist(other_end: Connection, end: Connection, prepare: Callable[[], object]) -> None:
+    """Until the other end is closed: then ``recv`` ends this copy by EOFError."""
+    other_end.close()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    try:
+        prepare()
+        while True:
+            end.send(_answer(*end.recv()))
+    except (EOFError, BrokenPipeError):
+        return
+
+
+def _answer(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+    """Whether the function failed, and what it returned or raised."""
+    try:
+        return False, function(*arguments)
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        return True, error
+
+
+def _call(function: Callable[..., Any], *arguments: Any) -> Any:
+    return function(*arguments)
+
+
 def _forked(workers: int) -> Pool:
-    with warnings.catch_warnings():
-        # numerical libraries' own idle threads: they restart in the copy
-        warnings.simplefilter("ignore", DeprecationWarning)
+    with _without_fork_warning():
         return multiprocessing.get_context("fork").Pool(workers, initializer=_begin_work)
+
+
+@contextmanager
+def _without_fork_warning() -> Iterator[None]:
+    """Of numerical libraries' own idle threads: they restart in the copy."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        yield
 
 
 def _begin_work() -> None:

@@ -84,9 +84,8 @@ def calibrate(
     used, with what, where and what to do. 130: interrupted.
     """
     with errors_in_words():
-        from telerig.estimator.calibrate import check_options, run_calibration
-        from telerig.estimator.calibration_results import write_results
-        from telerig.io.dataset import load_dataset
+        from telerig.estimator.calibrate import check_options
+        from telerig.estimator.calibration_results import report_beside, write_results
 
         begun = time.perf_counter()
         options: dict[str, Any] = {"model": model, "solver": solver, "dots": dots, "medium": medium,
@@ -96,29 +95,40 @@ def calibrate(
             "model": model, "solver": solver, "medium": medium, "seed": seed, "dots_free": dots,
         }  # fmt: skip
         check_options(**chosen)
-        earlier = None if compare is None else _earlier(compare, dataset)
-        if watch:
-            data, run = _watched(dataset, source, until_um, poll, chosen)
-            options |= {"watch": True, "until_um": until_um}
-        else:
-            if until_um is not None:
-                raise InputError("--until-um goes with --watch", todo="add --watch, or leave it")
-            data = load_dataset(dataset, source=checked_source(source))
-            with progress(quiet) as stage:
-                run = run_calibration(data, **chosen, stage=stage, pictures=True)
-        folder = out or data.results / "calibration"
-        seconds = {"calibrate": time.perf_counter() - begun}
-        change = None if earlier is None else _change(earlier, run.calibration)
-        write_results(
-            data, run, folder, command="calibrate", options=options, seconds=seconds,
-            change=change, report=report,
-        )  # fmt: skip
+        with report_beside(report) as write_report:
+            earlier = None if compare is None else _earlier(compare, dataset)
+            if watch:
+                data, run = _watched(dataset, source, until_um, poll, chosen)
+                options |= {"watch": True, "until_um": until_um}
+            else:
+                data, run = _at_once(dataset, source, until_um, quiet, chosen)
+            folder = out or data.results / "calibration"
+            seconds = {"calibrate": time.perf_counter() - begun}
+            change = None if earlier is None else _change(earlier, run.calibration)
+            write_results(
+                data, run, folder, command="calibrate", options=options, seconds=seconds,
+                change=change, report=write_report,
+            )  # fmt: skip
         say(run.calibration.report())
         if change is not None:
             say(f"since {compare}: {change.words()}")
         say(f"written: {folder}" + ("/report.html" if report else ""))
         if run.calibration.verdict["status"] == "REJECTED":
             raise typer.Exit(EXIT_REJECTED)
+
+
+def _at_once(
+    dataset: Path, source: str | None, until_um: float | None, quiet: bool, chosen: dict[str, Any]
+) -> tuple[Dataset, CalibrationRun]:
+    """The dataset as it lies there, and its calibration."""
+    from telerig.estimator.calibrate import run_calibration
+    from telerig.io.dataset import load_dataset
+
+    if until_um is not None:
+        raise InputError("--until-um goes with --watch", todo="add --watch, or leave it")
+    data = load_dataset(dataset, source=checked_source(source))
+    with progress(quiet) as stage:
+        return data, run_calibration(data, **chosen, stage=stage, pictures=True)
 
 
 def _earlier(path: Path, dataset: Path) -> Calibration:

@@ -125,7 +125,7 @@ def failure(status: str, words: str) -> dict[str, Any]:
 
 def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
     from telerig.estimator.calibrate import run_calibration
-    from telerig.estimator.calibration_results import write_results
+    from telerig.estimator.calibration_results import write_report, write_results
     from telerig.io.dataset import load_dataset
 
     begun = time.perf_counter()
@@ -137,7 +137,8 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
     write_results(
         data, run, job.results, command="run",
         options={"model": job.model, "medium": job.medium},
-        seconds={"calibrate": time.perf_counter() - begun}, report=job.report,
+        seconds={"calibrate": time.perf_counter() - begun},
+        report=write_report if job.report else None,
     )  # fmt: skip
     figures = {
         "verdict": found.verdict["status"],

@@ -197,7 +197,8 @@ def _first_pass(
     for blob in blobs:
         start = Start(blob.centre_px, blob.shape_px, sigma)
         window = dot_window(grey, found.labels, blob, start, coarse=True)
-        fits.append(fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1))
+        fit = fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1, rough=True)
+        fits.append(fit)
         sigma = float(np.median([fit.sigma_px for fit in fits[-9:]]))
     return fits
 

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 EDGE_EXPANSION_LIMIT = 0.12  # centres agree with the exact sum to 3e-6 px, levels to 2e-4
+ROUGH_EXPANSION_LIMIT = 0.3  # levels to 3e-3: enough to start a finer fit from
 _MIN_SIGMA_PX = 0.3
 _MIN_SEMI_AXIS_PX = 0.6
 _INSIDE = 0.9
@@ -48,9 +49,12 @@ class _Problem:
     radius: float
     noise: NoiseModel
     prior: Prior
+    expansion_limit: float
 
 
-def _problem(window: Window, start: Start, noise: NoiseModel, prior: Prior) -> _Problem:
+def _problem(
+    window: Window, start: Start, noise: NoiseModel, prior: Prior, expansion_limit: float
+) -> _Problem:
     origin, radius = np.round(start.centre_px), semi_axes(start.shape_px)[0]
     if start.previous is not None:
         origin, radius = start.previous.origin_px, start.previous.radius_px
@@ -68,12 +72,13 @@ def _problem(window: Window, start: Start, noise: NoiseModel, prior: Prior) -> _
         radius,
         noise,
         prior,
+        expansion_limit,
     )
 
 
 def _coverage(problem: _Problem, theta: Array) -> tuple[Array, Array]:
     centre, shape, sigma = theta[:2], theta[2:5], float(theta[5])
-    if largest_curvature(shape) * sigma < EDGE_EXPANSION_LIMIT:
+    if largest_curvature(shape) * sigma < problem.expansion_limit:
         return coverage_near_edge(problem.x - centre[0], problem.y - centre[1], shape, sigma)
     value, gradient = coverage_on_grid(problem.columns, problem.rows, centre, shape, sigma)
     return value[problem.mask], gradient[:, problem.mask]
@@ -219,13 +224,17 @@ def fit_dot(
     iterations: int = 25,
     tolerance: float = 0.02,
     outlier_rounds: int = 3,
+    rough: bool = False,
 ) -> DotFit:
     """Fit one dot's luminance model to the pixels of ``window``, leaving outliers out.
 
     Pixels more than 5 sigma off (sigma widened by the fit's own spread, so that a rough print
     edge is kept) are dropped and the fit goes on, as long as they are few.
+
+    rough : the model may be a few thousandths off, for a first look.
     """
-    problem = _problem(window, start, noise, prior)
+    limit = ROUGH_EXPANSION_LIMIT if rough else EDGE_EXPANSION_LIMIT
+    problem = _problem(window, start, noise, prior, limit)
     theta = np.concatenate([start.centre_px - problem.origin, start.shape_px, [start.sigma_px]])
     state = _state(problem, theta, None if start.previous is None else start.previous.levels)
     state = _weighted(problem, state, state.weight)

@@ -121,7 +121,7 @@ def _answer(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[b
     """Whether the function failed, and what it returned or raised."""
     try:
         return False, function(*arguments)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - raised where it was asked for
         error.add_note(traceback.format_exc())
         return True, error
 

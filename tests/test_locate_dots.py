@@ -219,6 +219,23 @@ def test_a_strong_vignette_and_a_larger_mark() -> None:
     assert matched.a_px.iloc[-1] == pytest.approx(13.0, abs=0.05)
 
 
+def test_a_bright_surround_of_the_plate_costs_nothing() -> None:
+    """Its outline encloses every dot, whose pixels are not its own for that."""
+    plate = scene(9.0, tilt_deg=40.0, size=280)
+    near = np.all(np.abs(plate.centres_px - 139.5) < 80, axis=1)
+    plate = replace(plate, centres_px=plate.centres_px[near])
+    grey = renderer.render(plate) + 3.0 * np.random.default_rng(4).standard_normal((280, 280))
+    framed = grey + 30.0
+    framed[35:-35, 35:-35] = grey[35:-35, 35:-35]
+    alone, within = measure_dots(grey), measure_dots(framed, polarity="white_on_black")
+    assert any(r == "touches the image border" for r in within.rejected.reason)
+    gap, table = errors(within.dots, plate.centres_px)
+    assert np.sqrt(np.mean(gap**2)) < 1.2 * np.sqrt(
+        np.mean(errors(alone.dots, plate.centres_px)[0] ** 2)
+    )
+    assert np.median(table.suu_px2) < 1.1 * np.median(alone.dots.suu_px2)
+
+
 @pytest.mark.parametrize("level", [0.0, 3.0])
 def test_nothing_is_found_in_nothing(level: float) -> None:
     rng = np.random.default_rng(9)

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from telerig.estimator.frontend import luminance
 from telerig.estimator.frontend.blurred_ellipse import coverage_on_grid, shape_from_axes
 from telerig.estimator.frontend.dot_types import DotFit, Prior, Start, Window
-from telerig.estimator.frontend.luminance import fit_dot
+from telerig.estimator.frontend.luminance_fit import fit_dots
 from telerig.estimator.frontend.noise import (
     NoiseModel,
     agreed_factor,
@@ -57,7 +57,7 @@ def lit_picture(radius: float, slope_per_px: float) -> Array:
 def fit(grey: Array, shape: Array, sigma: float, prior: Prior = HELD) -> DotFit:
     window = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
     start = Start(CENTRE + (0.4, -0.3), shape * 1.06, 1.2)
-    return fit_dot(window, start, noise_of(sigma), prior)
+    return fit_dots([window], [start], noise_of(sigma), [prior])[0]
 
 
 @pytest.mark.parametrize("axes", [(4.0, 4.0), (4.0, 1.7), (10.0, 10.0), (10.0, 4.2), (13.0, 12.0)])
@@ -90,15 +90,37 @@ def test_spread_equals_prediction_and_the_bound(radius: float) -> None:
 def test_jacobian_of_the_model() -> None:
     shape = shape_from_axes(5.0, 3.0, 0.4)
     window = Window(picture(shape), 0, 0, np.ones((SIZE, SIZE), dtype=bool))
-    problem = luminance._problem(window, Start(CENTRE, shape, 1.0), noise_of(1.0), HELD)
+    problem = luminance.gather([window], [Start(CENTRE, shape, 1.0)], noise_of(1.0), [HELD])
     parameters = np.array([0.2, -0.1, *shape, 0.9, 40.0, 3.0, -2.0, 150.0, 0.5, -0.4])
-    _, jacobian, _ = luminance._model(problem, parameters[:6], parameters[6:])
+
+    def model(values: Array) -> tuple[Array, Array, Array]:
+        return luminance.grey_levels(problem, values[None, :6], values[None, 6:])
+
+    jacobian = model(parameters)[1][0]
     for i in range(12):
         step = 1e-5 * np.eye(12)[i]
         high, low = parameters + step, parameters - step
-        quotient = luminance._model(problem, high[:6], high[6:])[0]
-        quotient = (quotient - luminance._model(problem, low[:6], low[6:])[0]) / 2e-5
+        quotient = (model(high)[0][0] - model(low)[0][0]) / 2e-5
         np.testing.assert_allclose(jacobian[i], quotient, atol=0.1)
+
+
+def test_dots_fitted_together_are_those_fitted_alone() -> None:
+    """Large and small, round and so bent that the edge's expansion would not do, one dirty."""
+    rng = np.random.default_rng(3)
+    shapes = [shape_from_axes(a, b, 0.4) for a, b in ((9, 8), (4, 2.5), (11, 5), (3, 3), (12, 11))]
+    windows = []
+    for shape in shapes:
+        grey = picture(shape) + 2.0 * rng.standard_normal((SIZE, SIZE))
+        windows.append(Window(grey, 0, 0, rng.uniform(size=grey.shape) < 0.8))
+    windows[0].grey[14:18, 22:26] -= 60.0
+    starts = [Start(CENTRE + rng.uniform(-0.4, 0.4, 2), shape * 1.06, 1.2) for shape in shapes]
+    priors = [Prior(), HELD, Prior(tie_to_background=True), Prior(edge_px=0.85), HELD]
+    together = fit_dots(windows, starts, noise_of(2.0), priors)
+    for i, ours in enumerate(together):
+        (alone,) = fit_dots(windows[i : i + 1], starts[i : i + 1], noise_of(2.0), priors[i : i + 1])
+        for name in ("centre_px", "shape_px", "levels", "covariance_px2", "chi2_dof"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(alone, name), rtol=1e-7)
+        assert (ours.pixels, ours.dropped, ours.converged) == (alone.pixels, alone.dropped, True)
 
 
 def test_a_free_contrast_gradient_would_more_than_double_the_variance() -> None:

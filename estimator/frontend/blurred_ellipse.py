@@ -8,8 +8,6 @@ of M are the semi-axes. The point spread (Gaussian blur and square pixel) is a G
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
@@ -54,15 +52,21 @@ def extent_px(shape_px: Array) -> Array:
 def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Array:
     """Signed distance to the ellipse to first order (positive outside), for choosing pixels.
 
-    ``shape_px`` (3,); ``du_px, dv_px`` offsets from the centre, broadcast together.
+    ``shape_px`` (..., 3); ``du_px, dv_px`` (..., P) offsets from the centre, or, for one ellipse,
+    any that broadcast together.
     """
-    m11, m12, m22 = shape_px
+    m11, m12, m22 = _columns(shape_px)
     determinant = m11 * m22 - m12 * m12
     x, y = (m22 * du_px - m12 * dv_px) / determinant, (m11 * dv_px - m12 * du_px) / determinant
     radius = np.sqrt(x * x + y * y) + 1e-12
     slope = np.hypot(m22 * x - m12 * y, m11 * y - m12 * x) / (determinant * radius) + 1e-12
     distance: Array = np.maximum((radius - 1.0) / slope, -0.5 * (m11 + m22))
     return distance
+
+
+def _columns(shape_px: Array) -> tuple[Array, Array, Array]:
+    """Three (..., 1) shape numbers that broadcast with (..., P) pixels."""
+    return shape_px[..., :1], shape_px[..., 1:2], shape_px[..., 2:]
 
 
 def _column_kernel(z: Array, sigma: Array) -> tuple[Array, Array, Array]:
@@ -139,85 +143,113 @@ def _transpose(x: Array) -> Array:
 def foot_points(
     shape_px: Array, du_px: Array, dv_px: Array, *, steps: int = 2
 ) -> tuple[Array, Array]:
-    """Nearest points of an ellipse: (cos t, sin t) with foot = M (cos t, sin t), each (P,).
+    """Nearest points of ellipses: (cos t, sin t) with foot = M (cos t, sin t), each (..., P).
 
-    ``shape_px`` (3,); offsets from the centre (P,). Newton on (p - x(t)) . x'(t) = 0 from the
-    radial start, for points nearer than the smallest radius of curvature. Steps turn the unit
+    ``shape_px`` (..., 3); offsets from the centre (..., P). Newton on (p - x(t)) . x'(t) = 0 from
+    the radial start, for points nearer than the smallest radius of curvature. Steps turn the unit
     vector instead of its angle, which saves the trigonometry.
     """
-    m11, m12, m22 = shape_px
-    determinant = m11 * m22 - m12 * m12
+    m11, m12, m22 = _columns(shape_px)
     c, s = m22 * du_px - m12 * dv_px, m11 * dv_px - m12 * du_px
-    length = np.hypot(c, s)
+    length = np.sqrt(c * c + s * s)
     c = np.where(length > 0.0, c, 1.0)
     shrink = 1.0 / np.where(length > 0.0, length, 1.0)
     c, s = c * shrink, s * shrink
     g11, g12, g22 = m11 * m11 + m12 * m12, m12 * (m11 + m22), m12 * m12 + m22 * m22
+    least = -(m11 * m22 - m12 * m12)
     pu, pv = m11 * du_px + m12 * dv_px, m12 * du_px + m22 * dv_px
     for _ in range(steps):
-        cs, c2 = c * s, c * c
-        value = pv * c - pu * s + (g11 - g22) * cs + g12 * (1.0 - 2.0 * c2)
-        slope = -pu * c - pv * s + (g11 - g22) * (2.0 * c2 - 1.0) + 4.0 * g12 * cs
-        turn = -value / np.where(slope < 0.0, slope, -determinant)
+        cs, cos2 = c * s, 2.0 * c * c - 1.0
+        value = pv * c - pu * s + (g11 - g22) * cs - g12 * cos2
+        slope = (g11 - g22) * cos2 + 4.0 * g12 * cs - pu * c - pv * s
+        turn = -value / np.where(slope < 0.0, slope, least)
         shrink = 1.0 / np.sqrt(1.0 + turn * turn)
         c, s = (c - turn * s) * shrink, (s + turn * c) * shrink
     return c, s
 
 
 def coverage_near_edge(
-    du_px: Array, dv_px: Array, shape_px: Array, sigma_px: float
+    du_px: Array, dv_px: Array, shape_px: Array, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
-    """Coverage (P,) and derivatives (6, P) at offsets from the centre of a large ellipse.
+    """Coverage (..., P) and derivatives (..., 6, P) at offsets (..., P) from ellipses' centres.
 
-    An expansion in curvature times sigma, to second order, in the exact signed distance:
-    F = Phi(-z) - (k s / 2) phi(z) + (3/8) (k s)^2 z phi(z), z = d / s. Good to 1e-4 for
-    k s < 0.08 and to 2e-4 for 0.12 (see :func:`largest_curvature`). By the envelope theorem the
-    distance moves by minus the normal motion of the foot point; the curvature's own change is
-    left out of the derivatives (relative error (k s)^2 / 2). Points deeper than 6 sigma are
-    simply inside: their foot point need not be the nearest one.
+    ``shape_px`` (..., 3), ``sigma_px`` (...). An expansion to third order in the blur over the
+    edge's radius of curvature. With z = d / s the exact signed distance, k the curvature and k''
+    its second derivative along the edge, both in units of s, the edge lies h = k x^2 / 2
+    + k' x^3 / 6 + (k'' + 3 k^3) x^4 / 24 inside its tangent, and F is the mean of Phi(-z - h) over
+    a normal x:
+
+    F = Phi(-z) - (k / 2) phi + (3/8) k^2 z phi - ((k'' + 3 k^3) / 8 + (5/16) k^3 (z^2 - 1)) phi
+
+    Good to 5e-4 for k < 0.25 (see :func:`largest_curvature`); the error is nearly even about the
+    centre, which it moves by 1e-5 px. By the envelope theorem the distance moves by minus the
+    normal motion of the foot point; the curvature's own change is left out of the derivatives
+    (relative error k^2 / 2). Points deeper than 6 sigma are simply inside: their foot point need
+    not be the nearest one.
     """
-    m11, m12, m22 = shape_px
-    deep = approximate_distance_px(shape_px, du_px, dv_px) < -_DEEP_SIGMA * sigma_px
+    m11, m12, m22 = _columns(shape_px)
+    sigma = np.asarray(sigma_px, dtype=np.float64)[..., None]
+    deep = approximate_distance_px(shape_px, du_px, dv_px) < -_DEEP_SIGMA * sigma
     c, s = foot_points(shape_px, du_px, dv_px)
     normal_u, normal_v = m22 * c - m12 * s, m11 * s - m12 * c
-    shrink = 1.0 / np.sqrt(normal_u * normal_u + normal_v * normal_v)
-    normal_u, normal_v = normal_u * shrink, normal_v * shrink
+    speed2 = normal_u * normal_u + normal_v * normal_v
+    shrink = 1.0 / np.sqrt(speed2)
+    normal_u *= shrink
+    normal_v *= shrink
     distance = (du_px - m11 * c - m12 * s) * normal_u + (dv_px - m12 * c - m22 * s) * normal_v
-    bend = (m11 * m22 - m12 * m12) * sigma_px * (shrink * shrink * shrink)
-    z = distance / sigma_px
+    bend, bend_along = _bend(m11, m12, m22, c, s, shrink, sigma)
+    z = distance / sigma
     z2 = z * z
-    density = np.exp(-0.5 * z2) / _ROOT_2PI
+    density = np.exp(-0.5 * z2) * (1.0 / _ROOT_2PI)
     across = normal_u * normal_v
-    fourth = _FOURTH / sigma_px**4 * (1.0 - 2.0 * across * across)
-    third = fourth * z * (z2 - 3.0)
-    half, bend2 = 0.5 * bend, 0.375 * bend * bend
-    coverage = ndtr(-z) + density * (bend2 * z - half + third)
-    by_distance = (
-        density
-        / sigma_px
-        * (half * z - 1.0 + bend2 * (1.0 - z2) - fourth * (z2 * (z2 - 6.0) + 3.0))
+    fourth = _FOURTH / sigma**4 * (1.0 - 2.0 * across * across)
+    pixel = fourth * z * (z2 - 3.0)
+    half, bend2, bend3 = 0.5 * bend, 0.375 * bend * bend, bend * bend * bend
+    even, bowl = 0.125 * bend_along + 0.375 * bend3, 0.3125 * bend3
+    third = even + bowl * (z2 - 1.0)
+    coverage = ndtr(-z) + density * (bend2 * z - half - third + pixel)
+    density /= sigma
+    by_distance = density * (
+        z * (half + even + bowl * (z2 - 3.0))
+        - 1.0
+        + bend2 * (1.0 - z2)
+        - fourth * (z2 * (z2 - 6.0) + 3.0)
     )
-    by_sigma = density / sigma_px * (2.0 * bend2 * z - half - 4.0 * third) - z * by_distance
-    gradient = np.empty((6, *z.shape))
-    np.multiply(by_distance, -normal_u, out=gradient[0])
-    np.multiply(by_distance, -normal_v, out=gradient[1])
-    np.multiply(gradient[0], c, out=gradient[2])
-    gradient[3] = gradient[0] * s + gradient[1] * c
-    np.multiply(gradient[1], s, out=gradient[4])
-    gradient[5] = by_sigma
-    coverage[deep] = 1.0
-    gradient[:, deep] = 0.0
-    return coverage, gradient
+    by_sigma = density * (2.0 * bend2 * z - half - 3.0 * third - 4.0 * pixel) - z * by_distance
+    gradient = np.empty((*z.shape[:-1], 6, z.shape[-1]))
+    centre_u, centre_v = -by_distance * normal_u, -by_distance * normal_v
+    motions = (centre_u, centre_v, centre_u * c, centre_u * s + centre_v * c, centre_v * s)
+    for k, motion in enumerate((*motions, by_sigma)):
+        gradient[..., k, :] = np.where(deep, 0.0, motion)
+    return np.where(deep, 1.0, coverage), gradient
 
 
-def semi_axes(shape_px: Array) -> tuple[float, float]:
-    """Semi-axes (a, b) [px] of one ellipse, as plain numbers."""
-    m11, m12, m22 = shape_px.tolist()
-    mean, half = 0.5 * (m11 + m22), math.hypot(0.5 * (m11 - m22), m12)
+def _bend(
+    m11: Array, m12: Array, m22: Array, c: Array, s: Array, shrink: Array, sigma: Array
+) -> tuple[Array, Array]:
+    """Curvature times sigma, and its second derivative by arc length times sigma^3, at feet.
+
+    ``shrink`` is 1 / |x'(t)|. With q = |x'|^2, k = det / q^(3/2).
+    """
+    g11, g12, g22 = m11 * m11 + m12 * m12, m12 * (m11 + m22), m12 * m12 + m22 * m22
+    cs2, cos2 = 2.0 * c * s, 2.0 * c * c - 1.0
+    slope = (g11 - g22) * cs2 - 2.0 * g12 * cos2
+    second = 2.0 * (g11 - g22) * cos2 + 4.0 * g12 * cs2
+    shrink2 = shrink * shrink
+    bend = (m11 * m22 - m12 * m12) * sigma * (shrink2 * shrink)
+    scaled = sigma * shrink2
+    along = -1.5 * bend * scaled * scaled * (second - 3.0 * slope * slope * shrink2)
+    return bend, along
+
+
+def semi_axes(shape_px: Array) -> tuple[Array, Array]:
+    """Semi-axes a >= b [px], each (...), of (..., 3) shape numbers."""
+    m11, m12, m22 = shape_px[..., 0], shape_px[..., 1], shape_px[..., 2]
+    mean, half = 0.5 * (m11 + m22), np.hypot(0.5 * (m11 - m22), m12)
     return mean + half, mean - half
 
 
-def largest_curvature(shape_px: Array) -> float:
-    """One ellipse's largest curvature a / b^2 [1/px]."""
+def largest_curvature(shape_px: Array) -> Array:
+    """Largest curvature a / b^2 [1/px], (...), of (..., 3) shape numbers."""
     a, b = semi_axes(shape_px)
     return a / (b * b)

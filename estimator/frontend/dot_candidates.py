@@ -174,7 +174,7 @@ def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) 
     for outline, look in shown:
         if look is not None:
             blobs.append(replace(look, label=len(blobs) + 1))
-            _fill(labels, outline, len(blobs))
+            _fill(labels, len(blobs), outline, *look.holes)
     return Candidates(polarity, tuple(blobs), labels)
 
 
@@ -201,10 +201,11 @@ def _with_pieces(shown: list[_Look], above: Grey, min_diameter_px: float) -> lis
     return result
 
 
-def _fill(canvas: NDArray[np.generic], outline: NDArray[np.int32], value: int) -> None:
+def _fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) -> None:
+    """The first outline's inside without that of the others, its holes: they may hold dots."""
     import cv2
 
-    cv2.drawContours(canvas, [outline.reshape(-1, 1, 2)], -1, value, cv2.FILLED)
+    cv2.drawContours(canvas, [o.reshape(-1, 1, 2) for o in outlines], -1, value, cv2.FILLED)
 
 
 def _outlines(
@@ -234,7 +235,7 @@ def _pieces(above: Grey, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
 
     low, high = outline.min(axis=0), outline.max(axis=0) + 1
     filled = np.zeros((high - low)[::-1] + 2, np.uint8)
-    _fill(filled, outline - low + 1, 1)
+    _fill(filled, 1, outline - low + 1)
     if cv2.distanceTransform(filled, cv2.DIST_L2, 3).max() > _PIECE_SEMI_AXIS_PX + 1.0:
         return []
     filled = filled[1:-1, 1:-1]
@@ -292,7 +293,7 @@ def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
 
     low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
     filled = np.zeros((int(size[1]), int(size[0])), np.uint8)
-    _fill(filled, outline - low, 1)
+    _fill(filled, 1, outline - low)
     m = cv2.moments(filled, binaryImage=True)
     area = float(m["m00"])
     variance = (m["mu20"] / area + 1 / 12, m["mu11"] / area, m["mu02"] / area + 1 / 12)

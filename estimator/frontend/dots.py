@@ -7,7 +7,7 @@ uses that as a prior for each dot's own contrast gradient and removes the neighb
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,7 +25,7 @@ from telerig.estimator.frontend.dot_candidates import (
     edge_map,
     find_candidates,
 )
-from telerig.estimator.frontend.dot_types import DotFit, Prior, Start
+from telerig.estimator.frontend.dot_types import DotFit, Prior, Start, Window
 from telerig.estimator.frontend.dot_verdicts import (
     is_ring,
     reason_against_blob,
@@ -38,7 +38,7 @@ from telerig.estimator.frontend.dot_windows import (
     dot_window,
     without_neighbours,
 )
-from telerig.estimator.frontend.luminance import fit_dot
+from telerig.estimator.frontend.luminance_fit import fit_dots
 from telerig.estimator.frontend.noise import (
     NoiseModel,
     agreed_factor,
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _FIRST_SIGMA_PX = 1.0
+_PILOTS = 5
 _FEWEST_PIXELS = 25
 """A first fit that ran out of the image leaves no window for a second one."""
 _ROUNDS = 10
@@ -191,16 +192,28 @@ def _measure(grey: NDArray[np.float32], found: Candidates, noise: NoiseModel) ->
 def _first_pass(
     grey: NDArray[np.float32], found: Candidates, blobs: list[Candidate], noise: NoiseModel
 ) -> list[DotFit]:
-    """Every dot by itself; the blur of the dots so far is where the next one starts."""
-    fits: list[DotFit] = []
-    sigma = _FIRST_SIGMA_PX
-    for blob in blobs:
-        start = Start(blob.centre_px, blob.shape_px, sigma)
-        window = dot_window(grey, found.labels, blob, start, coarse=True)
-        fit = fit_dot(window, start, noise, Prior(), tolerance=0.3, outlier_rounds=1, rough=True)
-        fits.append(fit)
-        sigma = float(np.median([fit.sigma_px for fit in fits[-9:]]))
-    return fits
+    """Every dot by itself; the first ones tell the blur at which the others start."""
+    pilots = _look(grey, found, blobs[:_PILOTS], noise, _FIRST_SIGMA_PX)
+    if len(blobs) <= _PILOTS:
+        return pilots
+    sigma = float(np.median([fit.sigma_px for fit in pilots]))
+    return pilots + _look(grey, found, blobs[_PILOTS:], noise, sigma)
+
+
+def _look(
+    grey: NDArray[np.float32],
+    found: Candidates,
+    blobs: Sequence[Candidate],
+    noise: NoiseModel,
+    sigma: float,
+) -> list[DotFit]:
+    starts = [Start(blob.centre_px, blob.shape_px, sigma) for blob in blobs]
+    windows = [
+        dot_window(grey, found.labels, blob, start, coarse=True)
+        for blob, start in zip(blobs, starts)
+    ]
+    priors = [Prior()] * len(blobs)
+    return fit_dots(windows, starts, noise, priors, tolerance=0.3, outlier_rounds=1)
 
 
 def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel:
@@ -231,22 +244,71 @@ def _second_pass(
     fits = list(fits)
     again: Sequence[int] = range(len(fits))
     for _ in range(_ROUNDS):
-        moved = []
-        for i in again:
-            fit, near = fits[i], neighbours[i]
-            start = Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
-            sure = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
-            window = dot_window(grey, found.labels, blobs[i], start, known=sure)
-            window = without_neighbours(window, [fits[k] for k in near])
-            if np.count_nonzero(window.mask) >= _FEWEST_PIXELS:
-                fits[i] = fit_dot(window, start, noise, priors[i])
-            step = float(np.linalg.norm(fits[i].centre_px - fit.centre_px))
-            if near and step > _SETTLED_SD * np.sqrt(np.trace(fits[i].covariance_px2)):
-                moved.append(i)
+        moved: list[int] = []
+        for some in _apart(again, neighbours):
+            windows = [_alone(grey, found, blobs, fits, i, neighbours[i]) for i in some]
+            moved += _refit(fits, some, windows, noise, priors, neighbours)
         again = sorted({k for i in moved for k in (i, *neighbours[i])})
         if not again:
             break
     return fits
+
+
+def _apart(dots: Sequence[int], neighbours: list[list[int]]) -> Iterator[list[int]]:
+    """Groups of dots that share no pixels, so that those of one may be fitted together."""
+    left = list(dots)
+    while left:
+        group: list[int] = []
+        near: set[int] = set()
+        for i in left:
+            if i not in near:
+                group.append(i)
+                near.update(neighbours[i])
+        yield group
+        left = sorted(set(left) - set(group))
+
+
+def _alone(
+    grey: NDArray[np.float32],
+    found: Candidates,
+    blobs: list[Candidate],
+    fits: list[DotFit],
+    dot: int,
+    near: list[int],
+) -> Window:
+    """A dot's pixels without its neighbours' light."""
+    sure = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
+    window = dot_window(grey, found.labels, blobs[dot], _start(fits[dot]), known=sure)
+    return without_neighbours(window, [fits[k] for k in near])
+
+
+def _start(fit: DotFit) -> Start:
+    return Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
+
+
+def _refit(
+    fits: list[DotFit],
+    dots: list[int],
+    windows: list[Window],
+    noise: NoiseModel,
+    priors: list[Prior],
+    neighbours: list[list[int]],
+) -> list[int]:
+    """Replace those dots' fits; returns those with neighbours whose centres moved."""
+    seen = {
+        i: window
+        for i, window in zip(dots, windows)
+        if np.count_nonzero(window.mask) >= _FEWEST_PIXELS
+    }
+    starts = [_start(fits[i]) for i in seen]
+    found = fit_dots(list(seen.values()), starts, noise, [priors[i] for i in seen])
+    moved = []
+    for i, fit in zip(seen, found):
+        step = float(np.linalg.norm(fit.centre_px - fits[i].centre_px))
+        if neighbours[i] and step > _SETTLED_SD * np.sqrt(np.trace(fit.covariance_px2)):
+            moved.append(i)
+        fits[i] = fit
+    return moved
 
 
 def _dots_table(accepted: list[tuple[Candidate, DotFit]], noise: NoiseModel) -> pd.DataFrame:

@@ -92,7 +92,7 @@ def number_dots(
     if target.layout == "points":
         return _number_points(dots, target, hands)
     points = dots[["u_px", "v_px"]].to_numpy(float)
-    shapes = shape_matrix(dots["a_px"], dots["b_px"], dots["angle_rad"])
+    shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
     ratio = target.pitch_mm[0] / target.pitch_mm[1]
     lattice = grow_lattice(points, shapes, pitch_ratio=ratio)
     ring = dots["ring"].to_numpy(bool) if "ring" in dots else np.zeros(len(dots), bool)
@@ -254,7 +254,7 @@ def _notes(target: Target, candidates: int, ambiguous: bool) -> tuple[str, ...]:
 
 def _number_points(dots: pd.DataFrame, target: Target, hands: tuple[int, ...]) -> Numbering:
     points = dots[["u_px", "v_px"]].to_numpy(float)
-    shapes = shape_matrix(dots["a_px"], dots["b_px"], dots["angle_rad"])
+    shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
     matches = match_points(
         points,
         shapes,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 _LARGEST_ID = 9999
 _FRACTION_BITS = 4
 _SCALE, _LINE_PX, _JPEG_QUALITY = 0.36, 14, 80
+_ENOUGH_PIXELS = 50_000
+"""For the brightness of the picture."""
 
 
 def draw_overlay(
@@ -43,15 +46,15 @@ def draw_overlay(
     _check(image, rejected, ["reason"], "rejected")
     factor = min(1.0, max_width_px / image.shape[1])
     picture = grey_picture(image, factor)
-    numbers = {r: i + 1 for i, r in enumerate(rejected["reason"].value_counts().index)}
+    counts = Counter(rejected["reason"]).most_common()
+    numbers = {reason: i + 1 for i, (reason, _) in enumerate(counts)}
     taken = np.zeros(picture.shape[:2], bool)
     _ellipses(picture, rejected, factor, RED)
     _ellipses(picture, accepted, factor, GREEN)
     _write(picture, accepted, _labels(accepted), factor, GREEN, taken)
     _write(picture, rejected, [str(numbers[r]) for r in rejected["reason"]], factor, RED, taken)
-    counts = rejected["reason"].value_counts()
     lines = [f"{len(accepted)} dots accepted, {len(rejected)} rejected"]
-    lines += [f"{n}: {reason} ({counts[reason]})" for reason, n in numbers.items()]
+    lines += [f"{numbers[reason]}: {reason} ({count})" for reason, count in counts]
     return np.concatenate([picture, legend(lines, picture.shape[1])])
 
 
@@ -94,10 +97,11 @@ def grey_picture(image: NDArray[Any], factor: float, least_contrast: float = 0.0
     grey = np.nan_to_num(image.astype(np.float32))
     if factor < 1:
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    low, high = np.percentile(grey, [0.1, 99.9])
+    stride = 1 + int(np.sqrt(grey.size / _ENOUGH_PIXELS))
+    low, high = np.percentile(grey[::stride, ::stride], [0.1, 99.9]).tolist()
     low = min(low, (1 - least_contrast) * high) if least_contrast > 0 else low
-    stretched = np.clip((grey - low) / max(high - low, 1e-9), 0, 1) * 255
-    return np.repeat(stretched.astype(np.uint8)[..., None], 3, axis=2)
+    stretched = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255)
+    return np.asarray(cv2.cvtColor(stretched.astype(np.uint8), cv2.COLOR_GRAY2RGB), np.uint8)
 
 
 def _labels(accepted: pd.DataFrame) -> list[str]:

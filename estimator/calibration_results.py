@@ -55,6 +55,9 @@ def report_beside(wanted: bool) -> Iterator[Callable[[Path], object] | None]:
 
 
 def _prepare_report() -> None:
+    import pandas  # noqa: F401
+    import scipy.spatial.transform  # noqa: F401
+
     import telerig.io.report.calibration_report  # noqa: F401
     from telerig.io.report.page import prepare_page
 

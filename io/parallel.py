@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -79,7 +80,7 @@ def assistant(prepare: Callable[[], object]) -> Iterator[Callable[..., Any]]:
         yield _call
         return
     ours, theirs = multiprocessing.Pipe()
-    with _without_fork_warning():
+    with _copying():
         process = multiprocessing.get_context("fork").Process(
             target=_assist, args=(ours, theirs, prepare)
         )
@@ -131,16 +132,21 @@ def _call(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _forked(workers: int) -> Pool:
-    with _without_fork_warning():
+    with _copying():
         return multiprocessing.get_context("fork").Pool(workers, initializer=_begin_work)
 
 
 @contextmanager
-def _without_fork_warning() -> Iterator[None]:
-    """Of numerical libraries' own idle threads: they restart in the copy."""
+def _copying() -> Iterator[None]:
+    """No warning of numerical libraries' own idle threads, which restart in the copy; and the
+    copy's garbage collector leaves alone what is here, whose memory it would copy by looking."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        yield
+        gc.freeze()
+        try:
+            yield
+        finally:
+            gc.unfreeze()
 
 
 def _begin_work() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import sys
 from collections.abc import Callable
 from io import TextIOWrapper
@@ -62,6 +64,7 @@ def run() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a pipe that knows no plus-minus sign
+    atexit.register(gc.freeze)  # an ending process need not look through its objects: 0.3 s
     app()
 
 

@@ -74,7 +74,8 @@ def _state(pixels: Pixels, theta: Array, levels: Array, weight: Array | None = N
 
 def _chi2(pixels: Pixels, parameters: Array, residual: Array, weight: Array) -> Array:
     _, gap = prior_rows(pixels, parameters)
-    return np.sum(weight * residual * residual, axis=1) + np.sum(gap * gap, axis=1)
+    chi2: Array = np.sum(weight * residual * residual, axis=1) + np.sum(gap * gap, axis=1)
+    return chi2
 
 
 def _normal_equations(pixels: Pixels, state: _State, dots: Ints) -> tuple[Array, Array]:

@@ -67,17 +67,17 @@ class _System:
 
 def channel_evidence(channel: Channel, model: ShakeModel) -> float:
     """Natural log of the density of the channel's measurements."""
-    return _Factor(channel, model).log_evidence()
+    return Factor(channel, model).log_evidence()
 
 
 def channel_posterior(channel: Channel, model: ShakeModel) -> ChannelPosterior:
     """Evidence and means."""
-    return _Factor(channel, model).posterior()
+    return Factor(channel, model).posterior()
 
 
 def position_sigma(channel: Channel, model: ShakeModel, frames: NDArray[np.int64]) -> Array:
     """(B, n) standard deviation of the moving items' positions at some frames."""
-    return _Factor(channel, model).position_sigma(frames)
+    return Factor(channel, model).position_sigma(frames)
 
 
 def shake_components(channel: Channel, model: ShakeModel) -> list[tuple[Component, int]]:
@@ -157,7 +157,7 @@ def _constants(channel: Channel, model: ShakeModel) -> tuple[Array, Array]:
     return columns, sigma
 
 
-class _Factor:
+class Factor:
     """The Cholesky factor of the states' precision, and the constants' after them."""
 
     def __init__(self, channel: Channel, model: ShakeModel) -> None:
@@ -165,10 +165,10 @@ class _Factor:
 
         self.channel = channel
         self.system = _system(channel, model)
-        steps = _steps(self.system, np.diff(channel.t_s))
+        self.steps = steps = _steps(self.system, np.diff(channel.t_s))
         self.which = np.append(steps.index, len(steps.basis) - 1)
         self.bases = steps.basis
-        weight = channel.weight / model.pixel_inflation**2
+        self.weight = weight = channel.weight / model.pixel_inflation**2
         diagonal, below, self.log_prior = _chain(self.system, steps)
         self.rows = self.system.rows @ self.bases
         size = self.rows.shape[-1]
@@ -188,8 +188,8 @@ class _Factor:
         self.guess = guess
         values = _replicates(channel)
         count = values.shape[-1]
-        rest = values - system.columns @ guess
-        data = np.concatenate([rest, system.columns], -1)
+        self.rest = values - system.columns @ guess
+        data = np.concatenate([self.rest, system.columns], -1)
         weighted = weight[..., None] * data
         right = np.swapaxes(self.rows, -1, -2)[self.which] @ weighted
         self.right = right.reshape(-1, right.shape[-1])
@@ -217,18 +217,45 @@ class _Factor:
         return float(self.count * each - self.square / 2)
 
     def _back(self, half: Array) -> Array:
-        """(F, D, c) states from L^-1 of the right side."""
+        """(F, D, c) states, in the bases, from L^-1 of the right side."""
         from scipy.linalg import lapack
 
         solved, info = lapack.dtbtrs(self.factor, half, uplo="L", trans="T")
         assert info == 0
-        states = solved.reshape(len(self.which), -1, half.shape[1])
-        return np.asarray(self.bases[self.which] @ states)
+        return np.asarray(solved.reshape(len(self.which), -1, half.shape[1]))
+
+    def blocks(self) -> tuple[Array, Array]:
+        """(F, D, D) and (F - 1, D, D): the Cholesky factor's blocks on and below the diagonal."""
+        frames, size = len(self.which), self.rows.shape[-1]
+        band = self.factor.T.reshape(-1)
+        lower, under = np.zeros((2, frames, size, size))
+        view = band.reshape(frames, size, 2 * size)
+        for j in range(size):
+            lower[:, j:, j] = view[:, j, : size - j]
+            under[:, :, j] = view[:, j, size - j : 2 * size - j]
+        return lower, under[:-1]
+
+    def spread(self) -> tuple[Array, Array]:
+        """States (F, K, D), in the bases, and constants (c, K), whose squares add up.
+
+        Over the replicates' posterior means, and what not knowing the constants adds: the second
+        moments are the sum over K, and those of states whose constants are known.
+        """
+        from scipy.linalg import solve_triangular
+
+        first, count = self.half[:, : self.count], self.count
+        by_constant = self.half[:, count:]
+        unit = np.sqrt(count) * np.eye(by_constant.shape[1])
+        off = solve_triangular(self.inner[0], unit, lower=True, trans="T")
+        constants = np.concatenate([self.constants, off], -1)
+        mixed = -by_constant @ constants
+        mixed[:, :count] += first
+        return np.swapaxes(self._back(mixed), -1, -2), constants
 
     def posterior(self) -> ChannelPosterior:
         system, channel = self.system, self.channel
         mixed = self.half[:, 0] - self.half[:, 1:] @ self.constants[:, 0]
-        states = self._back(mixed[:, None])[..., 0]
+        states = (self.bases[self.which] @ self._back(mixed[:, None]))[..., 0]
         movers = np.flatnonzero(channel.moving)
         speed = (self.guess + self.constants)[movers, 0]
         since = channel.t_s - channel.t_s[channel.first[movers], None]
@@ -334,10 +361,10 @@ def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
 
 
 def _banded(diagonal: Array, below: Array) -> Array:
-    """(2 D, F D) lower form of `scipy.linalg.cholesky_banded`."""
+    """(2 D, F D) lower form of `scipy.linalg.cholesky_banded`, a column after the other."""
     frames, size, _ = diagonal.shape
-    out = np.zeros((2 * size, frames, size))
+    out = np.zeros((frames, size, 2 * size))
     for b in range(size):
-        out[: size - b, :, b] = diagonal[:, b:, b].T
-        out[size - b : 2 * size - b, :-1, b] = below[:, :, b].T
-    return out.reshape(2 * size, frames * size)
+        out[:, b, : size - b] = diagonal[:, b:, b]
+        out[:-1, b, size - b : 2 * size - b] = below[:, :, b]
+    return out.reshape(frames * size, 2 * size).T

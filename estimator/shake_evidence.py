@@ -40,6 +40,8 @@ _broad_band, _slow_ou, _ou_velocity = _cached(broad_band), _cached(slow_ou), _ca
 class ChannelPosterior:
     """log_evidence : of the measurements.  position_mm : (B, F) of the moving items, lab, along
     the direction, less their start.  offset_mm : (J, F) of each camera.
+
+    Of a channel of R replicates (B R, F) and (J R, F), those of an item one after the other.
     """
 
     log_evidence: float
@@ -119,6 +121,12 @@ def bubble_components(channel: Channel, model: ShakeModel) -> list[Component]:
         if rms > 0:
             parts.append(_oscillator(rms, z.frequency_hz, z.damping))
     return parts
+
+
+def processes(channel: Channel, model: ShakeModel) -> list[Component]:
+    """Of the shake, then of one bubble. What two models have alike is the same object."""
+    shake = [c for c, _ in shake_components(channel, model)]
+    return shake + (bubble_components(channel, model) if channel.moving.any() else [])
 
 
 def _system(channel: Channel, model: ShakeModel) -> _System:
@@ -253,15 +261,19 @@ class Factor:
         return np.swapaxes(self._back(mixed), -1, -2), constants
 
     def posterior(self) -> ChannelPosterior:
-        system, channel = self.system, self.channel
-        mixed = self.half[:, 0] - self.half[:, 1:] @ self.constants[:, 0]
-        states = (self.bases[self.which] @ self._back(mixed[:, None]))[..., 0]
+        system, channel, count = self.system, self.channel, self.count
+        mixed = self.half[:, :count] - self.half[:, count:] @ self.constants
+        states = self.bases[self.which] @ self._back(mixed)
         movers = np.flatnonzero(channel.moving)
-        speed = (self.guess + self.constants)[movers, 0]
-        since = channel.t_s - channel.t_s[channel.first[movers], None]
-        position = system.position @ states.T + speed[:, None] * since
-        velocity = system.velocity @ states.T + speed[:, None]
-        return ChannelPosterior(self.log_evidence(), position, velocity, system.offset @ states.T)
+        speed = (self.guess + self.constants)[movers, :, None]
+        since = (channel.t_s - channel.t_s[channel.first[movers], None])[:, None]
+        position, velocity, offset = (
+            np.einsum("bd,fdr->brf", row, states, optimize=True)
+            for row in (system.position, system.velocity, system.offset)
+        )
+        found = position + speed * since, velocity + speed, offset
+        frames = len(channel.t_s)
+        return ChannelPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
 
     def position_sigma(self, frames: NDArray[np.int64]) -> Array:
         from scipy.linalg import cho_solve

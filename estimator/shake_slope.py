@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
-from telerig.estimator.shake_evidence import Factor, bubble_components, shake_components
+from telerig.estimator.shake_evidence import Factor, processes, shake_components
 from telerig.estimator.shake_parameters import value_of, with_values
 from telerig.estimator.smoother.model import ShakeModel
 from telerig.factors.measurements import whitener_of
@@ -78,35 +78,29 @@ def channel_slope(
     """The log evidence, as `channel_evidence`, and (n,) its derivatives by log-parameters."""
     factor = Factor(channel, model)
     moments = _moments(factor)
-    processes = _processes(factor, moments, model)
+    found = _processes(factor, moments, model)
     slope = np.zeros(len(names))
     for i, name in enumerate(names):
         if name == "pixel_inflation":
             slope[i] = moments.residual - factor.count * int((channel.weight > 0).sum())
         else:
-            slope[i] = _process_slope(channel, model, name, processes)
+            slope[i] = _process_slope(channel, model, name, found)
     return factor.log_evidence(), slope
 
 
 def _process_slope(
-    channel: Channel, model: ShakeModel, name: str, processes: list[_Process]
+    channel: Channel, model: ShakeModel, name: str, found: list[_Process]
 ) -> float:
     at = value_of(model, name)
     up, down = (
-        _components(channel, with_values(model, [name], [at * np.exp(sign * _DIFFERENCE)]))
+        processes(channel, with_values(model, [name], [at * np.exp(sign * _DIFFERENCE)]))
         for sign in (1, -1)
     )
     total = 0.0
-    for process, above, below in zip(processes, up, down, strict=True):
+    for process, above, below in zip(found, up, down, strict=True):
         if above is not process.component:
             total += process.expected(above) - process.expected(below)
     return total / (2 * _DIFFERENCE)
-
-
-def _components(channel: Channel, model: ShakeModel) -> list[Component]:
-    """Of the shake, and of one bubble; what has not changed is the same object."""
-    shake = [c for c, _ in shake_components(channel, model)]
-    return shake + (bubble_components(channel, model) if channel.moving.any() else [])
 
 
 def _processes(factor: Factor, moments: _Moments, model: ShakeModel) -> list[_Process]:
@@ -116,7 +110,7 @@ def _processes(factor: Factor, moments: _Moments, model: ShakeModel) -> list[_Pr
     dt_s = np.diff(channel.t_s)[first]
     out, at, size = [], 0, len(moments.start)
     shake = len(shake_components(channel, model))
-    parts = _components(channel, model)
+    parts = processes(channel, model)
     movers = int(channel.moving.sum())
     width = sum(c.size for c in parts[shake:])
     for i, part in enumerate(parts):
@@ -139,7 +133,7 @@ def _processes(factor: Factor, moments: _Moments, model: ShakeModel) -> list[_Pr
 def _moments(factor: Factor) -> _Moments:
     steps, count = factor.steps, factor.count
     states, mixed = factor.spread()
-    own, below = _inverse_blocks(factor)
+    own, below = inverse_blocks(factor)
     lengths = len(steps.by_next)
     size = own.shape[-1]
     total = np.zeros((lengths, 2 * size, 2 * size))
@@ -186,7 +180,7 @@ def _residual(factor: Factor, states: Array, constants: Array, own: Array) -> fl
     return square
 
 
-def _inverse_blocks(factor: Factor) -> tuple[Array, Array]:
+def inverse_blocks(factor: Factor) -> tuple[Array, Array]:
     """(F, D, D) and (F - 1, D, D): blocks of the inverse precision on and below the diagonal."""
     from scipy.linalg.lapack import dtrtri
 

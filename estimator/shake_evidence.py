@@ -8,32 +8,22 @@ evidence equals the graph's, channel by channel (see tests/test_shake_learning.p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
+from telerig.estimator.shake_processes import bubble_processes, shake_processes
 from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
 from telerig.factors.measurements import whitener_of
-from telerig.factors.motion import Motion, motion, start
-from telerig.factors.state_space import (
-    Component,
-    block_diagonal,
-    broad_band,
-    driven_mode,
-    oscillator,
-    ou_velocity,
-    slow_ou,
-)
+from telerig.factors.motion import Motion, start
+from telerig.factors.motion_stack import stacked_motion
+from telerig.factors.state_space import Component, slow_ou
 
 Array = NDArray[np.float64]
 
 _STILL_MM = 1e-6
 
-_cached = lru_cache(maxsize=512)
-_oscillator, _driven_mode = _cached(oscillator), _cached(driven_mode)
-_broad_band, _slow_ou, _ou_velocity = _cached(broad_band), _cached(slow_ou), _cached(ou_velocity)
 
 
 @dataclass(frozen=True)
@@ -82,57 +72,11 @@ def position_sigma(channel: Channel, model: ShakeModel, frames: NDArray[np.int64
     return Factor(channel, model).position_sigma(frames)
 
 
-def shake_components(channel: Channel, model: ShakeModel) -> list[tuple[Component, int]]:
-    """The shake's processes along the channel's direction, with the camera (CARRIAGE: all)."""
-    out: list[tuple[Component, int]] = []
-    if not channel.shaken:
-        return out
-    for mode in model.modes:
-        rms = _along(channel, mode.rms_mm, mode.camera)
-        if rms > 0:
-            if mode.force_hz is None:
-                part = _oscillator(rms, mode.frequency_hz, mode.damping)
-            else:
-                part = _driven_mode(rms, mode.frequency_hz, mode.damping, force_hz=mode.force_hz)
-            out.append((part, mode.camera))
-    for band in model.broad_bands:
-        rms = _along(channel, band.rms_mm, band.camera)
-        if rms > 0:
-            part = _broad_band(rms, low_hz=band.low_hz, high_hz=band.high_hz)
-            out.append((part, band.camera))
-            if band.slow_rms_mm > 0:
-                out.append((_slow_ou(band.slow_rms_mm, band.slow_tau_s), band.camera))
-    return out
-
-
-def _along(channel: Channel, rms_mm: tuple[float, float, float], camera: int) -> float:
-    if camera != CARRIAGE and camera not in channel.cameras:
-        return 0.0
-    return float(np.linalg.norm(channel.direction * np.asarray(rms_mm)))
-
-
-def bubble_components(channel: Channel, model: ShakeModel) -> list[Component]:
-    """The processes of a bubble along the channel's direction."""
-    bubble, share = model.bubble, 1 / np.sqrt(channel.pooled)
-    sigma, begin = share * bubble.velocity_sigma_mm_s, share * bubble.start_sigma_mm
-    parts = [_ou_velocity(sigma, bubble.velocity_tau_s, start_sigma_mm=begin)]
-    for z in bubble.zigzags:
-        rms = float(share * np.linalg.norm(channel.direction * np.asarray(z.rms_mm)))
-        if rms > 0:
-            parts.append(_oscillator(rms, z.frequency_hz, z.damping))
-    return parts
-
-
-def processes(channel: Channel, model: ShakeModel) -> list[Component]:
-    """Of the shake, then of one bubble. What two models have alike is the same object."""
-    shake = [c for c, _ in shake_components(channel, model)]
-    return shake + (bubble_components(channel, model) if channel.moving.any() else [])
-
-
 def _system(channel: Channel, model: ShakeModel) -> _System:
-    shake, bubble = shake_components(channel, model), bubble_components(channel, model)
+    shake = [(p.component, p.camera) for p in shake_processes(channel, model)]
+    bubble = [p.component for p in bubble_processes(channel, model)]
     if not shake and not channel.moving.any():
-        shake = [(_slow_ou(_STILL_MM, 1.0), CARRIAGE)]
+        shake = [(slow_ou(_STILL_MM, 1.0), CARRIAGE)]
     parts = [c for c, _ in shake] + bubble * int(channel.moving.sum())
     size, shaken = sum(c.size for c in parts), sum(c.size for c, _ in shake)
     offset = np.zeros((len(channel.cameras), size))
@@ -173,7 +117,7 @@ class Factor:
 
         self.channel = channel
         self.system = _system(channel, model)
-        self.steps = steps = _steps(self.system, np.diff(channel.t_s))
+        self.steps = steps = stacked_motion(self.system.components, np.diff(channel.t_s))
         self.which = np.append(steps.index, len(steps.basis) - 1)
         self.bases = steps.basis
         self.weight = weight = channel.weight / model.pixel_inflation**2
@@ -327,25 +271,6 @@ def _fitted(channel: Channel, system: _System, weight: Array) -> Array:
         if spread > 0:
             out[item] = (w * off) @ mean / spread
     return out
-
-
-def _steps(system: _System, dt_s: Array) -> Motion:
-    """`motion` of all components; what stays between two calls is not worked out again."""
-    key = dt_s.tobytes()
-    parts = [_one(component, key) for component in system.components]
-    return Motion(
-        block_diagonal([p.by_last for p in parts]),
-        block_diagonal([p.by_next for p in parts]),
-        block_diagonal([p.by_input for p in parts]),
-        np.sum([p.log_det for p in parts], 0),
-        block_diagonal([p.basis for p in parts]),
-        parts[0].index,
-    )
-
-
-@lru_cache(maxsize=512)
-def _one(component: Component, dt_s: bytes) -> Motion:
-    return motion([component], np.frombuffer(dt_s))
 
 
 def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel, channels_of, contrasts, pooled
-from telerig.estimator.shake_evidence import channel_posterior, processes
+from telerig.estimator.shake_evidence import channel_posterior
 from telerig.estimator.shake_parameters import value_of, with_values
+from telerig.estimator.shake_processes import processes
 from telerig.estimator.smoother.model import ShakeModel
 from telerig.estimator.smoother.solve import Covariances, Solution
 

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
-from telerig.estimator.shake_evidence import Factor, processes, shake_components
-from telerig.estimator.shake_parameters import value_of, with_values
+from telerig.estimator.shake_evidence import Factor
+from telerig.estimator.shake_processes import Process, bubble_processes, shake_processes
 from telerig.estimator.smoother.model import ShakeModel
-from telerig.factors.measurements import whitener_of
-from telerig.factors.state_space import Component, Steps, discretise
+from telerig.factors.motion_stack import lengths_of, stacks
+from telerig.factors.state_space import Component
 
 Array = NDArray[np.float64]
 
@@ -43,33 +43,16 @@ class _Moments:
 
 
 @dataclass(frozen=True)
-class _Process:
-    """One process of the channel, or several alike: ``copies`` of them.
+class _Change:
+    """A process with one hyper-parameter moved.
 
-    steps : of ``component``.  counts : (U,) steps of each length, ``dt_s`` (U,).
-    moments, start : (U, 2 n, 2 n), (n, n) as `_Moments`, summed over the copies.
+    process : place among the channel's.  name : index into the names.  sign : up or down.
     """
 
+    process: int
+    name: int
+    sign: int
     component: Component
-    steps: Steps
-    dt_s: Array
-    counts: Array
-    moments: Array
-    start: Array
-    copies: int
-
-    def expected(self, component: Component) -> float:
-        """Posterior mean of the states' log density were they a process like ``component``."""
-        steps, last = discretise(component, self.dt_s), self.steps
-        turned = np.swapaxes(last.whitener, -1, -2)
-        fresh = np.swapaxes(np.linalg.solve(turned, np.swapaxes(steps.whitener, -1, -2)), -1, -2)
-        moved = steps.whitener @ (last.transition - steps.transition)
-        rows = np.concatenate([fresh, moved], -1)
-        first = whitener_of(component.start_covariance)
-        square = float(np.sum((rows @ self.moments) * rows))
-        square += float(np.sum((first @ self.start) * first))
-        log_det = float(self.counts @ steps.log_det + np.log(np.diag(first)).sum())
-        return self.copies * log_det - square / 2
 
 
 def channel_slope(
@@ -78,55 +61,74 @@ def channel_slope(
     """The log evidence, as `channel_evidence`, and (n,) its derivatives by log-parameters."""
     factor = Factor(channel, model)
     moments = _moments(factor)
-    found = _processes(factor, moments, model)
     slope = np.zeros(len(names))
-    for i, name in enumerate(names):
-        if name == "pixel_inflation":
-            slope[i] = moments.residual - factor.count * int((channel.weight > 0).sum())
-        else:
-            slope[i] = _process_slope(channel, model, name, found)
+    if "pixel_inflation" in names:
+        seen = factor.count * int((channel.weight > 0).sum())
+        slope[names.index("pixel_inflation")] = moments.residual - seen
+    shake, bubble = shake_processes(channel, model), bubble_processes(channel, model)
+    changes = _changes([*shake, *bubble], names)
+    if changes:
+        expected = _expected(factor, moments, shake, bubble, changes)
+        for change, value in zip(changes, expected):
+            slope[change.name] += change.sign * value / (2 * _DIFFERENCE)
     return factor.log_evidence(), slope
 
 
-def _process_slope(
-    channel: Channel, model: ShakeModel, name: str, found: list[_Process]
-) -> float:
-    at = value_of(model, name)
-    up, down = (
-        processes(channel, with_values(model, [name], [at * np.exp(sign * _DIFFERENCE)]))
+def _changes(found: list[Process], names: Sequence[str]) -> list[_Change]:
+    where = {name: i for i, name in enumerate(names)}
+    return [
+        _Change(i, where[f"{p.stem}.{last}"], sign, p.moved(last, np.exp(sign * _DIFFERENCE)))
+        for i, p in enumerate(found)
+        for last in p.learned
+        if f"{p.stem}.{last}" in where
         for sign in (1, -1)
-    )
-    total = 0.0
-    for process, above, below in zip(found, up, down, strict=True):
-        if above is not process.component:
-            total += process.expected(above) - process.expected(below)
-    return total / (2 * _DIFFERENCE)
+    ]
 
 
-def _processes(factor: Factor, moments: _Moments, model: ShakeModel) -> list[_Process]:
-    channel = factor.channel
-    lengths, first, counts = np.unique(factor.steps.index, return_index=True, return_counts=True)
-    assert len(lengths) == len(factor.steps.by_next)
-    dt_s = np.diff(channel.t_s)[first]
-    out, at, size = [], 0, len(moments.start)
-    shake = len(shake_components(channel, model))
-    parts = processes(channel, model)
-    movers = int(channel.moving.sum())
-    width = sum(c.size for c in parts[shake:])
-    for i, part in enumerate(parts):
-        copies = 1 if i < shake else movers
+def _expected(
+    factor: Factor,
+    moments: _Moments,
+    shake: list[Process],
+    bubble: list[Process],
+    changes: list[_Change],
+) -> Array:
+    """(changes,) posterior mean of the states' log density, were a process like the change's."""
+    dt_s, index = lengths_of(np.diff(factor.channel.t_s).tobytes())
+    counts = np.bincount(index, minlength=len(dt_s))
+    own = [p.component for p in (*shake, *bubble)]
+    begin = np.r_[0, np.cumsum([c.size for c in own])]
+    movers = int(factor.channel.moving.sum())
+    copies = np.repeat([1, movers], [len(shake), len(bubble)])
+    width = begin[-1] - begin[len(shake)]
+    size = len(moments.start)
+    out = np.zeros(len(changes))
+    for stack in stacks([*own, *(c.component for c in changes)], dt_s):
+        place = {w: i for i, w in enumerate(stack.which.tolist())}
+        mine = [i for i in range(len(changes)) if len(own) + i in place]
+        if not mine:
+            continue
+        new = np.array([place[len(own) + i] for i in mine])
+        which = np.array([changes[i].process for i in mine])
+        old = np.array([place[w] for w in which])
         step, start = 0.0, 0.0
-        for k in range(copies):
-            mine = np.arange(at, at + part.size) + k * width
-            both = np.r_[mine, size + mine]
-            step = step + moments.step[:, both[:, None], both]
-            start = start + moments.start[mine[:, None], mine]
-        at += part.size
-        steps = discretise(part, dt_s)
-        alike = factor.count * copies
-        out.append(
-            _Process(part, steps, dt_s, counts, np.asarray(step), np.asarray(start), alike)
+        states = np.arange(stack.start.shape[-1])
+        for k in range(max(copies)):
+            at = begin[which][:, None] + states + np.where(copies[which] > k, k, 0)[:, None] * width
+            used = (copies[which] > k)[:, None, None]
+            both = np.concatenate([at, size + at], -1)
+            step = step + used[:, None] * np.moveaxis(
+                moments.step[:, both[:, :, None], both[:, None]], 0, 1
+            )
+            start = start + used * moments.start[at[:, :, None], at[:, None]]
+        fresh = np.linalg.solve(
+            np.swapaxes(stack.whitener[old], -1, -2), np.swapaxes(stack.whitener[new], -1, -2)
         )
+        moved = stack.whitener[new] @ (stack.transition[old] - stack.transition[new])
+        rows = np.concatenate([np.swapaxes(fresh, -1, -2), moved], -1)
+        square = ((rows @ step) * rows).sum((1, 2, 3))
+        square += ((stack.start[new] @ start) * stack.start[new]).sum((1, 2))
+        log_det = stack.log_det[new] @ counts + stack.start_log_det[new]
+        out[mine] = factor.count * copies[which] * log_det - square / 2
     return out
 
 

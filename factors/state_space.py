@@ -283,12 +283,12 @@ def discretise(component: Component, dt_s: ArrayLike) -> Steps:
 
 
 def _steps(transition: Array, gain: Array, q: Array, index: NDArray[np.int64]) -> Steps:
-    whitener = _inverse_root(q)
+    whitener = inverse_root(q)
     log_det = np.log(np.diagonal(whitener, axis1=-2, axis2=-1)).sum(-1)
     return Steps(transition, gain, q, whitener, log_det, index.ravel())
 
 
-def _inverse_root(covariance: Array) -> Array:
+def inverse_root(covariance: Array) -> Array:
     """(..., n, n) lower W with W C W^T = 1, scaled so that small variances keep their digits."""
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     scaled = covariance / sigma[..., :, None] / sigma[..., None, :]
@@ -305,7 +305,7 @@ def elimination_basis(component: Component, steps: Steps) -> Array:
     pivots of a forward elimination are of order one, as Cholesky in double precision asks for.
     """
     prior = np.broadcast_to(
-        _inverse_root(component.start_covariance), (len(steps.whitener) + 1, *component.drift.shape)
+        inverse_root(component.start_covariance), (len(steps.whitener) + 1, *component.drift.shape)
     )
     ahead = np.zeros_like(prior)
     ahead[:-1] = steps.whitener @ steps.transition
@@ -319,25 +319,34 @@ def _exact(component: Component, dt: Array) -> tuple[Array, Array, Array]:
     drift = np.zeros((n + k, n + k))
     drift[:n, :n], drift[:n, n:] = component.drift, component.input
     noise = np.vstack([component.noise, np.zeros((k, component.noise.shape[1]))])
-    rate = np.max(np.abs(np.linalg.eigvals(drift)), initial=0.0)
-    doublings = np.ceil(np.log2(np.maximum(rate * dt / _SHORT, 1.0))).astype(int)
-    transition, q = _short_step(drift, noise, dt / 2.0**doublings)
+    transition, q = exact_steps(drift, noise, dt)
+    return transition[:, :n, :n], transition[:, :n, n:], q[:, :n, :n]
+
+
+def exact_steps(drift: Array, noise: Array, dt_s: Array) -> tuple[Array, Array]:
+    """Transitions and covariances (M, n, n) of steps dt_s (M,), of one process or one each.
+
+    drift : (n, n) or (M, n, n), noise : (n, m) or (M, n, m), of the same `integrations` then.
+    """
+    rate = np.abs(np.linalg.eigvals(drift)).max(-1, initial=0.0)
+    doublings = np.ceil(np.log2(np.maximum(rate * dt_s / _SHORT, 1.0))).astype(int)
+    transition, q = _short_step(drift, noise, dt_s / 2.0**doublings)
     for step in range(int(doublings.max(initial=0))):
         more = doublings > step
         phi = transition[more]
         q[more] += phi @ q[more] @ np.swapaxes(phi, -1, -2)
         transition[more] = phi @ phi
-    q = (q + np.swapaxes(q, -1, -2)) / 2
-    return transition[:, :n, :n], transition[:, :n, n:], q[:, :n, :n]
+    return transition, (q + np.swapaxes(q, -1, -2)) / 2
 
 
 def _short_step(drift: Array, noise: Array, h: Array) -> tuple[Array, Array]:
     """Van Loan's exponential by its series, states scaled by the powers of h they grow with."""
-    n = len(drift)
-    scale = h[:, None] ** _orders(drift, noise)
+    n = drift.shape[-1]
+    one = (0,) * (drift.ndim - 2)
+    scale = h[:, None] ** integrations(drift[one], noise[one])
     ratio = scale[:, None, :] / scale[:, :, None]
     f = drift * h[:, None, None] * ratio
-    q = noise @ noise.T * h[:, None, None] / scale[:, :, None] / scale[:, None, :]
+    q = noise @ np.swapaxes(noise, -1, -2) * h[:, None, None] / scale[:, :, None] / scale[:, None, :]
     block = np.zeros((len(h), 2 * n, 2 * n))
     block[:, :n, :n], block[:, :n, n:], block[:, n:, n:] = -f, q, np.swapaxes(f, -1, -2)
     total = np.broadcast_to(np.eye(2 * n), block.shape).copy()
@@ -350,7 +359,7 @@ def _short_step(drift: Array, noise: Array, h: Array) -> tuple[Array, Array]:
     return phi / ratio, covariance * scale[:, :, None] * scale[:, None, :]
 
 
-def _orders(drift: Array, noise: Array) -> Array:
+def integrations(drift: Array, noise: Array) -> Array:
     """(n,) how many integrations lie between the white noise and each state."""
     orders = np.full(len(drift), np.nan)
     reached = np.abs(noise).sum(1)

@@ -1,17 +1,18 @@
-"""Marginal likelihood and posterior of one channel, from a banded Cholesky factor.
+"""Marginal likelihood and posterior of one channel, from the Cholesky factor of its chain.
 
-The precision of a chain of states is block-tridiagonal: LAPACK's `pbtrf` takes it in time linear
-in the frames. Constants (mean velocities, places of marks) are eliminated after the chain. The
+The precision of a chain of states is block-tridiagonal, eliminated frame by frame. Constants (mean velocities, places of marks) are eliminated after the chain. The
 evidence equals the graph's, channel by channel (see tests/test_shake_learning.py).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.shake_chain import eliminated
 from telerig.estimator.shake_channels import Channel
 from telerig.estimator.shake_processes import bubble_processes, shake_processes
 from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
@@ -110,109 +111,82 @@ def _constants(channel: Channel, model: ShakeModel) -> tuple[Array, Array]:
 
 
 class Factor:
-    """The Cholesky factor of the states' precision, and the constants' after them."""
+    """The Cholesky factor of the states' precision, and the constants' after them.
+
+    which : (F,) of each frame among ``bases``, (U + 1, D, D) in which its states are.
+    rows : (U + 1, P, D).  rest : (F, P, R) measured less ``guess``.  constants : (c, R).
+    """
 
     def __init__(self, channel: Channel, model: ShakeModel) -> None:
-        from scipy.linalg import cholesky_banded
-
         self.channel = channel
-        self.system = _system(channel, model)
-        self.steps = steps = stacked_motion(self.system.components, np.diff(channel.t_s))
+        self.system = system = _system(channel, model)
+        self.steps = steps = stacked_motion(system.components, np.diff(channel.t_s))
         self.which = np.append(steps.index, len(steps.basis) - 1)
         self.bases = steps.basis
         self.weight = weight = channel.weight / model.pixel_inflation**2
-        diagonal, below, self.log_prior = _chain(self.system, steps)
-        self.rows = self.system.rows @ self.bases
-        size = self.rows.shape[-1]
-        for basis, rows in enumerate(self.rows):
-            mine = self.which == basis
-            outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
-            diagonal[mine] += (weight[mine] @ outer).reshape(-1, size, size)
-        band = _banded(diagonal, below)
-        self.factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
-        self._eliminate(weight)
-
-    def _eliminate(self, weight: Array) -> None:
-        from scipy.linalg import cho_factor
-
-        channel, system = self.channel, self.system
-        guess = _fitted(channel, system, weight)
-        self.guess = guess
-        values = _replicates(channel)
-        count = values.shape[-1]
-        self.rest = values - system.columns @ guess
+        self.rows = system.rows @ self.bases
+        self.guess = _fitted(channel, system, weight)
+        self.rest = _replicates(channel) - system.columns @ self.guess
+        self.count = self.rest.shape[-1]
         data = np.concatenate([self.rest, system.columns], -1)
         weighted = weight[..., None] * data
-        right = np.swapaxes(self.rows, -1, -2)[self.which] @ weighted
-        self.right = right.reshape(-1, right.shape[-1])
-        self.half = _solve_half(self.factor, self.right)
+        own, following, self.log_prior = _chain(system, steps)
+        sides = np.empty((len(own), data.shape[-1], own.shape[-1]))
+        for basis, mine in runs(self.which):
+            rows = self.rows[basis]
+            outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+            own[mine] += (weight[mine] @ outer).reshape(-1, *own.shape[1:])
+            sides[mine] = np.swapaxes(weighted[mine], -1, -2) @ rows
+        self.chain = eliminated(own, following, sides)
         wide = data.shape[-1]
-        square = data.reshape(-1, wide).T @ weighted.reshape(-1, wide) - self.half.T @ self.half
-        prior = 1 / system.prior_sigma**2
-        inner = square[count:, count:] + np.diag(prior)
-        self.inner = cho_factor(inner, lower=True)
-        linear = square[count:, :count] - prior[:, None] * guess
-        from scipy.linalg import cho_solve
+        self._fix_constants(data.reshape(-1, wide).T @ weighted.reshape(-1, wide))
 
+    def _fix_constants(self, square: Array) -> None:
+        """square : (R + c, R + c) of measurements and columns."""
+        from scipy.linalg import cho_factor, cho_solve
+
+        count, prior = self.count, 1 / self.system.prior_sigma**2
+        half = np.swapaxes(self.chain.sides, 0, 1).reshape(len(square), -1)
+        square = square - half @ half.T
+        self.inner = cho_factor(square[count:, count:] + np.diag(prior), lower=True)
+        linear = square[count:, :count] - prior[:, None] * self.guess
         self.constants = cho_solve(self.inner, linear)
-        self.square = float(np.trace(square[:count, :count]) + (prior @ guess**2).sum())
+        self.square = float(np.trace(square[:count, :count]) + (prior @ self.guess**2).sum())
         self.square -= float((linear * self.constants).sum())
-        self.count = count
-        used = weight > 0
-        self.log_noise = 0.5 * float(np.log(weight[used] / (2 * np.pi)).sum())
 
     def log_evidence(self) -> float:
-        log_chain = float(np.log(self.factor[0]).sum())
+        used = self.weight[self.weight > 0]
+        log_noise = 0.5 * float(np.log(used / (2 * np.pi)).sum())
         log_inner = float(np.log(np.diag(self.inner[0])).sum())
         log_sigma = float(np.log(self.system.prior_sigma).sum())
-        each = self.log_noise + self.log_prior - log_chain - log_inner - log_sigma
+        each = log_noise + self.log_prior - self.chain.log_det() - log_inner - log_sigma
         return float(self.count * each - self.square / 2)
 
-    def _back(self, half: Array) -> Array:
-        """(F, D, c) states, in the bases, from L^-1 of the right side."""
-        from scipy.linalg import lapack
-
-        solved, info = lapack.dtbtrs(self.factor, half, uplo="L", trans="T")
-        assert info == 0
-        return np.asarray(solved.reshape(len(self.which), -1, half.shape[1]))
-
-    def blocks(self) -> tuple[Array, Array]:
-        """(F, D, D) and (F - 1, D, D): the Cholesky factor's blocks on and below the diagonal."""
-        frames, size = len(self.which), self.rows.shape[-1]
-        band = self.factor.T.reshape(-1)
-        lower, under = np.zeros((2, frames, size, size))
-        view = band.reshape(frames, size, 2 * size)
-        for j in range(size):
-            lower[:, j:, j] = view[:, j, : size - j]
-            under[:, :, j] = view[:, j, size - j : 2 * size - j]
-        return lower, under[:-1]
-
     def spread(self) -> tuple[Array, Array]:
-        """States (F, K, D), in the bases, and constants (c, K), whose squares add up.
+        """Right sides (F, K, D) of states, and constants (c, K), whose squares add up.
 
         Over the replicates' posterior means, and what not knowing the constants adds: the second
         moments are the sum over K, and those of states whose constants are known.
         """
         from scipy.linalg import solve_triangular
 
-        first, count = self.half[:, : self.count], self.count
-        by_constant = self.half[:, count:]
-        unit = np.sqrt(count) * np.eye(by_constant.shape[1])
+        count, size = self.count, len(self.constants)
+        unit = np.sqrt(count) * np.eye(size)
         off = solve_triangular(self.inner[0], unit, lower=True, trans="T")
         constants = np.concatenate([self.constants, off], -1)
-        mixed = -by_constant @ constants
-        mixed[:, :count] += first
-        return np.swapaxes(self._back(mixed), -1, -2), constants
+        sides = -constants.T @ self.chain.sides[:, count:]
+        sides[:, :count] += self.chain.sides[:, :count]
+        return sides, constants
 
     def posterior(self) -> ChannelPosterior:
         system, channel, count = self.system, self.channel, self.count
-        mixed = self.half[:, :count] - self.half[:, count:] @ self.constants
-        states = self.bases[self.which] @ self._back(mixed)
+        states = self.chain.means(self.spread()[0][:, :count])
+        states = states @ np.swapaxes(self.bases, -1, -2)[self.which]
         movers = np.flatnonzero(channel.moving)
         speed = (self.guess + self.constants)[movers, :, None]
         since = (channel.t_s - channel.t_s[channel.first[movers], None])[:, None]
         position, velocity, offset = (
-            np.einsum("bd,fdr->brf", row, states, optimize=True)
+            np.einsum("bd,frd->brf", row, states, optimize=True)
             for row in (system.position, system.velocity, system.offset)
         )
         found = position + speed * since, velocity + speed, offset
@@ -220,31 +194,25 @@ class Factor:
         return ChannelPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
 
     def position_sigma(self, frames: NDArray[np.int64]) -> Array:
-        from scipy.linalg import cho_solve
-
         system, channel = self.system, self.channel
-        movers, size = np.flatnonzero(channel.moving), self.system.rows.shape[1]
-        count = len(movers) * len(frames)
-        unit = np.zeros((len(self.right), count))
-        by_constant = np.zeros((count, len(channel.moving)))
-        for k, item in enumerate(movers):
-            for i, f in enumerate(frames):
-                column = k * len(frames) + i
-                row = system.position[k] @ self.bases[self.which[f]]
-                unit[f * size : (f + 1) * size, column] = row
-                by_constant[column, item] = channel.t_s[f] - channel.t_s[channel.first[item]]
-        half = _solve_half(self.factor, unit)
-        rest = by_constant - half.T @ self.half[:, 1:]
-        variance = (half**2).sum(0) + (rest * cho_solve(self.inner, rest.T).T).sum(-1)
-        return np.asarray(np.sqrt(variance)).reshape(len(movers), len(frames))
+        movers = np.flatnonzero(channel.moving)
+        sides, constants = self.spread()
+        mean, own, _ = self.chain.moments(sides[:, self.count :])
+        since = (channel.t_s - channel.t_s[channel.first[movers], None])[:, frames, None]
+        rows = system.position @ self.bases[self.which[frames]]
+        by_constant = np.einsum("fbd,fkd->bfk", rows, mean[frames])
+        by_constant += since * constants[movers, None, self.count :]
+        variance = np.einsum("fbd,fde,fbe->bf", rows, own[frames], rows, optimize=True)
+        return np.asarray(np.sqrt(variance + (by_constant**2).sum(-1)))
 
 
-def _solve_half(factor: Array, right: Array) -> Array:
-    from scipy.linalg import lapack
-
-    solved, info = lapack.dtbtrs(factor, right, uplo="L")
-    assert info == 0
-    return np.asarray(solved)
+def runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice | NDArray[np.int64]]]:
+    """Each value of an index with where it stands, as a slice where that is one stretch."""
+    order = np.argsort(index, kind="stable")
+    values, first = np.unique(index[order], return_index=True)
+    for value, mine in zip(values.tolist(), np.split(order, first[1:])):
+        whole = mine[-1] - mine[0] + 1 == len(mine)
+        yield value, slice(int(mine[0]), int(mine[-1]) + 1) if whole else mine
 
 
 def _replicates(channel: Channel) -> Array:
@@ -295,13 +263,3 @@ def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
     log_det = float(np.log(np.abs(np.diag(whitener))).sum() + steps.log_det[steps.index].sum())
     each = np.linalg.slogdet(steps.basis)[1]
     return diagonal, (forward @ last)[place], log_det + float(each[which].sum())
-
-
-def _banded(diagonal: Array, below: Array) -> Array:
-    """(2 D, F D) lower form of `scipy.linalg.cholesky_banded`, a column after the other."""
-    frames, size, _ = diagonal.shape
-    out = np.zeros((frames, size, 2 * size))
-    for b in range(size):
-        out[:, b, : size - b] = diagonal[:, b:, b]
-        out[:-1, b, size - b : 2 * size - b] = below[:, :, b]
-    return out.reshape(frames * size, 2 * size).T

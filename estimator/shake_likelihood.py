@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from telerig.estimator.shake_channels import Channel
 from telerig.estimator.shake_evidence import channel_evidence
 from telerig.estimator.shake_parameters import log_prior, prior_of, value_of, with_values
+from telerig.estimator.shake_processes import tells_of
 from telerig.estimator.shake_slope import channel_slope
 from telerig.estimator.smoother.model import ShakeModel
 
@@ -46,7 +47,7 @@ def evidence_slope(
         each = [channel_slope(c, model, names) for c in channels]
     except np.linalg.LinAlgError:
         return _IMPOSSIBLE, np.zeros(len(names))
-    total, slope = float(sum(e for e, _ in each)), np.sum([s for _, s in each], 0)
+    total, slope = float(sum(e for e, _ in each)), sum((s for _, s in each), np.zeros(len(names)))
     if not (np.isfinite(total) and np.all(np.isfinite(slope))):
         return _IMPOSSIBLE, np.zeros(len(names))
     return total, slope
@@ -76,12 +77,15 @@ def maximise(
     bounds = [(float(np.log(p.low) / s), float(np.log(p.high) / s)) for p, s in zip(priors, scale)]
     start: Array = np.log([value_of(model, n) for n in names]) / scale
 
+    moving = [c for c in channels if tells_of(c, model, names)]
+    still = evidence([c for c in channels if all(c is not m for m in moving)], model)
+
     def at(x: Array) -> ShakeModel:
         return with_values(model, names, np.exp(x * scale).tolist())
 
     def cost(x: Array) -> tuple[float, Array]:
-        value, slope = _posterior_slope(channels, at(x), names)
-        return -value, -slope * scale
+        value, slope = _posterior_slope(moving, at(x), names)
+        return -value - still, -slope * scale
 
     options: Any = {"maxiter": steps, "ftol": 1e-6, "gtol": 3e-2}
     low, high = np.array(bounds).T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -112,3 +112,10 @@ def processes(channel: Channel, model: ShakeModel) -> list[Component]:
     """Of the shake, then of one bubble. What two models have alike is the same object."""
     found = shake_processes(channel, model) + bubble_processes(channel, model)
     return [p.component for p in found]
+
+
+def tells_of(channel: Channel, model: ShakeModel, names: Sequence[str]) -> bool:
+    """Whether the channel's evidence depends on any of these hyper-parameters."""
+    found = shake_processes(channel, model) + bubble_processes(channel, model)
+    known = {f"{p.stem}.{last}" for p in found for last in p.learned}
+    return "pixel_inflation" in names or not known.isdisjoint(names)

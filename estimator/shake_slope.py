@@ -4,8 +4,7 @@ Fisher's identity: the derivative of the log evidence is the posterior mean of t
 log density of states and measurements together (Cappe, Moulines, Ryden, Inference in Hidden Markov
 Models, 2005, sec. 10.1.3). That density is a sum over independent processes, each a function of its
 own few states: second moments of these, summed over the frames, are all that is needed of the
-posterior. They come from the blocks of the inverse of the banded precision beside its diagonal
-(Takahashi's recursion); what a parameter does to a process of two or four states is cheap.
+posterior (see `shake_chain`); what a parameter does to a process of two or four states is cheap.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
-from telerig.estimator.shake_evidence import Factor
+from telerig.estimator.shake_evidence import Factor, runs
 from telerig.estimator.shake_processes import Process, bubble_processes, shake_processes
 from telerig.estimator.smoother.model import ShakeModel
 from telerig.factors.motion_stack import lengths_of, stacks
@@ -134,16 +133,12 @@ def _expected(
 
 def _moments(factor: Factor) -> _Moments:
     steps, count = factor.steps, factor.count
-    states, mixed = factor.spread()
-    own, below = inverse_blocks(factor)
-    lengths = len(steps.by_next)
-    size = own.shape[-1]
+    sides, constants = factor.spread()
+    states, own, below = factor.chain.moments(sides)
+    lengths, size = len(steps.by_next), own.shape[-1]
     total = np.zeros((lengths, 2 * size, 2 * size))
-    kinds = steps.index * (lengths + 1) + factor.which[1:]
-    for kind in np.unique(kinds):
-        step, after = divmod(int(kind), lengths + 1)
-        mine = np.flatnonzero(kinds == kind)
-        some = slice(mine[0], mine[-1] + 1) if len(mine) == np.ptp(mine) + 1 else mine
+    for kind, some in runs(steps.index * (lengths + 1) + factor.which[1:]):
+        step, after = divmod(kind, lengths + 1)
         basis = steps.basis[step]
         last, ahead = steps.by_last[step] @ basis, steps.by_next[step] @ steps.basis[after]
         here, there, across = own[:-1][some].sum(0), own[1:][some].sum(0), below[some].sum(0)
@@ -160,41 +155,18 @@ def _moments(factor: Factor) -> _Moments:
     basis = factor.bases[factor.which[0]]
     begin = states[0] @ basis.T
     start = begin.T @ begin + count * basis @ own[0] @ basis.T
-    return _Moments(total, start, _residual(factor, states, mixed, own))
+    return _Moments(total, start, _residual(factor, states, constants, own))
 
 
 def _residual(factor: Factor, states: Array, constants: Array, own: Array) -> float:
     """Posterior mean of the measurements' chi-square.  constants : (c, K)."""
-    weight, rows = factor.weight, factor.rows
-    values = np.zeros((*weight.shape, states.shape[1]))
-    values[..., : factor.count] = factor.rest
-    predicted = factor.system.columns @ constants
-    predicted += np.swapaxes(states @ np.swapaxes(rows, -1, -2)[factor.which], -1, -2)
-    square = float(np.sum(weight[..., None] * (values - predicted) ** 2))
-    for basis in np.unique(factor.which):
-        mine = factor.which == basis
-        summed = (weight[mine].T @ own[mine].reshape(int(mine.sum()), -1)).reshape(
-            -1, *own.shape[1:]
-        )
-        square += factor.count * float(
-            np.einsum("pi,pij,pj->", rows[basis], summed, rows[basis], optimize=True)
-        )
-    return square
-
-
-def inverse_blocks(factor: Factor) -> tuple[Array, Array]:
-    """(F, D, D) and (F - 1, D, D): blocks of the inverse precision on and below the diagonal."""
-    from scipy.linalg.lapack import dtrtri
-
-    lower, under = factor.blocks()
-    frames = len(lower)
-    for block in lower:
-        dtrtri(block.T, lower=0, overwrite_c=1)
-    own = np.swapaxes(lower, -1, -2) @ lower
-    gain = under @ lower[:-1]
-    below = np.empty_like(gain)
-    back = np.swapaxes(gain, -1, -2)
-    for t in range(frames - 2, -1, -1):
-        np.matmul(own[t + 1], gain[t], out=below[t])
-        own[t] += back[t] @ below[t]
-    return own, np.negative(below, out=below)
+    weight, count, total = factor.weight, factor.count, 0.0
+    values = -factor.system.columns @ constants
+    values[..., :count] += factor.rest
+    for basis, mine in runs(factor.which):
+        rows = factor.rows[basis]
+        off = values[mine] - np.swapaxes(states[mine] @ rows.T, -1, -2)
+        total += float((weight[mine] * (off**2).sum(-1)).sum())
+        mean = (weight[mine].T @ own[mine].reshape(len(off), -1)).reshape(-1, *own.shape[1:])
+        total += count * float(((rows[:, None] @ mean)[:, 0] * rows).sum())
+    return total

@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 
 LOWEST_HZ = 1.5
 _LEAST_PERIODS = 2.0
-_SMEAR_RAD = 0.35
+_SMEAR_RAD, _MOST_SMEAR_RAD = 0.35, 0.7
+_ENOUGH = 500
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,13 @@ def coarser(channel: Channel, factor: int) -> Channel:
 
 
 def coarsening(t_s: Array, highest_hz: float) -> int:
-    """How many frames may be averaged before a line of that frequency fades by 2 %."""
+    """How many frames may be averaged before a line of that frequency fades by 2 %.
+
+    By 8 % while more than `_ENOUGH` frames are left.
+    """
     step = float(np.median(np.diff(t_s)))
-    return max(1, int(_SMEAR_RAD / (np.pi * highest_hz * step)))
+    little, more = (int(s / (np.pi * highest_hz * step)) for s in (_SMEAR_RAD, _MOST_SMEAR_RAD))
+    return max(1, little, min(more, len(t_s) // _ENOUGH))
 
 
 def faded(frequency_hz: float, factor: int, t_s: Array) -> float:

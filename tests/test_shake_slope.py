@@ -9,11 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from shake_learning_data import run, true_model
 
+from telerig.estimator.shake_chain import eliminated
 from telerig.estimator.shake_channels import Channel, channels_of, pooled
-from telerig.estimator.shake_evidence import Factor, channel_evidence
+from telerig.estimator.shake_evidence import channel_evidence
 from telerig.estimator.shake_likelihood import evidence, evidence_slope, laplace_sigma
 from telerig.estimator.shake_parameters import log_prior, names_of, prior_of, value_of, with_values
-from telerig.estimator.shake_slope import channel_slope, inverse_blocks
+from telerig.estimator.shake_slope import channel_slope
 from telerig.estimator.smoother.model import BroadBand, ShakeModel
 
 Array = NDArray[np.float64]
@@ -29,7 +30,7 @@ MODELS = {
 
 
 def differences(channel: Channel, model: ShakeModel, names: list[str]) -> Array:
-    h, out = 1e-4, []
+    h, out = 5e-4, []
     for name in names:
         at = value_of(model, name)
         up, down = (with_values(model, [name], [at * np.exp(s * h)]) for s in (1, -1))
@@ -43,11 +44,11 @@ def test_slope_equals_differences_of_the_evidence(kind: str, kept: float, marks:
     problem, _, _ = run(np.random.default_rng(3), bubbles=3, seconds=0.3, marks=marks, kept=kept)
     model = replace(MODELS[kind], pixel_inflation=1.2)
     names = names_of(model)
-    for channel in channels_of(problem)[:2]:
+    for channel in channels_of(problem)[: 2 if kind == "modes" else 1]:
         for part in (channel, *pooled(channel)):
             value, slope = channel_slope(part, model, names)
             assert value == pytest.approx(channel_evidence(part, model), abs=1e-9)
-            # differences of an evidence of 1e4 nats are good to about 1e-2 with broad bands
+            # the evidence of broad bands, stiff in double precision, has noise of 1e-5 nats
             np.testing.assert_allclose(slope, differences(part, model, names), atol=0.03, rtol=1e-4)
 
 
@@ -66,18 +67,30 @@ def test_slope_with_frames_at_uneven_times_and_a_still_target() -> None:
         assert any(moves) != fixed
 
 
-def test_blocks_of_the_inverse_equal_the_dense_inverse() -> None:
-    problem, _, _ = run(np.random.default_rng(6), bubbles=2, seconds=0.1)
-    factor = Factor(channels_of(problem)[0], true_model())
-    size, count = factor.rows.shape[-1], len(problem.t_s)
-    lower = np.zeros((size * count,) * 2)
-    for offset, row in enumerate(factor.factor):
-        lower += np.diag(row[: size * count - offset], -offset)
-    dense = np.linalg.inv(lower @ lower.T).reshape(count, size, count, size)
-    own, below = inverse_blocks(factor)
-    at = np.arange(count)
-    np.testing.assert_allclose(own, dense[at, :, at], atol=1e-9 * np.abs(dense).max())
-    np.testing.assert_allclose(below, dense[at[1:], :, at[:-1]], atol=1e-9 * np.abs(dense).max())
+def test_the_chains_solution_and_covariances_equal_dense_algebra() -> None:
+    rng = np.random.default_rng(6)
+    frames, size = 7, 3
+    own = np.array([a @ a.T + 3 * np.eye(size) for a in rng.normal(size=(frames, size, size))])
+    below, sides = rng.normal(0, 0.4, (frames - 1, size, size)), rng.normal(size=(frames, 2, size))
+    dense = np.zeros((frames, size, frames, size))
+    for t in range(frames):
+        dense[t, :, t] = own[t]
+    for t in range(frames - 1):
+        dense[t + 1, :, t], dense[t, :, t + 1] = below[t], below[t].T
+    precision = dense.reshape(frames * size, -1)
+    inverse = np.linalg.inv(precision)
+    blocks = inverse.reshape(dense.shape)
+    chain = eliminated(own, below, sides)
+    assert chain.log_det() == pytest.approx(np.linalg.slogdet(precision)[1] / 2)
+    mean, spread, across = chain.moments(chain.sides)
+    whole = (inverse @ np.swapaxes(sides, 0, 1).reshape(2, -1).T).reshape(frames, size, 2)
+    np.testing.assert_allclose(mean, np.swapaxes(whole, -1, -2), atol=1e-12)
+    np.testing.assert_allclose(chain.means(chain.sides), mean, atol=1e-12)
+    at = np.arange(frames)
+    np.testing.assert_allclose(spread, blocks[at, :, at], atol=1e-12)
+    np.testing.assert_allclose(across, blocks[at[1:], :, at[:-1]], atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        eliminated(-np.ones((2, 1, 1)), np.zeros((1, 1, 1)), np.zeros((2, 1, 1)))
 
 
 def test_laplace_equals_second_differences_of_the_posterior() -> None:

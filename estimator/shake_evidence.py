@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 _STILL_MM = 1e-6
 
 
-
 @dataclass(frozen=True)
 class ChannelPosterior:
     """log_evidence : of the measurements.  position_mm : (B, F) of the moving items, lab, along

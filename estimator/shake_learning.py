@@ -193,9 +193,7 @@ def _highest(group: Group, model: ShakeModel) -> float:
     return max([_LOW_HZ, *known, *(line.frequency_hz for line in lines)])
 
 
-def _faded(
-    model: ShakeModel, factor: int, t_s: Array, *, back: bool = False
-) -> ShakeModel:
+def _faded(model: ShakeModel, factor: int, t_s: Array, *, back: bool = False) -> ShakeModel:
     """The RMS of lines as they are in means over ``factor`` frames, or back."""
     if factor < 2:
         return model

@@ -54,9 +54,7 @@ class _Change:
     component: Component
 
 
-def channel_slope(
-    channel: Channel, model: ShakeModel, names: Sequence[str]
-) -> tuple[float, Array]:
+def channel_slope(channel: Channel, model: ShakeModel, names: Sequence[str]) -> tuple[float, Array]:
     """The log evidence, as `channel_evidence`, and (n,) its derivatives by log-parameters."""
     factor = Factor(channel, model)
     moments = _moments(factor)

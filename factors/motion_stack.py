@@ -13,8 +13,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.factors.exact_steps import exact_steps, integrations, inverse_root
 from telerig.factors.motion import Motion
-from telerig.factors.state_space import Component, exact_steps, integrations, inverse_root
+from telerig.factors.state_space import Component
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -37,7 +38,8 @@ class Stack:
 
     def bases(self) -> Array:
         """(N, U + 1, n, n), see `telerig.factors.state_space.elimination_basis`."""
-        ahead = np.zeros((self.whitener.shape[0], self.whitener.shape[1] + 1, *self.start.shape[1:]))
+        count, lengths, size, _ = self.whitener.shape
+        ahead = np.zeros((count, lengths + 1, size, size))
         ahead[:, :-1] = self.whitener @ self.transition
         prior = np.broadcast_to(self.start[:, None], ahead.shape)
         root = np.linalg.qr(np.concatenate([ahead, prior], -2), mode="r")
@@ -54,7 +56,8 @@ def stacks(components: Sequence[Component], dt_s: Array) -> list[Stack]:
 
 def _kind(component: Component) -> tuple[float, ...]:
     """Alike for processes that one batch can hold."""
-    return _integrations(component.drift.astype(bool).tobytes(), component.noise.astype(bool).tobytes(), component.size)  # fmt: skip
+    drift, noise = (a.astype(bool).tobytes() for a in (component.drift, component.noise))
+    return _integrations(drift, noise, component.size)
 
 
 @lru_cache(maxsize=64)

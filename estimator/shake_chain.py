@@ -4,8 +4,10 @@ Forward over the frames, H_t the precision of frame t given those before, J its 
 
     L_t L_t^T = H_t,   M_t = J_t L_t^-T,   H_{t+1} -= M_t M_t^T
 
-and backward, with the gain G_t = M_t L_t^-1, the covariances S_t = (L_t L_t^T)^-1 + G_t^T S_{t+1} G_t
-and S_{t+1,t} = -S_{t+1} G_t (Takahashi, Fagan, Chin, Proc. 8th PICA Conf., 1973).
+and backward, with the gain G_t = M_t L_t^-1, the covariances (Takahashi, Fagan, Chin, Proc. 8th
+PICA Conf., 1973)
+
+    S_t = (L_t L_t^T)^-1 + G_t^T S_{t+1} G_t,   S_{t+1,t} = -S_{t+1} G_t
 """
 
 from __future__ import annotations

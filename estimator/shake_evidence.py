@@ -1,7 +1,8 @@
 """Marginal likelihood and posterior of one channel, from the Cholesky factor of its chain.
 
-The precision of a chain of states is block-tridiagonal, eliminated frame by frame. Constants (mean velocities, places of marks) are eliminated after the chain. The
-evidence equals the graph's, channel by channel (see tests/test_shake_learning.py).
+The precision of a chain of states is block-tridiagonal, eliminated frame by frame (`shake_chain`).
+Constants (mean velocities, places of marks) are eliminated after the chain. The evidence equals the
+graph's, channel by channel (see tests/test_shake_learning.py).
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ def laplace_sigma(channels: Sequence[Channel], model: ShakeModel, names: Sequenc
 
     def slope(step: Array) -> Array:
         moved = with_values(model, names, np.exp(values + step * scale).tolist())
-        return _posterior_slope(channels, moved, names)[1] * scale
+        return np.asarray(_posterior_slope(channels, moved, names)[1] * scale)
 
     h = 0.25
     rows = np.array([slope(-h * row) - slope(h * row) for row in np.eye(len(names))]) / (2 * h)

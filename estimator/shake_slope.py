@@ -19,10 +19,11 @@ from telerig.estimator.shake_channels import Channel
 from telerig.estimator.shake_evidence import Factor, runs
 from telerig.estimator.shake_processes import Process, bubble_processes, shake_processes
 from telerig.estimator.smoother.model import ShakeModel
-from telerig.factors.motion_stack import lengths_of, stacks
+from telerig.factors.motion_stack import Stack, lengths_of, stacks
 from telerig.factors.state_space import Component
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _DIFFERENCE = 1e-4
 
@@ -82,9 +83,32 @@ def _changes(found: list[Process], names: Sequence[str]) -> list[_Change]:
     ]
 
 
+@dataclass(frozen=True)
+class _Places:
+    """begin : (N + 1,) first state of each process.  copies : (N,) of it, ``width`` apart."""
+
+    begin: Ints
+    copies: Ints
+    width: int
+
+    def moments(self, found: _Moments, which: Ints) -> tuple[Array, Array]:
+        """(m, U, 2 n, 2 n) and (m, n, n): those of processes of n states, their copies' summed."""
+        size, count = len(found.start), self.copies[which]
+        states = np.arange(self.begin[which[0] + 1] - self.begin[which[0]])
+        step, start = np.zeros(()), np.zeros(())
+        for k in range(max(count)):
+            used = (count > k)[:, None, None]
+            at = self.begin[which, None] + states + np.minimum(k, count - 1)[:, None] * self.width
+            both = np.concatenate([at, size + at], -1)
+            more = found.step[:, both[:, :, None], both[:, None]]
+            step = step + used[:, None] * np.swapaxes(more, 0, 1)
+            start = start + used * found.start[at[:, :, None], at[:, None]]
+        return step, start
+
+
 def _expected(
     factor: Factor,
-    moments: _Moments,
+    found: _Moments,
     shake: list[Process],
     bubble: list[Process],
     changes: list[_Change],
@@ -94,39 +118,32 @@ def _expected(
     counts = np.bincount(index, minlength=len(dt_s))
     own = [p.component for p in (*shake, *bubble)]
     begin = np.r_[0, np.cumsum([c.size for c in own])]
-    movers = int(factor.channel.moving.sum())
-    copies = np.repeat([1, movers], [len(shake), len(bubble)])
-    width = begin[-1] - begin[len(shake)]
-    size = len(moments.start)
+    copies = np.repeat([1, int(factor.channel.moving.sum())], [len(shake), len(bubble)])
+    places = _Places(begin, copies, int(begin[-1] - begin[len(shake)]))
+    process = np.array([c.process for c in changes])
     out = np.zeros(len(changes))
     for stack in stacks([*own, *(c.component for c in changes)], dt_s):
-        place = {w: i for i, w in enumerate(stack.which.tolist())}
-        mine = [i for i in range(len(changes)) if len(own) + i in place]
-        if not mine:
+        new = np.flatnonzero(stack.which >= len(own))
+        if not len(new):
             continue
-        new = np.array([place[len(own) + i] for i in mine])
-        which = np.array([changes[i].process for i in mine])
-        old = np.array([place[w] for w in which])
-        step, start = 0.0, 0.0
-        states = np.arange(stack.start.shape[-1])
-        for k in range(max(copies)):
-            at = begin[which][:, None] + states + np.where(copies[which] > k, k, 0)[:, None] * width
-            used = (copies[which] > k)[:, None, None]
-            both = np.concatenate([at, size + at], -1)
-            step = step + used[:, None] * np.moveaxis(
-                moments.step[:, both[:, :, None], both[:, None]], 0, 1
-            )
-            start = start + used * moments.start[at[:, :, None], at[:, None]]
-        fresh = np.linalg.solve(
-            np.swapaxes(stack.whitener[old], -1, -2), np.swapaxes(stack.whitener[new], -1, -2)
-        )
-        moved = stack.whitener[new] @ (stack.transition[old] - stack.transition[new])
-        rows = np.concatenate([np.swapaxes(fresh, -1, -2), moved], -1)
+        mine = stack.which[new] - len(own)
+        which = process[mine]
+        old = np.searchsorted(stack.which, which)
+        step, start = places.moments(found, which)
+        rows = _noise_rows(stack, old, new)
         square = ((rows @ step) * rows).sum((1, 2, 3))
         square += ((stack.start[new] @ start) * stack.start[new]).sum((1, 2))
         log_det = stack.log_det[new] @ counts + stack.start_log_det[new]
         out[mine] = factor.count * copies[which] * log_det - square / 2
     return out
+
+
+def _noise_rows(stack: Stack, old: Ints, new: Ints) -> Array:
+    """(m, U, n, 2 n) whitened noise under new processes, from that under old ones and the state."""
+    one, two = (np.swapaxes(stack.whitener[at], -1, -2) for at in (old, new))
+    same = np.swapaxes(np.linalg.solve(one, two), -1, -2)
+    moved = stack.whitener[new] @ (stack.transition[old] - stack.transition[new])
+    return np.concatenate([same, moved], -1)
 
 
 def _moments(factor: Factor) -> _Moments:

@@ -236,7 +236,12 @@ def _one_more(group: Group, step: _Step, options: Learning, first: bool) -> _Ste
     for where in group.wheres:
         if step.found.count(where) < options.most_modes:
             tried += _trials(group, step.fit.model, where, options)
-    trials = [(evidence(group.fast, m), where, m) for where, m in tried]
+    still = [c for c in group.fast if not c.shaken]
+    shaken, rest = [c for c in group.fast if c.shaken], evidence(still, step.fit.model)
+    trials = [
+        (evidence(group.fast, m) if where == BUBBLE else evidence(shaken, m) + rest, where, m)
+        for where, m in tried
+    ]
     trials.sort(key=lambda trial: -trial[0])
     best: tuple[float, Where, Fit] | None = None
     for _, where, model in _distinct(trials):

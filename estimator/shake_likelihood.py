@@ -105,12 +105,17 @@ def laplace_sigma(channels: Sequence[Channel], model: ShakeModel, names: Sequenc
     scale = np.array([prior_of(n).step for n in names])
     values = np.log([value_of(model, n) for n in names])
 
-    def slope(step: Array) -> Array:
-        moved = with_values(model, names, np.exp(values + step * scale).tolist())
-        return np.asarray(_posterior_slope(channels, moved, names)[1] * scale)
+    def change(name: str, step: Array) -> Array:
+        own = [c for c in channels if tells_of(c, model, [name])]
+        down, up = (
+            with_values(model, names, np.exp(values + sign * step * scale).tolist())
+            for sign in (-1, 1)
+        )
+        both = [_posterior_slope(own, moved, names)[1] for moved in (down, up)]
+        return np.asarray((both[0] - both[1]) * scale)
 
     h = 0.25
-    rows = np.array([slope(-h * row) - slope(h * row) for row in np.eye(len(names))]) / (2 * h)
+    rows = np.array([change(n, h * row) for n, row in zip(names, np.eye(len(names)))]) / (2 * h)
     curvature = (rows + rows.T) / 2
     least = np.array([(s / prior_of(n).log_sigma) ** 2 for n, s in zip(names, scale)])
     roots = np.sqrt(least)

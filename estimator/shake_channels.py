@@ -221,12 +221,12 @@ def pooled(channel: Channel) -> tuple[Channel, ...]:
         start_sigma_mm=channel.start_sigma_mm[movers[:1]], bubble=np.array([-1]),
     )  # fmt: skip
     mean = replace(alike, value_mm=value.mean(1), weight=each * count, pooled=count)
-    turn = _contrasts(count)
+    turn = contrasts(count)
     apart = np.einsum("rk,fkc->fcr", turn, value)
     return mean, replace(alike, value_mm=apart, weight=each, shaken=False)
 
 
-def _contrasts(count: int) -> Array:
+def contrasts(count: int) -> Array:
     """(count - 1, count) orthonormal rows that are blind to the mean (Helmert)."""
     full = np.linalg.qr(np.c_[np.ones(count), np.eye(count)[:, : count - 1]])[0]
     return np.asarray(full[:, 1:].T)

@@ -1,45 +1,38 @@
-"""Marginal likelihood and posterior of one channel, from a banded Cholesky factor.
+"""Marginal likelihood and posterior of one channel, from the Cholesky factor of its chain.
 
-The precision of a chain of states is block-tridiagonal: LAPACK's `pbtrf` takes it in time linear
-in the frames. Constants (mean velocities, places of marks) are eliminated after the chain. The
-evidence equals the graph's, channel by channel (see tests/test_shake_learning.py).
+The precision of a chain of states is block-tridiagonal, eliminated frame by frame (`shake_chain`).
+Constants (mean velocities, places of marks) are eliminated after the chain. The evidence equals the
+graph's, channel by channel (see tests/test_shake_learning.py).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.shake_chain import eliminated
 from telerig.estimator.shake_channels import Channel
+from telerig.estimator.shake_processes import bubble_processes, shake_processes
 from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
 from telerig.factors.measurements import whitener_of
-from telerig.factors.motion import Motion, motion, start
-from telerig.factors.state_space import (
-    Component,
-    block_diagonal,
-    broad_band,
-    driven_mode,
-    oscillator,
-    ou_velocity,
-    slow_ou,
-)
+from telerig.factors.motion import Motion, start
+from telerig.factors.motion_stack import stacked_motion
+from telerig.factors.state_space import Component, slow_ou
 
 Array = NDArray[np.float64]
 
 _STILL_MM = 1e-6
-
-_cached = lru_cache(maxsize=512)
-_oscillator, _driven_mode = _cached(oscillator), _cached(driven_mode)
-_broad_band, _slow_ou, _ou_velocity = _cached(broad_band), _cached(slow_ou), _cached(ou_velocity)
 
 
 @dataclass(frozen=True)
 class ChannelPosterior:
     """log_evidence : of the measurements.  position_mm : (B, F) of the moving items, lab, along
     the direction, less their start.  offset_mm : (J, F) of each camera.
+
+    Of a channel of R replicates (B R, F) and (J R, F), those of an item one after the other.
     """
 
     log_evidence: float
@@ -67,64 +60,24 @@ class _System:
 
 def channel_evidence(channel: Channel, model: ShakeModel) -> float:
     """Natural log of the density of the channel's measurements."""
-    return _Factor(channel, model).log_evidence()
+    return Factor(channel, model).log_evidence()
 
 
 def channel_posterior(channel: Channel, model: ShakeModel) -> ChannelPosterior:
     """Evidence and means."""
-    return _Factor(channel, model).posterior()
+    return Factor(channel, model).posterior()
 
 
 def position_sigma(channel: Channel, model: ShakeModel, frames: NDArray[np.int64]) -> Array:
     """(B, n) standard deviation of the moving items' positions at some frames."""
-    return _Factor(channel, model).position_sigma(frames)
-
-
-def shake_components(channel: Channel, model: ShakeModel) -> list[tuple[Component, int]]:
-    """The shake's processes along the channel's direction, with the camera (CARRIAGE: all)."""
-    out: list[tuple[Component, int]] = []
-    if not channel.shaken:
-        return out
-    for mode in model.modes:
-        rms = _along(channel, mode.rms_mm, mode.camera)
-        if rms > 0:
-            if mode.force_hz is None:
-                part = _oscillator(rms, mode.frequency_hz, mode.damping)
-            else:
-                part = _driven_mode(rms, mode.frequency_hz, mode.damping, force_hz=mode.force_hz)
-            out.append((part, mode.camera))
-    for band in model.broad_bands:
-        rms = _along(channel, band.rms_mm, band.camera)
-        if rms > 0:
-            part = _broad_band(rms, low_hz=band.low_hz, high_hz=band.high_hz)
-            out.append((part, band.camera))
-            if band.slow_rms_mm > 0:
-                out.append((_slow_ou(band.slow_rms_mm, band.slow_tau_s), band.camera))
-    return out
-
-
-def _along(channel: Channel, rms_mm: tuple[float, float, float], camera: int) -> float:
-    if camera != CARRIAGE and camera not in channel.cameras:
-        return 0.0
-    return float(np.linalg.norm(channel.direction * np.asarray(rms_mm)))
-
-
-def bubble_components(channel: Channel, model: ShakeModel) -> list[Component]:
-    """The processes of a bubble along the channel's direction."""
-    bubble, share = model.bubble, 1 / np.sqrt(channel.pooled)
-    sigma, begin = share * bubble.velocity_sigma_mm_s, share * bubble.start_sigma_mm
-    parts = [_ou_velocity(sigma, bubble.velocity_tau_s, start_sigma_mm=begin)]
-    for z in bubble.zigzags:
-        rms = float(share * np.linalg.norm(channel.direction * np.asarray(z.rms_mm)))
-        if rms > 0:
-            parts.append(_oscillator(rms, z.frequency_hz, z.damping))
-    return parts
+    return Factor(channel, model).position_sigma(frames)
 
 
 def _system(channel: Channel, model: ShakeModel) -> _System:
-    shake, bubble = shake_components(channel, model), bubble_components(channel, model)
+    shake = [(p.component, p.camera) for p in shake_processes(channel, model)]
+    bubble = [p.component for p in bubble_processes(channel, model)]
     if not shake and not channel.moving.any():
-        shake = [(_slow_ou(_STILL_MM, 1.0), CARRIAGE)]
+        shake = [(slow_ou(_STILL_MM, 1.0), CARRIAGE)]
     parts = [c for c, _ in shake] + bubble * int(channel.moving.sum())
     size, shaken = sum(c.size for c in parts), sum(c.size for c, _ in shake)
     offset = np.zeros((len(channel.cameras), size))
@@ -157,111 +110,109 @@ def _constants(channel: Channel, model: ShakeModel) -> tuple[Array, Array]:
     return columns, sigma
 
 
-class _Factor:
-    """The Cholesky factor of the states' precision, and the constants' after them."""
+class Factor:
+    """The Cholesky factor of the states' precision, and the constants' after them.
+
+    which : (F,) of each frame among ``bases``, (U + 1, D, D) in which its states are.
+    rows : (U + 1, P, D).  rest : (F, P, R) measured less ``guess``.  constants : (c, R).
+    """
 
     def __init__(self, channel: Channel, model: ShakeModel) -> None:
-        from scipy.linalg import cholesky_banded
-
         self.channel = channel
-        self.system = _system(channel, model)
-        steps = _steps(self.system, np.diff(channel.t_s))
+        self.system = system = _system(channel, model)
+        self.steps = steps = stacked_motion(system.components, np.diff(channel.t_s))
         self.which = np.append(steps.index, len(steps.basis) - 1)
         self.bases = steps.basis
-        weight = channel.weight / model.pixel_inflation**2
-        diagonal, below, self.log_prior = _chain(self.system, steps)
-        self.rows = self.system.rows @ self.bases
-        size = self.rows.shape[-1]
-        for basis, rows in enumerate(self.rows):
-            mine = self.which == basis
-            outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
-            diagonal[mine] += (weight[mine] @ outer).reshape(-1, size, size)
-        band = _banded(diagonal, below)
-        self.factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
-        self._eliminate(weight)
-
-    def _eliminate(self, weight: Array) -> None:
-        from scipy.linalg import cho_factor
-
-        channel, system = self.channel, self.system
-        guess = _fitted(channel, system, weight)
-        self.guess = guess
-        values = _replicates(channel)
-        count = values.shape[-1]
-        rest = values - system.columns @ guess
-        data = np.concatenate([rest, system.columns], -1)
+        self.weight = weight = channel.weight / model.pixel_inflation**2
+        self.rows = system.rows @ self.bases
+        self.guess = _fitted(channel, system, weight)
+        self.rest = _replicates(channel) - system.columns @ self.guess
+        self.count = self.rest.shape[-1]
+        data = np.concatenate([self.rest, system.columns], -1)
         weighted = weight[..., None] * data
-        right = np.swapaxes(self.rows, -1, -2)[self.which] @ weighted
-        self.right = right.reshape(-1, right.shape[-1])
-        self.half = _solve_half(self.factor, self.right)
+        own, following, self.log_prior = _chain(system, steps)
+        sides = np.empty((len(own), data.shape[-1], own.shape[-1]))
+        for basis, mine in runs(self.which):
+            rows = self.rows[basis]
+            outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+            own[mine] += (weight[mine] @ outer).reshape(-1, *own.shape[1:])
+            sides[mine] = np.swapaxes(weighted[mine], -1, -2) @ rows
+        self.chain = eliminated(own, following, sides)
         wide = data.shape[-1]
-        square = data.reshape(-1, wide).T @ weighted.reshape(-1, wide) - self.half.T @ self.half
-        prior = 1 / system.prior_sigma**2
-        inner = square[count:, count:] + np.diag(prior)
-        self.inner = cho_factor(inner, lower=True)
-        linear = square[count:, :count] - prior[:, None] * guess
-        from scipy.linalg import cho_solve
+        self._fix_constants(data.reshape(-1, wide).T @ weighted.reshape(-1, wide))
 
+    def _fix_constants(self, square: Array) -> None:
+        """square : (R + c, R + c) of measurements and columns."""
+        from scipy.linalg import cho_factor, cho_solve
+
+        count, prior = self.count, 1 / self.system.prior_sigma**2
+        half = np.swapaxes(self.chain.sides, 0, 1).reshape(len(square), -1)
+        square = square - half @ half.T
+        self.inner = cho_factor(square[count:, count:] + np.diag(prior), lower=True)
+        linear = square[count:, :count] - prior[:, None] * self.guess
         self.constants = cho_solve(self.inner, linear)
-        self.square = float(np.trace(square[:count, :count]) + (prior @ guess**2).sum())
+        self.square = float(np.trace(square[:count, :count]) + (prior @ self.guess**2).sum())
         self.square -= float((linear * self.constants).sum())
-        self.count = count
-        used = weight > 0
-        self.log_noise = 0.5 * float(np.log(weight[used] / (2 * np.pi)).sum())
 
     def log_evidence(self) -> float:
-        log_chain = float(np.log(self.factor[0]).sum())
+        used = self.weight[self.weight > 0]
+        log_noise = 0.5 * float(np.log(used / (2 * np.pi)).sum())
         log_inner = float(np.log(np.diag(self.inner[0])).sum())
         log_sigma = float(np.log(self.system.prior_sigma).sum())
-        each = self.log_noise + self.log_prior - log_chain - log_inner - log_sigma
+        each = log_noise + self.log_prior - self.chain.log_det() - log_inner - log_sigma
         return float(self.count * each - self.square / 2)
 
-    def _back(self, half: Array) -> Array:
-        """(F, D, c) states from L^-1 of the right side."""
-        from scipy.linalg import lapack
+    def spread(self) -> tuple[Array, Array]:
+        """Right sides (F, K, D) of states, and constants (c, K), whose squares add up.
 
-        solved, info = lapack.dtbtrs(self.factor, half, uplo="L", trans="T")
-        assert info == 0
-        states = solved.reshape(len(self.which), -1, half.shape[1])
-        return np.asarray(self.bases[self.which] @ states)
+        Over the replicates' posterior means, and what not knowing the constants adds: the second
+        moments are the sum over K, and those of states whose constants are known.
+        """
+        from scipy.linalg import solve_triangular
+
+        count, size = self.count, len(self.constants)
+        unit = np.sqrt(count) * np.eye(size)
+        off = solve_triangular(self.inner[0], unit, lower=True, trans="T")
+        constants = np.concatenate([self.constants, off], -1)
+        sides = -constants.T @ self.chain.sides[:, count:]
+        sides[:, :count] += self.chain.sides[:, :count]
+        return sides, constants
 
     def posterior(self) -> ChannelPosterior:
-        system, channel = self.system, self.channel
-        mixed = self.half[:, 0] - self.half[:, 1:] @ self.constants[:, 0]
-        states = self._back(mixed[:, None])[..., 0]
+        system, channel, count = self.system, self.channel, self.count
+        states = self.chain.means(self.spread()[0][:, :count])
+        states = states @ np.swapaxes(self.bases, -1, -2)[self.which]
         movers = np.flatnonzero(channel.moving)
-        speed = (self.guess + self.constants)[movers, 0]
-        since = channel.t_s - channel.t_s[channel.first[movers], None]
-        position = system.position @ states.T + speed[:, None] * since
-        velocity = system.velocity @ states.T + speed[:, None]
-        return ChannelPosterior(self.log_evidence(), position, velocity, system.offset @ states.T)
+        speed = (self.guess + self.constants)[movers, :, None]
+        since = (channel.t_s - channel.t_s[channel.first[movers], None])[:, None]
+        position, velocity, offset = (
+            np.einsum("bd,frd->brf", row, states, optimize=True)
+            for row in (system.position, system.velocity, system.offset)
+        )
+        found = position + speed * since, velocity + speed, offset
+        frames = len(channel.t_s)
+        return ChannelPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
 
     def position_sigma(self, frames: NDArray[np.int64]) -> Array:
-        from scipy.linalg import cho_solve
-
         system, channel = self.system, self.channel
-        movers, size = np.flatnonzero(channel.moving), self.system.rows.shape[1]
-        count = len(movers) * len(frames)
-        unit = np.zeros((len(self.right), count))
-        by_constant = np.zeros((count, len(channel.moving)))
-        for k, item in enumerate(movers):
-            for i, f in enumerate(frames):
-                column = k * len(frames) + i
-                row = system.position[k] @ self.bases[self.which[f]]
-                unit[f * size : (f + 1) * size, column] = row
-                by_constant[column, item] = channel.t_s[f] - channel.t_s[channel.first[item]]
-        half = _solve_half(self.factor, unit)
-        rest = by_constant - half.T @ self.half[:, 1:]
-        variance = (half**2).sum(0) + (rest * cho_solve(self.inner, rest.T).T).sum(-1)
-        return np.asarray(np.sqrt(variance)).reshape(len(movers), len(frames))
+        movers = np.flatnonzero(channel.moving)
+        sides, constants = self.spread()
+        mean, own, _ = self.chain.moments(sides[:, self.count :])
+        since = (channel.t_s - channel.t_s[channel.first[movers], None])[:, frames, None]
+        rows = system.position @ self.bases[self.which[frames]]
+        by_constant = np.einsum("fbd,fkd->bfk", rows, mean[frames])
+        by_constant += since * constants[movers, None, self.count :]
+        variance = np.einsum("fbd,fde,fbe->bf", rows, own[frames], rows, optimize=True)
+        return np.asarray(np.sqrt(variance + (by_constant**2).sum(-1)))
 
 
-def _solve_half(factor: Array, right: Array) -> Array:
-    from scipy.linalg import lapack
-
-    solved, info = lapack.dtbtrs(factor, right, uplo="L")
-    assert info == 0
-    return np.asarray(solved)
+def runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice | NDArray[np.int64]]]:
+    """Each value of an index with where it stands, as a slice where that is one stretch."""
+    order = np.argsort(index, kind="stable")
+    values, first = np.unique(index[order], return_index=True)
+    for value, mine in zip(values.tolist(), np.split(order, first[1:])):
+        whole = mine[-1] - mine[0] + 1 == len(mine)
+        yield value, slice(int(mine[0]), int(mine[-1]) + 1) if whole else mine
 
 
 def _replicates(channel: Channel) -> Array:
@@ -290,25 +241,6 @@ def _fitted(channel: Channel, system: _System, weight: Array) -> Array:
     return out
 
 
-def _steps(system: _System, dt_s: Array) -> Motion:
-    """`motion` of all components; what stays between two calls is not worked out again."""
-    key = dt_s.tobytes()
-    parts = [_one(component, key) for component in system.components]
-    return Motion(
-        block_diagonal([p.by_last for p in parts]),
-        block_diagonal([p.by_next for p in parts]),
-        block_diagonal([p.by_input for p in parts]),
-        np.sum([p.log_det for p in parts], 0),
-        block_diagonal([p.basis for p in parts]),
-        parts[0].index,
-    )
-
-
-@lru_cache(maxsize=512)
-def _one(component: Component, dt_s: bytes) -> Motion:
-    return motion([component], np.frombuffer(dt_s))
-
-
 def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
     """Diagonal (F, D, D) and lower (F - 1, D, D) blocks of the prior; half log of its determinant.
 
@@ -331,13 +263,3 @@ def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
     log_det = float(np.log(np.abs(np.diag(whitener))).sum() + steps.log_det[steps.index].sum())
     each = np.linalg.slogdet(steps.basis)[1]
     return diagonal, (forward @ last)[place], log_det + float(each[which].sum())
-
-
-def _banded(diagonal: Array, below: Array) -> Array:
-    """(2 D, F D) lower form of `scipy.linalg.cholesky_banded`."""
-    frames, size, _ = diagonal.shape
-    out = np.zeros((2 * size, frames, size))
-    for b in range(size):
-        out[: size - b, :, b] = diagonal[:, b:, b].T
-        out[size - b : 2 * size - b, :-1, b] = below[:, :, b].T
-    return out.reshape(2 * size, frames * size)

@@ -12,15 +12,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.shake_channels import Channel, channels_of
-from telerig.estimator.shake_evidence import ChannelPosterior, channel_posterior
+from telerig.estimator.shake_channels import Channel, channels_of, contrasts, pooled
+from telerig.estimator.shake_evidence import channel_posterior
 from telerig.estimator.shake_parameters import value_of, with_values
+from telerig.estimator.shake_processes import processes
 from telerig.estimator.smoother.model import ShakeModel
 from telerig.estimator.smoother.solve import Covariances, Solution
 
 Array = NDArray[np.float64]
 
 _FARTHEST = 0.5
+_Triple = tuple[Array, Array, Array]
+"""Of positions, velocities and offsets."""
 
 
 def inflated(solution: Solution) -> Solution:
@@ -46,22 +49,51 @@ def inflated(solution: Solution) -> Solution:
     return replace(solution, covariances=replace(found, bubbles=bubbles, shake=shake))
 
 
-def _spread(channel: Channel, model: ShakeModel) -> tuple[Array, Array, Array]:
+def _spread(channel: Channel, model: ShakeModel) -> _Triple:
     """Variances (B, F) of positions and velocities, (J, F) of offsets, by the parameters."""
-    total = [np.zeros(1), np.zeros(1), np.zeros(1)]
+    parts = pooled(channel)
+    total = [np.zeros((1, len(channel.t_s)))] * 3
     for name, sigma in model.learned.items():
         at, step = value_of(model, name), min(sigma, _FARTHEST)
-        up, down = (
-            channel_posterior(channel, with_values(model, [name], [at * np.exp(sign * step)]))
-            for sign in (1, -1)
-        )
-        for i, (high, low) in enumerate(zip(_means(up), _means(down))):
-            total[i] = total[i] + ((high - low) / 2 * (sigma / step)) ** 2
+        up, down = (with_values(model, [name], [at * np.exp(s * step)]) for s in (1, -1))
+        same = [name != "pixel_inflation" and _same(part, up, model) for part in parts]
+        if all(same):
+            continue
+        moved = [_still(p) if s else _moved(p, up, down) for p, s in zip(parts, same)]
+        for i, change in enumerate(_of_bubbles(moved, int(channel.moving.sum()))):
+            total[i] = total[i] + (change / 2 * (sigma / step)) ** 2
     return total[0], total[1], total[2]
 
 
-def _means(found: ChannelPosterior) -> tuple[Array, Array, Array]:
-    return found.position_mm, found.velocity_mm_s, found.offset_mm
+def _same(channel: Channel, one: ShakeModel, two: ShakeModel) -> bool:
+    """Whether the channel cannot tell two models from each other."""
+    return all(a is b for a, b in zip(processes(channel, one), processes(channel, two)))
+
+
+def _moved(channel: Channel, up: ShakeModel, down: ShakeModel) -> _Triple:
+    """Posterior means under one model less those under the other."""
+    one, two = channel_posterior(channel, up), channel_posterior(channel, down)
+    return (
+        one.position_mm - two.position_mm,
+        one.velocity_mm_s - two.velocity_mm_s,
+        one.offset_mm - two.offset_mm,
+    )
+
+
+def _still(channel: Channel) -> _Triple:
+    nothing = np.zeros((1, len(channel.t_s)))
+    return nothing, nothing, nothing
+
+
+def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
+    """Of each bubble, where the channel is split into their mean and their differences."""
+    if len(moved) == 1:
+        return moved[0]
+    (position, velocity, offset), apart = moved
+    place, speed = (
+        contrasts(count).T @ np.broadcast_to(a, (count - 1, a.shape[-1])) for a in apart[:2]
+    )
+    return position + place, velocity + speed, offset
 
 
 def _rows(solution: Solution, channel: Channel, variance: Array) -> Array:
@@ -71,6 +103,7 @@ def _rows(solution: Solution, channel: Channel, variance: Array) -> Array:
     movers = channel.bubble[channel.moving]
     number[movers] = np.arange(len(movers))
     mine = number[frame.bubble_of_row]
+    variance = np.broadcast_to(variance, (len(movers), variance.shape[-1]))
     each = variance[mine, frame.frame_of_row]
     return np.asarray(np.where(mine >= 0, each, variance.mean(0)[frame.frame_of_row]))
 
@@ -85,5 +118,6 @@ def _shaken(
         if not np.any(rows):
             continue
         into = np.linalg.pinv(rows)
+        variance = np.broadcast_to(variance, (len(rows), len(out)))
         out += np.einsum("dk,kf,ek->fde", into, variance, into, optimize=True)
     return out

@@ -136,7 +136,9 @@ def _pattern(square: Array) -> Triple:
 def _learn_group(
     group: Group, model: ShakeModel, options: Learning, *, first: bool
 ) -> tuple[ShakeModel, dict[str, float]]:
-    factor = coarsening(group.channels[0].t_s, _highest(group, model))
+    t_s = group.channels[0].t_s
+    factor = coarsening(t_s, _highest(group, model))
+    model = _faded(model, factor, t_s)
     coarse = replace(group, channels=tuple(coarser(c, factor) for c in group.channels))
     step = _Step(maximise(coarse.fast, model, _free(model, coarse, options, first), steps=15))
     while True:
@@ -148,13 +150,13 @@ def _learn_group(
     names = _free(fit.model, coarse, options, first)
     fit = maximise(coarse.fast, fit.model, names)
     sigma = np.sqrt(np.diag(laplace_sigma(coarse.fast, fit.model, names)))
-    model = _unfaded(fit.model, names, factor, group.channels[0].t_s)
+    model = fit.model
     if not options.target:
         found = labels(coarse.fast, model, group.pattern, group.up)
         model = shared(model, [x for x in found if not _is_held(x, options)])
         if max(int(c.moving.sum()) for c in group.channels) > 1:
             model = doubted(coarse.fast, model, group.pattern, group.up)
-    return model, dict(zip(names, sigma.tolist()))
+    return _faded(model, factor, t_s, back=True), dict(zip(names, sigma.tolist()))
 
 
 def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeModel, Learning]:
@@ -191,14 +193,15 @@ def _highest(group: Group, model: ShakeModel) -> float:
     return max([_LOW_HZ, *known, *(line.frequency_hz for line in lines)])
 
 
-def _unfaded(model: ShakeModel, names: Sequence[str], factor: int, t_s: Array) -> ShakeModel:
-    """RMS as they are before the mean over frames."""
-    lines = [n for n in names if n.endswith("rms_mm") and not n.startswith("broad")]
-    values = [
-        value_of(model, n)
-        / faded(value_of(model, n.replace("rms_mm", "frequency_hz")), factor, t_s)
-        for n in lines
-    ]
+def _faded(model: ShakeModel, factor: int, t_s: Array, *, back: bool = False) -> ShakeModel:
+    """The RMS of lines as they are in means over ``factor`` frames, or back."""
+    if factor < 2:
+        return model
+    lines = [n for n in names_of(model) if n.endswith("rms_mm") and not n.startswith("broad")]
+    values = []
+    for n in lines:
+        fade = faded(value_of(model, n.replace("rms_mm", "frequency_hz")), factor, t_s)
+        values.append(value_of(model, n) * (1 / fade if back else fade))
     return with_values(model, lines, values)
 
 
@@ -233,7 +236,12 @@ def _one_more(group: Group, step: _Step, options: Learning, first: bool) -> _Ste
     for where in group.wheres:
         if step.found.count(where) < options.most_modes:
             tried += _trials(group, step.fit.model, where, options)
-    trials = [(evidence(group.fast, m), where, m) for where, m in tried]
+    still = [c for c in group.fast if not c.shaken]
+    shaken, rest = [c for c in group.fast if c.shaken], evidence(still, step.fit.model)
+    trials = [
+        (evidence(group.fast, m) if where == BUBBLE else evidence(shaken, m) + rest, where, m)
+        for where, m in tried
+    ]
     trials.sort(key=lambda trial: -trial[0])
     best: tuple[float, Where, Fit] | None = None
     for _, where, model in _distinct(trials):

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from telerig.estimator.shake_channels import Channel
 from telerig.estimator.shake_evidence import channel_evidence
 from telerig.estimator.shake_parameters import log_prior, prior_of, value_of, with_values
+from telerig.estimator.shake_processes import tells_of
+from telerig.estimator.shake_slope import channel_slope
 from telerig.estimator.smoother.model import ShakeModel
 
 Array = NDArray[np.float64]
 
-_DIFFERENCE = 1e-3
 _IMPOSSIBLE = -1e12
 
 
@@ -38,6 +39,30 @@ def evidence(channels: Sequence[Channel], model: ShakeModel) -> float:
     return float(total) if np.isfinite(total) else _IMPOSSIBLE
 
 
+def evidence_slope(
+    channels: Sequence[Channel], model: ShakeModel, names: Sequence[str]
+) -> tuple[float, Array]:
+    """The evidence, and (n,) its derivatives by the logarithms of the named parameters."""
+    try:
+        each = [channel_slope(c, model, names) for c in channels]
+    except np.linalg.LinAlgError:
+        return _IMPOSSIBLE, np.zeros(len(names))
+    total, slope = float(sum(e for e, _ in each)), sum((s for _, s in each), np.zeros(len(names)))
+    if not (np.isfinite(total) and np.all(np.isfinite(slope))):
+        return _IMPOSSIBLE, np.zeros(len(names))
+    return total, slope
+
+
+def _posterior_slope(
+    channels: Sequence[Channel], model: ShakeModel, names: Sequence[str]
+) -> tuple[float, Array]:
+    """As `evidence_slope`, the parameters' priors added."""
+    found, slope = evidence_slope(channels, model, names)
+    priors = [prior_of(n) for n in names]
+    of_prior = [p.log_slope(value_of(model, n)) for n, p in zip(names, priors)]
+    return found + log_prior(model, names), slope + np.array(of_prior)
+
+
 def maximise(
     channels: Sequence[Channel], model: ShakeModel, names: Sequence[str], *, steps: int = 25
 ) -> Fit:
@@ -52,23 +77,24 @@ def maximise(
     bounds = [(float(np.log(p.low) / s), float(np.log(p.high) / s)) for p, s in zip(priors, scale)]
     start: Array = np.log([value_of(model, n) for n in names]) / scale
 
-    def cost(x: Array) -> float:
-        moved = with_values(model, names, np.exp(x * scale).tolist())
-        return -evidence(channels, moved) - log_prior(moved, names)
+    moving = [c for c in channels if tells_of(c, model, names)]
+    still = evidence([c for c in channels if all(c is not m for m in moving)], model)
 
-    def slope(x: Array) -> tuple[float, Array]:
-        at = cost(x)
-        each = [cost(x + _DIFFERENCE * row) - at for row in np.eye(len(x))]
-        return at, np.array(each) / _DIFFERENCE
+    def at(x: Array) -> ShakeModel:
+        return with_values(model, names, np.exp(x * scale).tolist())
+
+    def cost(x: Array) -> tuple[float, Array]:
+        value, slope = _posterior_slope(moving, at(x), names)
+        return -value - still, -slope * scale
 
     options: Any = {"maxiter": steps, "ftol": 1e-6, "gtol": 3e-2}
     low, high = np.array(bounds).T
-    start = np.clip(start, low + 1e-6, high - 2 * _DIFFERENCE)
     result = minimize(
-        slope, start, args=(), jac=True, method="L-BFGS-B", bounds=bounds, options=options
-    )
-    best = with_values(model, names, np.exp(result.x * scale).tolist())
-    return Fit(best, evidence(channels, best), -float(result.fun))
+        cost, np.clip(start, low + 1e-6, high - 1e-6), jac=True, method="L-BFGS-B",
+        bounds=bounds, options=options,
+    )  # fmt: skip
+    best, top = at(result.x), -float(result.fun)
+    return Fit(best, top - log_prior(best, names), top)
 
 
 def laplace_sigma(channels: Sequence[Channel], model: ShakeModel, names: Sequence[str]) -> Array:
@@ -79,18 +105,18 @@ def laplace_sigma(channels: Sequence[Channel], model: ShakeModel, names: Sequenc
     scale = np.array([prior_of(n).step for n in names])
     values = np.log([value_of(model, n) for n in names])
 
-    def cost(step: Array) -> float:
-        moved = with_values(model, names, np.exp(values + step * scale).tolist())
-        return -evidence(channels, moved) - log_prior(moved, names)
+    def change(name: str, step: Array) -> Array:
+        own = [c for c in channels if tells_of(c, model, [name])]
+        down, up = (
+            with_values(model, names, np.exp(values + sign * step * scale).tolist())
+            for sign in (-1, 1)
+        )
+        both = [_posterior_slope(own, moved, names)[1] for moved in (down, up)]
+        return np.asarray((both[0] - both[1]) * scale)
 
-    h, unit, at = 0.25, np.eye(len(names)), cost(np.zeros(len(names)))
-    up = np.array([cost(h * row) for row in unit])
-    down = np.array([cost(-h * row) for row in unit])
-    curvature = np.diag((up + down - 2 * at) / h**2)
-    for i in range(len(names)):
-        for j in range(i):
-            both = cost(h * (unit[i] + unit[j]))
-            curvature[i, j] = curvature[j, i] = (both - up[i] - up[j] + at) / h**2
+    h = 0.25
+    rows = np.array([change(n, h * row) for n, row in zip(names, np.eye(len(names)))]) / (2 * h)
+    curvature = (rows + rows.T) / 2
     least = np.array([(s / prior_of(n).log_sigma) ** 2 for n, s in zip(names, scale)])
     roots = np.sqrt(least)
     values_, vectors = np.linalg.eigh(curvature / roots[:, None] / roots)

@@ -31,6 +31,10 @@ class Prior:
         """Up to a constant."""
         return float(-0.5 * (np.log(value / self.median) / self.log_sigma) ** 2)
 
+    def log_slope(self, value: float) -> float:
+        """Derivative of the log density by the number's logarithm."""
+        return float(-np.log(value / self.median) / self.log_sigma**2)
+
 
 PRIORS: dict[str, Prior] = {
     "modes.*.frequency_hz": Prior(1.0, 150.0, 15.0, 1.5, 0.02),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
-from telerig.estimator.shake_evidence import bubble_components, shake_components
+from telerig.estimator.shake_processes import bubble_processes, shake_processes
 from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
 from telerig.factors.state_space import Component
 
@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 
 LOWEST_HZ = 1.5
 _LEAST_PERIODS = 2.0
-_SMEAR_RAD = 0.35
+_SMEAR_RAD, _MOST_SMEAR_RAD = 0.35, 0.7
+_ENOUGH = 500
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,13 @@ def coarser(channel: Channel, factor: int) -> Channel:
 
 
 def coarsening(t_s: Array, highest_hz: float) -> int:
-    """How many frames may be averaged before a line of that frequency fades by 2 %."""
+    """How many frames may be averaged before a line of that frequency fades by 2 %.
+
+    By 8 % while more than `_ENOUGH` frames are left.
+    """
     step = float(np.median(np.diff(t_s)))
-    return max(1, int(_SMEAR_RAD / (np.pi * highest_hz * step)))
+    little, more = (int(s / (np.pi * highest_hz * step)) for s in (_SMEAR_RAD, _MOST_SMEAR_RAD))
+    return max(1, little, min(more, len(t_s) // _ENOUGH))
 
 
 def faded(frequency_hz: float, factor: int, t_s: Array) -> float:
@@ -122,16 +127,16 @@ def _spectra(channel: Channel, model: ShakeModel, where: int | str) -> tuple[Arr
 
 def _expected(channel: Channel, model: ShakeModel, where: int | str, frequency: Array) -> Array:
     movers = max(int(channel.moving.sum()), 1)
-    shake, cameras = shake_components(channel, model), len(channel.cameras)
-    bubble = bubble_components(channel, model) if channel.moving.any() else []
-    common = [c for c, camera in shake if camera == CARRIAGE]
-    own = [c for c, camera in shake if camera != CARRIAGE]
+    shake, cameras = shake_processes(channel, model), len(channel.cameras)
+    bubble = [p.component for p in bubble_processes(channel, model)]
+    common = [p.component for p in shake if p.camera == CARRIAGE]
+    own = [p.component for p in shake if p.camera != CARRIAGE]
     if where == "bubble" and movers > 1:
         return density(bubble, frequency) * (1 - 1 / movers)
     if where in (CARRIAGE, "bubble"):
         mean = density(bubble, frequency) / movers + density(common, frequency)
         return np.asarray(mean + density(own, frequency) / cameras**2)
-    mine = [c for c, camera in shake if camera == where]
+    mine = [p.component for p in shake if p.camera == where]
     return density(mine, frequency) + (density(own, frequency) - density(mine, frequency))
 
 

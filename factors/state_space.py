@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
+from telerig.factors.exact_steps import exact_steps, inverse_root
 
 Array = NDArray[np.float64]
-
-_TERMS = 26
-_SHORT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,18 +281,9 @@ def discretise(component: Component, dt_s: ArrayLike) -> Steps:
 
 
 def _steps(transition: Array, gain: Array, q: Array, index: NDArray[np.int64]) -> Steps:
-    whitener = _inverse_root(q)
+    whitener = inverse_root(q)
     log_det = np.log(np.diagonal(whitener, axis1=-2, axis2=-1)).sum(-1)
     return Steps(transition, gain, q, whitener, log_det, index.ravel())
-
-
-def _inverse_root(covariance: Array) -> Array:
-    """(..., n, n) lower W with W C W^T = 1, scaled so that small variances keep their digits."""
-    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    scaled = covariance / sigma[..., :, None] / sigma[..., None, :]
-    root = np.linalg.cholesky(scaled)
-    unit = np.broadcast_to(np.eye(root.shape[-1]), root.shape)
-    return np.asarray(np.tril(np.linalg.solve(root, unit)) / sigma[..., None, :])
 
 
 def elimination_basis(component: Component, steps: Steps) -> Array:
@@ -305,7 +294,7 @@ def elimination_basis(component: Component, steps: Steps) -> Array:
     pivots of a forward elimination are of order one, as Cholesky in double precision asks for.
     """
     prior = np.broadcast_to(
-        _inverse_root(component.start_covariance), (len(steps.whitener) + 1, *component.drift.shape)
+        inverse_root(component.start_covariance), (len(steps.whitener) + 1, *component.drift.shape)
     )
     ahead = np.zeros_like(prior)
     ahead[:-1] = steps.whitener @ steps.transition
@@ -319,45 +308,8 @@ def _exact(component: Component, dt: Array) -> tuple[Array, Array, Array]:
     drift = np.zeros((n + k, n + k))
     drift[:n, :n], drift[:n, n:] = component.drift, component.input
     noise = np.vstack([component.noise, np.zeros((k, component.noise.shape[1]))])
-    rate = np.max(np.abs(np.linalg.eigvals(drift)), initial=0.0)
-    doublings = np.ceil(np.log2(np.maximum(rate * dt / _SHORT, 1.0))).astype(int)
-    transition, q = _short_step(drift, noise, dt / 2.0**doublings)
-    for step in range(int(doublings.max(initial=0))):
-        more = doublings > step
-        phi = transition[more]
-        q[more] += phi @ q[more] @ np.swapaxes(phi, -1, -2)
-        transition[more] = phi @ phi
-    q = (q + np.swapaxes(q, -1, -2)) / 2
+    transition, q = exact_steps(drift, noise, dt)
     return transition[:, :n, :n], transition[:, :n, n:], q[:, :n, :n]
-
-
-def _short_step(drift: Array, noise: Array, h: Array) -> tuple[Array, Array]:
-    """Van Loan's exponential by its series, states scaled by the powers of h they grow with."""
-    n = len(drift)
-    scale = h[:, None] ** _orders(drift, noise)
-    ratio = scale[:, None, :] / scale[:, :, None]
-    f = drift * h[:, None, None] * ratio
-    q = noise @ noise.T * h[:, None, None] / scale[:, :, None] / scale[:, None, :]
-    block = np.zeros((len(h), 2 * n, 2 * n))
-    block[:, :n, :n], block[:, :n, n:], block[:, n:, n:] = -f, q, np.swapaxes(f, -1, -2)
-    total = np.broadcast_to(np.eye(2 * n), block.shape).copy()
-    term = total.copy()
-    for i in range(1, _TERMS):
-        term = term @ block / i
-        total += term
-    phi = np.swapaxes(total[:, n:, n:], -1, -2)
-    covariance = phi @ total[:, :n, n:]
-    return phi / ratio, covariance * scale[:, :, None] * scale[:, None, :]
-
-
-def _orders(drift: Array, noise: Array) -> Array:
-    """(n,) how many integrations lie between the white noise and each state."""
-    orders = np.full(len(drift), np.nan)
-    reached = np.abs(noise).sum(1)
-    for order in range(len(orders)):
-        orders[np.isnan(orders) & (reached > 0)] = order
-        reached = np.abs(drift) @ reached
-    return np.asarray(np.nan_to_num(orders, nan=0.0))
 
 
 def block_diagonal(blocks: Sequence[Array]) -> Array:

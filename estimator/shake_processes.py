@@ -1,0 +1,121 @@
+"""The stochastic processes that a channel's measurements are sums of, by hyper-parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.shake_channels import Channel
+from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
+from telerig.factors.state_space import (
+    Component,
+    broad_band,
+    driven_mode,
+    oscillator,
+    ou_velocity,
+    slow_ou,
+)
+
+Array = NDArray[np.float64]
+Make = Callable[..., Component]
+
+_cached = lru_cache(maxsize=512)
+_oscillator, _driven_mode = _cached(oscillator), _cached(driven_mode)
+_broad_band, _slow_ou, _ou_velocity = _cached(broad_band), _cached(slow_ou), _cached(ou_velocity)
+
+
+@dataclass(frozen=True)
+class Process:
+    """One process along a channel's direction, and what it is made from.
+
+    stem : of the hyper-parameters' names, "modes.0".  learned : their last parts with the arguments
+    of ``make`` and values here.  camera : the arm that it moves, CARRIAGE: all, None: a bubble.
+    """
+
+    stem: str
+    make: Make
+    learned: dict[str, tuple[str, float]]
+    fixed: dict[str, float] = field(default_factory=dict)
+    camera: int | None = None
+
+    @property
+    def component(self) -> Component:
+        """The same object for the same numbers."""
+        return self.make(**dict(self.learned.values()), **self.fixed)
+
+    def moved(self, name: str, factor: float) -> Component:
+        """With one hyper-parameter (its last part) times a factor."""
+        values = {n: (a, factor * v if n == name else v) for n, (a, v) in self.learned.items()}
+        return self.make(**dict(values.values()), **self.fixed)
+
+
+def shake_processes(channel: Channel, model: ShakeModel) -> list[Process]:
+    """The shake's, along the channel's direction."""
+    out: list[Process] = []
+    if not channel.shaken:
+        return out
+    for i, mode in enumerate(model.modes):
+        rms = _along(channel, mode.rms_mm, mode.camera)
+        if rms > 0:
+            learned = _line(rms, mode.frequency_hz, mode.damping)
+            make, fixed = _oscillator, {}
+            if mode.force_hz is not None:
+                make, fixed = _driven_mode, {"force_hz": mode.force_hz}
+            out.append(Process(f"modes.{i}", make, learned, fixed, mode.camera))
+    for i, band in enumerate(model.broad_bands):
+        rms = _along(channel, band.rms_mm, band.camera)
+        if rms > 0:
+            learned = {"rms_mm": ("rms_mm", rms)}
+            fixed = {"low_hz": band.low_hz, "high_hz": band.high_hz}
+            out.append(Process(f"broad_bands.{i}", _broad_band, learned, fixed, band.camera))
+            if band.slow_rms_mm > 0:
+                slow = {"rms": band.slow_rms_mm, "tau_s": band.slow_tau_s}
+                out.append(Process("", _slow_ou, {}, slow, band.camera))
+    return out
+
+
+def _line(rms_mm: float, frequency_hz: float, damping: float) -> dict[str, tuple[str, float]]:
+    values = {"rms_mm": rms_mm, "frequency_hz": frequency_hz, "damping": damping}
+    return {name: (name, value) for name, value in values.items()}
+
+
+def _along(channel: Channel, rms_mm: tuple[float, float, float], camera: int) -> float:
+    if camera != CARRIAGE and camera not in channel.cameras:
+        return 0.0
+    return float(np.sqrt(np.sum(np.square(channel.direction * rms_mm))))
+
+
+def bubble_processes(channel: Channel, model: ShakeModel) -> list[Process]:
+    """Of one bubble, along the channel's direction; none where nothing moves."""
+    if not channel.moving.any():
+        return []
+    bubble, share = model.bubble, 1 / np.sqrt(channel.pooled)
+    learned = {
+        "velocity_sigma_mm_s": ("sigma_mm_s", float(share * bubble.velocity_sigma_mm_s)),
+        "velocity_tau_s": ("tau_s", bubble.velocity_tau_s),
+    }
+    begin = {"start_sigma_mm": float(share * bubble.start_sigma_mm)}
+    parts = [Process("bubble", _ou_velocity, learned, begin)]
+    for i, z in enumerate(bubble.zigzags):
+        rms = float(share * np.sqrt(np.sum(np.square(channel.direction * z.rms_mm))))
+        if rms > 0:
+            line = _line(rms, z.frequency_hz, z.damping)
+            parts.append(Process(f"bubble.zigzags.{i}", _oscillator, line))
+    return parts
+
+
+def processes(channel: Channel, model: ShakeModel) -> list[Component]:
+    """Of the shake, then of one bubble. What two models have alike is the same object."""
+    found = shake_processes(channel, model) + bubble_processes(channel, model)
+    return [p.component for p in found]
+
+
+def tells_of(channel: Channel, model: ShakeModel, names: Sequence[str]) -> bool:
+    """Whether the channel's evidence depends on any of these hyper-parameters."""
+    found = shake_processes(channel, model) + bubble_processes(channel, model)
+    known = {f"{p.stem}.{last}" for p in found for last in p.learned}
+    return "pixel_inflation" in names or not known.isdisjoint(names)

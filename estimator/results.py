@@ -36,9 +36,17 @@ BAD_FLOOR = 5.0
 
 
 def calibration_from_fit(
-    fit: Fit, joint: JointCovariance, *, nominal_rotvec_deg: Array | None, name: str
+    fit: Fit,
+    joint: JointCovariance,
+    free: tuple[tuple[str, ...], ...],
+    *,
+    nominal_rotvec_deg: Array | None,
+    name: str,
 ) -> Calibration:
-    """Assemble the public result."""
+    """Assemble the public result.
+
+    free : per camera, the intrinsics of which the covariance speaks.
+    """
     problem, state = fit.robust.problem, fit.robust.solution.state
     cameras = cameras_from_state(problem, state)
     rig_names, rig_covariance = joint.rig_block()
@@ -52,7 +60,7 @@ def calibration_from_fit(
         target_poses={v: _pose(m) for v, m in zip(problem.views, state.rig_from_target)},
         covariance=rig_covariance,
         covariance_names=rig_names,
-        free=problem.free,
+        free=free,
         name=name,
         verdict=_verdict(fit, statistics),
         statistics=statistics,

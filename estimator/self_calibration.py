@@ -11,9 +11,17 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator import checks, initial, model_choice, numbering, tilt_signs, twins
+from telerig.estimator import (
+    checks,
+    initial,
+    model_choice,
+    model_doubt,
+    numbering,
+    tilt_signs,
+    twins,
+)
 from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import JointCovariance, joint_covariance
+from telerig.estimator.covariance import JointCovariance
 from telerig.estimator.eccentricity import eccentricity_px
 from telerig.estimator.graph import Progress, Solution, solve
 from telerig.estimator.halves import halves
@@ -124,16 +132,23 @@ def self_calibrate(
         fit, twin_cost=twin_cost, twin_by=by, twin_words=words_twin, pre=pre,
         notes=tuple(said),
     )  # fmt: skip
-    joint = joint_covariance(done.robust.problem, done.robust.solution)
-    found = calibration_from_fit(done, joint, nominal_rotvec_deg=nominal, name=name)
-    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint)})
+    open_groups = model_doubt.considered(done.choice, len(cameras))
+    doubt = model_doubt.considered_words(open_groups, [c.name for c in cameras])
+    done = replace(done, model_words=done.model_words + doubt)
+    free, joint = model_doubt.considered_covariance(
+        done.robust.problem, done.robust.solution, done.models, open_groups
+    )
+    found = calibration_from_fit(done, joint, free, nominal_rotvec_deg=nominal, name=name)
+    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint, free)})
 
 
-def _trust(fit: RobustFit, joint: JointCovariance) -> dict[str, Any]:
+def _trust(
+    fit: RobustFit, joint: JointCovariance, free: tuple[tuple[str, ...], ...]
+) -> dict[str, Any]:
     """What the data say of the covariance (repeatability, structure), and what would lower it."""
     problem, state = fit.problem, fit.solution.state
     whitened = whitened_error(state, problem.observations(), problem.rho_mm)
-    advice = next_view(problem, state, joint)
+    advice = next_view(replace(problem, free=free), state, joint)
     return {
         "halves": halves(problem, state),
         "structure": residual_tests(problem, whitened, joint.leverage),

@@ -64,13 +64,17 @@ def _acts_like(parameters: tuple[str, ...]) -> Lens:
 
 
 def considered_covariance(
-    problem: Problem, solution: Solution, models: Sequence[str], groups: Sequence[Lens]
+    problem: Problem,
+    solution: Solution,
+    joint: JointCovariance,
+    models: Sequence[str],
+    groups: Sequence[Lens],
 ) -> tuple[tuple[tuple[str, ...], ...], JointCovariance]:
     """Per camera what the covariance speaks of besides what is free, and the covariance.
 
-    models : of the solution, per camera.  groups : considered besides, per camera.
+    joint : of the solution.  models : of the solution, per camera.  groups : considered besides,
+    per camera.
     """
-    joint = joint_covariance(problem, solution)
     if not any(groups):
         return problem.free, joint
     names = [name_of({*groups_of(model), *more}) for model, more in zip(models, groups)]

@@ -21,7 +21,7 @@ from telerig.estimator import (
     twins,
 )
 from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import JointCovariance
+from telerig.estimator.covariance import JointCovariance, joint_covariance
 from telerig.estimator.eccentricity import eccentricity_px
 from telerig.estimator.graph import Progress, Solution, solve
 from telerig.estimator.halves import halves
@@ -127,18 +127,17 @@ def self_calibrate(
     fit = _fit(problem, start, models, solver, progress)
     if len(cameras) == 2 and by != PLATE:
         fit, by, words_twin = _settled_twin(fit, nominal)
-    twin_cost = _twin_cost(fit)
+    opened = model_doubt.considered(fit.choice, len(cameras))
+    doubt = model_doubt.considered_words(opened, [c.name for c in cameras])
     done = replace(
-        fit, twin_cost=twin_cost, twin_by=by, twin_words=words_twin, pre=pre,
-        notes=tuple(said),
+        fit, twin_cost=_twin_cost(fit), twin_by=by, twin_words=words_twin, pre=pre,
+        notes=tuple(said), model_words=fit.model_words + doubt,
     )  # fmt: skip
-    open_groups = model_doubt.considered(done.choice, len(cameras))
-    doubt = model_doubt.considered_words(open_groups, [c.name for c in cameras])
-    done = replace(done, model_words=done.model_words + doubt)
-    free, joint = model_doubt.considered_covariance(
-        done.robust.problem, done.robust.solution, done.models, open_groups
-    )
-    found = calibration_from_fit(done, joint, free, nominal_rotvec_deg=nominal, name=name)
+    final, solution = done.robust.problem, done.robust.solution
+    own = joint_covariance(final, solution)
+    free, joint = model_doubt.considered_covariance(final, solution, own, done.models, opened)
+    weak = checks.weak_parameters(final, solution.state, own)
+    found = calibration_from_fit(done, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
     return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint, free)})
 
 

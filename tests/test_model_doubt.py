@@ -107,8 +107,9 @@ def start_of(problem: Any, made: Any) -> Any:
 def test_the_covariance_is_the_richer_models_and_the_square_of_the_way_there(fitted: Any) -> None:
     """Against the richer model fitted to its minimum."""
     problem, solution = fitted
+    own = joint_covariance(problem, solution)
     free, joint = considered_covariance(
-        problem, solution, ("affine+radial", "radial"), (NONE, STRETCH)
+        problem, solution, own, ("affine+radial", "radial"), (NONE, STRETCH)
     )
     richer = problem.with_model(("affine+radial", "affine+radial"))
     assert free == richer.free
@@ -130,11 +131,9 @@ def test_the_covariance_is_the_richer_models_and_the_square_of_the_way_there(fit
 
 def test_nothing_considered_changes_nothing(fitted: Any) -> None:
     problem, solution = fitted
-    free, joint = considered_covariance(
-        problem, solution, ("affine+radial", "radial"), (NONE, NONE)
-    )
-    assert free == problem.free
-    np.testing.assert_array_equal(joint.matrix, joint_covariance(problem, solution).matrix)
+    own = joint_covariance(problem, solution)
+    given = (problem, solution, own, ("affine+radial", "radial"), (NONE, NONE))
+    assert considered_covariance(*given) == (problem.free, own)
 
 
 def test_of_many_dots_some_are_as_uncertain_as_in_the_whole(
@@ -144,7 +143,8 @@ def test_of_many_dots_some_are_as_uncertain_as_in_the_whole(
     problem, solution = fitted
     problem = replace(problem, scale=None)
     solution = solve(problem, solution.state)
-    given = (problem, solution, ("affine+radial", "radial"), (NONE, STRETCH))
+    own = joint_covariance(problem, solution)
+    given = (problem, solution, own, ("affine+radial", "radial"), (NONE, STRETCH))
     some = np.array([0, 3, 7])
     whole = considered_covariance(*given)[1].of_rig_and(some)
     monkeypatch.setattr(covariance, "WHOLE", 10)

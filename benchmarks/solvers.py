@@ -191,13 +191,22 @@ Per iteration, measured dot and CPU core, in nanoseconds ("images": all derivati
 
 {growth}
 
-At 50 views the sum is the same within 20 % from 400 to 2,000 dots; below, and with few views,
-calls into NumPy weigh more. The images' share does not grow with the views. The step does while
-the dots are many: each dot adds an outer product to the matrix of all V views, (6 V)^2 x 3 / (2 V)
-= 54 V multiply-adds a measured dot (10,800 at 200 views, at some 16 a nanosecond in the BLAS), and
-one factorisation of (6 V)^3 / 3 is shared by all of them. Where dots are fewer than twice the
-views, the views are eliminated instead; where each view sees a part of the dots, the outer
-products are of the views that do.
+At 50 views and 100, 400 and 2,000 dots the sums are alike: the largest over the smallest is
+1.09 with numpy, 1.14 to 1.21 with numba (three rounds, the sizes in turn). Before, 50x100 took
+937 (numba 784) beside 537 (450) of 50x400: its third chunk was half as large as the others, so
+that work arrays changed their shape and were allocated anew, and what glibc gives back to the
+system it takes again as fresh pages at 5 us each, up to 600 an iteration. Now chunks are of one
+size, arrays keep their memory whatever their shape, and the library is told to keep what is
+freed (`factors/image_blocks.py: keep_freed_memory`). What is left at 100 dots is the step: one
+factorisation is shared by fewer dots (37 ns a measured dot at 100, 10 at 400), and so are the
+triangular solves (20 and 10).
+
+The images' share does not grow with the views. The step does while the dots are many: each dot
+adds an outer product to one half of the matrix of all V views, (6 V)^2 x 3 / 2 / (2 V) = 27 V
+multiply-adds a measured dot, at some 17 a nanosecond in the BLAS (79 ns at 50 views, 318 at
+200), and the one factorisation, (6 V)^3 / 6, is shared by all of them (107 ns at 200x400): 425
+of the 435. Where dots are fewer than twice the views, the views are eliminated instead; where
+each view sees a part of the dots, the outer products are of the views that do.
 
 A limit is of wall time, on a machine shared with other work; "-" was not run. Where nothing but
 the product finished, its cost has no independent witness.

@@ -170,7 +170,7 @@ class _Sums:
         right = np.concatenate(
             [p.ravel() for p in (self.right_shared, self.right_views, self.right_dots.T)]
         )
-        cost = 0.5 * (self.twice + self.system.prior_cost(self.state))
+        cost = 0.5 * self.twice
         by_view = self.by_view.reshape(len(self.shared), -1)
         return NormalEquations(
             cost,
@@ -264,27 +264,36 @@ class _Sums:
         self.cross[lens, :, at] += by_lens
 
     def _add_priors(self) -> Array | None:
-        """Intrinsics, depth gauge, view places and dots; returns the row of the known distance."""
+        """Intrinsics, depth gauge, view places and dots, with their cost (`prior_cost`).
+
+        Returns the row of the known distance.
+        """
         system, problem, state = self.system, self.system.problem, self.state
         for c in range(len(problem.cameras)):
             pull, weight = system.intrinsic_pull(state, c)
             lens = system.intrinsics_of(c)
             self.shared[lens, lens] += np.diag(weight**2)
             self.right_shared[lens] -= pull * weight
+            self.twice += float(pull @ pull)
         for c in range(1, len(problem.cameras)):
             value, jacobian = depth_gauge_residual(state.rig_from_camera[c], GAUGE_SIGMA_MM)
             pose = system.pose_of(c)
             self.shared[pose, pose] += jacobian.T @ jacobian
             self.right_shared[pose] -= jacobian.T @ value
+            self.twice += float(value @ value)
         self.views[:, range(3, 6), range(3, 6)] += system.loose_mm**-2.0
-        turn, shift = state.rig_from_target[:, :3, :3], state.rig_from_target[:, :3, 3:]
-        self.right_views[:, 3:] -= (np.swapaxes(turn, -1, -2) @ shift)[..., 0] / system.loose_mm**2
-        weight = system.dot_weight
+        turn, shift = state.rig_from_target[:, :3, :3], state.rig_from_target[:, :3, 3]
+        self.right_views[:, 3:] -= np.einsum("vij,vi->vj", turn, shift) / system.loose_mm**2
+        self.twice += float(np.vdot(shift, shift)) / system.loose_mm**2
+        off, weight = (state.dots_mm - problem.nominal_mm).T, system.dot_weight
+        weighted = off * weight
         self.dots[range(3), range(3)] += weight
-        self.right_dots -= (state.dots_mm - problem.nominal_mm).T * weight
+        self.right_dots -= weighted
+        self.twice += float(np.vdot(off, weighted))
         if problem.scale is None:
             return None
         value, jacobian = distance_residual(state.dots_mm, *problem.scale)
+        self.twice += float(value @ value)
         self.right_dots -= (jacobian[0] * value[0]).reshape(-1, 3).T
         return np.asarray(jacobian[0])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ class JointCovariance:
     Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
     dots : (N, 3, 3) of each dot.  cross : (C, N, 3) of each dot with cameras and views.
     leverage : (M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs.
+    units : (D',) physical units per unit of the solver, of all numbers.
     """
 
     names: tuple[str, ...]
@@ -40,6 +41,7 @@ class JointCovariance:
     cross: Array
     rig: int
     leverage: Array
+    units: Array
 
     def of_rig_and(self, dots: Ints) -> Array:
         """(P + 3 n, P + 3 n) of the rig block and some of the dots.
@@ -68,14 +70,32 @@ class JointCovariance:
         """E[sum of squared whitened residuals] = rows - trace(J C J^T)."""
         return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
+    def widened(self, offset: Array) -> JointCovariance:
+        """With the square of a common offset, (D,) in the solver's units, added.
+
+        Dots stay independent given cameras and views where theirs follows from that of those.
+        """
+        shift = offset * self.units
+        whole = shift[: len(self.matrix)]
+        common, of_dots = shift[: len(self.cross)], shift[len(self.cross) :].reshape(-1, 3)
+        return replace(
+            self,
+            matrix=self.matrix + np.outer(whole, whole),
+            dots=self.dots + of_dots[:, :, None] * of_dots[:, None],
+            cross=self.cross + common[:, None, None] * of_dots,
+        )
+
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
         """Names and covariance of the cameras alone: intrinsics, then the second camera's pose."""
         return self.names[: self.rig], self.matrix[: self.rig, : self.rig]
 
 
-def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
+def joint_covariance(
+    problem: Problem, solution: Solution, *, leverage: Array | None = None
+) -> JointCovariance:
     """Inverse of the information at the solution, from the solver's own factorisation.
 
+    leverage : where it is known already.
     What no measurement touches (the pose of a view that was left out) is infinitely uncertain.
 
     Raises CalibrationError when it is singular to working precision.
@@ -86,13 +106,14 @@ def joint_covariance(problem: Problem, solution: Solution) -> JointCovariance:
     matrix = matrix.copy()
     untouched = posterior.untouched[: len(matrix)]
     matrix[untouched, untouched] = np.inf
-    units = _units(problem, len(matrix))
+    units = _units(problem, size)
     rig = sum(len(f) for f in problem.free) + 6 * (len(problem.cameras) - 1)
-    leverage = hat_matrix_blocks(problem, solution, posterior)
-    names = _names(problem)[: len(matrix)]
-    matrix *= units[:, None] * units
+    if leverage is None:
+        leverage = hat_matrix_blocks(problem, solution, posterior)
+    names, within = _names(problem)[: len(matrix)], units[: len(matrix)]
+    matrix *= within[:, None] * within
     cross = posterior.cross * units[: len(posterior.cross), None, None]
-    return JointCovariance(names, matrix, posterior.dots, cross, rig, leverage)
+    return JointCovariance(names, matrix, posterior.dots, cross, rig, leverage, units)
 
 
 def _units(problem: Problem, size: int) -> Array:

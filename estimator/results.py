@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator import checks
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import JointCovariance, aligned_covariance
 from telerig.estimator.model_rows import model_rows
@@ -36,15 +35,24 @@ BAD_FLOOR = 5.0
 
 
 def calibration_from_fit(
-    fit: Fit, joint: JointCovariance, *, nominal_rotvec_deg: Array | None, name: str
+    fit: Fit,
+    joint: JointCovariance,
+    free: tuple[tuple[str, ...], ...],
+    weak: list[str],
+    *,
+    nominal_rotvec_deg: Array | None,
+    name: str,
 ) -> Calibration:
-    """Assemble the public result."""
+    """Assemble the public result.
+
+    free : per camera, the intrinsics of which the covariance speaks.
+    weak : sentences of `checks.weak_parameters` on the fit.
+    """
     problem, state = fit.robust.problem, fit.robust.solution.state
     cameras = cameras_from_state(problem, state)
     rig_names, rig_covariance = joint.rig_block()
     residuals = residual_table(problem, state)
     statistics = _statistics(fit, joint, residuals) | _geometry(fit, joint)
-    weak = checks.weak_parameters(problem, state, joint)
     calibration = Calibration(
         cameras=cameras,
         dot_ids=problem.dot_ids,
@@ -52,7 +60,7 @@ def calibration_from_fit(
         target_poses={v: _pose(m) for v, m in zip(problem.views, state.rig_from_target)},
         covariance=rig_covariance,
         covariance_names=rig_names,
-        free=problem.free,
+        free=free,
         name=name,
         verdict=_verdict(fit, statistics),
         statistics=statistics,

@@ -105,18 +105,19 @@ class Reduced:
 
     def solve(self, right: Array) -> Array:
         """right : (D,) or (D, k)."""
-        columns = right.reshape(len(right), -1)
-        inner = self.blocks.forward(columns[self.eliminated].T)
-        of_kept = columns[self.kept]
+        # few vectors, each along memory: a product of its own for each reads the matrix fastest
+        rows = right.reshape(len(right), -1).T.copy()
+        inner = self.blocks.forward(np.take(rows, self.eliminated, axis=1))
+        of_kept = np.take(rows, self.kept, axis=1)
         for piece in self.pieces:
-            of_kept[piece.rows] -= piece.matrix @ inner[:, piece.columns].T
-        first, _ = dpotrs(self.factor, of_kept, lower=1)
+            of_kept[:, piece.rows] -= _each(piece.matrix, inner[:, piece.columns])
+        solved, _ = dpotrs(self.factor, of_kept.T, lower=1, overwrite_b=1)
+        first = solved.T
         for piece in self.pieces:
-            inner[:, piece.columns] -= first[piece.rows].T @ piece.matrix
-        out = np.empty_like(columns)
-        out[self.kept] = first
-        out[self.eliminated] = self.blocks.backward(inner).T
-        return out.reshape(right.shape)
+            inner[:, piece.columns] -= _each(piece.matrix.T, first[:, piece.rows])
+        rows[:, self.kept] = first
+        rows[:, self.eliminated] = self.blocks.backward(inner)
+        return np.ascontiguousarray(rows.T).reshape(right.shape)
 
     def inverse_kept(self) -> Array:
         """(K, K) block of the inverse."""
@@ -160,6 +161,11 @@ class Reduced:
         out[np.ix_(self.eliminated, self.kept)] = across.T
         out[np.ix_(self.eliminated, self.eliminated)] = own
         return out
+
+
+def _each(matrix: Array, vectors: Array) -> Array:
+    """(k, rows) the matrix times each of (k, columns)."""
+    return np.asarray((matrix @ vectors[..., None])[..., 0])
 
 
 def _piece(coupling: Array, blocks: Blocks, group: Group) -> Piece:

@@ -11,7 +11,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator import checks, initial, model_choice, numbering, tilt_signs, twins
+from telerig.estimator import (
+    checks,
+    initial,
+    model_choice,
+    model_doubt,
+    numbering,
+    tilt_signs,
+    twins,
+)
 from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import JointCovariance, joint_covariance
 from telerig.estimator.eccentricity import eccentricity_px
@@ -119,21 +127,27 @@ def self_calibrate(
     fit = _fit(problem, start, models, solver, progress)
     if len(cameras) == 2 and by != PLATE:
         fit, by, words_twin = _settled_twin(fit, nominal)
-    twin_cost = _twin_cost(fit)
+    opened = model_doubt.considered(fit.choice, len(cameras))
+    doubt = model_doubt.considered_words(opened, [c.name for c in cameras])
     done = replace(
-        fit, twin_cost=twin_cost, twin_by=by, twin_words=words_twin, pre=pre,
-        notes=tuple(said),
+        fit, twin_cost=_twin_cost(fit), twin_by=by, twin_words=words_twin, pre=pre,
+        notes=tuple(said), model_words=fit.model_words + doubt,
     )  # fmt: skip
-    joint = joint_covariance(done.robust.problem, done.robust.solution)
-    found = calibration_from_fit(done, joint, nominal_rotvec_deg=nominal, name=name)
-    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint)})
+    final, solution = done.robust.problem, done.robust.solution
+    own = joint_covariance(final, solution)
+    free, joint = model_doubt.considered_covariance(final, solution, own, done.models, opened)
+    weak = checks.weak_parameters(final, solution.state, own)
+    found = calibration_from_fit(done, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
+    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint, free)})
 
 
-def _trust(fit: RobustFit, joint: JointCovariance) -> dict[str, Any]:
+def _trust(
+    fit: RobustFit, joint: JointCovariance, free: tuple[tuple[str, ...], ...]
+) -> dict[str, Any]:
     """What the data say of the covariance (repeatability, structure), and what would lower it."""
     problem, state = fit.problem, fit.solution.state
     whitened = whitened_error(state, problem.observations(), problem.rho_mm)
-    advice = next_view(problem, state, joint)
+    advice = next_view(replace(problem, free=free), state, joint)
     return {
         "halves": halves(problem, state),
         "structure": residual_tests(problem, whitened, joint.leverage),

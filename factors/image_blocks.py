@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ from telerig.factors.projection import State, apparent_shift_mm
 from telerig.rig.pose import hat
 
 Array = NDArray[np.float64]
+
+FREED_BYTES = 16 << 20
+"""No more than 32 MB, where glibc stops to learn."""
 
 
 @dataclass(frozen=True)
@@ -76,17 +80,29 @@ def view_from_camera_tangent(rotation: Array, offset: Array) -> Array:
     return out
 
 
+def keep_freed_memory() -> None:
+    """Let the C library keep what is freed, up to twice `FREED_BYTES`, for the next array.
+
+    glibc gives blocks beyond a limit back to the system, whose fresh pages cost 5 us each, twice
+    what is computed in them. A block that was freed raises the limit to its size (mallopt(3),
+    M_MMAP_THRESHOLD); nothing is written into it, so that it takes no memory.
+    """
+    np.empty(FREED_BYTES, np.uint8)
+
+
 class Scratch:
     """Memory that is used again for the next chunk: a fresh megabyte costs more than its use."""
 
     def __init__(self) -> None:
         self._kept: dict[str, Array] = {}
+        keep_freed_memory()
 
     def empty(self, name: str, *shape: int) -> Array:
-        """What was kept under the name, if it is of this shape; its content is lost."""
-        if name not in self._kept or self._kept[name].shape != shape:
-            self._kept[name] = np.empty(shape)
-        return self._kept[name]
+        """The beginning of what is kept under the name, which grows; its content is lost."""
+        size = prod(shape)
+        if name not in self._kept or len(self._kept[name]) < size:
+            self._kept[name] = np.empty(size)
+        return self._kept[name][:size].reshape(shape)
 
 
 def view_gram(state: State, rows: ImageRows, rho_mm: tuple[float, ...]) -> Array:

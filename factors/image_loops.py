@@ -214,8 +214,8 @@ def _squared(
 def handles(state: State, rows: ImageRows, free: Sequence[int]) -> bool:
     """Whether the chunk's cameras are plain lenses in air."""
     tilt = range(planes.TILT.start, planes.TILT.stop)
-    plain = not any(rows.walls) and not np.any(rows.plate_shift)
-    return plain and not np.any(state.intrinsics[:, planes.TILT]) and not set(tilt) & set(free)
+    plain = not any(rows.walls) and not rows.plate_shift.any()
+    return plain and not state.intrinsics[:, planes.TILT].any() and not set(tilt) & set(free)
 
 
 @dataclass(frozen=True)

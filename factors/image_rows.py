@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CHUNK = 4000
-"""Measured dots evaluated at once: fewer cost calls, more leave the cache."""
+"""Measured dots evaluated at once, about: fewer cost calls, more leave the cache."""
 DENSE = 0.6
 """Share of the dots that images see on average, above which columns are dots."""
 
@@ -73,6 +73,9 @@ def in_chunks(obs: Observations, dot_count: int, chunk: int | None = None) -> li
     present, first, size = np.unique(image[order], return_index=True, return_counts=True)
     dense = len(obs) > DENSE * len(present) * dot_count and not any(obs.walls)
     width = np.full(len(present), dot_count) if dense else size
+    # of about equal size, so that none costs its calls for a few dots
+    parts = max(1, round(int(width.sum()) / chunk))
+    chunk = int(np.ceil(-(-len(present) // parts) * width.mean())) if len(present) else chunk
     out, start = [], 0
     while start < len(present):
         stop = start + 1

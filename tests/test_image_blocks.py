@@ -17,6 +17,7 @@ from telerig.estimator.covariance import joint_covariance
 from telerig.estimator.graph import Solution, slots
 from telerig.estimator.problem import Problem, nominal_state, whitening
 from telerig.factors import image_rows
+from telerig.factors.image_blocks import Scratch
 from telerig.factors.image_rows import in_chunks
 from telerig.factors.projection import State, whitened_residuals
 from telerig.rig.camera import Camera
@@ -171,6 +172,24 @@ def test_chunks_of_any_size(seen: float, rng: Any, monkeypatch: pytest.MonkeyPat
     assert len(system.chunks) >= 3
     np.testing.assert_allclose(system.linearised(state).right, whole.right, rtol=1e-9, atol=1e-6)
     check(problem, state)
+
+
+def test_chunks_share_the_work_alike(rng: Any) -> None:
+    """None is a small rest, and their arrays lie in the same memory whatever their shape."""
+    problem = problem_of(("k1",), rng, 1.0)
+    obs = problem.observations()
+    images = len(np.unique(obs.view * 2 + obs.camera))
+    for parts in (2, 3):
+        size = int(1.1 * len(obs) / parts)
+        sizes = [len(rows.view) for rows in in_chunks(obs, len(problem.dot_ids), size)]
+        assert sum(sizes) == images and len(sizes) == parts
+        assert max(sizes) - min(sizes) <= parts
+    scratch = Scratch()
+    large = scratch.empty("columns", 4, 6)
+    small = scratch.empty("columns", 5, 2)
+    assert np.shares_memory(large, small) and small.flags.c_contiguous
+    assert not np.shares_memory(small, scratch.empty("other", 5, 2))
+    assert scratch.empty("columns", 4, 6).shape == (4, 6)
 
 
 def test_every_measurement_is_in_one_chunk(rng: Any) -> None:

@@ -74,7 +74,9 @@ def test_cost_information_and_gradient(either: tuple[Problem, State]) -> None:
 def test_a_step_solves_the_damped_equations(damping: float, either: tuple[Problem, State]) -> None:
     problem, start = either
     ours = ArraySystem(problem, start).linearised(start)
+    given = ours.right.copy()
     step, promised = ours.step(damping)
+    np.testing.assert_array_equal(ours.right, given)
     dense = ours.information()
     if ours.distance is not None:
         size = ours.common

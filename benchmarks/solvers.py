@@ -197,7 +197,7 @@ At 50 views and 100, 400 and 2,000 dots the sums are alike: the largest over the
 that work arrays changed their shape and were allocated anew, and what glibc gives back to the
 system it takes again as fresh pages at 5 us each, up to 600 an iteration. Now chunks are of one
 size, arrays keep their memory whatever their shape, and the library is told to keep what is
-freed (`factors/image_blocks.py: keep_freed_memory`). What is left at 100 dots is the step: one
+freed (`rig/memory.py: keep_freed_memory`). What is left at 100 dots is the step: one
 factorisation is shared by fewer dots (37 ns a measured dot at 100, 10 at 400), and so are the
 triangular solves (20 and 10).
 

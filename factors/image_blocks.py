@@ -18,12 +18,10 @@ from telerig.factors import lens_planes as planes
 from telerig.factors.image_rows import ImageRows
 from telerig.factors.lens_planes import Lens
 from telerig.factors.projection import State, apparent_shift_mm
+from telerig.rig.memory import keep_freed_memory
 from telerig.rig.pose import hat
 
 Array = NDArray[np.float64]
-
-FREED_BYTES = 16 << 20
-"""No more than 32 MB, where glibc stops to learn."""
 
 
 @dataclass(frozen=True)
@@ -78,16 +76,6 @@ def view_from_camera_tangent(rotation: Array, offset: Array) -> Array:
     out[:, :3, :3] = out[:, 3:, 3:] = -back
     out[:, 3:, :3] = hat((back @ offset)[..., 0]) @ back
     return out
-
-
-def keep_freed_memory() -> None:
-    """Let the C library keep what is freed, up to twice `FREED_BYTES`, for the next array.
-
-    glibc gives blocks beyond a limit back to the system, whose fresh pages cost 5 us each, twice
-    what is computed in them. A block that was freed raises the limit to its size (mallopt(3),
-    M_MMAP_THRESHOLD); nothing is written into it, so that it takes no memory.
-    """
-    np.empty(FREED_BYTES, np.uint8)
 
 
 class Scratch:

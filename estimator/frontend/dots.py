@@ -48,6 +48,7 @@ from telerig.estimator.frontend.noise import (
     rough_sigma,
     with_inner_level,
 )
+from telerig.rig.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -106,6 +107,7 @@ def measure_dots(
     max_diameter_px : larger blobs are no dots, and tell nothing of the dots' size.
     """
     grey = _checked(image, polarity, min_diameter_px)
+    keep_freed_memory()
     response = high_pass(grey)
     edges = edge_map(grey, rough_sigma(response))
     noise = estimate_noise(grey, response, edges.flat, step=grey_step(np.asarray(image)))

@@ -123,6 +123,19 @@ def test_dots_fitted_together_are_those_fitted_alone() -> None:
         assert (ours.pixels, ours.dropped, ours.converged) == (alone.pixels, alone.dropped, True)
 
 
+@pytest.mark.parametrize("pixels", [0, 1, 3])
+def test_a_dot_that_shows_hardly_a_pixel_does_not_disturb_the_others(pixels: int) -> None:
+    shape = shape_from_axes(6, 5, 0.3)
+    grey = picture(shape)
+    hidden = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
+    hidden.mask.flat[pixels:] = False
+    whole = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
+    start = Start(CENTRE + (0.4, -0.3), shape * 1.06, 1.2)
+    none, one = fit_dots([hidden, whole], [start, start], noise_of(2.0), [HELD, HELD])
+    assert not none.converged and none.pixels == pixels
+    assert one.converged and np.linalg.norm(one.centre_px - CENTRE) < 1e-3
+
+
 def test_a_free_contrast_gradient_would_more_than_double_the_variance() -> None:
     shape = np.array([4.0, 0.0, 4.0])
     free = fit(picture(shape), shape, 1.0, Prior(sigma_per_px=1.0))

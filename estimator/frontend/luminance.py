@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+_FEW_PIXELS = 1e-9
+"""Of a pixel's weight on no grey at all, so that too few pixels tell something."""
 EDGE_EXPANSION_LIMIT = 0.25  # centres agree with the exact sum to 1e-5 px, levels to 5e-4
 
 
@@ -94,7 +96,7 @@ def gather(
 ) -> Pixels:
     """The pixels that each window's mask shows, those of the shorter ones padded."""
     counts = np.array([np.count_nonzero(w.mask) for w in windows])
-    x, y, grey = np.zeros((3, len(windows), int(counts.max())))
+    x, y, grey = np.zeros((3, len(windows), max(int(counts.max()), 1)))
     origin, radius, grids = np.empty((len(windows), 2)), np.empty(len(windows)), []
     for i, (window, start) in enumerate(zip(windows, starts)):
         before = start.previous
@@ -160,7 +162,8 @@ def grey_levels(pixels: Pixels, theta: Array, levels: Array) -> tuple[Array, Arr
 def _first_levels(pixels: Pixels, jacobian: Array) -> Array:
     design = jacobian[:, 6:10] * pixels.there[:, None]
     pull = design @ pixels.grey[..., None]
-    levels = np.linalg.solve(design @ transposed(design), pull)[..., 0]
+    information = design @ transposed(design) + _FEW_PIXELS * np.eye(4)
+    levels = np.linalg.solve(information, pull)[..., 0]
     return np.concatenate([levels, np.zeros((len(levels), 2))], axis=1)
 
 

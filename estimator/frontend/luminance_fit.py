@@ -122,7 +122,7 @@ def _descend(
         moved = state.parameters[dots] + step
         sound = _admissible(moved[:, :6], some.radius)
         gain = np.sum(step * pull, axis=1)
-        small = gain < tolerance * np.maximum(1.0, state.chi2[dots] / some.counts)
+        small = gain < tolerance * np.maximum(1.0, state.chi2[dots] / np.maximum(some.counts, 1))
         last = small & (damping[dots] <= 1e-3) & sound
         done = dots[last]
         state.parameters[done] = moved[last]
@@ -225,14 +225,14 @@ def _fit(
         converged[dots] = False
         settled = _descend(pixels, state, dots, iterations=iterations, tolerance=tolerance)
         converged[settled] = True
-    return converged
+    return converged & (pixels.counts > PARAMETERS)
 
 
 def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> Mask:
     """(N, P), of some dots."""
     whitened = np.abs(residual[dots]) / np.sqrt(variance[dots])
     limit = np.empty((len(dots), 1))
-    for k, count in enumerate(pixels.counts[dots]):
+    for k, count in enumerate(np.maximum(pixels.counts[dots], 1)):
         places = [count // 2, int(0.95 * (count - 1))]
         middle, high = np.partition(whitened[k, :count], places)[places]
         limit[k] = _OUTLIER_SIGMA * max(1.0, 1.4826 * middle, 0.51 * high)
@@ -276,7 +276,7 @@ def _results(pixels: Pixels, state: _State, converged: Mask) -> list[DotFit]:
             pixels.origin[i],
             float(pixels.radius[i]),
             covariance[i, :2, :2],
-            float(np.sqrt(covariance[i, 9, 9])),
+            float(np.sqrt(max(covariance[i, 9, 9], 0.0))),
             float(chi2_dof[i]),
             int(pixels.counts[i]),
             int(dropped[i]),

@@ -14,13 +14,14 @@ from telerig.estimator.frontend.dot_candidates import (
     Candidates,
     Polarity,
 )
-from telerig.estimator.frontend.dot_types import DotFit
+from telerig.estimator.frontend.dot_types import PARAMETERS, DotFit
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.float32]
 
 GLARE = "saturated by glare"
 MUCH_SMALLER = "much smaller than the other dots"
+HIDDEN = "hardly a pixel is its own"
 FAINT = "much fainter than the other dots"
 DARK_SPECK = "does not look like a dot (contrast has the wrong sign)"
 
@@ -92,6 +93,8 @@ def reason_against_fit(
     fit: DotFit, grey: Grey, polarity: Polarity, usual_contrast: float, saturation: float
 ) -> str:
     """Reason to leave a fitted dot out, or an empty string."""
+    if fit.pixels <= PARAMETERS:
+        return HIDDEN
     if not np.all(np.isfinite(fit.covariance_px2)) or axes_from_shape(fit.shape_px)[1] <= 0.0:
         return "does not look like a dot (fit failed)"
     half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(grey.shape[::-1])

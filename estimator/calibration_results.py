@@ -14,7 +14,6 @@ from telerig.estimator.calibrate import CalibrationRun
 from telerig.io.atomic import atomic_folder, write_json_atomic
 from telerig.io.parallel import assistant
 from telerig.io.provenance import run_record
-from telerig.io.tables import write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,7 +55,6 @@ def report_beside(wanted: bool) -> Iterator[Callable[[Path], object] | None]:
 
 def _prepare_report() -> None:
     import pandas  # noqa: F401
-    import scipy.spatial.transform  # noqa: F401
 
     import telerig.io.report.calibration_report  # noqa: F401
     from telerig.io.report.page import prepare_page
@@ -112,6 +110,8 @@ def write_uncertainty(calibration: Calibration, path: Path) -> None:
 
 def write_detections(detected: DatasetDots, folder: Path) -> None:
     """rejected.csv, and overlays/<camera>/<view>.jpg where they were drawn."""
+    from telerig.io.tables import write_table
+
     write_table(detected.rejected, folder / "rejected.csv")
     for image in (i for i in detected.images if i.overlay):
         target = folder / "overlays" / image.camera / f"{image.view}.jpg"

@@ -35,11 +35,26 @@ def rotation_from_rotvec(rotvec_rad: ArrayLike) -> Array:
 
 
 def rotvec_from_rotation(rotation: ArrayLike) -> Array:
-    """(..., 3, 3) -> (..., 3) rotation vectors, angles in [0, pi]."""
-    from scipy.spatial.transform import Rotation
+    """(..., 3, 3) -> (..., 3) rotation vectors, angles in [0, pi].
 
+    By the unit quaternion (Shepperd, J. Guidance and Control 1, 1978): every column of 4 q q^T is
+    a multiple of q, and the longest one is taken.
+    """
     r = np.asarray(rotation, float)
-    return np.asarray(Rotation.from_matrix(r.reshape(-1, 3, 3)).as_rotvec().reshape(r.shape[:-1]))
+    trace = np.trace(r, axis1=-2, axis2=-1)[..., None]
+    turned = np.swapaxes(r, -1, -2)
+    outer = np.empty((*r.shape[:-2], 4, 4))
+    outer[..., :3, :3] = r + turned
+    outer[..., range(3), range(3)] = 1 - trace + 2 * np.diagonal(r, axis1=-2, axis2=-1)
+    skew = r - turned
+    outer[..., :3, 3] = outer[..., 3, :3] = skew[..., [2, 0, 1], [1, 2, 0]]
+    outer[..., 3, 3] = 1 + trace[..., 0]
+    longest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(outer, longest[..., None, None], axis=-1)[..., 0]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True) * np.where(q[..., 3:] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., 3:])
+    return np.asarray(q[..., :3] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2.0))
 
 
 def nearest_rotation(matrix: ArrayLike) -> Array:

@@ -17,6 +17,7 @@ from telerig.estimator.frontend.blurred_ellipse import (
     largest_curvature,
     shape_from_axes,
 )
+from telerig.estimator.frontend.luminance import EDGE_EXPANSION_LIMIT
 
 Array = NDArray[np.float64]
 K = 40  # sub-pixels per pixel
@@ -132,6 +133,23 @@ def test_edge_expansion_agrees_with_the_exact_sum(
     coverage, gradient = coverage_near_edge(u[band], v[band], shape, sigma)
     assert np.max(np.abs(coverage - exact[band])) < 1e-4
     assert np.max(np.abs(gradient - slopes[:, band])) < 0.01 * np.max(np.abs(slopes))
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "angle"), [(5.0, 4.0, 0.4), (8.0, 5.0, 0.0), (12.0, 6.0, 0.4), (20.0, 9.0, 1.1)]
+)
+def test_edge_expansion_at_its_limit_hardly_moves_a_dot(a: float, b: float, angle: float) -> None:
+    shape, pixels = shape_from_axes(a, b, angle), np.arange(2 * int(a) + 20, dtype=float)
+    sigma = 0.96 * EDGE_EXPANSION_LIMIT / float(largest_curvature(shape))
+    centre = np.array([a + 10.23, a + 9.6])
+    exact, slopes = coverage_on_grid(pixels, pixels, centre, shape, sigma)
+    u, v = np.meshgrid(pixels - centre[0], pixels - centre[1])
+    found, _ = coverage_near_edge(u.ravel(), v.ravel(), shape, sigma)
+    error = found - exact.ravel()
+    assert np.max(np.abs(error)) < 5.5e-4
+    columns = np.vstack([slopes.reshape(6, -1), np.ones(error.size), exact.ravel()])
+    moved = np.linalg.lstsq(columns.T, error, rcond=None)[0]
+    assert np.linalg.norm(moved[:2]) < 2e-5
 
 
 def test_the_middle_of_a_dot_is_simply_inside() -> None:

@@ -166,13 +166,13 @@ def test_offset_roll_and_pitch_are_those_of_the_body() -> None:
 
 @pytest.mark.parametrize("shake_mm", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_coverage_with_and_without_shake(shake_mm: float) -> None:
-    """20 um and 50 urad come back with errors that their covariance says; 5 runs each."""
+    """20 um and 50 urad come back with errors that their covariance says; 8 runs each."""
     rng = np.random.default_rng(5)
     cameras = rig()
     prior = DriftPrior()
     basis = np.linalg.pinv(free_directions(drift_covariance(cameras, prior)))
     nees, called = [], 0
-    for _ in range(5):
+    for _ in range(8):
         known = calibration(cameras)
         wrong = np.sqrt(np.diagonal(known.covariance)) * rng.standard_normal(6)
         tangent = along_gap(cameras, 0.02, 3e-5, 4e-5)
@@ -186,14 +186,14 @@ def test_coverage_with_and_without_shake(shake_mm: float) -> None:
         spread = basis @ change.covariance @ basis.T
         nees.append(error @ np.linalg.solve(spread, error) / 3)
     assert 0.4 < np.mean(nees) < 1.9
-    assert called >= (3 if shake_mm else 5)
+    assert called >= (6 if shake_mm else 8)
 
 
 def test_no_movement_is_no_movement() -> None:
     rng = np.random.default_rng(6)
     cameras = rig()
     known = calibration(cameras)
-    for shake_mm in (0.0, 0.1) * 2:
+    for shake_mm in (0.0, 0.1) * 3:
         wrong = np.sqrt(np.diagonal(known.covariance)) * rng.standard_normal(6)
         tracks = Run(shake_mm=shake_mm, frames=200).tracks(cameras, moved(cameras, wrong), rng)
         found = rig_change(tracks, known)

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from telerig.estimator.frontend import luminance
 from telerig.estimator.frontend.blurred_ellipse import coverage_on_grid, shape_from_axes
 from telerig.estimator.frontend.dot_types import DotFit, Prior, Start, Window
+from telerig.estimator.frontend.dot_verdicts import HIDDEN, reason_against_fit
 from telerig.estimator.frontend.luminance_fit import fit_dots
 from telerig.estimator.frontend.noise import (
     NoiseModel,
@@ -133,6 +134,7 @@ def test_a_dot_that_shows_hardly_a_pixel_does_not_disturb_the_others(pixels: int
     start = Start(CENTRE + (0.4, -0.3), shape * 1.06, 1.2)
     none, one = fit_dots([hidden, whole], [start, start], noise_of(2.0), [HELD, HELD])
     assert not none.converged and none.pixels == pixels
+    assert reason_against_fit(none, grey, "white_on_black", 150.0, np.inf) == HIDDEN
     assert one.converged and np.linalg.norm(one.centre_px - CENTRE) < 1e-3
 
 

@@ -37,13 +37,6 @@ def axes_from_shape(shape_px: ArrayLike) -> Array:
     return np.stack([mean + half, mean - half, angle], axis=-1)
 
 
-def _long_axis(shape_px: Array) -> Array:
-    """(...) the larger semi-axis."""
-    m11, m12, m22 = (shape_px[..., i] for i in range(3))
-    longest: Array = 0.5 * (m11 + m22) + np.hypot(0.5 * (m11 - m22), m12)
-    return longest
-
-
 def extent_px(shape_px: Array) -> Array:
     """(..., 2) half width and half height of the ellipse's upright bounding box."""
     return np.hypot(shape_px[..., :2], shape_px[..., 1:])
@@ -108,7 +101,7 @@ def coverage_on_grid(
     """
     centre, shape = np.asarray(centre_px, dtype=np.float64), np.asarray(shape_px, dtype=np.float64)
     sigma = np.asarray(sigma_px, dtype=np.float64)
-    longest = float(np.max(_long_axis(shape)))
+    longest = float(np.max(semi_axes(shape)[0]))
     count = quadrature_nodes(longest, float(np.min(sigma)))
     t = 2.0 * np.pi / count * np.arange(count)
     c, s = np.cos(t), np.sin(t)

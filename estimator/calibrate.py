@@ -10,7 +10,7 @@ import numpy as np
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.lens_models import AUTO, Model, checked_model, models_by_camera
-from telerig.estimator.problem import DOTS_FREE, SOLVERS
+from telerig.estimator.problem import DOTS_FREE, OUTLIER_SD, SOLVERS, checked_outlier_sd
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ def check_options(
     solver: str = "auto",
     medium: str = "air",
     dots_free: str = "3d",
+    outlier_sd: float = OUTLIER_SD,
     cameras: Sequence[str] = (),
     **_: object,
 ) -> None:
@@ -57,6 +58,7 @@ def check_options(
     Raises InputError or CalibrationError for a word that is none of those known.
     """
     checked_medium(medium)
+    checked_outlier_sd(outlier_sd)
     if cameras:
         models_by_camera(model, cameras)
     elif isinstance(model, str):
@@ -83,6 +85,7 @@ def calibrate(
     model: Model = AUTO,
     solver: str = "auto",
     medium: str = "air",
+    outlier_sd: float = OUTLIER_SD,
     seed: int = 0,
 ) -> Calibration:
     """Calibrate a rig from the images or the dots of a dataset.
@@ -91,11 +94,14 @@ def calibrate(
         kappa+radial, ...), or one by camera: {"left": "brown"}, "left=brown,right=auto".
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
     medium : "air" or "water", of the target; with `[walls]` in `rig.toml` runs are in water.
+    outlier_sd : standard deviations from the model beyond which a dot is left out.
     seed : recorded with the result; the calibration itself draws no random numbers.
 
     Raises InputError, DetectionError or CalibrationError, each with what, where and what to do.
     """
-    run = run_calibration(dataset, model=model, solver=solver, medium=medium, seed=seed)
+    run = run_calibration(
+        dataset, model=model, solver=solver, medium=medium, outlier_sd=outlier_sd, seed=seed
+    )
     return run.calibration
 
 
@@ -107,6 +113,7 @@ def run_calibration(
     medium: str = "air",
     seed: int = 0,
     dots_free: str = "3d",
+    outlier_sd: float = OUTLIER_SD,
     stage: Stage | None = None,
     pictures: bool = False,
     detected: DatasetDots | None = None,
@@ -117,7 +124,7 @@ def run_calibration(
     detected : made before, by `telerig.estimator.watch`; None detects now.
     """
     check_options(
-        model=model, solver=solver, medium=medium, dots_free=dots_free,
+        model=model, solver=solver, medium=medium, dots_free=dots_free, outlier_sd=outlier_sd,
         cameras=list(dataset.rig.cameras),
     )  # fmt: skip
     if detected is None:
@@ -130,7 +137,7 @@ def run_calibration(
     rig, walls = dataset.rig, stated_walls(dataset.rig)
     calibration = solve_dots(
         dataset, table, model=model, solver=solver, medium=medium, dots_free=dots_free,
-        stage=stage, notes=notes,
+        outlier_sd=outlier_sd, stage=stage, notes=notes,
     )  # fmt: skip
     calibration = replace(calibration, stage=_stage(dataset, calibration, stage), medium=medium)
     if medium == "air":
@@ -148,6 +155,7 @@ def solve_dots(
     solver: str,
     medium: str,
     dots_free: str,
+    outlier_sd: float = OUTLIER_SD,
     stage: Stage | None = None,
     notes: Sequence[str] = (),
 ) -> Calibration:
@@ -165,6 +173,7 @@ def solve_dots(
         model=model,
         dots_free=dots_free,
         solver=solver,
+        outlier_sd=outlier_sd,
         progress=None if stage is None else lambda i, _: stage("solve", i, 0),
         notes=notes,
         name=rig.name,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.errors import InputError
 from telerig.estimator.lens_models import parameters_of
 from telerig.factors.projection import ImageKeys, Observations, State
 from telerig.rig.camera import Camera
@@ -26,6 +27,11 @@ GAUGE_SIGMA_MM = 1e-4
 
 _CENTRE = ("centre_u_px", "centre_v_px")
 _WALL = ("wall_x_rad", "wall_y_rad")
+
+OUTLIER_SD = 4.5
+"""A dot further than this many standard deviations is left out: 4e-5 of sound dots."""
+LEAST_OUTLIER_SD = 3.0
+"""Leaves out one sound dot in 90; nearer in, noise would be taken for outliers."""
 
 SOLVERS = ("auto", "gtsam", "schur")
 DOTS_FREE = ("3d", "plane", "nominal")
@@ -42,6 +48,16 @@ PRIOR_SIGMA = {
 """Weak priors: several times what any telecentric lens shows. They bound what data leave open."""
 
 
+def checked_outlier_sd(outlier_sd: float) -> float:
+    """Raises InputError where sound dots would be left out, or no number is given."""
+    if not outlier_sd >= LEAST_OUTLIER_SD:
+        raise InputError(
+            f"outliers from {outlier_sd:g} standard deviations on would be sound dots",
+            todo=f"give {LEAST_OUTLIER_SD:g} or more; {OUTLIER_SD:g} is usual",
+        )
+    return outlier_sd
+
+
 @dataclass(frozen=True)
 class Problem:
     """Measurements, knowledge and freedom of one self-calibration.
@@ -53,6 +69,7 @@ class Problem:
     free : per camera, names of the free intrinsics.
     scale : ((index, index), distance_mm, sigma_mm) or None.
     solver : "gtsam", "schur", or "auto" for the one that suits the size.
+    outlier_sd : standard deviations beyond which a dot is left out.
     """
 
     cameras: tuple[Camera, ...]
@@ -71,6 +88,7 @@ class Problem:
     scale: tuple[tuple[int, int], float, float] | None
     plate_shift: Array
     solver: str = "auto"
+    outlier_sd: float = OUTLIER_SD
 
     @property
     def rho_mm(self) -> tuple[float, ...]:

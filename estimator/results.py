@@ -12,7 +12,7 @@ from telerig.estimator.calibration import Calibration
 from telerig.estimator.covariance import JointCovariance, aligned_covariance
 from telerig.estimator.model_rows import model_rows
 from telerig.estimator.problem import Problem
-from telerig.estimator.robust import LIMIT, lost_views, pixel_residuals, squared_distance
+from telerig.estimator.robust import lost_views, pixel_residuals, squared_distance
 from telerig.factors.projection import State
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotvec_from_rotation
@@ -119,16 +119,16 @@ def residual_table(problem: Problem, state: State) -> pd.DataFrame:
     table["weight"] = problem.weight
     lost = np.isin(problem.view, lost_views(problem, problem.weight))
     table["reason"] = [
-        "" if w >= 1 else _reason(d, bool(alone))
+        "" if w >= 1 else _reason(d, bool(alone), problem.outlier_sd)
         for w, d, alone in zip(problem.weight, distance, lost)
     ]
     return table
 
 
-def _reason(distance: float, lost_view: bool) -> str:
+def _reason(distance: float, lost_view: bool, limit: float) -> str:
     if lost_view:
         return "too few dots of this view agree with the model to place the target"
-    return f"{distance:.1f} standard deviations from the model (limit {LIMIT})"
+    return f"{distance:.1f} standard deviations from the model (limit {limit:g})"
 
 
 def odd_views(problem: Problem) -> list[str]:

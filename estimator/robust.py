@@ -20,8 +20,6 @@ from telerig.factors.projection import State, pixels
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LIMIT = 4.5
-"""A dot further than this many standard deviations is left out: 4e-5 of sound dots."""
 LEAST_DOTS = 4
 """Sound dots below which a view is left out: they would not fix the target's pose."""
 _MEDIAN = 2 * np.log(2)  # of chi-square with two degrees of freedom
@@ -78,8 +76,8 @@ def free_share(problem: Problem) -> float:
 def robust_solve(
     problem: Problem, start: State, *, progress: Progress | None = None, rounds: int = 25
 ) -> RobustFit:
-    """Solve, find the floor, down-weight dots beyond `LIMIT`, until the kept set stands still."""
-    base = problem.covariance_px2
+    """Solve, find the floor, down-weight dots beyond the limit, until the kept set stands still."""
+    base, least = problem.covariance_px2, problem.outlier_sd
     problem = replace(problem, weight=np.ones(len(problem.view)))
     solution = solve(problem, start, progress=progress)
     limit, floor = np.inf, 0.0
@@ -91,25 +89,25 @@ def robust_solve(
         distance = np.sqrt(squared_distance(residual, covariance))
         worst = float(distance.max())
         previous = problem
-        limit = max(LIMIT, min(limit / 2, worst / 2))
-        if limit > LIMIT:
+        limit = max(least, min(limit / 2, worst / 2))
+        if limit > least:
             weight = (limit**2 / (limit**2 + distance**2)) ** 2
         else:
-            weight = _without_lost_views(problem, _truncated(distance, problem.weight))
+            weight = _without_lost_views(problem, _truncated(distance, problem.weight, least))
         problem = replace(problem, weight=weight, covariance_px2=covariance)
         settled = np.array_equal(weight, previous.weight) and np.allclose(
             covariance, previous.covariance_px2, rtol=1e-3
         )
         if settled:
             break
-        steps = 4 if limit > LIMIT else 60
+        steps = 4 if limit > least else 60
         solution = solve(problem, solution.state, max_iterations=steps, progress=progress)
     return RobustFit(problem, solution, floor)
 
 
-def _truncated(distance: Array, before: Array) -> Array:
+def _truncated(distance: Array, before: Array, limit: float) -> Array:
     """0 or 1; a dot that was out comes back only well inside, so that none flickers."""
-    bar = np.where(before < 0.01, 0.9 * LIMIT, LIMIT)
+    bar = np.where(before < 0.01, 0.9 * limit, limit)
     return (distance <= bar).astype(float)
 
 

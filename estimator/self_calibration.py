@@ -38,7 +38,14 @@ from telerig.estimator.measurements import problem_from_dots
 from telerig.estimator.model_choice import Choice
 from telerig.estimator.model_start import model_start
 from telerig.estimator.next_view import next_view
-from telerig.estimator.problem import SOLVERS, Problem, held_at_nominal, parameter_unit
+from telerig.estimator.problem import (
+    OUTLIER_SD,
+    SOLVERS,
+    Problem,
+    checked_outlier_sd,
+    held_at_nominal,
+    parameter_unit,
+)
 from telerig.estimator.residual_tests import residual_tests
 from telerig.estimator.results import calibration_from_fit
 from telerig.estimator.robust import RobustFit, robust_solve
@@ -87,6 +94,7 @@ def self_calibrate(
     model: Model = AUTO,
     dots_free: str = "3d",
     solver: str = "auto",
+    outlier_sd: float = OUTLIER_SD,
     progress: Progress | None = None,
     notes: Sequence[str] = (),
     name: str = "",
@@ -99,6 +107,7 @@ def self_calibrate(
     model : a name of `telerig.estimator.lens_models`, or "auto"; for all cameras, or by camera.
     dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
     solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
+    outlier_sd : standard deviations from the model beyond which a dot is left out.
 
     Raises CalibrationError when the views cannot determine a calibration, with the remedy.
     """
@@ -109,6 +118,7 @@ def self_calibrate(
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
+    problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd))
     problem = replace(problem, solver="schur" if solver == "auto" else solver)
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm

@@ -200,7 +200,7 @@ def watch(
 ) -> tuple[Dataset, CalibrationRun]:
     """Solve whenever a complete view is new, until another view is not worth it or ``stop`` is set.
 
-    options : model, solver, medium, dots_free and seed as for `run_calibration`.
+    options : model, solver, medium, dots_free, outlier_sd and seed as for `run_calibration`.
     Returns the dataset of the images that were used and its calibration, walls and stage included.
 
     Raises CalibrationError or DetectionError when stopped with too little to calibrate.

@@ -41,6 +41,10 @@ def calibrate(
     dots: Annotated[
         str, typer.Option(help="What dots may do: 3d, plane (stay in the plane), nominal (held).")
     ] = "3d",
+    outlier_sd: Annotated[
+        float,
+        typer.Option(help="Leave out dots more standard deviations off than this, 3 at least."),
+    ] = 4.5,
     medium: Annotated[
         str,
         typer.Option(help="air or water: where the target was. With [walls], runs are in water."),
@@ -89,10 +93,12 @@ def calibrate(
 
         begun = time.perf_counter()
         options: dict[str, Any] = {"model": model, "solver": solver, "dots": dots, "medium": medium,
+                   "outlier_sd": outlier_sd,
                    "compare": None if compare is None else str(compare), "from": source,
                    "seed": seed}  # fmt: skip
         chosen: dict[str, Any] = {
             "model": model, "solver": solver, "medium": medium, "seed": seed, "dots_free": dots,
+            "outlier_sd": outlier_sd,
         }  # fmt: skip
         check_options(**chosen)
         with report_beside(report) as write_report:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from telerig.errors import CalibrationError
+from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibrate import nominal_cameras
 from telerig.estimator.self_calibration import self_calibrate
 from telerig.io.simulation import simulate
@@ -164,6 +164,29 @@ def test_outliers(preset: str, seed: int, scene: Any) -> None:
     assert made.space_rms_um(calibration) < 1.2
     named = calibration.residuals.loc[calibration.residuals["weight"] < 1, "reason"]
     assert named.str.contains("standard deviations").all()
+
+
+def test_the_user_says_how_far_off_a_dot_may_be(paper: Any) -> None:
+    """One dot 4 standard deviations away stays by default, and is left out at a limit of 3.4."""
+    sound = paper.calibrate("radial")
+    row = 40
+    sigma = np.sqrt(paper.dots["suu_px2"].iloc[row])
+    off = sound.residuals["du_px"].iloc[row]
+    moved = paper.changed(lambda d: _shifted(d, row, 4.6 * sigma * np.sign(off) - off))
+    usual, strict = moved.calibrate("radial"), moved.calibrate("radial", outlier_sd=3.4)
+    left = strict.residuals[strict.residuals["weight"] < 1]
+    assert (usual.residuals["weight"] == 1).all()
+    assert left.index.tolist() == [row]
+    assert "limit 3.4" in left["reason"].iloc[0]
+    with pytest.raises(InputError, match="sound dots"):
+        paper.calibrate("radial", outlier_sd=2.0)
+    with pytest.raises(InputError, match="sound dots"):
+        paper.calibrate("radial", outlier_sd=np.nan)
+
+
+def _shifted(dots: pd.DataFrame, row: int, by_px: float) -> pd.DataFrame:
+    dots.iloc[row, dots.columns.get_loc("u_px")] += by_px
+    return dots
 
 
 def test_a_fifth_of_outliers_is_found_but_rejected(scene: Any) -> None:

@@ -114,16 +114,16 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
 
 def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[str, Any]:
     every = range(len(results.cameras))
-    drawings: list[tuple[str, Callable[[], Any]]] = [
-        ("sheet", partial(contact_sheet, results)),
-        *(("fields", partial(residual_field, results, i)) for i in every),
+    drawings: list[tuple[str, Callable[[], Any]]] = [  # what takes long comes first
+        ("trust", partial(trust_pictures, results)),
         ("target", partial(target_pictures, results)),
-        *(("covered", partial(coverage, results, i)) for i in every),
-        ("covered", partial(tilts, results)),
+        ("next", partial(next_pictures, results)),
+        *(("fields", partial(residual_field, results, i)) for i in every),
         ("spread", partial(residual_histogram, results)),
         ("plan", partial(rig_plan, results)),
-        ("trust", partial(trust_pictures, results)),
-        ("next", partial(next_pictures, results)),
+        *(("covered", partial(coverage, results, i)) for i in every),
+        ("covered", partial(tilts, results)),
+        ("sheet", partial(contact_sheet, results)),
     ]
     if dot is None:
         drawings.insert(0, ("dot", partial(dot_pictures, results.dot_example)))

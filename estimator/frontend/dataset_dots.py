@@ -88,12 +88,23 @@ def detect_dataset(
     count = _workers(dataset, len(tasks)) if workers is None else workers
     found: list[ImageDots] = []
     work = partial(_one_of, dataset, overlays)
+    if count > 1:
+        _prepare(dataset, overlays, tasks[0])
     for done, image in enumerate(ordered_map(work, tasks, count, meanwhile), 1):
         found.append(image)
         if progress is not None:
             progress(done, len(tasks))
     together = detected_together(dataset, found)
     return with_example(dataset, together) if overlays else together
+
+
+def _prepare(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
+    """Load what copies of this process would each load at their first image."""
+    dataset.image(*task)
+    if overlays:
+        import cv2  # noqa: F401
+
+        import telerig.io.report.overlay  # noqa: F401
 
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:

@@ -65,6 +65,8 @@ def report_beside(wanted: bool) -> Iterator[ReportBeside | None]:
     if not wanted:
         yield None
         return
+    import pandas  # noqa: F401 - both processes need it, and its import takes 0.2 s
+
     with assistant(_prepare_report) as call:
         yield ReportBeside(call)
 
@@ -76,8 +78,6 @@ def _draw_dot(example: Mapping[str, Any]) -> list[Picture]:
 
 
 def _prepare_report() -> None:
-    import pandas  # noqa: F401
-
     import telerig.io.report.calibration_report  # noqa: F401
     from telerig.io.report.page import prepare_page
 

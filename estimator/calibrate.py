@@ -194,7 +194,12 @@ def _load_libraries() -> None:
     """Load what comes after the detection while other processes detect."""
     import gtsam  # noqa: F401
 
-    import telerig.estimator.self_calibration  # noqa: F401
+    import telerig.estimator.behind_walls
+    import telerig.estimator.calibration_files
+    import telerig.estimator.self_calibration
+    import telerig.estimator.stage_axis_input
+    import telerig.estimator.summary
+    import telerig.estimator.uncertainty_map  # noqa: F401
 
 
 def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:

@@ -104,6 +104,7 @@ def _prepare(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
     if overlays:
         import cv2  # noqa: F401
 
+        import telerig.estimator.frontend.dot_example
         import telerig.io.report.overlay  # noqa: F401
 
 

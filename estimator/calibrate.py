@@ -121,16 +121,16 @@ def run_calibration(
     """Like `calibrate`, with progress, the choice of what dots may do, and the detections.
 
     pictures : draw what was found over each image, as `write_results` needs.
-    detected : made before, by `telerig.estimator.watch`; None detects now.
+    detected : made before, by `detect` or `telerig.estimator.watch`; None detects now.
     """
     check_options(
         model=model, solver=solver, medium=medium, dots_free=dots_free, outlier_sd=outlier_sd,
         cameras=list(dataset.rig.cameras),
     )  # fmt: skip
     if detected is None:
-        detected, table, notes = _measured(dataset, stage, pictures)
-    else:
-        table, notes = detected.dots, [*dataset.notes, *detected.notes]
+        detected = detect(dataset, stage=stage, pictures=pictures)
+    table = dataset.dots() if detected is None else detected.dots
+    notes = [*dataset.notes, *(() if detected is None else detected.notes)]
 
     from telerig.estimator.behind_walls import put_behind_walls, stated_walls, wall_words
 
@@ -180,28 +180,35 @@ def solve_dots(
     )
 
 
-def _measured(
-    dataset: Dataset, stage: Stage | None, pictures: bool
-) -> tuple[DatasetDots | None, pd.DataFrame, list[str]]:
-    """Detections, None for a table; all dots; notes."""
+def detect(
+    dataset: Dataset, *, stage: Stage | None = None, pictures: bool = False
+) -> DatasetDots | None:
+    """The dots of a dataset's images; None where it brings a table of dots instead.
+
+    pictures : as for `run_calibration`.
+    """
     if dataset.source != "images":
-        return None, dataset.dots(), list(dataset.notes)
+        return None
     from telerig.estimator.frontend.dataset_dots import detect_dataset
 
-    detected = detect_dataset(
+    return detect_dataset(
         dataset,
         progress=None if stage is None else lambda i, n: stage("images", i, n),
         overlays=pictures,
         meanwhile=_load_libraries,
     )
-    return detected, detected.dots, [*dataset.notes, *detected.notes]
 
 
 def _load_libraries() -> None:
     """Load what comes after the detection while other processes detect."""
     import gtsam  # noqa: F401
 
-    import telerig.estimator.self_calibration  # noqa: F401
+    import telerig.estimator.behind_walls
+    import telerig.estimator.calibration_files
+    import telerig.estimator.self_calibration
+    import telerig.estimator.stage_axis_input
+    import telerig.estimator.summary
+    import telerig.estimator.uncertainty_map  # noqa: F401
 
 
 def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +11,15 @@ import numpy as np
 
 from telerig.estimator.calibrate import CalibrationRun
 from telerig.io.atomic import atomic_folder, write_json_atomic
-from telerig.io.parallel import assistant
+from telerig.io.parallel import Assistant, assistant
 from telerig.io.provenance import run_record
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from telerig.estimator.calibration import Calibration
     from telerig.estimator.compare_calibrations import RigComparison
     from telerig.estimator.frontend.dataset_dots import DatasetDots
     from telerig.io.dataset import Dataset
+    from telerig.io.report.figures_common import Picture
 
 
 def input_files(dataset: Dataset) -> list[Path]:
@@ -33,33 +31,57 @@ def input_files(dataset: Dataset) -> list[Path]:
     return files + [path for view in dataset.views for path in view.image_paths.values()]
 
 
-def write_report(folder: Path) -> Path:
-    """The report of a results folder, whose path is returned."""
+def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
+    """The report of a results folder, whose path is returned.
+
+    dot : the pictures of its dot_example.npz, where they are drawn already.
+    """
     from telerig.io.report.calibration_report import write_calibration_report
 
-    return write_calibration_report(folder)
+    return write_calibration_report(folder, dot=dot)
+
+
+class ReportBeside:
+    """`write_report` by an assistant, which draws what it can while the dots are solved for."""
+
+    def __init__(self, call: Assistant) -> None:
+        self._call = call
+        self._dot: Callable[[], list[Picture] | None] = lambda: None
+
+    def begin(self, detected: DatasetDots) -> None:
+        """Draw what needs no calibration."""
+        self._dot = self._call.begin(_draw_dot, detected.example)
+
+    def __call__(self, folder: Path) -> Path:
+        return self._call(write_report, folder, self._dot())
 
 
 @contextmanager
-def report_beside(wanted: bool) -> Iterator[Callable[[Path], object] | None]:
-    """`write_report` in a process that loads its libraries while this one calibrates.
+def report_beside(wanted: bool) -> Iterator[ReportBeside | None]:
+    """A process that loads the report's libraries while this one detects and calibrates.
 
     None where no report is wanted.
     """
     if not wanted:
         yield None
         return
+    import pandas  # noqa: F401 - both processes need it, and its import takes 0.2 s
+
     with assistant(_prepare_report) as call:
-        yield partial(call, write_report)
+        yield ReportBeside(call)
+
+
+def _draw_dot(example: Mapping[str, Any]) -> list[Picture]:
+    from telerig.io.report.figures_dot import dot_pictures
+
+    return dot_pictures(example)
 
 
 def _prepare_report() -> None:
-    import pandas  # noqa: F401
-
     import telerig.io.report.calibration_report  # noqa: F401
     from telerig.io.report.page import prepare_page
 
-    prepare_page()
+    prepare_page("template_calibration.html")
 
 
 def write_results(
@@ -90,7 +112,6 @@ def write_results(
             write_uncertainty(run.calibration, staged / "uncertainty.npz")
         if run.detected is not None:
             write_detections(run.detected, staged)
-            _write_example(dataset, run, staged / "dot_example.npz")
         if report is not None:
             report(staged)
     return folder / "report.html"
@@ -109,7 +130,7 @@ def write_uncertainty(calibration: Calibration, path: Path) -> None:
 
 
 def write_detections(detected: DatasetDots, folder: Path) -> None:
-    """rejected.csv, and overlays/<camera>/<view>.jpg where they were drawn."""
+    """rejected.csv, and where they were made overlays/<camera>/<view>.jpg and dot_example.npz."""
     from telerig.io.tables import write_table
 
     write_table(detected.rejected, folder / "rejected.csv")
@@ -117,25 +138,6 @@ def write_detections(detected: DatasetDots, folder: Path) -> None:
         target = folder / "overlays" / image.camera / f"{image.view}.jpg"
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(image.overlay)
-
-
-def _write_example(dataset: Dataset, run: CalibrationRun, path: Path) -> None:
-    """One well-kept dot with its fit, for the picture of the 2004 paper's figure 2."""
-    from telerig.estimator.frontend.dot_example import dot_example
-
-    assert run.detected is not None
-    chosen = _typical_dot(run.detected.dots)
-    view = next(v for v in dataset.views if v.name == chosen["view"])
-    example = dot_example(
-        dataset.image(view, chosen["camera"]), float(chosen["u_px"]), float(chosen["v_px"]),
-        float(chosen["a_px"]), polarity=dataset.target.polarity,
-    )  # fmt: skip
-    if example is not None:
-        with path.open("wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **example)
-
-
-def _typical_dot(dots: pd.DataFrame) -> Any:
-    """The dot of median chi-square."""
-    order = np.argsort(dots["chi2_dof"].to_numpy())
-    return dots.iloc[int(order[len(order) // 2])]
+    if detected.example:  # for the picture of the 2004 paper's figure 2
+        with (folder / "dot_example.npz").open("wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, **detected.example)

@@ -37,6 +37,8 @@ from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
 
+DOTS_FOR_WORKERS = 500
+"""With fewer measured dots, four fits take 0.1 s, and starting processes for them 0.05 s."""
 HOPELESS = 10.0
 """Times the rich model's cost beyond which a model is not asked to predict."""
 ROUNDS = 3
@@ -183,7 +185,8 @@ def _rivals(landscape: Landscape, wanted: Lenses, allowed: list[list[Lens]]) -> 
 def _fits(problem: Problem, rich: Solution, path: list[Lenses], rivals: list[Lenses]) -> list[Fit]:
     # a copy of a process in which GTSAM has worked may wait for threads that it does not have
     tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in rivals]
-    workers = 1 if problem.solver == "gtsam" else quick_workers(len(tasks))
+    here = problem.solver == "gtsam" or len(problem.uv_px) < DOTS_FOR_WORKERS
+    workers = 1 if here else quick_workers(len(tasks))
     return list(ordered_map(partial(_fit, problem, rich), tasks, workers))
 
 

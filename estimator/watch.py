@@ -25,6 +25,7 @@ from telerig.estimator.frontend.dataset_dots import (
     ImageDots,
     detect_image,
     detected_together,
+    with_example,
 )
 from telerig.estimator.frontend.target_detection import REJECTED
 from telerig.estimator.next_view import ENOUGH_SHARE, rounded_um
@@ -221,6 +222,7 @@ def watch(
         tell("stopped; calibrating with what has arrived")
     detected = folder.detected()
     assert folder.dataset is not None
+    detected = with_example(folder.dataset, detected)
     run = run_calibration(folder.dataset, detected=detected, **options)
     return folder.dataset, run
 

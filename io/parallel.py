@@ -67,17 +67,71 @@ def quick_workers(tasks: int) -> int:
     return min(cores(), tasks) if can_fork() else 1
 
 
+class Assistant:
+    """Calls functions in another process, one after the other, or in this one without ``end``."""
+
+    def __init__(self, end: Connection | None = None) -> None:
+        self._end = end
+        self._last: Answer | None = None
+
+    def __call__(self, function: Callable[..., Result], *arguments: Any) -> Result:
+        """What a module's function returns; what it raises is raised here."""
+        return self.begin(function, *arguments)()
+
+    def begin(self, function: Callable[..., Result], *arguments: Any) -> Callable[[], Result]:
+        """Ask for a call of a module's function; what is given back waits for its result.
+
+        Without another process, or when it died, the function is called then, in this one.
+        """
+        if self._last is not None:
+            self._last.fetch()  # an end that nobody reads would block the other one
+        self._last = Answer(self._end, function, arguments)
+        return self._last
+
+
+class Answer:
+    """A call that was asked for."""
+
+    def __init__(
+        self, end: Connection | None, function: Callable[..., Any], arguments: tuple[Any, ...]
+    ) -> None:
+        self._end, self._function, self._arguments = end, function, arguments
+        self._found: tuple[bool, Any] | None = None
+        try:
+            if end is not None:
+                end.send((function, arguments))
+        except OSError:
+            self._end = None
+
+    def fetch(self) -> None:
+        """Wait for it, where another process does it."""
+        if self._end is None or self._found is not None:
+            return
+        try:
+            self._found = self._end.recv()
+        except (EOFError, OSError):
+            self._end = None
+
+    def __call__(self) -> Any:
+        self.fetch()
+        if self._found is None:
+            return self._function(*self._arguments)
+        failed, result = self._found
+        if failed:
+            raise result
+        return result
+
+
 @contextmanager
-def assistant(prepare: Callable[[], object]) -> Iterator[Callable[..., Any]]:
+def assistant(prepare: Callable[[], object]) -> Iterator[Assistant]:
     """A copy of this process that calls ``prepare`` at once, and functions when it is asked to.
 
     Libraries that only the end of a command needs are loaded in it while this process, whose
-    start leaves the other cores idle, gets on. Yields ``call(function, *arguments)``: it returns
-    or raises what a module's function does. Where a copy does not pay, or it died, functions are
-    called in this process.
+    start leaves the other cores idle, gets on. Where a copy does not pay, or it died, functions
+    are called in this process.
     """
     if cores() < 2 or not can_fork():
-        yield _call
+        yield Assistant()
         return
     ours, theirs = multiprocessing.Pipe()
     with _copying():
@@ -86,19 +140,8 @@ def assistant(prepare: Callable[[], object]) -> Iterator[Callable[..., Any]]:
         )
         process.start()
     theirs.close()
-
-    def call(function: Callable[..., Any], *arguments: Any) -> Any:
-        try:
-            ours.send((function, arguments))
-            failed, result = ours.recv()
-        except (EOFError, OSError):
-            return function(*arguments)
-        if failed:
-            raise result
-        return result
-
     try:
-        yield call
+        yield Assistant(ours)
     finally:
         ours.close()
         process.terminate()
@@ -125,10 +168,6 @@ def _answer(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[b
     except Exception as error:  # noqa: BLE001 - raised where it was asked for
         error.add_note(traceback.format_exc())
         return True, error
-
-
-def _call(function: Callable[..., Any], *arguments: Any) -> Any:
-    return function(*arguments)
 
 
 def _forked(workers: int) -> Pool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from telerig.estimator.calibrate import CalibrationRun
     from telerig.estimator.calibration import Calibration
     from telerig.estimator.compare_calibrations import RigComparison
+    from telerig.estimator.frontend.dataset_dots import DatasetDots
     from telerig.io.dataset import Dataset
 
 
@@ -107,7 +109,8 @@ def calibrate(
                 data, run = _watched(dataset, source, until_um, poll, chosen)
                 options |= {"watch": True, "until_um": until_um}
             else:
-                data, run = _at_once(dataset, source, until_um, quiet, chosen)
+                begin = None if write_report is None else write_report.begin
+                data, run = _at_once(dataset, source, until_um, quiet, chosen, begin)
             folder = out or data.results / "calibration"
             seconds = {"calibrate": time.perf_counter() - begun}
             change = None if earlier is None else _change(earlier, run.calibration)
@@ -124,17 +127,26 @@ def calibrate(
 
 
 def _at_once(
-    dataset: Path, source: str | None, until_um: float | None, quiet: bool, chosen: dict[str, Any]
+    dataset: Path,
+    source: str | None,
+    until_um: float | None,
+    quiet: bool,
+    chosen: dict[str, Any],
+    found: Callable[[DatasetDots], object] | None,
 ) -> tuple[Dataset, CalibrationRun]:
-    """The dataset as it lies there, and its calibration."""
-    from telerig.estimator.calibrate import run_calibration
+    """The dataset as it lies there, and its calibration. found : called when dots are detected."""
+    from telerig.estimator.calibrate import check_options, detect, run_calibration
     from telerig.io.dataset import load_dataset
 
     if until_um is not None:
         raise InputError("--until-um goes with --watch", todo="add --watch, or leave it")
     data = load_dataset(dataset, source=checked_source(source))
+    check_options(**chosen, cameras=list(data.rig.cameras))
     with progress(quiet) as stage:
-        return data, run_calibration(data, **chosen, stage=stage, pictures=True)
+        detected = detect(data, stage=stage, pictures=True)
+        if detected is not None and found is not None:
+            found(detected)
+        return data, run_calibration(data, **chosen, stage=stage, detected=detected)
 
 
 def _earlier(path: Path, dataset: Path) -> Calibration:

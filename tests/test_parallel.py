@@ -80,6 +80,13 @@ def _die() -> None:
     os._exit(1)
 
 
+def _die_elsewhere(process: int) -> int:
+    """Unless called in that process."""
+    if os.getpid() != process:
+        os._exit(1)
+    return process
+
+
 @forks
 def test_an_assistant_does_what_it_is_asked_in_a_process_that_has_prepared_itself(monkeypatch):
     monkeypatch.setenv("TELERIG_CORES", "2")
@@ -97,8 +104,23 @@ def test_an_assistant_does_what_it_is_asked_in_a_process_that_has_prepared_itsel
 
 
 @forks
+def test_an_assistant_works_while_this_process_goes_on(monkeypatch):
+    monkeypatch.setenv("TELERIG_CORES", "2")
+    with assistant(int) as call:
+        first, failed = call.begin(os.getpid), call.begin(_fail_at_three, 3)
+        large = call.begin(bytes, 1 << 22)  # more than the system keeps on the way
+        assert call(os.getpid) == first() == first() != os.getpid()
+        with pytest.raises(ValueError, match="three"):
+            failed()
+        assert large() == bytes(1 << 22)
+        dies, after = call.begin(_die_elsewhere, os.getpid()), call.begin(os.getpid)
+        assert dies() == after() == os.getpid(), "done here"
+
+
+@forks
 @pytest.mark.parametrize("prepare", [_die, lambda: 1 / 0, int])
 def test_without_an_assistant_the_work_is_done_here(monkeypatch, prepare):
     monkeypatch.setenv("TELERIG_CORES", "1" if prepare is int else "2")
     with assistant(prepare) as call:
-        assert call(os.getpid) == os.getpid()
+        asked = call.begin(os.getpid)
+        assert call(os.getpid) == asked() == os.getpid()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -57,12 +57,14 @@ class DatasetDots:
     """dots, rejected : tables of all images, first columns view and camera.
 
     images : per image, in the order of views and cameras.  notes : words for the user.
+    example : one dot with its fit, as `dot_example` gives it, where overlays were asked for.
     """
 
     dots: pd.DataFrame
     rejected: pd.DataFrame
     images: tuple[ImageDots, ...] = ()
     notes: tuple[str, ...] = field(default=())
+    example: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 def detect_dataset(
@@ -75,7 +77,8 @@ def detect_dataset(
 ) -> DatasetDots:
     """Detect the target in every calibration image.
 
-    workers : processes; None takes one per core where that pays.  overlays : draw them, too.
+    workers : processes; None takes one per core where that pays.
+    overlays : draw them, and fit one dot as an example.
     meanwhile : called in this process while the others work.
 
     Raises InputError for images that cannot be read, DetectionError when no image shows the
@@ -85,11 +88,24 @@ def detect_dataset(
     count = _workers(dataset, len(tasks)) if workers is None else workers
     found: list[ImageDots] = []
     work = partial(_one_of, dataset, overlays)
+    if count > 1:
+        _prepare(dataset, overlays, tasks[0])
     for done, image in enumerate(ordered_map(work, tasks, count, meanwhile), 1):
         found.append(image)
         if progress is not None:
             progress(done, len(tasks))
-    return detected_together(dataset, found)
+    together = detected_together(dataset, found)
+    return with_example(dataset, together) if overlays else together
+
+
+def _prepare(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
+    """Load what copies of this process would each load at their first image."""
+    dataset.image(*task)
+    if overlays:
+        import cv2  # noqa: F401
+
+        import telerig.estimator.frontend.dot_example
+        import telerig.io.report.overlay  # noqa: F401
 
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:
@@ -118,6 +134,20 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
     return DatasetDots(
         _joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(notes)
     )
+
+
+def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
+    """With the fit of a well-kept dot, that of median chi-square."""
+    from telerig.estimator.frontend.dot_example import dot_example
+
+    order = np.argsort(detected.dots["chi2_dof"].to_numpy())
+    chosen = detected.dots.iloc[int(order[len(order) // 2])]
+    view = next(v for v in dataset.views if v.name == chosen["view"])
+    example = dot_example(
+        dataset.image(view, chosen["camera"]), float(chosen["u_px"]), float(chosen["v_px"]),
+        float(chosen["a_px"]), polarity=dataset.target.polarity,
+    )  # fmt: skip
+    return replace(detected, example=example or {})
 
 
 def _joined(images: list[ImageDots], name: str) -> pd.DataFrame:

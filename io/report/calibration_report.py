@@ -11,6 +11,7 @@ from telerig.io.atomic import write_text_atomic
 from telerig.io.report import calibration_tables as tables
 from telerig.io.report.calibration_results import CalibrationResults, read_results
 from telerig.io.report.contact_sheet import contact_sheet
+from telerig.io.report.figures_common import Picture
 from telerig.io.report.figures_coverage import coverage, tilts
 from telerig.io.report.figures_dot import dot_pictures
 from telerig.io.report.figures_next import next_pictures
@@ -30,24 +31,28 @@ _SHOWN = {
 }  # fmt: skip
 
 
-def write_calibration_report(results_folder: Path, out: Path | None = None) -> Path:
+def write_calibration_report(
+    results_folder: Path, out: Path | None = None, *, dot: list[Picture] | None = None
+) -> Path:
     """Write report.html into a calibration's results folder, or into ``out``; returns its path.
 
     It reads nothing but that folder: calibration.json and residuals.csv, and if they are there
     dots.csv, covariance.npz, run.json, overlays/<camera>/<view>.jpg and dot_example.npz. The page
     is written whole or not at all. Raises InputError for a folder that holds no calibration, or
     files that cannot be read or do not fit together.
+
+    dot : what `dot_pictures` made of that dot_example.npz before; None draws it now.
     """
     folder = Path(results_folder)
-    page = render(read_results(folder))
+    page = render(read_results(folder), dot)
     file = (folder if out is None else Path(out)) / "report.html"
     write_text_atomic(file, page)
     return file
 
 
-def render(results: CalibrationResults) -> str:
-    """The page as text."""
-    context = _words(results) | _tables(results) | _pictures(results)
+def render(results: CalibrationResults, dot: list[Picture] | None = None) -> str:
+    """The page as text. dot : as for `write_calibration_report`."""
+    context = _words(results) | _tables(results) | _pictures(results, dot)
     return render_page("template_calibration.html", context, scene_json(results))
 
 
@@ -107,22 +112,23 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
     }
 
 
-def _pictures(results: CalibrationResults) -> dict[str, Any]:
+def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[str, Any]:
     every = range(len(results.cameras))
-    drawings: list[tuple[str, Callable[[], Any]]] = [
-        ("sheet", partial(contact_sheet, results)),
-        *(("fields", partial(residual_field, results, i)) for i in every),
-        ("dot", partial(dot_pictures, results.dot_example)),
+    drawings: list[tuple[str, Callable[[], Any]]] = [  # what takes long comes first
+        ("trust", partial(trust_pictures, results)),
         ("target", partial(target_pictures, results)),
-        *(("covered", partial(coverage, results, i)) for i in every),
-        ("covered", partial(tilts, results)),
+        ("next", partial(next_pictures, results)),
+        *(("fields", partial(residual_field, results, i)) for i in every),
         ("spread", partial(residual_histogram, results)),
         ("plan", partial(rig_plan, results)),
-        ("trust", partial(trust_pictures, results)),
-        ("next", partial(next_pictures, results)),
+        *(("covered", partial(coverage, results, i)) for i in every),
+        ("covered", partial(tilts, results)),
+        ("sheet", partial(contact_sheet, results)),
     ]
+    if dot is None:
+        drawings.insert(0, ("dot", partial(dot_pictures, results.dot_example)))
     drawn = drawn_over_cores([d for _, d in drawings])
-    pictures: dict[str, Any] = {"fields": [], "covered": [], "spread": []}
+    pictures: dict[str, Any] = {"fields": [], "covered": [], "spread": [], "dot": dot}
     for (place, _), picture in zip(drawings, drawn):
         if place in ("fields", "covered", "spread"):
             pictures[place].append(picture)

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from telerig.io.parallel import ordered_map, quick_workers
 from telerig.io.report.figures_common import prepare_drawing
+from telerig.rig.memory import keep_freed_memory
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+_IN_EVERY_PAGE = ("layout.html", "macros.html", "scene_script.html")
 
 
 @dataclass(frozen=True)
@@ -35,30 +42,39 @@ def render_page(template: str, context: Mapping[str, Any], scene: str) -> str:
     template : a file of this package; it includes "scene_script.html" where the 3-D library goes.
     context : escaped where it is text. scene : what `scene.scene_text` gives.
     """
-    from jinja2 import Environment, FunctionLoader
     from markupsafe import Markup
 
-    loader = FunctionLoader(_package_file)
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
     carried = {
         "css": Markup(_package_file("report.css")),
         "scene": Markup(scene),
         "plotly": Markup(plotly_javascript()),
     }
-    return environment.get_template(template).render({**context, **carried})
+    return _environment().get_template(template).render({**context, **carried})
 
 
+@cache
+def _environment() -> Environment:
+    """It keeps the templates that it compiled."""
+    from jinja2 import Environment, FunctionLoader
+
+    loader = FunctionLoader(_package_file)
+    return Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=loader)
+
+
+@cache
 def plotly_javascript() -> str:
     """The library's own JavaScript, from the installed package. Reading it imports no plotly."""
     file = resources.files("plotly") / "package_data" / "plotly.min.js"
     return file.read_text(encoding="utf-8")
 
 
-def prepare_page() -> None:
-    """Load what every page needs."""
-    import jinja2  # noqa: F401
-
+def prepare_page(template: str) -> None:
+    """Load what a page of this template needs, so that rendering it takes a third of the time."""
+    keep_freed_memory()
     prepare_drawing()
+    for name in (template, *_IN_EVERY_PAGE):
+        _environment().get_template(name)
+    plotly_javascript()
 
 
 def drawn_over_cores(drawings: Sequence[Callable[[], Any]]) -> list[Any]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from telerig.estimator.shake_channels import Channel, channels_of, pooled
 from telerig.estimator.shake_labels import LineLabel, doubted, is_zigzag, labels, shared
 from telerig.estimator.shake_likelihood import Fit, evidence, laplace_sigma, maximise
-from telerig.estimator.shake_parameters import names_of, value_of, with_values
+from telerig.estimator.shake_parameters import FORCE, driven, names_of, value_of, with_values
 from telerig.estimator.shake_spectrum import Line, coarsening, coarser, faded, unexplained
 from telerig.estimator.smoother.model import (
     CARRIAGE,
@@ -36,6 +36,7 @@ Where = int | str
 
 BUBBLE = "bubble"
 START_DAMPING = 0.04
+START_FORCE_HZ = 60.0
 _HARMONIC = 0.12
 _TIE_NATS = 2.0
 _STRONG = 20.0
@@ -145,7 +146,7 @@ def _learn_group(
         better = _one_more(coarse, step, options, first)
         if better is None:
             break
-        step = better
+        step = _coloured(coarse, better, options, first)
     fit = _pruned(coarse, step.fit, options, first)
     names = _free(fit.model, coarse, options, first)
     fit = maximise(coarse.fast, fit.model, names)
@@ -211,7 +212,9 @@ def _free(model: ShakeModel, group: Group, options: Learning, first: bool) -> li
     for name in names_of(model):
         if any(fnmatch(name, pattern) for pattern in options.hold):
             continue
-        if name.startswith(("modes", "bubble.zigzags", "broad_bands")):
+        if name == FORCE:
+            names += [name] * first
+        elif name.startswith(("modes", "bubble.zigzags", "broad_bands")):
             if _concerns(group, model, name):
                 names.append(name)
         elif first and not (options.target and name.startswith("bubble")):
@@ -254,6 +257,17 @@ def _one_more(group: Group, step: _Step, options: Learning, first: bool) -> _Ste
     model, found = _alike(group, best[2].model, best[1]), (*step.found, best[1])
     names = _free(model, group, options, first)
     return _Step(maximise(group.fast, model, names, steps=8), found)
+
+
+def _coloured(group: Group, step: _Step, options: Learning, first: bool) -> _Step:
+    """The modes' forces given a corner, where it brings more than one parameter must."""
+    model = step.fit.model
+    if not first or not model.modes or model.force_hz is not None:
+        return step
+    model = driven(model, START_FORCE_HZ, white=True)
+    fit = maximise(group.fast, model, _free(model, group, options, first), steps=8)
+    gain = fit.log_evidence - step.fit.log_evidence
+    return _Step(fit, step.found) if gain > _penalty(group, model) / 3 else step
 
 
 def _alike(group: Group, model: ShakeModel, where: Where) -> ShakeModel:
@@ -333,7 +347,8 @@ def _with_line(
         added = Zigzag(line.frequency_hz, START_DAMPING, (x, y, z))
         zigzags = (*model.bubble.zigzags, added)
         return replace(model, bubble=replace(model.bubble, zigzags=zigzags))
-    mode = RigMode(line.frequency_hz, START_DAMPING, (x, y, z), int(where), options.force_hz)
+    force_hz = model.force_hz or options.force_hz
+    mode = RigMode(line.frequency_hz, START_DAMPING, (x, y, z), int(where), force_hz)
     return replace(model, modes=(*model.modes, mode))
 
 

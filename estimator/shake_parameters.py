@@ -36,7 +36,11 @@ class Prior:
         return float(-np.log(value / self.median) / self.log_sigma**2)
 
 
+FORCE = "modes.force_hz"
+"""Corner of the force that drives the modes, one for all."""
+
 PRIORS: dict[str, Prior] = {
+    FORCE: Prior(10.0, 1000.0, 60.0, 1.0, 0.2),
     "modes.*.frequency_hz": Prior(1.0, 150.0, 15.0, 1.5, 0.02),
     "modes.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
     "modes.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
@@ -64,6 +68,8 @@ def prior_of(name: str) -> Prior:
 def value_of(model: ShakeModel, name: str) -> float:
     """The number under that name. Raises InputError for an unknown one."""
     found: Any = model
+    if name == FORCE and model.force_hz is not None:
+        return model.force_hz
     try:
         for part in name.split("."):
             found = found[int(part)] if part.isdigit() else getattr(found, part)
@@ -76,9 +82,23 @@ def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]
     """The model with these numbers replaced."""
     out: Any = model
     for name, value in zip(names, values):
-        out = _replaced(out, name.split("."), float(value))
+        if name == FORCE:
+            out = driven(out, float(value))
+        else:
+            out = _replaced(out, name.split("."), float(value))
     assert isinstance(out, ShakeModel)
     return out
+
+
+def driven(model: ShakeModel, force_hz: float, *, white: bool = False) -> ShakeModel:
+    """The model with that corner of the force, white forces left so unless these are meant."""
+
+    def corner(line: Any) -> Any:
+        return replace(line, force_hz=force_hz) if white or line.force_hz is not None else line
+
+    zigzags = tuple(z if z.force_hz is None else corner(z) for z in model.bubble.zigzags)
+    bubble = replace(model.bubble, zigzags=zigzags)
+    return replace(model, modes=tuple(corner(m) for m in model.modes), bubble=bubble)
 
 
 def _replaced(node: Any, path: list[str], value: float) -> Any:
@@ -99,6 +119,7 @@ def names_of(model: ShakeModel) -> list[str]:
     out: list[str] = []
     fields = ("frequency_hz", "damping", "rms_mm")
     out += [f"modes.{i}.{f}" for i in range(len(model.modes)) for f in fields]
+    out += [FORCE] * (model.force_hz is not None)
     out += [f"broad_bands.{i}.rms_mm" for i in range(len(model.broad_bands))]
     out += [f"bubble.zigzags.{i}.{f}" for i in range(len(model.bubble.zigzags)) for f in fields]
     return [*out, "bubble.velocity_sigma_mm_s", "bubble.velocity_tau_s", "pixel_inflation"]

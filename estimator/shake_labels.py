@@ -208,10 +208,11 @@ def doubted(
 
 
 def _expected(model: ShakeModel, line: Zigzag, rms_mm: Sequence[float]) -> Array:
-    """Prior weights of lines of the rig, (n,) of these RMS, beside one of the bubbles.
+    """Prior weights of none (first) and lines of the rig, (n,) of these RMS, beside the bubbles'.
 
-    One that is weaker than the strongest that the rig shows elsewhere would be one more, and lie
-    just here by chance: with the probability that the prior of modes gives to frequencies so near.
+    All alike, but for those weaker than the strongest that the rig shows elsewhere: one more would
+    have to lie just here, with the probability that the prior of modes gives to frequencies so
+    near; the rest of their weight is that of none.
     """
     away = [
         max(m.rms_mm)
@@ -221,5 +222,8 @@ def _expected(model: ShakeModel, line: Zigzag, rms_mm: Sequence[float]) -> Array
     prior = prior_of("modes.0.frequency_hz")
     density = np.exp(prior.log_density(line.frequency_hz)) / (prior.log_sigma * np.sqrt(2 * np.pi))
     chance = 2 * _NEAR_HZ * density
-    rms, strongest = np.asarray(rms_mm), max(away, default=0.0)
-    return np.where((rms > 0) & (rms < strongest), chance, 1.0)
+    weaker = np.asarray(rms_mm) < max(away, default=0.0)
+    weaker[0] = False
+    weight = np.where(weaker, chance * (1 + 1 / max(weaker.sum(), 1)), 1.0)
+    weight[0] += weaker.sum() - weight[weaker].sum()
+    return weight

@@ -29,7 +29,8 @@ class Learning:
     hold : patterns of names (see `telerig.estimator.shake_parameters`) that keep the start's
         values, "modes.*" for instance for a rig that is known.
     target : the tracks are those of a target standing still in the lab, not of bubbles.
-    force_hz : corner of the modes' force, None for a white one, which images alone call for.
+    force_hz : corner of the modes' force to begin with, None for a white one, which gets a corner
+        where the data ask for it.
     """
 
     most_modes: int = 3

@@ -58,7 +58,7 @@ class Group:
 
 
 def groups_of(channels: Sequence[Channel], options: Learning, up: Array) -> list[Group]:
-    """The shared coordinate, and what lies across it; up : (3,)."""
+    """The shared coordinate, and what lies across it, alike whichever way; up : (3,)."""
     if not channels:
         return []
     bubble: tuple[Where, ...] = () if options.target else (BUBBLE,)
@@ -67,7 +67,8 @@ def groups_of(channels: Sequence[Channel], options: Learning, up: Array) -> list
     square = shared.direction**2
     groups = [Group((shared,), _pattern(square), (CARRIAGE, *own, *bubble), up)]
     if len(channels) > 1:
-        across = np.clip(sum(c.direction**2 for c in channels[1:]), 0, 1)
+        directions = np.array([c.direction for c in channels[1:]])
+        across = np.diagonal(np.linalg.pinv(directions) @ directions)
         groups.append(Group(tuple(channels[1:]), _pattern(across), (CARRIAGE, *bubble), up))
     return groups
 

@@ -11,6 +11,7 @@ from shake_learning_data import ARM_HZ, BUBBLE_HZ, COMMON_HZ, SWING_HZ, run, tru
 from telerig.errors import InputError
 from telerig.estimator.shake_channels import channels_of, pooled, seen_channels
 from telerig.estimator.shake_evidence import channel_evidence, channel_posterior, position_sigma
+from telerig.estimator.shake_groups import groups_of
 from telerig.estimator.shake_inflation import inflated
 from telerig.estimator.shake_labels import doubted, labels, moved_to_bubble, moved_to_rig
 from telerig.estimator.shake_learning import Learning, learn
@@ -28,6 +29,8 @@ from telerig.estimator.smoother.defaults import default_model
 from telerig.estimator.smoother.model import CARRIAGE, BroadBand, RigMode, ShakeModel, Zigzag
 from telerig.estimator.smoother.solve import Options, solve
 from telerig.factors.state_space import broad_band, driven_mode, oscillator
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
 
 OTHER = replace(
     true_model(0.4),
@@ -302,3 +305,18 @@ def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None
     weak = replace(strong, rms_mm=(0.0, 0.02, 0.0))
     near = replace(strong, frequency_hz=1.2 * BUBBLE_HZ)
     assert room(strong) < 0.5 * min(room(), room(weak), room(near))
+
+
+@pytest.mark.parametrize("angle_deg", [40.0, 90.0, 140.0])
+def test_lines_across_are_as_wide_whichever_way_the_cameras_look(angle_deg: float) -> None:
+    """A line's RMS found along one camera's lateral direction is that along the other's."""
+    problem, _, _ = run(np.random.default_rng(17), bubbles=1, seconds=0.2)
+    turned = Pose.from_rotvec([0.0, np.deg2rad(angle_deg), 0.0])
+    right = Camera.create("right", (1024, 1024), 10.0, camera_from_rig=turned)
+    channels = channels_of(replace(problem, cameras=(problem.cameras[0], right)))
+    upright, across = groups_of(channels, Learning(), problem.up)
+    np.testing.assert_allclose(upright.pattern, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(across.pattern, [1, 0, 1], atol=1e-12)
+    # one camera alone knows nothing of its own depth
+    single = groups_of(channels[:2], Learning(), problem.up)[1]
+    np.testing.assert_allclose(single.pattern, np.abs(channels[1].direction), atol=1e-12)

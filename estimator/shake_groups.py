@@ -27,7 +27,8 @@ class Learning:
 
     most_modes : lines of one kind (common, each arm, bubble) at most, in the vertical and across.
     hold : patterns of names (see `telerig.estimator.shake_parameters`) that keep the start's
-        values, "modes.*" for instance for a rig that is known.
+        values, "modes.*" for instance for a rig that is known. The forces' corner, which all modes
+        share, is held with any mode of which all is held.
     target : the tracks are those of a target standing still in the lab, not of bubbles.
     force_hz : corner of the modes' force to begin with, None for a white one, which gets a corner
         where the data ask for it.
@@ -82,16 +83,29 @@ def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) 
     """Names of what this group determines and nobody holds."""
     names = []
     for name in names_of(model):
-        if any(fnmatch(name, pattern) for pattern in options.hold):
+        if is_held(name, model, options):
             continue
         if name == FORCE:
-            names += [name] * first
+            if any(_concerns(group, model, f"modes.{i}.rms_mm") for i in _with_corner(model)):
+                names.append(name)
         elif name.startswith(("modes", "bubble.zigzags", "broad_bands")):
             if _concerns(group, model, name):
                 names.append(name)
         elif first and not (options.target and name.startswith("bubble")):
             names.append(name)
     return names
+
+
+def is_held(name: str, model: ShakeModel, options: Learning) -> bool:
+    """Whether the user keeps that hyper-parameter as it is."""
+    names = [name]
+    if name == FORCE:
+        names += [f"modes.{i}.force_hz" for i in range(len(model.modes))]
+    return any(fnmatch(n, pattern) for n in names for pattern in options.hold)
+
+
+def _with_corner(model: ShakeModel) -> list[int]:
+    return [i for i, mode in enumerate(model.modes) if mode.force_hz is not None]
 
 
 def _concerns(group: Group, model: ShakeModel, name: str) -> bool:

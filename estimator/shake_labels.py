@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
 from telerig.estimator.shake_likelihood import evidence, maximise
-from telerig.estimator.shake_parameters import driven, prior_of
+from telerig.estimator.shake_parameters import prior_of
 from telerig.estimator.smoother.model import CARRIAGE, RigMode, ShakeModel, Zigzag
 
 Array = NDArray[np.float64]
@@ -30,6 +30,7 @@ _ZIGZAG_MM = 0.3
 _ZIGZAG_HZ = (3.0, 12.0)
 _SHARES = np.linspace(0.0, 1.0, 6)
 _NEAR_HZ, _ELSEWHERE_HZ = 0.1, 0.25
+_MORE = 3
 _LEAST_SHARE = 0.1
 
 
@@ -175,7 +176,7 @@ def shared(model: ShakeModel, found: Sequence[LineLabel]) -> ShakeModel:
     for label in found:
         if label.ambiguous and label.owner == "rig":
             model = moved_to_bubble(model, label.index, 0.5)
-    return model if model.force_hz is None else driven(model, model.force_hz, white=True)
+    return model
 
 
 def doubted(
@@ -186,20 +187,23 @@ def doubted(
     The bubbles' differences show their own line; a rig's line of the same frequency adds to what
     they have in common, where a share of 1 / bubbles is theirs anyway, and a few cycles do not
     tell it from none. Its RMS is the root of the posterior's mean square, under a flat prior up
-    to the bubbles' own. Where the rig shows a stronger line of its own elsewhere, a second one just
-    here is a coincidence. Wide swings across the vertical are the bubbles'.
+    to the bubbles' own, less where the rig shows a stronger line elsewhere. Wide swings across the
+    vertical are the bubbles'.
     """
+    own = [
+        m for m in model.modes
+        if m.camera == CARRIAGE and _lies_in(m.rms_mm, pattern) and not _is_half(m, model)
+    ]  # fmt: skip
     for line in model.bubble.zigzags:
         common = [m.frequency_hz for m in model.modes if m.camera == CARRIAGE]
         seen = any(abs(f / line.frequency_hz - 1) < _NEAR_HZ for f in common)
         if seen or not _lies_in(line.rms_mm, pattern) or is_zigzag(line, up):
             continue
-        rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=model.force_hz)
+        rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=line.force_hz)
         options = [replace(rig, rms_mm=_times(rig.rms_mm, s)) for s in _SHARES]
         trials = [replace(model, modes=(*model.modes, mode)) for mode in options[1:]]
         found = np.array([evidence(channels, m) for m in (model, *trials)])
-        weight = np.exp(found - found.max())
-        weight *= _expected(model, line, [max(m.rms_mm) for m in options])
+        weight = np.exp(found - found.max()) * expected(line, own)
         share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
         if share > _LEAST_SHARE:
             mode = replace(rig, rms_mm=_times(rig.rms_mm, share))
@@ -207,23 +211,30 @@ def doubted(
     return model
 
 
-def _expected(model: ShakeModel, line: Zigzag, rms_mm: Sequence[float]) -> Array:
-    """Prior weights of none (first) and lines of the rig, (n,) of these RMS, beside the bubbles'.
+def _is_half(mode: RigMode, model: ShakeModel) -> bool:
+    """Of an ambiguous line, whose other half is the bubbles'."""
+    return any(z.frequency_hz == mode.frequency_hz for z in model.bubble.zigzags)
 
-    All alike, but for those weaker than the strongest that the rig shows elsewhere: one more would
-    have to lie just here, with the probability that the prior of modes gives to frequencies so
-    near; the rest of their weight is that of none.
+
+def expected(line: Zigzag, own: Sequence[RigMode]) -> Array:
+    """Prior weights of lines of the rig beside one of the bubbles', by their `_SHARES` of its RMS.
+
+    All alike where the rig shows no line of its own elsewhere (a quarter of the frequency away):
+    its main one must be somewhere. One that is weaker than the strongest there would be one more,
+    and lie just here by chance: with the probability that one of `_MORE` falls so near under the
+    prior of modes. What it loses goes to none (the first).
     """
-    away = [
-        max(m.rms_mm)
-        for m in model.modes
-        if m.camera == CARRIAGE and abs(m.frequency_hz / line.frequency_hz - 1) > _ELSEWHERE_HZ
-    ]
-    prior = prior_of("modes.0.frequency_hz")
-    density = np.exp(prior.log_density(line.frequency_hz)) / (prior.log_sigma * np.sqrt(2 * np.pi))
-    chance = 2 * _NEAR_HZ * density
-    weaker = np.asarray(rms_mm) < max(away, default=0.0)
-    weaker[0] = False
-    weight = np.where(weaker, chance * (1 + 1 / max(weaker.sum(), 1)), 1.0)
-    weight[0] += weaker.sum() - weight[weaker].sum()
-    return weight
+    away = [max(m.rms_mm) for m in own if _is_elsewhere(m, line)]
+    strongest = max(away, default=0.0)
+    if not strongest:
+        return np.ones(len(_SHARES))
+    each = 2 * _NEAR_HZ * prior_of("modes.*.frequency_hz").density(line.frequency_hz)
+    chance = 1 - (1 - each) ** _MORE
+    size = np.minimum(_SHARES * max(line.rms_mm) / strongest, 1.0)
+    weight = chance + (1 - chance) * size**2
+    weight[0] = len(weight) - weight[1:].sum()
+    return np.asarray(weight)
+
+
+def _is_elsewhere(mode: RigMode, line: Zigzag) -> bool:
+    return abs(mode.frequency_hz / line.frequency_hz - 1) >= _ELSEWHERE_HZ

@@ -10,17 +10,16 @@ a target standing still is the best source: there every line is the rig's.
 from __future__ import annotations
 
 from dataclasses import replace
-from fnmatch import fnmatch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import channels_of
-from telerig.estimator.shake_groups import Group, Learning, free_names, groups_of
+from telerig.estimator.shake_groups import Group, Learning, free_names, groups_of, is_held
 from telerig.estimator.shake_labels import LineLabel, doubted, labels, shared
 from telerig.estimator.shake_likelihood import laplace_sigma, maximise
-from telerig.estimator.shake_parameters import names_of, value_of, with_values
-from telerig.estimator.shake_search import LOW_HZ, Step, coloured, one_more, pruned
+from telerig.estimator.shake_parameters import FORCE, names_of, value_of, with_values
+from telerig.estimator.shake_search import LOW_HZ, Step, coloured, one_more, pruned, whitened
 from telerig.estimator.shake_spectrum import coarsening, coarser, faded, unexplained
 from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
 
@@ -65,20 +64,24 @@ def _learn_group(
     factor = coarsening(t_s, _highest(group, model))
     model = _faded(model, factor, t_s)
     coarse = replace(group, channels=tuple(coarser(c, factor) for c in group.channels))
+    begun_white = model.force_hz is None and options.force_hz is None
     step = Step(maximise(coarse.fast, model, free_names(model, coarse, options, first), steps=15))
+    step = coloured(coarse, step, options, first)
     while True:
         better = one_more(coarse, step, options, first)
         if better is None:
             break
         step = coloured(coarse, better, options, first)
     fit = pruned(coarse, step.fit, options, first)
+    if first and begun_white:
+        fit = whitened(coarse, fit, options)
     names = free_names(fit.model, coarse, options, first)
     fit = maximise(coarse.fast, fit.model, names)
     sigma = np.sqrt(np.diag(laplace_sigma(coarse.fast, fit.model, names)))
     model = fit.model
     if not options.target:
         found = labels(coarse.fast, model, group.pattern, group.up)
-        model = shared(model, [x for x in found if not _is_held(x, options)])
+        model = shared(model, [x for x in found if not _is_kept(x, model, options)])
         if max(int(c.moving.sum()) for c in group.channels) > 1:
             model = doubted(coarse.fast, model, group.pattern, group.up)
     return _faded(model, factor, t_s, back=True), dict(zip(names, sigma.tolist()))
@@ -96,13 +99,14 @@ def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeMo
         x, y, z = (_ACROSS * max(mode.rms_mm) * p for p in group.pattern)
         added.append(replace(mode, rms_mm=(x, y, z)))
     held = [f"modes.{at + i}.{f}" for i in range(len(added)) for f in ("frequency_hz", "damping")]
+    held += [FORCE] if added else []
     model = replace(model, modes=(*model.modes, *added))
     return model, replace(options, hold=(*options.hold, *held))
 
 
-def _is_held(label: LineLabel, options: Learning) -> bool:
+def _is_kept(label: LineLabel, model: ShakeModel, options: Learning) -> bool:
     name = f"modes.{label.index}.frequency_hz"
-    return label.owner == "rig" and any(fnmatch(name, pattern) for pattern in options.hold)
+    return label.owner == "rig" and is_held(name, model, options)
 
 
 def _highest(group: Group, model: ShakeModel) -> float:

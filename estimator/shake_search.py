@@ -6,15 +6,22 @@ The criterion is Schwarz's (Ann. Stat. 6:461, 1978).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.shake_groups import BUBBLE, Group, Learning, Where, free_names
+from telerig.estimator.shake_groups import (
+    BUBBLE,
+    Group,
+    Learning,
+    Where,
+    free_names,
+    is_held,
+)
 from telerig.estimator.shake_labels import is_zigzag
 from telerig.estimator.shake_likelihood import Fit, evidence, maximise
-from telerig.estimator.shake_parameters import driven
+from telerig.estimator.shake_parameters import FORCE, forced
 from telerig.estimator.shake_spectrum import Line, unexplained
 from telerig.estimator.smoother.model import CARRIAGE, RigMode, ShakeModel, Zigzag
 
@@ -30,7 +37,7 @@ class Step:
     """Where the search stands: the model, its fit, and lines of each kind found in this group."""
 
     fit: Fit
-    found: tuple[Where, ...] = field(default=())
+    found: tuple[Where, ...] = ()
 
 
 def one_more(group: Group, step: Step, options: Learning, first: bool) -> Step | None:
@@ -60,14 +67,32 @@ def one_more(group: Group, step: Step, options: Learning, first: bool) -> Step |
 
 
 def coloured(group: Group, step: Step, options: Learning, first: bool) -> Step:
-    """The modes' forces given a corner, where it brings more than one parameter must."""
+    """The modes' white forces given a corner, where it brings more than one parameter must.
+
+    Both ways get as many steps more.
+    """
     model = step.fit.model
-    if not first or not model.modes or model.force_hz is not None:
+    white = bool(model.modes) and all(m.force_hz is None for m in model.modes)
+    if not first or not white or is_held(FORCE, model, options) or step.found[-1:] == (BUBBLE,):
         return step
-    model = driven(model, START_FORCE_HZ, white=True)
-    fit = maximise(group.fast, model, free_names(model, group, options, first), steps=8)
-    gain = fit.log_evidence - step.fit.log_evidence
-    return Step(fit, step.found) if gain > _penalty(group, model) / 3 else step
+    with_corner = forced(model, START_FORCE_HZ)
+    fits = [
+        maximise(group.fast, m, free_names(m, group, options, first), steps=8)
+        for m in (model, with_corner)
+    ]
+    gain = fits[1].log_evidence - fits[0].log_evidence
+    return Step(fits[gain > _penalty(group, model) / 3], step.found)
+
+
+def whitened(group: Group, fit: Fit, options: Learning) -> Fit:
+    """The forces' corner taken away again where the criterion does not mind."""
+    names = free_names(fit.model, group, options, True)
+    if FORCE not in names:
+        return fit
+    white = forced(fit.model, None)
+    quick = maximise(group.fast, white, [n for n in names if n != FORCE], steps=8)
+    worth = _penalty(group, fit.model) / 3
+    return quick if quick.log_evidence > fit.log_evidence - worth else fit
 
 
 def _alike(group: Group, model: ShakeModel, where: Where) -> ShakeModel:

@@ -13,12 +13,16 @@ from telerig.estimator.shake_channels import channels_of, pooled, seen_channels
 from telerig.estimator.shake_evidence import channel_evidence, channel_posterior, position_sigma
 from telerig.estimator.shake_groups import groups_of
 from telerig.estimator.shake_inflation import inflated
-from telerig.estimator.shake_labels import doubted, labels, moved_to_bubble, moved_to_rig
+from telerig.estimator.shake_labels import (
+    doubted,
+    labels,
+    moved_to_bubble,
+    moved_to_rig,
+)
 from telerig.estimator.shake_learning import Learning, learn
 from telerig.estimator.shake_likelihood import evidence, laplace_sigma, maximise
 from telerig.estimator.shake_parameters import (
-    FORCE,
-    driven,
+    forced,
     log_prior,
     names_of,
     value_of,
@@ -26,7 +30,7 @@ from telerig.estimator.shake_parameters import (
 )
 from telerig.estimator.shake_spectrum import coarsening, coarser, density, faded, unexplained
 from telerig.estimator.smoother.defaults import default_model
-from telerig.estimator.smoother.model import CARRIAGE, BroadBand, RigMode, ShakeModel, Zigzag
+from telerig.estimator.smoother.model import CARRIAGE, BroadBand, ShakeModel, Zigzag
 from telerig.estimator.smoother.solve import Options, solve
 from telerig.factors.state_space import broad_band, driven_mode, oscillator
 from telerig.rig.camera import Camera
@@ -158,39 +162,6 @@ def test_a_fixed_target_shows_every_mode_of_the_rig() -> None:
     assert 0 < spread < 0.1
 
 
-@pytest.mark.parametrize("force_hz", [40.0, 1000.0])
-def test_a_force_with_a_corner_is_told_from_a_white_one(force_hz: float) -> None:
-    problem, _, _ = run(
-        np.random.default_rng(12), bubbles=1, still=True, seconds=1.5, rate_hz=500.0,
-        sigma_px=0.05, common_hz=25.0, force_hz=force_hz,
-    )  # fmt: skip
-    found = learn(problem, default_model(problem), Learning(target=True, most_modes=1))
-    assert len(found.modes) >= 3
-    if force_hz > 500:
-        assert found.force_hz is None or found.force_hz > 150
-    else:
-        assert found.force_hz == pytest.approx(force_hz, rel=0.4)
-        assert all(m.force_hz == found.force_hz for m in found.modes)
-        assert 0.02 < found.learned[FORCE] < 0.5
-
-
-def test_one_corner_is_every_modes_that_has_one() -> None:
-    white = true_model()
-    assert white.force_hz is None
-    assert FORCE not in names_of(white)
-    with pytest.raises(InputError, match="the model has no"):
-        value_of(white, FORCE)
-    swing, line = white.bubble.zigzags
-    bubble = replace(white.bubble, zigzags=(swing, replace(line, force_hz=50.0)))
-    modes = (replace(white.modes[0], force_hz=50.0), *white.modes[1:])
-    one = replace(white, modes=modes, bubble=bubble)
-    assert value_of(one, FORCE) == 50.0
-    moved = with_values(one, [FORCE], [80.0])
-    assert [m.force_hz for m in moved.modes] == [80.0, None, None]
-    assert [z.force_hz for z in moved.bubble.zigzags] == [None, 80.0]
-    assert [m.force_hz for m in driven(white, 30.0, white=True).modes] == [30.0] * 3
-
-
 def test_several_bubbles_tell_their_own_line_from_the_rigs() -> None:
     problem, lab, _ = run(np.random.default_rng(7), bubbles=4, seconds=2.0, rate_hz=100.0)
     found = learn(problem, default_model(problem), Learning(most_modes=1))
@@ -228,7 +199,7 @@ def test_a_line_changes_hands_without_changing_one_bubbles_likelihood() -> None:
     assert evidence(channels, moved_to_bubble(true_model(), 0)) == pytest.approx(at, abs=1e-5)
     assert evidence(channels, moved_to_rig(true_model(), 1)) == pytest.approx(at, abs=1e-5)
     assert evidence(channels, moved_to_rig(true_model(), 1, 0.3)) == pytest.approx(at, abs=1e-5)
-    coloured = driven(true_model(), 40.0, white=True)
+    coloured = forced(true_model(), 40.0)
     at = evidence(channels, coloured)
     there = moved_to_bubble(coloured, 0)
     assert evidence(channels, there) == pytest.approx(at, abs=1e-5)
@@ -288,23 +259,6 @@ def test_a_line_of_several_bubbles_leaves_room_for_the_rigs() -> None:
     assert round(SWING_HZ) not in at
     assert doubted(channels, replace(missed, modes=(*missed.modes, common)), (0, 1, 0),
                    problem.up).modes[: len(true.modes)] == (*true.modes[1:], common)  # fmt: skip
-
-
-def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None:
-    """Elsewhere, of its own: then a second one just here would be a coincidence."""
-    problem, _, _ = run(np.random.default_rng(16), bubbles=3)
-    channels, true = pooled(channels_of(problem)[0]), true_model()
-
-    def room(*common: RigMode) -> float:
-        modes = (*common, *true.modes[1:])
-        found = doubted(channels, replace(true, modes=modes), (0, 1, 0), problem.up)
-        added = found.modes[len(modes) :]
-        return max((m.rms_mm[1] for m in added if round(m.frequency_hz) == BUBBLE_HZ), default=0.0)
-
-    strong = true.modes[0]
-    weak = replace(strong, rms_mm=(0.0, 0.02, 0.0))
-    near = replace(strong, frequency_hz=1.2 * BUBBLE_HZ)
-    assert room(strong) < 0.5 * min(room(), room(weak), room(near))
 
 
 @pytest.mark.parametrize("angle_deg", [40.0, 90.0, 140.0])

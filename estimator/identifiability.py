@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import channels_of
+from telerig.estimator.shake_groups import Learning, groups_of
 from telerig.estimator.shake_labels import LineLabel, labels
-from telerig.estimator.shake_learning import Learning, groups_of
 from telerig.estimator.shake_modes import shake_modes
 from telerig.estimator.shake_window import Window, window_of
 from telerig.estimator.smoother.model import (

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
 from telerig.estimator.shake_likelihood import evidence, maximise
+from telerig.estimator.shake_parameters import prior_of
 from telerig.estimator.smoother.model import CARRIAGE, RigMode, ShakeModel, Zigzag
 
 Array = NDArray[np.float64]
@@ -28,7 +29,8 @@ _REFIT_NATS = 40.0
 _ZIGZAG_MM = 0.3
 _ZIGZAG_HZ = (3.0, 12.0)
 _SHARES = np.linspace(0.0, 1.0, 6)
-_NEAR_HZ = 0.1
+_NEAR_HZ, _ELSEWHERE_HZ = 0.1, 0.25
+_MORE = 3
 _LEAST_SHARE = 0.1
 
 
@@ -129,7 +131,8 @@ def is_zigzag(line: Zigzag, up: Array) -> bool:
 def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
     """A share of a mode's variance given to the bubbles; all of it: the mode goes."""
     mode = model.modes[index]
-    added = Zigzag(mode.frequency_hz, mode.damping, _times(mode.rms_mm, np.sqrt(share)))
+    rms = _times(mode.rms_mm, np.sqrt(share))
+    added = Zigzag(mode.frequency_hz, mode.damping, rms, mode.force_hz)
     kept = replace(mode, rms_mm=_times(mode.rms_mm, np.sqrt(1 - share)))
     rest = (kept,) if share < 1 else ()
     modes = (*model.modes[:index], *rest, *model.modes[index + 1 :])
@@ -140,9 +143,8 @@ def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeM
 def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
     """A share of a bubble line's variance given to a mode of the whole rig."""
     line = model.bubble.zigzags[index]
-    force = next((m.force_hz for m in model.modes), None)
     rms = _times(line.rms_mm, np.sqrt(share))
-    added = RigMode(line.frequency_hz, line.damping, rms, force_hz=force)
+    added = RigMode(line.frequency_hz, line.damping, rms, force_hz=line.force_hz)
     kept = replace(line, rms_mm=_times(line.rms_mm, np.sqrt(1 - share)))
     rest = (kept,) if share < 1 else ()
     zigzags = (*model.bubble.zigzags[:index], *rest, *model.bubble.zigzags[index + 1 :])
@@ -154,6 +156,7 @@ def _joined(lines: tuple[Zigzag, ...], added: Zigzag) -> tuple[Zigzag, ...]:
     """With the variances of equal lines added up."""
     for i, line in enumerate(lines):
         near = abs(line.frequency_hz / added.frequency_hz - 1) < _SAME_HZ
+        near &= line.force_hz == added.force_hz
         if near and np.isclose(line.damping, added.damping, rtol=_SAME_HZ):
             x, y, z = np.hypot(line.rms_mm, added.rms_mm).tolist()
             return (*lines[:i], replace(line, rms_mm=(x, y, z)), *lines[i + 1 :])
@@ -184,23 +187,54 @@ def doubted(
     The bubbles' differences show their own line; a rig's line of the same frequency adds to what
     they have in common, where a share of 1 / bubbles is theirs anyway, and a few cycles do not
     tell it from none. Its RMS is the root of the posterior's mean square, under a flat prior up
-    to the bubbles' own. Wide swings across the vertical are the bubbles'.
+    to the bubbles' own, less where the rig shows a stronger line elsewhere. Wide swings across the
+    vertical are the bubbles'.
     """
+    own = [
+        m for m in model.modes
+        if m.camera == CARRIAGE and _lies_in(m.rms_mm, pattern) and not _is_half(m, model)
+    ]  # fmt: skip
     for line in model.bubble.zigzags:
-        rivals = [m for m in model.modes if m.camera == CARRIAGE]
-        seen = any(abs(m.frequency_hz / line.frequency_hz - 1) < _NEAR_HZ for m in rivals)
+        common = [m.frequency_hz for m in model.modes if m.camera == CARRIAGE]
+        seen = any(abs(f / line.frequency_hz - 1) < _NEAR_HZ for f in common)
         if seen or not _lies_in(line.rms_mm, pattern) or is_zigzag(line, up):
             continue
-        force = next((m.force_hz for m in model.modes), None)
-        options = [
-            RigMode(line.frequency_hz, line.damping, _times(line.rms_mm, s), force_hz=force)
-            for s in _SHARES
-        ]
+        rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=line.force_hz)
+        options = [replace(rig, rms_mm=_times(rig.rms_mm, s)) for s in _SHARES]
         trials = [replace(model, modes=(*model.modes, mode)) for mode in options[1:]]
         found = np.array([evidence(channels, m) for m in (model, *trials)])
-        weight = np.exp(found - found.max())
+        weight = np.exp(found - found.max()) * expected(line, own)
         share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
         if share > _LEAST_SHARE:
-            mode = replace(options[0], rms_mm=_times(line.rms_mm, share))
+            mode = replace(rig, rms_mm=_times(rig.rms_mm, share))
             model = replace(model, modes=(*model.modes, mode))
     return model
+
+
+def _is_half(mode: RigMode, model: ShakeModel) -> bool:
+    """Of an ambiguous line, whose other half is the bubbles'."""
+    return any(z.frequency_hz == mode.frequency_hz for z in model.bubble.zigzags)
+
+
+def expected(line: Zigzag, own: Sequence[RigMode]) -> Array:
+    """Prior weights of lines of the rig beside one of the bubbles', by their `_SHARES` of its RMS.
+
+    All alike where the rig shows no line of its own elsewhere (a quarter of the frequency away):
+    its main one must be somewhere. One that is weaker than the strongest there would be one more,
+    and lie just here by chance: with the probability that one of `_MORE` falls so near under the
+    prior of modes. What it loses goes to none (the first).
+    """
+    away = [max(m.rms_mm) for m in own if _is_elsewhere(m, line)]
+    strongest = max(away, default=0.0)
+    if not strongest:
+        return np.ones(len(_SHARES))
+    each = 2 * _NEAR_HZ * prior_of("modes.*.frequency_hz").density(line.frequency_hz)
+    chance = 1 - (1 - each) ** _MORE
+    size = np.minimum(_SHARES * max(line.rms_mm) / strongest, 1.0)
+    weight = chance + (1 - chance) * size**2
+    weight[0] = len(weight) - weight[1:].sum()
+    return np.asarray(weight)
+
+
+def _is_elsewhere(mode: RigMode, line: Zigzag) -> bool:
+    return abs(mode.frequency_hz / line.frequency_hz - 1) >= _ELSEWHERE_HZ

@@ -1,7 +1,8 @@
 """Hyper-parameters by name: reading, replacing and bounding numbers inside a `ShakeModel`.
 
 Names are paths: ``modes.0.frequency_hz``, ``bubble.zigzags.1.rms_mm``, ``pixel_inflation``. An RMS
-with three components is one number, its largest component; setting it keeps the proportions.
+with three components is one number, its largest component; setting it keeps the proportions. The
+corner of the modes' force is one for all, ``modes.force_hz``.
 """
 
 from __future__ import annotations
@@ -31,12 +32,20 @@ class Prior:
         """Up to a constant."""
         return float(-0.5 * (np.log(value / self.median) / self.log_sigma) ** 2)
 
+    def density(self, value: float) -> float:
+        """Probability per unit of the value's logarithm."""
+        return float(np.exp(self.log_density(value)) / (self.log_sigma * np.sqrt(2 * np.pi)))
+
     def log_slope(self, value: float) -> float:
         """Derivative of the log density by the number's logarithm."""
         return float(-np.log(value / self.median) / self.log_sigma**2)
 
 
+FORCE = "modes.force_hz"
+"""Corner of the force that drives the modes, one for all."""
+
 PRIORS: dict[str, Prior] = {
+    FORCE: Prior(10.0, 1000.0, 60.0, 1.5, 0.2),
     "modes.*.frequency_hz": Prior(1.0, 150.0, 15.0, 1.5, 0.02),
     "modes.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
     "modes.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
@@ -64,6 +73,8 @@ def prior_of(name: str) -> Prior:
 def value_of(model: ShakeModel, name: str) -> float:
     """The number under that name. Raises InputError for an unknown one."""
     found: Any = model
+    if name == FORCE and model.force_hz is not None:
+        return model.force_hz
     try:
         for part in name.split("."):
             found = found[int(part)] if part.isdigit() else getattr(found, part)
@@ -76,9 +87,26 @@ def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]
     """The model with these numbers replaced."""
     out: Any = model
     for name, value in zip(names, values):
-        out = _replaced(out, name.split("."), float(value))
+        if name == FORCE:
+            out = with_force(out, float(value))
+        else:
+            out = _replaced(out, name.split("."), float(value))
     assert isinstance(out, ShakeModel)
     return out
+
+
+def with_force(model: ShakeModel, force_hz: float) -> ShakeModel:
+    """The model with that corner of all forces that have one."""
+    modes = tuple(m if m.force_hz is None else replace(m, force_hz=force_hz) for m in model.modes)
+    zigzags = tuple(
+        z if z.force_hz is None else replace(z, force_hz=force_hz) for z in model.bubble.zigzags
+    )
+    return replace(model, modes=modes, bubble=replace(model.bubble, zigzags=zigzags))
+
+
+def forced(model: ShakeModel, force_hz: float | None) -> ShakeModel:
+    """The model with that corner of all modes' forces, None: all white."""
+    return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
 
 
 def _replaced(node: Any, path: list[str], value: float) -> Any:
@@ -99,6 +127,8 @@ def names_of(model: ShakeModel) -> list[str]:
     out: list[str] = []
     fields = ("frequency_hz", "damping", "rms_mm")
     out += [f"modes.{i}.{f}" for i in range(len(model.modes)) for f in fields]
+    if model.force_hz is not None:
+        out.append(FORCE)
     out += [f"broad_bands.{i}.rms_mm" for i in range(len(model.broad_bands))]
     out += [f"bubble.zigzags.{i}.{f}" for i in range(len(model.bubble.zigzags)) for f in fields]
     return [*out, "bubble.velocity_sigma_mm_s", "bubble.velocity_tau_s", "pixel_inflation"]

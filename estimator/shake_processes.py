@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
-from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
+from telerig.estimator.shake_parameters import FORCE
+from telerig.estimator.smoother.model import CARRIAGE, RigMode, ShakeModel, Zigzag
 from telerig.factors.state_space import (
     Component,
     broad_band,
-    driven_mode,
-    oscillator,
     ou_velocity,
+    resonance,
     slow_ou,
 )
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Make = Callable[..., Component]
 
 _cached = lru_cache(maxsize=512)
-_oscillator, _driven_mode = _cached(oscillator), _cached(driven_mode)
+_resonance = _cached(resonance)
 _broad_band, _slow_ou, _ou_velocity = _cached(broad_band), _cached(slow_ou), _cached(ou_velocity)
 
 
@@ -41,6 +41,11 @@ class Process:
     learned: dict[str, tuple[str, float]]
     fixed: dict[str, float] = field(default_factory=dict)
     camera: int | None = None
+
+    @property
+    def names(self) -> dict[str, str]:
+        """The hyper-parameters' names, with their last parts."""
+        return {FORCE if n == "force_hz" else f"{self.stem}.{n}": n for n in self.learned}
 
     @property
     def component(self) -> Component:
@@ -61,11 +66,7 @@ def shake_processes(channel: Channel, model: ShakeModel) -> list[Process]:
     for i, mode in enumerate(model.modes):
         rms = _along(channel, mode.rms_mm, mode.camera)
         if rms > 0:
-            learned = _line(rms, mode.frequency_hz, mode.damping)
-            make, fixed = _oscillator, {}
-            if mode.force_hz is not None:
-                make, fixed = _driven_mode, {"force_hz": mode.force_hz}
-            out.append(Process(f"modes.{i}", make, learned, fixed, mode.camera))
+            out.append(Process(f"modes.{i}", _resonance, _line(mode, rms), camera=mode.camera))
     for i, band in enumerate(model.broad_bands):
         rms = _along(channel, band.rms_mm, band.camera)
         if rms > 0:
@@ -78,8 +79,10 @@ def shake_processes(channel: Channel, model: ShakeModel) -> list[Process]:
     return out
 
 
-def _line(rms_mm: float, frequency_hz: float, damping: float) -> dict[str, tuple[str, float]]:
-    values = {"rms_mm": rms_mm, "frequency_hz": frequency_hz, "damping": damping}
+def _line(line: RigMode | Zigzag, rms_mm: float) -> dict[str, tuple[str, float]]:
+    values = {"rms_mm": rms_mm, "frequency_hz": line.frequency_hz, "damping": line.damping}
+    if line.force_hz is not None:
+        values["force_hz"] = line.force_hz
     return {name: (name, value) for name, value in values.items()}
 
 
@@ -103,8 +106,7 @@ def bubble_processes(channel: Channel, model: ShakeModel) -> list[Process]:
     for i, z in enumerate(bubble.zigzags):
         rms = float(share * np.sqrt(np.sum(np.square(channel.direction * z.rms_mm))))
         if rms > 0:
-            line = _line(rms, z.frequency_hz, z.damping)
-            parts.append(Process(f"bubble.zigzags.{i}", _oscillator, line))
+            parts.append(Process(f"bubble.zigzags.{i}", _resonance, _line(z, rms)))
     return parts
 
 
@@ -117,5 +119,5 @@ def processes(channel: Channel, model: ShakeModel) -> list[Component]:
 def tells_of(channel: Channel, model: ShakeModel, names: Sequence[str]) -> bool:
     """Whether the channel's evidence depends on any of these hyper-parameters."""
     found = shake_processes(channel, model) + bubble_processes(channel, model)
-    known = {f"{p.stem}.{last}" for p in found for last in p.learned}
+    known = {name for p in found for name in p.names}
     return "pixel_inflation" in names or not known.isdisjoint(names)

@@ -75,10 +75,10 @@ def channel_slope(channel: Channel, model: ShakeModel, names: Sequence[str]) -> 
 def _changes(found: list[Process], names: Sequence[str]) -> list[_Change]:
     where = {name: i for i, name in enumerate(names)}
     return [
-        _Change(i, where[f"{p.stem}.{last}"], sign, p.moved(last, np.exp(sign * _DIFFERENCE)))
+        _Change(i, where[name], sign, p.moved(last, np.exp(sign * _DIFFERENCE)))
         for i, p in enumerate(found)
-        for last in p.learned
-        if f"{p.stem}.{last}" in where
+        for name, last in p.names.items()
+        if name in where
         for sign in (1, -1)
     ]
 

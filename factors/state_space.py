@@ -186,6 +186,15 @@ def driven_mode(
     return _scaled("driven_mode", drift, np.array([1.0, 0, 0, 0]), rms_mm)
 
 
+def resonance(
+    rms_mm: float, frequency_hz: float, damping: float, force_hz: float | None = None
+) -> Component:
+    """An `oscillator`, or with a corner of the force a `driven_mode`."""
+    if force_hz is None:
+        return oscillator(rms_mm, frequency_hz, damping)
+    return driven_mode(rms_mm, frequency_hz, damping, force_hz=force_hz)
+
+
 def broad_band(
     rms_mm: float,
     *,

@@ -59,17 +59,19 @@ def run(
     marks: int = 0,
     still: bool = False,
     kept: float = 1.0,
+    common_hz: float = COMMON_HZ,
+    force_hz: float = 60.0,
 ) -> tuple[SmoothingProblem, Array, Array]:
     """A problem, the truth (bubbles, F, 3) and the shake (2, F, 3); the stage stands still.
 
     marks : features of each camera fixed to the tank.  still : bubbles do not move either.
-    kept : share of pixels that are not lost.
+    kept : share of pixels that are not lost.  common_hz, force_hz : of the rig's shake.
     """
     frames = round(seconds * rate_hz)
     t = np.arange(frames) / rate_hz
     shake = rig_shake(
         1 / rate_hz, frames, rng, cameras=2, rms_mm=[0.0, shake_mm, 0.0],
-        frequency_hz=COMMON_HZ, arm_ratio=ARM_HZ / COMMON_HZ,
+        frequency_hz=common_hz, arm_ratio=ARM_HZ / COMMON_HZ, force_hz=force_hz,
     ).offset_mm  # fmt: skip
     lab = np.zeros((bubbles, frames, 3))
     if not still:

@@ -11,16 +11,30 @@ from shake_learning_data import ARM_HZ, BUBBLE_HZ, COMMON_HZ, SWING_HZ, run, tru
 from telerig.errors import InputError
 from telerig.estimator.shake_channels import channels_of, pooled, seen_channels
 from telerig.estimator.shake_evidence import channel_evidence, channel_posterior, position_sigma
+from telerig.estimator.shake_groups import groups_of
 from telerig.estimator.shake_inflation import inflated
-from telerig.estimator.shake_labels import doubted, labels, moved_to_bubble, moved_to_rig
+from telerig.estimator.shake_labels import (
+    doubted,
+    labels,
+    moved_to_bubble,
+    moved_to_rig,
+)
 from telerig.estimator.shake_learning import Learning, learn
 from telerig.estimator.shake_likelihood import evidence, laplace_sigma, maximise
-from telerig.estimator.shake_parameters import log_prior, names_of, value_of, with_values
+from telerig.estimator.shake_parameters import (
+    forced,
+    log_prior,
+    names_of,
+    value_of,
+    with_values,
+)
 from telerig.estimator.shake_spectrum import coarsening, coarser, density, faded, unexplained
 from telerig.estimator.smoother.defaults import default_model
 from telerig.estimator.smoother.model import CARRIAGE, BroadBand, ShakeModel, Zigzag
 from telerig.estimator.smoother.solve import Options, solve
 from telerig.factors.state_space import broad_band, driven_mode, oscillator
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
 
 OTHER = replace(
     true_model(0.4),
@@ -185,6 +199,13 @@ def test_a_line_changes_hands_without_changing_one_bubbles_likelihood() -> None:
     assert evidence(channels, moved_to_bubble(true_model(), 0)) == pytest.approx(at, abs=1e-5)
     assert evidence(channels, moved_to_rig(true_model(), 1)) == pytest.approx(at, abs=1e-5)
     assert evidence(channels, moved_to_rig(true_model(), 1, 0.3)) == pytest.approx(at, abs=1e-5)
+    coloured = forced(true_model(), 40.0)
+    at = evidence(channels, coloured)
+    there = moved_to_bubble(coloured, 0)
+    assert evidence(channels, there) == pytest.approx(at, abs=1e-5)
+    back = moved_to_rig(there, len(there.bubble.zigzags) - 1)
+    assert evidence(channels, back) == pytest.approx(at, abs=1e-5)
+    assert back.modes[-1].force_hz == 40.0
     several, _, _ = run(np.random.default_rng(9), bubbles=4)
     costs = labels(pooled(channels_of(several)[0]), true_model(), (0, 1, 0), several.up)
     assert {(c.owner, c.index) for c in costs} == {("rig", 0), ("bubble", 1)}
@@ -238,3 +259,18 @@ def test_a_line_of_several_bubbles_leaves_room_for_the_rigs() -> None:
     assert round(SWING_HZ) not in at
     assert doubted(channels, replace(missed, modes=(*missed.modes, common)), (0, 1, 0),
                    problem.up).modes[: len(true.modes)] == (*true.modes[1:], common)  # fmt: skip
+
+
+@pytest.mark.parametrize("angle_deg", [40.0, 90.0, 140.0])
+def test_lines_across_are_as_wide_whichever_way_the_cameras_look(angle_deg: float) -> None:
+    """A line's RMS found along one camera's lateral direction is that along the other's."""
+    problem, _, _ = run(np.random.default_rng(17), bubbles=1, seconds=0.2)
+    turned = Pose.from_rotvec([0.0, np.deg2rad(angle_deg), 0.0])
+    right = Camera.create("right", (1024, 1024), 10.0, camera_from_rig=turned)
+    channels = channels_of(replace(problem, cameras=(problem.cameras[0], right)))
+    upright, across = groups_of(channels, Learning(), problem.up)
+    np.testing.assert_allclose(upright.pattern, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(across.pattern, [1, 0, 1], atol=1e-12)
+    # one camera alone knows nothing of its own depth
+    single = groups_of(channels[:2], Learning(), problem.up)[1]
+    np.testing.assert_allclose(single.pattern, np.abs(channels[1].direction), atol=1e-12)

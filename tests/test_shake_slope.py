@@ -12,20 +12,34 @@ from shake_learning_data import run, true_model
 from telerig.estimator.shake_chain import eliminated
 from telerig.estimator.shake_channels import Channel, channels_of, pooled
 from telerig.estimator.shake_evidence import channel_evidence
+from telerig.estimator.shake_labels import moved_to_bubble
 from telerig.estimator.shake_likelihood import evidence, evidence_slope, laplace_sigma
-from telerig.estimator.shake_parameters import log_prior, names_of, prior_of, value_of, with_values
+from telerig.estimator.shake_parameters import (
+    forced,
+    log_prior,
+    names_of,
+    prior_of,
+    value_of,
+    with_values,
+)
 from telerig.estimator.shake_slope import channel_slope
 from telerig.estimator.smoother.model import BroadBand, ShakeModel
 
 Array = NDArray[np.float64]
 
 BANDS = (BroadBand((0.1, 0.05, 0.1), 0, slow_rms_mm=0.02), BroadBand((0.0, 0.1, 0.0)))
+
+
+def partly_forced() -> ShakeModel:
+    white = true_model()
+    return replace(white, modes=(*forced(white, 45.0).modes[:2], white.modes[2]))
+
+
 MODELS = {
     "modes": true_model(),
     "bands": replace(true_model(0.4), broad_bands=BANDS),
-    "forced": replace(
-        true_model(), modes=tuple(replace(m, force_hz=60.0) for m in true_model().modes)
-    ),
+    "forced": forced(true_model(), 60.0),
+    "partly forced": moved_to_bubble(partly_forced(), 0, 0.5),
 }
 
 

@@ -23,8 +23,8 @@ from telerig.factors.state_space import (
     driven_mode,
     forced_mass,
     independent,
-    oscillator,
     ou_velocity,
+    resonance,
     slow_ou,
     wander,
     white_jerk,
@@ -180,10 +180,7 @@ def _offsets(cameras: Sequence[Camera], model: ShakeModel) -> list[_Placed]:
     for mode in model.modes:
         for direction, rms in _directed(mode.rms_mm, mode.camera, cameras):
             where, label = mode.camera, f"mode {mode.frequency_hz:.4g} Hz"
-            if mode.force_hz is None:
-                part = oscillator(rms, mode.frequency_hz, mode.damping)
-            else:
-                part = driven_mode(rms, mode.frequency_hz, mode.damping, force_hz=mode.force_hz)
+            part = resonance(rms, mode.frequency_hz, mode.damping, mode.force_hz)
             placed.append(_Placed(part, label, direction, where))
     for band in model.broad_bands:
         for direction, rms in _directed(band.rms_mm, band.camera, cameras):
@@ -234,7 +231,7 @@ def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
         for axis in range(3)
     ]
     parts += [
-        (oscillator(rms, z.frequency_hz, z.damping), axis)
+        (resonance(rms, z.frequency_hz, z.damping, z.force_hz), axis)
         for z in model.zigzags
         for axis, rms in enumerate(z.rms_mm)
         if rms > 0

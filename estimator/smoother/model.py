@@ -22,11 +22,15 @@ CARRIAGE = -1
 
 @dataclass(frozen=True)
 class Zigzag:
-    """A stochastic oscillation of the bubbles' paths; RMS along the rig's x, y, z, 0 for none."""
+    """A stochastic oscillation of the bubbles' paths; RMS along the rig's x, y, z, 0 for none.
+
+    force_hz : as of `RigMode`.
+    """
 
     frequency_hz: float
     damping: float
     rms_mm: Triple
+    force_hz: float | None = None
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,12 @@ class ShakeModel:
     pixel_inflation: float = 1.0
     name: str = "given"
     learned: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def force_hz(self) -> float | None:
+        """Corner of the modes' forces; None where they are white, or have unlike ones."""
+        corners = {m.force_hz for m in self.modes if m.force_hz is not None}
+        return corners.pop() if len(corners) == 1 else None
 
     def without_shake(self) -> ShakeModel:
         """The oracle's model: the cameras stand still on the carriage."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel
-from telerig.estimator.shake_likelihood import evidence, maximise
+from telerig.estimator.shake_likelihood import Fit, evidence, maximise
 from telerig.estimator.shake_parameters import prior_of
 from telerig.estimator.smoother.model import CARRIAGE, RigMode, ShakeModel, Zigzag
 
@@ -194,21 +194,33 @@ def doubted(
         m for m in model.modes
         if m.camera == CARRIAGE and _lies_in(m.rms_mm, pattern) and not _is_half(m, model)
     ]  # fmt: skip
-    for line in model.bubble.zigzags:
+    for index, line in enumerate(model.bubble.zigzags):
         common = [m.frequency_hz for m in model.modes if m.camera == CARRIAGE]
         seen = any(abs(f / line.frequency_hz - 1) < _NEAR_HZ for f in common)
         if seen or not _lies_in(line.rms_mm, pattern) or is_zigzag(line, up):
             continue
         rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=line.force_hz)
-        options = [replace(rig, rms_mm=_times(rig.rms_mm, s)) for s in _SHARES]
-        trials = [replace(model, modes=(*model.modes, mode)) for mode in options[1:]]
-        found = np.array([evidence(channels, m) for m in (model, *trials)])
+        found = np.array([_beside(channels, model, index, rig, s).log_posterior for s in _SHARES])
         weight = np.exp(found - found.max()) * expected(line, own)
         share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
         if share > _LEAST_SHARE:
-            mode = replace(rig, rms_mm=_times(rig.rms_mm, share))
-            model = replace(model, modes=(*model.modes, mode))
+            model = _beside(channels, model, index, rig, share).model
     return model
+
+
+def _beside(
+    channels: Sequence[Channel], model: ShakeModel, index: int, rig: RigMode, share: float
+) -> Fit:
+    """A share of that line given to the rig, beside the bubbles' own, which is fitted again.
+
+    Found without it, the bubbles' line is too wide: it had to be what they have in common, too.
+    """
+    stem = f"bubble.zigzags.{index}"
+    names = [f"{stem}.{last}" for last in ("frequency_hz", "damping", "rms_mm")]
+    if share > 0:
+        mode = replace(rig, rms_mm=_times(rig.rms_mm, share))
+        model = replace(model, modes=(*model.modes, mode))
+    return maximise(channels, model, names, steps=6)
 
 
 def _is_half(mode: RigMode, model: ShakeModel) -> bool:

@@ -166,3 +166,18 @@ def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None
     near = replace(strong, frequency_hz=1.2 * BUBBLE_HZ)
     across = replace(strong, rms_mm=(0.2, 0.0, 0.2))
     assert room(strong) < 0.8 * min(room(), room(weak), room(near), room(across))
+
+
+def test_beside_the_rigs_hidden_line_the_bubbles_own_gets_its_width_back() -> None:
+    """Fitted without the rig's, it was wider: it had to be what the bubbles have in common, too."""
+    problem, _, _ = run(np.random.default_rng(19), bubbles=4, common_hz=BUBBLE_HZ)
+    channels, true = pooled(channels_of(problem)[0]), true_model()
+    missed = replace(true, modes=true.modes[1:])
+    names = [f"bubble.zigzags.1.{n}" for n in ("frequency_hz", "damping", "rms_mm")]
+    alone = maximise(channels, missed, names).model
+    found = doubted(channels, alone, (0, 1, 0), problem.up)
+    assert [m.camera for m in found.modes] == [0, 1, CARRIAGE]
+    wide, own = (m.bubble.zigzags[1].rms_mm[1] for m in (alone, found))
+    assert abs(own - 0.18) < 0.7 * abs(wide - 0.18)
+    assert own < 0.95 * wide
+    assert evidence(channels, found) > evidence(channels, alone)

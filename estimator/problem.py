@@ -49,10 +49,10 @@ PRIOR_SIGMA = {
 
 
 def checked_outlier_sd(outlier_sd: float) -> float:
-    """Raises InputError where sound dots would be left out, or no number is given."""
-    if not outlier_sd >= LEAST_OUTLIER_SD:
+    """Raises InputError for what is no number, or so small that sound dots would be left out."""
+    if not LEAST_OUTLIER_SD <= outlier_sd < np.inf:
         raise InputError(
-            f"outliers from {outlier_sd:g} standard deviations on would be sound dots",
+            f"dots beyond {outlier_sd:g} standard deviations cannot be told as outliers",
             todo=f"give {LEAST_OUTLIER_SD:g} or more; {OUTLIER_SD:g} is usual",
         )
     return outlier_sd

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from telerig.estimator.shake_channels import Channel, pooled
 from telerig.estimator.shake_parameters import FORCE, names_of
-from telerig.estimator.smoother.model import CARRIAGE, ShakeModel
+from telerig.estimator.smoother.model import CARRIAGE, ShakeModel, Triple
 
 Array = NDArray[np.float64]
-Triple = tuple[float, float, float]
 Where = int | str
 
 BUBBLE = "bubble"

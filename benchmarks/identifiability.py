@@ -1,7 +1,8 @@
 """What does the verdict say, and what do learned modes cost? Nothing is told to the smoother.
 
 Usage: python benchmarks/identifiability.py [--seeds 2] [--only S1,S5] [--information
-    one,five,carriage,arms,references] [--seed 0] [--out FILE.md]
+    one,five,carriage,arms,references] [--seed 0] [--truth] [--out FILE.md]
+With --truth the hyper-parameters that the runs are made with are told, to compare seed by seed.
 Every seed counts. Runs as in shake_scenarios.py; vertical axis, middle 80 %.
 """
 
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
-from shake_scene import cases, simulate
+from shake_problem import true_model
+from shake_scene import LATERAL, LATERAL_SHAKE, cases, simulate
 
 from telerig.estimator.smoother.smooth import smooth
 
@@ -55,9 +57,13 @@ class Outcome:
         return None if wanted is None else wanted <= {self.verdict, *self.flags}
 
 
-def outcome(name: str, information: str, seed: int) -> Outcome:
+def outcome(name: str, information: str, seed: int, truth: bool = False) -> Outcome:
     run = simulate(cases()[name], np.random.default_rng([seed, int(name[1])]))
     inputs = run.inputs(information)
+    if truth:
+        inputs["model"] = true_model(
+            run.case.scenario, information, lateral=LATERAL, lateral_shake=LATERAL_SHAKE
+        )
     begin = time.process_time()
     result = smooth(inputs.pop("tracks"), inputs.pop("calibration"), **inputs)
     spent = time.process_time() - begin
@@ -104,15 +110,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="S0,S1,S2,S3,S4,S5,S6")
     parser.add_argument("--information", default="one,five,carriage,arms,references")
+    parser.add_argument("--truth", action="store_true")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     found = []
     for name in options.only.split(","):
         for information in options.information.split(","):
             for seed in range(options.seed, options.seed + options.seeds):
-                found.append(outcome(name, information, seed))
+                found.append(outcome(name, information, seed, options.truth))
                 print(found[-1], file=sys.stderr, flush=True)
-    text = f"Verdicts; {options.seeds} seeds from {options.seed}.\n\n" + "".join(report(found))
+    told = "true hyper-parameters" if options.truth else "nothing told"
+    text = f"Verdicts; {told}; {options.seeds} seeds from {options.seed}.\n\n"
+    text += "".join(report(found))
     print(text)
     if options.out:
         options.out.write_text(text)

@@ -39,7 +39,7 @@ INFORMATION = ("one", "five", "carriage", "arms", "references", "oracle")
 
 @dataclass(frozen=True)
 class Record:
-    """One smoothed run, bubble 0, middle 80 %; vertical, um and mm/s unless named otherwise.
+    """One smoothed run, all its bubbles, middle 80 %; vertical, um and mm/s unless named otherwise.
 
     square, velocity_square : mean of (error / sd)^2.  nees : of the 3-D position, per dimension.
     position_3d, naive_3d : RMS of the vector.
@@ -73,18 +73,17 @@ def rms(values: Array) -> float:
 def measured(run: Run, result: Smoothing, what: tuple[str, str, int], seconds: float) -> Record:
     inner = middle(len(run.t_s))
     table = result.trajectories
-    table = table[table["particle"] == 0]
-    rows = table["frame"].to_numpy()
-    keep = (rows >= inner.start) & (rows < inner.stop)
-    rows = rows[keep]
+    frame, bubble = table["frame"].to_numpy(), table["particle"].to_numpy()
+    keep = (frame >= inner.start) & (frame < inner.stop)
+    there = bubble[keep], frame[keep]
 
     def columns(pattern: str) -> Array:
         return table[[pattern.format(a) for a in "xyz"]].to_numpy(float)[keep]
 
-    off = columns("{}_mm") - run.position_mm[0, rows]
-    fast = columns("v{}_mm_s") - run.velocity_mm_s[0, rows]
-    naive = columns("naive_{}_mm") - run.position_mm[0, rows]
-    naive_fast = columns("naive_v{}_mm_s") - run.velocity_mm_s[0, rows]
+    off = columns("{}_mm") - run.position_mm[there]
+    fast = columns("v{}_mm_s") - run.velocity_mm_s[there]
+    naive = columns("naive_{}_mm") - run.position_mm[there]
+    naive_fast = columns("naive_v{}_mm_s") - run.velocity_mm_s[there]
     sigma, fast_sigma = columns("s{}_mm")[:, 1], columns("sv{}_mm_s")[:, 1]
     verdict = result.verdict
     return Record(
@@ -100,12 +99,11 @@ def measured(run: Run, result: Smoothing, what: tuple[str, str, int], seconds: f
 
 
 def nees(result: Smoothing, off: Array, keep: NDArray[np.bool_]) -> float:
-    """Mean of e' C^-1 e / 3 over the frames of bubble 0."""
+    """Mean of e' C^-1 e / 3 over all bubbles and frames."""
     frame, found = result.solution.frame, result.solution.covariances
     assert found is not None
-    mine = np.arange(frame.first_row[0], frame.first_row[1])[keep]
     row = frame.bubble.position
-    covariance = row @ found.bubbles[mine] @ row.T
+    covariance = row @ found.bubbles[keep] @ row.T
     return float(np.mean(np.einsum("fi,fij,fj->f", off, np.linalg.inv(covariance), off)) / 3)
 
 

@@ -72,6 +72,7 @@ class Case:
 
     scale_sigma : what rig.toml states of the encoder's scale, 0 exact, None nothing.
     angle_deg between the cameras.  kappa_per_mm of both.  nonlinear : one of ``NONLINEAR``.
+    force_hz : corner of what shakes the rig.
     """
 
     scenario: Scenario
@@ -84,6 +85,7 @@ class Case:
     encoder_scale: float = 0.0
     scale_sigma: float | None = 0.0
     ramp_s: float = 0.0
+    force_hz: float = FORCE_HZ
 
     @property
     def name(self) -> str:
@@ -236,7 +238,7 @@ def _shake(case: Case, t: Array, rng: Generator) -> tuple[Shake, Shake]:
         "frequency_hz": scenario.hz,
         "arm_ratio": ARM_RATIO,
         "damping": DAMPING,
-        "force_hz": FORCE_HZ,
+        "force_hz": case.force_hz,
     }
     common = rig_shake(
         H, len(t), rng, cameras=2, rms_mm=rms * np.sqrt(COMMON), common_share=1.0, **options

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shutil
@@ -17,6 +18,8 @@ import tifffile
 from typer.testing import CliRunner
 
 import telerig
+from telerig.estimator.calibrate import run_calibration
+from telerig.scripts.calibrate import calibrate as calibrate_command
 from telerig.scripts.main import app
 
 runner = CliRunner()
@@ -281,3 +284,11 @@ def test_unknown_preset_and_model_are_named(paper_images, tmp_path):
 def test_help_of_every_command():
     for command in ("demo", "simulate", "detect", "calibrate"):
         assert "Exit" in run(command, "--help") or command != "calibrate"
+
+
+def test_calibrate_as_a_command_and_from_python_have_the_same_defaults() -> None:
+    command = inspect.signature(calibrate_command).parameters
+    python = inspect.signature(run_calibration).parameters
+    same = {name: name for name in ("model", "solver", "medium", "outlier_sd", "seed")}
+    for option, parameter in (same | {"dots": "dots_free"}).items():
+        assert command[option].default == python[parameter].default, option

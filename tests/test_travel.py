@@ -31,7 +31,7 @@ from telerig.estimator.smoother.smooth import problem_of
 from telerig.estimator.smoother.solve import Options, Solution, solve
 from telerig.estimator.smoother.tables import shake, trajectories
 from telerig.estimator.smoother.travel import left_open, total_scale, travel_of
-from telerig.estimator.smoother.whiteness import accelerometer_spectra, pixel_whiteness
+from telerig.estimator.smoother.whiteness import accelerometer_spectra
 from telerig.io.rig_description import StageDescription
 
 Array = NDArray[np.float64]
@@ -148,34 +148,6 @@ def test_calibrated_stage_goes_before_rig_toml() -> None:
     stated = travel_of({}, described)
     assert (stated.source, stated.covariance[2, 2]) == ("rig.toml", pytest.approx(1.6e-5))
     assert travel_of({}, None).source == "assumed"
-
-
-def pixels(residuals: Array) -> Any:
-    frames, bubbles = residuals.shape[:2]
-    frame, item = np.indices((frames, bubbles)).reshape(2, -1)
-    obs = Observations(
-        item, frame, np.zeros(len(item), int), np.zeros((len(item), 2)), np.zeros((len(item), 2, 2))
-    )
-    parts = SimpleNamespace(cameras=CAMERAS[:1], observations=obs)
-    return SimpleNamespace(
-        frame=SimpleNamespace(problem=parts),
-        weights=(np.ones(len(item)), np.zeros(0)),
-        residuals=(residuals.reshape(-1, 2), np.zeros((0, 2))),
-    )
-
-
-def test_whiteness_of_pixels() -> None:
-    rng = np.random.default_rng(3)
-    white = rng.normal(size=(600, 2, 2))
-    found = pixel_whiteness(pixels(white))["left"]
-    assert found["verdict"] == "white" and found["p"] > 1e-3
-    red = white.copy()
-    for k in range(1, len(red)):
-        red[k] += 0.5 * red[k - 1]
-    found = pixel_whiteness(pixels(red))["left"]
-    assert found["verdict"] == "correlated" and found["p"] < 1e-9
-    np.testing.assert_allclose(found["autocorrelation"][:3], [0.5, 0.25, 0.125], atol=0.06)
-    assert pixel_whiteness(pixels(white[:20])) == {}
 
 
 def test_accelerometer_spectra_before_and_after() -> None:

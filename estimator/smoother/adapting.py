@@ -19,7 +19,10 @@ Array = NDArray[np.float64]
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
-_SAMPLED = 500
+_SAMPLED = 1000
+_LEAST_SPARE = 0.2
+_LEAST_TELLING = 60
+_MEDIAN_OF_CHI_SQUARE = 0.4549
 _FLOORS = np.geomspace(0.03, 0.4, 40)
 _FLOOR_SPREAD = np.log(2.0)
 _LOW_BAND = 0.4
@@ -40,7 +43,7 @@ def adapted(solution: Solution) -> ShakeModel | None:
     wide = widened(solution)
     if wide is not None:
         better = replace(better, encoder_scale_sigma=wide)
-    if abs(inflation - 1) > _INFLATE_BEYOND:
+    if inflation > 1 + _INFLATE_BEYOND:
         better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
     if model.broad_bands:
         fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
@@ -135,27 +138,37 @@ def _dominant_hz(solution: Solution) -> float:
 
 
 def _inflation(solution: Solution) -> float:
-    """By how much the pixels' stated noise is too small (above 1) or too large.
+    """By how much the pixels' stated noise is too small, 1 at least.
 
-    From the median, which outliers do not move; the share of the noise that the fit takes up is
-    given back by counting states as far as the pixels determine them.
+    From the median square of single coordinates, which outliers do not move; what the fit takes up
+    is given back to each by its leverage. Those that it follows closely tell next to nothing, and
+    none tells that the noise is smaller than stated: the error of a bubble's outline changes slowly
+    with its shape, and the fit takes that for motion.
     """
-    kept = solution.weights[0] > 0.5
-    if kept.sum() < 30:
+    square, spare = [], []
+    for which, leverage in leverages(solution):
+        kept = solution.weights[0][which] > 0.5
+        square.append(solution.residuals[0][which[kept]].ravel() ** 2)
+        spare.append(1 - leverage[kept].ravel())
+    if not square:
         return 1.0
-    square = (solution.residuals[0][kept] ** 2).sum(-1)
-    spare = 1 - min(_taken_up(solution), 0.9)
-    return float(np.sqrt(np.median(square) / (2 * np.log(2)) / spare))
+    squares, spares = np.concatenate(square), np.concatenate(spare)
+    telling = spares > _LEAST_SPARE
+    if np.count_nonzero(telling) < _LEAST_TELLING:
+        return 1.0
+    median = float(np.median(squares[telling] / spares[telling]))
+    return max(float(np.sqrt(median / _MEDIAN_OF_CHI_SQUARE)), 1.0)
 
 
-def _taken_up(solution: Solution) -> float:
-    """Mean leverage of a pixel: var(prediction) / var(noise), from the bubbles' covariances."""
+def leverages(solution: Solution) -> list[tuple[NDArray[np.int64], Array]]:
+    """By camera: some of the bubbles' pixels (m,), var(prediction) / var(noise) of each (m, 2)."""
     frame, found = solution.frame, solution.covariances
     if found is None or not frame.rows:
-        return 0.0
-    linear = images(frame, solution.state, np.ones(len(frame.problem.observations))).linear
-    total, count = 0.0, 0
-    for part in linear:
+        return []
+    observed = frame.problem.observations
+    out = []
+    linear = images(frame, solution.state, np.ones(len(observed))).linear
+    for camera, part in zip(np.unique(observed.camera), linear, strict=True):
         row, node = np.asarray(part.keys[0]) - frame.base()[1], np.asarray(part.keys[1])
         some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
         row, node = row[some], node[some]
@@ -165,8 +178,8 @@ def _taken_up(solution: Solution) -> float:
         if frame.to_frames is not None:
             by_shake = by_shake @ np.linalg.inv(frame.to_frames[at])
         both = by_shake @ found.cross[row]
-        total += float((by_bubble @ found.bubbles[row] * by_bubble).sum())
-        total += float((by_shake @ found.shake[at] * by_shake).sum())
-        total += float(2 * (both * by_bubble).sum())
-        count += 2 * len(row)
-    return total / count
+        leverage = (by_bubble @ found.bubbles[row] * by_bubble).sum(-1)
+        leverage += (by_shake @ found.shake[at] * by_shake).sum(-1)
+        leverage += 2 * (both * by_bubble).sum(-1)
+        out.append((np.flatnonzero(observed.camera == camera)[some], leverage))
+    return out

@@ -8,71 +8,112 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoother.linear_sensors import accelerometers, felt
+from telerig.estimator.smoother.residual_draws import drawn_residuals
 from telerig.estimator.smoother.solve import Solution
 
 Array = NDArray[np.float64]
 
 LAGS = 10
-_LEAST_PAIRS = 50
+_LEAST_PAIRS, _LEAST_DRAWN = 25, 10
+_DRAWS = 8, 32
 _SURE = 1e-3
-_SLIGHT = 0.15
+_SLIGHT = 0.04
 _LONGEST_SEGMENT = 2048
 _MOST_BINS = 120
 
 
 def pixel_whiteness(solution: Solution) -> dict[str, Any]:
-    """By camera, of the bubbles' kept pixels: autocorrelation, Ljung-Box test, a word.
+    """By camera, of the bubbles' kept pixels: autocorrelation beside the model's, a test, a word.
 
-    Residuals of one bubble a number of frames apart, both coordinates, in sigmas. The fit takes up
-    the slow part of the noise, which leaves small negative correlations in what is right: "white"
-    where the test does not object, "nearly white" where it does to correlations below 0.15 (long
-    runs make the test sharp), else "correlated". Ljung and Box, Biometrika 65:297, 1978.
+    Residuals of one bubble a number of frames apart, both coordinates, in sigmas. The fit follows
+    part of the noise, so that those of a right model are not white; ``expected`` is drawn from the
+    model. "as expected" where a test of the difference does not object, "nearly" where it does to
+    little (long runs make it sharp: chi-square below 0.04 a value), else "correlated".
     """
-    from scipy.stats import chi2
-
-    problem = solution.frame.problem
-    obs, kept = problem.observations, solution.weights[0] > 0.5
+    obs, kept = solution.frame.problem.observations, solution.weights[0] > 0.5
+    if not kept.any():
+        return {}
+    draws = int(np.clip(kept.sum() / 100, *_DRAWS))
+    middle = int(np.median(obs.frame[kept]))
+    drawn = drawn_residuals(solution, middle, draws, np.random.default_rng(0))
     out: dict[str, Any] = {}
-    for c, camera in enumerate(problem.cameras):
-        mine = kept & (obs.camera == c)
-        table = _table(solution.residuals[0][mine], obs.item[mine], obs.frame[mine])
-        found = [_lagged(table, lag) for lag in range(1, LAGS + 1)]
-        if min(pairs for _, pairs in found) < _LEAST_PAIRS:
-            continue
-        rho = np.array([r for r, _ in found])
-        count = int(2 * mine.sum())
-        terms = count * (count + 2) * rho**2 / (count - np.arange(1, LAGS + 1))
-        p = float(chi2.sf(terms.sum(), LAGS))
-        largest = float(np.abs(rho).max())
-        slight = "nearly white" if largest < _SLIGHT else "correlated"
-        out[camera.name] = {
-            "autocorrelation": rho.tolist(),
-            "ljung_box": float(terms.sum()),
-            "lags": LAGS,
-            "p": p,
-            "verdict": "white" if p > _SURE else slight,
-        }
+    for c, camera in enumerate(solution.frame.problem.cameras):
+        mine, (which, residuals) = np.flatnonzero(kept & (obs.camera == c)), drawn[c]
+        here, there = ((obs.item[i], obs.frame[i]) for i in (mine, which))
+        seen = _lagged(solution.residuals[0][mine], *here, _LEAST_PAIRS)
+        each = [_lagged(r, *there, _LEAST_DRAWN) for r in np.moveaxis(residuals, -1, 0)]
+        if seen is not None and each and all(e is not None for e in each):
+            model = np.mean(np.array(each), 0)
+            out[camera.name] = _compared(seen, model, len(mine), len(which) * draws)
     return out
 
 
-def _table(residuals: Array, item: NDArray[np.int64], frame: NDArray[np.int64]) -> Array:
-    """(items, frames, 2), NaN where there is none, about each bubble's mean."""
+def _compared(seen: Array, model: Array, count: int, drawn: int) -> dict[str, Any]:
+    """Mean products (2, LAGS + 1) of both coordinates of so many pixels, and of the model's."""
+    from scipy.stats import chi2
+
+    rho, expected = seen.sum(0) / seen[:, 0].sum(), model.sum(0) / model[:, 0].sum()
+    share = model[:, 0] / model[:, 0].sum()
+    covariance = sum(s**2 * bartlett(m[1:] / m[0]) for s, m in zip(share, model))
+    covariance = covariance * (1 / count + 1 / drawn)
+    off = (rho - expected)[1:]
+    distance = float(off @ np.linalg.solve(covariance, off))
+    p = float(chi2.sf(distance, LAGS))
+    slight = "nearly" if distance < _SLIGHT * 2 * count else "correlated"
+    return {
+        "autocorrelation": rho[1:].tolist(),
+        "expected": expected[1:].tolist(),
+        "rms_sigmas": float(np.sqrt(seen[:, 0].mean())),
+        "expected_rms_sigmas": float(np.sqrt(model[:, 0].mean())),
+        "chi_square": distance,
+        "lags": LAGS,
+        "p": p,
+        "verdict": "as expected" if p > _SURE else slight,
+    }
+
+
+def bartlett(rho: Array) -> Array:
+    """(L, L) covariance, times the number of values, of autocorrelations at lags 1 to L.
+
+    rho : (L,) the true ones, zero beyond. Bartlett, J. R. Stat. Soc. Suppl. 8:27, 1946.
+    """
+    count = len(rho)
+    whole = np.zeros(6 * count + 1)
+    middle = 3 * count
+    whole[middle] = 1.0
+    whole[middle + 1 : middle + count + 1] = whole[middle - count : middle][::-1] = rho
+    k = np.arange(-2 * count, 2 * count + 1)
+    lag = np.arange(1, count + 1)
+    after, before = whole[middle + k + lag[:, None]], whole[middle + k - lag[:, None]]
+    here = whole[middle + k]
+    crossed = np.outer(after @ here, rho)
+    return np.asarray(
+        after @ after.T + before @ after.T + 2 * np.outer(rho, rho) * (here @ here)
+        - 2 * crossed - 2 * crossed.T
+    )  # fmt: skip
+
+
+def _lagged(
+    residuals: Array, item: NDArray[np.int64], frame: NDArray[np.int64], least: int
+) -> Array | None:
+    """(2, LAGS + 1) mean products of residuals (m, 2) so many frames apart; None of too few."""
     if not len(item):
-        return np.zeros((0, 0, 2))
+        return None
     items, row = np.unique(item, return_inverse=True)
-    table = np.full((len(items), int(np.ptp(frame)) + 1, 2), np.nan)
-    table[row.reshape(-1), frame - frame.min()] = residuals
-    return np.asarray(table - np.nanmean(table, axis=1, keepdims=True))
-
-
-def _lagged(table: Array, lag: int) -> tuple[float, int]:
-    """Autocorrelation over all pairs that far apart, and their number."""
-    if table.shape[1] <= lag:
-        return 0.0, 0
-    product = table[:, lag:] * table[:, :-lag]
-    pairs = int(np.isfinite(product).sum())
-    variance = float(np.nanmean(table**2))
-    return (float(np.nanmean(product)) / variance if pairs and variance > 0 else 0.0), pairs
+    table = np.zeros((len(items), int(np.ptp(frame)) + 1, 2))
+    there = np.zeros(table.shape[:2], bool)
+    at = row.reshape(-1), frame - frame.min()
+    table[at], there[at] = residuals, True
+    table -= (table.sum(1) / there.sum(1)[:, None])[:, None]
+    table[~there] = 0.0
+    out = np.zeros((2, LAGS + 1))
+    for lag in range(LAGS + 1):
+        last = table.shape[1] - lag
+        pairs = int((there[:, lag:] & there[:, :last]).sum()) if last > 0 else 0
+        if pairs < least:
+            return None
+        out[:, lag] = (table[:, lag:] * table[:, :last]).sum((0, 1)) / pairs
+    return out
 
 
 def accelerometer_spectra(solution: Solution) -> dict[str, Any]:

@@ -16,51 +16,75 @@ from telerig.io.report.words import is_number, number
 
 Array = NDArray[np.float64]
 
-WHITENESS_HEADS = ["camera", "residuals are", "next frame", "largest", "Ljung-Box p"]
+WHITENESS_HEADS = ["camera", "residuals are", "next frame", "RMS, sigmas", "excess, all lags", "p"]
 _LITTLE = 0.5
 
 
 def whiteness_rows(results: SmoothingResults) -> list[Row]:
-    """By camera: the verdict, correlation from one frame to the next and the largest, p."""
+    """By camera: the verdict, next frame's correlation and RMS beside the model's, a test."""
     rows = []
-    for camera, found in _known(results, "whiteness", "autocorrelation").items():
-        rho = np.array(found["autocorrelation"], float)
+    for camera, found in _known(results, "whiteness", "expected").items():
+        rho, expected = (np.array(found[key], float) for key in ("autocorrelation", "expected"))
+        sizes = (found.get(key) for key in ("rms_sigmas", "expected_rms_sigmas"))
         verdict = str(found.get("verdict"))
         cells = (
-            camera, verdict, number(float(rho[0]), 2), number(float(np.abs(rho).max()), 2),
-            number(found.get("p"), 2),
+            camera, _VERDICTS.get(verdict, verdict), _beside(float(rho[0]), float(expected[0])),
+            _beside(*sizes), number(_excess(found), 2), number(found.get("p"), 2),
         )  # fmt: skip
         rows.append(Row(cells, strong=verdict == "correlated"))
     return rows
 
 
+_VERDICTS = {"nearly": "nearly as expected"}
+
+
+def _beside(seen: Any, expected: Any) -> str:
+    return f"{number(seen, 2)} (model {number(expected, 2)})"
+
+
+def _excess(found: Mapping[str, Any]) -> float:
+    """Of the correlations over the model's, their sum: of the slow part of the residuals."""
+    return float(np.sum(found["autocorrelation"]) - np.sum(found["expected"]))
+
+
 def whiteness_words(results: SmoothingResults) -> str:
     """What correlated residuals would mean."""
-    verdicts = {str(v.get("verdict")) for v in _known(results, "whiteness", "p").values()}
-    if not verdicts:
+    known = _known(results, "whiteness", "expected").values()
+    if not known:
         return "Too few frames to tell whether residuals of one frame and the next are alike."
-    if "correlated" in verdicts:
+    worst = [_excess(v) for v in known if v.get("verdict") == "correlated"]
+    if any(off > 0 for off in worst):
         return (
-            "Residuals of neighbouring frames are alike: motion that the model does not hold, or "
-            "centres that wander with the bubbles' shapes. The standard deviations are too small."
+            "Residuals of neighbouring frames are more alike than this model leaves them: motion "
+            "that it does not hold, or centres that wander with the bubbles' shapes. The standard "
+            "deviations are too small."
+        )
+    if worst:
+        return (
+            "Residuals of neighbouring frames are less alike than this model leaves them: the "
+            "pixels' noise is larger, or the motion smaller, than it holds."
         )
     return (
-        "Residuals of neighbouring frames have next to nothing in common: what the images hold of "
-        "the motion is in the trajectories."
+        "Residuals of neighbouring frames are as alike as the fit leaves them where the model is "
+        "right: what the images hold of the motion is in the trajectories."
     )
 
 
 def autocorrelation(results: SmoothingResults) -> Picture | None:
-    """Of the bubbles' pixels, against the lag in frames, by camera."""
-    known = _known(results, "whiteness", "autocorrelation")
+    """Of the bubbles' pixels, against the lag in frames, by camera, beside the model's."""
+    known = _known(results, "whiteness", "expected")
     if not known:
         return None
     with drawing(2.3) as (figure, axes):
         for camera, found in known.items():
-            rho = np.array(found["autocorrelation"], float)
-            lags = np.arange(1, len(rho) + 1)
+            lags = np.arange(1, len(found["expected"]) + 1)
             index = results.cameras.index(camera) if camera in results.cameras else 0
-            axes.plot(lags, rho, "o-", color=camera_colour(index), label=camera, linewidth=0.9)
+            axes.plot(
+                lags, np.array(found["autocorrelation"], float), "o-",
+                color=camera_colour(index), label=camera, linewidth=0.9,
+            )  # fmt: skip
+        models = [np.array(found["expected"], float) for found in known.values()]
+        axes.plot(lags, np.mean(models, 0), "--", color=MUTED, label="model", linewidth=1.1)
         axes.axhline(0, color=MUTED, linewidth=0.7)
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, -0.2), max(high, 0.2))
@@ -72,8 +96,9 @@ def autocorrelation(results: SmoothingResults) -> Picture | None:
     return Picture(
         "Residuals some frames apart",
         source,
-        "Both coordinates of the bubbles' pixels, outliers left out. The fit takes up the slow "
-        "part of the noise: small negative values are right.",
+        "Both coordinates of the bubbles' pixels, outliers left out. The fit follows part of the "
+        "noise, so that neighbours differ more than noise does; dashed: by how much, drawn from "
+        "the model.",
     )
 
 

@@ -1,0 +1,154 @@
+"""Residuals as they would be if the model were right, drawn for a stretch of the run.
+
+The fit follows part of the noise: residuals are smaller than the noise, and one frame's are unlike
+the next one's. With A the whitened factors and e ~ N(0, I) they are (I - A (A^T A)^-1 A^T) e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from telerig.estimator.smoother.blocks import Linear
+from telerig.estimator.smoother.linear import all_factors
+from telerig.estimator.smoother.solve import Solution
+from telerig.estimator.smoother.state import Frame
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_MOST_FRAMES, _LEAST_FRAMES = 200, 24
+_MOST_BAND = 1e6
+_MOST_BUBBLES = 40
+_RIDGE = 1e-9
+"""Of the diagonal: the smooth prior of a broad band has fewer digits than double precision."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Some frames with what moves in them; all else is held.
+
+    column : of each key of shake and bubbles its first, -1 where it is held.  size : columns.
+    """
+
+    frame: Frame
+    column: Ints
+    size: int
+
+    def columns(self, linear: Linear) -> Ints:
+        """(M, keys) first column of each block of the factors, -1 where it is held."""
+        count = len(linear.rhs)
+        moving = len(self.column)
+        out = np.full((count, len(linear.keys)), -1)
+        for i, (key, block) in enumerate(zip(linear.keys, linear.blocks)):
+            keys = np.broadcast_to(np.asarray(key, np.int64), (count,))
+            mine = (keys < moving) & (block.shape[-1] > 0)
+            out[mine, i] = self.column[keys[mine]]
+        return out
+
+
+def stretch_of(frame: Frame, middle: int) -> Stretch:
+    """At most `_MOST_FRAMES` about a frame, fewer where much moves; some of many bubbles held."""
+    (nodes, shake), (_, bubble) = frame.counts()[:2]
+    chosen = frame.bubble_of_row < _MOST_BUBBLES
+    at_once = int(np.bincount(frame.frame_of_row[chosen], minlength=1).max())
+    each = len(frame.nodes.t_s) / len(frame.problem.t_s)
+    width = shake + bubble * at_once
+    frames = int(_MOST_BAND / (2 * width * (each * shake + bubble * at_once)))
+    half = min(max(frames, _LEAST_FRAMES), _MOST_FRAMES) // 2
+    count = len(frame.problem.t_s)
+    first = int(np.clip(middle - half, 0, max(count - 2 * half, 0)))
+    last = min(first + 2 * half, count) - 1
+    low, high = frame.nodes.of_frame[[first, last]]
+    when = np.r_[np.arange(nodes), frame.node_of_row]
+    sizes = np.repeat([shake, bubble], [nodes, frame.rows])
+    inside = (when >= low) & (when <= high) & (sizes > 0)
+    inside[nodes:] &= chosen
+    order = np.flatnonzero(inside)[np.argsort(when[inside], kind="stable")]
+    starts = np.r_[0, np.cumsum(sizes[order])]
+    column = np.full(len(when), -1)
+    column[order] = starts[:-1]
+    return Stretch(frame, column, int(starts[-1]))
+
+
+def drawn_residuals(
+    solution: Solution, middle: int, draws: int, rng: Generator
+) -> list[tuple[Ints, Array]]:
+    """By camera: which of its bubbles' pixels (m,), and residuals (m, 2, draws) in sigmas.
+
+    middle : the frame about which the stretch lies. Only kept pixels; a camera that saw no bubble
+    has none.
+    """
+    frame, kept = solution.frame, solution.weights[0] > 0.5
+    stretch = stretch_of(frame, middle)
+    parts = [_Part.of(stretch, f) for f in all_factors(frame, solution.state, solution.weights)]
+    noise = [rng.standard_normal((*p.block.shape[:2], draws)) for p in parts]
+    found = _fitted(stretch, parts, noise)
+    pixels = iter(i for i, p in enumerate(parts) if p.of_bubbles)
+    out = []
+    for c in range(len(frame.problem.cameras)):
+        mine = np.flatnonzero(frame.problem.observations.camera == c)
+        residual = np.zeros((0, 2, draws))
+        if len(mine):
+            i = next(pixels)
+            mine = mine[parts[i].which]
+            residual = noise[i] - parts[i].block @ found[parts[i].column]
+        out.append((mine[kept[mine]], residual[kept[mine]]))
+    return out
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Factors of one kind that reach into a stretch.
+
+    which : (m,) of them.  block : (m, rows, columns), zero where the key is held.
+    column : (m, columns) the stretch's.  of_bubbles : images of them.
+    """
+
+    which: Ints
+    block: Array
+    column: Ints
+    of_bubbles: bool
+
+    @classmethod
+    def of(cls, stretch: Stretch, linear: Linear) -> _Part:
+        first = stretch.columns(linear)
+        which = np.flatnonzero(np.any(first >= 0, axis=1))
+        blocks, columns = [], []
+        for start, block in zip(first[which].T, linear.blocks):
+            if np.any(start >= 0):
+                whole = np.broadcast_to(block, (len(linear.rhs), *block.shape[-2:]))[which]
+                blocks.append(whole * (start >= 0)[:, None, None])
+                columns.append(np.maximum(start, 0)[:, None] + np.arange(block.shape[-1]))
+        base, key = stretch.frame.base(), int(np.min(linear.keys[0]))
+        if not blocks:
+            blocks, columns = [np.zeros((0, linear.rhs.shape[1], 0))], [np.zeros((0, 0), np.int64)]
+        return cls(
+            which, np.concatenate(blocks, -1), np.concatenate(columns, -1),
+            linear.weight is not None and base[1] <= key < base[2],
+        )  # fmt: skip
+
+
+def _fitted(stretch: Stretch, parts: Sequence[_Part], noise: Sequence[Array]) -> Array:
+    """(columns, draws) least squares of the noise."""
+    places, values = [np.zeros(0, np.int64)], [np.zeros(0)]
+    side = np.zeros((stretch.size, noise[0].shape[-1]))
+    for part, one in zip(parts, noise):
+        turned = np.swapaxes(part.block, -1, -2)
+        gram = turned @ part.block
+        below = part.column[:, :, None] - part.column[:, None]
+        there = (below >= 0) & (gram != 0)
+        right = np.broadcast_to(part.column[:, None], below.shape)
+        places.append(below[there] * stretch.size + right[there])
+        values.append(gram[there])
+        np.add.at(side, part.column, turned @ one)
+    place = np.concatenate(places)
+    rows = int(place.max(initial=0)) // stretch.size + 1
+    band = np.bincount(place, np.concatenate(values), rows * stretch.size).reshape(rows, -1)
+    band[0] *= 1 + _RIDGE
+    return np.asarray(cho_solve_banded((cholesky_banded(band, lower=True), True), side))

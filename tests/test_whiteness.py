@@ -1,0 +1,111 @@
+"""Residuals beside those that the model would leave: drawn, tested, and what they tell of noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from shake_learning_data import run, true_model
+
+from telerig.estimator.smoother.adapting import adapted, leverages
+from telerig.estimator.smoother.model import Observations, ShakeModel, SmoothingProblem
+from telerig.estimator.smoother.residual_draws import drawn_residuals, stretch_of
+from telerig.estimator.smoother.solve import Options, Solution, solve
+from telerig.estimator.smoother.whiteness import bartlett, pixel_whiteness
+
+Array = NDArray[np.float64]
+
+TRUE = true_model()
+TRUE = replace(TRUE, modes=tuple(replace(m, force_hz=60.0) for m in TRUE.modes))
+
+
+def solved(problem: SmoothingProblem, model: ShakeModel = TRUE) -> Solution:
+    return solve(problem, model, Options(robust=False))
+
+
+def stated(problem: SmoothingProblem, times: float) -> SmoothingProblem:
+    """The same pixels, their stated standard deviation so many times as large."""
+    obs = problem.observations
+    whole = obs.item, obs.frame, obs.camera, obs.uv_px, times**2 * obs.covariance_px2
+    return replace(problem, observations=Observations(*whole))
+
+
+@pytest.mark.parametrize("seed", [31, 32, 33, 34])
+def test_residuals_of_the_right_model_are_as_expected(seed: int) -> None:
+    """They are not white: the fit follows part of the noise."""
+    problem, _, _ = run(np.random.default_rng(seed), bubbles=2, seconds=1.5)
+    found = pixel_whiteness(solved(problem))
+    assert list(found) == ["left", "right"]
+    for one in found.values():
+        assert one["verdict"] == "as expected" and one["p"] > 1e-3
+        assert one["expected"][0] < -0.05
+        np.testing.assert_allclose(one["autocorrelation"], one["expected"], atol=0.15)
+        assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.08)
+
+
+def test_drawn_residuals_are_as_small_as_the_covariances_say() -> None:
+    """An independent way: variance left = 1 - leverage, from the posterior's covariance."""
+    problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=0.4)
+    solution = solved(problem)
+    drawn = drawn_residuals(solution, 40, 400, np.random.default_rng(1))
+    for (which, residuals), (some, leverage) in zip(drawn, leverages(solution), strict=True):
+        np.testing.assert_array_equal(which, some)
+        np.testing.assert_allclose((residuals**2).mean(-1), 1 - leverage, atol=0.25)
+        np.testing.assert_allclose((residuals**2).mean((0, 2)), 1 - leverage.mean(0), rtol=0.02)
+
+
+def test_a_centre_that_wanders_is_seen() -> None:
+    rng = np.random.default_rng(36)
+    problem, _, _ = run(rng, bubbles=1, seconds=2.0, sigma_px=0.2)
+    obs = problem.observations
+    wander = np.zeros((2, 400, 2))
+    for k in range(1, 400):
+        wander[:, k] = 0.8 * wander[:, k - 1] + 0.4 * rng.normal(size=(2, 2))
+    pixels = obs.uv_px + wander[obs.camera, obs.frame]
+    moved = Observations(obs.item, obs.frame, obs.camera, pixels, obs.covariance_px2)
+    for one in pixel_whiteness(solved(replace(problem, observations=moved))).values():
+        assert one["verdict"] == "correlated" and one["p"] < 1e-6
+        assert one["autocorrelation"][0] > one["expected"][0] + 0.05
+        assert one["rms_sigmas"] > 1.4 * one["expected_rms_sigmas"]
+
+
+def test_too_few_frames_are_not_judged() -> None:
+    problem, _, _ = run(np.random.default_rng(37), bubbles=1, seconds=0.15)
+    assert pixel_whiteness(solved(problem)) == {}
+
+
+def test_a_stretch_is_short_and_holds_what_does_not_move() -> None:
+    problem, _, _ = run(np.random.default_rng(38), bubbles=3, seconds=2.5, marks=2)
+    frame = solved(problem).frame
+    width = frame.shake.size + 3 * frame.bubble.size
+    for middle, first in ((250, 150), (0, 0), (499, 300)):
+        stretch = stretch_of(frame, middle)
+        assert stretch.size == 200 * width
+        inside = np.flatnonzero(stretch.column[:500] >= 0)
+        assert (inside[0], inside[-1]) == (first, first + 199)
+
+
+def test_bartletts_covariance() -> None:
+    """Closed form for white noise, and the scatter of a moving average's autocorrelations."""
+    np.testing.assert_allclose(bartlett(np.zeros(5)), np.eye(5))
+    rng, length = np.random.default_rng(39), 2000
+    noise = rng.normal(size=(1500, length + 1))
+    series = noise[:, 1:] - 0.6 * noise[:, :-1]
+    found = np.array(
+        [(series[:, k:] * series[:, : length - k]).mean(1) / (series**2).mean(1) for k in (1, 2, 3)]
+    )
+    rho = np.array([-0.6 / 1.36, 0.0, 0.0])
+    np.testing.assert_allclose(length * np.cov(found), bartlett(rho), atol=0.12)
+
+
+@pytest.mark.parametrize(("times", "wanted"), [(0.6, 1 / 0.6), (1.0, 1.0), (2.0, 1.0)])
+def test_noise_that_is_stated_too_small_is_found(times: float, wanted: float) -> None:
+    """One that is stated too large is believed: outlines err slowly, which looks like motion."""
+    problem, _, _ = run(np.random.default_rng(40), bubbles=2, seconds=1.5)
+    better = adapted(solved(stated(problem, times)))
+    found = 1.0 if better is None else better.pixel_inflation
+    assert found == pytest.approx(wanted, rel=0.1)
+    if wanted == 1.0:
+        assert better is None

@@ -187,13 +187,10 @@ def doubted(
     The bubbles' differences show their own line; a rig's line of the same frequency adds to what
     they have in common, where a share of 1 / bubbles is theirs anyway, and a few cycles do not
     tell it from none. Its RMS is the root of the posterior's mean square, under a flat prior up
-    to the bubbles' own, less where the rig shows a stronger line elsewhere. Wide swings across the
+    to the bubbles' own, less where the rig's main line is seen elsewhere. Wide swings across the
     vertical are the bubbles'.
     """
-    own = [
-        m for m in model.modes
-        if m.camera == CARRIAGE and _lies_in(m.rms_mm, pattern) and not _is_half(m, model)
-    ]  # fmt: skip
+    own = [m for m in model.modes if _lies_in(m.rms_mm, pattern) and not _is_half(m, model)]
     for index, line in enumerate(model.bubble.zigzags):
         common = [m.frequency_hz for m in model.modes if m.camera == CARRIAGE]
         seen = any(abs(f / line.frequency_hz - 1) < _NEAR_HZ for f in common)
@@ -232,18 +229,21 @@ def expected(line: Zigzag, own: Sequence[RigMode]) -> Array:
     """Prior weights of lines of the rig beside one of the bubbles', by their `_SHARES` of its RMS.
 
     All alike where the rig shows no line of its own elsewhere (a quarter of the frequency away):
-    its main one must be somewhere. One that is weaker than the strongest there would be one more,
-    and lie just here by chance: with the probability that one of `_MORE` falls so near under the
-    prior of modes. What it loses goes to none (the first).
+    its main one must be somewhere. One that is weaker than the strongest there, or any where that
+    is as strong as the arms', would be one more, and lie just here by chance: with the probability
+    that one of `_MORE` falls so near under the prior of modes. What it loses goes to none (the
+    first).
     """
-    away = [max(m.rms_mm) for m in own if _is_elsewhere(m, line)]
+    away = [max(m.rms_mm) for m in own if m.camera == CARRIAGE and _is_elsewhere(m, line)]
     strongest = max(away, default=0.0)
     if not strongest:
         return np.ones(len(_SHARES))
+    arms = max((max(m.rms_mm) for m in own if m.camera != CARRIAGE), default=np.inf)
+    missing = 1 - min(strongest / arms, 1.0) ** 4
     each = 2 * _NEAR_HZ * prior_of("modes.*.frequency_hz").density(line.frequency_hz)
     chance = 1 - (1 - each) ** _MORE
     size = np.minimum(_SHARES * max(line.rms_mm) / strongest, 1.0)
-    weight = chance + (1 - chance) * size**2
+    weight = chance + (1 - chance) * missing * size**2
     weight[0] = len(weight) - weight[1:].sum()
     return np.asarray(weight)
 

@@ -9,15 +9,16 @@ a target standing still is the best source: there every line is the rig's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.shake_channels import channels_of
+from telerig.estimator.shake_channels import Channel, channels_of
 from telerig.estimator.shake_groups import Group, Learning, free_names, groups_of, is_held
 from telerig.estimator.shake_labels import LineLabel, doubted, labels, shared
-from telerig.estimator.shake_likelihood import laplace_sigma, maximise
+from telerig.estimator.shake_likelihood import evidence, laplace_sigma, maximise
 from telerig.estimator.shake_parameters import FORCE, names_of, value_of, with_values
 from telerig.estimator.shake_search import LOW_HZ, Step, coloured, one_more, pruned, whitened
 from telerig.estimator.shake_spectrum import coarsening, coarser, faded, unexplained
@@ -26,7 +27,9 @@ from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
 Array = NDArray[np.float64]
 
 _STRONG = 20.0
-_ACROSS = 0.5
+_ACROSS, _ACROSS_LOG_SIGMA = 0.5, 1.0
+_VAGUE_LOG_SIGMA = 0.3
+_LOG_RATIOS = np.linspace(-3.0, 2.0, 11)
 
 
 def learn(
@@ -64,6 +67,7 @@ def _learn_group(
     factor = coarsening(t_s, _highest(group, model))
     model = _faded(model, factor, t_s)
     coarse = replace(group, channels=tuple(coarser(c, factor) for c in group.channels))
+    seeds = {} if first else _seeds(model, options)
     begun_white = model.force_hz is None and options.force_hz is None
     step = Step(maximise(coarse.fast, model, free_names(model, coarse, options, first), steps=15))
     step = coloured(coarse, step, options, first)
@@ -82,6 +86,9 @@ def _learn_group(
     if not options.target:
         found = labels(coarse.fast, model, group.pattern, group.up)
         model = shared(model, [x for x in found if not _is_kept(x, model, options)])
+        vague = {n for n, s in zip(names, sigma) if s > _VAGUE_LOG_SIGMA}
+        for name in vague & seeds.keys():
+            model = _as_likely(coarse.fast, model, name, seeds[name])
         if max(int(c.moving.sum()) for c in group.channels) > 1:
             model = doubted(coarse.fast, model, group.pattern, group.up)
     return _faded(model, factor, t_s, back=True), dict(zip(names, sigma.tolist()))
@@ -102,6 +109,30 @@ def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeMo
     held += [FORCE] if added else []
     model = replace(model, modes=(*model.modes, *added))
     return model, replace(options, hold=(*options.hold, *held))
+
+
+def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
+    """Names of the RMS of modes across that others began, and what those expect of it."""
+    return {
+        f"modes.{i}.rms_mm": max(mode.rms_mm)
+        for i, mode in enumerate(model.modes)
+        if f"modes.{i}.frequency_hz" in options.hold
+    }
+
+
+def _as_likely(
+    channels: Sequence[Channel], model: ShakeModel, name: str, median: float
+) -> ShakeModel:
+    """An RMS that the data hardly determine as the root of its posterior's mean square.
+
+    The most probable of a line that bubbles' wide swings hide is next to none, and would say that
+    the rig stands still. median : of the log-normal prior.
+    """
+    values = median * np.exp(_LOG_RATIOS)
+    found = np.array([evidence(channels, with_values(model, [name], [v])) for v in values])
+    found -= 0.5 * (_LOG_RATIOS / _ACROSS_LOG_SIGMA) ** 2
+    weight = np.exp(found - found.max())
+    return with_values(model, [name], [float(np.sqrt(weight @ values**2 / weight.sum()))])
 
 
 def _is_kept(label: LineLabel, model: ShakeModel, options: Learning) -> bool:

@@ -88,7 +88,7 @@ def _learn_group(
         model = shared(model, [x for x in found if not _is_kept(x, model, options)])
         vague = {n for n, s in zip(names, sigma) if s > _VAGUE_LOG_SIGMA}
         for name in vague & seeds.keys():
-            model = _as_likely(coarse.fast, model, name, seeds[name])
+            model = as_likely(coarse.fast, model, name, seeds[name])
         if max(int(c.moving.sum()) for c in group.channels) > 1:
             model = doubted(coarse.fast, model, group.pattern, group.up)
     return _faded(model, factor, t_s, back=True), dict(zip(names, sigma.tolist()))
@@ -120,7 +120,7 @@ def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
     }
 
 
-def _as_likely(
+def as_likely(
     channels: Sequence[Channel], model: ShakeModel, name: str, median: float
 ) -> ShakeModel:
     """An RMS that the data hardly determine as the root of its posterior's mean square.

@@ -148,6 +148,13 @@ def test_prior_weights_of_a_line_beside_the_bubbles() -> None:
     assert weight.sum() == pytest.approx(6.0)
     weak = replace(mode, rms_mm=(0.0, 0.02, 0.0))
     np.testing.assert_allclose(expected(line, [weak])[1:], 1.0)
+    # as strong as the arms': the main line is seen, and whatever lies here does so by chance
+    arm = RigMode(60.0, 0.03, (0.0, 0.3, 0.0), 0)
+    np.testing.assert_allclose(expected(line, [mode, arm])[1:], chance, rtol=0.01)
+    half = replace(mode, rms_mm=(0.0, 0.15, 0.0))
+    size = np.minimum(shares * 0.2 / 0.15, 1)
+    wanted = chance + (1 - chance) * (1 - 0.5**4) * size**2
+    np.testing.assert_allclose(expected(line, [half, arm])[1:], wanted[1:], rtol=0.01)
 
 
 def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None:

@@ -49,7 +49,7 @@ def test_a_rig_that_bubbles_swings_hide_is_not_taken_for_still() -> None:
     upright = [m for m in found.modes if max(m.rms_mm) == m.rms_mm[1]]
     across = [m for m in found.modes if m not in upright and m.frequency_hz < 12]
     assert upright and across
-    hidden, seen = ([m for m in modes if m.camera == CARRIAGE][0] for modes in (across, upright))
+    hidden, seen = (next(m for m in modes if m.camera == CARRIAGE) for modes in (across, upright))
     assert max(hidden.rms_mm) > 0.4 * max(seen.rms_mm)
     start = replace(true_model(), name="mine")
     held = learn(problem, start, Learning(hold=("modes.*",), most_modes=0))

@@ -68,6 +68,7 @@ def _learn_group(
     model = _faded(model, factor, t_s)
     coarse = replace(group, channels=tuple(coarser(c, factor) for c in group.channels))
     seeds = {} if first else _seeds(model, options)
+    given = len(model.modes)
     begun_white = model.force_hz is None and options.force_hz is None
     step = Step(maximise(coarse.fast, model, free_names(model, coarse, options, first), steps=15))
     step = coloured(coarse, step, options, first)
@@ -76,7 +77,7 @@ def _learn_group(
         if better is None:
             break
         step = coloured(coarse, better, options, first)
-    fit = pruned(coarse, step.fit, options, first)
+    fit = pruned(coarse, step.fit, options, first, given)
     if first and begun_white:
         fit = whitened(coarse, fit, options)
     names = free_names(fit.model, coarse, options, first)
@@ -86,9 +87,9 @@ def _learn_group(
     if not options.target:
         found = labels(coarse.fast, model, group.pattern, group.up)
         model = shared(model, [x for x in found if not _is_kept(x, model, options)])
-        vague = {n for n, s in zip(names, sigma) if s > _VAGUE_LOG_SIGMA}
-        for name in vague & seeds.keys():
-            model = as_likely(coarse.fast, model, name, seeds[name])
+        vague = [n for n, s in zip(names, sigma) if n in seeds and s > _VAGUE_LOG_SIGMA]
+        likely = [as_likely(coarse.fast, model, n, seeds[n]) for n in vague]
+        model = with_values(model, vague, likely)
         if max(int(c.moving.sum()) for c in group.channels) > 1:
             model = doubted(coarse.fast, model, group.pattern, group.up)
     return _faded(model, factor, t_s, back=True), dict(zip(names, sigma.tolist()))
@@ -120,9 +121,7 @@ def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
     }
 
 
-def as_likely(
-    channels: Sequence[Channel], model: ShakeModel, name: str, median: float
-) -> ShakeModel:
+def as_likely(channels: Sequence[Channel], model: ShakeModel, name: str, median: float) -> float:
     """An RMS that the data hardly determine as the root of its posterior's mean square.
 
     The most probable of a line that bubbles' wide swings hide is next to none, and would say that
@@ -132,7 +131,7 @@ def as_likely(
     found = np.array([evidence(channels, with_values(model, [name], [v])) for v in values])
     found -= 0.5 * (_LOG_RATIOS / _ACROSS_LOG_SIGMA) ** 2
     weight = np.exp(found - found.max())
-    return with_values(model, [name], [float(np.sqrt(weight @ values**2 / weight.sum()))])
+    return float(np.sqrt(weight @ values**2 / weight.sum()))
 
 
 def _is_kept(label: LineLabel, model: ShakeModel, options: Learning) -> bool:

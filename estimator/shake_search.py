@@ -184,12 +184,18 @@ def _last_line(model: ShakeModel, where: Where) -> list[str]:
     return [f"{stem}.{field_}" for field_ in ("frequency_hz", "damping", "rms_mm")]
 
 
-def pruned(group: Group, fit: Fit, options: Learning, first: bool) -> Fit:
-    """Lines taken away again whose absence the criterion does not mind."""
+def pruned(group: Group, fit: Fit, options: Learning, first: bool, given: int = 0) -> Fit:
+    """Lines taken away again whose absence the criterion does not mind.
+
+    given : so many modes were there before the search, and stay, so that their names do.
+    """
     at = 0
     while True:
         names = [
-            n for n in free_names(fit.model, group, options, first) if n.endswith(".frequency_hz")
+            n
+            for n in free_names(fit.model, group, options, first)
+            if n.endswith(".frequency_hz")
+            and not (n.startswith("modes") and int(n.split(".")[1]) < given)
         ]
         if at >= len(names):
             return fit

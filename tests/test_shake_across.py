@@ -12,7 +12,7 @@ from telerig.estimator.shake_channels import channels_of
 from telerig.estimator.shake_groups import groups_of
 from telerig.estimator.shake_learning import Learning, as_likely, learn
 from telerig.estimator.shake_likelihood import evidence
-from telerig.estimator.shake_parameters import value_of, with_values
+from telerig.estimator.shake_parameters import with_values
 from telerig.estimator.smoother.defaults import default_model
 from telerig.estimator.smoother.model import CARRIAGE, RigMode
 
@@ -26,7 +26,7 @@ def test_an_rms_that_the_data_hardly_determine_is_the_root_of_its_mean_square(se
     group = groups_of(channels_of(problem), Learning(), problem.up)[1]
     hidden = RigMode(1.2 * SWING_HZ, 0.03, (0.1, 0.0, 0.1), CARRIAGE, None)
     model = replace(true_model(), modes=(*true_model().modes, hidden))
-    found = value_of(as_likely(group.fast, model, NAME, 0.1), NAME)
+    found = as_likely(group.fast, model, NAME, 0.1)
     fine = np.linspace(-3.25, 2.25, 221)
     values = 0.1 * np.exp(fine)
     log = np.array([evidence(group.fast, with_values(model, [NAME], [v])) for v in values])
@@ -36,7 +36,7 @@ def test_an_rms_that_the_data_hardly_determine_is_the_root_of_its_mean_square(se
 
 def test_where_nothing_tells_it_is_the_priors() -> None:
     model = replace(true_model(), modes=(*true_model().modes, RigMode(9.0, 0.03, (0.1, 0.0, 0.1))))
-    found = value_of(as_likely((), model, NAME, 0.1), NAME)
+    found = as_likely((), model, NAME, 0.1)
     ratio = np.random.default_rng(1).normal(size=200_000)
     ratio = ratio[(ratio > -3.25) & (ratio < 2.25)]
     assert found == pytest.approx(0.1 * np.sqrt(np.mean(np.exp(2 * ratio))), rel=0.02)

@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import kstest
 from shake_learning_data import run, true_model
 
 from telerig.estimator.smoother.adapting import adapted, leverages
 from telerig.estimator.smoother.model import Observations, ShakeModel, SmoothingProblem
 from telerig.estimator.smoother.residual_draws import drawn_residuals, stretch_of
 from telerig.estimator.smoother.solve import Options, Solution, solve
-from telerig.estimator.smoother.whiteness import bartlett, pixel_whiteness
+from telerig.estimator.smoother.state import frame_of
+from telerig.estimator.smoother.whiteness import pixel_whiteness
 
 Array = NDArray[np.float64]
 
@@ -32,24 +34,43 @@ def stated(problem: SmoothingProblem, times: float) -> SmoothingProblem:
     return replace(problem, observations=Observations(*whole))
 
 
-@pytest.mark.parametrize("seed", [31, 32, 33, 34])
-def test_residuals_of_the_right_model_are_as_expected(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "kept"), [(31, 1.0), (32, 1.0), (33, 0.7), (34, 0.5)])
+def test_residuals_of_the_right_model_are_as_expected(seed: int, kept: float) -> None:
     """They are not white: the fit follows part of the noise."""
-    problem, _, _ = run(np.random.default_rng(seed), bubbles=2, seconds=1.5)
+    problem, _, _ = run(np.random.default_rng(seed), bubbles=2, seconds=1.5, kept=kept)
     found = pixel_whiteness(solved(problem))
     assert list(found) == ["left", "right"]
     for one in found.values():
         assert one["verdict"] == "as expected" and one["p"] > 1e-3
         assert one["expected"][0] < -0.05
-        np.testing.assert_allclose(one["autocorrelation"], one["expected"], atol=0.15)
-        assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.08)
+        np.testing.assert_allclose(one["autocorrelation"], one["expected"], atol=0.2)
+        assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.1)
+
+
+def test_p_is_uniform_where_the_model_is_right() -> None:
+    """Residuals drawn from the model itself, judged by others: a false alarm as often as said."""
+    problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=1.0, kept=0.7)
+    solution = solved(problem)
+    stretch = stretch_of(solution.frame, 100)
+    assert stretch is not None
+    others = drawn_residuals(solution, stretch, 60, np.random.default_rng(2))
+    found = []
+    for k in range(60):
+        residuals = solution.residuals[0].copy()
+        for which, drawn in others:
+            residuals[which] = drawn[..., k]
+        one = pixel_whiteness(replace(solution, residuals=(residuals, solution.residuals[1])))
+        found += [one["left"]["p"], one["right"]["p"]]
+    assert kstest(found, "uniform").pvalue > 0.01
 
 
 def test_drawn_residuals_are_as_small_as_the_covariances_say() -> None:
     """An independent way: variance left = 1 - leverage, from the posterior's covariance."""
     problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=0.4)
     solution = solved(problem)
-    drawn = drawn_residuals(solution, 40, 400, np.random.default_rng(1))
+    stretch = stretch_of(solution.frame, 40)
+    assert stretch is not None and stretch.inner == (0, 79)
+    drawn = drawn_residuals(solution, stretch, 400, np.random.default_rng(1))
     for (which, residuals), (some, leverage) in zip(drawn, leverages(solution), strict=True):
         np.testing.assert_array_equal(which, some)
         np.testing.assert_allclose((residuals**2).mean(-1), 1 - leverage, atol=0.25)
@@ -66,8 +87,7 @@ def test_a_centre_that_wanders_is_seen() -> None:
     pixels = obs.uv_px + wander[obs.camera, obs.frame]
     moved = Observations(obs.item, obs.frame, obs.camera, pixels, obs.covariance_px2)
     for one in pixel_whiteness(solved(replace(problem, observations=moved))).values():
-        assert one["verdict"] == "correlated" and one["p"] < 1e-6
-        assert one["autocorrelation"][0] > one["expected"][0] + 0.05
+        assert one["verdict"] == "correlated" and one["p"] < 1e-5
         assert one["rms_sigmas"] > 1.4 * one["expected_rms_sigmas"]
 
 
@@ -76,28 +96,42 @@ def test_too_few_frames_are_not_judged() -> None:
     assert pixel_whiteness(solved(problem)) == {}
 
 
-def test_a_stretch_is_short_and_holds_what_does_not_move() -> None:
+def tracks(problem: SmoothingProblem, spans: list[tuple[int, int]]) -> SmoothingProblem:
+    """Each bubble seen in its span of frames only."""
+    obs, bubbles, keep = problem.observations, [], np.zeros(len(problem.observations), bool)
+    for k, (first, last) in enumerate(spans):
+        guess = problem.bubbles[k].guess_mm[first : last + 1]
+        bubbles.append(replace(problem.bubbles[k], first=first, last=last, guess_mm=guess))
+        keep |= (obs.item == k) & (obs.frame >= first) & (obs.frame <= last)
+    whole = (a[keep] for a in (obs.item, obs.frame, obs.camera, obs.uv_px, obs.covariance_px2))
+    return replace(problem, bubbles=tuple(bubbles), observations=Observations(*whole))
+
+
+def test_tracks_one_after_the_other_and_pauses() -> None:
+    """Later bubbles count like the first; a rig without shake has no state where none is seen."""
+    problem, _, _ = run(np.random.default_rng(38), bubbles=20, seconds=3.0)
+    short = tracks(problem, [(30 * k, 30 * k + 29) for k in range(20)])
+    for one in pixel_whiteness(solved(short)).values():
+        assert one["verdict"] == "as expected"
+        assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.12)
+    apart = tracks(replace(problem, bubbles=problem.bubbles[:2]), [(0, 99), (500, 599)])
+    still = solved(apart, TRUE.without_shake())
+    assert still.frame.shake.size == 0
+    assert list(pixel_whiteness(still)) == ["left", "right"]
+
+
+def test_a_stretch_is_short_and_what_is_too_much_is_not_judged() -> None:
     problem, _, _ = run(np.random.default_rng(38), bubbles=3, seconds=2.5, marks=2)
     frame = solved(problem).frame
     width = frame.shake.size + 3 * frame.bubble.size
-    for middle, first in ((250, 150), (0, 0), (499, 300)):
+    for middle, first, inner in ((250, 150, (162, 337)), (0, 0, (0, 187)), (499, 300, (312, 499))):
         stretch = stretch_of(frame, middle)
-        assert stretch.size == 200 * width
+        assert stretch is not None
+        assert stretch.size == 200 * width and stretch.inner == inner
         inside = np.flatnonzero(stretch.column[:500] >= 0)
         assert (inside[0], inside[-1]) == (first, first + 199)
-
-
-def test_bartletts_covariance() -> None:
-    """Closed form for white noise, and the scatter of a moving average's autocorrelations."""
-    np.testing.assert_allclose(bartlett(np.zeros(5)), np.eye(5))
-    rng, length = np.random.default_rng(39), 2000
-    noise = rng.normal(size=(1500, length + 1))
-    series = noise[:, 1:] - 0.6 * noise[:, :-1]
-    found = np.array(
-        [(series[:, k:] * series[:, : length - k]).mean(1) / (series**2).mean(1) for k in (1, 2, 3)]
-    )
-    rho = np.array([-0.6 / 1.36, 0.0, 0.0])
-    np.testing.assert_allclose(length * np.cov(found), bartlett(rho), atol=0.12)
+    crowd, _, _ = run(np.random.default_rng(38), bubbles=40, seconds=0.3)
+    assert stretch_of(frame_of(crowd, TRUE, np.zeros(0)), 30) is None
 
 
 @pytest.mark.parametrize(("times", "wanted"), [(0.6, 1 / 0.6), (1.0, 1.0), (2.0, 1.0)])

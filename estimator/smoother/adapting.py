@@ -22,7 +22,7 @@ _RESCALE_BEYOND = 0.2
 _SAMPLED = 1000
 _LEAST_SPARE = 0.2
 _LEAST_TELLING = 60
-_MEDIAN_OF_CHI_SQUARE = 0.4549
+_MEDIAN_OF_CHI_SQUARE, _SD_OF_MEDIAN = 0.4549, 1.16
 _FLOORS = np.geomspace(0.03, 0.4, 40)
 _FLOOR_SPREAD = np.log(2.0)
 _LOW_BAND = 0.4
@@ -43,7 +43,7 @@ def adapted(solution: Solution) -> ShakeModel | None:
     wide = widened(solution)
     if wide is not None:
         better = replace(better, encoder_scale_sigma=wide)
-    if inflation > 1 + _INFLATE_BEYOND:
+    if inflation > 1:
         better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
     if model.broad_bands:
         fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
@@ -157,7 +157,9 @@ def _inflation(solution: Solution) -> float:
     if np.count_nonzero(telling) < _LEAST_TELLING:
         return 1.0
     median = float(np.median(squares[telling] / spares[telling]))
-    return max(float(np.sqrt(median / _MEDIAN_OF_CHI_SQUARE)), 1.0)
+    found = float(np.sqrt(median / _MEDIAN_OF_CHI_SQUARE))
+    sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(np.count_nonzero(telling)))
+    return found if found > sure else 1.0
 
 
 def leverages(solution: Solution) -> list[tuple[NDArray[np.int64], Array]]:

@@ -22,23 +22,25 @@ from telerig.estimator.smoother.state import Frame
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_MOST_FRAMES, _LEAST_FRAMES = 200, 24
-_MOST_BAND = 1e6
-_MOST_BUBBLES = 40
+_HALVES, _EDGE = (100, 50, 30, 20), 12
+_MOST_WORK = 1.5e8
 _RIDGE = 1e-9
-"""Of the diagonal: the smooth prior of a broad band has fewer digits than double precision."""
+"""Of the diagonal: the smooth prior of a broad band has fewer digits than double precision. Single
+residuals move by some hundredths of a standard deviation, their variance by less than 0.001."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Some frames with what moves in them; all else is held.
+    """Some frames with what moves in them; the rest is held.
 
     column : of each key of shake and bubbles its first, -1 where it is held.  size : columns.
+    inner : (first, last) frames far enough from those that are held.
     """
 
     frame: Frame
     column: Ints
     size: int
+    inner: tuple[int, int]
 
     def columns(self, linear: Linear) -> Ints:
         """(M, keys) first column of each block of the factors, -1 where it is held."""
@@ -52,53 +54,54 @@ class Stretch:
         return out
 
 
-def stretch_of(frame: Frame, middle: int) -> Stretch:
-    """At most `_MOST_FRAMES` about a frame, fewer where much moves; some of many bubbles held."""
+def stretch_of(frame: Frame, middle: int) -> Stretch | None:
+    """About a frame, 200 frames or, where much moves, down to 40; None if that is too much, too."""
     (nodes, shake), (_, bubble) = frame.counts()[:2]
-    chosen = frame.bubble_of_row < _MOST_BUBBLES
-    at_once = int(np.bincount(frame.frame_of_row[chosen], minlength=1).max())
-    each = len(frame.nodes.t_s) / len(frame.problem.t_s)
-    width = shake + bubble * at_once
-    frames = int(_MOST_BAND / (2 * width * (each * shake + bubble * at_once)))
-    half = min(max(frames, _LEAST_FRAMES), _MOST_FRAMES) // 2
-    count = len(frame.problem.t_s)
-    first = int(np.clip(middle - half, 0, max(count - 2 * half, 0)))
-    last = min(first + 2 * half, count) - 1
-    low, high = frame.nodes.of_frame[[first, last]]
     when = np.r_[np.arange(nodes), frame.node_of_row]
     sizes = np.repeat([shake, bubble], [nodes, frame.rows])
-    inside = (when >= low) & (when <= high) & (sizes > 0)
-    inside[nodes:] &= chosen
+    count = len(frame.problem.t_s)
+    for half in _HALVES:
+        first = int(np.clip(middle - half, 0, max(count - 2 * half, 0)))
+        last = min(first + 2 * half, count) - 1
+        low, high = frame.nodes.of_frame[[first, last]]
+        inside = (when >= low) & (when <= high) & (sizes > 0)
+        at_once = int(np.bincount(when[nodes:][inside[nodes:]], minlength=1).max())
+        width = 2 * (shake + bubble * at_once)
+        if 0 < int(sizes[inside].sum()) * width**2 <= _MOST_WORK:
+            break
+    else:
+        return None
     order = np.flatnonzero(inside)[np.argsort(when[inside], kind="stable")]
     starts = np.r_[0, np.cumsum(sizes[order])]
     column = np.full(len(when), -1)
     column[order] = starts[:-1]
-    return Stretch(frame, column, int(starts[-1]))
+    inner = (first + _EDGE * (first > 0), last - _EDGE * (last < count - 1))
+    return Stretch(frame, column, int(starts[-1]), inner)
 
 
 def drawn_residuals(
-    solution: Solution, middle: int, draws: int, rng: Generator
+    solution: Solution, stretch: Stretch, draws: int, rng: Generator
 ) -> list[tuple[Ints, Array]]:
     """By camera: which of its bubbles' pixels (m,), and residuals (m, 2, draws) in sigmas.
 
-    middle : the frame about which the stretch lies. Only kept pixels; a camera that saw no bubble
-    has none.
+    Kept pixels in the inner frames. Raises numpy.linalg.LinAlgError where digits run out.
     """
-    frame, kept = solution.frame, solution.weights[0] > 0.5
-    stretch = stretch_of(frame, middle)
+    frame, observed = solution.frame, solution.frame.problem.observations
     parts = [_Part.of(stretch, f) for f in all_factors(frame, solution.state, solution.weights)]
     noise = [rng.standard_normal((*p.block.shape[:2], draws)) for p in parts]
     found = _fitted(stretch, parts, noise)
+    inside = (observed.frame >= stretch.inner[0]) & (observed.frame <= stretch.inner[1])
+    inside &= solution.weights[0] > 0.5
     pixels = iter(i for i, p in enumerate(parts) if p.of_bubbles)
     out = []
     for c in range(len(frame.problem.cameras)):
-        mine = np.flatnonzero(frame.problem.observations.camera == c)
+        mine = np.flatnonzero(observed.camera == c)
         residual = np.zeros((0, 2, draws))
         if len(mine):
             i = next(pixels)
             mine = mine[parts[i].which]
             residual = noise[i] - parts[i].block @ found[parts[i].column]
-        out.append((mine[kept[mine]], residual[kept[mine]]))
+        out.append((mine[inside[mine]], residual[inside[mine]]))
     return out
 
 
@@ -117,21 +120,20 @@ class _Part:
 
     @classmethod
     def of(cls, stretch: Stretch, linear: Linear) -> _Part:
+        base, key = stretch.frame.base(), int(np.min(linear.keys[0]))
+        of_bubbles = linear.weight is not None and base[1] <= key < base[2]
         first = stretch.columns(linear)
-        which = np.flatnonzero(np.any(first >= 0, axis=1))
+        reached = first[:, 0] >= 0 if of_bubbles else np.any(first >= 0, axis=1)
+        which = np.flatnonzero(reached)
         blocks, columns = [], []
         for start, block in zip(first[which].T, linear.blocks):
             if np.any(start >= 0):
                 whole = np.broadcast_to(block, (len(linear.rhs), *block.shape[-2:]))[which]
                 blocks.append(whole * (start >= 0)[:, None, None])
                 columns.append(np.maximum(start, 0)[:, None] + np.arange(block.shape[-1]))
-        base, key = stretch.frame.base(), int(np.min(linear.keys[0]))
         if not blocks:
             blocks, columns = [np.zeros((0, linear.rhs.shape[1], 0))], [np.zeros((0, 0), np.int64)]
-        return cls(
-            which, np.concatenate(blocks, -1), np.concatenate(columns, -1),
-            linear.weight is not None and base[1] <= key < base[2],
-        )  # fmt: skip
+        return cls(which, np.concatenate(blocks, -1), np.concatenate(columns, -1), of_bubbles)
 
 
 def _fitted(stretch: Stretch, parts: Sequence[_Part], noise: Sequence[Array]) -> Array:

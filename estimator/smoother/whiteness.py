@@ -8,16 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoother.linear_sensors import accelerometers, felt
-from telerig.estimator.smoother.residual_draws import drawn_residuals
+from telerig.estimator.smoother.residual_draws import drawn_residuals, stretch_of
 from telerig.estimator.smoother.solve import Solution
 
 Array = NDArray[np.float64]
 
 LAGS = 10
-_LEAST_PAIRS, _LEAST_DRAWN = 25, 10
-_DRAWS = 8, 32
+_LEAST_PAIRS = 25
+_DRAWS = 48
 _SURE = 1e-3
-_SLIGHT = 0.04
 _LONGEST_SEGMENT = 2048
 _MOST_BINS = 120
 
@@ -25,95 +24,72 @@ _MOST_BINS = 120
 def pixel_whiteness(solution: Solution) -> dict[str, Any]:
     """By camera, of the bubbles' kept pixels: autocorrelation beside the model's, a test, a word.
 
-    Residuals of one bubble a number of frames apart, both coordinates, in sigmas. The fit follows
-    part of the noise, so that those of a right model are not white; ``expected`` is drawn from the
-    model. "as expected" where a test of the difference does not object, "nearly" where it does to
-    little (long runs make it sharp: chi-square below 0.04 a value), else "correlated".
+    Residuals of one bubble a number of frames apart, both coordinates, in sigmas, in a stretch of
+    the run. The fit follows part of the noise, so that those of a right model are not white;
+    ``expected`` and the test's covariance (Hotelling, Ann. Math. Stat. 2:360, 1931) are drawn from
+    the model. "as expected" where the test does not object, else "correlated". Empty where there
+    are too few frames, or too much moves in them.
     """
     obs, kept = solution.frame.problem.observations, solution.weights[0] > 0.5
     if not kept.any():
         return {}
-    draws = int(np.clip(kept.sum() / 100, *_DRAWS))
-    middle = int(np.median(obs.frame[kept]))
-    drawn = drawn_residuals(solution, middle, draws, np.random.default_rng(0))
+    middle = int(np.sort(obs.frame[kept])[np.count_nonzero(kept) // 2])
+    stretch = stretch_of(solution.frame, middle)
+    if stretch is None or stretch.inner[1] - stretch.inner[0] <= LAGS:
+        return {}
+    try:
+        drawn = drawn_residuals(solution, stretch, _DRAWS, np.random.default_rng(0))
+    except np.linalg.LinAlgError:
+        return {}
     out: dict[str, Any] = {}
-    for c, camera in enumerate(solution.frame.problem.cameras):
-        mine, (which, residuals) = np.flatnonzero(kept & (obs.camera == c)), drawn[c]
-        here, there = ((obs.item[i], obs.frame[i]) for i in (mine, which))
-        seen = _lagged(solution.residuals[0][mine], *here, _LEAST_PAIRS)
-        each = [_lagged(r, *there, _LEAST_DRAWN) for r in np.moveaxis(residuals, -1, 0)]
-        if seen is not None and each and all(e is not None for e in each):
-            model = np.mean(np.array(each), 0)
-            out[camera.name] = _compared(seen, model, len(mine), len(which) * draws)
+    for camera, (which, residuals) in zip(solution.frame.problem.cameras, drawn):
+        both = np.concatenate([solution.residuals[0][which][..., None], residuals], -1)
+        found = _lagged(both, obs.item[which], obs.frame[which])
+        if found is not None:
+            out[camera.name] = _compared(found[0], found[1:])
     return out
 
 
-def _compared(seen: Array, model: Array, count: int, drawn: int) -> dict[str, Any]:
-    """Mean products (2, LAGS + 1) of both coordinates of so many pixels, and of the model's."""
-    from scipy.stats import chi2
+def _compared(seen: Array, model: Array) -> dict[str, Any]:
+    """Mean products so many frames apart, (LAGS + 1,) of the residuals, (draws, ...) of drawn."""
+    from scipy.stats import f as fisher
 
-    rho, expected = seen.sum(0) / seen[:, 0].sum(), model.sum(0) / model[:, 0].sum()
-    share = model[:, 0] / model[:, 0].sum()
-    covariance = sum(s**2 * bartlett(m[1:] / m[0]) for s, m in zip(share, model))
-    covariance = covariance * (1 / count + 1 / drawn)
-    off = (rho - expected)[1:]
+    rho, drawn = seen[1:] / seen[0], model[:, 1:] / model[:, :1]
+    expected, draws = drawn.mean(0), len(drawn)
+    off = rho - expected
+    covariance = np.cov(drawn.T) * (1 + 1 / draws)
     distance = float(off @ np.linalg.solve(covariance, off))
-    p = float(chi2.sf(distance, LAGS))
-    slight = "nearly" if distance < _SLIGHT * 2 * count else "correlated"
+    p = float(fisher.sf(distance * (draws - LAGS) / (LAGS * (draws - 1)), LAGS, draws - LAGS))
     return {
-        "autocorrelation": rho[1:].tolist(),
-        "expected": expected[1:].tolist(),
-        "rms_sigmas": float(np.sqrt(seen[:, 0].mean())),
+        "autocorrelation": rho.tolist(),
+        "expected": expected.tolist(),
+        "rms_sigmas": float(np.sqrt(seen[0])),
         "expected_rms_sigmas": float(np.sqrt(model[:, 0].mean())),
-        "chi_square": distance,
+        "hotelling": distance,
         "lags": LAGS,
         "p": p,
-        "verdict": "as expected" if p > _SURE else slight,
+        "verdict": "as expected" if p > _SURE else "correlated",
     }
 
 
-def bartlett(rho: Array) -> Array:
-    """(L, L) covariance, times the number of values, of autocorrelations at lags 1 to L.
-
-    rho : (L,) the true ones, zero beyond. Bartlett, J. R. Stat. Soc. Suppl. 8:27, 1946.
-    """
-    count = len(rho)
-    whole = np.zeros(6 * count + 1)
-    middle = 3 * count
-    whole[middle] = 1.0
-    whole[middle + 1 : middle + count + 1] = whole[middle - count : middle][::-1] = rho
-    k = np.arange(-2 * count, 2 * count + 1)
-    lag = np.arange(1, count + 1)
-    after, before = whole[middle + k + lag[:, None]], whole[middle + k - lag[:, None]]
-    here = whole[middle + k]
-    crossed = np.outer(after @ here, rho)
-    return np.asarray(
-        after @ after.T + before @ after.T + 2 * np.outer(rho, rho) * (here @ here)
-        - 2 * crossed - 2 * crossed.T
-    )  # fmt: skip
-
-
-def _lagged(
-    residuals: Array, item: NDArray[np.int64], frame: NDArray[np.int64], least: int
-) -> Array | None:
-    """(2, LAGS + 1) mean products of residuals (m, 2) so many frames apart; None of too few."""
+def _lagged(residuals: Array, item: NDArray[np.int64], frame: NDArray[np.int64]) -> Array | None:
+    """(K, LAGS + 1) mean products of residuals (m, 2, K) so many frames apart; None of too few."""
     if not len(item):
         return None
     items, row = np.unique(item, return_inverse=True)
-    table = np.zeros((len(items), int(np.ptp(frame)) + 1, 2))
-    there = np.zeros(table.shape[:2], bool)
+    length = int(np.ptp(frame)) + 1
+    table = np.zeros((len(items), length, *residuals.shape[1:]))
+    there = np.zeros((len(items), length), bool)
     at = row.reshape(-1), frame - frame.min()
     table[at], there[at] = residuals, True
-    table -= (table.sum(1) / there.sum(1)[:, None])[:, None]
-    table[~there] = 0.0
-    out = np.zeros((2, LAGS + 1))
+    out = np.zeros((LAGS + 1, residuals.shape[-1]))
     for lag in range(LAGS + 1):
-        last = table.shape[1] - lag
+        last = length - lag
         pairs = int((there[:, lag:] & there[:, :last]).sum()) if last > 0 else 0
-        if pairs < least:
+        if pairs < _LEAST_PAIRS:
             return None
-        out[:, lag] = (table[:, lag:] * table[:, :last]).sum((0, 1)) / pairs
-    return out
+        out[lag] = np.einsum("bfck,bfck->k", table[:, lag:], table[:, :last]) / (2 * pairs)
+    return out.T
 
 
 def accelerometer_spectra(solution: Solution) -> dict[str, Any]:

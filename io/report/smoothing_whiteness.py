@@ -16,8 +16,9 @@ from telerig.io.report.words import is_number, number
 
 Array = NDArray[np.float64]
 
-WHITENESS_HEADS = ["camera", "residuals are", "next frame", "RMS, sigmas", "excess, all lags", "p"]
+WHITENESS_HEADS = ["camera", "residuals are", "next frame", "RMS, sigmas", "p"]
 _LITTLE = 0.5
+_LARGER, _SMALLER = 1.25, 0.8
 
 
 def whiteness_rows(results: SmoothingResults) -> list[Row]:
@@ -28,45 +29,46 @@ def whiteness_rows(results: SmoothingResults) -> list[Row]:
         sizes = (found.get(key) for key in ("rms_sigmas", "expected_rms_sigmas"))
         verdict = str(found.get("verdict"))
         cells = (
-            camera, _VERDICTS.get(verdict, verdict), _beside(float(rho[0]), float(expected[0])),
-            _beside(*sizes), number(_excess(found), 2), number(found.get("p"), 2),
+            camera, verdict, _beside(float(rho[0]), float(expected[0])), _beside(*sizes),
+            number(found.get("p"), 2),
         )  # fmt: skip
         rows.append(Row(cells, strong=verdict == "correlated"))
     return rows
-
-
-_VERDICTS = {"nearly": "nearly as expected"}
 
 
 def _beside(seen: Any, expected: Any) -> str:
     return f"{number(seen, 2)} (model {number(expected, 2)})"
 
 
-def _excess(found: Mapping[str, Any]) -> float:
-    """Of the correlations over the model's, their sum: of the slow part of the residuals."""
-    return float(np.sum(found["autocorrelation"]) - np.sum(found["expected"]))
-
-
 def whiteness_words(results: SmoothingResults) -> str:
-    """What correlated residuals would mean."""
+    """What larger, smaller or otherwise correlated residuals mean."""
     known = _known(results, "whiteness", "expected").values()
     if not known:
-        return "Too few frames to tell whether residuals of one frame and the next are alike."
-    worst = [_excess(v) for v in known if v.get("verdict") == "correlated"]
-    if any(off > 0 for off in worst):
         return (
-            "Residuals of neighbouring frames are more alike than this model leaves them: motion "
-            "that it does not hold, or centres that wander with the bubbles' shapes. The standard "
-            "deviations are too small."
+            "Not judged: too few frames for it, too many bubbles at once, or sensors far faster "
+            "than the frames."
         )
-    if worst:
-        return (
-            "Residuals of neighbouring frames are less alike than this model leaves them: the "
-            "pixels' noise is larger, or the motion smaller, than it holds."
+    ratios = [v["rms_sigmas"] / v["expected_rms_sigmas"] for v in known]
+    out = []
+    if max(ratios) > _LARGER:
+        out.append(
+            f"Residuals are {number(max(ratios), 2)} times what this model leaves: more noise or "
+            "faster motion than it states. The standard deviations are too small."
         )
-    return (
-        "Residuals of neighbouring frames are as alike as the fit leaves them where the model is "
-        "right: what the images hold of the motion is in the trajectories."
+    elif min(ratios) < _SMALLER:
+        out.append(
+            f"Residuals are {number(min(ratios), 2)} of what this model leaves: pixels scatter "
+            "less from frame to frame than their stated standard deviations."
+        )
+    if any(v.get("verdict") == "correlated" for v in known):
+        out.append(
+            "Residuals of neighbouring frames are not alike as the model leaves them: motion that "
+            "it does not hold, centres that wander with the bubbles' shapes, or noise that is not "
+            "as stated. The standard deviations cannot be relied on."
+        )
+    return " ".join(out) or (
+        "Residuals are as large, and neighbouring frames' as alike, as the fit leaves them where "
+        "the model is right: what the images hold of the motion is in the trajectories."
     )
 
 

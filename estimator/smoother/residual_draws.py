@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _HALVES, _EDGE = (100, 50, 30, 20), 12
-_MOST_WORK = 1.5e8
+_MOST_BAND = 1e6
 _RIDGE = 1e-9
 """Of the diagonal: the smooth prior of a broad band has fewer digits than double precision. Single
 residuals move by some hundredths of a standard deviation, their variance by less than 0.001."""
@@ -67,7 +67,7 @@ def stretch_of(frame: Frame, middle: int) -> Stretch | None:
         inside = (when >= low) & (when <= high) & (sizes > 0)
         at_once = int(np.bincount(when[nodes:][inside[nodes:]], minlength=1).max())
         width = 2 * (shake + bubble * at_once)
-        if 0 < int(sizes[inside].sum()) * width**2 <= _MOST_WORK:
+        if 0 < int(sizes[inside].sum()) * width <= _MOST_BAND:
             break
     else:
         return None

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 LAGS = 10
 _LEAST_PAIRS = 25
-_DRAWS = 48
+_DRAWS = 32
 _SURE = 1e-3
 _LONGEST_SEGMENT = 2048
 _MOST_BINS = 120

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from telerig.estimator.frontend.body import Bodies, fit_bodies
-from telerig.estimator.frontend.bubble_types import DETECTION_COLUMNS, HARMONICS
+from telerig.estimator.bubbles.outline.types import DETECTION_COLUMNS, HARMONICS
+from telerig.estimator.bubbles.shape.volume_centroid import Bodies, fit_bodies
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -24,13 +24,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from telerig.estimator.frontend.bubbles import detect_bubbles
-from telerig.estimator.frontend.matching import match_pairs
-from telerig.estimator.frontend.pair_geometry import pair_geometry, shared_axis, view_of
-from telerig.estimator.frontend.pair_model import estimate_pair_model
-from telerig.estimator.frontend.pair_types import Matches
-from telerig.io.images import read_image
-from telerig.io.openlpt import read_openlpt_cameras
+from telerig.estimator.bubbles.detect import detect_bubbles
+from telerig.estimator.bubbles.pairing.geometry import pair_geometry, shared_axis, view_of
+from telerig.estimator.bubbles.pairing.matching import match_pairs
+from telerig.estimator.bubbles.pairing.model import estimate_pair_model
+from telerig.estimator.bubbles.pairing.types import Matches
+from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
+from telerig.io.images.read import read_image
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 

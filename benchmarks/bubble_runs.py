@@ -22,10 +22,10 @@ import numpy as np
 import pandas as pd
 
 import telerig
-from telerig.estimator.imported_calibration import calibration_from_cameras
-from telerig.estimator.track_truth import TrackScore, score_tracks
-from telerig.io.run_presets import run_preset
-from telerig.io.simulation_scene import true_cameras
+from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.tracking.truth import TrackScore, score_tracks
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.run.presets import run_preset
 
 
 def run_one(

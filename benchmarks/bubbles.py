@@ -29,7 +29,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from telerig.estimator.frontend.bubbles import detect_bubbles, find_bubbles, outline_points
+from telerig.estimator.bubbles.detect import detect_bubbles, find_bubbles, outline_points
 
 sys.path.insert(0, str(Path(__file__).parent))
 from bubble_outline_renderer import Drawn, centre_bound_px, draw

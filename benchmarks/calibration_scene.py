@@ -10,20 +10,20 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.calibrate import nominal_cameras
-from telerig.estimator.eccentricity import eccentricity_px
-from telerig.estimator.measurements import problem_from_dots
-from telerig.estimator.problem import Problem, nominal_state
+from telerig.estimator.calibration.calibrate import nominal_cameras
+from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
+from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.factors.projection import State
-from telerig.io.simulation import exact_dots, rig_description
-from telerig.io.simulation_presets import SimulationConfig
-from telerig.io.simulation_scene import (
+from telerig.io.simulation.calibration.presets import SimulationConfig
+from telerig.io.simulation.calibration.scene import (
     TrueTarget,
     View,
     hand_held_views,
     true_cameras,
     true_target,
 )
+from telerig.io.simulation.simulate import exact_dots, rig_description
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.target import Target

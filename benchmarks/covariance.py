@@ -40,9 +40,9 @@ from rig_truth import (
 )
 from scipy.stats import chi2
 
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.io.simulation_presets import SimulationConfig, preset
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.io.simulation.calibration.presets import SimulationConfig, preset
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import telerig.estimator.frontend.dots as dots
+import telerig.estimator.dots.locate as dots
 
 sys.path.insert(0, str(Path(__file__).parent))
 from dot_renderer import Scene, centre_bound_px, picture, render, tilted_disc

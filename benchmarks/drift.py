@@ -21,20 +21,26 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 import telerig
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.camera_drift import (
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.rig_drift.drift import (
     DriftPrior,
     drift_covariance,
     free_directions,
     moved_pose,
     offset_roll_pitch,
 )
-from telerig.estimator.camera_drift_pairs import rig_change
-from telerig.estimator.smoother.model import CARRIAGE, BubbleModel, RigMode, ShakeModel, Zigzag
-from telerig.io.run_presets import RunConfig, run_preset
-from telerig.io.run_scene import RunScene, run_scene
-from telerig.io.run_sensors import stage_table
-from telerig.io.simulation_scene import true_cameras
+from telerig.estimator.rig_drift.from_pairs import rig_change
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    BubbleModel,
+    RigMode,
+    ShakeModel,
+    Zigzag,
+)
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.run.presets import RunConfig, run_preset
+from telerig.io.simulation.run.scene import RunScene, run_scene
+from telerig.io.simulation.run.sensors import stage_table
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 

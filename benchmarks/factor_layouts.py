@@ -23,9 +23,14 @@ import numpy as np
 from calibration_scene import make_scene
 from numpy.typing import NDArray
 
-from telerig.estimator import graph as product
-from telerig.estimator import initial
-from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem, parameter_unit, prior_sigma
+from telerig.estimator.calibration.solver import graph as product
+from telerig.estimator.calibration.solver.problem import (
+    GAUGE_SIGMA_MM,
+    Problem,
+    parameter_unit,
+    prior_sigma,
+)
+from telerig.estimator.calibration.start import known_target
 from telerig.factors.priors import (
     custom_factor,
     depth_gauge_residual,
@@ -33,7 +38,7 @@ from telerig.factors.priors import (
     distance_residual,
 )
 from telerig.factors.projection import Observations, State, whitened_residuals
-from telerig.io.simulation_presets import preset
+from telerig.io.simulation.calibration.presets import preset
 
 Array = NDArray[np.float64]
 
@@ -222,7 +227,7 @@ class Layout:
     # --- solvers
 
     def ours(self) -> tuple[float, int]:
-        """The product's loop (`telerig.estimator.graph.solve`) for any keys."""
+        """The product's loop (`telerig.estimator.calibration.solver.graph.solve`) for any keys."""
         factors, values = self.graph(), self.values()
         ordering = gtsam.Ordering()
         for key in self.sizes:
@@ -280,7 +285,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     problem = make_scene(preset("paper"), np.random.default_rng(1)).problem().with_model("radial")
-    start = initial.stereo_states(problem, problem.nominal_mm)[0]
+    start = known_target.stereo_states(problem, problem.nominal_mm)[0]
 
     def solved() -> tuple[float, int]:
         solution = product.solve(problem, start, relative=1e-9)

@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
 from shake_problem import true_model
 from shake_scene import LATERAL, LATERAL_SHAKE, cases, simulate
 
-from telerig.estimator.smoother.smooth import smooth
+from telerig.estimator.smoothing.smooth import smooth
 
 Array = NDArray[np.float64]
 

@@ -22,13 +22,13 @@ import numpy as np
 from calibration_scene import Scene, make_scene
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator import twins
-from telerig.estimator.graph import solve
-from telerig.estimator.initial import angle_between
-from telerig.estimator.problem import Problem, held_at_nominal
-from telerig.estimator.self_calibration import best_start, with_plate
+from telerig.estimator.calibration.self_calibration import best_start, with_plate
+from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
+from telerig.estimator.calibration.start import mirror_ambiguity
+from telerig.estimator.calibration.start.known_target import angle_between
 from telerig.factors.projection import State
-from telerig.io.simulation_presets import CameraConfig, SimulationConfig, preset
+from telerig.io.simulation.calibration.presets import CameraConfig, SimulationConfig, preset
 from telerig.rig.target import Target
 
 MODEL = "kappa+radial"
@@ -107,7 +107,7 @@ def judge(scene: Scene) -> tuple[str, str]:
     truth = scene.true_state(problem)
     try:
         start = best_start(problem, problem.nominal_mm)
-        start, _, _ = twins.choose_twin(start, problem, nominal)
+        start, _, _ = mirror_ambiguity.choose_twin(start, problem, nominal)
     except CalibrationError as error:
         return "refused", str(error.what)
     final = problem.with_model(MODEL)
@@ -126,7 +126,7 @@ def judge(scene: Scene) -> tuple[str, str]:
 
 
 def _cause(problem: Problem, truth: State, start: State, turn_deg: float) -> str:
-    mirrored = twins.twin_state(truth)
+    mirrored = mirror_ambiguity.twin_state(truth)
     turns = [
         np.degrees(angle_between(s.rig_from_camera[1, :3, :3], start.rig_from_camera[1, :3, :3]))
         for s in (truth, mirrored)

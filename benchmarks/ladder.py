@@ -30,14 +30,14 @@ from calibration_scene import Scene, make_scene
 from covariance import aligned
 from numpy.typing import NDArray
 
-from telerig.estimator.graph import solve
-from telerig.estimator.lens_models import name_of
-from telerig.estimator.model_start import model_start
-from telerig.estimator.problem import Problem, held_at_nominal, parameter_unit
-from telerig.estimator.results import cameras_from_state
-from telerig.estimator.self_calibration import choose_model
+from telerig.estimator.calibration.lens.start_values import model_start
+from telerig.estimator.calibration.result_from_fit import cameras_from_state
+from telerig.estimator.calibration.self_calibration import choose_model
+from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal, parameter_unit
 from telerig.factors.projection import State
-from telerig.io.simulation_presets import CameraConfig, SimulationConfig
+from telerig.io.simulation.calibration.presets import CameraConfig, SimulationConfig
+from telerig.rig.lens_models import name_of
 from telerig.rig.target import Target
 from telerig.rig.triangulation import triangulate
 

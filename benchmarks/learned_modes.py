@@ -20,25 +20,25 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
 from shake_learning_data import ARM_HZ, COMMON_HZ, run, true_model
 from shake_scene import cases, simulate
 
-from telerig.estimator import shake_labels
-from telerig.estimator.shake_channels import channels_of, pooled
-from telerig.estimator.shake_likelihood import maximise
-from telerig.estimator.shake_parameters import FORCE
-from telerig.estimator.smoother.model import ShakeModel, SmoothingProblem
-from telerig.estimator.smoother.smooth import smooth
-from telerig.estimator.smoother.solve import Options, solve
+from telerig.estimator.smoothing.graph.solve import Options, solve
+from telerig.estimator.smoothing.learning import mode_labels
+from telerig.estimator.smoothing.learning.likelihood import maximise
+from telerig.estimator.smoothing.learning.lines_of_sight import channels_of, pooled
+from telerig.estimator.smoothing.learning.parameters import FORCE
+from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+from telerig.estimator.smoothing.smooth import smooth
 
 Array = NDArray[np.float64]
 
 RIG_HZ, RIG_MM = 30.0, 0.5
 HIDDEN_MM = (0.0, 0.08, 0.15)
 LINE = "bubble.zigzags.1."
-PRIORS = {"as it is": shake_labels.expected, "all sizes alike": lambda line, own: np.ones(6)}
+PRIORS = {"as it is": mode_labels.expected, "all sizes alike": lambda line, own: np.ones(6)}
 
 
 def hidden(hidden_mm: float, seed: int) -> Iterable[tuple[str, float, float, float]]:
@@ -55,8 +55,8 @@ def hidden(hidden_mm: float, seed: int) -> Iterable[tuple[str, float, float, flo
     names = [LINE + last for last in ("frequency_hz", "damping", "rms_mm")]
     found = maximise(heights, told, names, steps=8).model
     for prior, expected in PRIORS.items():
-        with patch.object(shake_labels, "expected", expected):
-            model = shake_labels.doubted(heights, found, (0.0, 1.0, 0.0), problem.up)
+        with patch.object(mode_labels, "expected", expected):
+            model = mode_labels.doubted(heights, found, (0.0, 1.0, 0.0), problem.up)
         yield prior, *_heights(problem, model, lab)
 
 

@@ -21,22 +21,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from telerig.io.report import (
-    figures_coverage,
-    figures_dot,
-    figures_residuals,
-    figures_rig,
-    figures_target,
-    smoothing_figures,
-    smoothing_shake,
-)
-from telerig.io.report.calibration_results import read_results
-from telerig.io.report.figures_common import Picture
-from telerig.io.report.figures_rays import two_rays
-from telerig.io.report.results_cameras import run_cameras
-from telerig.io.report.smoothing_results import read_smoothing_results
-from telerig.io.report.track_figures_rays import ray_miss_histogram
-from telerig.io.report.track_results import read_track_results
+from telerig.io.report.calibration import coverage, dot_fit, residuals, rig, target
+from telerig.io.report.calibration.results import read_results
+from telerig.io.report.page.figures import Picture
+from telerig.io.report.run.smoothing import figures, shake
+from telerig.io.report.run.smoothing.results import read_smoothing_results
+from telerig.io.report.run.tracking.cameras import run_cameras
+from telerig.io.report.run.tracking.ray_miss import ray_miss_histogram
+from telerig.io.report.run.tracking.results import read_track_results
+from telerig.io.report.run.tracking.two_rays import two_rays
 
 DPI = 150
 COLOURS = 64
@@ -50,14 +43,14 @@ def _as_png(figure: Figure, stream: Any, **options: Any) -> None:
 
 def calibration_pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
     results = read_results(folder)
-    yield "rig", figures_rig.rig_plan(results)
-    yield "coverage", figures_coverage.coverage(results, 0)
-    yield "tilts", figures_coverage.tilts(results)
-    yield "residuals", figures_residuals.residual_field(results, 0)
-    yield "residual-histogram", figures_residuals.residual_histogram(results)
-    yield "target", figures_target.target_pictures(results)[0]
+    yield "rig", rig.rig_plan(results)
+    yield "coverage", coverage.coverage(results, 0)
+    yield "tilts", coverage.tilts(results)
+    yield "residuals", residuals.residual_field(results, 0)
+    yield "residual-histogram", residuals.residual_histogram(results)
+    yield "target", target.target_pictures(results)[0]
     with np.load(folder / "dot_example.npz") as example:
-        yield "dot", figures_dot.dot_pictures(dict(example))[-1]
+        yield "dot", dot_fit.dot_pictures(dict(example))[-1]
 
 
 def run_pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
@@ -71,11 +64,11 @@ def run_pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
     if smoothed is None:
         raise SystemExit(f"{folder} is not smoothed: telerig smooth first")
     up, first = 1, smoothed.cameras[0]
-    yield "closer", smoothing_figures.closer(smoothed, up)
-    yield "velocity", smoothing_figures.velocities(smoothed, up)
-    yield "shake", smoothing_shake.shake_in_time(smoothed, first, "y")
+    yield "closer", figures.closer(smoothed, up)
+    yield "velocity", figures.velocities(smoothed, up)
+    yield "shake", shake.shake_in_time(smoothed, first, "y")
 
-    spectra = smoothing_shake.shake_spectra(smoothed, first)
+    spectra = shake.shake_spectra(smoothed, first)
     if spectra is not None:
         yield "shake-spectra", spectra
 

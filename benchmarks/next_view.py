@@ -22,12 +22,12 @@ from calibration_scene import Scene, make_scene
 from numpy.typing import NDArray
 from rig_truth import without_advice
 
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import aligned_covariance
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.estimator.truth import space_error, working_volume
-from telerig.io.simulation_presets import SimulationConfig, preset
-from telerig.io.simulation_scene import View, hand_held_views, true_cameras, true_target
+from telerig.estimator.calibration.quality.truth import space_error, working_volume
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.estimator.calibration.solver.covariance import aligned_covariance
+from telerig.io.simulation.calibration.presets import SimulationConfig, preset
+from telerig.io.simulation.calibration.scene import View, hand_held_views, true_cameras, true_target
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
 Array = NDArray[np.float64]

@@ -18,9 +18,9 @@ import numpy as np
 import pandas as pd
 
 import telerig
-from telerig.estimator.calibrate import nominal_cameras, run_calibration
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.estimator.truth import space_error, true_cameras, working_volume
+from telerig.estimator.calibration.calibrate import nominal_cameras, run_calibration
+from telerig.estimator.calibration.quality.truth import space_error, true_cameras, working_volume
+from telerig.estimator.calibration.self_calibration import self_calibrate
 
 
 def main() -> None:

@@ -23,14 +23,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 from calibration_scene import make_scene
 
 import telerig
-from telerig.estimator.calibrate import run_calibration
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.estimator.smooth_truth import motion_error
-from telerig.estimator.track_truth import score_tracks
-from telerig.estimator.truth import working_volume
-from telerig.io.run_presets import run_preset
-from telerig.io.simulation_presets import preset
+from telerig.estimator.calibration.calibrate import run_calibration
+from telerig.estimator.calibration.quality.truth import working_volume
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.estimator.smoothing.truth import motion_error
+from telerig.estimator.tracking.truth import score_tracks
+from telerig.io.simulation.calibration.presets import preset
+from telerig.io.simulation.run.presets import run_preset
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation
 

@@ -19,8 +19,8 @@ from calibration_scene import Scene, make_scene
 from numpy.typing import NDArray
 from rig_truth import aligned, volume
 
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.io.simulation_presets import preset
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.io.simulation.calibration.presets import preset
 from telerig.rig.triangulation import triangulate
 
 Array = NDArray[np.float64]

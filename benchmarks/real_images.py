@@ -13,9 +13,9 @@ import time
 from pathlib import Path
 
 import telerig
-from telerig.estimator.calibrate import nominal_cameras
-from telerig.estimator.frontend.dataset_dots import detect_dataset
-from telerig.estimator.self_calibration import self_calibrate
+from telerig.estimator.calibration.calibrate import nominal_cameras
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.estimator.dots.dataset_dots import detect_dataset
 
 RIG = """
 schema = 1

@@ -28,19 +28,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.recording.description import DeviceDescription
-from telerig.io.recording.practice import practice_rig
 from telerig.io.recording.replay import DeviceRecord, replay
 from telerig.io.recording.session import record
-from telerig.io.recording.signals import (
+from telerig.io.recording.simulated.devices import SimulatedPorts, Truth
+from telerig.io.recording.simulated.practice import practice_rig
+from telerig.io.recording.simulated.signals import (
     Faults,
     SimulatedDevice,
     stage_position_mm,
     true_values,
 )
-from telerig.io.recording.simulators import SimulatedPorts, Truth
 from telerig.io.recording.tables import write_tables
-from telerig.io.rigfile import write_rig_toml
+from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.rig_file import write_rig_toml
 
 Array = NDArray[np.float64]
 

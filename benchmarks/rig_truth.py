@@ -11,16 +11,16 @@ import numpy as np
 from calibration_scene import Scene
 from numpy.typing import NDArray
 
-from telerig.estimator import self_calibration
-from telerig.estimator.array_system import ArraySystem
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import aligned_covariance, joint_covariance
-from telerig.estimator.eccentricity import eccentricity_px
-from telerig.estimator.graph import solve
-from telerig.estimator.problem import held_at_nominal
-from telerig.estimator.self_calibration import with_plate
-from telerig.io.simulation import exact_dots
-from telerig.io.simulation_presets import SimulationConfig
+from telerig.estimator.calibration import self_calibration
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.self_calibration import with_plate
+from telerig.estimator.calibration.solver.array_system import ArraySystem
+from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
+from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
+from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.problem import held_at_nominal
+from telerig.io.simulation.calibration.presets import SimulationConfig
+from telerig.io.simulation.simulate import exact_dots
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.projection import PARAMETERS

@@ -9,12 +9,12 @@ import pandas as pd
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from telerig.estimator.calibrate import nominal_cameras
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.io.simulation import exact_dots, rig_description
-from telerig.io.simulation_presets import CameraConfig, preset
-from telerig.io.simulation_scene import hand_held_views, true_cameras, true_target
+from telerig.estimator.calibration.calibrate import nominal_cameras
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.io.simulation.calibration.presets import CameraConfig, preset
+from telerig.io.simulation.calibration.scene import hand_held_views, true_cameras, true_target
+from telerig.io.simulation.simulate import exact_dots, rig_description
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
 from shake_cases import SCENARIOS, middle
 from shake_problem import true_model
 from shake_scene import LATERAL, LATERAL_SHAKE, Case, Run, simulate
 
-from telerig.estimator.smoother.model import ShakeModel
-from telerig.estimator.smoother.results import Smoothing
-from telerig.estimator.smoother.smooth import smooth
+from telerig.estimator.smoothing.problem.problem import ShakeModel
+from telerig.estimator.smoothing.result import Smoothing
+from telerig.estimator.smoothing.smooth import smooth
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from telerig.io.bubble_motion import Shake
+from telerig.io.simulation.run.motion import Shake
 
 Array = NDArray[np.float64]
 

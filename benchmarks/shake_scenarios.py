@@ -4,7 +4,7 @@ Usage: python benchmarks/shake_scenarios.py [--seeds 4] [--only S2,S3,zigzag] [-
     one,five,carriage,arms,references,oracle] [--models true,default] [--oblique] [--calibrated]
     [--seed 0] [--out FILE.md] [--csv FILE.csv] [--read FILE.csv ...]
 Every seed counts. Runs come from `shake_scene`; posteriors to compare with from the independent
-reference in tests/shake_reference.py.
+reference in tests/support/shake_reference.py.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
 from shake_calibration import calibrated
 from shake_cases import generate, middle, reference
@@ -29,8 +29,8 @@ from shake_problem import true_model
 from shake_scene import LATERAL, LATERAL_SHAKE, NONLINEAR, UP, Case, Run, cases, oblique, simulate
 
 from telerig.errors import TelerigError
-from telerig.estimator.smoother.results import Smoothing
-from telerig.estimator.smoother.smooth import smooth
+from telerig.estimator.smoothing.result import Smoothing
+from telerig.estimator.smoothing.smooth import smooth
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Runs for the smoother, in three dimensions and with the truth, made without its models.
 
-Bubbles, carriage and shake come from the simulator of motions (`telerig.io.bubble_motion`), the
-nonlinear ones from equations of motion integrated here; pixels from the cameras' projection.
+Bubbles, carriage and shake come from the simulator of motions (`telerig.io.simulation.run.motion`),
+the nonlinear ones from equations of motion integrated here; pixels from the cameras' projection.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 from shake_cases import (
     ARM_RATIO,
     COMMON,
@@ -39,11 +39,12 @@ from shake_cases import (
 from shake_forces import NONLINEAR as FORCED
 from shake_forces import nonlinear_shake
 
-from telerig.estimator.calibration import Calibration
-from telerig.io.bubble_motion import (
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.io.rig_file.description import AccelerometerDescription, StageDescription
+from telerig.io.simulation.run.motion import (
     Path as Motion,
 )
-from telerig.io.bubble_motion import (
+from telerig.io.simulation.run.motion import (
     Shake,
     accelerometer_readings,
     constant_speed_path,
@@ -53,7 +54,6 @@ from telerig.io.bubble_motion import (
     rig_shake,
     stochastic_paths,
 )
-from telerig.io.rig_description import AccelerometerDescription, StageDescription
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -191,7 +191,7 @@ def _carriage(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
     """Position and acceleration along the axis, the servo's error included."""
     place, push = RISE_MM_S * t, np.zeros_like(t)
     if case.ramp_s > 0:
-        from telerig.io.bubble_motion import stage_trajectory
+        from telerig.io.simulation.run.motion import stage_trajectory
 
         place, _, push = stage_trajectory(t, RISE_MM_S, case.ramp_s)
     servo = rig_mode(*SERVO, FORCE_HZ)

@@ -1,8 +1,8 @@
 """What is possible in each scenario of the smoother: exact posteriors, checked by runs.
 
 Usage: python benchmarks/shake_table.py [--runs 50] [--seed 0] [--out FILE.md]
-The estimator is tests/shake_reference.py, which shares no code with the product; the runs come
-from the product's simulator of motions.
+The estimator is tests/support/shake_reference.py, which shares no code with the product; the runs
+come from the product's simulator of motions.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 from shake_cases import SCENARIOS, Runs, Scenario, generate, middle, naive, reference
 
 Array = NDArray[np.float64]
@@ -143,16 +143,17 @@ def main() -> None:
     text = f"""# What is possible: exact posteriors of the scenarios
 
 Standard deviations in the middle 80 % of a run, position um / velocity mm/s, by the independent
-reference (`tests/shake_reference.py`) with true hyper-parameters; in brackets the table of the
-design. naive and rts (a smoother with the bubble's own priors and no shake) are RMS errors over
-{options.runs} runs, so they scatter; the design does not say how its RTS was tuned. "worst": the
+reference (`tests/support/shake_reference.py`) with true hyper-parameters; in brackets the
+table of the design. naive and rts (a smoother with the bubble's own priors and no shake) are RMS
+errors over {options.runs} runs, so they scatter; the design does not say how its RTS was tuned.
+"worst": the
 largest difference of a posterior from the design's figure, beyond the rounding of that figure.
 
 {chr(10).join(table(found))}
 
 ## The same over {options.runs} runs of an independent generator
 
-The generator is `telerig.io.bubble_motion`. RMS error of position and velocity, the mean of
+The generator is `telerig.io.simulation.run.motion`. RMS error of position and velocity, the mean of
 (error / sd)^2, and in brackets its distance from 1 in standard errors over the runs.
 
 | | information | posterior | RMS error | position | velocity |

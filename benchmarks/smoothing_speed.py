@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
 from shake_cases import SCENARIOS
 from shake_scene import Case, Run, simulate
 
-from telerig.estimator.smoother.smooth import problem_of, smooth
-from telerig.estimator.smoother.solve import solve
+from telerig.estimator.smoothing.graph.solve import solve
+from telerig.estimator.smoothing.smooth import problem_of, smooth
 
 
 def run_of(frames: int, rate_hz: float = 500.0) -> Run:

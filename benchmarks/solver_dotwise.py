@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from solver_scipy import right_jacobian
 
-from telerig.estimator.array_system import ArraySystem
-from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem
+from telerig.estimator.calibration.solver.array_system import ArraySystem
+from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem
 from telerig.factors.priors import (
     custom_factor,
     depth_gauge_residual,

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator import initial
-from telerig.estimator.problem import Problem, matrix_from_camera
+from telerig.estimator.calibration.solver.problem import Problem, matrix_from_camera
+from telerig.estimator.calibration.start import known_target
 from telerig.factors.projection import Observations, State, pixels
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
@@ -54,7 +54,7 @@ def make_problem(views: int, dots: int, rng: np.random.Generator) -> tuple[Probl
         np.full((dots, 3), PRINT_MM), view, camera, dot, uv, variance, np.ones(len(view)),
         ((), ()), ((0, far), length, 0.001), np.zeros((views, 2)),
     ).with_model(MODEL)  # fmt: skip
-    return problem, initial.stereo_states(problem, flat)[0]
+    return problem, known_target.stereo_states(problem, flat)[0]
 
 
 def _truth(cameras: list[Camera], dots: Array, views: int, rng: np.random.Generator) -> State:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import block_diag, csr_array
 
-from telerig.estimator.array_system import ArraySystem
-from telerig.estimator.problem import GAUGE_SIGMA_MM, Problem
+from telerig.estimator.calibration.solver.array_system import ArraySystem
+from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem
 from telerig.factors.priors import depth_gauge_residual, distance_residual
 from telerig.factors.projection import State, whitened_residuals
 from telerig.rig.pose import hat

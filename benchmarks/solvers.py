@@ -32,9 +32,9 @@ from typing import Any
 import numpy as np
 from solver_problem import make_problem
 
-from telerig.estimator import array_system, graph
-from telerig.estimator.array_system import ArraySystem
-from telerig.estimator.problem import Problem
+from telerig.estimator.calibration.solver import array_system, graph
+from telerig.estimator.calibration.solver.array_system import ArraySystem
+from telerig.estimator.calibration.solver.problem import Problem
 from telerig.factors.projection import State
 
 SIZES = ("12x15", "12x100", "50x400", "200x400", "200x2000")

@@ -31,11 +31,11 @@ from rig_truth import aligned, bound_covariance, volume, without_advice
 
 import telerig
 from telerig.errors import TelerigError
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.covariance import aligned_shift
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.estimator.truth import space_error, true_cameras
-from telerig.io.simulation_presets import SimulationConfig, preset
+from telerig.estimator.calibration.quality.truth import space_error, true_cameras
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.estimator.calibration.solver.covariance import aligned_shift
+from telerig.io.simulation.calibration.presets import SimulationConfig, preset
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 

@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 
 import telerig
-from telerig.estimator.imported_calibration import calibration_from_cameras
-from telerig.io.run_presets import run_preset
-from telerig.io.simulation_scene import true_cameras
+from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.run.presets import run_preset
 
 TRACK = """
 import resource, sys, runpy

@@ -1,1 +1,5 @@
-"""The back end: initialisation, self-calibration, covariance, diagnostics."""
+"""The stages of the data's way, from images and sensors to calibrations and trajectories.
+
+Order of the stages: ``images``, ``dots``, ``bubbles``, ``marks``, ``calibration``, ``rig_drift``,
+``tracking``, ``sensors``, ``smoothing``, ``batch``. A stage knows only stages before it.
+"""

@@ -11,11 +11,11 @@ import numpy as np
 
 from telerig.errors import TelerigError
 from telerig.estimator.batch.jobs import check_run_name
-from telerig.io.dataset import Dataset, load_dataset
-from telerig.io.doctor import Check
+from telerig.io.dataset.dataset import Dataset, load_dataset
+from telerig.io.machine.installation import Check
 
 if TYPE_CHECKING:
-    from telerig.io.run_data import RunData
+    from telerig.io.dataset.run_data import RunData
 
 FEWEST_VIEWS = 6
 _GOOD_VIEWS = 10
@@ -132,7 +132,7 @@ def _clocks(run: RunData, what: str) -> Iterator[Check]:
 
 
 def _sensors(run: RunData, what: str) -> Iterator[Check]:
-    from telerig.estimator.sensor_checks import check_sensors
+    from telerig.estimator.sensors.checks import check_sensors
 
     try:
         warnings = check_sensors(run)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.factors.projection import Observations
-from telerig.rig.walls import Wall
+from telerig.rig.windows import Wall
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

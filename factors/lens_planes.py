@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.factors.image_rows import ImageRows
-from telerig.rig import projection, walls
+from telerig.rig import projection, windows
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
@@ -104,10 +104,10 @@ def _behind_walls(points: Array, lens: Lens, rows: ImageRows, derivatives: bool)
             continue
         stands = projection.standing_wall(intrinsics, wall)
         if not derivatives:
-            seen_at = walls.ideal_from_water(in_camera, kappa, stands)
+            seen_at = windows.ideal_from_water(in_camera, kappa, stands)
             xy[:, images] = np.moveaxis(seen_at, -1, 0) / rho
             continue
-        seen = walls.ideal_jacobians(in_camera, kappa, stands)
+        seen = windows.ideal_jacobians(in_camera, kappa, stands)
         xy[:, images] = np.moveaxis(seen.value, -1, 0) / rho
         by_point[:, :, images] = np.moveaxis(seen.by_point, (-2, -1), (0, 1)) / rho
         by_kappa[:, images] = np.moveaxis(seen.by_kappa, -1, 0) / rho

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from telerig.rig import projection
 from telerig.rig.pose import hat
-from telerig.rig.walls import Wall
+from telerig.rig.windows import Wall
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

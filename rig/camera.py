@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import GeometryError
-from telerig.rig import projection, walls
+from telerig.rig import projection, windows
 from telerig.rig.pose import Pose
 from telerig.rig.projection import INDEX, PARAMETERS
-from telerig.rig.walls import Wall
+from telerig.rig.windows import Wall
 
 Array = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ class Camera:
         ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), self.intrinsics, self.rho_mm)
         if self.wall is not None:
             stands = projection.standing_wall(self.intrinsics, self.wall)
-            return self._in_rig(*walls.water_from_ideal(ideal, self["kappa_per_mm"], stands))
+            return self._in_rig(*windows.water_from_ideal(ideal, self["kappa_per_mm"], stands))
         zero, one = np.zeros((*ideal.shape[:-1], 1)), np.ones((*ideal.shape[:-1], 1))
         origin = np.concatenate([ideal, zero], -1)
         direction = np.concatenate([self["kappa_per_mm"] * ideal, one], -1)

@@ -9,8 +9,8 @@ tangent vector of the tilt and w = 1 / image distance (object-space mm):
 w = 0 is the bilateral telecentric lens (an affine stretch, even in q: the sign of the tilt is
 unobservable); w > 0 the object-side telecentric one (a homography).
 
-Behind a glass wall the first step is `telerig.rig.walls`; wall_x_rad and wall_y_rad turn the wall's
-stated normal (`Wall.turned`) and mean nothing without a wall.
+Behind a glass wall the first step is `telerig.rig.windows`; wall_x_rad and wall_y_rad turn the
+wall's stated normal (`Wall.turned`) and mean nothing without a wall.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.rig import distortion, walls
-from telerig.rig.walls import Wall
+from telerig.rig import distortion, windows
+from telerig.rig.windows import Wall
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def pixel_from_camera(
         telecentric = points_mm[..., :2] / (1 + intrinsics[_KAPPA] * points_mm[..., 2:3])
     else:
         stands = standing_wall(intrinsics, wall)
-        telecentric = walls.ideal_from_water(points_mm, float(intrinsics[_KAPPA]), stands)
+        telecentric = windows.ideal_from_water(points_mm, float(intrinsics[_KAPPA]), stands)
     distorted = distortion.distort(telecentric / rho_mm, intrinsics[_DISTORTION]) * rho_mm
     return _pixel_from_sensor(sensor_from_distorted(distorted, intrinsics), intrinsics)
 
@@ -124,7 +124,7 @@ def _behind_wall(
     points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall
 ) -> tuple[Array, Array, Array]:
     stands = standing_wall(intrinsics, wall)
-    seen = walls.ideal_jacobians(points_mm, float(intrinsics[_KAPPA]), stands)
+    seen = windows.ideal_jacobians(points_mm, float(intrinsics[_KAPPA]), stands)
     uv, by_ideal, by_intrinsics = _lens_jacobians(seen.value, intrinsics, rho_mm)
     by_intrinsics[..., _KAPPA] = np.einsum("...ij,...j->...i", by_ideal, seen.by_kappa)
     by_turn = seen.by_wall[..., :2] @ wall.turn_jacobian(intrinsics[_WALL])

@@ -11,7 +11,7 @@ from telerig.errors import GeometryError, InputError
 from telerig.rig import distortion, projection
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX
-from telerig.rig.walls import affine_map
+from telerig.rig.windows import affine_map
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import time
 from telerig.errors import TelerigError
 from telerig.estimator.batch.jobs import Job
 from telerig.estimator.batch.work import FAILED, do_job, failure
-from telerig.io.atomic import plain
+from telerig.io.files.atomic import plain
 
 _PATIENCE_S = 10.0
 

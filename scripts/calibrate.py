@@ -20,11 +20,11 @@ from telerig.scripts.console import (
 )
 
 if TYPE_CHECKING:
-    from telerig.estimator.calibrate import CalibrationRun
-    from telerig.estimator.calibration import Calibration
-    from telerig.estimator.compare_calibrations import RigComparison
-    from telerig.estimator.frontend.dataset_dots import DatasetDots
-    from telerig.io.dataset import Dataset
+    from telerig.estimator.calibration.calibrate import CalibrationRun
+    from telerig.estimator.calibration.quality.comparison import RigComparison
+    from telerig.estimator.calibration.result.calibration import Calibration
+    from telerig.estimator.dots.dataset_dots import DatasetDots
+    from telerig.io.dataset.dataset import Dataset
 
 
 def calibrate(
@@ -90,8 +90,8 @@ def calibrate(
     used, with what, where and what to do. 130: interrupted.
     """
     with errors_in_words():
-        from telerig.estimator.calibrate import check_options
-        from telerig.estimator.calibration_results import report_beside, write_results
+        from telerig.estimator.calibration.calibrate import check_options
+        from telerig.estimator.calibration.results_folder import report_beside, write_results
 
         begun = time.perf_counter()
         options: dict[str, Any] = {"model": model, "solver": solver, "dots": dots, "medium": medium,
@@ -135,8 +135,8 @@ def _at_once(
     found: Callable[[DatasetDots], object] | None,
 ) -> tuple[Dataset, CalibrationRun]:
     """The dataset as it lies there, and its calibration. found : called when dots are detected."""
-    from telerig.estimator.calibrate import check_options, detect, run_calibration
-    from telerig.io.dataset import load_dataset
+    from telerig.estimator.calibration.calibrate import check_options, detect, run_calibration
+    from telerig.io.dataset.dataset import load_dataset
 
     if until_um is not None:
         raise InputError("--until-um goes with --watch", todo="add --watch, or leave it")
@@ -151,9 +151,9 @@ def _at_once(
 
 def _earlier(path: Path, dataset: Path) -> Calibration:
     """The calibration to compare with, checked to be of this rig before anything is solved."""
-    from telerig.estimator.calibration import load_calibration
-    from telerig.estimator.compare_calibrations import check_same_rig
-    from telerig.io.dataset import load_dataset
+    from telerig.estimator.calibration.quality.comparison import check_same_rig
+    from telerig.estimator.calibration.result.calibration import load_calibration
+    from telerig.io.dataset.dataset import load_dataset
 
     kept = path / "results" / "calibration"
     earlier = load_calibration(kept if (kept / "calibration.json").is_file() else path)
@@ -163,7 +163,7 @@ def _earlier(path: Path, dataset: Path) -> Calibration:
 
 
 def _change(earlier: Calibration, now: Calibration) -> RigComparison:
-    from telerig.estimator.compare_calibrations import compare_calibrations
+    from telerig.estimator.calibration.quality.comparison import compare_calibrations
 
     return compare_calibrations(earlier, now)
 
@@ -172,8 +172,8 @@ def _watched(
     dataset: Path, source: str | None, until_um: float | None, poll: float, chosen: dict[str, Any]
 ) -> tuple[Dataset, CalibrationRun]:
     """The images that arrived, and their calibration."""
-    from telerig.estimator.watch import watch
-    from telerig.io.dataset import load_dataset
+    from telerig.estimator.calibration.watch import watch
+    from telerig.io.dataset.dataset import load_dataset
 
     if source == "dots":
         raise InputError("--watch waits for images", todo="leave out --from dots")

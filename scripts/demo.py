@@ -12,9 +12,9 @@ import typer
 from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, say
 
 if TYPE_CHECKING:
-    from telerig.estimator.calibration import Calibration
-    from telerig.io.dataset import Dataset
-    from telerig.io.run_presets import RunConfig
+    from telerig.estimator.calibration.result.calibration import Calibration
+    from telerig.io.dataset.dataset import Dataset
+    from telerig.io.simulation.run.presets import RunConfig
 
 
 def demo(
@@ -32,10 +32,10 @@ def demo(
     with errors_in_words():
         import numpy as np
 
-        from telerig.estimator.calibrate import run_calibration
-        from telerig.estimator.calibration_results import write_results
-        from telerig.estimator.truth import compare_with_truth
-        from telerig.io.simulation import simulate
+        from telerig.estimator.calibration.calibrate import run_calibration
+        from telerig.estimator.calibration.quality.truth import compare_with_truth
+        from telerig.estimator.calibration.results_folder import write_results
+        from telerig.io.simulation.simulate import simulate
 
         say("simulating two telecentric cameras of 512 x 512 px: 12 views of a hand-held target,")
         say("and a bubble of 5 mm that zigzags upwards, followed by the vibrating rig")
@@ -67,7 +67,7 @@ def demo(
 
 def _config() -> RunConfig:
     """The run of 2004, with an accelerometer on each camera's arm."""
-    from telerig.io.run_presets import run_preset
+    from telerig.io.simulation.run.presets import run_preset
 
     config = run_preset("rise")
     return replace(config, stage=replace(config.stage, accelerometers=("left", "right")))
@@ -79,11 +79,11 @@ def track_and_compare(
     """Track the only run of a simulated dataset; whether the bubble was followed throughout."""
     import pandas as pd
 
-    from telerig.estimator.track_results import write_tracking
-    from telerig.estimator.track_run import TrackOptions
-    from telerig.estimator.track_truth import score_tracks
-    from telerig.estimator.track_words import tracking_words
-    from telerig.estimator.tracks import load_tracks
+    from telerig.estimator.tracking.results_folder import write_tracking
+    from telerig.estimator.tracking.track import TrackOptions
+    from telerig.estimator.tracking.tracks import load_tracks
+    from telerig.estimator.tracking.truth import score_tracks
+    from telerig.estimator.tracking.wording import tracking_words
 
     begun = time.perf_counter()
     (name,) = data.runs
@@ -112,9 +112,9 @@ def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> 
     """Smooth with and without the accelerometers; whether they bring the path near the truth."""
     import pandas as pd
 
-    from telerig.estimator.smooth_run import smooth_run
-    from telerig.estimator.smooth_truth import motion_error
-    from telerig.estimator.smooth_words import smoothing_words
+    from telerig.estimator.smoothing.results_folder import smooth_run
+    from telerig.estimator.smoothing.truth import motion_error
+    from telerig.estimator.smoothing.wording import smoothing_words
 
     (name,) = data.runs
     folder = data.results / name

@@ -23,11 +23,11 @@ def detect(
     dot-like thing that was left out, with the reason) and overlays/<camera>/<view>.jpg.
     """
     with errors_in_words():
-        from telerig.estimator.calibration_results import write_detections
-        from telerig.estimator.frontend.dataset_dots import detect_dataset
-        from telerig.io.atomic import atomic_folder
-        from telerig.io.dataset import load_dataset
-        from telerig.io.tables import write_table
+        from telerig.estimator.calibration.results_folder import write_detections
+        from telerig.estimator.dots.dataset_dots import detect_dataset
+        from telerig.io.dataset.dataset import load_dataset
+        from telerig.io.dataset.tables import write_table
+        from telerig.io.files.atomic import atomic_folder
 
         data = load_dataset(dataset, source="images")
         with progress(quiet) as stage:

@@ -26,7 +26,7 @@ def doctor(
     """
     with errors_in_words():
         from telerig.estimator.doctor import check_dataset
-        from telerig.io.doctor import check_installation, check_ports
+        from telerig.io.machine.installation import check_installation, check_ports
 
         checks = [*check_installation(), *check_ports()]
         if dataset is not None:

@@ -13,7 +13,7 @@ from telerig.scripts.console import errors_in_words, say
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from telerig.io.export.volume import Volume
+    from telerig.io.exchange.export.volume import Volume
     from telerig.rig.camera import Camera
 
 
@@ -82,8 +82,8 @@ def _export(
     volume: Volume | None,
     polynomial: dict[str, Any],
 ) -> list[str]:
-    from telerig.io.export.results import read_results
-    from telerig.io.export.write import (
+    from telerig.io.exchange.export.run_results import read_results
+    from telerig.io.exchange.export.write import (
         CAMERA_FORMATS,
         RUN_FORMATS,
         SUFFIXES,
@@ -137,7 +137,7 @@ def results_root(source: Path) -> Path:
 
 def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Sequence[Camera]:
     """Of --calibration, of a calibration.json, or of the dataset's own; () where there is none."""
-    from telerig.estimator.calibration import load_calibration
+    from telerig.estimator.calibration.result.calibration import load_calibration
 
     trials = [results_root(source) / "calibration" / "calibration.json"]
     if source.suffix == ".json":
@@ -184,7 +184,7 @@ def run_folder(source: Path, run: str | None) -> Path:
 
 def volume_from(words: str | None) -> Volume | None:
     """A `Volume` from six numbers; None for None. Raises InputError for anything else."""
-    from telerig.io.export.volume import volume_of
+    from telerig.io.exchange.export.volume import volume_of
 
     if words is None:
         return None

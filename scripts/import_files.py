@@ -30,7 +30,7 @@ SigmaPx = Annotated[float, typer.Option(help="Pixel noise to go with the cameras
 def openlpt(files: Files, out: Out, names: Names = None, sigma_px: SigmaPx = 0.1) -> None:
     """Import OpenLPT's pinhole cameras (cam1.txt ...)."""
     with errors_in_words():
-        from telerig.io.openlpt import read_openlpt_cameras
+        from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 
         cameras, _ = read_openlpt_cameras(files, split(names))
         write_cameras(cameras, "OpenLPT", files, out, sigma_px)
@@ -49,7 +49,7 @@ def opencv(
 ) -> None:
     """Import a stereo calibration of OpenCV (YAML, XML or JSON: M1 D1 M2 D2 R T)."""
     with errors_in_words():
-        from telerig.io.importing.opencv import read_opencv_cameras
+        from telerig.io.exchange.importing.opencv import read_opencv_cameras
 
         size = None if image_size is None else pair(image_size, "--image-size")
         cameras, _ = read_opencv_cameras(
@@ -78,7 +78,7 @@ def openptv(
     Give --ptv-par, or --image-size and --pixel-mm.
     """
     with errors_in_words():
-        from telerig.io.importing.openptv import Sensor, read_openptv_cameras, read_ptv_par
+        from telerig.io.exchange.importing.openptv import Sensor, read_openptv_cameras, read_ptv_par
 
         if ptv_par is not None:
             sensor = read_ptv_par(ptv_par)
@@ -113,7 +113,7 @@ def accelerometer(
 ) -> None:
     """Add a sensor's recording to a run's accelerometer.csv; other sensors' readings stay."""
     with errors_in_words():
-        from telerig.io.importing.accelerometer import (
+        from telerig.io.exchange.importing.accelerometer import (
             layout_from,
             merge_accelerations,
             read_accelerations,
@@ -159,9 +159,9 @@ def write_cameras(
     notes: Sequence[str] = (),
 ) -> None:
     """calibration.json (held fixed) and nominal.toml (a start for a calibration of one's own)."""
-    from telerig.estimator.imported_calibration import calibration_from_cameras
-    from telerig.io.atomic import write_text_atomic
-    from telerig.io.importing.nominals import nominal_toml
+    from telerig.estimator.calibration.result.imported import calibration_from_cameras
+    from telerig.io.exchange.importing.nominals import nominal_toml
+    from telerig.io.files.atomic import write_text_atomic
 
     source = f"imported from {program}: {', '.join(str(file) for file in files)}"
     calibration = calibration_from_cameras(

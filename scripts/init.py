@@ -28,7 +28,7 @@ def init(
     Exit code 0: made. 2: there is a rig.toml already, or a value cannot be.
     """
     with errors_in_words():
-        from telerig.io.new_dataset import new_dataset
+        from telerig.io.dataset.new_dataset import new_dataset
 
         first, *rest = [name.strip() for name in cameras.split(",")]
         if len(rest) != 1:

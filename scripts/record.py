@@ -12,8 +12,8 @@ from telerig.errors import InputError
 from telerig.scripts.console import errors_in_words, say, stopped_by_signals
 
 if TYPE_CHECKING:
-    from telerig.io.recording.description import DeviceDescription
-    from telerig.io.rig_description import RigDescription
+    from telerig.io.rig_file.description import RigDescription
+    from telerig.io.rig_file.device_description import DeviceDescription
 
 
 def record(
@@ -91,7 +91,7 @@ def _recorded(
 
 
 def _rig(run: Path, rig: Path | None) -> RigDescription:
-    from telerig.io.rigfile import read_rig_toml
+    from telerig.io.rig_file.rig_file import read_rig_toml
 
     file = rig or run.resolve().parent.parent / "rig.toml"
     if rig is None and not file.is_file():
@@ -113,7 +113,7 @@ def _rig(run: Path, rig: Path | None) -> RigDescription:
 
 def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
     """The rig's devices, with the ports that the command line gives."""
-    from telerig.io.rig_description import suggestion
+    from telerig.io.rig_file.description import suggestion
 
     given: dict[str, str] = {}
     for text in ports:

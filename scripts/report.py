@@ -13,7 +13,7 @@ from telerig.errors import InputError
 from telerig.scripts.console import errors_in_words, progress, say
 
 if TYPE_CHECKING:
-    from telerig.io.report.film_files import Progress
+    from telerig.io.report.film.files import Progress
     from telerig.io.report.remake import ResultsFolder
 
 
@@ -55,7 +55,7 @@ def report(
     Exit code 0: written. 2: the input cannot be used. 130: interrupted.
     """
     with errors_in_words():
-        from telerig.io.report.film_files import need_av
+        from telerig.io.report.film.files import need_av
         from telerig.io.report.remake import remake_report, results_folders
 
         found = results_folders(folder)
@@ -87,7 +87,7 @@ def _film(
     results: ResultsFolder, place: Path, kind: FilmFormat, run: Path | None, stage: Progress
 ) -> None:
     """Both films; the second only where the recording's images are at hand."""
-    from telerig.io.report.film import write_path_film
+    from telerig.io.report.film.film import write_path_film
 
     endings = ("mp4", "gif") if kind is FilmFormat.both else (kind.value,)
     files = [place / f"path.{ending}" for ending in endings]
@@ -104,9 +104,9 @@ def _film(
 def _film_views(
     folder: Path, recording: Path, files: list[Path], stage: Progress
 ) -> tuple[str, ...]:
-    from telerig.io.report.film_views import write_views_film
-    from telerig.io.report.track_results import read_track_results
-    from telerig.io.run import load_run
+    from telerig.io.dataset.run import load_run
+    from telerig.io.report.film.views import write_views_film
+    from telerig.io.report.run.tracking.results import read_track_results
 
     tracked = read_track_results(folder)
     sizes = {c: s for c in tracked.cameras if (s := tracked.image_size_px(c)) is not None}

@@ -12,8 +12,8 @@ from telerig.errors import InputError
 from telerig.scripts.console import errors_in_words, say
 
 if TYPE_CHECKING:
-    from telerig.io.run_presets import RunConfig
-    from telerig.io.simulation_presets import SimulationConfig
+    from telerig.io.simulation.calibration.presets import SimulationConfig
+    from telerig.io.simulation.run.presets import RunConfig
 
 
 def simulate(
@@ -66,7 +66,7 @@ def simulate(
             return
         preset, out = _both(preset, out)
 
-        from telerig.io.simulation import simulate as run
+        from telerig.io.simulation.simulate import simulate as run
 
         run_only = {"frames": frames, "bubbles": bubbles}
         stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale}
@@ -90,7 +90,7 @@ def _both(preset: str | None, out: Path | None) -> tuple[str, Path]:
 def _settings(
     name: str, run: dict[str, int | None], stage: dict[str, Any]
 ) -> SimulationConfig | RunConfig:
-    from telerig.io.run_presets import RUN_PRESETS, any_preset, run_preset
+    from telerig.io.simulation.run.presets import RUN_PRESETS, any_preset, run_preset
 
     changes: dict[str, Any] = {key: value for key, value in run.items() if value is not None}
     moved = {key: value for key, value in stage.items() if value is not None}
@@ -112,8 +112,8 @@ def _with_strip(
     name: str, settings: SimulationConfig | RunConfig, dots: int | None, images: bool
 ) -> SimulationConfig | RunConfig:
     """In the images, or in `references.csv` where there are none."""
-    from telerig.io.run_presets import RunConfig
-    from telerig.io.strip_config import StripConfig
+    from telerig.io.simulation.run.mark_strip_config import StripConfig
+    from telerig.io.simulation.run.presets import RunConfig
 
     if dots is None:
         return settings

@@ -16,10 +16,10 @@ def simulate_devices(out: Path | None, seconds: float | None, rng: Generator) ->
     """Print the ports' names; with ``out`` also write a dataset whose rig.toml has them."""
     if sys.platform == "win32":
         raise InputError("Windows has no pseudo-terminals", todo="practise on Linux or macOS")
-    from telerig.io.recording.practice import practice_devices, practice_rig
-    from telerig.io.recording.simulators import SimulatedPorts
-    from telerig.io.rig_writer import rig_toml
-    from telerig.io.rigfile import write_rig_toml
+    from telerig.io.recording.simulated.devices import SimulatedPorts
+    from telerig.io.recording.simulated.practice import practice_devices, practice_rig
+    from telerig.io.rig_file.rig_file import write_rig_toml
+    from telerig.io.rig_file.writer import rig_toml
 
     if out is not None and (out / "rig.toml").exists():
         raise InputError(

@@ -43,10 +43,10 @@ def smooth(
     Exit code 0: smoothed, whatever the verdict. 2: the input cannot be used. 130: interrupted.
     """
     with errors_in_words():
-        from telerig.estimator.smooth_run import smooth_run
-        from telerig.estimator.smooth_words import smoothing_words
-        from telerig.estimator.track_calibration import calibration_for
-        from telerig.io.run import load_run
+        from telerig.estimator.smoothing.results_folder import smooth_run
+        from telerig.estimator.smoothing.wording import smoothing_words
+        from telerig.estimator.tracking.calibration_of_run import calibration_for
+        from telerig.io.dataset.run import load_run
         from telerig.scripts.track import any_source, cameras_without_rig, default_folder
 
         calibrated, files = calibration_for(run, calibration)

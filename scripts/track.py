@@ -12,7 +12,7 @@ from telerig.errors import InputError
 from telerig.scripts.console import errors_in_words, progress, say
 
 if TYPE_CHECKING:
-    from telerig.estimator.calibration import Calibration
+    from telerig.estimator.calibration.result.calibration import Calibration
 
 
 def track(
@@ -42,11 +42,11 @@ def track(
     """
     with errors_in_words():
         from telerig.estimator.batch.jobs import check_run_name
-        from telerig.estimator.track_calibration import calibration_for
-        from telerig.estimator.track_results import write_tracking
-        from telerig.estimator.track_run import TrackOptions
-        from telerig.estimator.track_words import tracking_words
-        from telerig.io.run import load_run
+        from telerig.estimator.tracking.calibration_of_run import calibration_for
+        from telerig.estimator.tracking.results_folder import write_tracking
+        from telerig.estimator.tracking.track import TrackOptions
+        from telerig.estimator.tracking.wording import tracking_words
+        from telerig.io.dataset.run import load_run
 
         if out is None:
             check_run_name(run)

@@ -18,13 +18,13 @@ import pandas as pd
 import pytest
 from run_files import LEFT, RIG, RIGHT, write_images
 
-from telerig.estimator.calibrate import nominal_cameras
-from telerig.estimator.calibration import Calibration
-from telerig.estimator.self_calibration import self_calibrate
-from telerig.io import parallel
-from telerig.io.simulation import exact_dots, rig_description
-from telerig.io.simulation_presets import SimulationConfig, preset
-from telerig.io.simulation_scene import View, hand_held_views, true_cameras, true_target
+from telerig.estimator.calibration.calibrate import nominal_cameras
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.io.machine import parallel
+from telerig.io.simulation.calibration.presets import SimulationConfig, preset
+from telerig.io.simulation.calibration.scene import View, hand_held_views, true_cameras, true_target
+from telerig.io.simulation.simulate import exact_dots, rig_description
 from telerig.rig.camera import Camera
 from telerig.rig.target import Target
 

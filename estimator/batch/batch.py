@@ -19,7 +19,7 @@ from telerig.estimator.batch.work import (
     perform,
     stop_all,
 )
-from telerig.io.parallel import cores
+from telerig.io.machine.parallel import cores
 
 Told = Callable[[Job, dict[str, Any], int, int], None]
 """Progress: (job, its record, done, of)."""

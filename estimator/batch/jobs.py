@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from telerig import __version__
 from telerig.errors import InputError
-from telerig.io.dataset import load_dataset
+from telerig.io.dataset.dataset import load_dataset
 
 Kind = Literal["calibrate", "track", "smooth"]
 
@@ -171,8 +171,8 @@ def check_run_name(run: Path) -> None:
 def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
     """Raise InputError for a calibration that is not there, an unknown lens model or medium."""
     from telerig.errors import CalibrationError
-    from telerig.estimator.calibrate import checked_medium
-    from telerig.estimator.lens_models import checked_model
+    from telerig.estimator.calibration.calibrate import checked_medium
+    from telerig.rig.lens_models import checked_model
 
     if calibration is not None and not Path(calibration).exists():
         raise InputError(

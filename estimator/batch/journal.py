@@ -10,7 +10,7 @@ from typing import Any
 
 from telerig.estimator.batch.jobs import Job, fingerprint
 from telerig.estimator.batch.work import DONE
-from telerig.io.atomic import write_json_atomic
+from telerig.io.files.atomic import write_json_atomic
 
 FOLDER = "jobs"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telerig.estimator.batch.work import DONE
-from telerig.io.atomic import write_json_atomic
-from telerig.io.tables import write_table
+from telerig.io.dataset.tables import write_table
+from telerig.io.files.atomic import write_json_atomic
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +48,7 @@ def write_batch(
     content = {"schema": 1, "kind": "telerig batch", "jobs": list(records)}
     write_json_atomic(folder / "batch.json", content)
     if report:
-        from telerig.io.report.batch_report import write_batch_report
+        from telerig.io.report.batch.report import write_batch_report
 
         write_batch_report(folder)
     return table

@@ -124,9 +124,9 @@ def failure(status: str, words: str) -> dict[str, Any]:
 
 
 def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
-    from telerig.estimator.calibrate import run_calibration
-    from telerig.estimator.calibration_results import write_report, write_results
-    from telerig.io.dataset import load_dataset
+    from telerig.estimator.calibration.calibrate import run_calibration
+    from telerig.estimator.calibration.results_folder import write_report, write_results
+    from telerig.io.dataset.dataset import load_dataset
 
     begun = time.perf_counter()
     data = load_dataset(Path(job.dataset))
@@ -150,11 +150,11 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 
 def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
-    from telerig.estimator.track_calibration import calibration_for
-    from telerig.estimator.track_results import write_tracking
-    from telerig.estimator.track_run import TrackOptions
-    from telerig.estimator.track_words import tracking_words
-    from telerig.io.run import load_run
+    from telerig.estimator.tracking.calibration_of_run import calibration_for
+    from telerig.estimator.tracking.results_folder import write_tracking
+    from telerig.estimator.tracking.track import TrackOptions
+    from telerig.estimator.tracking.wording import tracking_words
+    from telerig.io.dataset.run import load_run
 
     begun = time.perf_counter()
     run = Path(job.dataset) / "runs" / job.run
@@ -173,10 +173,10 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 
 def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
-    from telerig.estimator.smooth_run import smooth_run
-    from telerig.estimator.smooth_words import smoothing_words
-    from telerig.estimator.track_calibration import calibration_for
-    from telerig.io.run import load_run
+    from telerig.estimator.smoothing.results_folder import smooth_run
+    from telerig.estimator.smoothing.wording import smoothing_words
+    from telerig.estimator.tracking.calibration_of_run import calibration_for
+    from telerig.io.dataset.run import load_run
 
     run = Path(job.dataset) / "runs" / job.run
     calibration, files = calibration_for(run, _given(job))

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 from telerig.errors import InputError
-from telerig.io.recording.description import DeviceDescription
 from telerig.io.recording.log import FOUND, LOST, RECEIVED, SENT, Entry
 from telerig.io.recording.ports import open_port, read_chunk
 from telerig.io.recording.protocols import poll_command
+from telerig.io.rig_file.device_description import DeviceDescription
 
 RETRY_S = 0.2
 """How often a lost port is tried again."""

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from telerig.io.recording.clock import ClockFit, host_times
 from telerig.io.recording.damage import beside_gaps
-from telerig.io.recording.description import DeviceDescription
 from telerig.io.recording.log import (
     END,
     FOUND,
@@ -23,6 +22,7 @@ from telerig.io.recording.log import (
     read_log,
 )
 from telerig.io.recording.protocols import Readings, parser
+from telerig.io.rig_file.device_description import DeviceDescription
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

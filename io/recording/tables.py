@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.atomic import atomic_folder, write_json_atomic
+from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.recording.damage import GAP_INTERVALS
 from telerig.io.recording.frames import FrameTimes, frame_times
 from telerig.io.recording.log import damaged_bytes

@@ -53,14 +53,14 @@ def remake_report(results: ResultsFolder, out: Path | None = None) -> Path:
     Raises InputError for results that cannot be read.
     """
     if results.kind == "calibration":
-        from telerig.io.report.calibration_report import write_calibration_report
+        from telerig.io.report.calibration.report import write_calibration_report
 
         return write_calibration_report(results.folder, out)
     if results.kind == "run":
-        from telerig.io.report.track_report import write_track_report
+        from telerig.io.report.run.report import write_track_report
 
         return write_track_report(results.folder, out)
-    from telerig.io.report.batch_report import write_batch_report
+    from telerig.io.report.batch.report import write_batch_report
 
     return write_batch_report(results.folder, out)
 

@@ -12,49 +12,55 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from telerig.errors import TelerigError as TelerigError
-    from telerig.estimator.calibrate import calibrate as calibrate
-    from telerig.estimator.calibration import Calibration as Calibration
-    from telerig.estimator.calibration import load_calibration as load_calibration
-    from telerig.estimator.compare_calibrations import compare_calibrations as compare_calibrations
-    from telerig.estimator.frontend.bubbles import detect_bubbles as detect_bubbles
-    from telerig.estimator.frontend.dots import locate_dots as locate_dots
-    from telerig.estimator.frontend.target_detection import detect_target as detect_target
-    from telerig.estimator.smoother.model import ShakeModel as ShakeModel
-    from telerig.estimator.smoother.results import Smoothing as Smoothing
-    from telerig.estimator.smoother.smooth import smooth as smooth
-    from telerig.estimator.track_run import track as track
-    from telerig.estimator.tracks import Tracks as Tracks
-    from telerig.estimator.tracks import load_tracks as load_tracks
-    from telerig.estimator.uncertainty_map import uncertainty_map as uncertainty_map
-    from telerig.io.dataset import Dataset as Dataset
-    from telerig.io.dataset import load_dataset as load_dataset
-    from telerig.io.run import load_run as load_run
-    from telerig.io.simulation import simulate as simulate
-    from telerig.io.simulation_presets import SimulationConfig as SimulationConfig
+    from telerig.estimator.bubbles.detect import detect_bubbles as detect_bubbles
+    from telerig.estimator.calibration.calibrate import calibrate as calibrate
+    from telerig.estimator.calibration.quality.comparison import (
+        compare_calibrations as compare_calibrations,
+    )
+    from telerig.estimator.calibration.quality.uncertainty_map import (
+        uncertainty_map as uncertainty_map,
+    )
+    from telerig.estimator.calibration.result.calibration import Calibration as Calibration
+    from telerig.estimator.calibration.result.calibration import (
+        load_calibration as load_calibration,
+    )
+    from telerig.estimator.dots.detect_target import detect_target as detect_target
+    from telerig.estimator.dots.locate import locate_dots as locate_dots
+    from telerig.estimator.smoothing.problem.problem import ShakeModel as ShakeModel
+    from telerig.estimator.smoothing.result import Smoothing as Smoothing
+    from telerig.estimator.smoothing.smooth import smooth as smooth
+    from telerig.estimator.tracking.track import track as track
+    from telerig.estimator.tracking.tracks import Tracks as Tracks
+    from telerig.estimator.tracking.tracks import load_tracks as load_tracks
+    from telerig.io.dataset.dataset import Dataset as Dataset
+    from telerig.io.dataset.dataset import load_dataset as load_dataset
+    from telerig.io.dataset.run import load_run as load_run
+    from telerig.io.simulation.calibration.presets import SimulationConfig as SimulationConfig
+    from telerig.io.simulation.simulate import simulate as simulate
     from telerig.rig.triangulation import Triangulation as Triangulation
 
 _WHERE = {
-    "Calibration": "telerig.estimator.calibration",
-    "Dataset": "telerig.io.dataset",
-    "ShakeModel": "telerig.estimator.smoother.model",
-    "SimulationConfig": "telerig.io.simulation_presets",
-    "Smoothing": "telerig.estimator.smoother.results",
+    "Calibration": "telerig.estimator.calibration.result.calibration",
+    "Dataset": "telerig.io.dataset.dataset",
+    "ShakeModel": "telerig.estimator.smoothing.problem.problem",
+    "SimulationConfig": "telerig.io.simulation.calibration.presets",
+    "Smoothing": "telerig.estimator.smoothing.result",
     "TelerigError": "telerig.errors",
     "Triangulation": "telerig.rig.triangulation",
-    "calibrate": "telerig.estimator.calibrate",
-    "Tracks": "telerig.estimator.tracks",
-    "compare_calibrations": "telerig.estimator.compare_calibrations",
-    "detect_bubbles": "telerig.estimator.frontend.bubbles",
-    "detect_target": "telerig.estimator.frontend.target_detection",
-    "load_calibration": "telerig.estimator.calibration",
-    "load_dataset": "telerig.io.dataset",
-    "load_run": "telerig.io.run",
-    "load_tracks": "telerig.estimator.tracks",
-    "locate_dots": "telerig.estimator.frontend.dots",
-    "simulate": "telerig.io.simulation",
-    "smooth": "telerig.estimator.smoother.smooth",
-    "track": "telerig.estimator.track_run",
-    "uncertainty_map": "telerig.estimator.uncertainty_map",
+    "calibrate": "telerig.estimator.calibration.calibrate",
+    "Tracks": "telerig.estimator.tracking.tracks",
+    "compare_calibrations": "telerig.estimator.calibration.quality.comparison",
+    "detect_bubbles": "telerig.estimator.bubbles.detect",
+    "detect_target": "telerig.estimator.dots.detect_target",
+    "load_calibration": "telerig.estimator.calibration.result.calibration",
+    "load_dataset": "telerig.io.dataset.dataset",
+    "load_run": "telerig.io.dataset.run",
+    "load_tracks": "telerig.estimator.tracking.tracks",
+    "locate_dots": "telerig.estimator.dots.locate",
+    "simulate": "telerig.io.simulation.simulate",
+    "smooth": "telerig.estimator.smoothing.smooth",
+    "track": "telerig.estimator.tracking.track",
+    "uncertainty_map": "telerig.estimator.calibration.quality.uncertainty_map",
 }
 __all__ = ["__version__", *_WHERE]
 

@@ -1,0 +1,161 @@
+"""The bright-field level behind the bubbles, from the run itself.
+
+log image = rig layer(u, v) + lab layer(u + shift_u, v + shift_v) + gain of the frame, with bubbles
+as dark outliers. The rig layer is all that is fixed in the image (lens dirt, flat field, a screen
+that moves with the rig), the lab layer all that stays behind (a fixed screen, dirt on the tank).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import DetectionError, InputError
+from telerig.estimator.bubbles.background.from_one_image import level_of_image
+from telerig.estimator.bubbles.background.layers import Layers, fit_layers
+from telerig.estimator.bubbles.background.subpixel_shift import crop_of_lab
+
+Array = NDArray[np.float64]
+Level = NDArray[np.float32]
+Shift = tuple[float, float]
+
+LEAST_FRAMES = 4
+"""Fewer frames cannot tell a bubble from the background by its motion."""
+
+LEAST_TRAVEL_PX = 2.0
+"""Total travel from which on a layer that stays behind can be told from one that comes along."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """rig_level : (H, W) level of what is fixed in the image, in grey values.
+
+    lab_factor : (Hl, Wl) what multiplies it, fixed in the lab; None without one. Its pixel (0, 0)
+    is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
+    covered : (H, W) True where a bubble hid the screen all the time, so that the level there is
+    interpolated. frames, gains : the frames it was made of, and their brightness.
+    noise : relative standard deviation of a pixel at the median level.
+    """
+
+    rig_level: Level
+    covered: NDArray[np.bool_]
+    lab_factor: Level | None = None
+    lab_origin_px: tuple[int, int] = (0, 0)
+    frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    gains: Array = field(default_factory=lambda: np.ones(0))
+    noise: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+    def at(self, frame_shift_px: Shift = (0.0, 0.0)) -> Level:
+        """(H, W) level at the median brightness, with the lab displaced by (u, v) px.
+
+        What is fixed in the lab and seen at pixel p at shift 0 is seen at p - shift. A shift that
+        is not finite, or outside the lab seen in the run, gives the rig layer alone.
+        """
+        if self.lab_factor is None or not np.all(np.isfinite(frame_shift_px)):
+            return self.rig_level.copy()
+        shape = self.rig_level.shape
+        return self.rig_level * crop_of_lab(
+            self.lab_factor, self.lab_origin_px, frame_shift_px, (shape[0], shape[1]), 1.0
+        )
+
+    def gain(self, image: NDArray[np.generic], frame_shift_px: Shift = (0.0, 0.0)) -> float:
+        """How much brighter than `at` an image is: the robust ratio outside bubbles."""
+        step = max(1, int(np.sqrt(image.size / 20_000)))
+        level = self.at(frame_shift_px)[::step, ::step]
+        ratio = image[::step, ::step].astype(np.float64) / np.maximum(level, 0.5)
+        for _ in range(3):
+            ratio = ratio[ratio > 0.9 * np.median(ratio)]
+        return float(np.median(ratio))
+
+    @classmethod
+    def from_image(cls, image: NDArray[np.generic]) -> Background:
+        """The large-scale level of a single image; what is dark and compact counts as a bubble."""
+        level, covered = level_of_image(image)
+        return cls(level, covered, notes=["the background is that of a single image"])
+
+
+def estimate_background(
+    images: Callable[[int], NDArray[np.generic] | None],
+    frame_count: int,
+    *,
+    shift_px: Array | None = None,
+    max_frames: int = 41,
+) -> Background:
+    """The background from a sample of at most ``max_frames`` frames spread over the run.
+
+    images : gives a frame's (H, W) image, or None where it is missing.
+    shift_px : (F, 2) travel of the rig as seen in the image, (u, v): what is fixed in the lab is
+    seen at p - shift. None when nothing moves, or everything seen moves along. Frames with NaN are
+    not used.
+
+    A bubble that the rig follows keeps some pixels dark all the time: they are recognised by the
+    changing edge around them, filled smoothly, and marked in `Background.covered`.
+    Raises DetectionError without a single frame, InputError for images that differ in size.
+    """
+    shifts = np.zeros((frame_count, 2)) if shift_px is None else np.asarray(shift_px, float)
+    if shifts.shape != (frame_count, 2):
+        raise InputError(
+            f"has the shape {shifts.shape}", where="shift_px", todo=f"give ({frame_count}, 2)"
+        )
+    frames, stack = _sample(images, np.flatnonzero(np.isfinite(shifts).all(1)), max_frames)
+    if len(frames) < LEAST_FRAMES:
+        level, covered = level_of_image(stack.max(0))
+        note = f"only {len(frames)} frames: the background is a smooth surface"
+        return Background(level, covered, frames=frames, gains=np.ones(len(frames)), notes=[note])
+    travel = shifts[frames]
+    moving = bool(np.ptp(travel, axis=0).max() >= LEAST_TRAVEL_PX)
+    return _background(fit_layers(stack, travel if moving else None), frames)
+
+
+def _background(layers: Layers, frames: NDArray[np.int64]) -> Background:
+    notes = []
+    if layers.covered.any():
+        notes.append(
+            f"{np.mean(layers.covered):.2%} of the image is hidden by a bubble all the time: "
+            "the level there is interpolated"
+        )
+    return Background(
+        rig_level=np.exp(layers.rig),
+        covered=layers.covered,
+        lab_factor=None if layers.lab is None else np.exp(layers.lab),
+        lab_origin_px=layers.lab_origin_px,
+        frames=frames,
+        gains=np.exp(layers.gains),
+        noise=layers.noise,
+        notes=notes,
+    )
+
+
+def _sample(
+    images: Callable[[int], NDArray[np.generic] | None],
+    candidates: NDArray[np.int64],
+    max_frames: int,
+) -> tuple[NDArray[np.int64], NDArray[np.generic]]:
+    """Frames and their (n, H, W) images, unevenly spread.
+
+    Even spacing at even speed would make every texture whose period is the spacing look the same
+    in both layers; the golden ratio's multiples avoid all periods.
+    """
+    parts = np.array_split(candidates, min(max_frames, len(candidates)))
+    frames, pictures = [], []
+    for k, part in enumerate(parts):
+        turn = int((k * 0.6180339887498949) % 1 * len(part)) if len(part) else 0
+        for frame in np.roll(part, -turn)[:4]:
+            picture = images(int(frame))
+            if picture is not None:
+                frames.append(int(frame))
+                pictures.append(picture)
+                break
+    if not pictures:
+        raise DetectionError(
+            "no frame can be used for the background",
+            where="run",
+            todo="check that images exist and the stage's record covers their times",
+        )
+    if len({picture.shape for picture in pictures}) > 1:
+        raise InputError("the images differ in size", where="run", todo="give one camera's images")
+    return np.array(frames, np.int64), np.stack(pictures)

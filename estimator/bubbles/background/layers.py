@@ -1,0 +1,365 @@
+"""Two layers of a moving camera's background, told from each other and from bubbles.
+
+Robust quantiles give a start; then the pixels under bubbles are marked frame by frame, and means
+over the rest, one layer after the other, sharpen both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.bubbles.background.from_one_image import DARK, fill_masked, level_of_image
+from telerig.estimator.bubbles.background.masks import first_masks
+from telerig.estimator.bubbles.background.subpixel_shift import crop_of_lab, shifted
+
+Array = NDArray[np.float64]
+Log = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+UPPER = 0.8
+"""Quantile over frames at the start: a bubble may darken a pixel in this share of them."""
+
+STEADY = 0.04
+"""A pixel whose brighter frames spread less than this shows the screen, or dirt on it."""
+
+_STARTS = 2
+_ROUNDS = 3
+_BLOCK_ROWS = 64
+_LEAST_SEEN = 3
+_LEAST_SEEN_LAB = 2
+"""What a single frame shows of the lab cannot be told from a bubble."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Logarithms: rig (H, W), lab (Hl, Wl) or None, gains (n,); noise relative, covered (H, W)."""
+
+    rig: Log
+    lab: Log | None
+    lab_origin_px: tuple[int, int]
+    gains: Array
+    noise: float
+    covered: Mask
+
+
+@dataclass(frozen=True)
+class _Model:
+    """What is known of the frames at some point of the estimate; fields as in `Layers`."""
+
+    rig: Log
+    lab: Log | None
+    origin_px: tuple[int, int]
+    gains: Array
+
+    def lab_in(self, shift_px: Array, rows: slice = slice(None)) -> Log | float:
+        """(H, W) of the lab layer as a frame sees it, or some rows of it."""
+        if self.lab is None:
+            return 0.0
+        first, last, _ = rows.indices(self.rig.shape[0])
+        shape = (last - first, self.rig.shape[1])
+        return crop_of_lab(self.lab, self.origin_px, (shift_px[0], shift_px[1] + first), shape, 0.0)
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """stack (n, H, W) grey values; shifts (n, 2) px (u, v); table of logarithms."""
+
+    stack: NDArray[np.generic]
+    shifts: Array
+    table: Log | None
+
+    def log(self, frame: int | slice, rows: slice = slice(None), step: int = 1) -> Log:
+        values: NDArray[Any] = self.stack[frame, rows][..., ::step, ::step]
+        if self.table is None:
+            return np.log(np.maximum(values.astype(np.float32), 1e-6))
+        return np.take(self.table, values)
+
+
+def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> Layers:
+    """Both layers of (n, H, W) images; shifts_px (n, 2), None for the rig layer alone."""
+    shifts = np.zeros((len(stack), 2)) if shifts_px is None else shifts_px
+    sample = _Sample(stack, shifts, _log_table(stack.dtype))
+    gains = _first_gains(sample)
+    empty = np.zeros(stack.shape[1:], np.float32)
+    masks = first_masks(stack, shifts_px, gains)
+    model, spread, never = _first_rig(sample, _Model(empty, None, (0, 0), gains), masks)
+    for _ in range(_STARTS if shifts_px is not None else 0):
+        model = _first_lab(sample, model, masks)
+        model, spread, never = _first_rig(sample, model, masks)
+    model, marked, covered, usable = _uncovered(sample, *_marked(sample, model), spread, never)
+    for turn in range(_ROUNDS):
+        if turn:
+            model, marked = _marked(sample, model)
+        model, seen = _mean_rig(sample, model, marked, covered)
+        if model.lab is not None:
+            model = _mean_lab(sample, model, marked)
+    noise = float(np.median(_noise(sample, model)[1]))
+    hidden = covered & (seen < _least_seen(len(stack)))
+    if hidden.any():
+        filled = fill_masked(model.rig, hidden, usable, _along_travel(sample, model))
+        model = replace(model, rig=filled)
+    return Layers(model.rig, model.lab, model.origin_px, model.gains, noise, hidden)
+
+
+def _log_table(kind: np.dtype[Any]) -> Log | None:
+    if kind not in (np.uint8, np.uint16):
+        return None
+    return np.log(np.maximum(np.arange(np.iinfo(kind).max + 1), 0.5)).astype(np.float32)
+
+
+def _step(sample: _Sample) -> int:
+    """Between the pixels that stand for the image where a median is all that is asked for."""
+    return max(1, int(np.sqrt(np.prod(sample.stack.shape[1:]) / 16_000)))
+
+
+def _first_gains(sample: _Sample) -> Array:
+    log = sample.log(slice(None), step=_step(sample)).reshape(len(sample.stack), -1)
+    gains = np.zeros(len(log))
+    for _ in range(3):
+        gains += np.median(log - gains[:, None] - np.median(log - gains[:, None], axis=0), axis=1)
+        gains -= np.median(gains)
+    return gains
+
+
+def _first_rig(sample: _Sample, model: _Model, masks: Mask) -> tuple[_Model, Log, Mask]:
+    """The model with the frames' upper quantile, and how far the brighter frames spread.
+
+    masks : (n, H, W) what is left out. Then (H, W) the pixels that no two frames show, filled.
+    """
+    rig, spread = np.empty((2, *sample.stack.shape[1:]), np.float32)
+    for rows in _blocks(rig.shape[0]):
+        log = sample.log(slice(None), rows) - model.gains[:, None, None].astype(np.float32)
+        for k, shift in enumerate(sample.shifts):
+            log[k] -= model.lab_in(shift, rows)
+        log[masks[:, rows]] = np.nan
+        low, rig[rows], high = _quantiles(log, (UPPER - 0.1, UPPER, UPPER + 0.1))
+        spread[rows] = high - low
+    never = np.isnan(rig)
+    rig[never] = 0
+    if never.any():
+        rig = fill_masked(rig, never, ~never, _along_travel(sample, model))
+    return replace(model, rig=rig), np.nan_to_num(spread), never
+
+
+def _blocks(height: int) -> Iterator[slice]:
+    return (slice(r, min(r + _BLOCK_ROWS, height)) for r in range(0, height, _BLOCK_ROWS))
+
+
+def _quantiles(values: Log, shares: tuple[float, ...]) -> Log:
+    """(Q, H, W) quantiles over the first axis, NaN left out; NaN where fewer than two remain."""
+    count, height, width = values.shape
+    ordered = np.sort(np.ascontiguousarray(values.reshape(count, -1).T), axis=1)
+    known = count - np.sum(np.isnan(ordered), axis=1)
+    at = np.rint(np.outer(known - 1, shares)).astype(np.int64).clip(0)
+    found = np.take_along_axis(ordered, at, axis=1)
+    found[known < _LEAST_SEEN_LAB] = np.nan
+    return np.ascontiguousarray(found.T).reshape(len(shares), height, width)
+
+
+def _first_lab(sample: _Sample, model: _Model, masks: Mask) -> _Model:
+    """The model with the lab layer's quantiles over the frames that saw each place."""
+    height, width = model.rig.shape
+    low, high = np.floor(sample.shifts.min(0)), np.ceil(sample.shifts.max(0))
+    origin = (int(low[0]), int(low[1]))
+    spread = (high - low).astype(int)
+    lab = np.zeros((height + spread[1] + 1, width + spread[0] + 1), np.float32)
+    for rows in _blocks(len(lab)):
+        seen = [
+            found
+            for k in range(len(sample.stack))
+            if (found := _lab_rows(sample, model, k, masks[k], rows, origin, lab.shape[1]))
+            is not None
+        ]
+        if seen:
+            lab[rows] = np.nan_to_num(_quantiles(np.stack(seen), (UPPER,))[0], nan=0.0)
+    return _centred(replace(model, lab=lab, origin_px=origin))
+
+
+def _lab_rows(
+    sample: _Sample,
+    model: _Model,
+    k: int,
+    mask: Mask,
+    rows: slice,
+    origin: tuple[int, int],
+    width: int,
+) -> Log | None:
+    """What frame k shows in these rows of the lab, NaN beside it; None when it shows nothing."""
+    left, top = sample.shifts[k] - origin
+    column, row = math.floor(left), math.floor(top)
+    height = model.rig.shape[0]
+    first, last = max(rows.start - row, 0), min(rows.stop - row, height)
+    if first >= last:
+        return None
+    margin = slice(max(first - 2, 0), min(last + 2, height))
+    residual = sample.log(k, margin) - np.float32(model.gains[k]) - model.rig[margin]
+    residual[mask[margin]] = np.nan
+    moved = shifted(residual, (column - left, row - top))
+    out = np.full((rows.stop - rows.start, width), np.nan, np.float32)
+    place = slice(first + row - rows.start, last + row - rows.start)
+    part = moved[first - margin.start : last - margin.start]
+    out[place, column : column + part.shape[1]] = part
+    return out
+
+
+def _centred(model: _Model) -> _Model:
+    """The same sum of layers with the lab's median at 0."""
+    assert model.lab is not None
+    known = model.lab[model.lab != 0]
+    middle = np.float32(np.median(known)) if known.size else np.float32(0)
+    lab = np.where(model.lab != 0, model.lab - middle, 0).astype(np.float32)
+    return replace(model, lab=lab, rig=model.rig + middle)
+
+
+def _residual(sample: _Sample, model: _Model, k: int) -> Log:
+    out = sample.log(k) - model.rig
+    out -= np.float32(model.gains[k])
+    out -= model.lab_in(sample.shifts[k])
+    return out
+
+
+def _noise(sample: _Sample, model: _Model) -> tuple[Array, Array]:
+    """Log levels and the relative noise at each, from the bright half of the residuals."""
+    step = _step(sample)
+    every = range(0, len(sample.stack), max(1, len(sample.stack) // 8))
+    residual = np.concatenate([_residual(sample, model, k)[::step, ::step].ravel() for k in every])
+    level = np.tile(model.rig[::step, ::step].ravel(), len(every))
+    edges = np.quantile(level, np.linspace(0, 1, 7))
+    levels, sigmas = [], []
+    for low, high in pairwise(edges):
+        part = residual[(level >= low) & (level <= high)]
+        part = part - np.median(part)
+        sigmas.append(max(0.002, float(np.median(part[part >= 0])) / 0.6745))
+        levels.append(0.5 * (low + high))
+    return np.array(levels), np.array(sigmas)
+
+
+def _marked(sample: _Sample, model: _Model) -> tuple[_Model, Mask]:
+    """The model with new gains, and (n, H, W) the pixels under bubbles and other outliers."""
+    levels, sigmas = _noise(sample, model)
+    sigma = np.interp(model.rig, levels, sigmas).astype(np.float32)
+    marked = np.empty(sample.stack.shape, bool)
+    gains = model.gains.copy()
+    step = _step(sample)
+    for k in range(len(sample.stack)):
+        residual = _residual(sample, model, k)
+        thin = residual[::step, ::step]
+        change = float(np.median(thin))
+        near = np.abs(thin - change) < 3 * sigma[::step, ::step]
+        change = float(np.mean(thin[near])) if near.any() else change
+        residual -= np.float32(change)
+        gains[k] += change
+        marked[k] = _outliers(residual, sigma)
+    middle = float(np.median(gains))
+    return replace(model, gains=gains - middle, rig=model.rig + np.float32(middle)), marked
+
+
+def _outliers(residual: Log, sigma: Log) -> Mask:
+    """Dark things with their soft edges and bright hearts, and bright specks."""
+    import cv2
+
+    soft = cv2.blur(residual, (5, 5))
+    thin = soft[::8, ::8] - np.median(soft[::8, ::8])
+    spread = float(np.median(thin[thin >= 0])) / 0.6745
+    dark = (residual < -4 * sigma) | (soft < -max(5 * spread, 0.01))
+    grown = cv2.dilate(dark.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+    outlines, _ = cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(grown, outlines, -1, 1, cv2.FILLED)
+    return np.asarray((grown > 0) | (residual > 5 * sigma), bool)
+
+
+def _uncovered(
+    sample: _Sample, model: _Model, marked: Mask, spread: Log, never: Mask
+) -> tuple[_Model, Mask, Mask, Mask]:
+    """The rig layer filled where a bubble kept it dark all the time, and the new marks.
+
+    Then (H, W) where it was filled, and what is clean enough to fill from.
+
+    spread, never : (H, W), as `_first_rig` gives them.
+
+    Dirt and a bubble that the rig follows both look dark in the layer, but a bubble's edge
+    moves: just outside it the frames differ.
+    """
+    import cv2
+
+    dark = (np.log(level_of_image(np.exp(model.rig))[0]) - model.rig > DARK).astype(np.uint8)
+    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    share = marked.mean(0, dtype=np.float32)
+    usual = float(np.median(share))
+    covered = never.astype(np.uint8)
+    for outline in outlines:
+        thing = cv2.drawContours(np.zeros_like(dark), [outline], -1, 1, cv2.FILLED)
+        around = cv2.dilate(thing, np.ones((7, 7), np.uint8)) > thing
+        if np.mean(share[around] > usual + 0.25) > 0.5:
+            covered |= thing
+    if not covered.any():
+        return model, marked, covered.astype(bool), covered == 0
+    edge = cv2.dilate(covered, np.ones((13, 13), np.uint8)) > covered
+    hidden = covered.astype(bool) | (edge & (spread > STEADY))
+    usable = (cv2.dilate(dark | covered, np.ones((5, 5), np.uint8)) == 0) & ~edge
+    filled = fill_masked(model.rig, hidden, usable, _along_travel(sample, model))
+    return *_marked(sample, replace(model, rig=filled)), hidden, usable
+
+
+def _along_travel(sample: _Sample, model: _Model) -> tuple[float, float] | None:
+    """The reach (u, v) px of the fill when the travel follows an image axis.
+
+    A pattern that is constant along the travel looks the same in both layers, and what one has of
+    it the other lacks: such stripes must go on through a hole.
+    """
+    spread_u, spread_v = np.ptp(sample.shifts, axis=0)
+    if model.lab is None or min(spread_u, spread_v) > 0.02 * max(spread_u, spread_v):
+        return None
+    return (1.0, np.inf) if spread_v > spread_u else (np.inf, 1.0)
+
+
+def _least_seen(frames: int) -> int:
+    """Frames that must show a pixel that a bubble usually hides before they are believed."""
+    return max(_LEAST_SEEN, frames // 7)
+
+
+def _mean_rig(
+    sample: _Sample, model: _Model, marked: Mask, covered: Mask
+) -> tuple[_Model, NDArray[np.float32]]:
+    """The rig layer as the mean of the frames' unmarked pixels, and (H, W) their number."""
+    import cv2
+
+    total, seen = np.zeros(model.rig.shape, np.float32), np.zeros(model.rig.shape, np.float32)
+    for k in range(len(sample.stack)):
+        free = (~marked[k]).astype(np.uint8)
+        cv2.accumulate(_residual(sample, model, k), total, free)
+        seen += free
+    needed = np.where(covered, _least_seen(len(sample.stack)), _LEAST_SEEN)
+    rig = np.where(seen >= needed, model.rig + total / np.maximum(seen, 1), model.rig)
+    return replace(model, rig=rig.astype(np.float32)), seen
+
+
+def _mean_lab(sample: _Sample, model: _Model, marked: Mask) -> _Model:
+    """The lab layer as the mean of the residuals that are free of marks."""
+    import cv2
+
+    assert model.lab is not None
+    height, width = model.rig.shape
+    total, seen = np.zeros_like(model.lab), np.zeros_like(model.lab)
+    for k, shift in enumerate(sample.shifts):
+        left, top = shift - model.origin_px
+        column, row = math.floor(left), math.floor(top)
+        fraction = (column - left, row - top)
+        residual = _residual(sample, model, k)
+        residual[marked[k]] = 0
+        near = cv2.dilate(marked[k].astype(np.uint8), np.ones((3, 3), np.uint8))
+        free = (near == 0).astype(np.float32)
+        free[: int(fraction[1] < 0)] = 0
+        free[:, : int(fraction[0] < 0)] = 0
+        place = (slice(row, row + height), slice(column, column + width))
+        total[place] += free * shifted(residual, fraction)
+        seen[place] += free
+    change = np.where(seen >= _LEAST_SEEN_LAB, total / np.maximum(seen, 1), 0)
+    return _centred(replace(model, lab=model.lab + change.astype(np.float32)))

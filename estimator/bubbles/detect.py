@@ -1,0 +1,286 @@
+"""Bubbles in a backlit image: sub-pixel outlines with covariance, and why the rest are none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.bubbles.flat_field import checked_image, normalised, nothing_to_see
+from telerig.estimator.bubbles.outline.ellipse_geometry import points_on, rough_distance
+from telerig.estimator.bubbles.outline.fit_types import Outlines, Start
+from telerig.estimator.bubbles.outline.measures import (
+    outline_centroid,
+    outline_moments,
+    outline_points,
+)
+from telerig.estimator.bubbles.outline.outline_fit import fit_outlines
+from telerig.estimator.bubbles.outline.regions import (
+    Blob,
+    Speck,
+    dark_noise_share,
+    find_blobs,
+    noise_share,
+)
+from telerig.estimator.bubbles.outline.rim_pixels import close_pairs
+from telerig.estimator.bubbles.outline.second_attempt import (
+    agreed,
+    halves_at_waists,
+    unsound_parts,
+)
+from telerig.estimator.bubbles.outline.split import Part, split_blobs
+from telerig.estimator.bubbles.outline.types import DETECTION_COLUMNS, HARMONIC_COLUMNS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+__all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
+
+_REJECTED_COLUMNS = ["u_px", "v_px", "radius_px", "reason"]
+_MAX_AXIS_RATIO = 3.0
+_DEFOCUS_FACTOR = 2.0
+_DEFOCUS_FLOOR_PX = 1.5
+_SMALL_EDGES = 3.0
+_MOSTLY_SEEN = 0.6
+_SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
+
+
+@dataclass(frozen=True)
+class Bubbles:
+    """``accepted``: columns DETECTION_COLUMNS; ``rejected``: u_px v_px radius_px reason.
+
+    ``noise``: grey sigma as a share of the background; ``reason``: why there is nothing, if so.
+    """
+
+    accepted: pd.DataFrame
+    rejected: pd.DataFrame
+    noise: float
+    reason: str
+
+
+def detect_bubbles(
+    image: NDArray[Any],
+    *,
+    background: NDArray[Any] | None = None,
+    min_diameter_px: float = 8.0,
+    min_contrast: float = 0.3,
+) -> pd.DataFrame:
+    """Every bubble of a backlit grey image, unordered, with the columns DETECTION_COLUMNS.
+
+    ``background`` (rows, columns) is the bright-field level; without it the level of the screen
+    is estimated from the image itself. ``min_contrast`` is the least depth of a shadow, as a
+    share of the background. An image that holds nothing gives an empty table whose
+    ``attrs["reason"]`` says why.
+
+    Raises InputError for anything but a 2-D image of finite numbers, and for a background of
+    another shape or one that is not positive.
+    """
+    return find_bubbles(
+        image,
+        background=background,
+        min_diameter_px=min_diameter_px,
+        min_contrast=min_contrast,
+    ).accepted
+
+
+def find_bubbles(
+    image: NDArray[Any],
+    *,
+    background: NDArray[Any] | None = None,
+    min_diameter_px: float = 8.0,
+    min_contrast: float = 0.3,
+) -> Bubbles:
+    """Like :func:`detect_bubbles`, with what was rejected and why."""
+    image = checked_image(image, min_diameter_px, min_contrast)
+    reason = nothing_to_see(image)
+    if reason:
+        return _bubbles(_empty_columns(), [], np.nan, reason)
+    ratio, clipped = normalised(image, background)
+    sigma = max(noise_share(ratio), 1e-4)
+    blobs, specks = find_blobs(
+        ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
+    )
+    parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
+    parts, slender = _without_slender(parts)
+    specks += slender
+    if not parts:
+        return _bubbles(_empty_columns(), specks, sigma, "no shadow dark and large enough")
+    dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
+    start = _start(parts, blobs, sigma, dark_sigma)
+    outlines = fit_outlines(ratio, start)
+    halves = halves_at_waists(outlines, parts, blobs, image.shape, min_diameter_px)
+    for _ in range(2 if halves else 0):
+        split = _replaced(parts, halves)
+        start = _start(split, blobs, sigma, dark_sigma)
+        refitted = fit_outlines(ratio, start)
+        sound = agreed(halves, outlines, split, refitted)
+        if len(sound) == len(halves):
+            parts, outlines = split, refitted
+            break
+        halves = sound
+    columns = _columns(outlines, parts, image.shape, clipped)
+    against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
+    kept = np.array([not reason for reason in against])
+    specks += [
+        Speck(float(u), float(v), float(r), why)
+        for u, v, r, why in zip(
+            columns["u_px"], columns["v_px"], columns["d_eq_px"] / 2.0, against, strict=True
+        )
+        if why
+    ]
+    kept_columns = {name: values[kept] for name, values in columns.items()}
+    reason = "" if np.any(kept) else "no shadow has a bubble's outline"
+    return _bubbles(kept_columns, specks, sigma, reason)
+
+
+def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Speck]]:
+    kept, slender = [], []
+    for part in parts:
+        u, v, a, b, _ = part.ellipse.tolist()
+        if a <= _MAX_AXIS_RATIO * b:
+            kept.append(part)
+        else:
+            slender.append(Speck(u, v, (a * b) ** 0.5, f"{a / b:.1f} times as long as wide"))
+    return kept, slender
+
+
+def _replaced(parts: list[Part], halves: dict[int, list[Part]]) -> list[Part]:
+    return [new for k, part in enumerate(parts) for new in halves.get(k, [part])]
+
+
+def _bubbles(columns: dict[str, Any], specks: list[Speck], noise: float, reason: str) -> Bubbles:
+    import pandas as pd
+
+    accepted = pd.DataFrame(columns, columns=DETECTION_COLUMNS, copy=False)
+    accepted.attrs["reason"] = reason
+    accepted.attrs["noise"] = noise
+    rejected = pd.DataFrame(
+        [(speck.u_px, speck.v_px, speck.radius_px, speck.reason) for speck in specks],
+        columns=_REJECTED_COLUMNS,
+    )
+    return Bubbles(accepted, rejected, noise, reason)
+
+
+def _empty_columns() -> dict[str, Any]:
+    columns: dict[str, Any] = {name: np.empty(0) for name in DETECTION_COLUMNS}
+    columns["flags"] = np.empty(0, dtype=object)
+    return columns
+
+
+def _start(parts: list[Part], blobs: list[Blob], sigma: float, dark_sigma: float) -> Start:
+    own = [blobs[part.blob] for part in parts]
+    return Start(
+        np.stack([part.ellipse for part in parts]),
+        np.zeros((len(parts), len(HARMONIC_COLUMNS))),
+        np.array([blob.blur_px for blob in own]),
+        np.array([blob.inner for blob in own]),
+        np.full(len(parts), sigma),
+        np.full(len(parts), dark_sigma),
+    )
+
+
+def _columns(
+    outlines: Outlines, parts: list[Part], shape: tuple[int, ...], clipped: bool
+) -> dict[str, Any]:
+    ellipse, covariance = outlines.ellipse, outlines.centre_covariance_px2
+    area, _ = outline_moments(ellipse, outlines.harmonics)
+    columns: dict[str, Any] = {
+        "u_px": ellipse[:, 0],
+        "v_px": ellipse[:, 1],
+        "suu_px2": covariance[:, 0, 0],
+        "suv_px2": covariance[:, 0, 1],
+        "svv_px2": covariance[:, 1, 1],
+        "a_px": ellipse[:, 2],
+        "b_px": ellipse[:, 3],
+        "angle_rad": (ellipse[:, 4] + np.pi / 2.0) % np.pi - np.pi / 2.0,
+        "area_px2": area,
+        "d_eq_px": 2.0 * np.sqrt(area / np.pi),
+        "contrast": (outlines.outer - outlines.inner) / outlines.outer,
+        "edge_px": outlines.blur_px,
+        "chi2_dof": outlines.chi2_dof,
+        "sigma_outline_px": np.where(outlines.resolved, outlines.sigma_outline_px, np.nan),
+        "flags": _flags(outlines, parts, shape, clipped),
+    }
+    # A half turn of the axes changes the sign of the odd orders.
+    turned = np.cos(ellipse[:, 4] - columns["angle_rad"]) < 0.0
+    harmonics = np.where(outlines.resolved[:, None], outlines.harmonics, np.nan)
+    for index, name in enumerate(HARMONIC_COLUMNS):
+        odd = name[1] in "35"
+        columns[name] = harmonics[:, index] * np.where(turned & odd, -1.0, 1.0)
+    return columns
+
+
+def _flags(
+    outlines: Outlines, parts: list[Part], shape: tuple[int, ...], clipped: bool
+) -> NDArray[np.object_]:
+    ellipse = outlines.ellipse
+    rim = points_on(ellipse, outlines.harmonics, np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False))
+    reach = outlines.blur_px[:, None]
+    beyond = (rim[..., 0] < reach - 0.5) | (rim[..., 0] > shape[1] - 0.5 - reach)
+    beyond |= (rim[..., 1] < reach - 0.5) | (rim[..., 1] > shape[0] - 0.5 - reach)
+    border = np.any(beyond, axis=1)
+    hidden = np.zeros(len(parts), dtype=np.bool_)
+    blur, own = outlines.blur_px, np.arange(len(parts))
+    for index, other in close_pairs(ellipse, ellipse, blur, blur, own):
+        gap = rough_distance(ellipse[other], rim[index, :, 0], rim[index, :, 1])
+        hidden[index] |= bool(np.any(gap < 0.0))
+    words = {
+        "border": border,
+        "defocus": _defocused(outlines),
+        "overlap": hidden,
+        "merged": _merged(outlines, parts),
+        "small": ellipse[:, 3] < _SMALL_EDGES * np.hypot(outlines.blur_px, 0.29),
+        "saturated": np.full(len(parts), clipped),
+    }
+    flags = ["|".join(word for word, on in words.items() if on[i]) for i in range(len(parts))]
+    return np.array(flags, dtype=object)
+
+
+def _merged(outlines: Outlines, parts: list[Part]) -> Mask:
+    """What could not be split; and where one part of a blob turns out unsound, all those whose
+    own outline is not mostly seen."""
+    merged: Mask = np.array([part.merged for part in parts]) | unsound_parts(outlines, parts)
+    unsound = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
+    doubtful = np.array([part.blob in unsound for part in parts])
+    return merged | (doubtful & (outlines.coverage < _MOSTLY_SEEN))
+
+
+def _defocused(outlines: Outlines) -> Mask:
+    sharp = float(np.quantile(outlines.blur_px, 0.25))
+    defocused: Mask = outlines.blur_px > max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX)
+    return defocused
+
+
+def _reasons(
+    outlines: Outlines,
+    columns: dict[str, Any],
+    start: Start,
+    min_diameter_px: float,
+    min_contrast: float,
+) -> list[str]:
+    """Why each fitted outline is no bubble; empty where it is one."""
+    reasons = []
+    typical = float(np.median(columns["contrast"]))
+    for i in range(outlines.ellipse.shape[0]):
+        _u, _v, a, b, _ = outlines.ellipse[i]
+        jump = float(np.hypot(*(outlines.ellipse[i, :2] - start.ellipse[i, :2])))
+        if not np.all(np.isfinite(outlines.ellipse[i])):
+            reasons.append("the outline's fit failed")
+        elif columns["d_eq_px"][i] < min_diameter_px:
+            reasons.append(f"smaller than {min_diameter_px:g} px")
+        elif columns["contrast"][i] < min_contrast:
+            reasons.append(f"contrast {columns['contrast'][i]:.2f} is below {min_contrast:g}")
+        elif a > _MAX_AXIS_RATIO * b:
+            reasons.append(f"{a / b:.1f} times as long as wide")
+        elif outlines.blur_px[i] > _SMUDGE_BLUR * b and columns["contrast"][i] < _SMUDGE * typical:
+            reasons.append("a smudge: blurred beyond its size, fainter than the bubbles")
+        elif jump > 0.3 * a + 2.0 or outlines.coverage[i] < 0.12:
+            reasons.append("too little of its outline can be seen")
+        else:
+            reasons.append("")
+    return reasons

@@ -1,0 +1,98 @@
+"""The image that bubbles are looked for in: checks, and division by the lit screen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.bubbles.outline.regions import screen_level
+
+_UNIFORM_SHARE = 0.004
+_CLIPPED_SHARE = 0.5
+_WHITE_SHARE = 0.98
+
+
+def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: float) -> NDArray[Any]:
+    image = np.asarray(image)
+    if image.ndim != 2:
+        raise InputError(
+            f"a grey image has 2 dimensions, this array has {image.ndim}: {image.shape}",
+            where="image",
+            todo="convert colour images to grey first (cv2.cvtColor, or one channel of the array)",
+        )
+    if min(image.shape) < 16 or image.dtype.kind not in "uif":
+        raise InputError(
+            f"cannot look for bubbles in an array of shape {image.shape} and type {image.dtype}",
+            where="image",
+            todo="give at least 16 x 16 pixels of an integer or float type",
+        )
+    if image.dtype.kind == "f" and not np.all(np.isfinite(image)):
+        raise InputError(
+            "has pixels that are not finite", where="image", todo="replace NaN and infinity"
+        )
+    if not min_diameter_px >= 4.0:
+        raise InputError(
+            f"must be at least 4, not {min_diameter_px}", where="min_diameter_px", todo="try 8.0"
+        )
+    if not 0.05 <= min_contrast < 1.0:
+        raise InputError(
+            f"must lie in 0.05 .. 1, not {min_contrast}", where="min_contrast", todo="try 0.3"
+        )
+    return image
+
+
+def nothing_to_see(image: NDArray[Any]) -> str:
+    low, high = float(image.min()), float(image.max())
+    if high <= 0.0:
+        return "the image is black"
+    if high - low > _UNIFORM_SHARE * high:
+        return ""
+    if image.dtype.kind in "ui" and high >= _WHITE_SHARE * _full_scale(image):
+        return "the image is saturated"
+    return "the image is uniform"
+
+
+def _full_scale(image: NDArray[Any]) -> float:
+    """White of the image's type; 16 bits may hold 10, 12 or 14."""
+    if image.dtype.itemsize == 1:
+        return 255.0
+    high = float(image.max())
+    return next((float(2**bits - 1) for bits in (10, 12, 14) if high <= 2**bits - 1), 65535.0)
+
+
+def normalised(
+    image: NDArray[Any], background: NDArray[Any] | None
+) -> tuple[NDArray[np.float32], bool]:
+    """Grey over background, and whether the screen is clipped at the sensor's white."""
+    import cv2
+
+    grey = image if image.dtype in (np.uint8, np.uint16, np.float32) else image.astype(np.float32)
+    if background is None:
+        screen = screen_level(grey.astype(np.float32))
+    else:
+        screen = np.asarray(background)
+        if screen.shape != image.shape:
+            raise InputError(
+                f"shape {screen.shape} differs from the image's {image.shape}",
+                where="background",
+                todo="estimate the background from images of this camera",
+            )
+        screen = screen.astype(np.float32, copy=False)
+        if not float(screen.min()) > 0.0:
+            raise InputError(
+                "has pixels that are not positive",
+                where="background",
+                todo="give the level of the lit screen at every pixel",
+            )
+    screen = np.maximum(screen, 1e-6 * float(image.max()) + 1e-12)
+    ratio = cv2.divide(grey.astype(np.float32, copy=False), screen)
+    sample = image[::8, ::8]
+    clipped = bool(
+        image.dtype.kind in "ui"
+        and np.mean(sample == sample.max()) > _CLIPPED_SHARE
+        and sample.max() >= _WHITE_SHARE * _full_scale(image)
+    )
+    return ratio, clipped

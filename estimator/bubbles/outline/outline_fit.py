@@ -1,0 +1,302 @@
+"""Sub-pixel outlines: maximum-likelihood fit of ellipse and harmonics to the pixels at the rim.
+
+The model of a pixel is ``outer + (inner - outer) F``, with F the profile of a blurred disc
+(:mod:`bubble_profile`) at the pixel's distance from the outline and the ellipse's curvature there;
+the outline is an ellipse with normal displacements of orders 3 to 6 in the eccentric anomaly. In
+that parametrisation the centre is orthogonal to the harmonics (b cos phi / h times cos k phi,
+integrated along the arc h dphi, is zero), so fitting them costs a whole outline nothing. Where a
+part is hidden it does, and the shapes of the frame's whole outlines serve as prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.bubbles.outline.ellipse_geometry import (
+    Index,
+    moved,
+    spread,
+    turned_harmonics,
+)
+from telerig.estimator.bubbles.outline.fit_types import (
+    PIXEL_VARIANCE_PX2,
+    Outlines,
+    Start,
+)
+from telerig.estimator.bubbles.outline.prior import (
+    ShapePrior,
+    learnt_prior,
+    prior_equations,
+    weak_prior,
+)
+from telerig.estimator.bubbles.outline.rim_model import (
+    BLUR,
+    FIRST_HARMONIC,
+    INNER,
+    OUTER,
+    PARAMETERS,
+    Linear,
+    RimState,
+    linearised,
+    normal_equations,
+    rim_model,
+)
+from telerig.estimator.bubbles.outline.rim_pixels import Pixels, rim_pixels, unlike_rim
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_MIN_SIGMA_PX = 0.3
+_OUTLIER_SIGMA = 4.5
+_WHOLE = 0.9
+_BINS = 32
+_STEPS = 3
+_FAR_SHIFT_PX, _CONVERGED_PX = 0.25, 0.02
+_HIDING_SIGMA = 3.0
+_MEAN_SLOPE = 0.35
+"""RMS of the unit normal density within one sigma."""
+
+
+def fit_outlines(ratio: NDArray[np.float32], start: Start) -> Outlines:
+    """Fit B outlines to the normalised image ``ratio`` (grey over background).
+
+    Pixels inside or near another bubble of ``start`` are left out, and so are hearts, dirt and
+    whatever else is unlike a rim. A first look at some of the pixels brings blur and levels; the
+    fit to all is repeated for outlines that moved far or are partly hidden.
+    """
+    everyone = np.arange(len(start))
+    state = RimState(
+        start.ellipse,
+        start.harmonics,
+        np.sqrt(start.blur_px**2 + PIXEL_VARIANCE_PX2),
+        np.ones(len(start)),
+        start.inner,
+    )
+    state = _first_look(ratio, state, start)
+    fit = _refined(ratio, state, start, state, everyone, weak_prior(len(start)))
+    partial = fit.coverage < _WHOLE
+    again = np.flatnonzero(partial | (fit.shift_px > _FAR_SHIFT_PX))
+    for _ in range(2):
+        if again.size == 0:
+            break
+        prior = learnt_prior(fit.ellipse, fit.harmonics, fit.resolved & ~partial, partial)
+        near = _refined(
+            ratio, fit.state(again), start[again], fit.state(everyone), again, prior[again]
+        )
+        fit = fit.updated(again, near)
+        again = again[near.shift_px > _FAR_SHIFT_PX]
+    return fit
+
+
+def _first_look(ratio: NDArray[np.float32], state: RimState, start: Start) -> RimState:
+    """Ellipse, blur and levels from a share of the pixels within a narrow band."""
+    pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state), thin=True)
+    linear = linearised(state, pixels)
+    distance, sigma = _distance(state, pixels, linear), spread(state.sigma, pixels.counts)
+    depth = np.minimum(2.0 * state.sigma + 0.5, 0.45 * state.ellipse[:, 3])
+    used = (distance > -spread(depth, pixels.counts)) & (distance < 2.5 * sigma + 1.0)
+    everyone = np.arange(len(start))
+    used &= ~pixels.hidden(state.ellipse, state.ellipse, _HIDING_SIGMA * state.sigma, everyone)
+    weight = spread(1.0 / start.sigma_outer**2, pixels.counts) * used.astype(np.float32)
+    prior = weak_prior(len(start), held=True)
+    descent = _descend(state, pixels, linear, weight, start, prior, steps=2)
+    return _moved(descent.state, descent.shifts)
+
+
+def _bulge(state: RimState) -> Array:
+    bulge: Array = np.sum(np.abs(state.harmonics), axis=1)
+    return bulge
+
+
+def _distance(state: RimState, pixels: Pixels, linear: Linear) -> Single:
+    bump = linear.displacements(pixels, _shifts(state))
+    return np.asarray(linear.foot.distance - bump, dtype=np.float32)
+
+
+def _shifts(state: RimState) -> Array:
+    return np.concatenate([np.zeros_like(state.ellipse), state.harmonics], axis=1)
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where Gauss-Newton stands: ``shifts`` (B, 13) since the linearisation, covariance
+    (B, 16, 16) and what is left of the grey levels (N,)."""
+
+    state: RimState
+    shifts: Array
+    covariance: Array
+    residual: Single
+    shift_px: Array
+    step_px: Array
+
+
+def _refined(
+    ratio: NDArray[np.float32],
+    state: RimState,
+    start: Start,
+    everyone: RimState,
+    own: Index,
+    prior: ShapePrior,
+) -> Outlines:
+    """One linearisation: pixels, window, steps, results of the bubbles ``own`` of everyone."""
+    pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state))
+    linear = linearised(state, pixels)
+    hidden = pixels.hidden(state.ellipse, everyone.ellipse, _HIDING_SIGMA * everyone.sigma, own)
+    weight = _window(state, pixels, linear, start, hidden)
+    prior = prior.held_where(~linear.resolved)
+    descent = _descend(state, pixels, linear, weight, start, prior, steps=_STEPS)
+    return _result(descent, pixels, linear, weight, hidden, start)
+
+
+def _window(state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Mask) -> Single:
+    """Weights (N,): inverse variances, 0 for what must not be looked at."""
+    counts = pixels.counts
+    grey, _, inside = rim_model(state, pixels, linear, _shifts(state))
+    outside, change = start.sigma_outer**2, start.sigma_inner**2 - start.sigma_outer**2
+    inverse = 1.0 / (spread(outside, counts) + spread(change, counts) * inside)
+    distance, sigma = _distance(state, pixels, linear), spread(state.sigma, counts)
+    kept = (np.abs(distance) < 3.0 * sigma + 0.5) & ~hidden
+    residual = (pixels.value - grey) * np.sqrt(inverse)
+    contrast = (state.outer - state.inner) / start.sigma_outer
+    kept &= ~unlike_rim(pixels, linear.foot, distance, residual, state.sigma, contrast)
+    limit = _OUTLIER_SIGMA * np.maximum(_typical_residual(residual, pixels, kept), 1.0)
+    kept &= np.abs(residual) < spread(limit, counts)
+    weight: Single = (inverse * kept).astype(np.float32)
+    return weight
+
+
+def _typical_residual(residual: Single, pixels: Pixels, kept: Mask) -> Array:
+    typical = np.ones(pixels.bubbles)
+    for index, part in enumerate(pixels.parts()):
+        own = np.abs(residual[part][kept[part]])
+        if own.size > 8:
+            typical[index] = 1.4826 * np.partition(own, own.size // 2)[own.size // 2]
+    return typical
+
+
+def _descend(
+    state: RimState,
+    pixels: Pixels,
+    linear: Linear,
+    weight: Single,
+    start: Start,
+    prior: ShapePrior,
+    *,
+    steps: int,
+) -> _Descent:
+    """Gauss-Newton at fixed feet."""
+    first, shifts = state, _shifts(state)
+    for index in range(steps):
+        grey, jacobian, _ = rim_model(state, pixels, linear, shifts)
+        residual = pixels.value - grey
+        information, pull = normal_equations(jacobian, residual, weight, pixels)
+        prior_equations(information, pull, state, shifts, start.inner, prior)
+        step, covariance = _solved(information, pull)
+        step = _limited(step, state)
+        shifts = shifts + np.delete(step, (BLUR, OUTER, INNER), axis=1)
+        state = replace(
+            state,
+            sigma=np.maximum(state.sigma + step[:, BLUR], _MIN_SIGMA_PX),
+            outer=state.outer + step[:, OUTER],
+            inner=state.inner + step[:, INNER],
+        )
+        reach = np.max(np.abs(step[:, :BLUR]), axis=1)
+        if index + 1 == steps or float(np.max(reach)) < _CONVERGED_PX:
+            break
+    for part, own in zip(pixels.parts(), step.astype(np.float32), strict=True):
+        residual[part] -= own @ jacobian[:, part]
+    since = np.max(np.abs(shifts - _shifts(first)), axis=1)
+    return _Descent(state, shifts, covariance, residual, since, reach)
+
+
+def _solved(information: Array, pull: Array) -> tuple[Array, Array]:
+    """Steps (B, 16) and covariances (B, 16, 16)."""
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", information), 1e-12))
+    equilibrated = information * scale[:, :, None] * scale[:, None, :]
+    diagonal = np.arange(PARAMETERS)
+    equilibrated[:, diagonal, diagonal] += 1e-7
+    covariance = np.linalg.inv(equilibrated) * scale[:, :, None] * scale[:, None, :]
+    step: Array = (covariance @ pull[..., None])[..., 0]
+    return step, covariance
+
+
+def _limited(step: Array, state: RimState) -> Array:
+    """Steps that keep within the range where the linearisation holds."""
+    reach = np.max(np.abs(step[:, :BLUR]), axis=1)
+    share = np.minimum(1.0, np.minimum(1.5, 0.3 * state.ellipse[:, 3]) / (reach + 1e-12))
+    share = np.minimum(share, 0.4 * state.sigma / (np.abs(step[:, BLUR]) + 1e-12))
+    limited: Array = step * share[:, None]
+    return limited
+
+
+def _moved(state: RimState, shifts: Array) -> RimState:
+    ellipse, turn = moved(state.ellipse, shifts[:, :BLUR])
+    return replace(state, ellipse=ellipse, harmonics=turned_harmonics(shifts[:, BLUR:], turn))
+
+
+def _coverage(pixels: Pixels, linear: Linear, weight: Single, sigma: Array) -> Array:
+    """Share of the outline (B,) at which pixels at the edge were looked at."""
+    close = np.abs(linear.foot.distance) < spread(1.2 * sigma + 0.3, pixels.counts)
+    near = np.flatnonzero(close & (weight > 0.0))
+    angle = np.arctan2(linear.foot.sin[near], linear.foot.cos[near])
+    slot = ((angle + np.pi) * (_BINS / (2.0 * np.pi))).astype(np.intp) % _BINS
+    seen = np.bincount(pixels.owner[near] * _BINS + slot, minlength=pixels.bubbles * _BINS)
+    share: Array = np.mean(seen.reshape(-1, _BINS) > 0, axis=1)
+    return share
+
+
+def _misfit(
+    state: RimState, pixels: Pixels, linear: Linear, residual: Single, hidden: Mask, start: Start
+) -> Array:
+    """RMS distance (B,) between rim and outline: grey residuals over the edge's slope.
+
+    At the edge's steepest, outliers included, with the noise's share taken away.
+    """
+    counts = pixels.counts
+    near = np.abs(_distance(state, pixels, linear)) < spread(state.sigma, counts)
+    near &= ~hidden
+    count = np.maximum(pixels.sums(near.astype(np.float32)), 1.0)
+    excess = pixels.sums(near * residual**2) / count - start.sigma_outer**2
+    slope = _MEAN_SLOPE * (state.outer - state.inner) / state.sigma
+    misfit: Array = np.sqrt(np.maximum(excess, 0.0)) / np.maximum(slope, 1e-9)
+    return misfit
+
+
+def _result(
+    descent: _Descent,
+    pixels: Pixels,
+    linear: Linear,
+    weight: Single,
+    hidden: Mask,
+    start: Start,
+) -> Outlines:
+    """Covariances are widened by chi2_dof where that exceeds 1 by 3 sigma."""
+    state = _moved(descent.state, descent.shifts)
+    fitted = np.where(linear.resolved, PARAMETERS, FIRST_HARMONIC)
+    dof = np.maximum(pixels.sums((weight > 0.0).astype(np.float32)) - fitted, 1.0)
+    chi2_dof = pixels.sums(weight * descent.residual**2) / dof
+    misfit = np.where(chi2_dof > 1.0 + 3.0 * np.sqrt(2.0 / dof), chi2_dof, 1.0)
+    covariance = descent.covariance * misfit[:, None, None]
+    angle = descent.state.ellipse[:, 4]
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+    variances = np.einsum("bii->bi", covariance)[:, FIRST_HARMONIC:]
+    return Outlines(
+        state.ellipse,
+        np.where(linear.resolved[:, None], state.harmonics, 0.0),
+        linear.resolved,
+        state.sigma,
+        state.outer,
+        state.inner,
+        turn @ covariance[:, :2, :2] @ np.swapaxes(turn, 1, 2),
+        np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0)),
+        chi2_dof,
+        _coverage(pixels, linear, weight, state.sigma),
+        _misfit(state, pixels, linear, descent.residual, hidden, start),
+        descent.shift_px,
+        descent.step_px,
+    )

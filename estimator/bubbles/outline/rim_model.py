@@ -1,0 +1,148 @@
+"""Grey levels along a bubble's rim and how they change with its outline, blur and levels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.bubbles.outline.edge_profile import rim_profile
+from telerig.estimator.bubbles.outline.ellipse_geometry import (
+    ELLIPSE_PARAMETERS,
+    Foot,
+    ellipse_basis,
+    foot_points,
+    harmonic_basis,
+    spread,
+)
+from telerig.estimator.bubbles.outline.rim_pixels import Pixels
+from telerig.estimator.bubbles.outline.types import HARMONICS
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+BLUR, OUTER, INNER, FIRST_HARMONIC = 5, 6, 7, 8
+"""Places in the parameter vector; before BLUR the five displacements of the ellipse."""
+PARAMETERS = FIRST_HARMONIC + 2 * len(HARMONICS)
+_RESOLVED_BLURS = 3.0
+_BENDING_FROM, _MAX_RETREAT = 0.2, 0.3
+
+
+@dataclass(frozen=True)
+class RimState:
+    """Outlines of B bubbles: ``ellipse`` (B, 5), ``harmonics`` (B, 8), and the edges' ``sigma``
+    [px], ``outer`` and ``inner`` levels (B,)."""
+
+    ellipse: Array
+    harmonics: Array
+    sigma: Array
+    outer: Array
+    inner: Array
+
+
+@dataclass(frozen=True)
+class Linear:
+    """What stays while outlines move a little: the pixels' feet, and the outward displacement
+    ``shape`` (13, N) there by each parameter of the outline. Harmonics of bubbles that are not
+    ``resolved`` (B,), too small against their blur, are not to be fitted. ``bending`` (N,) is the
+    curvature's second derivative along the arc over 8, where the blur makes it matter."""
+
+    foot: Foot
+    shape: Single
+    resolved: Mask
+    bending: Single | None
+
+    def displacements(self, pixels: Pixels, shifts: Array) -> Single:
+        """Outward displacement (N,) of the outline at each pixel's foot for shifts (B, 13)."""
+        result = np.empty(self.shape.shape[1], dtype=np.float32)
+        for part, own in zip(pixels.parts(), shifts.astype(np.float32), strict=True):
+            np.matmul(own, self.shape[:, part], out=result[part])
+        return result
+
+
+def linearised(state: RimState, pixels: Pixels) -> Linear:
+    """Feet and displacements at the state's ellipses.
+
+    Blur damps an outline's wave of order k against a shift (k = 1) by I_k / I_1 of Bessel's
+    functions, nearly exp(-(k^2 - 1) sigma^2 / (2 R^2)).
+    """
+    foot = foot_points(pixels.local(state.ellipse), pixels.counts, pixels.u, pixels.v)
+    order = np.repeat(np.array(HARMONICS, dtype=np.float64), 2)
+    square = state.sigma**2 / (state.ellipse[:, 2] * state.ellipse[:, 3])
+    gain = np.exp(-(order[:, None] ** 2 - 1.0) * square / 2.0)
+    shape = np.empty((ELLIPSE_PARAMETERS + order.size, pixels.u.size), dtype=np.float32)
+    ellipse_basis(foot, shape[:ELLIPSE_PARAMETERS])
+    shape[ELLIPSE_PARAMETERS:] = harmonic_basis(foot.cos, foot.sin)
+    for index, part in enumerate(pixels.parts()):
+        shape[ELLIPSE_PARAMETERS:, part] *= gain[:, index : index + 1].astype(np.float32)
+    sharpest = state.ellipse[:, 2] / state.ellipse[:, 3] ** 2
+    bent = bool(np.any(sharpest * state.sigma > _BENDING_FROM))
+    resolved = state.ellipse[:, 3] > _RESOLVED_BLURS * state.sigma
+    return Linear(foot, shape, resolved, _bending(state, pixels, foot) if bent else None)
+
+
+def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Single:
+    """Second derivative of the curvature by the arc's length, over 8.
+
+    Across the blur an arc runs at -(K y^2 / 2 + (K'' + 3 K^3) y^4 / 24) from its tangent, a circle
+    of the same curvature at K'' = 0; the mean of y^4 is 3 sigma^4, so the blurred edge retreats
+    by K'' sigma^4 / 8.
+    """
+    a, b = state.ellipse[:, 2], state.ellipse[:, 3]
+    product, gap = spread(np.stack([a * b, a * a - b * b]), pixels.counts)
+    square = foot.speed * foot.speed
+    turn = gap * (foot.cos * foot.cos - foot.sin * foot.sin)
+    slope = gap * foot.sin * foot.cos
+    bending: Single = (
+        -0.375 * product * (turn - 6.0 * slope * slope / square) / (square**3 * foot.speed)
+    )
+    return bending
+
+
+def rim_model(
+    state: RimState, pixels: Pixels, linear: Linear, shifts: Array
+) -> tuple[Single, Single, Single]:
+    """Grey (N,), its Jacobian (16, N) and the share F (N,) of the bubble's own level.
+
+    ``shifts`` (B, 13): displacements of the outline since the linearisation.
+    """
+    counts = pixels.counts
+    inverse_sigma, contrast, outer = spread(
+        np.stack([1.0 / state.sigma, state.inner - state.outer, state.outer]), counts
+    )
+    distance = linear.foot.distance - linear.displacements(pixels, shifts)
+    if linear.bending is not None:
+        limit = spread(_MAX_RETREAT * state.sigma, counts)
+        retreat = linear.bending * spread(state.sigma**4, counts)
+        distance += np.clip(retreat, -limit, limit)
+    distance *= inverse_sigma
+    curvature = linear.foot.curvature / inverse_sigma
+    profile = rim_profile(distance, curvature)
+    slope = contrast * inverse_sigma
+    jacobian = np.empty((PARAMETERS, pixels.u.size), dtype=np.float32)
+    np.multiply(curvature, profile.by_curvature, out=jacobian[BLUR])
+    jacobian[BLUR] -= profile.by_distance * distance
+    jacobian[BLUR] *= slope
+    slope *= -profile.by_distance
+    np.multiply(linear.shape[:ELLIPSE_PARAMETERS], slope, out=jacobian[:ELLIPSE_PARAMETERS])
+    np.multiply(linear.shape[ELLIPSE_PARAMETERS:], slope, out=jacobian[FIRST_HARMONIC:])
+    np.subtract(1.0, profile.value, out=jacobian[OUTER])
+    jacobian[INNER] = profile.value
+    return outer + contrast * profile.value, jacobian, profile.value
+
+
+def normal_equations(
+    jacobian: Single, residual: Single, weight: Single, pixels: Pixels
+) -> tuple[Array, Array]:
+    """Information (B, 16, 16) and pull (B, 16) of weighted residuals (N,)."""
+    information = np.empty((pixels.bubbles, PARAMETERS, PARAMETERS))
+    pull = np.empty((pixels.bubbles, PARAMETERS))
+    root = np.sqrt(weight)
+    whitened, gap = jacobian * root, residual * root
+    for index, part in enumerate(pixels.parts()):
+        own = whitened[:, part]
+        information[index] = own @ own.T
+        pull[index] = own @ gap[part]
+    return information, pull

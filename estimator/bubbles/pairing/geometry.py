@@ -1,0 +1,237 @@
+"""What two detections say of each other: the gap along the shared coordinate, heights, sizes.
+
+Two views of one body share the planes that touch it and hold both viewing directions. So along
+the common perpendicular of the rays both silhouettes have the same top and the same bottom, for
+any body and any angle between the cameras. The *gap* is the mismatch of the two middles, the
+*height* half the distance of top and bottom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.bubbles.outline.types import HARMONIC_COLUMNS, HARMONICS
+from telerig.rig import projection
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import midpoint
+
+Array = NDArray[np.float64]
+
+NO_SIZE_FLAGS = ("border", "merged")
+_DOUBTFUL = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
+_UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
+"""What hidden outline may add to a centre's sd, as a share of the larger semi-axis."""
+_OUTLINE_SAMPLES = 96
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's detections, seen along the shared axis; N rows.
+
+    uv_px : (N, 2).  origin_mm, direction : (N, 3) rays.
+    mm_by_px : (N, 2, 2) camera-plane mm by pixel, at depth 0.
+    covariance_px2 : (N, 2, 2).
+    middle_mm : (N,) middle of top and bottom less the centre, along the shared axis.
+    log_size : (N, 2) logarithms of half the height and half the width (mm), along and across the
+        shared axis; NaN where unknown.  log_contrast : (N, 1), likewise.
+    doubt : (N,) factor for the scatter of flagged detections.
+    """
+
+    camera: Camera
+    uv_px: Array
+    origin_mm: Array
+    direction: Array
+    mm_by_px: Array
+    covariance_px2: Array
+    middle_mm: Array
+    log_size: Array
+    log_contrast: Array
+    doubt: Array
+
+    def __len__(self) -> int:
+        return len(self.doubt)
+
+
+@dataclass(frozen=True)
+class PairGeometry:
+    """All N1 x N2 combinations of one frame's detections.
+
+    gap_px : (N1, N2) first less second along the shared axis, in px of the first image, bias
+    included; positive along that image's +u or +v, whichever is nearer the axis.
+    variance_px2 : its variance by the detections' covariances.  points_mm : (N1, N2, 3) mid-points.
+    size, contrast : (N1, N2, 2), (N1, N2, 1) logarithms of the ratios first / second.
+    mm_per_px : (N1, N2) length of a pixel of the gap.  doubt : (N1, N2).
+    """
+
+    views: tuple[View, View]
+    gap_px: Array
+    variance_px2: Array
+    points_mm: Array
+    size: Array
+    contrast: Array
+    mm_per_px: Array
+    doubt: Array
+
+
+def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
+    """(3,) unit vector in the rig frame, across both optical axes; along +u or +v of the first.
+
+    Raises InputError for cameras that look along one direction.
+    """
+    first, second = (c.camera_from_rig.rotation[2] for c in cameras)
+    cross = np.cross(first, second)
+    length = np.linalg.norm(cross)
+    if length < 0.05:
+        raise InputError(
+            "both cameras look along nearly the same direction",
+            todo="views less than 3 deg apart cannot be matched by a shared coordinate",
+        )
+    in_first = (cameras[0].camera_from_rig.rotation @ cross)[:2]
+    return np.asarray(cross / length * np.sign(in_first[np.argmax(np.abs(in_first))]))
+
+
+def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
+    """Rays and sizes of a detection table.  Raises InputError for columns or values not there."""
+    missing = {"u_px", "v_px", "suu_px2", "suv_px2", "svv_px2", "a_px", "b_px"} - set(table)
+    if missing:
+        raise InputError(
+            f"the detections of camera {camera.name!r} lack {', '.join(sorted(missing))}",
+            todo="give the table that detect_bubbles returns",
+        )
+    uv = np.stack([_column(table, c) for c in ("u_px", "v_px")], -1)
+    covariance = np.stack(
+        [_column(table, c) for c in ("suu_px2", "suv_px2", "suv_px2", "svv_px2")], -1
+    )
+    bad = ~(np.isfinite(uv).all(1) & np.isfinite(covariance).all(1))
+    if bad.any():
+        raise InputError(
+            f"{int(bad.sum())} detections of camera {camera.name!r} have no finite centre or "
+            f"covariance (first: row {int(np.argmax(bad))})",
+            todo="leave such rows out",
+        )
+    origin, direction = camera.unproject(uv)
+    mm_by_px = _mm_by_px(camera, uv)
+    across = np.einsum("i,nij->nj", (camera.camera_from_rig.rotation @ axis)[:2], mm_by_px)
+    middle, height = outline_extent(table, across)
+    known, doubt, unsure = _trust(table)
+    extra = np.square(unsure * np.nan_to_num(_column(table, "a_px")))
+    area = np.pi * _column(table, "a_px") * _column(table, "b_px")
+    measured = _column(table, "area_px2")
+    area = np.where(measured > 0, measured, area)
+    area_mm2 = area * np.abs(np.linalg.det(mm_by_px))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_height = np.where(known & (height > 0), np.log(height), np.nan)
+        log_width = np.log(area_mm2 / np.pi) - log_height
+        contrast = np.log(_column(table, "contrast"))
+    return View(
+        camera, uv, origin, direction, mm_by_px,
+        covariance.reshape(-1, 2, 2) + extra[:, None, None] * np.eye(2), middle,
+        _finite(np.stack([log_height, log_width], -1)), _finite(contrast[:, None]),
+        doubt,
+    )  # fmt: skip
+
+
+def pair_geometry(first: View, second: View) -> PairGeometry:
+    """Every combination of a detection of the first view with one of the second."""
+    views = (first, second)
+    origins = (first.origin_mm[:, None], second.origin_mm[None])
+    directions = (first.direction[:, None], second.direction[None])
+    points, _ = midpoint(origins[0], directions[0], origins[1], directions[1])
+    axis = np.cross(directions[0], directions[1])
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    axis *= np.sign(axis @ shared_axis((first.camera, second.camera)))[..., None]
+    gap = ((origins[0] - origins[1]) * axis).sum(-1)
+    variance, stretch, lengths = np.zeros_like(gap), [], []
+    for c, view in enumerate(views):
+        pose = view.camera.camera_from_rig
+        depth = points @ pose.rotation[2] + pose.translation_mm[2]
+        magnified = 1 + view.camera["kappa_per_mm"] * depth
+        per_row = (slice(None), None) if c == 0 else (None, slice(None))
+        across = (axis @ pose.rotation.T)[..., None, :2] @ view.mm_by_px[per_row]
+        across = across[..., 0, :] * magnified[..., None]
+        spread = np.einsum("...i,...ij,...j", across, view.covariance_px2[per_row], across)
+        variance += spread
+        gap += (1 - 2 * c) * view.middle_mm[per_row] * magnified
+        stretch.append(np.log(magnified))
+        lengths.append(np.linalg.norm(across, axis=-1))
+    return PairGeometry(
+        views, gap / lengths[0], variance / lengths[0] ** 2, points,
+        first.log_size[:, None] - second.log_size + (stretch[0] - stretch[1])[..., None],
+        first.log_contrast[:, None] - second.log_contrast,
+        lengths[0], np.maximum(first.doubt[:, None], second.doubt),
+    )  # fmt: skip
+
+
+def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
+    """Middle and half the extent of outlines along per-row covectors (N, 2), in the latter's unit.
+
+    The middle is relative to (u_px, v_px). Harmonics are used where they were fitted.
+    """
+    a, b = _column(table, "a_px"), _column(table, "b_px")
+    angle = np.nan_to_num(_column(table, "angle_rad"))
+    turn = np.stack([np.cos(angle), np.sin(angle)], -1)
+    along = (across * turn).sum(-1)
+    beside = across[:, 1] * turn[:, 0] - across[:, 0] * turn[:, 1]
+    half = np.hypot(a * along, b * beside)
+    middle = np.zeros(len(table))
+    harmonics = np.stack([_column(table, c) for c in HARMONIC_COLUMNS], -1)
+    shaped = np.isfinite(harmonics).all(1)
+    if shaped.any():
+        phi = 2 * np.pi * np.arange(_OUTLINE_SAMPLES) / _OUTLINE_SAMPLES
+        cosine, sine = np.cos(phi), np.sin(phi)
+        a, b, along, beside = (v[shaped, None] for v in (a, b, along, beside))
+        normal = (b * cosine * along + a * sine * beside) / np.hypot(b * cosine, a * sine)
+        waves = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)])
+        displaced = harmonics[shaped] @ waves
+        profile = a * cosine * along + b * sine * beside + normal * displaced
+        top, bottom = _peak(profile), -_peak(-profile)
+        middle[shaped], half[shaped] = (top + bottom) / 2, (top - bottom) / 2
+    return middle, half
+
+
+def _peak(profile: Array) -> Array:
+    """Maximum of each periodic row, refined by a parabola through its highest sample."""
+    rows, i = np.arange(len(profile)), np.argmax(profile, axis=1)
+    n = profile.shape[1]
+    before, here, after = profile[rows, i - 1], profile[rows, i], profile[rows, (i + 1) % n]
+    bend = before - 2 * here + after
+    bend = np.where(bend < 0, bend, -1.0)
+    return np.asarray(here - (after - before) ** 2 / (8 * bend))
+
+
+def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
+    ideal = projection.ideal_from_pixel(uv_px, camera.intrinsics, camera.rho_mm)
+    points = np.concatenate([ideal, np.zeros((len(ideal), 1))], -1)
+    _, by_point, _ = projection.pixel_jacobians(points, camera.intrinsics, camera.rho_mm)
+    return np.asarray(np.linalg.inv(by_point[..., :2]))
+
+
+def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array, Array]:
+    """By the flags: is the size known, the factor for the scatter, the unsure share of the size."""
+    known, doubt, unsure = np.ones(len(table), bool), np.ones(len(table)), np.zeros(len(table))
+    if "flags" in table:
+        for i, text in enumerate(table["flags"].tolist()):
+            for word in text.split("|") if isinstance(text, str) and text else ():
+                known[i] &= word not in NO_SIZE_FLAGS
+                doubt[i] = max(doubt[i], _DOUBTFUL.get(word, 1.0))
+                unsure[i] = max(unsure[i], _UNSURE_SHARE.get(word, 0.0))
+    return known, doubt, unsure
+
+
+def _column(table: pd.DataFrame, name: str) -> Array:
+    """A column as numbers; NaN where there is none."""
+    if name not in table:
+        return np.full(len(table), np.nan)
+    values = table[name].to_numpy()
+    if values.dtype.kind not in "fiu":
+        values = pd.to_numeric(table[name], errors="coerce").to_numpy()
+    return values.astype(np.float64)
+
+
+def _finite(values: Array) -> Array:
+    return np.where(np.isfinite(values), values, np.nan)

@@ -1,0 +1,357 @@
+"""The centre of a bubble's volume from its two outlines.
+
+An outline's centre is not the volume's: a third-degree shape mode of 5 % moves it by up to 4 % of
+the radius. The outline's own third harmonics tell part of that, see `body_modes` and
+docs/decisions/007-volume-centroid.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.bubbles.shape import modes
+from telerig.estimator.bubbles.shape.ellipsoids import BodyShapes, body_shapes
+from telerig.estimator.bubbles.shape.modes import Views
+from telerig.estimator.bubbles.shape.outlines import Outlines, outlines_from_table
+from telerig.rig import silhouette
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import stacked_jacobian, triangulate
+
+Array = NDArray[np.float64]
+
+DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
+_ZONAL_SHARE = 0.2  # prior probability of a shape that is axisymmetric about the spheroid's axis
+_KNOWN_AXIS = 0.15  # rad: beyond this uncertainty of the axis that account is left out
+_RUN_WEIGHT = 4.0  # harmonics' worth of the run's shape_sigma against a bubble's own four
+_DEFAULT_WEIGHT = 0.05  # in bubbles, of DEFAULT_SHAPE_SIGMA in what a run learns
+_LARGEST_SIGMA = 0.03  # one bubble's share in what a run learns
+_MODEL_ERROR, _CROSS_TERM = 0.02, 8.0  # second order: of the third harmonic, times the fourth
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """M bubbles, rig frame.
+
+    points_mm, covariance_mm2 : (M, 3), (M, 3, 3) centre of volume, with the share of the shape that
+        two outlines leave open.
+    silhouette_points_mm, silhouette_covariance_mm2 : maximum-likelihood point of the two outlines'
+        centres, with the covariance of the outlines' noise alone.
+    used : (M,) "volume": points_mm is corrected for the shape; "silhouettes": points_mm is
+        silhouette_points_mm (harmonics unknown in a view, an outline that is hidden in part or
+        leaves the image, or rays that pass farther apart than a bubble is large), covariance_mm2
+        with the shape's share; "none": a centre or its covariance is missing, the row is NaN.
+    du_px, dv_px : (M, 2) first and second camera: added to the outlines' centres they make them
+        measurements of the projected centre of volume; 0 unless used is "volume".
+    d_eq_mm, d_eq_sd_mm : (M,) diameter of the sphere of equal volume; semi_axes_mm : (M, 3),
+        descending, of the most spherical ellipsoid with these outlines.  ray_miss_mm : (M,) of the
+        outlines' centres.
+    zonal_probability : (M,) that the third degree is axisymmetric about an oblate body's axis.
+    """
+
+    points_mm: Array
+    covariance_mm2: Array
+    silhouette_points_mm: Array
+    silhouette_covariance_mm2: Array
+    used: NDArray[np.str_]
+    du_px: Array
+    dv_px: Array
+    d_eq_mm: Array
+    d_eq_sd_mm: Array
+    semi_axes_mm: Array
+    ray_miss_mm: Array
+    zonal_probability: Array
+
+
+def fit_bodies(
+    first: pd.DataFrame,
+    second: pd.DataFrame,
+    cameras: tuple[Camera, Camera],
+    *,
+    shape_sigma: ArrayLike | None = None,
+    gap_sigma_px: float = 0.0,
+) -> Bodies:
+    """Centres of volume of M pairs of outlines, row i of one table matching row i of the other.
+
+    shape_sigma : standard deviations of the shape's coefficients (harmonics of unit mean square,
+    relative to the radius) of degree 3 and 4, one number for both; by default
+    `estimate_shape_sigma` of these pairs.
+
+    gap_sigma_px : how far the cameras' own motion or their calibration may part the two views
+    along the shared coordinate; so much of the centres' difference says nothing of the shape.
+
+    Raises InputError for tables of unequal length or a shape_sigma that is not positive.
+    """
+    outlines = _paired(first, second, cameras)
+    sigma = _learned_sigma(outlines) if shape_sigma is None else _checked_sigma(shape_sigma)
+    located = outlines[0].located & outlines[1].located
+    bodies = _empty(len(located))
+    _fill_points(bodies, outlines, cameras, located)
+    located = bodies.used == "silhouettes"
+    shaped = located & outlines[0].shaped & outlines[1].shaped
+    shaped[shaped] = _meet(bodies.silhouette_points_mm[shaped], outlines, cameras, shaped)
+    whole = shaped & outlines[0].whole & outlines[1].whole
+    for rows, correct in ((whole, True), (shaped & ~whole, False)):
+        if np.any(rows):
+            pair = (outlines[0].rows(rows), outlines[1].rows(rows))
+            at = np.flatnonzero(rows)
+            _fill_shapes(bodies, pair, cameras, at, sigma, gap_sigma_px, correct=correct)
+    return bodies
+
+
+def estimate_shape_sigma(
+    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
+) -> Array:
+    """(2,) standard deviations of the shape's coefficients of degree 3 and 4, learned from a run.
+
+    Empirical Bayes: the mean square of the outlines' third and fourth harmonics, less their noise,
+    with a little of `DEFAULT_SHAPE_SIGMA`. Raises InputError for tables of unequal length.
+    """
+    return _learned_sigma(_paired(first, second, cameras))
+
+
+def _paired(
+    first: pd.DataFrame, second: pd.DataFrame, cameras: tuple[Camera, Camera]
+) -> tuple[Outlines, Outlines]:
+    if len(first) != len(second):
+        raise InputError(
+            f"{len(first)} outlines in the first camera and {len(second)} in the second",
+            todo="row i of one table must be the same bubble as row i of the other",
+        )
+    left, right = (
+        outlines_from_table(table, camera.image_size_px)
+        for table, camera in zip((first, second), cameras)
+    )
+    return left, right
+
+
+def _checked_sigma(shape_sigma: ArrayLike) -> Array:
+    sigma = np.asarray(shape_sigma, float)
+    if sigma.shape not in ((), (2,)) or not np.all(np.isfinite(sigma) & (sigma > 0)):
+        raise InputError(
+            f"shape_sigma {shape_sigma!r}: one positive number, or one each for degree 3 and 4",
+            todo="give the shape's rms relative to the radius divided by 2.6, for instance 0.005",
+        )
+    return np.broadcast_to(sigma, (2,))
+
+
+def _learned_sigma(outlines: tuple[Outlines, Outlines]) -> Array:
+    whole = outlines[0].whole & outlines[1].whole
+    out = []
+    for degree, part, default in zip((3, 4), (slice(2, 4), slice(4, 6)), DEFAULT_SHAPE_SIGMA):
+        variance = np.mean([_variance(o.rows(whole), degree, part) for o in outlines], 0)
+        variance = np.minimum(variance, _LARGEST_SIGMA**2)
+        out.append(
+            np.sqrt(
+                (max(variance.sum(), 0.0) + _DEFAULT_WEIGHT * default**2)
+                / (len(variance) + _DEFAULT_WEIGHT)
+            )
+        )
+    return np.array(out)
+
+
+def _variance(outlines: Outlines, degree: int, part: slice, less: float = 1.0) -> Array:
+    """(M,) one degree's sigma^2 from one outline each, unbiased with once the noise taken off."""
+    noise = np.einsum("mii->m", outlines.trace_covariance[:, part, part])
+    power = (outlines.trace[:, part] ** 2).sum(-1) - less * noise
+    return np.asarray(power / (2 * silhouette.TRACE_VARIANCE[degree, degree]))
+
+
+def _empty(count: int) -> Bodies:
+    def nan(*shape: int) -> Array:
+        return np.full((count, *shape), np.nan)
+
+    return Bodies(
+        nan(3), nan(3, 3), nan(3), nan(3, 3), np.full(count, "none", "<U11"),
+        np.zeros((count, 2)), np.zeros((count, 2)), nan(), nan(), nan(3), nan(), nan(),
+    )  # fmt: skip
+
+
+def _fill_points(
+    bodies: Bodies,
+    outlines: tuple[Outlines, Outlines],
+    cameras: tuple[Camera, Camera],
+    rows: NDArray[np.bool_],
+) -> None:
+    """The outlines' centres triangulated."""
+    pair = [o.rows(rows) for o in outlines]
+    found = triangulate(
+        cameras, (pair[0].uv_px, pair[1].uv_px), (pair[0].covariance_px2, pair[1].covariance_px2)
+    )
+    for points in (bodies.points_mm, bodies.silhouette_points_mm):
+        points[rows] = found.points_mm
+    for covariance in (bodies.covariance_mm2, bodies.silhouette_covariance_mm2):
+        covariance[rows] = found.covariance_mm2
+    bodies.ray_miss_mm[rows] = found.ray_miss_mm
+    bodies.used[np.isfinite(bodies.covariance_mm2).all((1, 2))] = "silhouettes"
+
+
+def _meet(
+    points_mm: Array,
+    outlines: tuple[Outlines, Outlines],
+    cameras: tuple[Camera, Camera],
+    rows: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """(M,) the triangulated point is seen inside both outlines: they may be one body's."""
+    pixels, _, _ = stacked_jacobian(cameras, points_mm)
+    pair = [o.rows(rows) for o in outlines]
+    gap = np.concatenate([o.uv_px for o in pair], -1) - pixels
+    extent = np.minimum(*(np.linalg.norm(o.axes_px, axis=1).max(-1) for o in pair))
+    return np.asarray((np.abs(gap) < extent[:, None]).all(-1))
+
+
+def _fill_shapes(
+    bodies: Bodies,
+    pair: tuple[Outlines, Outlines],
+    cameras: tuple[Camera, Camera],
+    rows: NDArray[np.int64],
+    sigma: Array,
+    gap_sigma_px: float,
+    *,
+    correct: bool,
+) -> None:
+    """Sizes; the centres of volume, or else what the shape adds to the outlines' centres' error."""
+    pixels, jacobian, _ = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
+    axes_px = (pair[0].axes_px, pair[1].axes_px)
+    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), axes_px)
+    squares = np.linalg.eigvalsh(shapes.moments_mm2)
+    bodies.semi_axes_mm[rows] = np.sqrt(squares[:, ::-1])
+    bodies.d_eq_mm[rows], bodies.d_eq_sd_mm[rows] = _diameter(shapes, pair, sigma)
+    if correct:
+        _correct(bodies, pair, shapes, pixels, jacobian, rows, sigma, gap_sigma_px)
+    else:
+        bodies.covariance_mm2[rows] = modes.uncorrected_covariance(
+            _pixel_noise(pair), jacobian, axes_px, shapes.pair.frames(shapes.coupling), sigma[0]
+        )
+
+
+def _correct(
+    bodies: Bodies,
+    pair: tuple[Outlines, Outlines],
+    shapes: BodyShapes,
+    pixels: Array,
+    jacobian: Array,
+    rows: NDArray[np.int64],
+    sigma: Array,
+    gap_sigma_px: float,
+) -> None:
+    """Centres of volume: every account of the shape, weighted by its evidence."""
+    measured, noise, conversion = _measured(pair, pixels)
+    shared = _images(jacobian, (shapes.pair.shared, shapes.pair.shared))
+    noise[:, :4, :4] += _gap_covariance(shared, gap_sigma_px)
+    slope = np.concatenate([jacobian, np.zeros_like(jacobian)], 1)
+    views = Views(
+        measured,
+        noise,
+        slope,
+        (pair[0].axes_px, pair[1].axes_px),
+        _own_sigma(pair, sigma[0]),
+        conversion,
+        _images(jacobian, shapes.pair.sides),
+        shared,
+    )
+    accounts, shares = [], []
+    for coupling, share in shapes.couplings():
+        accounts.append(modes.isotropic(views, shapes.pair.frames(coupling)))
+        shares.append(share)
+    axis_sigma = _axis_sigma(shapes, pair, sigma)
+    accounts.append(modes.zonal(views, shapes.poles, axis_sigma))
+    zonal_share = np.where(axis_sigma < _KNOWN_AXIS, _ZONAL_SHARE, 1e-9)
+    prior = np.stack([*((1 - zonal_share) * p for p in shares), zonal_share])
+    answer, weight = modes.combine(accounts, prior)
+    correction = conversion - answer.shift_px
+    bodies.points_mm[rows] = bodies.silhouette_points_mm[rows] + answer.step_mm
+    bodies.covariance_mm2[rows] = answer.covariance_mm2
+    bodies.du_px[rows], bodies.dv_px[rows] = correction[:, 0::2], correction[:, 1::2]
+    bodies.used[rows] = "volume"
+    bodies.zonal_probability[rows] = weight[-1]
+
+
+def _gap_covariance(shared: tuple[Array, Array], gap_sigma_px: float) -> Array:
+    """(M, 4, 4) of the two centres moved apart along the shared coordinate."""
+    left, right = (image / np.linalg.norm(image, axis=-1, keepdims=True) for image in shared)
+    apart = np.concatenate([left, -right], -1) / 2
+    return gap_sigma_px**2 * apart[:, :, None] * apart[:, None, :]
+
+
+def _images(jacobian: Array, directions: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Two (M, 2): the first direction in the first view, the second in the second."""
+    left, right = (
+        (jacobian[:, 2 * c : 2 * c + 2] @ d[..., None])[..., 0] for c, d in enumerate(directions)
+    )
+    return left, right
+
+
+def _measured(pair: tuple[Outlines, Outlines], pixels: Array) -> tuple[Array, Array, Array]:
+    """`Views.measured`, `Views.noise`, and (M, 4) what was added to the ellipses' centres."""
+    count = len(pixels)
+    measured, noise = np.zeros((count, 8)), np.zeros((count, 8, 8))
+    conversion = np.zeros((count, 4))
+    third2 = np.mean([(o.trace[:, 2:4] ** 2).mean(-1) for o in pair], 0)
+    fourth2 = np.mean([(o.trace[:, 4:] ** 2).mean(-1) for o in pair], 0)
+    second_order2 = third2 * (_MODEL_ERROR**2 + _CROSS_TERM**2 * fourth2)
+    for c, outlines in enumerate(pair):
+        pixel, third = slice(2 * c, 2 * c + 2), slice(4 + 2 * c, 6 + 2 * c)
+        mix = np.zeros((count, 4, 4))
+        mix[:, :2, :2], mix[:, 2:, 2:] = outlines.axes_px, np.eye(2)
+        error = outlines.trace_covariance[:, :4, :4]
+        error = error + second_order2[:, None, None] * np.eye(4)
+        error = mix @ error @ np.swapaxes(mix, -1, -2)
+        error[:, :2, :2] += outlines.covariance_px2
+        conversion[:, pixel] = np.einsum("mij,mj->mi", outlines.axes_px, outlines.trace[:, :2])
+        measured[:, pixel] = outlines.uv_px + conversion[:, pixel] - pixels[:, pixel]
+        measured[:, third] = outlines.trace[:, 2:4]
+        noise[:, pixel, pixel], noise[:, third, third] = error[:, :2, :2], error[:, 2:, 2:]
+        noise[:, pixel, third], noise[:, third, pixel] = error[:, :2, 2:], error[:, 2:, :2]
+    return measured, noise, conversion
+
+
+def _pixel_noise(pair: tuple[Outlines, Outlines]) -> Array:
+    noise = np.zeros((len(pair[0].uv_px), 4, 4))
+    noise[:, :2, :2], noise[:, 2:, 2:] = pair[0].covariance_px2, pair[1].covariance_px2
+    return noise
+
+
+def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
+    """(M,) each bubble's sigma of degree 3: the run's, as `_RUN_WEIGHT` harmonics, and its own.
+
+    Mean of an inverse gamma distribution, so that the blind components are covered; less twice the
+    noise, so that a bubble without shape is left alone.
+    """
+    own = np.sum([2 * _variance(o, 3, slice(2, 4), 2.0) for o in pair], 0)
+    return np.asarray(np.sqrt((_RUN_WEIGHT * sigma**2 + np.maximum(own, 0)) / (_RUN_WEIGHT + 2)))
+
+
+def _diameter(
+    shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: Array
+) -> tuple[Array, Array]:
+    """(M,) volume's diameter and its standard deviation.
+
+    Three things are open: the coupling of the viewing directions (the mean of the most spherical
+    ellipsoid and the oblate spheroid is taken), the fourth degree's share of the ellipses, and the
+    outlines' noise.
+    """
+    logs = [np.log(np.linalg.det(m)) / 6 for m in (shapes.moments_mm2, shapes.oblate_mm2)]
+    unseen = np.hypot((logs[1] - logs[0]) / 2, shapes.coupling_sigma**2 / np.sqrt(18))
+    diameter = 2 * np.exp((logs[0] + logs[1]) / 2)
+    relative2 = (
+        unseen**2 + 0.8 * sigma[1] ** 2 + (30 * sigma[0] ** 2) ** 2 + _relative_noise2(pair) / 8
+    )
+    return diameter, diameter * np.sqrt(relative2)
+
+
+def _axis_sigma(shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
+    """(M,) how well a spheroid's axis is known: errors of the ellipses over its flatness."""
+    squares = np.linalg.eigvalsh(shapes.oblate_mm2)
+    flatness = 1 - squares[:, 0] / squares[:, 2]
+    error2 = 4 * _relative_noise2(pair) + (6.7 * sigma[1]) ** 2 + (80 * sigma[0] ** 2) ** 2
+    return np.asarray(np.clip(np.sqrt(error2) / (flatness + 1e-6), 0.01, 0.7))
+
+
+def _relative_noise2(pair: tuple[Outlines, Outlines]) -> Array:
+    noise2 = [np.trace(o.covariance_px2, axis1=1, axis2=2) / np.linalg.det(o.axes_px) for o in pair]
+    return np.asarray(np.abs(np.sum(noise2, 0)))

@@ -1,0 +1,332 @@
+"""Which lens model the data support, camera by camera.
+
+A rich model is fitted once; the criterion of `lens_search` names the best model that it contains.
+The way there from the simplest model is then fitted step by step, and each step has to predict
+views that were left out no worse than the one before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from telerig.estimator.calibration.lens.cross_validation import held_out_chi2
+from telerig.estimator.calibration.lens.search import (
+    UNDETERMINED,
+    Addition,
+    Landscape,
+    Lens,
+    Lenses,
+    additions,
+    possible,
+    search,
+    steps_to,
+)
+from telerig.estimator.calibration.lens.start_values import model_start
+from telerig.estimator.calibration.solver.graph import Solution, solve
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.factors.projection import State, pixels
+from telerig.io.machine.parallel import ordered_map, quick_workers
+from telerig.rig.lens_models import AUTO, GROUPS, joint_name, name_of, ordered
+from telerig.rig.projection import INDEX
+
+Array = NDArray[np.float64]
+
+DOTS_FOR_WORKERS = 500
+"""With fewer measured dots, four fits take 0.1 s, and starting processes for them 0.05 s."""
+HOPELESS = 10.0
+"""Times the rich model's cost beyond which a model is not asked to predict."""
+ROUNDS = 3
+AGREEMENT = 2.0
+"""How far (chi-square) a fit may be from what the landscape promised before it is drawn anew."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model: groups of every camera, free intrinsics of all, what is left.
+
+    per_view : (V,) mean squared whitened residual of each view, predicted by a fit without it;
+        NaN where too few views are left, infinite where it was not asked for.
+    """
+
+    lenses: Lenses
+    parameters: int
+    cost: float
+    rows: int
+    rms_px: float
+    per_view: Array
+    state: State
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name_of(lens) for lens in self.lenses)
+
+    @property
+    def held_out(self) -> float:
+        """Mean over the views; infinite when no view could be left out."""
+        seen = self.per_view[~np.isnan(self.per_view)]
+        return float(seen.mean()) if len(seen) else float("inf")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the ladder, taken or not.
+
+    camera, added : index of the camera whose model has these parameters more than the step before;
+        -1 and () for the first.
+    gain : chi-square that it takes away, in units of the noise.  worth : gain less price.
+    fit : None where the gain alone decides.  vague : these views do not determine it.
+    """
+
+    camera: int
+    added: tuple[str, ...]
+    lenses: Lenses
+    gain: float
+    worth: float
+    taken: bool
+    words: str
+    fit: Fit | None
+    vague: bool = False
+
+    @property
+    def p_value(self) -> float:
+        """Chance of such a gain without any reason for it; NaN for the first step."""
+        return float(chdtrc(len(self.added), self.gain)) if self.added else float("nan")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The steps up to the chosen model, then those that were not taken; the choice in words."""
+
+    steps: tuple[Step, ...]
+    chosen: Fit
+    words: str
+
+
+def rich_lens(*, mono: bool, strong: bool) -> Lens:
+    """What is tried of a camera.
+
+    strong : perspective; kappa and the centre are then free in any case. With the centre free the
+        image on a tilted sensor is that of a turned camera, so that s or a tilt cannot be told
+        from a turn, and aspect+skew hardly from the target's own stretch (docs/decisions/014).
+    """
+    if strong:
+        return Lens({"kappa", "k1", "k2", "p", "centre"})
+    return Lens({"affine", "k1", "k2", "p", "s"} | (set() if mono else {"kappa"}))
+
+
+def climb(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
+    """Choose among what the problem has free.
+
+    problem, rich : with the richest model, at its minimum.
+    models : per camera, "auto" or a model that stays.
+    """
+    whole = tuple(_lens_of(free) for free in problem.free)
+    allowed = [possible(lens) if m == AUTO else [lens] for lens, m in zip(whole, models)]
+    least = tuple(min(options, key=len) for options in allowed)
+    landscape = Landscape.of(problem, rich)
+    wanted = _determined(landscape, allowed)
+    for _ in range(ROUNDS):
+        path = steps_to(landscape, wanted, least)
+        rivals = _rivals(landscape, wanted, allowed)
+        fits = _fits(problem, rich, [least, *(step[2] for step in path)], rivals)
+        fitted, others = fits[: len(path) + 1], fits[len(path) + 1 :]
+        landscape, better = _thought_over(problem, landscape, fitted[-1], others, allowed)
+        if better == wanted:
+            break
+        wanted = better
+    steps = _with_held_out(_taken(landscape, path, fitted))
+    chosen = [step.fit for step in steps if step.taken and step.fit is not None][-1]
+    refused = [step for step in steps if not step.taken]
+    steps += _not_taken(landscape, chosen.lenses, allowed, refused)
+    return Choice(tuple(steps), chosen, _words(problem, steps, chosen, others))
+
+
+def _lens_of(free: Sequence[str]) -> Lens:
+    return Lens(g for g, parameters in GROUPS.items() if set(parameters) <= set(free))
+
+
+def _determined(landscape: Landscape, allowed: list[list[Lens]]) -> Lenses:
+    """The best model of which the views determine every parameter."""
+    allowed = list(allowed)
+    while True:
+        found = search(landscape, allowed)
+        vague = [
+            (c, group) for c, lens in enumerate(found) for group in ordered(lens)
+            if len(allowed[c]) > 1 and group != "centre"
+            and landscape.sd_over_prior(found, c, group) > UNDETERMINED
+        ]  # fmt: skip
+        if not vague:
+            return found
+        for c, group in vague:
+            allowed[c] = [lens for lens in allowed[c] if group not in lens]
+
+
+def _rivals(landscape: Landscape, wanted: Lenses, allowed: list[list[Lens]]) -> list[Lenses]:
+    """What else is fitted: the best model without a tilt, and the richest without kappa."""
+    out = []
+    if any("tilt" in lens for lens in wanted):
+        flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
+        out.append(_determined(landscape, flat))
+    if any("kappa" in lens and len(options) > 1 for lens, options in zip(wanted, allowed)):
+        richest = (max(options, key=len) for options in allowed)
+        out.append(tuple(
+            lens - {"kappa", "centre"} if len(options) > 1 else lens
+            for lens, options in zip(richest, allowed)
+        ))  # fmt: skip
+    return out
+
+
+def _fits(problem: Problem, rich: Solution, path: list[Lenses], rivals: list[Lenses]) -> list[Fit]:
+    # a copy of a process in which GTSAM has worked may wait for threads that it does not have
+    tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in rivals]
+    here = problem.solver == "gtsam" or len(problem.uv_px) < DOTS_FOR_WORKERS
+    workers = 1 if here else quick_workers(len(tasks))
+    return list(ordered_map(partial(_fit, problem, rich), tasks, workers))
+
+
+def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> Fit:
+    lenses, predict = task
+    problem = problem.with_model([name_of(lens) for lens in lenses])
+    begin = model_start(problem, rich.state)
+    solution = solve(problem, begin, max_iterations=40, relative=1e-7)
+    obs = problem.observations()
+    residual = pixels(solution.state, obs, problem.rho_mm) - obs.uv_px
+    per_view = np.full(len(problem.views), np.inf)
+    if predict and solution.cost < HOPELESS * rich.cost:
+        per_view = held_out_chi2(problem, solution.state)
+    count = sum(len(free) for free in problem.free)
+    rms = float(np.sqrt((residual**2).mean()))
+    return Fit(lenses, count, solution.cost, residual.size, rms, per_view, solution.state)
+
+
+def _thought_over(
+    problem: Problem,
+    landscape: Landscape,
+    fit: Fit,
+    others: list[Fit],
+    allowed: list[list[Lens]],
+) -> tuple[Landscape, Lenses]:
+    """The wanted model again, or a better one: a rival, or one of a landscape drawn anew.
+
+    A landscape is right near the fit that it was drawn at; one that promised the wanted model
+    another cost than it has is drawn again there.
+    """
+    rivals = [o for o in others if all(x in options for x, options in zip(o.lenses, allowed))]
+    best = min((fit, *rivals), key=landscape.cost_of_fit)
+    if best is not fit:
+        return landscape, best.lenses
+    promised = landscape.least + landscape.rise(fit.lenses)
+    if any("tilt" in lens for lens in fit.lenses):
+        return landscape, fit.lenses
+    if abs(2 * fit.cost / landscape.variance - promised) < AGREEMENT:
+        return landscape, fit.lenses
+    there = solve(problem, fit.state, max_iterations=0)
+    landscape = Landscape.of(problem, there)
+    return landscape, _determined(landscape, allowed)
+
+
+def _taken(landscape: Landscape, path: list[Addition], fits: list[Fit]) -> list[Step]:
+    out = [Step(-1, (), fits[0].lenses, float("nan"), float("nan"), True, "", fits[0])]
+    for (camera, group, lenses), before, after in zip(path, fits, fits[1:]):
+        gain = 2 * (before.cost - after.cost) / landscape.variance
+        worth = gain - landscape.price_of(Lens({group}))
+        out.append(Step(camera, GROUPS[group], lenses, gain, worth, True, "", after))
+    return out
+
+
+def _with_held_out(steps: list[Step]) -> list[Step]:
+    """Steps back from the end while the last one predicts left-out views worse."""
+    last = len(steps) - 1
+    while last > 0:
+        before, after = (steps[k].fit for k in (last - 1, last))
+        assert before is not None and after is not None
+        if not after.held_out > before.held_out:
+            break
+        words = f"left-out views are predicted {after.held_out / before.held_out - 1:.1%} worse"
+        steps[last] = replace(steps[last], taken=False, words=words)
+        last -= 1
+    return steps
+
+
+def _not_taken(
+    landscape: Landscape, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
+) -> list[Step]:
+    """What one more group would have brought, but for those that were tried and refused.
+
+    A tilt is not asked for by itself: where aspect and skew bring nothing, it does not either.
+    """
+    known = {(step.camera, step.added) for step in refused}
+    out = []
+    for camera, group, lenses in additions(chosen, allowed):
+        if group == "tilt" or (camera, GROUPS[group]) in known:
+            continue
+        gain = max(landscape.rise(chosen) - landscape.rise(lenses), 0.0)
+        worth = gain - landscape.price_of(Lens({group}))
+        share = landscape.sd_over_prior(lenses, camera, group)
+        words = f"held: price {gain - worth:.1f}"
+        if share > UNDETERMINED:
+            words = f"held: not determined by these views (sd {share:.0%} of the prior's)"
+        out.append(
+            Step(camera, GROUPS[group], lenses, gain, worth, False, words, None,
+                 share > UNDETERMINED)
+        )  # fmt: skip
+    return out
+
+
+def _words(problem: Problem, steps: list[Step], chosen: Fit, others: list[Fit]) -> str:
+    cameras = [c.name for c in problem.cameras]
+    name = joint_name(chosen.names, cameras)
+    words = f"{name}: {_prediction_words(steps, chosen, cameras)}"
+    without = [fit for fit in others if not any("kappa" in lens for lens in fit.lenses)]
+    if any("kappa" in lens for lens in chosen.lenses) and without:
+        words += (
+            "; kappa = 0 is rejected: the scale changes with depth, and the best model without "
+            f"it ({joint_name(without[-1].names, cameras)}) leaves {without[-1].rms_px:.3g} px RMS "
+            f"against {chosen.rms_px:.3g}"
+        )
+    for camera, lens, intrinsics in zip(cameras, chosen.lenses, chosen.state.intrinsics):
+        if "affine" in lens:
+            words += f"; {_stretch_words(camera, intrinsics)}"
+    vague = [
+        f"{', '.join(step.added)} of camera {cameras[step.camera]!r}"
+        for step in steps if step.vague
+    ]  # fmt: skip
+    return words + (f"; these views do not determine {', '.join(vague)}: held" if vague else "")
+
+
+def _prediction_words(steps: list[Step], chosen: Fit, cameras: list[str]) -> str:
+    """What the ladder as a whole and its last step did for the prediction of left-out views."""
+    taken = [step for step in steps if step.taken]
+    fits = [step.fit for step in taken if step.fit is not None]
+    simpler = [fit for fit in fits[:-1] if np.isfinite(fit.held_out)]
+    if not np.isfinite(chosen.held_out):
+        return "lowest information criterion; too few views to leave out"
+    if not simpler:
+        return "no richer model predicts left-out views better"
+    words = (
+        f"left-out views are predicted {simpler[0].held_out / chosen.held_out:.3g} times better "
+        f"(mean square) than by {joint_name(simpler[0].names, cameras)}"
+    )
+    if len(simpler) > 1:
+        last = ", ".join(taken[-1].added)
+        words += (
+            f", {simpler[-1].held_out / chosen.held_out:.4g} times better than without the last "
+            f"step ({last} of camera {cameras[taken[-1].camera]!r})"
+        )
+    return words
+
+
+def _stretch_words(camera: str, intrinsics: Array) -> str:
+    aspect, skew = intrinsics[[INDEX["aspect"], INDEX["skew"]]]
+    axes = np.linalg.svd(np.array([[1.0, skew], [0.0, aspect]]), compute_uv=False)
+    return (
+        f"the image of camera {camera!r} is stretched by {100 * (axes[0] / axes[1] - 1):.2g} %: by "
+        "pixels that are not square, or by a tilted sensor behind a lens that is telecentric on "
+        "both sides; no image can tell which"
+    )

@@ -1,0 +1,252 @@
+"""The best lens model of each camera, from one fit of a rich one.
+
+At the minimum of the rich model, poses and dots eliminated, the cost is a quadratic form in the
+lens parameters. A simpler model holds some of their combinations d at nominal; its least cost is
+higher by half of d^T C_dd^-1 d, C the rich model's covariance (Wald's statistic, exact where the
+problem is linear). So all models of all cameras are compared by small solves, without a fit.
+
+The criterion is the extended Bayesian one (Chen and Chen, Biometrika 95:759, 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.calibration.solver.graph import Solution
+from telerig.estimator.calibration.solver.problem import Problem, parameter_unit, prior_sigma
+from telerig.factors.projection import whitened_error
+from telerig.rig.lens_models import GROUPS, ordered
+from telerig.rig.projection import INDEX
+
+Array = NDArray[np.float64]
+Lens = frozenset[str]
+"""The groups of one camera."""
+Lenses = tuple[Lens, ...]
+Addition = tuple[int, str, Lenses]
+"""Camera, group, and the model that has it."""
+
+_HOMOGRAPHY = (("p1", "s3"), ("p2", "s1"))
+"""A tilted sensor's homography is, to first order, p1 = -s3 and p2 = -s1: these sums vanish."""
+_PLAIN = ("kappa", "affine", "k1", "k2", "p", "s")
+UNDETERMINED = 0.5
+"""Standard deviation over the prior's beyond which the data say little of a parameter."""
+CAUTION = 4.0
+"""Price of a group, over the logarithm of how many there are: 2 would be Chen and Chen's gamma = 1;
+twice that lets one group in about 20 000 in by chance (docs/decisions/014)."""
+BELIEF = 20.0
+"""Degrees of freedom that the stated noise is worth beside the residuals."""
+
+
+class _Fitted(Protocol):
+    @property
+    def lenses(self) -> Lenses: ...
+
+    @property
+    def cost(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """The quadratic form at the minimum of a rich model.
+
+    names : (camera, parameter) of each coordinate; the homography's two per camera come last.
+    offset : (K,) from nominal at the minimum.  covariance : (K, K).
+    prior : (K,) standard deviations before any data.
+    least : chi-square at the minimum.
+    variance : of the residuals, 1 where the stated noise is right; every chi-square is over it.
+    price : what one parameter must lower chi-square by; group_price : and what a group must.
+    """
+
+    names: tuple[tuple[int, str], ...]
+    offset: Array
+    covariance: Array
+    prior: Array
+    least: float
+    variance: float
+    price: float
+    group_price: float
+
+    @staticmethod
+    def of(problem: Problem, solution: Solution) -> Landscape:
+        """From a fit of the rich model, or from any point near its minimum."""
+        names = [(c, p) for c, free in enumerate(problem.free) for p in free]
+        posterior = solution.equations.posterior(whole=False)
+        step, still = solution.equations.step(1e-12)
+        size = len(names)
+        unit = np.concatenate(
+            [parameter_unit(k)[problem.free_indices(c)] for c, k in enumerate(problem.cameras)]
+        )
+        prior = np.concatenate(
+            [prior_sigma(k)[problem.free_indices(c)] for c, k in enumerate(problem.cameras)]
+        )
+        nominal = [problem.cameras[c].intrinsics[INDEX[p]] for c, p in names]
+        there = [solution.state.intrinsics[c, INDEX[p]] for c, p in names]
+        offset = (np.array(there) - nominal) / unit + step[:size]
+        covariance = posterior.common[:size, :size]
+        more = [
+            ((c, f"{a}+{b}"), names.index((c, a)), names.index((c, b)))
+            for c in range(len(problem.cameras))
+            for a, b in _HOMOGRAPHY
+            if (c, a) in names and (c, b) in names
+        ]
+        extend = np.eye(size + len(more), size)
+        for row, (_, a, b) in enumerate(more, size):
+            extend[row, [a, b]] = 1.0
+        groups = sum(1 for c in range(len(problem.cameras)) for g in _PLAIN
+                     if (c, GROUPS[g][0]) in names)  # fmt: skip
+        variance = _variance(problem, solution, posterior.common, posterior.dots)
+        rows = 2 * int(np.sum(problem.weight > 0))
+        return Landscape(
+            (*names, *(m[0] for m in more)), extend @ offset, extend @ covariance @ extend.T,
+            np.r_[prior / unit, np.ones(len(more))],
+            2 * (solution.cost - still) / variance, variance,
+            float(np.log(rows)), float(CAUTION * np.log(max(groups, 1))),
+        )  # fmt: skip
+
+    def rise(self, lenses: Lenses) -> float:
+        """How much chi-square, in units of the noise, exceeds the rich model's."""
+        held = self._held(lenses)
+        if len(held) == 0:
+            return 0.0
+        d, inside = self.offset[held], self.covariance[np.ix_(held, held)]
+        return float(d @ np.linalg.solve(inside, d)) / self.variance
+
+    def cost(self, lenses: Lenses) -> float:
+        """Of a model, by the criterion: chi-square and the price of what is free."""
+        return self.rise(lenses) + sum(self.price_of(lens) for lens in lenses)
+
+    def cost_of_fit(self, fit: _Fitted) -> float:
+        """The same of a model that was fitted."""
+        prices = sum(self.price_of(lens) for lens in fit.lenses)
+        return 2 * fit.cost / self.variance - self.least + prices
+
+    def price_of(self, lens: Lens) -> float:
+        """A tilt pays for two groups: the stretch, and the homography that it adds."""
+        free = sum(len(GROUPS[g]) for g in lens - {"centre"})
+        return self.price * free + self.group_price * len((lens - {"centre"}) | _also(lens))
+
+    def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
+        """The largest standard deviation of a group's parameters in a model, over the prior's."""
+        held = self._held(lenses)
+        mine = [i for i, n in enumerate(self.names) if n[0] == camera and n[1] in GROUPS[group]]
+        cross = self.covariance[np.ix_(mine, held)]
+        inside = self.covariance[np.ix_(held, held)]
+        block = self.covariance[np.ix_(mine, mine)] - cross @ np.linalg.solve(inside, cross.T)
+        sd = np.sqrt(np.maximum(np.diag(block), 0.0))
+        return float((sd / self.prior[mine]).max()) if mine else 0.0
+
+    def _held(self, lenses: Lenses) -> list[int]:
+        return [
+            i for i, (camera, parameter) in enumerate(self.names)
+            if parameter in _held_by(lenses[camera])
+        ]  # fmt: skip
+
+
+def _also(lens: Lens) -> Lens:
+    return Lens({"affine"}) if "tilt" in lens else Lens()
+
+
+@cache
+def _held_by(lens: Lens) -> frozenset[str]:
+    """Coordinates that a lens holds at nominal, of all that a landscape can have."""
+    free = {p for g in lens for p in GROUPS[g]}
+    held = {p for g in (*_PLAIN, "centre") for p in GROUPS[g]} - free
+    if "tilt" in lens:
+        held -= {p for g in ("affine", "p", "s") for p in GROUPS[g]}
+        if "p" not in lens:
+            held |= {f"{a}+{b}" for a, b in _HOMOGRAPHY}
+    return frozenset(held)
+
+
+def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) -> float:
+    """Chi-square of the images over its expectation, the stated noise believed to a degree.
+
+    E[r^T r] = rows - numbers + tr(C P), P the information of the priors (docs/theory.md).
+    """
+    error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
+    shared = sum(len(f) for f in problem.free)
+    weight = np.concatenate([
+        (parameter_unit(k) / prior_sigma(k))[problem.free_indices(c)]
+        for c, k in enumerate(problem.cameras)
+    ])  # fmt: skip
+    by_prior = (np.diag(common)[:shared] * weight**2).sum()
+    by_prior += (np.diagonal(dots, 0, 1, 2) / problem.dot_sigma_mm**2).sum()
+    seen = len(np.unique(problem.view[problem.weight > 0]))
+    numbers = shared + 4 * (len(problem.cameras) - 1) + 6 * seen + 3 * len(problem.dot_ids)
+    dof = max(error.size - numbers + by_prior, 0.0)
+    return float(((error**2).sum() + BELIEF) / (dof + BELIEF))
+
+
+def possible(rich: Lens) -> list[Lens]:
+    """Every lens that a rich one contains: k2 goes with k1, a tilt in place of aspect and skew.
+
+    A tilt leaves out s, with which its homography would be spanned twice. Where the centre is free,
+    it and kappa always are.
+    """
+    shapes = [Lens()]
+    if "affine" in rich:
+        shapes.append(Lens({"affine"}))
+        shapes += [Lens({"tilt"})] if {"p", "s"} <= rich else []
+    radial = [Lens(), Lens({"k1"}), Lens({"k1", "k2"})]
+    choices = [[Lens(), Lens({g})] for g in ("kappa", "p", "s")]
+    always = rich & ({"centre", "kappa"} if "centre" in rich else set())
+    found = {
+        frozenset.union(always, shape, *parts)
+        for shape, *parts in product(shapes, radial, *choices)
+        if not ("tilt" in shape and {"s"} <= frozenset.union(*parts))
+    }
+    return sorted((f for f in found if f - {"tilt"} <= rich), key=ordered)
+
+
+def search(landscape: Landscape, allowed: Sequence[Sequence[Lens]]) -> Lenses:
+    """The model of least cost, one camera after the other until none changes.
+
+    allowed : per camera.  From the richest and the simplest model; the better end is taken.
+    """
+    ends = []
+    for start in (max, min):
+        now = tuple(start(options, key=len) for options in allowed)
+        for _ in range(10):
+            before = now
+            for c, options in enumerate(allowed):
+                now = min(((*now[:c], lens, *now[c + 1 :]) for lens in options), key=landscape.cost)
+            if now == before:
+                break
+        ends.append(now)
+    return min(ends, key=landscape.cost)
+
+
+def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Addition]:
+    """(camera, group, model) of every model that is one group richer."""
+    for c, options in enumerate(allowed):
+        for lens in options:
+            more = lens - lenses[c]
+            if lenses[c] < lens and len(more) == 1:
+                yield c, min(more), (*lenses[:c], lens, *lenses[c + 1 :])
+
+
+def steps_to(landscape: Landscape, chosen: Lenses, least: Lenses) -> list[Addition]:
+    """The way from the simplest model to the chosen one, the most useful group first."""
+    within = [list(_between(low, high)) for low, high in zip(least, chosen)]
+    now = least
+    out: list[Addition] = []
+    while now != chosen:
+        step = min(additions(now, within), key=lambda s: landscape.cost(s[2]))
+        now = step[2]
+        out.append(step)
+    return out
+
+
+def _between(low: Lens, high: Lens) -> Iterator[Lens]:
+    more = ordered(high - low)
+    for picks in product((False, True), repeat=len(more)):
+        lens = low | {g for g, pick in zip(more, picks) if pick}
+        if "k2" not in lens or "k1" in lens:
+            yield Lens(lens)

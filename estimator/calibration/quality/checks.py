@@ -1,0 +1,230 @@
+"""Checks before and after a self-calibration: refuse, warn, and name what is weak in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator.calibration.solver.covariance import JointCovariance
+from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
+from telerig.estimator.calibration.start.known_target import ImageMap, image_maps
+from telerig.estimator.dots.grid.numbering import check_handedness
+from telerig.factors.projection import State
+from telerig.rig.projection import INDEX
+
+Array = NDArray[np.float64]
+
+RECOMMENDED_VIEWS = 6
+MINIMUM_DOTS = 4
+PARALLEL_DEG = 3.0
+SMALL_TILT_DEG = 10.0
+CLEAR_MISFIT = 0.1
+"""Misfit of an image's map, over the spread of its dots, up to which the map is believed."""
+
+
+@dataclass(frozen=True)
+class PreCheck:
+    """tilts_deg : (view, camera) -> tilt of the target to that camera; notes for the user."""
+
+    tilts_deg: dict[tuple[int, int], float]
+    notes: tuple[str, ...]
+
+
+def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreCheck:
+    """Refuse what cannot be solved, warn of what will be weak.
+
+    Raises CalibrationError for too few views, too few dots or views that are all parallel; the
+    message names what is undetermined and what to do. DetectionError for mirrored images of an
+    opaque plate.
+    """
+    maps = image_maps(problem, dots_mm)
+    stereo = len(problem.cameras) == 2
+    shared = [v for v in range(len(problem.views)) if all((v, c) in maps for c in range(2))]
+    usable = shared if stereo else sorted({v for v, _ in maps})
+    _refuse_too_few(problem, usable, stereo=stereo, unknown_dots=unknown_dots)
+    mirrored = _mirrored_note(problem, maps)
+    tilts = {k: _tilt_deg(m.jacobian) for k, m in maps.items()}
+    _refuse_parallel(problem, maps, usable)
+    notes = mirrored
+    if len(usable) < RECOMMENDED_VIEWS:
+        notes.append(
+            f"only {len(usable)} views that {'both cameras' if stereo else 'the camera'} can use: "
+            f"{RECOMMENDED_VIEWS} or more are recommended; lens distortion and the dots' own "
+            "positions are the first to become uncertain (see their standard deviations)"
+        )
+    for c, camera in enumerate(problem.cameras):
+        mine = np.array([t for (_, k), t in tilts.items() if k == c])
+        if len(mine) and mine.max() < SMALL_TILT_DEG:
+            notes.append(
+                f"camera {camera.name!r}: no tilt above {mine.max():.0f} degrees, so its depth "
+                "scale is weak; add views at 20-40 degrees"
+            )
+        notes += _coverage_note(problem, c)
+    for v, name in enumerate(problem.views):
+        alone = [c for c in range(len(problem.cameras)) if (v, c) in maps]
+        if stereo and len(alone) == 1:
+            seen = problem.cameras[alone[0]].name
+            notes.append(f"view {name!r} is usable in camera {seen!r} only: it gives no stereo")
+        if not alone:
+            notes.append(f"view {name!r} has fewer than {MINIMUM_DOTS} dots in every camera")
+    return PreCheck(tilts, tuple(notes))
+
+
+def minimum_views(*, stereo: bool, unknown_dots: bool) -> tuple[int, str]:
+    """Fewest views that determine a calibration, and what is undetermined below it."""
+    if stereo and unknown_dots:
+        return 4, "the shape of the target (3 affine numbers), with it both scales and all tilts"
+    if stereo:
+        return 2, (
+            "the sign of the target's tilt in each camera: two inter-camera rotations fit alike"
+        )
+    if unknown_dots:
+        return 4, "the shape of the target (3 affine numbers) and with it the scale"
+    return 1, "everything"
+
+
+def _refuse_too_few(
+    problem: Problem, usable: list[int], *, stereo: bool, unknown_dots: bool
+) -> None:
+    needed, undetermined = minimum_views(stereo=stereo, unknown_dots=unknown_dots)
+    if len(usable) >= needed:
+        return
+    kind = "unknown" if unknown_dots else "known"
+    both = " in both cameras" if stereo else ""
+    counts = {
+        (problem.views[v], problem.cameras[c].name): int(np.sum(rows))
+        for v in range(len(problem.views))
+        for c in range(len(problem.cameras))
+        if (rows := (problem.view == v) & (problem.camera == c)).sum() < MINIMUM_DOTS
+    }
+    poor = "; ".join(f"view {v}, camera {c}: {n} dots" for (v, c), n in list(counts.items())[:6])
+    raise CalibrationError(
+        f"{len(usable)} view(s) with {MINIMUM_DOTS} or more dots{both}; a target of {kind} dots "
+        f"needs at least {needed}. Undetermined with fewer: {undetermined}."
+        + (f" Too few dots in: {poor}." if poor else ""),
+        todo=f"take at least {RECOMMENDED_VIEWS} views at different tilts, seen by "
+        + ("both cameras" if stereo else "the camera"),
+    )
+
+
+def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[str]:
+    """Refuse images of which some are mirrored.
+
+    Not judged: an image seen nearly edge on, and one in which the dots are not where any view of
+    the target has them.
+    """
+    hands = {}
+    for (v, c), m in maps.items():
+        singular = np.linalg.svd(m.jacobian, compute_uv=False)
+        clear = singular[1] > 0.02 * singular[0] and m.misfit < CLEAR_MISFIT
+        sign = int(np.sign(np.linalg.det(m.jacobian))) if clear else 0
+        hands[problem.views[v], problem.cameras[c].name] = sign
+    check_handedness(hands, problem.target.two_sided)
+    if problem.target.two_sided or not hands or max(hands.values()) > 0:
+        return []
+    return [
+        "every image shows the target as a mirror image of rig.toml: right if its rows are "
+        "numbered upwards, but if the images are flipped, so is every helix"
+    ]
+
+
+def _tilt_deg(jacobian: Array) -> float:
+    singular = np.linalg.svd(jacobian, compute_uv=False)
+    return float(np.degrees(np.arccos(np.clip(singular[1] / singular[0], -1, 1))))
+
+
+def _refuse_parallel(
+    problem: Problem, maps: dict[tuple[int, int], ImageMap], usable: list[int]
+) -> None:
+    """Views are parallel when each camera sees them foreshortened alike along the same dots.
+
+    A roll of the plate in its own plane is enough to tell them apart: see docs/theory.md.
+    """
+    spread = 0.0
+    for c in range(len(problem.cameras)):
+        mine = [m.jacobian for (v, k), m in maps.items() if k == c and v in usable]
+        if len(mine) > 1:
+            _, singular, axes = np.linalg.svd(np.array(mine))
+            sine = np.sqrt(np.clip(1 - (singular[:, 1] / singular[:, 0]) ** 2, 0, 1))
+            along = axes[:, 1]
+            vectors = sine[:, None, None] * along[:, :, None] * along[:, None, :]
+            spread = max(spread, float(np.degrees(np.ptp(vectors, 0).max())))
+    if len(usable) > 1 and spread < PARALLEL_DEG:
+        raise CalibrationError(
+            f"all views are parallel: the target's tilt differs by {spread:.1f} degrees at most, "
+            "so depth can be stretched against the tilt (a bas-relief) and hardly a pixel moves",
+            todo="tilt the target differently in every view, by 20-40 degrees about several axes",
+        )
+
+
+def _coverage_note(problem: Problem, c: int) -> list[str]:
+    camera = problem.cameras[c]
+    mine = problem.camera == c
+    if not np.any(mine):
+        return [f"camera {camera.name!r} has no dots at all"]
+    cells = np.floor(problem.uv_px[mine] / np.array(camera.image_size_px) * 4).astype(int)
+    filled = len({tuple(x) for x in np.clip(cells, 0, 3)})
+    if filled >= 8:
+        return []
+    return [
+        f"camera {camera.name!r}: dots cover {filled} of 16 parts of the image; distortion outside "
+        "is extrapolated. Hold the target nearer to the edges in some views"
+    ]
+
+
+def weak_parameters(problem: Problem, state: State, joint: JointCovariance) -> list[str]:
+    """Sentences on the rig's parameters that the data leave to their priors or to each other."""
+    del state
+    names, covariance = joint.rig_block()
+    sd = np.sqrt(np.diag(covariance))
+    out = []
+    for camera, free in zip(problem.cameras, problem.free):
+        prior = prior_sigma(camera)
+        for name in free:
+            i = names.index(f"{camera.name}.{name}")
+            share = sd[i] / prior[INDEX[name]]
+            if share > 0.5:
+                out.append(
+                    f"{_spoken(name)} of camera {camera.name!r} is not determined by these views "
+                    f"(its standard deviation is {share:.0%} of the prior's)"
+                )
+    return out + _trades(names, covariance)
+
+
+def _trades(names: tuple[str, ...], covariance: Array) -> list[str]:
+    sd = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sd, sd)
+    out = []
+    for i, j in zip(*np.triu_indices(len(names), 1)):
+        if abs(correlation[i, j]) > 0.98:
+            a, b = (_spoken_full(names[k]) for k in (i, j))
+            together = "both" if correlation[i, j] > 0 else "one and a fall of the other"
+            out.append(
+                f"{a} and {b} trade against each other (correlation {correlation[i, j]:+.3f}): "
+                f"a rise of {together} hardly changes the images"
+            )
+    return out
+
+
+_SPOKEN = {
+    "scale_px_per_mm": "the scale", "aspect": "the aspect ratio", "skew": "the skew",
+    "centre_u_px": "the image centre (u)", "centre_v_px": "the image centre (v)",
+    "kappa_per_mm": "the residual perspective kappa", "tilt_x": "the sensor tilt (x)",
+    "tilt_y": "the sensor tilt (y)", "image_convergence_per_mm": "the image-side convergence",
+    "wall_x_rad": "the wall's tilt along x", "wall_y_rad": "the wall's tilt along y",
+    "rx_rad": "the inter-camera angle about its x", "ry_rad": "the inter-camera angle about its y",
+    "rz_rad": "the inter-camera angle about its axis", "tx_mm": "the offset along x",
+    "ty_mm": "the offset along y", "tz_mm": "the depth origin",
+}  # fmt: skip
+
+
+def _spoken(parameter: str) -> str:
+    return _SPOKEN.get(parameter, f"the distortion coefficient {parameter}")
+
+
+def _spoken_full(name: str) -> str:
+    camera, parameter = name.split(".", 1)
+    return f"{_spoken(parameter)} of camera {camera!r}"

@@ -1,0 +1,324 @@
+"""Two calibrations of one rig: what moved, by how much, and is that more than their uncertainty?
+
+Only what images can tell is compared (the gauge is set aside): the rotation between the cameras,
+their offset along the common perpendicular of the optical axes, the scales, and how far the same
+pair of pixels triangulates apart over the working volume after the best rigid motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from telerig.errors import InputError
+from telerig.estimator.calibration.quality.truth import working_volume
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.solver.covariance import aligned_shift
+from telerig.io.report.page.number_format import number, with_sd
+from telerig.rig.camera import Camera
+from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
+from telerig.rig.triangulation import triangulate
+
+Array = NDArray[np.float64]
+
+UNLIKELY = 1e-3
+"""A difference that chance gives less often than this is called a movement."""
+_RANK = 1e-3
+"""Directions with a smaller share of the largest standard deviation are not judged: there the
+second order of the others is larger than what is predicted."""
+_ROUNDING = 1e-6
+_FAR = 5.0
+_LEAST_CHANCE = 1e-12
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What is compared: two cameras, their free intrinsics, the covariance of the rig block."""
+
+    cameras: tuple[Camera, Camera]
+    free: tuple[tuple[str, ...], ...]
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Change:
+    """One quantity: ``change`` of second minus first in ``unit``, with its standard deviation."""
+
+    quantity: str
+    unit: str
+    change: float
+    sd: float
+
+    @property
+    def deviations(self) -> float:
+        return self.change / self.sd if self.sd > 0 else np.inf * np.sign(self.change)
+
+
+@dataclass(frozen=True)
+class FieldDifference:
+    """The same pixels through both rigs, best rigid motion removed.
+
+    points_mm, shift_mm : (N, 3).  sd_mm : (N, 3) expected of the shift.  p_value : how often chance
+    gives as large a field, by chi-square over the directions that the two covariances span.
+    """
+
+    points_mm: Array
+    shift_mm: Array
+    sd_mm: Array
+    p_value: float
+
+    @property
+    def rms_um(self) -> float:
+        """Per axis."""
+        return float(1e3 * np.sqrt(np.mean(self.shift_mm**2)))
+
+    @property
+    def predicted_um(self) -> float:
+        """What `rms_um` is for two calibrations of a rig at rest."""
+        return float(1e3 * np.sqrt(np.mean(self.sd_mm**2)))
+
+
+@dataclass(frozen=True)
+class RigComparison:
+    """changes : between the cameras, then scales.  p_moved : of the pose between the cameras.
+
+    exchanged : each camera now has the scale that the other had.  media : of first and second.
+    """
+
+    changes: tuple[Change, ...]
+    field: FieldDifference
+    p_moved: float
+    exchanged: bool = False
+    media: tuple[str, str] = ("air", "air")
+
+    @property
+    def identical(self) -> bool:
+        """The same to rounding, as no two independent sets of views are."""
+        return self.field.rms_um < _ROUNDING * self.field.predicted_um
+
+    @property
+    def moved(self) -> bool:
+        return self.p_moved < UNLIKELY
+
+    @property
+    def differs(self) -> bool:
+        return self.field.p_value < UNLIKELY
+
+    def words(self) -> str:
+        """The verdict for a reader."""
+        if self.identical:
+            return (
+                "both calibrations are the same to rounding, so they come from the same views: "
+                "compare with one from other views to learn whether the rig moved"
+            )
+        shift, turn = self.changes[3], _norm(self.changes[:3])
+        size = (
+            f"{with_sd(abs(shift.change), shift.sd)} um and {with_sd(turn.change, turn.sd)} urad "
+            "between the cameras"
+        )
+        first = (
+            f"the rig moved: {size}"
+            if self.moved
+            else f"no movement of the cameras against each other is seen ({size})"
+        )
+        field = self.field
+        apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
+        second = (
+            f"the same pixels lie {apart} um RMS per axis apart in space, where the two "
+            f"calibrations' uncertainty explains {expected} um"
+        )
+        if self.differs:
+            chance = chance_words(field.p_value)
+            second += (
+                f": more than chance where both know it well ({chance}); do not mix their runs"
+            )
+        return "; ".join([first, *self._scale_words(), second, *self._medium_words()])
+
+    def _scale_words(self) -> list[str]:
+        """Of scales that changed by more than chance."""
+        if self.exchanged:
+            return [
+                "each camera has the other's scale, as if their images or cables were exchanged"
+            ]
+        changed = [c for c in self.changes[4:] if chdtrc(1, c.deviations**2) < UNLIKELY]
+        if not changed:
+            return []
+        said = (f"{with_sd(c.change, c.sd)} ppm ({c.quantity})" for c in changed)
+        return [f"the magnification changed: {', '.join(said)}"]
+
+    def _medium_words(self) -> list[str]:
+        if self.media[0] == self.media[1]:
+            return []
+        return [
+            f"the earlier one was made in {_of(self.media[0])}, this one in {_of(self.media[1])}: "
+            "windows that [walls] does not state count as changes"
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For comparison.json."""
+        return {
+            "verdict": "MOVED" if self.moved else "DIFFERENT" if self.differs else "SAME",
+            "words": self.words(),
+            "changes": [asdict(c) | {"deviations": c.deviations} for c in self.changes],
+            "space": {
+                "rms_um": self.field.rms_um,
+                "predicted_um": self.field.predicted_um,
+                "p_value": self.field.p_value,
+            },
+            "p_moved": self.p_moved,
+        }
+
+
+def compare_calibrations(first: Calibration, second: Calibration) -> RigComparison:
+    """How the rig changed from ``first`` to ``second``.
+
+    The two are taken as independent: errors that they share (a target's stated distance) make the
+    standard deviations too large, never too small.
+
+    Raises InputError for rigs with other cameras, image sizes, or a single camera.
+    """
+    check_same_rig(first.cameras, second.cameras)
+    found = compare_rigs(_rig(first), _rig(second))
+    return replace(found, media=(first.medium, second.medium))
+
+
+class Named(Protocol):
+    """A camera, calibrated or of `rig.toml`."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def image_size_px(self) -> tuple[int, int]: ...
+
+
+def check_same_rig(first: Sequence[Named], second: Sequence[Named]) -> None:
+    """Raises InputError for other cameras, another order, other image sizes, or a single camera."""
+    mine, theirs = ([(c.name, tuple(c.image_size_px)) for c in k] for k in (first, second))
+    if len(mine) < 2 and len(theirs) < 2:
+        raise InputError(
+            "one camera has no pose to another", todo="compare calibrations of two cameras"
+        )
+    if mine == theirs:
+        return
+    todo = "compare calibrations with the same camera names, order and image sizes"
+    if sorted(mine) == sorted(theirs):
+        todo = "give the cameras in the same order in rig.toml: the first one is the rig's frame"
+    raise InputError(
+        f"these are calibrations of different rigs: {_named(mine)} and {_named(theirs)}", todo=todo
+    )
+
+
+def _rig(calibration: Calibration) -> Rig:
+    bare = calibration.in_air()
+    return Rig((bare.cameras[0], bare.cameras[1]), bare.free, bare.covariance)
+
+
+def _named(cameras: list[tuple[str, tuple[int, ...]]]) -> str:
+    return ", ".join(f"{name} {'x'.join(map(str, size))}" for name, size in cameras)
+
+
+def compare_rigs(first: Rig, second: Rig) -> RigComparison:
+    """The differences second minus first, with covariances added."""
+    pose, covariance = _pose_change(first, second)
+    sd = np.sqrt(np.diag(covariance))
+    names = [f"rotation about {a}" for a in "xyz"] + ["offset along the common perpendicular"]
+    units = ["urad", "urad", "urad", "um"]
+    factors = np.array([1e6, 1e6, 1e6, 1e3])
+    changes = [
+        Change(n, u, float(f * c), float(f * s))
+        for n, u, f, c, s in zip(names, units, factors, pose, sd)
+    ]
+    changes += [_scale_change(first, second, i) for i in range(2)]
+    moved = _chance(pose, _root(covariance))
+    field = field_difference(first, second)
+    return RigComparison(tuple(changes), field, moved, _exchanged(first, second, changes[4:]))
+
+
+def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
+    """Whether each scale left its camera by far and came to where the other's was."""
+    before, after = ([c["scale_px_per_mm"] for c in r.cameras] for r in (first, second))
+    left = min(abs(c.deviations) for c in scales) > _FAR
+    return left and all(
+        abs(1e6 * (after[i] / before[1 - i] - 1)) < _FAR * scales[i].sd for i in range(2)
+    )
+
+
+def chance_words(p_value: float) -> str:
+    return f"chance {p_value:.0e}" if p_value >= _LEAST_CHANCE else "chance below 1e-12"
+
+
+def _of(medium: str) -> str:
+    return "the water" if medium == "water" else medium
+
+
+def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:
+    """(4,) rotation (rad, rig axes) and offset along the common perpendicular (mm); (4, 4)."""
+    a, b = (r.cameras[1].camera_from_rig.inverse() for r in (first, second))
+    turn = a.rotation @ rotvec_from_rotation(a.rotation.T @ b.rotation)
+    across = np.cross([0.0, 0.0, 1.0], a.rotation[:, 2])
+    across /= np.linalg.norm(across)
+    shift = across @ (b.translation_mm - a.translation_mm)
+    rows = np.zeros((4, 6))
+    rows[:3, :3] = a.rotation
+    rows[3, 3:] = across @ a.rotation
+    blocks = sum(r.covariance[-6:, -6:] for r in (first, second))
+    return np.r_[turn, shift], rows @ blocks @ rows.T
+
+
+def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
+    name = "scale_px_per_mm"
+    values, variance = [], 0.0
+    for rig in (first, second):
+        scale = rig.cameras[camera][name]
+        values.append(scale)
+        if name in rig.free[camera]:
+            at = sum(len(f) for f in rig.free[:camera]) + rig.free[camera].index(name)
+            variance += rig.covariance[at, at] / scale**2
+    change = 1e6 * (values[1] / values[0] - 1)
+    label = f"scale of camera {first.cameras[camera].name}"
+    return Change(label, "ppm", float(change), float(1e6 * np.sqrt(variance)))
+
+
+def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference:
+    """Over the working volume: pixels by the first rig, points by the second."""
+    points = working_volume(first.cameras, steps)
+    pixels = [camera.project(points) for camera in first.cameras]
+    found = triangulate(second.cameras, (pixels[0], pixels[1]), 1.0, "ml").points_mm
+    a, b = found - found.mean(0), points - points.mean(0)
+    shift = a @ nearest_rotation(b.T @ a).T - b
+    root = np.concatenate(
+        [
+            aligned_shift(rig.cameras, rig.free, points) @ _root(rig.covariance)
+            for rig in (first, second)
+        ],
+        -1,
+    )
+    sd = np.linalg.norm(root, axis=-1).reshape(-1, 3)
+    return FieldDifference(points, shift, sd, _chance(shift.ravel(), root))
+
+
+def _root(covariance: Array) -> Array:
+    """R with R R^T = covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+
+
+def _chance(difference: Array, root: Array) -> float:
+    """Probability of so large a chi-square in the directions of the covariance root root^T."""
+    directions, sizes, _ = np.linalg.svd(root, full_matrices=False)
+    seen = sizes > _RANK * sizes.max()
+    along = directions[:, seen].T @ difference / sizes[seen]
+    return float(chdtrc(int(seen.sum()), float(along @ along)))
+
+
+def _norm(parts: tuple[Change, ...]) -> Change:
+    """Length of a vector of changes; its sd along its own direction."""
+    vector, sd = (np.array([getattr(p, k) for p in parts]) for k in ("change", "sd"))
+    length = float(np.linalg.norm(vector))
+    along = float(np.sqrt(((vector / max(length, 1e-12)) ** 2 * sd**2).sum()))
+    return Change("rotation", parts[0].unit, length, along)

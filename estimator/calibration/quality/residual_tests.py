@@ -1,0 +1,162 @@
+"""Is anything left in the residuals? Tests of their places, directions, neighbours and views.
+
+Residuals of a right model are independent, alike in all directions and everywhere. Each is first
+brought to unit variance with the share of noise that the fit absorbs (the hat matrix). What the
+fit absorbs besides makes the tests say "nothing" slightly too often, never too seldom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, ndtr
+
+from telerig.estimator.calibration.solver.problem import Problem
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+UNLIKELY = 1e-3
+"""Of all tests together."""
+CELLS = 4
+LEAST_IN_CELL = 5
+_LEAST_DOTS = 3
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """One test: ``size`` of the effect in standard deviations of a residual, chance, and words."""
+
+    name: str
+    camera: str
+    size: float
+    p_value: float
+    words: str
+
+
+def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[str, Any]:
+    """For `Calibration.diagnostics`: a verdict, words, and every test.
+
+    whitened : (M, 2) residuals, leverage : (M, 2, 2) J C J^T of each dot, both in the order of
+    ``problem.observations()``.
+    """
+    obs = problem.observations()
+    standardised = standardised_residuals(whitened, leverage)
+    share = 1 - float(np.trace(leverage, axis1=-2, axis2=-1).mean()) / 2
+    tests: list[ResidualTest] = []
+    for c, camera in enumerate(problem.cameras):
+        mine = obs.camera == c
+        if mine.sum() < 2 * LEAST_IN_CELL:
+            continue
+        values, uv = standardised[mine], obs.uv_px[mine]
+        tests.append(_regions(camera.name, values, uv, camera.image_size_px))
+        tests.append(_direction(camera.name, values, share))
+        tests.append(_neighbours(camera.name, values, uv, obs.view[mine]))
+        tests += _views(camera.name, values, obs.view[mine], problem.views)
+    limit = UNLIKELY / max(len(tests), 1)
+    found = [t for t in tests if t.p_value < limit]
+    words = [t.words for t in found] or ["no structure is left in the residuals"]
+    return {"sound": not found, "words": words, "tests": [asdict(t) for t in tests]}
+
+
+def standardised_residuals(whitened: Array, leverage: Array) -> Array:
+    """(M, 2) whitened residuals over the spread that the fit leaves them: (1 - h)^1/2.
+
+    leverage : (M, 2, 2) J C J^T of each. A dot that the fit follows wholly counts as zero.
+    """
+    left = np.eye(2) - leverage
+    values, vectors = np.linalg.eigh(0.5 * (left + np.swapaxes(left, -1, -2)))
+    scale = np.where(values > 0.02, 1 / np.sqrt(np.maximum(values, 0.02)), 0.0)
+    return np.asarray(np.einsum("mij,mj,mkj,mk->mi", vectors, scale, vectors, whitened))
+
+
+def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int]) -> ResidualTest:
+    """Do residuals point the same way in a part of the image? What the lens model lacks."""
+    cell = np.clip((uv_px + 0.5) / np.array(size_px) * CELLS, 0, CELLS - 1).astype(int)
+    index = cell[:, 1] * CELLS + cell[:, 0]
+    count = np.bincount(index, minlength=CELLS**2)
+    sums = np.stack([np.bincount(index, v, minlength=CELLS**2) for v in values.T], -1)
+    full = count >= LEAST_IN_CELL
+    mean = sums[full] / count[full, None]
+    p = float(chdtrc(2 * full.sum(), (count[full, None] * mean**2).sum()))
+    lengths = np.hypot(*mean.T)
+    worst = np.flatnonzero(full)[int(lengths.argmax())]
+    row, column = divmod(int(worst), CELLS)
+    size = float(np.sqrt((mean**2).mean()))
+    words = (
+        f"camera {camera}: residuals point the same way in parts of the image (most in row "
+        f"{row + 1}, column {column + 1} of {CELLS} x {CELLS}, {lengths.max():.1f} sd): the lens "
+        "model lacks a term; try a richer --model"
+    )
+    return ResidualTest("region", camera, size, p, words)
+
+
+def _direction(camera: str, values: Array, share: float) -> ResidualTest:
+    """Are residuals longer in one direction? Vibration, motion blur, an interlaced sensor.
+
+    share : degrees of freedom per row.
+    """
+    u, v = values.T
+    mean = 0.5 * float((u**2 + v**2).mean())
+    half, cross = 0.5 * float((u**2 - v**2).mean()) / mean, float((u * v).mean()) / mean
+    length = np.hypot(half, cross)
+    p = float(chdtrc(2, share * len(values) * length**2))
+    angle = np.degrees(0.5 * np.arctan2(cross, half)) % 180
+    ratio = np.sqrt((1 + length) / max(1 - length, 1e-3))
+    words = (
+        f"camera {camera}: residuals are {ratio:.2f} times longer along {angle:.0f} degrees (from "
+        "u towards v): motion during the exposure, or a sensor read line by line"
+    )
+    return ResidualTest("direction", camera, float(length), p, words)
+
+
+def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> ResidualTest:
+    """Do neighbours in one image err together, more than any two dots of that image do?"""
+    from scipy.spatial import cKDTree
+
+    near, expected, spread = [], [], []
+    for v in np.unique(view):
+        rows = np.flatnonzero(view == v)
+        if len(rows) < _LEAST_DOTS:
+            continue
+        r = values[rows]
+        n = len(rows)
+        _, other = cKDTree(uv_px[rows]).query(uv_px[rows], k=2)
+        nearest = np.asarray(other)[:, 1]
+        products = (r * r[nearest]).sum(-1)
+        squares = (r**2).sum(-1)
+        near.append(products.mean())
+        expected.append(((r.sum(0) ** 2).sum() - squares.sum()) / (n * (n - 1)))
+        spread.append(2.0 * 1.5 / n)  # unit variances; mutual neighbours count twice
+    if not near:
+        return ResidualTest("neighbours", camera, 0.0, 1.0, "")
+    excess = float(np.mean(np.subtract(near, expected)))
+    sd = float(np.sqrt(np.sum(spread)) / len(spread))
+    p = float(ndtr(-excess / sd))
+    words = (
+        f"camera {camera}: neighbouring dots err together (correlation {excess / 2:.2f}): the "
+        "plate bends from view to view, refraction, or a lens error finer than the model"
+    )
+    return ResidualTest("neighbours", camera, excess / 2, p, words)
+
+
+def _views(camera: str, values: Array, view: Ints, names: tuple[str, ...]) -> list[ResidualTest]:
+    """Is a view worse than the others?"""
+    squares = (values**2).sum(-1)
+    usual = float(np.median(squares)) / (2 * np.log(2))
+    out = []
+    for v in np.unique(view):
+        mine = squares[view == v] / max(usual, 1e-12)
+        if len(mine) < _LEAST_DOTS:
+            continue
+        p = float(chdtrc(2 * len(mine), mine.sum()))
+        size = float(np.sqrt(mine.mean() / 2))
+        words = (
+            f"view {names[v]!r}, camera {camera}: residuals {size:.1f} times the others': blurred, "
+            "moved, or badly lit"
+        )
+        out.append(ResidualTest("view", camera, size, p, words))
+    return out

@@ -1,0 +1,117 @@
+"""Cross-validation by halves: is the calibration as repeatable as its covariance says?
+
+Every second view calibrates the rig anew, and so do the others; the two rigs are compared over the
+working volume like two calibrations of one rig. The covariance does not know of errors that the
+views share (a wrong lens model), but two halves with other tilts feel them otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator.calibration.quality.comparison import (
+    UNLIKELY,
+    FieldDifference,
+    Rig,
+    chance_words,
+    field_difference,
+)
+from telerig.estimator.calibration.result_from_fit import cameras_from_state
+from telerig.estimator.calibration.solver.covariance import joint_covariance
+from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.factors.projection import State
+from telerig.io.report.page.number_format import number
+
+Array = NDArray[np.float64]
+
+LEAST_VIEWS = 4
+"""In a half; with fewer, a half does not determine a rig."""
+_SCALE = 1e-7
+
+
+def halves(problem: Problem, state: State) -> dict[str, Any]:
+    """For `Calibration.diagnostics`: words, figures and the field of differences.
+
+    The target's size is common to both halves and tells nothing about repeatability: the known
+    distance, or without one that of two dots far apart, is taken as exact in both.
+    """
+    if len(problem.cameras) != 2:
+        return {"words": "one camera: halves are compared in space, which takes two"}
+    used = np.unique(problem.view[problem.weight > 0])
+    parts = [used[0::2], used[1::2]]
+    if min(len(p) for p in parts) < LEAST_VIEWS:
+        return {
+            "words": f"{len(used)} views are too few to be calibrated by halves: take "
+            f"{2 * LEAST_VIEWS} or more"
+        }
+    problem = replace(problem, scale=problem.scale or _size(problem, state, parts))
+    try:
+        first, second = (_rig(problem, state, views) for views in parts)
+    except CalibrationError as error:
+        return {"words": f"a half of the views does not determine the rig: {error.what}"}
+    field = field_difference(first, second)
+    return {
+        "views": [len(p) for p in parts],
+        "rms_um": field.rms_um,
+        "predicted_um": field.predicted_um,
+        "p_value": field.p_value,
+        "agree": bool(field.p_value >= UNLIKELY),
+        "words": _words(field, [len(p) for p in parts]),
+        "points_mm": np.round(field.points_mm, 4).tolist(),
+        "shift_um": np.round(1e3 * field.shift_mm, 4).tolist(),
+        "sd_um": np.round(1e3 * field.sd_mm, 4).tolist(),
+    }
+
+
+def _size(
+    problem: Problem, state: State, parts: list[NDArray[np.int64]]
+) -> tuple[tuple[int, int], float, float] | None:
+    """The estimated distance of two dots far apart that both halves see, as a known one."""
+    weighed = problem.weight > 0
+    one, other = (problem.dot[weighed & np.isin(problem.view, views)] for views in parts)
+    both = np.intersect1d(one, other)
+    if len(both) < 2:
+        return None
+    points = state.dots_mm[both]
+    first = int(np.argmax(np.linalg.norm(points - points.mean(0), axis=-1)))
+    distance = np.linalg.norm(points - points[first], axis=-1)
+    second = int(np.argmax(distance))
+    return (int(both[first]), int(both[second])), float(distance[second]), 0.0
+
+
+def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
+    half = problem.subset(np.isin(problem.view, views) & (problem.weight > 0))
+    half = replace(half, solver="schur")
+    if half.scale is not None:
+        pair, distance, _ = half.scale
+        half = replace(half, scale=(pair, distance, _SCALE * distance))
+    solution = solve(half, state, max_iterations=30, relative=1e-7)
+    names, covariance = joint_covariance(half, solution).rig_block()
+    cameras = cameras_from_state(half, solution.state)
+    if not np.isfinite(covariance).all():
+        raise CalibrationError(
+            f"nothing determines {names[int(np.argmax(~np.isfinite(covariance)))]}"
+        )
+    return Rig((cameras[0], cameras[1]), half.free, covariance)
+
+
+def _words(field: FieldDifference, views: list[int]) -> str:
+    ratio = field.rms_um / max(field.predicted_um, 1e-12)
+    apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
+    words = (
+        f"two halves of {views[0]} and {views[1]} views put the same pixels {apart} um "
+        f"RMS per axis apart in space; their covariances predict {expected} um"
+    )
+    if field.p_value >= UNLIKELY:
+        return words + f" (ratio {ratio:.2f}): the covariance can be believed"
+    return (
+        words + f" (ratio {ratio:.2f}; {chance_words(field.p_value)}): the halves "
+        "disagree, so something that the model does not know acts; every stated standard "
+        "deviation is too small by about this ratio"
+    )

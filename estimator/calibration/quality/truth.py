@@ -1,0 +1,133 @@
+"""A calibration against a simulator's truth, what no image can tell (the gauge) set aside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.solver.covariance import aligned_covariance
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, nearest_rotation
+from telerig.rig.projection import intrinsics_from
+
+Array = NDArray[np.float64]
+
+MANY_SD = 4.0
+VOLUME_SHARE = 0.6
+"""The working volume: a cube of this share of the smaller field of view, round the rig's origin."""
+
+
+@dataclass(frozen=True)
+class SpaceError:
+    """Errors of triangulated points, after the best rigid motion, in um per axis.
+
+    predicted_um : from the calibration's covariance, the same motion projected out.
+    """
+
+    rms_um: float
+    predicted_um: float
+    errors_mm: Array
+    covariance_mm2: Array
+
+
+@dataclass(frozen=True)
+class Comparison:
+    table: str
+    verdict: str
+    passed: bool
+    space: SpaceError
+
+
+def true_cameras(truth: Mapping[str, Any]) -> tuple[Camera, ...]:
+    """Cameras from the dictionary of `truth/truth.json`."""
+    out = []
+    for name, data in truth["cameras"].items():
+        pose = data["camera_from_rig"]
+        intrinsics = intrinsics_from(data["parameters"])
+        out.append(
+            Camera(
+                name, (data["image_size_px"][0], data["image_size_px"][1]), data["rho_mm"],
+                intrinsics, Pose(np.array(pose["rotation"]), np.array(pose["translation_mm"])),
+            )
+        )  # fmt: skip
+    return tuple(out)
+
+
+def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
+    """(steps^3, 3) grid of rig points that all cameras see."""
+    field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
+    axis = np.linspace(-0.5, 0.5, steps) * VOLUME_SHARE * field
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+
+def space_error(
+    calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array
+) -> SpaceError:
+    """Triangulate the true pixels of true points with the estimated rig, and align rigidly.
+
+    Of cameras alone: without the walls that runs are taken through.
+    """
+    calibration = calibration.in_air()
+    pixels = [camera.project(points_mm) for camera in truth]
+    found = calibration.triangulate(*pixels, sigma_px=1.0, include_calibration=False).points_mm
+    a, b = found - found.mean(0), points_mm - points_mm.mean(0)
+    turn = nearest_rotation(b.T @ a)
+    errors = a @ turn.T - b
+    pair = (calibration.cameras[0], calibration.cameras[1])
+    covariance = aligned_covariance(pair, calibration.free, calibration.covariance, found)
+    predicted = np.sqrt(np.trace(covariance) / errors.size)
+    return SpaceError(
+        float(1e3 * np.sqrt((errors**2).mean())), float(1e3 * predicted), errors, covariance
+    )
+
+
+def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Comparison:
+    """Estimate beside truth, in standard deviations, and a verdict."""
+    cameras = true_cameras(truth)
+    space = space_error(calibration, cameras, working_volume(cameras))
+    rows = [_row(*r) for r in _parameters(calibration, cameras)]
+    worst = max(abs(deviation) for *_, deviation in rows)
+    ratio = space.rms_um / space.predicted_um
+    passed = worst < MANY_SD and ratio < 2.0
+    lines = [f"{'quantity':<28}{'estimate':>14}{'truth':>14}{'sd':>10}{'off by':>9}"]
+    lines += [f"{n:<28}{e:>14.6f}{t:>14.6f}{s:>10.2g}{d:>6.1f} sd" for n, e, t, s, d in rows]
+    lines.append(
+        f"3-D error of the calibration over the working volume: {space.rms_um:.2f} um RMS per "
+        f"axis; its covariance predicts {space.predicted_um:.2f} um"
+    )
+    words = (
+        f"PASSED: every quantity within {MANY_SD:.0f} standard deviations of the truth"
+        if passed
+        else f"FAILED: worst quantity {worst:.1f} standard deviations off, 3-D error "
+        f"{ratio:.2f} times the predicted"
+    )
+    return Comparison("\n".join(lines), words, passed, space)
+
+
+def _row(
+    name: str, estimate: float, truth: float, sd: float
+) -> tuple[str, float, float, float, float]:
+    return name, estimate, truth, sd, (estimate - truth) / sd
+
+
+def _parameters(
+    calibration: Calibration, cameras: tuple[Camera, ...]
+) -> list[tuple[str, float, float, float]]:
+    """What is comparable whatever the gauge: scales, radial distortion, angle of the axes."""
+    rows = []
+    for estimate, truth in zip(calibration.cameras, cameras):
+        for name in ("scale_px_per_mm", "k1"):
+            sd = calibration.sd(f"{estimate.name}.{name}")
+            if sd > 0:
+                unit = (estimate.rho_mm / truth.rho_mm) ** 2 if name == "k1" else 1.0
+                rows.append((f"{estimate.name} {name}", estimate[name], truth[name] * unit, sd))
+    s = calibration.statistics
+    axis = cameras[1].camera_from_rig.rotation[2]
+    angle = float(np.degrees(np.arccos(axis[2])))
+    rows.append(("angle of the axes (deg)", s["axes_angle_deg"], angle, s["axes_angle_sd_deg"]))
+    return rows

@@ -1,0 +1,281 @@
+"""A rig that was calibrated in one medium and measures behind glass walls in water."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.calibration.quality.truth import working_volume
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.solver.covariance import aligned_covariance
+from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freedom
+from telerig.estimator.calibration.start.mirror_ambiguity import ENTOCENTRIC
+from telerig.io.rig_file.description import RigDescription
+from telerig.rig.camera import Camera
+from telerig.rig.projection import INDEX, standing_wall
+from telerig.rig.triangulation import triangulate
+from telerig.rig.windows import Wall
+
+Array = NDArray[np.float64]
+
+_NOTABLE_UM = 0.1
+_STEP_MM = 10.0
+_LEANING_DEG = 30.0
+
+
+def stated_walls(rig: RigDescription) -> dict[str, Wall]:
+    """The walls of `rig.toml`, by camera."""
+    return {name: wall.wall() for name, wall in rig.walls.items()}
+
+
+def with_walls(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
+    """The cameras, each behind its wall if it has one."""
+    return tuple(replace(c, wall=walls.get(c.name, c.wall)) for c in cameras)
+
+
+def put_behind_walls(calibration: Calibration, walls: Mapping[str, Wall]) -> Calibration:
+    """A calibration made in air, for use in the water behind walls.
+
+    What is not known of a wall's orientation joins the covariance as its prior, so it reaches
+    every projected and triangulated point.
+    """
+    cameras = with_walls(calibration.cameras, walls)
+    names, covariance = _with_priors(
+        calibration, cameras, calibration.covariance_names, calibration.covariance
+    )
+    joint_names, joint = calibration.joint_names, calibration.joint_covariance
+    if joint_names:
+        joint_names, joint = _with_priors(calibration, cameras, joint_names, joint)
+    behind = replace(
+        calibration, cameras=cameras, covariance=covariance, covariance_names=names,
+        free=tuple((*f, *wall_freedom(c)) for f, c in zip(calibration.free, cameras)),
+        joint_names=joint_names, joint_covariance=joint,
+    )  # fmt: skip
+    return replace(behind, statistics=_with_walls_share(behind, calibration))
+
+
+def _with_walls_share(behind: Calibration, in_air: Calibration) -> dict[str, Any]:
+    """The statistics with what the walls' unknown orientation adds to the errors in space."""
+    statistics = dict(in_air.statistics)
+    if "space_sd_um" not in statistics or behind.free == in_air.free:
+        return statistics
+    points = working_volume(in_air.cameras)
+    after, before = (_space_variance_um2(c, points) for c in (behind, in_air))
+    share = max(after - before, 0.0)
+    for name in ("space_sd_um", "space_sd_calibration_um"):
+        statistics[name] = float(np.hypot(statistics[name], np.sqrt(share)))
+    return statistics | {"space_sd_walls_um": float(np.sqrt(share))}
+
+
+def _space_variance_um2(calibration: Calibration, points_mm: Array) -> float:
+    """Of the calibration's share, per axis; a common rigid motion of all points is set aside."""
+    pair = (calibration.cameras[0], calibration.cameras[1])
+    shared = aligned_covariance(pair, calibration.free, calibration.covariance, points_mm)
+    return float(1e6 * np.trace(shared) / len(shared))
+
+
+def _with_priors(
+    calibration: Calibration, cameras: Sequence[Camera], names: tuple[str, ...], matrix: Array
+) -> tuple[tuple[str, ...], Array]:
+    """Names and covariance with each camera's wall after its intrinsics."""
+    grown: list[str] = []
+    added: dict[str, float] = {}
+    at = 0
+    for camera, free in zip(cameras, calibration.free):
+        grown += names[at : at + len(free)]
+        at += len(free)
+        for name in wall_freedom(camera):
+            added[f"{camera.name}.{name}"] = float(prior_sigma(camera)[INDEX[name]] ** 2)
+            grown.append(f"{camera.name}.{name}")
+    grown += names[at:]
+    variance = np.array([added.get(name, 0.0) for name in grown])
+    out, old = np.diag(variance), np.flatnonzero([name not in added for name in grown])
+    out[np.ix_(old, old)] = matrix
+    return tuple(grown), out
+
+
+def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
+    """How wrong points are, at most, over the working volume (um): the same but for their walls.
+
+    A shift of all points alike is set aside: the rig's origin is a matter of definition. With one
+    camera, its error across its own axis.
+    """
+    points = working_volume(tuple(used))
+    pixels = [camera.project(points) for camera in true]
+    if len(used) == 2:
+        wrong = triangulate((used[0], used[1]), (pixels[0], pixels[1]), 1.0).points_mm - points
+    else:
+        wrong = (pixels[0] - used[0].project(points)) / used[0]["scale_px_per_mm"]
+    wrong = wrong - wrong.mean(0)
+    return float(1e3 * np.linalg.norm(wrong, axis=-1).max())
+
+
+def wall_words(calibration: Calibration, rig: RigDescription) -> list[str]:
+    """What a user should know of the walls: what they do, and what is not known of them."""
+    cameras = [c for c in calibration.cameras if c.wall is not None]
+    if not cameras:
+        return _without_walls(calibration)
+    words = [_in_words(calibration, [c.name for c in cameras])]
+    for camera in cameras:
+        words += _odd(camera)
+        words += _uncertain(calibration, camera) + _sign_open(calibration, camera)
+        if rig.walls[camera.name].distance_mm is None:
+            words += _without_distance(camera)
+    return words
+
+
+def _in_words(calibration: Calibration, names: Sequence[str]) -> str:
+    where = f"behind the walls of {', '.join(names)}"
+    error = _um(model_error_um(calibration.in_air().cameras, calibration.cameras))
+    if calibration.medium == "air":
+        return (
+            f"calibrated in air; points of runs lie in the water {where}: a model without them "
+            f"would be {error} wrong over the working volume"
+        )
+    return f"calibrated in the water {where}; used in air without them, it would be {error} wrong"
+
+
+def _um(error_um: float) -> str:
+    return f"up to {_rounded(error_um)} um" if error_um >= _NOTABLE_UM else "less than 0.1 um"
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+
+
+def _without_walls(calibration: Calibration) -> list[str]:
+    """Of a target in the water when `rig.toml` states no walls."""
+    if calibration.medium == "air":
+        return []
+    words = "calibrated in the water without [walls]: scales and axes are those of the water"
+    if any(abs(c["kappa_per_mm"]) * c.rho_mm >= ENTOCENTRIC for c in calibration.cameras):
+        words += "; a perspective lens behind glass needs [walls.<camera>], or dots will scatter"
+    return [words]
+
+
+def _odd(camera: Camera) -> list[str]:
+    """What is rarely meant: media in the wrong order, a wall that hardly faces the camera."""
+    wall, words = camera.wall, []
+    if wall is None:
+        return []
+    if wall.indices[0] > wall.indices[-1]:
+        words.append(
+            f"[walls.{camera.name}] indices {list(wall.indices)} put this camera into the denser "
+            "medium: the camera's side comes first, as in [1.0, 1.52, 1.333]"
+        )
+    leaning = np.degrees(np.arccos(min(1.0, abs(wall.normal[2]))))
+    if leaning > _LEANING_DEG:
+        words.append(
+            f"the wall of {camera.name} leans {leaning:.0f} degrees to its line of sight: its "
+            "normal is in the camera's frame, where a wall that faces the camera is [0, 0, 1]"
+        )
+    return words
+
+
+def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
+    """The share of a wall's unknown orientation, one standard deviation in the worse direction."""
+    sd = max((calibration.sd(f"{camera.name}.{n}") for n in wall_freedom(camera)), default=0.0)
+    if sd == 0 or camera.wall is None:
+        return []
+    turned = camera.with_parameters(wall_x_rad=camera["wall_x_rad"] + sd)
+    points = working_volume((camera,))
+    moved = (turned.project(points) - camera.project(points)) / camera["scale_px_per_mm"]
+    moved = moved - moved.mean(0)
+    most = 1e3 * float(np.abs(moved).max())
+    words = f"the normal of the wall of {camera.name} is known to {np.degrees(sd):.2g} deg"
+    if calibration.medium == "water":
+        return [f"{words}, counted in the covariances"]
+    words += f": {_rounded(most)} um over the working volume, counted in the covariances"
+    if most > calibration.statistics.get("space_sd_um", np.inf) / 2:
+        words += "; measure it better, or calibrate with the target in the water"
+    return [words]
+
+
+def _sign_open(calibration: Calibration, camera: Camera) -> list[str]:
+    """Whether a wall that leans as much to the other side fits as well, and was as likely before.
+
+    Without perspective a target in the water shows the square of the tilt only.
+    """
+    free, wall = wall_freedom(camera), camera.wall
+    weak = abs(camera["kappa_per_mm"]) * camera.rho_mm < ENTOCENTRIC
+    if calibration.medium == "air" or not free or wall is None or not weak:
+        return []
+    normal = standing_wall(camera.intrinsics, wall).normal
+    mirrored = normal * [-1, -1, 1]
+    apart, from_stated = (_angle_rad(mirrored, n) for n in (normal, wall.normal))
+    sd = max(calibration.sd(f"{camera.name}.{name}") for name in free)
+    if apart < 3 * sd or from_stated > 3 * wall.normal_sigma_rad:
+        return []
+    return [
+        f"the wall of {camera.name} may as well lean {np.degrees(apart / 2):.2g} deg to the other "
+        "side: a telecentric lens with the target in the water sees no sign; points are not "
+        "affected, but state the normal's side better if its value matters"
+    ]
+
+
+def _angle_rad(a: Array, b: Array) -> float:
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def _without_distance(camera: Camera) -> list[str]:
+    """What 10 mm of a wall's unknown distance would do."""
+    if camera.wall is None:
+        return []
+    farther = replace(camera.wall, distance_mm=camera.wall.distance_mm + _STEP_MM)
+    points = working_volume((camera,))
+    moved = replace(camera, wall=farther).project(points) - camera.project(points)
+    moved = moved / camera["scale_px_per_mm"] * 1e3
+    common = moved.mean(0)
+    shift, rest = float(np.linalg.norm(common)), float(np.abs(moved - common).max())
+    if max(shift, rest) < _NOTABLE_UM:
+        return []
+    return [
+        f"[walls.{camera.name}] has no distance_mm, so the wall is taken at the camera's origin: "
+        f"every {_STEP_MM:.0f} mm that it stands elsewhere shift this camera's points by "
+        f"{_rounded(shift)} um, all alike, and change them by {_um(rest)}"
+    ]
+
+
+def forgotten_walls(rig: RigDescription | None, calibration: Calibration) -> list[str]:
+    """Warnings where `rig.toml` has walls that the calibration does not model, or the reverse.
+
+    A calibration made in water without walls holds them in its scales and axes, but for what
+    perspective does.
+    """
+    if rig is None:
+        return []
+    stated = stated_walls(rig)
+    have = {c.name: c.wall for c in calibration.cameras}
+    gone = [name for name, wall in have.items() if wall is not None and name not in stated]
+    if gone:
+        bare = [replace(c, wall=None) if c.name in gone else c for c in calibration.cameras]
+        much = _um(model_error_um(calibration.cameras, bare))
+        return [
+            f"the calibration has walls for {', '.join(gone)} that rig.toml does not state: if "
+            f"they are gone, points are {much} wrong over the working volume; calibrate again"
+        ]
+    missing = [name for name, wall in stated.items() if not _same(have.get(name), wall)]
+    if not missing or calibration.medium == "water":
+        return []
+    error = model_error_um(calibration.cameras, with_walls(calibration.cameras, stated))
+    if error < _NOTABLE_UM:
+        return []
+    return [
+        f"the walls that rig.toml states for {', '.join(missing)} are not in the calibration as "
+        f"stated: points are {_um(error)} wrong over the working volume; calibrate again"
+    ]
+
+
+def _same(one: Wall | None, other: Wall) -> bool:
+    """Alike to what a file keeps of them."""
+    if one is None:
+        return False
+    return np.allclose(_numbers(one), _numbers(other), rtol=1e-9, atol=1e-12)
+
+
+def _numbers(wall: Wall) -> Array:
+    return np.concatenate([np.atleast_1d(value) for value in wall.as_dict().values()])

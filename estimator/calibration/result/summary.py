@@ -1,0 +1,77 @@
+"""A calibration in plain words, for the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration.result.calibration import Calibration
+
+
+def summary(calibration: Calibration) -> str:
+    """Verdict first, then residuals, cameras with standard deviations, twin, warnings."""
+    s = calibration.statistics
+    if "views" not in s:
+        return _imported(calibration)
+    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.get('status', '?')}"]
+    lines += [f"  ! {reason}" for reason in calibration.verdict.get("reasons", [])]
+    lines.append(
+        f"  {s['views']} views, {s['dots_kept']} of {s['dots_measured']} dots kept "
+        f"({s['share_kept']:.1%}), residual {s['rms_px']:.4f} px RMS per coordinate, "
+        f"chi-square {s['chi2_dof']:.2f} per degree of freedom"
+    )
+    if s["noise_floor_px"]:
+        lines.append(
+            f"  the dots scatter by {s['noise_floor_px']:.4f} px beyond their image noise of "
+            f"{s['image_noise_px']:.4f} px (print, compression or lens); it is in every covariance"
+        )
+    lines.append(f"  model {calibration.model['words']}")
+    for camera, free in zip(calibration.cameras, calibration.free):
+        parts = [
+            f"{name} {camera[name]:.6g} +- {calibration.sd(f'{camera.name}.{name}'):.2g}"
+            for name in free
+        ]
+        lines.append(f"  camera {camera.name}: " + ", ".join(parts))
+    if "axes_angle_deg" in s:
+        lines.append(
+            f"  angle between the axes {s['axes_angle_deg']:.4f} +- {s['axes_angle_sd_deg']:.2g} "
+            "degrees"
+        )
+    if "space_sd_um" in s:
+        lines.append(
+            f"  in space: dots {s['space_rms_um']:.2f} um RMS from the fit; a point triangulated "
+            f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um per axis"
+        )
+    lines += _trust(calibration)
+    advice = calibration.diagnostics.get("next_view") or {}
+    lines += [f"  {advice['words']}"] if advice else []
+    t = calibration.twin
+    lines.append(
+        f"  mirror twin: cost {t['cost']:.9g} kept, {t['other_cost']:.9g} for the other; "
+        f"decided by {t['decided_by']}: {t['words']}"
+    )
+    lines += [f"  stage: {word}" for word in calibration.stage.get("notes", ())]
+    said = calibration.verdict.get("reasons", [])
+    notes = (*calibration.notes, *calibration.diagnostics["weak"])
+    lines += [f"  note: {note}" for note in notes if note not in said]
+    return "\n".join(lines)
+
+
+def _trust(calibration: Calibration) -> list[str]:
+    """What halves of the views and the residuals say of the stated uncertainty."""
+    halves = calibration.diagnostics.get("halves") or {}
+    structure = calibration.diagnostics.get("structure") or {}
+    lines = [f"  {'' if halves.get('agree', True) else '! '}{halves['words']}"] if halves else []
+    mark = "" if structure.get("sound", True) else "! "
+    return lines + [f"  {mark}{words}" for words in structure.get("words", ())]
+
+
+def _imported(calibration: Calibration) -> str:
+    """Of cameras that were not calibrated here: what they are, and the notes."""
+    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.get('status', '?')}"]
+    for camera in calibration.cameras:
+        lines.append(
+            f"  camera {camera.name}: {camera['scale_px_per_mm']:.6g} px/mm, "
+            f"kappa {camera['kappa_per_mm']:.4g} per mm"
+        )
+    return "\n".join(lines + [f"  note: {note}" for note in calibration.notes])

@@ -1,0 +1,337 @@
+"""From a finished fit to a `Calibration`: numbers, tables and a verdict in plain words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.estimator.calibration.lens.choice_record import model_rows
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.solver.covariance import JointCovariance, aligned_covariance
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.robust import (
+    lost_views,
+    pixel_residuals,
+    squared_distance,
+)
+from telerig.factors.projection import State
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotvec_from_rotation
+from telerig.rig.triangulation import triangulate
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration.self_calibration import Fit
+
+Array = NDArray[np.float64]
+
+GAUGE = (
+    "rig frame = first camera's frame, its origin where the two optical axes come closest; image "
+    "centres held at the middle of the image unless the model frees them; target frame tied to "
+    "the nominal dot positions by the dots' priors"
+)
+BAD_SCATTER_PX = 0.5
+BAD_KEPT = 0.9
+BAD_FLOOR = 5.0
+"""Noise floor over image noise beyond which the model is doubted aloud."""
+
+
+def calibration_from_fit(
+    fit: Fit,
+    joint: JointCovariance,
+    free: tuple[tuple[str, ...], ...],
+    weak: list[str],
+    *,
+    nominal_rotvec_deg: Array | None,
+    name: str,
+) -> Calibration:
+    """Assemble the public result.
+
+    free : per camera, the intrinsics of which the covariance speaks.
+    weak : sentences of `checks.weak_parameters` on the fit.
+    """
+    problem, state = fit.robust.problem, fit.robust.solution.state
+    cameras = cameras_from_state(problem, state)
+    rig_names, rig_covariance = joint.rig_block()
+    residuals = residual_table(problem, state)
+    statistics = _statistics(fit, joint, residuals) | _geometry(fit, joint)
+    calibration = Calibration(
+        cameras=cameras,
+        dot_ids=problem.dot_ids,
+        target_points_mm=state.dots_mm,
+        target_poses={v: _pose(m) for v, m in zip(problem.views, state.rig_from_target)},
+        covariance=rig_covariance,
+        covariance_names=rig_names,
+        free=free,
+        name=name,
+        verdict=_verdict(fit, statistics),
+        statistics=statistics,
+        twin=_twin(fit, nominal_rotvec_deg),
+        model=model_rows(fit),
+        diagnostics={
+            "gauge": GAUGE,
+            "weak": weak,
+            "tilts_deg": {
+                f"{problem.views[v]}/{problem.cameras[c].name}": t
+                for (v, c), t in fit.pre.tilts_deg.items()
+            },
+        },
+        notes=fit.notes,
+        joint_names=joint.names,
+        joint_covariance=joint.matrix,
+        dots=dot_table(problem),
+        residuals=residuals,
+    )
+    statistics |= _space(calibration, problem, state)
+    return calibration
+
+
+def cameras_from_state(problem: Problem, state: State) -> tuple[Camera, ...]:
+    """The estimated cameras."""
+    return tuple(
+        Camera(c.name, c.image_size_px, c.rho_mm, k, _pose(m).inverse(), c.wall)
+        for c, k, m in zip(problem.cameras, state.intrinsics, state.rig_from_camera)
+    )
+
+
+def _pose(matrix: Array) -> Pose:
+    return Pose(matrix[:3, :3], matrix[:3, 3])
+
+
+def dot_table(problem: Problem) -> pd.DataFrame:
+    """The measured dots as `results/calibration/dots.csv` holds them."""
+    ids = problem.dot_ids[problem.dot]
+    row, column = problem.target.row_column_from_id(ids)
+    return pd.DataFrame(
+        {
+            "view": np.array(problem.views)[problem.view],
+            "camera": np.array([c.name for c in problem.cameras])[problem.camera],
+            "dot": ids, "row": row, "column": column,
+            "u_px": problem.uv_px[:, 0], "v_px": problem.uv_px[:, 1],
+        }
+    )  # fmt: skip
+
+
+def residual_table(problem: Problem, state: State) -> pd.DataFrame:
+    """`residuals.csv`: measured minus predicted, weight, and the reason for a weight below one."""
+    residual = -pixel_residuals(problem, state)
+    distance = np.sqrt(squared_distance(residual, problem.covariance_px2))
+    table = dot_table(problem)
+    table["du_px"], table["dv_px"] = residual[:, 0], residual[:, 1]
+    table["weight"] = problem.weight
+    lost = np.isin(problem.view, lost_views(problem, problem.weight))
+    table["reason"] = [
+        "" if w >= 1 else _reason(d, bool(alone), problem.outlier_sd)
+        for w, d, alone in zip(problem.weight, distance, lost)
+    ]
+    return table
+
+
+def _reason(distance: float, lost_view: bool, limit: float) -> str:
+    if lost_view:
+        return "too few dots of this view agree with the model to place the target"
+    return f"{distance:.1f} standard deviations from the model (limit {limit:g})"
+
+
+def odd_views(problem: Problem) -> list[str]:
+    """Views of which most dots were left out: wrongly numbered, or of a target that moved."""
+    measured = np.bincount(problem.view, minlength=len(problem.views))
+    kept = np.bincount(problem.view[problem.weight > 0.5], minlength=len(problem.views))
+    return [
+        f"view {name!r}: only {k} of {n} dots agree with the others; is it numbered wrongly, or "
+        "did the target move between the cameras' images?"
+        for name, k, n in zip(problem.views, kept, measured)
+        if k < 0.5 * n
+    ]
+
+
+def _statistics(fit: Fit, joint: JointCovariance, residuals: pd.DataFrame) -> dict[str, Any]:
+    problem = fit.robust.problem
+    kept = problem.weight > 0.5
+    values = residuals[["du_px", "dv_px"]].to_numpy()
+    squares = squared_distance(values, problem.covariance_px2)[kept].sum()
+    out: dict[str, Any] = {
+        "views": len(problem.views),
+        "dots_measured": len(kept),
+        "dots_kept": int(kept.sum()),
+        "share_kept": float(kept.mean()),
+        "rms_px": _rms(values[kept]),
+        "rms_all_px": _rms(values),
+        "chi2_dof": float(squares / joint.effective_dof),
+        "degrees_of_freedom": joint.effective_dof,
+        "cost": fit.robust.solution.cost,
+        "iterations": fit.robust.solution.iterations,
+        "noise_floor_px": fit.robust.floor_px,
+        "scatter_px": _scatter(problem.covariance_px2),
+        "image_noise_px": _scatter(problem.covariance_px2 - fit.robust.floor_px**2 * np.eye(2)),
+    }
+    for c, camera in enumerate(problem.cameras):
+        mine = kept & (problem.camera == c)
+        out[f"rms_{camera.name}_px"] = _rms(values[mine])
+    return out
+
+
+def _scatter(covariance: Array) -> float:
+    return float(np.sqrt(np.median(np.trace(covariance, axis1=-2, axis2=-1)) / 2))
+
+
+def _rms(values: Array) -> float:
+    """Per coordinate."""
+    return float(np.sqrt((values**2).mean())) if values.size else float("nan")
+
+
+def _geometry(fit: Fit, joint: JointCovariance) -> dict[str, Any]:
+    problem, state = fit.robust.problem, fit.robust.solution.state
+    out = _target_shape(problem, state, joint)
+    if len(problem.cameras) < 2:
+        return out
+    turn = state.rig_from_camera[1, :3, :3].T
+    rotvec = rotvec_from_rotation(turn)
+    angle = float(np.arccos(np.clip(turn[2, 2], -1, 1)))
+    names, covariance = joint.rig_block()
+    second = problem.cameras[1].name
+    index = [names.index(f"{second}.{p}") for p in ("rx_rad", "ry_rad")]
+    # the first axis in second-camera coordinates; a turn about x, y of the second tips its axis
+    slope = np.array([-turn[1, 2], turn[0, 2]]) / max(np.sin(angle), 1e-12)
+    sd = float(np.sqrt(slope @ covariance[np.ix_(index, index)] @ slope))
+    out |= {
+        "inter_camera_rotvec_deg": np.degrees(rotvec).tolist(),
+        "axes_angle_deg": float(np.degrees(angle)),
+        "axes_angle_formal_sd_deg": float(np.degrees(sd)),
+        "axes_angle_sd_deg": float(np.degrees(np.hypot(sd, _angle_systematic(fit, angle)))),
+    }
+    kappas = [k[5] for k in state.intrinsics]
+    if all(abs(k) > 1e-9 for k in kappas):
+        centres = [
+            (m @ np.array([0, 0, -1 / k, 1]))[:3] for m, k in zip(state.rig_from_camera, kappas)
+        ]
+        out["perspective_centres_distance_mm"] = float(np.linalg.norm(centres[1] - centres[0]))
+    return out
+
+
+def _angle_systematic(fit: Fit, angle_rad: float) -> float:
+    """How far the angle moves when the image centres are held at the middle of the image.
+
+    With strong perspective the angle trades with the centres; the centres come from the
+    perspective alone only as far as the distortion model is right. 0 when they are held anyway.
+    """
+    if fit.centre_held is None:
+        return 0.0
+    return float(angle_rad - np.arccos(fit.centre_held[1, 2, 2]))
+
+
+def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dict[str, Any]:
+    """How the printed target differs from nominal, a rigid motion and a stretch set aside."""
+    dots, nominal = state.dots_mm, problem.nominal_mm
+    design = np.c_[nominal[:, :2], np.ones(len(dots))]
+    affine, *_ = np.linalg.lstsq(design, dots, rcond=None)
+    leftover = dots - design @ affine
+    rank = min(len(dots) - 3, len(dots))
+    factor = np.sqrt(len(dots) / max(rank, 1))
+    sd = np.sqrt(np.diagonal(joint.dots, 0, 1, 2))
+    stretch = np.linalg.svd(affine[:2, :2], compute_uv=False)
+    return {
+        "target_rms_from_nominal_mm": float(np.sqrt(((dots - nominal)[:, :2] ** 2).mean())),
+        "target_in_plane_rms_mm": float(factor * np.sqrt((leftover[:, :2] ** 2).mean())),
+        "target_out_of_plane_rms_mm": float(factor * leftover[:, 2].std()),
+        "target_stretch": [float(s) for s in stretch],
+        "target_point_sd_mm": [float(s) for s in np.median(sd, 0)],
+    }
+
+
+def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str, Any]:
+    """Residuals in space, and the predicted uncertainty of a triangulated point (um per axis).
+
+    The calibration's share is without the common rigid motion of all points.
+    """
+    if len(problem.cameras) < 2:
+        return {}
+    pixels, truth = _paired(problem, state)
+    if len(truth) == 0:
+        return {}
+    pair = (calibration.cameras[0], calibration.cameras[1])
+    sigma = calibration.statistics["scatter_px"]
+    found = triangulate(pair, (pixels[:, 0], pixels[:, 1]), sigma)
+    some = found.points_mm[:: max(1, len(truth) // 200)]
+    shared = aligned_covariance(pair, calibration.free, calibration.covariance, some)
+    measurement = np.trace(found.covariance_mm2, axis1=-2, axis2=-1).mean() / 3
+    from_calibration = np.trace(shared) / len(shared)
+    error = found.points_mm - truth
+    return {
+        "space_rms_um": float(1e3 * np.sqrt((error**2).mean())),
+        "space_sd_um": float(1e3 * np.sqrt(measurement + from_calibration)),
+        "space_sd_measurement_um": float(1e3 * np.sqrt(measurement)),
+        "space_sd_calibration_um": float(1e3 * np.sqrt(from_calibration)),
+        "ray_miss_rms_um": float(1e3 * np.sqrt((found.ray_miss_mm**2).mean())),
+    }
+
+
+def _paired(problem: Problem, state: State) -> tuple[Array, Array]:
+    """(K, 2, 2) pixels of dots kept in both cameras of a view, (K, 3) their fitted places."""
+    keyed: dict[tuple[int, int], dict[int, Array]] = {}
+    for v, c, d, uv, w in zip(
+        problem.view, problem.camera, problem.dot, problem.uv_px, problem.weight
+    ):
+        if w > 0.5:
+            keyed.setdefault((int(v), int(d)), {})[int(c)] = uv
+    both = [(k, p) for k, p in keyed.items() if len(p) == 2]
+    if not both:
+        return np.zeros((0, 2, 2)), np.zeros((0, 3))
+    pixels = np.array([[p[0], p[1]] for _, p in both])
+    views, dots = np.array([k for k, _ in both]).T
+    poses = state.rig_from_target[views]
+    points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[dots]) + poses[:, :3, 3]
+    return pixels, points
+
+
+def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
+    reasons = []
+    if statistics["noise_floor_px"] > BAD_SCATTER_PX:
+        reasons.append(
+            f"the model {fit.model!r} does not describe these images: the dots scatter by "
+            f"{statistics['scatter_px']:.2g} px round it, their own image noise is "
+            f"{statistics['image_noise_px']:.2g} px" + _kappa_hint(fit)
+        )
+    if statistics["share_kept"] < BAD_KEPT:
+        reasons.append(
+            f"only {statistics['share_kept']:.0%} of the dots agree with the model; see "
+            "residuals.csv for those that do not"
+        )
+    if reasons:
+        return {"status": "REJECTED", "reasons": reasons}
+    chi2 = statistics["chi2_dof"]
+    spread = 5 * np.sqrt(2 / max(statistics["degrees_of_freedom"], 1))
+    if abs(chi2 - 1) > max(0.15, spread):
+        reasons.append(f"chi-square per degree of freedom is {chi2:.2f}, not 1")
+    if statistics["noise_floor_px"] > BAD_FLOOR * statistics["image_noise_px"]:
+        reasons.append(
+            f"the dots scatter by {statistics['scatter_px']:.2g} px round the model {fit.model!r}, "
+            f"their own image noise is {statistics['image_noise_px']:.2g} px: what is left is "
+            "systematic, and errors in space may exceed their stated standard deviations"
+        )
+    if len(fit.notes):
+        reasons += [n for n in fit.notes if "weak" in n or "only" in n]
+    reasons += odd_views(fit.robust.problem)
+    status = "USABLE, with warnings" if reasons else "GOOD"
+    return {"status": status, "reasons": reasons}
+
+
+def _kappa_hint(fit: Fit) -> str:
+    if any("kappa_per_mm" in names for names in fit.robust.problem.free):
+        return ""
+    return (
+        ". The lenses' residual perspective is held at its nominal value in this model; if the "
+        "scale changes with depth, kappa = 0 cannot fit: try --model auto"
+    )
+
+
+def _twin(fit: Fit, nominal_rotvec_deg: Array | None) -> dict[str, Any]:
+    return {
+        "cost": fit.robust.solution.cost,
+        "other_cost": fit.twin_cost,
+        "decided_by": fit.twin_by,
+        "words": fit.twin_words,
+        "nominal_rotvec_deg": None if nominal_rotvec_deg is None else list(nominal_rotvec_deg),
+    }

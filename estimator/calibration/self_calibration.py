@@ -1,0 +1,361 @@
+"""Self-calibration from a table of dots: start, model, robust fit, twin, covariance, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.lens import choice as model_choice
+from telerig.estimator.calibration.lens import considered_parameters
+from telerig.estimator.calibration.lens.choice import Choice
+from telerig.estimator.calibration.lens.start_values import model_start
+from telerig.estimator.calibration.quality import checks
+from telerig.estimator.calibration.quality.residual_tests import residual_tests
+from telerig.estimator.calibration.quality.split_half import halves
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.result_from_fit import calibration_from_fit
+from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
+from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
+from telerig.estimator.calibration.solver.graph import Progress, Solution, solve
+from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.problem import (
+    OUTLIER_SD,
+    SOLVERS,
+    Problem,
+    checked_outlier_sd,
+    held_at_nominal,
+    parameter_unit,
+)
+from telerig.estimator.calibration.solver.robust import RobustFit, robust_solve
+from telerig.estimator.calibration.start import (
+    known_target,
+    mirror_ambiguity,
+    symmetric_target,
+    tilt_signs,
+)
+from telerig.estimator.calibration.start.unknown_target import dots_from_images
+from telerig.estimator.calibration.views.next_view import next_view
+from telerig.factors.projection import State, whitened_error
+from telerig.rig.camera import Camera
+from telerig.rig.lens_models import (
+    AUTO,
+    Model,
+    groups_of,
+    joint_name,
+    models_by_camera,
+    name_of,
+)
+from telerig.rig.projection import INDEX
+from telerig.rig.target import Target
+
+Array = NDArray[np.float64]
+
+PLATE = "refraction in the plate"
+"""What decides the mirror twin of a two-sided target when no nominal rotation is given."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Everything that a finished self-calibration knows, before it is put into words.
+
+    models : the chosen one of each camera.  choice : None when they were given.
+    centre_held : the cameras' poses with the image centres held, when perspective frees them.
+    """
+
+    robust: RobustFit
+    twin_cost: float
+    twin_by: str
+    twin_words: str
+    models: tuple[str, ...]
+    model_words: str
+    choice: Choice | None
+    centre_held: Array | None
+    pre: checks.PreCheck
+    notes: tuple[str, ...]
+
+    @property
+    def model(self) -> str:
+        """In one name."""
+        return joint_name(self.models, [c.name for c in self.robust.problem.cameras])
+
+
+def self_calibrate(
+    dots: pd.DataFrame,
+    cameras: Sequence[Camera],
+    target: Target,
+    *,
+    nominal_rotvec_deg: Sequence[float] | None = None,
+    model: Model = AUTO,
+    dots_free: str = "3d",
+    solver: str = "auto",
+    outlier_sd: float = OUTLIER_SD,
+    progress: Progress | None = None,
+    notes: Sequence[str] = (),
+    name: str = "",
+) -> Calibration:
+    """Calibrate one or two cameras from measured dots.
+
+    dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
+    cameras : nominal, the first defines the rig frame.
+    nominal_rotvec_deg : of second_from_first; decides the mirror twin.
+    model : a name of `telerig.rig.lens_models`, or "auto"; for all cameras, or by camera.
+    dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
+    solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
+    outlier_sd : standard deviations from the model beyond which a dot is left out.
+
+    Raises CalibrationError when the views cannot determine a calibration, with the remedy.
+    """
+    if len(cameras) not in (1, 2):
+        raise InputError(f"{len(cameras)} cameras", todo="a rig has one camera or two")
+    models = models_by_camera(model, [c.name for c in cameras])
+    if solver not in SOLVERS:
+        raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
+    nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
+    problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
+    problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd))
+    problem = replace(problem, solver="schur" if solver == "auto" else solver)
+    unknown = dots_unknown(problem)
+    start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
+    pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
+    said = [*notes, *pre.notes]
+    if target.symmetry_order() > 1:
+        problem, words = symmetric_target.settle(problem, nominal)
+        said += words
+        start_dots = problem.nominal_mm
+    problem = with_plate(problem)
+    start = best_start(problem, start_dots)
+    by, words_twin = "mono", "one camera: its mirror twin has the same pixels and is not decided"
+    if len(cameras) == 2:
+        start, by, words_twin = _side(problem, start, nominal)
+    start = tilt_signs.settle(problem, start)
+    fit = _fit(problem, start, models, solver, progress)
+    if len(cameras) == 2 and by != PLATE:
+        fit, by, words_twin = _settled_twin(fit, nominal)
+    opened = considered_parameters.considered(fit.choice, len(cameras))
+    doubt = considered_parameters.considered_words(opened, [c.name for c in cameras])
+    done = replace(
+        fit, twin_cost=_twin_cost(fit), twin_by=by, twin_words=words_twin, pre=pre,
+        notes=tuple(said), model_words=fit.model_words + doubt,
+    )  # fmt: skip
+    final, solution = done.robust.problem, done.robust.solution
+    own = joint_covariance(final, solution)
+    free, joint = considered_parameters.considered_covariance(
+        final, solution, own, done.models, opened
+    )
+    weak = checks.weak_parameters(final, solution.state, own)
+    found = calibration_from_fit(done, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
+    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint, free)})
+
+
+def _trust(
+    fit: RobustFit, joint: JointCovariance, free: tuple[tuple[str, ...], ...]
+) -> dict[str, Any]:
+    """What the data say of the covariance (repeatability, structure), and what would lower it."""
+    problem, state = fit.problem, fit.solution.state
+    whitened = whitened_error(state, problem.observations(), problem.rho_mm)
+    advice = next_view(replace(problem, free=free), state, joint)
+    return {
+        "halves": halves(problem, state),
+        "structure": residual_tests(problem, whitened, joint.leverage),
+        "next_view": {} if advice is None else advice.as_dict(),
+    }
+
+
+def dots_unknown(problem: Problem) -> bool:
+    """True when the nominal places are too vague to start from: a tenth of the spacing."""
+    spread = np.ptp(problem.nominal_mm[:, :2], axis=0).max()
+    spacing = spread / max(1.0, np.sqrt(len(problem.dot_ids)))
+    return bool(problem.target.print_sigma_mm > 0.1 * spacing)
+
+
+def hold_dots(problem: Problem, dots_free: str) -> Problem:
+    """The problem with its dots free in 3-D, in the plane, or not at all."""
+    held = 1e-6
+    sigma = problem.dot_sigma_mm.copy()
+    if dots_free not in ("3d", "plane", "nominal"):
+        raise CalibrationError(f"unknown choice {dots_free!r}", todo="3d, plane or nominal")
+    if dots_free in ("plane", "nominal"):
+        sigma[:, 2] = held
+    if dots_free == "nominal":
+        sigma[:] = held
+    return replace(problem, dot_sigma_mm=sigma)
+
+
+def with_plate(problem: Problem) -> Problem:
+    """Where a two-sided plate is seen from behind, the side that fits the pixels better."""
+    target = problem.target
+    if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
+        return problem
+    hands = np.zeros((len(problem.views), len(problem.cameras)))
+    for (v, c), sign in _handedness(problem).items():
+        hands[v, c] = sign
+    options = [replace(problem, plate_shift=np.where(hands == h, -hands, 0.0)) for h in (1, -1)]
+    costs = []
+    for option in options:
+        start = best_start(option, option.nominal_mm)
+        costs.append(solve(option, start, max_iterations=20).cost)
+    return options[int(np.argmin(costs))]
+
+
+def _handedness(problem: Problem) -> dict[tuple[int, int], int]:
+    maps = known_target.image_maps(problem, problem.nominal_mm)
+    return {k: int(np.sign(np.linalg.det(m.jacobian))) for k, m in maps.items()}
+
+
+def best_start(problem: Problem, dots_mm: Array) -> State:
+    """The closed-form start that a short solve likes best."""
+    if len(problem.cameras) == 1:
+        return known_target.mono_state(problem, dots_mm)
+    starts = known_target.stereo_states(problem, dots_mm)
+    if np.any(problem.plate_shift):  # refraction tells the mirror twins apart
+        starts += [mirror_ambiguity.twin_state(start) for start in starts]
+    fits: list[Solution] = []
+    for start in starts:
+        perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)
+        candidate = problem.with_model("kappa" if perspective else "none")
+        fits.append(solve(candidate, start, max_iterations=15, relative=1e-4))
+    return min(fits, key=lambda f: f.cost).state
+
+
+def _fit(
+    problem: Problem,
+    start: State,
+    models: tuple[str, ...],
+    solver: str,
+    progress: Progress | None,
+) -> Fit:
+    """Outliers and floor with a rich model, the ladder, then the chosen model to the end.
+
+    solver : of the last fit; the trials before it take ``problem.solver``.
+    """
+    choice, held = None, None
+    weighed = problem
+    words = f"{joint_name(models, [c.name for c in problem.cameras])}: as asked"
+    if AUTO in models:
+        first, choice = choose_model(problem, start, models, progress)
+        weighed = first.problem
+        models, start, words = choice.chosen.names, choice.chosen.state, choice.words
+        if any("centre" in name for name in models):
+            words += _CENTRE_WORDS
+            held = _centre_held(first.problem, start, models)
+    final = problem.with_model(models)
+    if choice is None:
+        begin = robust_solve(final, model_start(final, start)).solution.state
+    else:  # without the outliers that are known by now
+        sound = replace(final, weight=weighed.weight, covariance_px2=weighed.covariance_px2)
+        start = held_at_nominal(final, start)
+        begin = solve(sound, start, max_iterations=15, relative=1e-5).state
+    shift = eccentricity_px(final, begin)
+    final = replace(final, uv_px=final.uv_px - shift)
+    robust = robust_solve(replace(final, solver=solver), begin, progress=progress)
+    none = checks.PreCheck({}, ())
+    return Fit(robust, np.nan, "", "", models, words, choice, held, none, ())
+
+
+def choose_model(
+    problem: Problem,
+    start: State,
+    models: tuple[str, ...],
+    progress: Progress | None = None,
+) -> tuple[RobustFit, Choice]:
+    """The robust fit of the richest model, and what of it each camera needs.
+
+    models : per camera, "auto" or a model that stays.
+    """
+    first = _rich(problem, start, models, progress)
+    return first, model_choice.climb(first.problem, first.solution, models)
+
+
+_CENTRE_WORDS = (
+    "; the perspective is strong, so the image centre (where the axis meets the image) is "
+    "free too, and the inter-camera angle is as uncertain as it makes it"
+)
+
+
+def _rich(
+    problem: Problem, start: State, models: tuple[str, ...], progress: Progress | None
+) -> RobustFit:
+    """Outliers and noise floor from the richest model, so that no lens is taken for either."""
+    mono = len(problem.cameras) == 1
+    auto = np.array([m == AUTO for m in models])
+    plain = name_of(model_choice.rich_lens(mono=mono, strong=False))
+    whole = problem.with_model([plain if m == AUTO else m for m in models])
+    first = robust_solve(whole, model_start(whole, start), progress=progress)
+    strong = auto & _strong(first)
+    if mono or not strong.any():
+        return first
+    perspective = name_of(model_choice.rich_lens(mono=mono, strong=True))
+    names = [perspective if s else plain if m == AUTO else m for s, m in zip(strong, models)]
+    whole = problem.with_model(names)
+    return robust_solve(whole, model_start(whole, first.solution.state), progress=progress)
+
+
+_SURE = 5.0
+"""Standard deviations by which a perspective must differ from none to be one."""
+
+
+def _strong(fit: RobustFit) -> NDArray[np.bool_]:
+    """(C,) whether a camera's perspective is that of no telecentric lens."""
+    problem, kappa = fit.problem, INDEX["kappa_per_mm"]
+    strength = np.abs(fit.solution.state.intrinsics[:, kappa]) * np.array(problem.rho_mm)
+    out = np.asarray(strength > mirror_ambiguity.ENTOCENTRIC)
+    if not out.any():
+        return out
+    variance = iter(np.diag(fit.solution.equations.posterior(whole=False).common))
+    for c, camera in enumerate(problem.cameras):
+        for parameter in problem.free_indices(c):
+            sd = np.sqrt(next(variance)) * parameter_unit(camera)[parameter]
+            if parameter == kappa:
+                out[c] &= strength[c] > _SURE * sd * camera.rho_mm
+    return out
+
+
+def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Array:
+    """(C, 4, 4) rig_from_camera of the same models with the image centres held."""
+    held = problem.with_model([name_of(set(groups_of(m)) - {"centre"}) for m in models])
+    return solve(held, held_at_nominal(held, state), relative=1e-7).state.rig_from_camera
+
+
+def _side(problem: Problem, start: State, nominal: Array | None) -> tuple[State, str, str]:
+    """The twin to go on with: by the plate's refraction where nothing else can tell."""
+    if nominal is not None or not np.any(problem.plate_shift):
+        return mirror_ambiguity.choose_twin(start, problem, nominal)
+    both = (start, mirror_ambiguity.twin_state(start))
+    costs = [solve(problem, s, max_iterations=20).cost for s in both]
+    words = "the plate's refraction, which has another sign in the mirror twin"
+    return both[int(np.argmin(costs))], PLATE, words
+
+
+def _settled_twin(fit: Fit, nominal: Array | None) -> tuple[Fit, str, str]:
+    """The final fit may know the sign of kappa that the start did not."""
+    robust = fit.robust
+    state, by, words = mirror_ambiguity.choose_twin(robust.solution.state, robust.problem, nominal)
+    if state is not robust.solution.state:
+        fit = replace(fit, robust=replace(robust, solution=solve(robust.problem, state)))
+    return fit, by, words
+
+
+def _twin_cost(fit: Fit) -> float:
+    """The cost of the twin that was not kept.
+
+    Raises CalibrationError when it is far lower: the plate's refraction decides against the side
+    that the nominal rotation names.
+    """
+    problem, solution = fit.robust.problem, fit.robust.solution
+    if len(problem.cameras) == 1:
+        return solution.cost
+    other = solve(problem, mirror_ambiguity.twin_state(solution.state), max_iterations=20).cost
+    if np.any(problem.plate_shift) and other < 0.5 * solution.cost - 10:
+        raise CalibrationError(
+            "the nominal rotation puts the second camera on one side, the refraction in the "
+            f"two-sided plate on the other (cost {solution.cost:.4g} against {other:.4g})",
+            where="rig.toml [stereo]",
+            todo="check the sign of the nominal rotation, and the plate's thickness and index",
+        )
+    return other

@@ -1,0 +1,123 @@
+"""Robust self-calibration: weights per dot, and a noise floor where the model is not perfect.
+
+GTSAM's robust noise models weigh a whole factor, here a whole image; one wrong dot would cost
+every other dot of the image its weight. Dots are weighted one by one instead (graduated
+non-convexity towards truncated least squares; Yang, Antonante, Tzoumas and Carlone, RA-L 5:1127,
+2020), and every weight is listed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.calibration.solver.graph import Progress, Solution, solve
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.factors.projection import State, pixels
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LEAST_DOTS = 4
+"""Sound dots below which a view is left out: they would not fix the target's pose."""
+_MEDIAN = 2 * np.log(2)  # of chi-square with two degrees of freedom
+
+
+@dataclass(frozen=True)
+class RobustFit:
+    """The problem with its final weights and covariances, its solution, and the floor (px)."""
+
+    problem: Problem
+    solution: Solution
+    floor_px: float
+
+
+def pixel_residuals(problem: Problem, state: State) -> Array:
+    """(M, 2) predicted minus measured of every dot, kept or not."""
+    return pixels(state, problem.unweighted(), problem.rho_mm) - problem.uv_px
+
+
+def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:
+    """(M,) squared Mahalanobis distance."""
+    solved = np.linalg.solve(covariance_px2, residual_px[..., None])[..., 0]
+    return np.asarray((residual_px * solved).sum(-1))
+
+
+def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float) -> float:
+    """Isotropic scatter that the residuals show beyond their own covariance; 0 if not significant.
+
+    From the median squared distance, so that up to half of the dots may be wrong. ``free_share``:
+    degrees of freedom over rows.
+    """
+    expected = _MEDIAN * free_share
+
+    def excess(floor: float) -> float:
+        covariance = covariance_px2 + floor**2 * np.eye(2)
+        return float(np.median(squared_distance(residual_px, covariance)) / expected - 1)
+
+    if excess(0.0) < 5 * 1.44 / np.sqrt(len(residual_px)):
+        return 0.0
+    from scipy.optimize import brentq
+
+    top = 2 * float(np.abs(residual_px).max()) + 1e-9
+    return float(brentq(excess, 0.0, top, xtol=1e-7)) if excess(top) < 0 else top
+
+
+def free_share(problem: Problem) -> float:
+    """Roughly the degrees of freedom per measured coordinate."""
+    rows = int(2 * np.sum(problem.weight > 0))
+    used = sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1)
+    used += 6 * len(problem.views) + 3 * len(problem.dot_ids)
+    return float(max(0.3, 1 - used / max(rows, 1)))
+
+
+def robust_solve(
+    problem: Problem, start: State, *, progress: Progress | None = None, rounds: int = 25
+) -> RobustFit:
+    """Solve, find the floor, down-weight dots beyond the limit, until the kept set stands still."""
+    base, least = problem.covariance_px2, problem.outlier_sd
+    problem = replace(problem, weight=np.ones(len(problem.view)))
+    solution = solve(problem, start, progress=progress)
+    limit, floor = np.inf, 0.0
+    for _ in range(rounds):
+        residual = pixel_residuals(problem, solution.state)
+        sound = problem.weight > 0
+        floor = noise_floor_px(residual[sound], base[sound], free_share(problem))
+        covariance = base + floor**2 * np.eye(2)
+        distance = np.sqrt(squared_distance(residual, covariance))
+        worst = float(distance.max())
+        previous = problem
+        limit = max(least, min(limit / 2, worst / 2))
+        if limit > least:
+            weight = (limit**2 / (limit**2 + distance**2)) ** 2
+        else:
+            weight = _without_lost_views(problem, _truncated(distance, problem.weight, least))
+        problem = replace(problem, weight=weight, covariance_px2=covariance)
+        settled = np.array_equal(weight, previous.weight) and np.allclose(
+            covariance, previous.covariance_px2, rtol=1e-3
+        )
+        if settled:
+            break
+        steps = 4 if limit > least else 60
+        solution = solve(problem, solution.state, max_iterations=steps, progress=progress)
+    return RobustFit(problem, solution, floor)
+
+
+def _truncated(distance: Array, before: Array, limit: float) -> Array:
+    """0 or 1; a dot that was out comes back only well inside, so that none flickers."""
+    bar = np.where(before < 0.01, 0.9 * limit, limit)
+    return (distance <= bar).astype(float)
+
+
+def _without_lost_views(problem: Problem, weight: Array) -> Array:
+    """No weight for views with too few sound dots to place the target; see `lost_views`."""
+    lost = lost_views(problem, weight)
+    return np.where(np.isin(problem.view, lost), 0.0, weight)
+
+
+def lost_views(problem: Problem, weight: Array) -> Ints:
+    """Views of which fewer than `LEAST_DOTS` measurements are kept."""
+    kept = np.bincount(problem.view[weight > 0], minlength=len(problem.views))
+    return np.flatnonzero(kept < LEAST_DOTS)

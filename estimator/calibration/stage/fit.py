@@ -1,0 +1,233 @@
+"""Gauss-Newton on the pixels of a static target that the stage carries the cameras past.
+
+A dot X of the target, at rest in the lab, stands at R X + t - w s - e in the rig when the encoder
+reads s: w = axis / (1 + scale) is the travel per unit of reading, e the carriage's error there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator.calibration.solver.covariance import rig_jacobian
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, hat, nearest_rotation, rotation_from_rotvec
+from telerig.rig.triangulation import triangulate
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LEAST_TRAVEL_MM = 1.0
+_STEPS = 60
+_REWEIGHTED = 25
+_SUSPECT = 3.5
+
+
+@dataclass(frozen=True)
+class Dots:
+    """view, camera (M,) indices; place_mm (M, 3) in the target's frame; uv_px (M, 2).
+
+    information : (M, 2, 2) inverse covariances.  views : names; reading_mm : (V,).
+    """
+
+    views: tuple[str, ...]
+    reading_mm: Array
+    view: Ints
+    camera: Ints
+    place_mm: Array
+    uv_px: Array
+    information: Array
+
+
+@dataclass(frozen=True)
+class State:
+    """rig_from_target at reading 0; slope : (3,) w, travel per unit of reading."""
+
+    rig_from_target: Pose
+    slope: Array
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Robust weights of dots (M,) and of the views' readings (V,)."""
+
+    dots: Array
+    views: Array
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Normal equations of (pose 6, slope 3) with the carriage's errors eliminated.
+
+    by_rig : (9, P) cross term with the calibration's rig block.
+    shift_mm, shift_covariance : (V, 3), (V, 3, 3) each view's own displacement off the line.
+    dot_score : (M,) squared residuals in sd, each view freely shifted.
+    """
+
+    normal: Array
+    right: Array
+    by_rig: Array
+    shift_mm: Array
+    shift_covariance: Array
+    dot_score: Array
+
+
+def fit(
+    cameras: tuple[Camera, ...],
+    free: tuple[tuple[str, ...], ...],
+    dots: Dots,
+    state: State,
+    sigma_mm: tuple[float, float],
+) -> tuple[State, Weights, Linear]:
+    """Robust Gauss-Newton from a start. sigma_mm : of the carriage along and across the axis.
+
+    Dots and readings beyond 3.5 sd keep the weight (3.5 / z)^4; the limit halves from turn to
+    turn, so that what lies farthest off goes first (graduated non-convexity).
+    Raises CalibrationError when it does not settle.
+    """
+    weights = Weights(np.ones(len(dots.view)), np.ones(len(dots.views)))
+    system = linearised(cameras, free, dots, state, sigma_mm, weights)
+    limit = np.inf
+    for turn in range(_STEPS):
+        step = np.asarray(np.linalg.solve(system.normal, system.right), np.float64)
+        state = State(
+            state.rig_from_target @ Pose(rotation_from_rotvec(step[:3]), step[3:6]),
+            state.slope + step[6:],
+        )
+        scores = _scores(system, state, sigma_mm[0])
+        highest = float(np.sqrt(max(s.max() for s in scores)))
+        limit = max(_SUSPECT, min(limit, highest) / 2)
+        fresh = _reweighted(scores, limit) if turn < _REWEIGHTED else weights
+        moved = np.ptp(fresh.dots - weights.dots) + np.ptp(fresh.views - weights.views)
+        weights = fresh
+        system = linearised(cameras, free, dots, state, sigma_mm, weights)
+        if limit == _SUSPECT and moved < 1e-3 and np.abs(step).max() < 1e-7:
+            return state, weights, system
+    raise CalibrationError(
+        "the target's views do not fit one straight travel",
+        where="stage_axis",
+        todo="check that the target stood still and that positions.csv belongs to the views",
+    )
+
+
+def _scores(system: Linear, state: State, sigma_mm: float) -> tuple[Array, Array]:
+    """Squared distances in sd of dots (M,) and of the views' readings (V,).
+
+    Readings that scatter by more than twice what is stated are measured by their own scatter.
+    """
+    axis = state.slope / np.linalg.norm(state.slope)
+    own = np.einsum("i,vij,j->v", axis, system.shift_covariance, axis)
+    off = system.shift_mm @ axis
+    spread = 1.4826 * float(np.median(np.abs(off)))
+    stated = float(np.sqrt(np.median(own) + sigma_mm**2))
+    variance = own + sigma_mm**2 if spread < 2 * stated else own + spread**2
+    return system.dot_score, off**2 / variance
+
+
+def _reweighted(scores: tuple[Array, Array], limit: float) -> Weights:
+    """(limit / z)^4 beyond ``limit`` standard deviations."""
+    cut = [np.minimum(1.0, limit**4 / np.maximum(score, 1.0) ** 2) for score in scores]
+    return Weights(cut[0], cut[1])
+
+
+def linearised(
+    cameras: tuple[Camera, ...],
+    free: tuple[tuple[str, ...], ...],
+    dots: Dots,
+    state: State,
+    sigma_mm: tuple[float, float],
+    weights: Weights,
+) -> Linear:
+    """Linear system at a state; the errors e of each view are marginalised in closed form."""
+    residual, by_point, by_state, by_rig = derivatives(cameras, free, dots, state)
+    information = dots.information * weights.dots[:, None, None]
+    axis = state.slope / np.linalg.norm(state.slope)
+    along = np.outer(axis, axis)
+    every = np.concatenate([by_state, by_rig, residual[:, :, None]], -1)
+    count = len(dots.views)
+    total = np.zeros((9, every.shape[-1]))
+    shift, spread = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for v in range(count):
+        mine = dots.view == v
+        prior = sigma_mm[0] ** 2 / weights.views[v] * along + sigma_mm[1] ** 2 * (np.eye(3) - along)
+        white = information[mine] @ every[mine]
+        total += np.einsum("mki,mkj->ij", by_state[mine], white)
+        felt = np.einsum("mki,mkj->ij", by_point[mine], white)
+        seen = np.einsum("mki,mkl,mlj->ij", by_point[mine], information[mine], by_point[mine])
+        total -= felt[:, :9].T @ np.linalg.solve(np.eye(3) + prior @ seen, prior @ felt)
+        spread[v] = np.linalg.pinv(seen, rcond=1e-9)
+        shift[v] = spread[v] @ felt[:, -1]
+    off = residual - np.einsum("mki,mi->mk", by_point, shift[dots.view])
+    score = np.einsum("mi,mij,mj->m", off, dots.information, off)
+    return Linear(total[:, :9], total[:, -1], total[:, 9:-1], shift, spread, score)
+
+
+def derivatives(
+    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], dots: Dots, state: State
+) -> tuple[Array, Array, Array, Array]:
+    """(M, 2) measured - predicted; (M, 2, 3) by rig point, (M, 2, 9) by state, (M, 2, P) by rig."""
+    pose = state.rig_from_target
+    points = pose.apply(dots.place_mm) - dots.reading_mm[dots.view, None] * state.slope
+    whole = rig_jacobian(cameras, free, points)
+    residual, by_point = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
+    by_rig = np.empty((len(points), 2, whole.shape[-1]))
+    for c, camera in enumerate(cameras):
+        mine = dots.camera == c
+        in_camera = camera.camera_from_rig.apply(points[mine])
+        uv, by_camera_point, _ = camera.pixel_jacobians(in_camera)
+        residual[mine] = dots.uv_px[mine] - uv
+        by_point[mine] = by_camera_point @ camera.camera_from_rig.rotation
+        by_rig[mine] = whole[mine, 2 * c : 2 * c + 2]
+    by_move = by_point @ pose.rotation
+    by_turn = -by_move @ hat(dots.place_mm)
+    by_slope = -dots.reading_mm[dots.view, None, None] * by_point
+    return residual, by_point, np.concatenate([by_turn, by_move, by_slope], -1), by_rig
+
+
+def start(cameras: tuple[Camera, Camera], dots: Dots) -> State:
+    """Closed form: dots triangulated view by view, median slopes, the target fitted to medians.
+
+    Raises CalibrationError when no dot is seen by both cameras at two positions.
+    """
+    ids = np.unique(dots.place_mm, axis=0, return_inverse=True)[1].reshape(-1)
+    keys = dots.view * (ids.max() + 1) + ids
+    left, right = (np.flatnonzero(dots.camera == c) for c in (0, 1))
+    _, i, j = np.intersect1d(keys[left], keys[right], return_indices=True)
+    left, right = left[i], right[j]
+    points = triangulate(cameras, (dots.uv_px[left], dots.uv_px[right]), 0.02).points_mm
+    reading = dots.reading_mm[dots.view[left]]
+    slope = _median_slope(reading, ids[left], points)
+    settled = points + slope * reading[:, None]
+    return State(_fitted_pose(ids[left], dots.place_mm[left], settled), slope)
+
+
+def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
+    """(3,) travel per reading: median over pairs of views of one dot (Theil and Sen)."""
+    slopes = [np.zeros((0, 3))]
+    for one in np.unique(dot):
+        members = np.flatnonzero(dot == one)
+        a, b = members[np.array(np.triu_indices(len(members), 1))]
+        far = np.abs(reading[b] - reading[a]) >= LEAST_TRAVEL_MM / 2
+        a, b = a[far], b[far]
+        slopes.append((points[a] - points[b]) / (reading[b] - reading[a])[:, None])
+    every = np.concatenate(slopes)
+    if not len(every):
+        raise CalibrationError(
+            "no dot is seen by both cameras at two positions",
+            where="stage_axis",
+            todo="keep the target in both images while the stage travels",
+        )
+    return np.asarray(np.median(every, axis=0))
+
+
+def _fitted_pose(dot: Ints, place: Array, points: Array) -> Pose:
+    """rig_from_target of least squares over the median place of each dot (Kabsch)."""
+    _, first = np.unique(dot, return_index=True)
+    nominal = place[first]
+    middle = np.array([np.median(points[dot == d], axis=0) for d in dot[first]])
+    a, b = nominal.mean(0), middle.mean(0)
+    rotation = nearest_rotation((middle - b).T @ (nominal - a))
+    return Pose(rotation, b - rotation @ a)

@@ -1,0 +1,295 @@
+"""Travel axis and encoder scale from views of one static target at several stage positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.stage.fit import (
+    LEAST_TRAVEL_MM,
+    Dots,
+    Linear,
+    State,
+    Weights,
+    fit,
+    start,
+)
+from telerig.io.rig_file.description import suggestion
+from telerig.rig.pose import Pose, across
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.estimator.calibration.result.calibration import Calibration
+
+Array = NDArray[np.float64]
+
+_COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
+_UNLIKELY = 1e-3
+_DOUBTED = 0.5
+_WHERE = "stage_axis"
+
+
+@dataclass(frozen=True)
+class StageAxis:
+    """The stage as calibrated.
+
+    axis_rig : (3,) unit vector of travel at growing readings, in rig axes.
+    basis : (3, 2) orthonormal tangent vectors at the axis; covariance : (2, 2) rad^2 in it.
+    scale, scale_sd : reading = (1 + scale) travel.  joint_covariance : (3, 3) of both and scale.
+    rig_from_target : pose of the target at reading 0.
+    chi2_dof : of the dots.  position_sigma_mm, wander_sigma_mm : of the carriage along and across
+        the axis, as given, or as the views show where that is more.
+    words : for the user.
+    """
+
+    axis_rig: Array
+    basis: Array
+    covariance: Array
+    scale: float
+    scale_sd: float
+    joint_covariance: Array
+    rig_from_target: Pose
+    chi2_dof: float
+    position_sigma_mm: float
+    wander_sigma_mm: float
+    words: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for calibration.json."""
+        return {
+            "axis": self.axis_rig.tolist(),
+            "basis": self.basis.tolist(),
+            "axis_covariance_rad2": self.covariance.tolist(),
+            "encoder_scale": self.scale,
+            "encoder_scale_sd": self.scale_sd,
+            "joint_covariance": self.joint_covariance.tolist(),
+            "rig_from_target": {
+                "rotation": self.rig_from_target.rotation.tolist(),
+                "translation_mm": self.rig_from_target.translation_mm.tolist(),
+            },
+            "chi2_dof": self.chi2_dof,
+            "position_sigma_mm": self.position_sigma_mm,
+            "wander_sigma_mm": self.wander_sigma_mm,
+            "notes": list(self.words),
+        }
+
+
+def stage_axis_of(
+    calibration: Calibration,
+    table: pd.DataFrame,
+    positions_mm: Mapping[str, float] | pd.DataFrame,
+    *,
+    position_sigma_mm: float = 0.001,
+    wander_sigma_mm: float = 0.0,
+) -> StageAxis:
+    """Travel axis and encoder scale with their covariance, the calibration's carried in.
+
+    table : view, camera, dot, u_px, v_px and suu_px2, suv_px2, svv_px2 or sigma_px, as dots.csv.
+    positions_mm : the encoder's reading of each view, or a table view, position_mm.
+    position_sigma_mm, wander_sigma_mm : sd of the carriage along and across the axis; what the
+        views show is taken where that is significantly more.
+
+    Raises InputError for views without a position and unknown cameras, CalibrationError for
+    fewer than two positions, less than 1 mm between them, or one camera alone.
+    """
+    dots, words = _dots(calibration, table, positions_mm)
+    cameras = calibration.cameras
+    state = start((cameras[0], cameras[1]), dots)
+    sigma = (position_sigma_mm, wander_sigma_mm)
+    state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
+    shown = _shown_sigma(state, weights, system, sigma)
+    if shown != sigma:
+        words += _scatter_words(sigma, shown)
+        sigma = shown
+        state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
+    words += _doubts(dots, weights, system)
+    return _result(calibration, dots, state, weights, system, sigma, words)
+
+
+def _dots(
+    calibration: Calibration, table: pd.DataFrame, positions_mm: Mapping[str, float] | pd.DataFrame
+) -> tuple[Dots, list[str]]:
+    readings = _readings(positions_mm)
+    names = [c.name for c in calibration.cameras]
+    _check_names(table, "view", list(readings), "has no position")
+    _check_names(table, "camera", names, "is not in the calibration")
+    index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
+    known = table["dot"].isin(index).to_numpy()
+    strangers = int((~known).sum())
+    words = [f"{strangers} dots are not in the calibration: not used"] if strangers else []
+    rows = table[known]
+    views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
+    unseen = [v for v in readings if v not in views]
+    words += [f"no dots of view {', '.join(unseen)}"] if unseen else []
+    reading = np.array([readings[v] for v in views])
+    _check_enough(reading, set(rows["camera"]))
+    number = {v: i for i, v in enumerate(views)}
+    place = np.array([index[int(d)] for d in rows["dot"]], np.int64)
+    found = Dots(
+        views,
+        reading,
+        np.array([number[str(v)] for v in rows["view"]], np.int64),
+        np.array([names.index(c) for c in rows["camera"]], np.int64),
+        calibration.target_points_mm[place],
+        rows[["u_px", "v_px"]].to_numpy(float),
+        np.asarray(np.linalg.inv(_covariance(rows, calibration)), np.float64),
+    )
+    return found, words
+
+
+def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, float]:
+    if isinstance(positions_mm, Mapping):
+        out = {str(view): float(position) for view, position in positions_mm.items()}
+    else:
+        views = positions_mm["view"].astype(str)
+        if views.duplicated().any():
+            raise InputError(
+                f"view {views[views.duplicated()].iloc[0]!r} has two positions",
+                where=f"{_WHERE}/positions.csv",
+                todo="keep one of the rows",
+            )
+        out = dict(zip(views, positions_mm["position_mm"].astype(float)))
+    bad = [view for view, position in out.items() if not np.isfinite(position)]
+    if bad:
+        raise InputError(
+            f"the position of view {bad[0]!r} is not finite", where=_WHERE, todo="leave it out"
+        )
+    return out
+
+
+def _check_names(table: pd.DataFrame, column: str, known: list[str], fault: str) -> None:
+    strange = sorted(set(table[column].astype(str)) - set(known))
+    if strange:
+        raise InputError(
+            f"{column} {strange[0]!r} {fault}", where=_WHERE, todo=suggestion(strange[0], known)
+        )
+
+
+def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
+    if len(seen_by) < 2:
+        raise CalibrationError(
+            "one camera never sees travel along its own axis",
+            where=_WHERE,
+            todo="show the target to both cameras",
+        )
+    span = float(np.ptp(reading_mm))
+    if span < LEAST_TRAVEL_MM:
+        raise CalibrationError(
+            f"{len(reading_mm)} view(s) over {span:.3g} mm of readings show no travel",
+            where=_WHERE,
+            todo="take views at three or more positions, as far apart as the image allows",
+        )
+
+
+def _covariance(rows: pd.DataFrame, calibration: Calibration) -> Array:
+    """(M, 2, 2) of the dots' pixels; without columns, the scatter of the calibration's own dots."""
+    if all(c in rows for c in _COVARIANCE):
+        uu, uv, vv = rows[_COVARIANCE].to_numpy(float).T
+    else:
+        scatter = float(calibration.statistics.get("scatter_px", 0.02))
+        sigma = rows["sigma_px"].to_numpy(float) if "sigma_px" in rows else scatter
+        uu = vv = np.broadcast_to(np.square(sigma), (len(rows),))
+        uv = np.zeros(len(rows))
+    return np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
+
+
+def _shown_sigma(
+    state: State, weights: Weights, system: Linear, sigma_mm: tuple[float, float]
+) -> tuple[float, float]:
+    """The given sd of the carriage, or what the views show where that is significantly more.
+
+    A straight line takes two of the views' places on each of the three axes.
+    """
+    from scipy.stats import chi2
+
+    kept = weights.views > _DOUBTED
+    spare = int(kept.sum()) - 2
+    if spare < 1:
+        return sigma_mm
+    axis = state.slope / np.linalg.norm(state.slope)
+    basis = across(axis)
+    out = []
+    for directions, given in ((axis[:, None], sigma_mm[0]), (basis, sigma_mm[1])):
+        shift = system.shift_mm[kept] @ directions
+        own = np.einsum("ia,vij,ja->va", directions, system.shift_covariance[kept], directions)
+        dof = spare * directions.shape[1]
+        score = float((shift**2 / (own + given**2)).sum())
+        excess = float((shift**2).sum() / dof - own.mean())
+        out.append(np.sqrt(excess) if score > chi2.isf(_UNLIKELY, dof) and excess > 0 else given)
+    return float(max(out[0], sigma_mm[0])), float(max(out[1], sigma_mm[1]))
+
+
+def _scatter_words(given: tuple[float, float], shown: tuple[float, float]) -> list[str]:
+    names = ("the readings scatter", "the carriage wanders across its axis")
+    return [
+        f"{name} by {1000 * new:.2g} um, more than the {1000 * old:.2g} um that were stated: taken "
+        "into account"
+        for name, old, new in zip(names, given, shown)
+        if new > old
+    ]
+
+
+def _doubts(dots: Dots, weights: Weights, system: Linear) -> list[str]:
+    words = []
+    for v in np.flatnonzero(weights.views < _DOUBTED):
+        words.append(
+            f"the reading {dots.reading_mm[v]:.6g} mm of view {dots.views[v]} is off by "
+            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm: hardly used"
+        )
+    odd = int((weights.dots < _DOUBTED).sum())
+    if odd:
+        words.append(f"{odd} of {len(weights.dots)} dots lie far off and are hardly used")
+    if len(dots.views) == 2:
+        words.append("two positions: nothing checks the readings; take three or more")
+    return words
+
+
+def _result(
+    calibration: Calibration,
+    dots: Dots,
+    state: State,
+    weights: Weights,
+    system: Linear,
+    sigma_mm: tuple[float, float],
+    words: list[str],
+) -> StageAxis:
+    kept = weights.dots > _DOUBTED
+    spare = 2 * int(kept.sum()) - 3 * len(dots.views) - 3
+    chi2_dof = float(system.dot_score[kept].sum() / spare) if spare > 0 else 1.0
+    inverse = np.linalg.inv(system.normal)
+    felt = -inverse @ system.by_rig
+    full = max(chi2_dof, 1.0) * inverse + felt @ calibration.covariance @ felt.T
+    pace = float(np.linalg.norm(state.slope))
+    axis = state.slope / pace
+    basis = across(axis)
+    turn = np.vstack([basis.T / pace, -axis / pace**2])
+    joint = turn @ full[6:, 6:] @ turn.T
+    return StageAxis(
+        axis,
+        basis,
+        joint[:2, :2],
+        1 / pace - 1,
+        float(np.sqrt(joint[2, 2])),
+        joint,
+        state.rig_from_target,
+        chi2_dof,
+        *sigma_mm,
+        (*_summary(dots, axis, pace, joint), *words),
+    )
+
+
+def _summary(dots: Dots, axis: Array, pace: float, joint: Array) -> list[str]:
+    angle = np.degrees(np.sqrt(np.linalg.eigvalsh(joint[:2, :2])[-1]))
+    direction = ", ".join(f"{v:.6f}" for v in axis)
+    return [
+        f"travel along ({direction}) +- {angle:.2g} deg, from {len(dots.views)} positions over "
+        f"{np.ptp(dots.reading_mm):.4g} mm",
+        f"the encoder reads {1e6 * (1 / pace - 1):+.0f} +- {1e6 * np.sqrt(joint[2, 2]):.0f} ppm "
+        "of the travel too much",
+    ]

@@ -1,0 +1,5 @@
+"""Closed-form starts of a self-calibration, and the ambiguities that a start must settle.
+
+In: a ``Problem``. Out: a state near the solution. Read ``known_target``, then
+``mirror_ambiguity``.
+"""

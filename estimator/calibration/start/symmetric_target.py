@@ -1,0 +1,222 @@
+"""A target without marks looks the same after a turn: one numbering for all images.
+
+Within a view, the two cameras must agree on one inter-camera rotation; between views, on the
+print errors of the dots, which are the only thing that a turn changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.robust import robust_solve
+from telerig.estimator.calibration.start import known_target
+from telerig.factors.projection import State, whitened_residuals
+from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
+from telerig.rig.target import Target
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+TIE_DEG = 15.0
+
+
+def turns(target: Target) -> list[Ints]:
+    """Every relabelling (id -> id, as arrays over ids 0..N-1) that leaves the target unchanged."""
+    order = target.symmetry_order()
+    grid = np.arange(target.rows * target.columns).reshape(target.rows, target.columns)
+    return [np.rot90(grid, k * (4 // order)).ravel() for k in range(order)]
+
+
+def settle(problem: Problem, nominal_rotvec_deg: Array | None) -> tuple[Problem, list[str]]:
+    """Renumber images so that both cameras and all views agree; says how it was decided.
+
+    Raises CalibrationError when two numberings explain the two cameras alike.
+    """
+    labels = turns(problem.target)
+    if len(problem.cameras) == 2:
+        problem = _agree_between_cameras(problem, labels, nominal_rotvec_deg)
+    problem, contrast = _agree_between_views(problem, labels)
+    problem, about_scale = _scale_of_any_turn(problem, labels)
+    many = f"{len(labels)}-fold symmetric target without marks"
+    if contrast > 3:
+        return problem, [
+            f"{many}: numbered so that both cameras and all views agree; the dots' print errors "
+            f"tell the turns apart ({contrast:.0f} standard deviations in the least certain view)",
+            *about_scale,
+        ]
+    return problem, [
+        f"{many}: both cameras agree within each view; between views the print errors are too "
+        f"small to tell the turns apart ({contrast:.1f} standard deviations in the least certain "
+        "view), so the dots' estimated positions may be averages over turns",
+        *about_scale,
+    ]
+
+
+def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, list[str]]:
+    """The known distance, less certain where a turn puts other dots in the place of its two."""
+    if problem.scale is None:
+        return problem, []
+    pair, distance, sigma = problem.scale
+    ends = problem.dot_ids[list(pair)]
+    if all(set(label[ends]) == set(ends) for label in labels):
+        return problem, []
+    either = float(np.hypot(sigma, np.sqrt(2) * problem.target.print_sigma_mm))
+    words = (
+        f"the distance of dots {tuple(int(e) for e in ends)} may be that of another pair, which a "
+        f"turn puts in their place, so it is taken as good to {1e3 * either:.0f} um; choose two "
+        "dots that are opposite each other, or put marks on the target"
+    )
+    return replace(problem, scale=(pair, distance, either)), [words]
+
+
+def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:
+    ids = problem.dot_ids[problem.dot].copy()
+    for (v, c), label in choice.items():
+        rows = (problem.view == v) & (problem.camera == c)
+        ids[rows] = label[ids[rows]]
+    known = np.searchsorted(problem.dot_ids, ids)
+    if not np.array_equal(problem.dot_ids[known], ids):
+        raise CalibrationError("a turned numbering names dots that no image shows")
+    return replace(problem, dot=known)
+
+
+def _agree_between_cameras(
+    problem: Problem, labels: list[Ints], nominal_rotvec_deg: Array | None
+) -> Problem:
+    """The turn of the second camera's numbering in each view that one rotation explains."""
+    maps = known_target.image_maps(problem, problem.nominal_mm)
+    both = [v for v in range(len(problem.views)) if (v, 0) in maps and (v, 1) in maps]
+    rotation = {k: known_target.rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
+    spin = [_spin(k, len(labels)) for k in range(len(labels))]
+    options = np.array([[_pairs(rotation[v, 0], rotation[v, 1] @ s) for s in spin] for v in both])
+    hypotheses = []
+    for candidate in options.reshape(-1, 3, 3):
+        refined, cost = _consensus(candidate, options)
+        distance = _to_nominal_deg(refined, nominal_rotvec_deg)
+        hypotheses.append((cost + (distance / 60) ** 2, refined))
+    best = min(hypotheses, key=lambda h: h[0])[1]
+    angles = known_target.angle_between(options, best).min(2)
+    ranked = np.sort(angles, 1)
+    close = np.flatnonzero(ranked[:, 1] - ranked[:, 0] < np.radians(TIE_DEG) / 5)
+    if len(close):
+        raise CalibrationError(
+            "two numberings of the symmetric target explain both cameras alike in view "
+            f"{problem.views[both[int(close[0])]]!r}",
+            todo="put marks on the target, or leave this view out",
+        )
+    # image v of the second camera agrees once turned by spin k: its ids follow the turn back
+    choice = {(v, 1): labels[-int(k)] for v, k in zip(both, angles.argmin(1))}
+    return _relabel(problem, choice)
+
+
+def _spin(k: int, order: int) -> Array:
+    return rotation_from_rotvec([0.0, 0.0, 2 * np.pi * k / order])
+
+
+def _pairs(first: Array, second: Array) -> Array:
+    """(4, 3, 3) second_from_first for the signs of both tilts."""
+    plain, crossed = second @ first.T, known_target.mirrored(second) @ first.T
+    return np.array([plain, crossed, known_target.mirrored(plain), known_target.mirrored(crossed)])
+
+
+def _consensus(rotation: Array, options: Array) -> tuple[Array, float]:
+    flat = options.reshape(len(options), -1, 3, 3)
+    angles = known_target.angle_between(flat, rotation)
+    for _ in range(4):
+        angles = known_target.angle_between(flat, rotation)
+        best = flat[np.arange(len(flat)), angles.argmin(1)]
+        rotation = nearest_rotation(best.mean(0))
+    worst = np.minimum(angles.min(1), np.radians(20))
+    return rotation, float((worst**2).mean() / np.radians(2) ** 2)
+
+
+def _to_nominal_deg(rotation: Array, nominal_rotvec_deg: Array | None) -> float:
+    if nominal_rotvec_deg is None:
+        return 0.0
+    nominal = rotation_from_rotvec(np.radians(nominal_rotvec_deg))
+    both = np.array([rotation, known_target.mirrored(rotation)])
+    return float(np.degrees(known_target.angle_between(both, nominal).min()))
+
+
+def _agree_between_views(problem: Problem, labels: list[Ints]) -> tuple[Problem, float]:
+    """Turn whole views until their print errors look like those of the others."""
+    held = replace(problem, dot_sigma_mm=np.full_like(problem.dot_sigma_mm, 1e-6))
+    if len(problem.cameras) == 2:
+        start = known_target.stereo_states(held, held.nominal_mm, count=1)[0]
+    else:
+        start = known_target.mono_state(held, held.nominal_mm)
+    rough = robust_solve(held.with_model("tangential"), start)
+    marks = _print_errors(rough.problem, rough.solution.state)
+    turned = np.array([_turned(marks, label, k, len(labels)) for k, label in enumerate(labels)])
+    choice = _alike(turned)
+    contrast = _contrast(turned, choice)
+    picks = {
+        (v, c): labels[k] for v, k in enumerate(choice) for c in range(len(problem.cameras)) if k
+    }
+    return _relabel(problem, picks), contrast
+
+
+def _alike(turned: Array) -> Ints:
+    """(V,) turns that make the views' print errors most alike: to one view, then to the mean."""
+    views = np.arange(turned.shape[1])
+    starts = [_misfits(turned, turned[0, v][None]).argmin(0) for v in views]
+    choice = min(starts, key=lambda c: _scatter(turned[c, views]))
+    for _ in range(10):
+        chosen = turned[choice, views]
+        others = np.array([np.nanmean(np.delete(chosen, v, 0), 0) for v in views])
+        before, choice = choice, _misfits(turned, others).argmin(0)
+        if np.array_equal(before, choice):
+            break
+    return np.asarray(choice, np.int64)
+
+
+def _misfits(turned: Array, others: Array) -> Array:
+    """(T, V) mean square difference of each turn of each view from (V or 1, N, 2) print errors."""
+    return np.asarray(np.nanmean((turned - others) ** 2, (2, 3)))
+
+
+def _scatter(marks: Array) -> float:
+    return float(np.nansum((marks - np.nanmean(marks, 0)) ** 2))
+
+
+def _print_errors(problem: Problem, state: State) -> Array:
+    """(V, N, 2) where each view sees the dots, minus nominal, in the target's plane (mm).
+
+    NaN for dots that it does not see.
+    """
+    obs = problem.observations()
+    jac = whitened_residuals(state, obs, problem.rho_mm)
+    normal = np.zeros((len(problem.views), len(problem.dot_ids), 2, 2))
+    right = np.zeros((*normal.shape[:2], 2))
+    plane = jac.by_dot[..., :2]
+    np.add.at(normal, (obs.view, obs.dot), np.swapaxes(plane, -1, -2) @ plane)
+    np.add.at(right, (obs.view, obs.dot), -np.einsum("mij,mi->mj", plane, jac.value))
+    unseen = np.linalg.det(normal) <= 0
+    normal[unseen] = np.eye(2)
+    errors = np.linalg.solve(normal, right[..., None])[..., 0]
+    errors[unseen] = np.nan
+    return np.asarray(errors - np.nanmean(errors, 1, keepdims=True))
+
+
+def _turned(marks: Array, label: Ints, k: int, order: int) -> Array:
+    out = np.empty_like(marks)
+    out[:, label] = marks @ _spin(k, order)[:2, :2].T
+    return out
+
+
+def _contrast(turned: Array, choice: Ints) -> float:
+    """How many standard deviations the chosen turn beats the next, in the least certain view."""
+    chosen = turned[choice, np.arange(len(choice))]
+    worst = np.inf
+    for v in range(len(choice)):
+        others = np.delete(chosen, v, 0)
+        mean = np.nanmean(others, 0)
+        scatter = np.nanvar(others, axis=0).mean() + 1e-18
+        costs = np.sort(np.nansum((turned[:, v] - mean) ** 2, (1, 2)) / scatter)
+        worst = min(worst, np.sqrt(max(0.0, costs[1] - costs[0])))
+    return float(worst)

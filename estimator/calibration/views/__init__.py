@@ -1,0 +1,5 @@
+"""The next best view of the target.
+
+In: a fitted calibration. Out: poses in which one more view would help most. Read ``next_view``
+first.
+"""

@@ -1,0 +1,234 @@
+"""The next best view: how to hold the target so that the calibration gains most.
+
+For every candidate pose the covariance that the calibration would have with that view is exact to
+first order: the view's information, its own pose eliminated, joins the joint covariance of cameras
+and dots (Haner and Heyden, Optimal view path planning for visual SLAM, SCIA 2011, choose views by
+the same trace). What is minimised is the calibration's share of the variance of triangulated
+points over the working volume.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.calibration.quality.checks import RECOMMENDED_VIEWS
+from telerig.estimator.calibration.solver.covariance import JointCovariance
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.views.candidate_poses import (
+    Candidates,
+    candidates,
+    dots_seen,
+    field_mm,
+    joined,
+    neighbours,
+    new_cells,
+)
+from telerig.estimator.calibration.views.gain import ViewGain
+from telerig.estimator.calibration.views.wording import hold_words, reason_words
+from telerig.factors.projection import State
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+ENOUGH_SHARE = 0.05
+"""A view that lowers the standard deviation by less is not worth taking."""
+ALIKE_SHARE = 0.75
+"""Of the best gain: among such candidates the one that fills most of the empty image is taken."""
+_NOTABLE_SHARE = 0.5
+_FIRST, _NEAR, _SHOWN = 90, 30, 3
+_STEPS = ((0.1, 12.0), (0.1, 12.0), (0.05, 12.0), (0.05, 6.0), (0.05, 6.0))
+_WHOLE_UM = 100.0
+_FEW_DOTS, _MANY_DOTS = 25, 150
+
+
+@dataclass(frozen=True)
+class HeldPose:
+    """One way to hold the target: after_um is the 3-D sd that the calibration would then have."""
+
+    rig_from_target: Array
+    after_um: float
+    words: str
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class NextView:
+    """Advice after ``views`` views.
+
+    before_um : standard deviation per axis of points over the working volume, the calibration's
+    share, their common rigid motion set aside.  poses : best first; none when no pose of the grid
+    is seen by both cameras.  size_um : what the stated uncertainty of the target's known
+    distance and print leaves, which no view can lower.  marks : ids of the target's marks.
+    """
+
+    views: int
+    before_um: float
+    poses: tuple[HeldPose, ...]
+    size_um: float = 0.0
+    marks: tuple[int, ...] = ()
+
+    @property
+    def after_um(self) -> float:
+        return self.poses[0].after_um if self.poses else self.before_um
+
+    @property
+    def gain(self) -> float:
+        """Share by which the best view lowers the standard deviation."""
+        return 1 - self.after_um / self.before_um
+
+    def enough(self) -> bool:
+        """Whether there are views enough and another one would bring little."""
+        many = self.views >= RECOMMENDED_VIEWS
+        return many and bool(self.poses) and self.gain < ENOUGH_SHARE
+
+    def verdict(self) -> str:
+        """What another view would bring."""
+        if not self.poses:
+            good = rounded_um(self.before_um)
+            return f"{self.views} views, good to {good} um; no pose was found to add"
+        worth = ": enough" if self.enough() else ""
+        return (
+            f"{self.views} views; one more would bring the calibration's share of errors in space "
+            f"from {rounded_um(self.before_um, self.after_um)} to "
+            f"{rounded_um(self.after_um, self.before_um)} um{self._floor()}{worth}"
+        )
+
+    def _floor(self) -> str:
+        if self.size_um < _NOTABLE_SHARE * self.before_um:
+            return ""
+        return f" ({rounded_um(self.size_um)} um stay: how well the target's size is known)"
+
+    def words(self) -> str:
+        """Verdict, and how to hold the target."""
+        if not self.poses or self.enough():
+            return self.verdict()
+        best = self.poses[0]
+        because = f" ({'; '.join(best.reasons)})" if best.reasons else ""
+        return f"{self.verdict()}. Next: {best.words}{because}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `Calibration.diagnostics`."""
+        return {
+            "words": self.words(), "verdict": self.verdict(), "views": self.views,
+            "before_um": self.before_um, "after_um": self.after_um, "enough": self.enough(),
+            "size_um": self.size_um, "marks": list(self.marks),
+            "poses": [
+                {
+                    "words": p.words, "reasons": list(p.reasons), "after_um": p.after_um,
+                    "rig_from_target": np.round(p.rig_from_target, 6).tolist(),
+                }
+                for p in self.poses
+            ],
+        }  # fmt: skip
+
+
+def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextView | None:
+    """The best ways to hold the target next; None for a single camera, or a rig left undetermined.
+
+    The candidates' noise is the median of the dots so far. Of many dots some stand for all, which
+    promises slightly too little, as the dots' own uncertainty is averaged over fewer of them.
+    """
+    if len(problem.cameras) != 2 or not np.isfinite(joint.rig_block()[1]).all():
+        return None
+    few, many = _spread(problem, _FEW_DOTS), _spread(problem, _MANY_DOTS)
+    gain = ViewGain.of(problem, state, joint, np.union1d(few, many))
+    used = [np.unique(problem.view[(problem.weight > 0) & (problem.camera == c)]) for c in (0, 1)]
+    views = len(np.intersect1d(used[0], used[1]))
+    found = candidates(problem, state)
+    if not len(found):
+        return NextView(views, gain.before_um, (), gain.size_um)
+    best = _search(gain, found, few)
+    order = _preferred(problem, state, found, gain.before_um - best, few)
+    first, first_um = _refined(gain, found.some(order[:1]), float(best[order[0]]), few)
+    chosen = joined(first, found.some(order[1:]))
+    after = np.r_[first_um, best[order[1:]]]
+    if len(many) > len(few):
+        after = gain.after_um(chosen, many)
+    marks = problem.dot_ids[problem.target.is_mark(problem.dot_ids)]
+    poses = tuple(
+        HeldPose(
+            chosen.rig_from_target[i],
+            float(after[i]),
+            hold_words(problem, state, chosen.rig_from_target[i], chosen.facing[i]),
+            reason_words(problem, state, chosen.some(slice(i, i + 1))),
+        )
+        for i in range(len(chosen))
+    )
+    marked = tuple(int(m) for m in marks)
+    return NextView(views, gain.before_um, poses, gain.size_um, marked)
+
+
+def _spread(problem: Problem, count: int) -> Ints:
+    """Up to ``count`` dots, spread over the list of all."""
+    whole = len(problem.dot_ids)
+    return np.unique(np.linspace(0, whole - 1, min(count, whole)).round().astype(np.int64))
+
+
+def _search(gain: ViewGain, found: Candidates, dots: Ints) -> Array:
+    """(K,) standard deviation after each candidate; NaN where it was not computed.
+
+    Some of the whole grid first, then all that share two of tilt, roll and place with the best.
+    """
+    after = np.full(len(found), np.nan)
+    some = np.unique(np.linspace(0, len(found) - 1, _FIRST).round().astype(np.int64))
+    after[some] = gain.after_um(found.some(some), dots)
+    for _ in range(2):
+        best = found.cell[int(np.nanargmin(after))]
+        near = np.flatnonzero((np.sum(found.cell == best, -1) == 2) & np.isnan(after))
+        if len(near):
+            near = near[:: -(-len(near) // _NEAR)]
+            after[near] = gain.after_um(found.some(near), dots)
+    return after
+
+
+def _refined(
+    gain: ViewGain, one: Candidates, after_um: float, dots: Ints
+) -> tuple[Candidates, float]:
+    """A candidate moved between the points of the grid as long as that helps."""
+    for share, step_deg in _STEPS:
+        near = neighbours(gain.problem, gain.state, one, share * field_mm(gain.problem), step_deg)
+        if not len(near):
+            continue
+        found = gain.after_um(near, dots)
+        best = int(np.argmin(found))
+        if found[best] < after_um:
+            one, after_um = near.some(slice(best, best + 1)), float(found[best])
+    return one, after_um
+
+
+def _preferred(
+    problem: Problem, state: State, found: Candidates, gained_um: Array, dots: Ints
+) -> Ints:
+    """Up to three candidates of different tilts, those nearly as good as the best first.
+
+    The lens model that the views so far have chosen may lack what acts where no dot has been:
+    among those nearly as good, the one that fills most of the empty image is preferred.
+    """
+    known = np.flatnonzero(np.isfinite(gained_um))
+    order = known[np.argsort(-gained_um[known], kind="stable")]
+    alike = order[gained_um[order] >= ALIKE_SHARE * gained_um[order[0]]]
+    seen = dots_seen(problem, state, found.some(alike), dots)
+    fills = np.array([new_cells(problem, v, uv).sum() for v, uv in zip(*seen)])
+    ranked = np.r_[alike[np.argsort(-fills, kind="stable")], order[len(alike) :]]
+    tilts: list[int] = []
+    chosen: list[int] = []
+    for i in ranked:
+        tilt = int(found.cell[i, 0])
+        if tilt not in tilts and len(chosen) < _SHOWN:
+            tilts.append(tilt)
+            chosen.append(int(i))
+    return np.array(chosen)
+
+
+def rounded_um(value: float, other: float = np.nan) -> str:
+    """Digits enough to tell the two apart, and no powers of ten."""
+    if value >= _WHOLE_UM:
+        return f"{value:.0f}"
+    digits = 2
+    while digits < 4 and f"{value:.{digits}g}" == f"{other:.{digits}g}":
+        digits += 1
+    return f"{value:.{digits}g}"

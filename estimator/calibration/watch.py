@@ -1,0 +1,295 @@
+"""Calibrate while the views are being taken: solve again whenever a view is complete."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import pandas as pd
+
+from telerig.errors import CalibrationError, InputError, TelerigError
+from telerig.estimator.calibration.calibrate import (
+    CalibrationRun,
+    check_options,
+    run_calibration,
+    solve_dots,
+)
+from telerig.estimator.calibration.quality.checks import RECOMMENDED_VIEWS
+from telerig.estimator.calibration.views.next_view import ENOUGH_SHARE, rounded_um
+from telerig.estimator.calibration.views.wording import first_views
+from telerig.estimator.dots.dataset_dots import (
+    NO_DOTS,
+    DatasetDots,
+    ImageDots,
+    detect_image,
+    detected_together,
+    with_example,
+)
+from telerig.estimator.dots.detect_target import REJECTED
+from telerig.io.dataset.dataset import Dataset, View, load_dataset
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration.result.calibration import Calibration
+
+Tell = Callable[[str], None]
+Stamp = tuple[int, int]
+_FEWEST = 2
+_NAMED = 5
+
+
+class Stop(Protocol):
+    """What `threading.Event` has."""
+
+    def wait(self, timeout: float) -> bool: ...
+    def is_set(self) -> bool: ...
+
+
+@dataclass
+class WatchedFolder:
+    """The images of a dataset as they arrive; each is detected once.
+
+    An image counts as written when its size and time were the same at two polls. One that changes
+    later is detected again, one that is removed is forgotten. A view that lacks a camera's image
+    for longer than ``patience_s`` is named, once.
+    """
+
+    path: Path
+    tell: Tell
+    dataset: Dataset | None = None
+    patience_s: float = 5.0
+    _stamps: dict[Path, Stamp] = field(default_factory=dict)
+    _found: dict[Path, tuple[Stamp, ImageDots]] = field(default_factory=dict)
+    _said: str = ""
+    _rig: bytes = b""
+    _alone: dict[tuple[str, str], float] = field(default_factory=dict)
+
+    def poll(self, stop: Stop | None = None) -> None:
+        """Look at the folder and detect what is new, until ``stop`` is set."""
+        dataset = self._listed()
+        if dataset is None:
+            return
+        before, self._stamps = self._stamps, {}
+        paths = {path for view in dataset.views for path in view.image_paths.values()}
+        for path in self._found.keys() - paths:
+            del self._found[path]
+        for view in dataset.views:
+            for camera, path in view.image_paths.items():
+                stamp = _stamp(path)
+                if stamp is None or (stop is not None and stop.is_set()):
+                    continue
+                self._stamps[path] = stamp
+                settled = stamp[0] > 0 and before.get(path) == stamp
+                if settled and self._found.get(path, (None,))[0] != stamp:
+                    self._found[path] = stamp, self._detected(dataset, view, camera)
+        self.dataset = replace(dataset, views=self._views(dataset))
+        self._remind(dataset, time.monotonic())
+
+    def _remind(self, dataset: Dataset, now_s: float) -> None:
+        """Name the views that wait for a camera; infinite once named."""
+        waiting = [
+            (view.name, camera)
+            for view in dataset.views
+            for camera in dataset.rig.cameras
+            if camera not in view.image_paths
+        ]
+        self._alone = {key: self._alone.get(key, now_s) for key in waiting}
+        late = [key for key, since_s in self._alone.items() if now_s - since_s > self.patience_s]
+        self._alone |= dict.fromkeys(late, float("inf"))
+        for camera in dataset.rig.cameras:
+            if names := [view for view, lacking in late if lacking == camera]:
+                self.tell(_missing(names, camera))
+
+    def _listed(self) -> Dataset | None:
+        try:
+            dataset = load_dataset(self.path, "images")
+        except InputError as error:
+            if "there are no views" not in error.what:
+                self._say_once(str(error))
+            return None
+        self._said = ""
+        rig = (self.path / "rig.toml").read_bytes()
+        if rig != self._rig:
+            self._found, self._rig = {}, rig
+        return dataset
+
+    def _say_once(self, words: str) -> None:
+        if words != self._said:
+            self.tell(words)
+            self._said = words
+
+    def _detected(self, dataset: Dataset, view: View, camera: str) -> ImageDots:
+        try:
+            found = detect_image(dataset, view, camera, overlay=True)
+        except InputError as error:
+            nothing = pd.DataFrame(columns=REJECTED)
+            found = ImageDots(view.name, camera, NO_DOTS, nothing, 0, error.what)
+        if found.failure:
+            self.tell(f"view {view.name}, camera {camera} cannot be used: {found.failure}")
+        return found
+
+    def _views(self, dataset: Dataset) -> tuple[View, ...]:
+        """Of the images detected so far."""
+        views = (
+            View(v.name, {c: p for c, p in v.image_paths.items() if p in self._found})
+            for v in dataset.views
+        )
+        return tuple(v for v in views if v.image_paths)
+
+    def images(self) -> list[ImageDots]:
+        """Detections in the order of views and cameras."""
+        if self.dataset is None:
+            return []
+        return [self._found[p][1] for v in self.dataset.views for p in v.image_paths.values()]
+
+    def complete(self) -> list[str]:
+        """Names of the views in which every camera found the target."""
+        if self.dataset is None:
+            return []
+        good: dict[str, int] = {}
+        for image in self.images():
+            good[image.view] = good.get(image.view, 0) + (not image.failure)
+        return [name for name, count in good.items() if count == len(self.dataset.rig.cameras)]
+
+    def version(self) -> frozenset[tuple[Path, Stamp]]:
+        """The images of complete views, as they are now."""
+        complete = set(self.complete())
+        return frozenset((p, s) for p, (s, i) in self._found.items() if i.view in complete)
+
+    def detected(self) -> DatasetDots:
+        """All detections together.
+
+        Raises DetectionError as `detected_together` does, CalibrationError when there are none.
+        """
+        images = self.images()
+        if self.dataset is None or not images:
+            raise CalibrationError(
+                "no image has arrived", where=str(self.path / "calibration"),
+                todo="put images of the target into calibration/<camera>/",
+            )  # fmt: skip
+        return detected_together(self.dataset, images)
+
+
+def _missing(views: list[str], camera: str) -> str:
+    some = ", ".join(views[:_NAMED]) + (", ..." if len(views) > _NAMED else "")
+    what = f"view {some} has" if len(views) == 1 else f"{len(views)} views ({some}) have"
+    return (
+        f"{what} no image of camera {camera}; the images of a view have the same name in every "
+        f"calibration/<camera>/"
+    )
+
+
+def _stamp(path: Path) -> Stamp | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
+def watch(
+    dataset: Dataset,
+    *,
+    stop: Stop,
+    tell: Tell,
+    interval_s: float = 1.0,
+    until_um: float | None = None,
+    **options: Any,
+) -> tuple[Dataset, CalibrationRun]:
+    """Solve whenever a complete view is new, until another view is not worth it or ``stop`` is set.
+
+    options : model, solver, medium, dots_free, outlier_sd and seed as for `run_calibration`.
+    Returns the dataset of the images that were used and its calibration, walls and stage included.
+
+    Raises CalibrationError or DetectionError when stopped with too little to calibrate.
+    """
+    check_options(**options, cameras=list(dataset.rig.cameras))
+    folder = WatchedFolder(dataset.path, tell)
+    solve = {k: v for k, v in options.items() if k != "seed"}
+    known: object = None
+    folder.poll(stop)
+    while not stop.wait(interval_s):
+        folder.poll(stop)
+        version = folder.version()
+        if version != known:
+            known = version
+            if _solved(folder, dataset, tell, until_um, solve):
+                break
+    if stop.is_set():
+        tell("stopped; calibrating with what has arrived")
+    detected = folder.detected()
+    assert folder.dataset is not None
+    detected = with_example(folder.dataset, detected)
+    run = run_calibration(folder.dataset, detected=detected, **options)
+    return folder.dataset, run
+
+
+def _solved(
+    folder: WatchedFolder,
+    dataset: Dataset,
+    tell: Tell,
+    until_um: float | None,
+    options: dict[str, Any],
+) -> bool:
+    """Solve and say how things stand; whether it is enough."""
+    count = len(folder.complete())
+    if count < _FEWEST:
+        tell(_too_few(dataset, count))
+        return False
+    try:
+        calibration = solve_dots(folder.dataset or dataset, folder.detected().dots, **options)
+    except TelerigError as error:
+        tell(f"{_views(count)}: {error}")
+        return False
+    words, enough = standing(calibration, dataset, count, until_um)
+    tell(words)
+    return enough
+
+
+def _too_few(dataset: Dataset, count: int) -> str:
+    missing = RECOMMENDED_VIEWS - count
+    return f"{_views(count)}, {missing} more to begin with. Next: {_generic(dataset, count)}"
+
+
+def _views(count: int) -> str:
+    return f"{count} complete view{'' if count == 1 else 's'}"
+
+
+def _generic(dataset: Dataset, count: int) -> str:
+    """What to do first, before a calibration can say more."""
+    names, rotvec = list(dataset.rig.cameras), dataset.rig.second_from_first_rotvec_deg
+    if len(names) < 2:
+        return "tilt the target by 20 to 50 degrees, otherwise than before"
+    angle = 90.0 if rotvec is None else float(np.linalg.norm(rotvec))
+    return first_views(names[0], names[1], angle)[min(count, RECOMMENDED_VIEWS - 1)]
+
+
+def standing(
+    calibration: Calibration, dataset: Dataset, count: int, until_um: float | None
+) -> tuple[str, bool]:
+    """One line on a calibration in the making, and whether it is enough."""
+    advice = calibration.diagnostics.get("next_view") or {}
+    status = str(calibration.verdict["status"])
+    words = _views(count) + (f", {status}" if status != "GOOD" else "")
+    if not advice:
+        residual = calibration.statistics["rms_px"]
+        return f"{words}: residual {residual:.3g} px. Next: {_generic(dataset, count)}", False
+    sd = advice["before_um"]
+    words += f": {rounded_um(sd)} um in space"
+    if count < RECOMMENDED_VIEWS:
+        missing = RECOMMENDED_VIEWS - count
+        return f"{words}, {missing} more to begin with. Next: {_generic(dataset, count)}", False
+    if status == "REJECTED":
+        return f"{words}: {calibration.verdict['reasons'][0]}", False
+    if until_um is not None and sd <= until_um:
+        return f"{words}: enough, {until_um:g} um were asked for", True
+    if advice["enough"]:
+        unmet = "" if until_um is None else f", though {until_um:g} um were asked for"
+        gain = f"one more view would bring less than {ENOUGH_SHARE:.0%}"
+        return f"{words}: enough, {gain}{unmet}", True
+    if not advice["poses"]:
+        return f"{words}. {advice['verdict']}", False
+    return f"{words}, {rounded_um(advice['after_um'])} with: {advice['poses'][0]['words']}", False

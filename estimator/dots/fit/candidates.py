@@ -1,0 +1,326 @@
+"""Where dots may be: a threshold that follows the light, outlines, and a first look at each.
+
+The threshold is half-way between the local extremes wherever an edge is near and is carried
+smoothly across the flats between edges, so it needs no dot size and no even light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.dots.fit.blurred_ellipse import (
+    approximate_distance_px,
+    axes_from_shape,
+    shape_from_axes,
+)
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.float32]
+Polarity = Literal["white_on_black", "black_on_white"]
+
+TOUCHES_BORDER = "touches the image border"
+TOO_LARGE = "larger than the dots"
+MERGED = "merged with its neighbour"
+NOT_ELLIPSE = "outline is not an ellipse"
+TOO_SMALL = "smaller than the smallest dot asked for"
+
+_BLOCK = 4
+_COARSE_WINDOW = 5
+_STRONG_SHARE = 0.15
+_STRONG_SIGMA = 7.0
+_FLAT_DISTANCES_PX = (6, 5, 4, 3, 2)
+_FLAT_SHARE = 0.1
+_PIECE_LEVELS = (0.15, 0.3, 0.45, 0.6, 0.75)
+_PIECE_SHARE = 0.6
+_PIECE_SEMI_AXIS_PX = 4.0
+_PIECE_GROWTH_PX = 0.5
+_LARGE_PIECE = 1.5
+_MIN_PIECE_PIXELS = 4
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A blob: ellipse of equal second moments, its box (u, v, width, height), and ``reason``.
+
+    ``reason`` is empty for a blob that may be a dot. ``holes`` lists the outlines (N, 2) of holes.
+    """
+
+    label: int
+    centre_px: Array
+    shape_px: Array
+    box: tuple[int, int, int, int]
+    area_px2: float
+    holes: tuple[NDArray[np.int32], ...]
+    reason: str
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """All blobs of one polarity and the image (rows, columns) of their labels, 0 for none."""
+
+    polarity: Polarity
+    blobs: tuple[Candidate, ...]
+    labels: NDArray[np.int32]
+
+    @property
+    def promising(self) -> tuple[Candidate, ...]:
+        return tuple(blob for blob in self.blobs if not blob.reason)
+
+    def up_to(self, diameter_px: float) -> Candidates:
+        """The same, with a reason against those that are larger."""
+        if np.isinf(diameter_px):
+            return self
+        most = np.pi / 4 * diameter_px**2
+        blobs = (replace(b, reason=TOO_LARGE) if b.area_px2 > most else b for b in self.blobs)
+        return replace(self, blobs=tuple(blobs))
+
+
+@dataclass(frozen=True)
+class EdgeMap:
+    """The smoothed image, its threshold surface, and where the image is flat (no edge near)."""
+
+    smooth: Grey
+    threshold: Grey
+    flat: NDArray[np.bool_]
+    has_edges: bool
+
+
+def edge_map(image: Grey, sigma: float) -> EdgeMap:
+    """Threshold surface of ``image`` (rows, columns) whose noise is about ``sigma`` grey levels."""
+    import cv2
+
+    smooth = cv2.GaussianBlur(image, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
+    rows, columns = image.shape
+    missing = (-rows % _BLOCK, -columns % _BLOCK)
+    padded = cv2.copyMakeBorder(smooth, 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE)
+    square = np.ones((_BLOCK, _BLOCK), np.uint8)
+    anchor = (0, 0)
+    fine_high = cv2.dilate(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
+    fine_low = cv2.erode(padded, square, anchor=anchor)[::_BLOCK, ::_BLOCK]
+    window = np.ones((_COARSE_WINDOW, _COARSE_WINDOW), np.uint8)
+    high, low = cv2.dilate(fine_high, window), cv2.erode(fine_low, window)
+    span = high - low
+    strong_span = max(_STRONG_SHARE * float(np.quantile(span, 0.995)), _STRONG_SIGMA * sigma)
+    strong = span > strong_span
+    weight = np.where(strong, span, 0.0).astype(np.float32) ** 2 * (fine_high - fine_low + 1e-6)
+    middle = _spread(0.5 * (high + low), weight)
+    size = (padded.shape[1], padded.shape[0])
+    threshold = cv2.resize(middle, size, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+    flat = _away_from(smooth > threshold)
+    return EdgeMap(smooth, threshold, flat, bool(np.any(strong)))
+
+
+def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels far from any crossing of the threshold, as far as leaves enough of them.
+
+    Chosen by place alone: choosing quiet pixels would bias the noise that they are to tell.
+    """
+    import cv2
+
+    grey = bright.astype(np.uint8)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
+    flat: NDArray[np.bool_] = crossing == 0
+    for distance in _FLAT_DISTANCES_PX:
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * distance + 1, 2 * distance + 1))
+        flat = np.asarray(cv2.dilate(crossing, disc) == 0)
+        flat[[0, -1]] = flat[:, [0, -1]] = False
+        if np.count_nonzero(flat) > _FLAT_SHARE * flat.size:
+            break
+    return flat
+
+
+def _spread(values: Grey, weight: Grey) -> Grey:
+    """Weighted values carried over to where there is no weight, coarse scales filling in."""
+    import cv2
+
+    rows, columns = values.shape
+    if min(rows, columns) <= 2:
+        total = float(np.sum(weight))
+        mean = float(np.sum(values * weight)) / total if total > 0 else float(np.mean(values))
+        return np.full_like(values, mean)
+    half = (max(1, (columns + 1) // 2), max(1, (rows + 1) // 2))
+    peak = max(float(weight.max()), 1e-30)
+    product = cv2.GaussianBlur(values * (weight / peak), (0, 0), 1.0)
+    mass = cv2.GaussianBlur(weight / peak, (0, 0), 1.0)
+    local = product / np.maximum(mass, 1e-30)
+    coarse_mass = cv2.resize(mass, half, interpolation=cv2.INTER_AREA)
+    coarse_product = cv2.resize(product, half, interpolation=cv2.INTER_AREA)
+    coarse = _spread(coarse_product / np.maximum(coarse_mass, 1e-30), coarse_mass)
+    filled = cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    share = mass / (mass + 1e-3)
+    spread: Grey = share * local + (1.0 - share) * filled
+    return spread
+
+
+def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) -> Candidates:
+    """Every blob of one polarity, with the reason why it cannot be a dot if there is one."""
+    sign = 1.0 if polarity == "white_on_black" else -1.0
+    labels = np.zeros(edges.smooth.shape, np.int32)
+    if not edges.has_edges:
+        return Candidates(polarity, (), labels)
+    above: Grey = (edges.smooth - edges.threshold) * np.float32(sign)
+    shown = [
+        (outline, _first_look(outline, holes, labels.shape, min_diameter_px))
+        for outline, holes in _outlines(above > 0)
+    ]
+    for _ in range(2):
+        shown = _with_pieces(shown, above, min_diameter_px)
+    blobs: list[Candidate] = []
+    for outline, look in shown:
+        if look is not None:
+            blobs.append(replace(look, label=len(blobs) + 1))
+            _fill(labels, len(blobs), outline, *look.holes)
+    return Candidates(polarity, tuple(blobs), labels)
+
+
+_Look = tuple[NDArray[np.int32], Candidate | None]
+
+
+def _with_pieces(shown: list[_Look], above: Grey, min_diameter_px: float) -> list[_Look]:
+    """The outlines with those replaced by their pieces that come apart (see :func:`_pieces`)."""
+    good = [look.area_px2 for _, look in shown if look is not None and not look.reason]
+    large = _LARGE_PIECE * float(np.median(good)) if good else 0.0
+    result: list[_Look] = []
+    for outline, look in shown:
+        pieces: list[NDArray[np.int32]] = []
+        if look is not None and look.reason != TOO_SMALL and (look.reason or look.area_px2 > large):
+            pieces = _pieces(above, outline)
+        for piece in pieces:
+            smallest = min_diameter_px - 2.0 * _PIECE_GROWTH_PX
+            part = _first_look(piece, (), above.shape, smallest)
+            if part is not None:
+                grown = part.shape_px + _PIECE_GROWTH_PX * np.array([1.0, 0.0, 1.0])
+                result.append((piece, replace(part, shape_px=grown)))
+        if not pieces:
+            result.append((outline, look))
+    return result
+
+
+def _fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) -> None:
+    """The first outline's inside without that of the others, its holes: they may hold dots."""
+    import cv2
+
+    cv2.drawContours(canvas, [o.reshape(-1, 1, 2) for o in outlines], -1, value, cv2.FILLED)
+
+
+def _outlines(
+    inside: NDArray[np.bool_],
+) -> list[tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]]:
+    """Outer outline (N, 2) of each connected region, with the outlines of its holes."""
+    import cv2
+
+    found, tree = cv2.findContours(inside.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if not found:
+        return []
+    parents = np.asarray(tree).reshape(-1, 4)[:, 3]
+    outlines = [np.asarray(outline, dtype=np.int32).reshape(-1, 2) for outline in found]
+    holes: dict[int, list[NDArray[np.int32]]] = {}
+    for index in np.flatnonzero(parents >= 0):
+        holes.setdefault(int(parents[index]), []).append(outlines[index])
+    return [(outlines[k], tuple(holes.get(int(k), ()))) for k in np.flatnonzero(parents < 0)]
+
+
+def _pieces(above: Grey, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
+    """Outlines of small dots whose blur runs together, told apart by a higher threshold.
+
+    Only dots of the blur's own size are, in blobs that are nowhere thicker: larger ones that
+    touch do so in the world.
+    """
+    import cv2
+
+    low, high = outline.min(axis=0), outline.max(axis=0) + 1
+    filled = np.zeros((high - low)[::-1] + 2, np.uint8)
+    _fill(filled, 1, outline - low + 1)
+    if cv2.distanceTransform(filled, cv2.DIST_L2, 3).max() > _PIECE_SEMI_AXIS_PX + 1.0:
+        return []
+    filled = filled[1:-1, 1:-1]
+    crop = np.where(filled > 0, above[low[1] : high[1], low[0] : high[0]], 0.0)
+    if np.count_nonzero(crop > 0) < 2 * _MIN_PIECE_PIXELS:
+        return []
+    peak = float(np.quantile(crop[crop > 0], 0.95))
+    best: list[NDArray[np.int32]] = []
+    for level in _PIECE_LEVELS:
+        inside = crop > level * peak
+        small = [p + low for p, _ in _outlines(inside) if _is_small_dot(p + low, above.shape)]
+        covered = sum(_filled_moments(piece)[0] for piece in small)
+        if len(small) > max(1, len(best)) and covered > _PIECE_SHARE * np.count_nonzero(inside):
+            best = small
+    return best
+
+
+def _is_small_dot(outline: NDArray[np.int32], image_shape: tuple[int, ...]) -> bool:
+    if len(outline) < 4:
+        return False
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    if low.min() <= 0 or high[0] >= image_shape[1] - 1 or high[1] >= image_shape[0] - 1:
+        return True
+    area, centre, shape = _filled_moments(outline)
+    small = axes_from_shape(shape)[1] <= _PIECE_SEMI_AXIS_PX
+    return bool(
+        area >= _MIN_PIECE_PIXELS and small and not _outline_verdict(outline, centre, shape)
+    )
+
+
+def _first_look(
+    outline: NDArray[np.int32],
+    holes: tuple[NDArray[np.int32], ...],
+    image_shape: tuple[int, ...],
+    min_diameter_px: float,
+) -> Candidate | None:
+    """Moments and first verdict of one outline; None for specks below half the smallest dot."""
+    low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
+    if size.max() < 0.5 * min_diameter_px:
+        return None
+    area, centre, shape = _filled_moments(outline)
+    if low.min() <= 0 or np.any(low + size >= image_shape[::-1]):
+        reason = TOUCHES_BORDER
+    elif 2.0 * axes_from_shape(shape)[0] < min_diameter_px:
+        reason = TOO_SMALL
+    else:
+        reason = _outline_verdict(outline, centre, shape)
+    box = (int(low[0]), int(low[1]), int(size[0]), int(size[1]))
+    return Candidate(0, centre, shape, box, area, holes, reason)
+
+
+def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
+    """Area, centre (2,) and ellipse of equal second moments (3,) of a filled outline's pixels."""
+    import cv2
+
+    low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
+    filled = np.zeros((int(size[1]), int(size[0])), np.uint8)
+    _fill(filled, 1, outline - low)
+    m = cv2.moments(filled, binaryImage=True)
+    area = float(m["m00"])
+    variance = (m["mu20"] / area + 1 / 12, m["mu11"] / area, m["mu02"] / area + 1 / 12)
+    centre = np.array([m["m10"], m["m01"]]) / area + low
+    return area, centre, shape_from_matrix(variance)
+
+
+def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
+    """Shape numbers of the uniform ellipse with these second moments (uu, uv, vv)."""
+    large, small, angle = axes_from_shape(np.array(variance))
+    return shape_from_axes(2.0 * np.sqrt(large), 2.0 * np.sqrt(max(small, 0.05)), angle)
+
+
+def _outline_verdict(outline: NDArray[np.int32], centre: Array, shape: Array) -> str:
+    import cv2
+
+    offset = outline - centre
+    distance = approximate_distance_px(shape, offset[:, 0], offset[:, 1]) + 0.5
+    _, b, _ = axes_from_shape(shape)
+    roughness = float(np.sqrt(np.mean(distance**2)))
+    if roughness <= 0.5 + 0.04 * b:
+        return ""
+    hull = cv2.contourArea(cv2.convexHull(outline.reshape(-1, 1, 2)))
+    solidity = cv2.contourArea(outline.reshape(-1, 1, 2)) / max(hull, 1.0)
+    return MERGED if 0.6 < solidity < 0.95 else NOT_ELLIPSE
+
+
+def choose_polarity(options: tuple[Candidates, Candidates]) -> Candidates:
+    """The polarity whose dot-like blobs cover more of the image."""
+    return max(options, key=lambda c: sum(blob.area_px2 for blob in c.promising))

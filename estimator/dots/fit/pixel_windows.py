@@ -1,0 +1,154 @@
+"""Which pixels a dot's fit looks at, cleared of holes, neighbours and their blur."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.dots.fit.blurred_ellipse import (
+    approximate_distance_px,
+    coverage_on_grid,
+    extent_px,
+    semi_axes,
+)
+from telerig.estimator.dots.fit.candidates import Candidate
+from telerig.estimator.dots.fit.types import DotFit, Start, Window
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CLEAR_SIGMA = 3.5
+_MAX_MARGIN_PX = 12.0
+_THIN_ABOVE_PIXELS, _COARSE_ABOVE_PIXELS = 3000, 800
+_EDGE_SIGMA = 2.7
+
+
+def dot_window(
+    grey: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    blob: Candidate,
+    start: Start,
+    *,
+    coarse: bool = False,
+    known: Sequence[int] = (),
+) -> Window:
+    """Crop and mask round one dot: its edge, what is inside, background as far as it is free.
+
+    Pixels nearer to another blob than to this dot, or near a hole in it, are left out. Of a large
+    dot, only the surroundings of its edge count, and one in four of those beyond its blur
+    (``coarse``: one in four everywhere, for a first look).
+
+    known : labels of blobs whose light will be taken away: what they share with this dot's blur
+        stays. Left out, it costs a third of the precision where blurs overlap.
+    """
+    a, b = semi_axes(start.shape_px)
+    reach = 4.0 * start.sigma_px + 2.0
+    outer = float(np.clip(1.3 * np.sqrt(a * b), reach, max(reach, _MAX_MARGIN_PX)))
+    half = extent_px(start.shape_px) + outer
+    low = np.maximum(np.floor(start.centre_px - half).astype(int), 0)
+    high = np.minimum(np.ceil(start.centre_px + half).astype(int) + 1, grey.shape[::-1])
+    crop = np.s_[low[1] : high[1], low[0] : high[0]]
+    du = np.arange(low[0], high[0]) - start.centre_px[0]
+    dv = np.arange(low[1], high[1]) - start.centre_px[1]
+    distance = approximate_distance_px(start.shape_px, du[None, :], dv[:, None])
+    mask: Mask = (distance < outer) & (distance > -max(8.0, reach))
+    clear = CLEAR_SIGMA * start.sigma_px
+    around = (low, high, int(np.ceil(max(clear, outer))) + 1)
+    gap = _distance_to_others(labels, (blob.label,), *around)
+    if gap is not None:
+        free = (gap > clear) | (distance < gap)
+        if known:
+            strange = _distance_to_others(labels, (blob.label, *known), *around)
+            alone = True if strange is None else (strange > clear) | (distance < strange)
+            free |= (distance < clear) & alone
+        mask &= free
+    if blob.holes:
+        mask &= _distance_to(_holes(blob, low, mask.shape)) > clear + 0.5
+    if np.count_nonzero(mask) > (_COARSE_ABOVE_PIXELS if coarse else _THIN_ABOVE_PIXELS):
+        thin = np.abs(distance) > (0.0 if coarse else _EDGE_SIGMA * start.sigma_px)
+        thin[::2, ::2] = False
+        mask &= ~thin
+    return Window(grey[crop].astype(np.float64), int(low[0]), int(low[1]), mask)
+
+
+def _distance_to(marked: Mask) -> Array:
+    import cv2
+
+    distance: Array = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, 5) - 0.5
+    return distance
+
+
+def _distance_to_others(
+    labels: NDArray[np.int32],
+    own: Sequence[int],
+    low: NDArray[np.int_],
+    high: NDArray[np.int_],
+    reach: int,
+) -> Array | None:
+    """Distance to all blobs but ``own``, also just outside the crop; None where there is none."""
+    first = np.maximum(low - reach, 0)
+    wide = labels[first[1] : high[1] + reach, first[0] : high[0] + reach]
+    others = wide != 0
+    for label in own:
+        others &= wide != label
+    if not np.any(others):
+        return None
+    inner = low - first
+    size = high - low
+    distance = _distance_to(others)
+    return distance[inner[1] : inner[1] + size[1], inner[0] : inner[0] + size[0]]
+
+
+def _holes(blob: Candidate, low: NDArray[np.int_], shape: tuple[int, ...]) -> Mask:
+    import cv2
+
+    canvas = np.zeros(shape, np.uint8)
+    for hole in blob.holes:
+        cv2.drawContours(canvas, [(hole - low).reshape(-1, 1, 2)], -1, 1, cv2.FILLED)
+    return canvas > 0
+
+
+def close_neighbours(fits: list[DotFit]) -> list[list[int]]:
+    """For each dot, those whose blur reaches its window."""
+    from scipy.spatial import cKDTree
+
+    if not fits:
+        return []
+    centres = np.array([fit.centre_px for fit in fits])
+    sizes = np.array([float(np.max(extent_px(fit.shape_px))) + 4 * fit.sigma_px for fit in fits])
+    tree = cKDTree(centres)
+    near = tree.query_ball_point(centres, sizes + sizes.max())
+    return [
+        [j for j in near[i] if j != i and _blur_meets(fits[i], fits[j])] for i in range(len(fits))
+    ]
+
+
+def _blur_meets(first: DotFit, second: DotFit) -> bool:
+    du, dv = second.centre_px - first.centre_px
+    way = float(np.hypot(du, dv)) + 1e-9
+    radii = [way / _radius_of(fit.shape_px, du, dv) for fit in (first, second)]
+    gap = way - radii[0] - radii[1]
+    return gap < 2.0 * CLEAR_SIGMA * max(first.sigma_px, second.sigma_px)
+
+
+def _radius_of(shape: Array, du: float, dv: float) -> float:
+    m11, m12, m22 = shape
+    determinant = m11 * m22 - m12 * m12
+    return float(np.hypot(m22 * du - m12 * dv, m11 * dv - m12 * du) / determinant)
+
+
+def without_neighbours(window: Window, neighbours: list[DotFit]) -> Window:
+    """The window with the neighbours' fitted light taken away."""
+    if not neighbours:
+        return window
+    rows, columns = window.grey.shape
+    u, v = window.first_u + np.arange(columns), window.first_v + np.arange(rows)
+    grey = window.grey.copy()
+    for fit in neighbours:
+        coverage, _ = coverage_on_grid(
+            u.astype(np.float64), v.astype(np.float64), fit.centre_px, fit.shape_px, fit.sigma_px
+        )
+        grey -= fit.contrast * coverage
+    return Window(grey, window.first_u, window.first_v, window.mask)

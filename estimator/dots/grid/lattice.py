@@ -1,0 +1,302 @@
+"""Grow a lattice from unordered dots: which of them lie on one grid, and at which places.
+
+The dots are circles, so their median ellipse tells how the image is foreshortened; mapping it to
+a circle makes the grid rectangular to first order, however strong the tilt. From there the grid
+grows place by place, each predicted from the dots around it, so perspective and distortion only
+have to be smooth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from telerig.errors import DetectionError
+from telerig.estimator.dots.grid.local_fit import (
+    NEIGHBOURS,
+    apply_homography,
+    fit_affine,
+    fit_homography,
+    fit_neighbours,
+    leave_one_out,
+    nearest,
+)
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MIN_DOTS = 6
+NOT_ON_GRID = "not on the grid"
+OFF_PLACE = "off its place on the grid"
+SECOND_DOT = "a second dot at an occupied place"
+
+_REACH = 0.25
+"""A dot is at a predicted place when it is within this part of the local pitch."""
+_ROUGH = 0.05
+"""Of a true grid the median dot is within this part of the pitch of where its neighbours say."""
+_PATCH = 60
+_SEEDS = 4
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Dots at the places of one grid. The axes of the places turn as u and v do (det > 0).
+
+    index : (n,) positions in the given arrays of the dots that have a place.
+    places : (n, 2) integer place of each.
+    basis_px : (n, 2, 2) local pitch vectors; basis_px[k, axis] is the step in (u, v).
+    shape : (n, 2, 2) each dot's shape matrix in units of the local pitch vectors; for a round dot
+        of radius r on pitches p it is diag(r^2 / p1^2, r^2 / p2^2).
+    unplaced : (m,) positions of the other dots; reasons : why, one each.
+    """
+
+    index: Ints
+    places: Ints
+    basis_px: Array
+    shape: Array
+    unplaced: Ints
+    reasons: tuple[str, ...]
+
+
+def shape_matrix(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> Array:
+    """(..., 2, 2) matrix S of the ellipse x^T S^-1 x = 1 with semi-axes a, b."""
+    a2, b2 = np.square(np.asarray(a_px, float)), np.square(np.asarray(b_px, float))
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    uu, vv, uv = a2 * c * c + b2 * s * s, a2 * s * s + b2 * c * c, (a2 - b2) * c * s
+    return np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
+
+
+def circle_from_ellipses(shapes_px2: ArrayLike) -> Array:
+    """(2, 2) matrix that maps the median ellipse of (N, 2, 2) shapes to the unit circle.
+
+    The median is taken over the logarithms of the shapes, so that neither dirt nor marks matter.
+    """
+    values, vectors = np.linalg.eigh(np.asarray(shapes_px2, float))
+    values = np.maximum(values, 1e-6)
+    logs = np.einsum("nij,nj,nkj->nik", vectors, np.log(values), vectors)
+    values, vectors = np.linalg.eigh(np.median(logs, axis=0))
+    return np.asarray((vectors * np.exp(-0.5 * values)) @ vectors.T)
+
+
+def grow_lattice(
+    points_px: ArrayLike, shapes_px2: ArrayLike, *, pitch_ratio: float = 1.0, floor_px: float = 0.3
+) -> Lattice:
+    """Find the largest grid among (N, 2) dots of shapes (N, 2, 2).
+
+    pitch_ratio : pitch_x / pitch_y of the grid; which axis is x need not be known.
+    floor_px : dots within this distance of their place are never taken for false ones.
+
+    Raises DetectionError when fewer than 6 dots lie on a common grid.
+    """
+    points, shapes = np.asarray(points_px, float), np.asarray(shapes_px2, float)
+    if len(points) < MIN_DOTS:
+        raise DetectionError(
+            f"{len(points)} dots are too few to make out a grid",
+            todo=f"at least {MIN_DOTS} dots of the target must be whole and sharp",
+        )
+    circle = circle_from_ellipses(shapes)
+    back = np.asarray(np.linalg.inv(circle), float)
+    flat = points @ circle.T
+    best = _best_growth(flat, pitch_ratio)
+    if best is not None:
+        _drop_false_dots(best, back, floor_px)
+    if best is None or not _is_grid(best):
+        found = 0 if best is None else int(best.placed().sum())
+        raise DetectionError(
+            f"of {len(points)} dots only {found} lie on a grid with the target's pitch ratio",
+            todo="check [target] pitch_mm and polarity, and that the target is sharp and in view",
+        )
+    return _lattice(best, back, shapes)
+
+
+def _best_growth(flat: Array, pitch_ratio: float) -> _Growth | None:
+    """The best of a few starts; the first that takes in nearly all dots is good enough."""
+    best: _Growth | None = None
+    for basis in _bases(flat, pitch_ratio):
+        for seed in _seeds(flat, basis):
+            growth = _Growth(flat, seed, basis)
+            growth.grow()
+            if best is None or growth.score(pitch_ratio) > best.score(pitch_ratio):
+                best = growth
+            if best.score(pitch_ratio) > 0.85 * len(flat):
+                return best
+    return best
+
+
+def _bases(flat: Array, pitch_ratio: float) -> list[Array]:
+    """Pairs of frequent steps that are upright on each other in the pitch ratio, likely first."""
+    ratio = max(pitch_ratio, 1 / pitch_ratio)
+    steps, votes = _frequent_steps(flat, min(len(flat) - 1, round(4 + 6 * ratio)))
+    length = np.linalg.norm(steps, axis=1)
+    one, two = np.triu_indices(len(steps), 1)
+    area = np.abs(steps[one, 0] * steps[two, 1] - steps[one, 1] * steps[two, 0])
+    aspect = np.abs(np.abs(np.log(length[one] / length[two])) - np.log(ratio))
+    good = (area > 0.85 * length[one] * length[two]) & (aspect < 0.3)
+    score = np.sqrt(votes[one] * votes[two]) * good
+    kept = np.flatnonzero((score > 0) & (score >= 0.4 * score.max(initial=0)))
+    return [steps[[one[k], two[k]]] for k in kept[np.argsort(area[kept])][:6]]
+
+
+def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
+    """(K, 2) steps between near dots, each up to sign, and how often each occurs (K,)."""
+    middle = np.median(flat, axis=0)
+    patch = np.argsort(np.sum((flat - middle) ** 2, axis=1))[:_PATCH]
+    _, near = nearest(cKDTree(flat), flat[patch], neighbours + 1)
+    steps = (flat[near[:, 1:]] - flat[patch][:, None]).reshape(-1, 2)
+    steps = np.concatenate([steps, -steps])
+    reach = 0.15 * np.linalg.norm(steps, axis=1)
+    votes = cKDTree(steps).query_ball_point(steps, reach, return_length=True).astype(float)
+    found, counts = [], []
+    left = np.where(steps @ [1.0, 1e-3] > 0, votes, 0.0)
+    for _ in range(16):
+        top = int(np.argmax(left))
+        if left[top] < 0.1 * votes.max() or left[top] == 0:
+            break
+        close = np.linalg.norm(steps - steps[top], axis=1) <= reach[top]
+        found.append(np.median(steps[close], axis=0))
+        counts.append(votes[top])
+        for sign in (1, -1):
+            left[np.linalg.norm(steps - sign * steps[top], axis=1) <= 2 * reach[top]] = 0
+    return np.array(found).reshape(-1, 2), np.array(counts)
+
+
+def _seeds(flat: Array, basis: Array) -> Iterator[int]:
+    """Dots with good neighbours on all sides, best first and well apart."""
+    steps = np.concatenate([basis, -basis])
+    miss, _ = nearest(cKDTree(flat), (flat[:, None] + steps).reshape(-1, 2))
+    pitch = np.linalg.norm(steps, axis=1)
+    part = np.minimum(miss.reshape(-1, 4) / pitch, 1.0)
+    order = np.argsort(np.sum(part, axis=1), kind="stable")
+    yield from order[:: max(1, len(order) // (4 * _SEEDS))][:_SEEDS].tolist()
+
+
+class _Growth:
+    """A grid while it grows: `at` holds the dot at each place, -1 where there is none."""
+
+    def __init__(self, flat: Array, seed: int, basis: Array) -> None:
+        turn = np.sign(np.linalg.det(basis))
+        basis = basis * np.array([[1.0], [turn]])
+        extent = np.ptp(flat, axis=0).max() / np.linalg.norm(basis, axis=1).min()
+        self.half = int(min(2 * extent + 8, 1500))
+        self.flat, self.tree = flat, cKDTree(flat)
+        self.at = np.full((2 * self.half + 1, 2 * self.half + 1), -1, np.int64)
+        self.place = np.full((len(flat), 2), -1, np.int64)
+        self.basis = np.zeros((len(flat), 2, 2))
+        self.banned = np.zeros(len(flat), bool)
+        self.basis[seed] = basis
+        self._put(np.array([seed]), np.array([[self.half, self.half]]))
+
+    def placed(self) -> NDArray[np.bool_]:
+        return np.asarray(self.place[:, 0] >= 0)
+
+    def score(self, pitch_ratio: float) -> float:
+        """Dots on the grid, less when they leave many places empty or it is not upright."""
+        dots = np.flatnonzero(self.placed())
+        i, j = self.place[dots].T
+        runs = (self.at[i + 1, j] >= 0).sum() + (self.at[i, j + 1] >= 0).sum()
+        full = min(1.0, 0.5 + float(runs) / (2 * len(dots)))
+        one, two = np.median(self.basis[dots], axis=0)
+        length = np.hypot(*one), np.hypot(*two)
+        lean = abs(one @ two) / (length[0] * length[1])
+        stretch = abs(abs(np.log(length[0] / length[1])) - abs(np.log(pitch_ratio)))
+        return len(dots) * full * float(np.exp(-((lean / 0.3) ** 2) - (stretch / 0.3) ** 2))
+
+    def grow(self) -> None:
+        """Add dots round by round until no place next to the grid, or two away, has one."""
+        front = self.place[self.placed()]
+        while len(front):
+            front = self._round(front, NEIGHBOURS[np.abs(NEIGHBOURS).sum(1) == 1])
+            if not len(front):
+                front = self._round(self.place[self.placed()], NEIGHBOURS)
+
+    def remove(self, dots: Ints) -> None:
+        self.at[tuple(self.place[dots].T)] = -1
+        self.place[dots] = -1
+        self.banned[dots] = True
+
+    def _round(self, front: Ints, steps: Ints) -> Ints:
+        around = (front[:, None] + steps).reshape(-1, 2)
+        wanted = np.stack(np.divmod(np.unique(around @ [len(self.at), 1]), len(self.at)), axis=1)
+        wanted = wanted[np.all((wanted > 2) & (wanted < 2 * self.half - 2), axis=1)]
+        wanted = wanted[self.at[tuple(wanted.T)] < 0]
+        if not len(wanted):
+            return np.asarray(wanted)
+        expected, basis, _ = fit_neighbours(self.at, self.flat, wanted, self.basis)
+        reach = _REACH * np.linalg.norm(basis, axis=2).min(axis=1)
+        miss, dot = nearest(self.tree, expected, 2)
+        free = ~self.placed()[dot] & ~self.banned[dot]
+        pick = np.where(free[:, 0], 0, 1)
+        rows = np.arange(len(dot))
+        miss, dot, free = miss[rows, pick], dot[rows, pick], free[rows, pick]
+        good = np.flatnonzero(free & (miss < reach))
+        good = good[np.argsort(miss[good] / reach[good])]
+        _, first = np.unique(dot[good], return_index=True)
+        good = good[first]
+        self.basis[dot[good]] = basis[good]
+        self._put(dot[good], wanted[good])
+        return np.asarray(wanted[good])
+
+    def _put(self, dots: Ints, places: Ints) -> None:
+        self.at[tuple(places.T)] = dots
+        self.place[dots] = places
+
+
+def _drop_false_dots(growth: _Growth, image_from_flat: Array, floor_px: float) -> None:
+    """Take out dots that are off the smooth surface of their neighbours, then grow again.
+
+    Global consistency: the residuals to one homography must be smooth over the grid.
+    """
+    for _ in range(8):
+        dots = np.flatnonzero(growth.placed())
+        if len(dots) < MIN_DOTS:
+            return
+        places = growth.place[dots]
+        smooth = apply_homography(fit_homography(places, growth.flat[dots]), places)
+        residual = np.zeros_like(growth.flat)
+        residual[dots] = (growth.flat[dots] - smooth) @ image_from_flat.T
+        miss = leave_one_out(growth.at, residual, places)
+        limit = max(8 * 1.4826 * float(np.median(miss)), floor_px)
+        worst = np.full(growth.at.shape, 0.0)
+        worst[tuple(places.T)] = miss
+        around = [worst[tuple((places + step).T)] for step in NEIGHBOURS]
+        false = dots[(miss > limit) & (miss >= np.max(around, axis=0))]
+        if not len(false):
+            return
+        growth.remove(false)
+        growth.grow()
+
+
+def _is_grid(growth: _Growth) -> bool:
+    """Whether enough dots lie on it, closely enough: scattered dots can look like a few places."""
+    dots = np.flatnonzero(growth.placed())
+    if len(dots) < max(MIN_DOTS, 0.3 * len(growth.flat)):
+        return False
+    places = growth.place[dots]
+    fit = fit_homography if len(dots) > 9 else fit_affine
+    residual = np.zeros_like(growth.flat)
+    residual[dots] = growth.flat[dots] - apply_homography(fit(places, growth.flat[dots]), places)
+    pitch = np.linalg.norm(growth.basis[dots], axis=2).min(axis=1)
+    rough = np.median(leave_one_out(growth.at, residual, places) / pitch)
+    return bool(rough < _ROUGH)
+
+
+def _lattice(growth: _Growth, image_from_flat: Array, shapes_px2: Array) -> Lattice:
+    index = np.flatnonzero(growth.placed())
+    places = growth.place[index]
+    _, basis, _ = fit_neighbours(growth.at, growth.flat, places, growth.basis, itself=True)
+    basis_px = basis @ image_from_flat.T
+    pitch_from_px = np.linalg.inv(np.swapaxes(basis_px, -1, -2))
+    shape = pitch_from_px @ shapes_px2[index] @ np.swapaxes(pitch_from_px, -1, -2)
+    unplaced = np.flatnonzero(~growth.placed())
+    reach = np.linalg.norm(basis, axis=2).min(axis=1)
+    miss, next_to = nearest(cKDTree(growth.flat[index]), growth.flat[unplaced])
+    second = miss < _REACH * reach[next_to]
+    reasons = np.where(second, SECOND_DOT, NOT_ON_GRID)
+    reasons = np.where(growth.banned[unplaced] & ~second, OFF_PLACE, reasons)
+    return Lattice(
+        index, places - places.min(0), basis_px, shape, unplaced, tuple(reasons.tolist())
+    )

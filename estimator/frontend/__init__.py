@@ -1,1 +1,0 @@
-"""From images to measurements: dots, their numbering, bubbles."""

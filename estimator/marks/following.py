@@ -1,0 +1,301 @@
+"""Dots fixed to the tank followed through a run: which dot of one frame is which of the next.
+
+All dots of a frame are shifted alike against the stage's reading: by the camera's shake. A frame's
+shift is the one that most dots agree on and that is near the last one; where another shift, such
+as one spacing of an even strip further, is nearly as likely, nothing says which dot is which, and
+following begins anew with new marks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.marks.strip_dots import DotSightings
+from telerig.estimator.marks.tank_view import TankView
+
+Array = NDArray[np.float64]
+
+HIDDEN = "hidden, touched by a bubble, or unlike the other dots"
+BORDER = "cut by the image's border"
+MOVED = "off its place against the other dots"
+AMBIGUOUS = "the strip's motion between two frames is ambiguous"
+LOST = "no dot is where it was expected"
+
+_FIRST_STEP_MM = 0.3
+_LEAST_STEP_MM = 0.1
+_REACH = 5.0
+_LEARN = 0.1
+_UNMATCHED, _MISSED, _SURE = 4.5, 2.5, 6.0
+_TOLERANCE, _SAME, _APART = 0.06, 0.5, 0.4
+_GATE, _PLACE_PX, _PLACE_GAIN = 5.0, 0.1, 0.3
+_CONFIRM, _FORGET = 3, 50
+_FIRST_SHARE = 0.2
+_TOO_MANY_LOST = 2
+
+
+@dataclass
+class Mark:
+    """A dot of the strip: lab place (2,) mm, and how often and over which travel it was seen.
+
+    left_out : frames in which it should have been seen, by the reason why it was not measured.
+    """
+
+    number: int
+    place_mm: Array
+    epoch: int
+    last_frame: int
+    low_px: Array
+    high_px: Array
+    sightings: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def travelled_px(self) -> float:
+        return float(np.linalg.norm(self.high_px - self.low_px))
+
+
+@dataclass(frozen=True)
+class _Shift:
+    """mm : (2,) of this frame. pairs : (dot, mark) that agree on it. sure : no other is as good."""
+
+    mm: Array
+    pairs: list[tuple[int, int]]
+    sure: bool
+
+
+class Follower:
+    """One camera's dots, frame by frame.
+
+    diameter_mm : of a dot. margin_px : least distance of a whole dot's centre from the border.
+    """
+
+    def __init__(
+        self, view: TankView, *, diameter_mm: float, margin_px: float, frame_count: int
+    ) -> None:
+        self.view, self.diameter_mm, self.margin_px = view, diameter_mm, margin_px
+        self.marks: list[Mark] = []
+        self.finished: list[Mark] = []
+        self.shift_mm = np.full((frame_count, 2), np.nan)
+        self.epoch_starts = [0]
+        self.breaks: list[tuple[int, str]] = []
+        self._scale = view.px_per_mm
+        self._number = 0
+        self._last: tuple[int, Array, bool] | None = None
+        self._speed = np.zeros(2)
+        self._step_mm: float | None = None
+        self._held_mm = 0.0
+
+    def add(
+        self, frame: int, dots: DotSightings, position_mm: float | None
+    ) -> list[tuple[int, int]]:
+        """(dot, mark's number) of the frame's dots. position_mm : None where it is not known.
+
+        Frames come in order; those without an image may be left out.
+        """
+        known = position_mm is not None and bool(np.isfinite(position_mm))
+        if known and position_mm is not None:
+            self._held_mm = position_mm
+        if self._last is not None and self._last[2] != known:
+            self._restart(frame, "the stage's record begins or ends")
+        place = self.view.lab_mm(dots.uv_px, self._held_mm)
+        if not len(place):
+            self._count_missing(frame, [], known)
+            return []
+        predicted, sd = self._prediction(frame, place, known)
+        if not self.marks:
+            self._accept(frame, predicted, known)
+            return self._born(frame, place - predicted, dots, range(len(place)))
+        shift = self._best(place, predicted, sd)
+        if shift is None or not shift.sure:
+            if shift is None and known and len(self._expected(predicted)) < _TOO_MANY_LOST:
+                return self._born(frame, place - predicted, dots, range(len(place)))
+            self._restart(frame, LOST if shift is None else AMBIGUOUS)
+            predicted = predicted if known else np.zeros(2)
+            self._accept(frame, predicted, known)
+            return self._born(frame, place - predicted, dots, range(len(place)))
+        self._learn(shift.mm - predicted, sd)
+        self._accept(frame, shift.mm, known)
+        return self._taken(frame, place - shift.mm, dots, shift)
+
+    def kept(self, *, moved: bool) -> list[Mark]:
+        """Marks that stayed at one place of the tank while it passed through the image.
+
+        moved : False where it never did, so that being seen often must do.
+        """
+        far = self.diameter_mm * self._scale if moved else 0.0
+        return [
+            m
+            for m in [*self.finished, *self.marks]
+            if m.sightings >= _CONFIRM and (m.travelled_px >= far or _always_seen(m))
+        ]
+
+    def brief(self, kept: list[Mark]) -> list[Mark]:
+        """Dots in line with the kept marks, seen too rarely to be measured, but never missed: as
+        at a run's ends."""
+        if not kept:
+            return []
+        across = np.array([m.place_mm[1] for m in kept])
+        low, high = across.min() - self.diameter_mm / 2, across.max() + self.diameter_mm / 2
+        taken = {m.number for m in kept}
+        return [
+            m
+            for m in [*self.finished, *self.marks]
+            if m.number not in taken and low < m.place_mm[1] < high and _always_seen(m)
+        ]
+
+    def _prediction(self, frame: int, place: Array, known: bool) -> tuple[Array, float]:
+        """Shift (2,) mm expected now, and its standard deviation."""
+        step = self._step_mm or (_FIRST_STEP_MM if known else self._first_step_mm(place))
+        if self._last is None:
+            return np.zeros(2), step
+        last, shift, _ = self._last
+        gap = frame - last
+        return shift + (0 if known else gap) * self._speed, step * np.sqrt(gap)
+
+    def _first_step_mm(self, place: Array) -> float:
+        """Without an encoder the first motion is taken as well below half the dots' spacing."""
+        if len(place) < 2:
+            return self.diameter_mm
+        apart = np.linalg.norm(place[:, None] - place, axis=-1)
+        return _FIRST_SHARE * float(apart[apart > 0].min())
+
+    def _expected(self, shift: Array) -> list[int]:
+        """Marks that should be whole in the image."""
+        inside, uv = self._in_image(shift)
+        size = np.array(self.view.camera.image_size_px) - 1
+        margin = self.margin_px + 1
+        whole = np.all((uv > margin) & (uv < size - margin), axis=1)
+        return [k for k, good in zip(inside, whole) if good]
+
+    def _in_image(self, shift: Array) -> tuple[list[int], Array]:
+        """Marks whose centre is in the image, and these centres (n, 2) px."""
+        places = np.array([m.place_mm for m in self.marks]).reshape(-1, 2) + shift
+        return self.view.in_image(places, self._held_mm)
+
+    def _best(self, place: Array, predicted: Array, sd: float) -> _Shift | None:
+        """The likeliest shift; None where no dot is near a mark."""
+        known = np.array([m.place_mm for m in self.marks])
+        apart = place[:, None] - known
+        near = np.linalg.norm(apart - predicted, axis=-1) < max(_REACH * sd, self.diameter_mm / 2)
+        tries = apart[near]
+        if not len(tries):
+            return None
+        costs = np.array([self._cost(apart, t, predicted, sd) for t in tries])
+        best = int(costs.argmin())
+        pairs = self._pairs(apart, tries[best])
+        shift = np.mean([apart[i, k] for i, k in pairs], axis=0)
+        other = np.linalg.norm(tries - tries[best], axis=-1) > _APART * self.diameter_mm
+        sure = not other.any() or float(costs[other].min() - costs[best]) > _SURE
+        return _Shift(shift, pairs, sure)
+
+    def _cost(self, apart: Array, shift: Array, predicted: Array, sd: float) -> float:
+        """Negative log likelihood of a shift: dots off their marks, marks not seen, a leap."""
+        distance = np.linalg.norm(apart - shift, axis=-1).min(1)
+        square = (distance / (_TOLERANCE * self.diameter_mm)) ** 2
+        seen = {k for _, k in self._pairs(apart, shift)}
+        missed = sum(k not in seen for k in self._expected(shift))
+        leap = float(np.sum((shift - predicted) ** 2)) / (2 * sd**2)
+        return float(np.minimum(square / 2, _UNMATCHED).sum()) + _MISSED * missed + leap
+
+    def _pairs(self, apart: Array, shift: Array) -> list[tuple[int, int]]:
+        """Dots and marks that are each other's nearest and agree with a shift."""
+        distance = np.linalg.norm(apart - shift, axis=-1)
+        nearest, back = distance.argmin(1), distance.argmin(0)
+        limit = 3 * _TOLERANCE * self.diameter_mm
+        return [
+            (i, int(k)) for i, k in enumerate(nearest) if back[k] == i and distance[i, k] < limit
+        ]
+
+    def _learn(self, leap: Array, sd: float) -> None:
+        """How far the shift goes from frame to frame in this run."""
+        before = self._step_mm or sd
+        square = (1 - _LEARN) * before**2 + _LEARN * float(np.sum(leap**2))
+        self._step_mm = max(_LEAST_STEP_MM, float(np.sqrt(square)))
+
+    def _accept(self, frame: int, shift: Array, known: bool) -> None:
+        if self._last is not None and not known:
+            self._speed = (shift - self._last[1]) / (frame - self._last[0])
+        self.shift_mm[frame] = shift
+        self._last = (frame, shift, known)
+
+    def _taken(
+        self, frame: int, place: Array, dots: DotSightings, shift: _Shift
+    ) -> list[tuple[int, int]]:
+        """Sightings of the marks at their places; dots elsewhere may be new marks."""
+        out, used = [], set()
+        off = np.array([place[i] - self.marks[k].place_mm for i, k in shift.pairs])
+        middle = np.median(off, axis=0) if len(off) > 2 else np.zeros(2)
+        seen = []
+        for (i, k), residual in zip(shift.pairs, off - middle):
+            mark, sigma = self.marks[k], float(dots.sigma_px[i])
+            used.add(i)
+            seen.append(k)
+            if np.linalg.norm(residual) * self._scale > _GATE * np.hypot(sigma, _PLACE_PX):
+                mark.left_out[MOVED] = mark.left_out.get(MOVED, 0) + 1
+                continue
+            mark.place_mm = mark.place_mm + _PLACE_GAIN / max(1, mark.sightings) * residual
+            self._sighted(mark, frame, dots.uv_px[i], sigma)
+            out.append((i, mark.number))
+        self._count_missing(frame, seen, True)
+        known = np.array([m.place_mm for m in self.marks])
+        free = [
+            i
+            for i in range(len(place))
+            if i not in used
+            and np.linalg.norm(known - place[i], axis=-1).min() > _SAME * self.diameter_mm
+        ]
+        return out + self._born(frame, place, dots, free)
+
+    def _sighted(self, mark: Mark, frame: int, uv: Array, sigma: float) -> None:
+        mark.sightings += 1
+        mark.last_frame = frame
+        mark.low_px, mark.high_px = np.minimum(mark.low_px, uv), np.maximum(mark.high_px, uv)
+
+    def _born(
+        self, frame: int, place: Array, dots: DotSightings, chosen: list[int] | range
+    ) -> list[tuple[int, int]]:
+        out = []
+        for i in chosen:
+            uv = dots.uv_px[i]
+            mark = Mark(self._number, place[i], len(self.epoch_starts) - 1, frame, uv, uv, 1)
+            self.marks.append(mark)
+            out.append((i, mark.number))
+            self._number += 1
+        self._forget(frame)
+        return out
+
+    def _forget(self, frame: int) -> None:
+        """Dots that were not where they had been seen: bubbles, dirt on the lens."""
+        self.marks = [
+            m
+            for m in self.marks
+            if m.sightings >= _CONFIRM or _always_seen(m) or frame - m.last_frame < _FORGET
+        ]
+
+    def _count_missing(self, frame: int, seen: list[int], known: bool) -> None:
+        if self._last is None or not self.marks:
+            return
+        gap = 0 if known else frame - self._last[0]
+        inside, uv = self._in_image(self._last[1] + gap * self._speed)
+        size = np.array(self.view.camera.image_size_px) - 1
+        whole = np.all((uv > self.margin_px) & (uv < size - self.margin_px), axis=1)
+        for k, good in zip(inside, whole):
+            if k not in seen:
+                why = HIDDEN if good else BORDER
+                left = self.marks[k].left_out
+                left[why] = left.get(why, 0) + 1
+
+    def _restart(self, frame: int, why: str) -> None:
+        """New marks from here on; those so far are not seen again."""
+        self.breaks.append((frame, why))
+        self.finished += self.marks
+        self.marks = []
+        self.epoch_starts.append(frame)
+        self._speed, self._step_mm = np.zeros(2), None
+
+
+def _always_seen(mark: Mark) -> bool:
+    return not mark.left_out.get(HIDDEN)

@@ -1,0 +1,209 @@
+"""Dots of a strip fixed to the tank in bubble images: where they may be, and each frame's dots.
+
+The luminance fit of `dots` measures them. What is not as large, as dark and as well fitted as the
+strip's dots is left out: bubbles, dirt, and dots that a bubble covers or the border cuts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.dots.locate import measure_dots
+from telerig.rig.camera import Camera
+
+if TYPE_CHECKING:
+    from telerig.estimator.dots.fit.candidates import Polarity
+
+Array = NDArray[np.float64]
+Window = tuple[slice, slice]
+
+BORDER_PX = 1.5
+"""Between a dot's blurred rim and the image's border."""
+
+_FIRST_SIZE = (0.7, 1.35)
+_SIZE, _CONTRAST = 0.15, 0.25
+_MISFIT, _LEAST_MISFIT = 2.0, 1.0
+_LEAST_ROUND, _LEAST_CONTRAST = 0.5, 0.2
+_LEAST_FRAMES, _LEAST_SHARE = 3, 0.25
+_SYSTEMATIC_PX = 0.005
+_RING_TAIL, _RING_STEP = 0.1, 0.25
+
+
+@dataclass(frozen=True)
+class DotLook:
+    """What a strip's dots look like to one camera, and where in the image they may be.
+
+    windows : image parts that the strip passes through. a_px >= b_px : usual semi-axes.
+    contrast : usual step over the brighter level. chi2_dof : usual misfit. blur_px : of the edge.
+    """
+
+    polarity: Polarity
+    diameter_px: float
+    windows: tuple[Window, ...]
+    a_px: float
+    b_px: float
+    contrast: float
+    chi2_dof: float
+    blur_px: float
+
+    @property
+    def margin_px(self) -> float:
+        """Least distance of a whole dot's centre from the image's border."""
+        return self.a_px + 2 * self.blur_px + BORDER_PX
+
+
+@dataclass(frozen=True)
+class DotSightings:
+    """uv_px (n, 2) and the isotropic standard deviation sigma_px (n,) of a frame's dots."""
+
+    uv_px: Array
+    sigma_px: Array
+
+
+def travel_in_image(camera: Camera, axis_rig: Array) -> Array:
+    """(2,) px per mm of travel, of what is fixed to the tank, in the middle of the image."""
+    width, height = camera.image_size_px
+    origin, _ = camera.unproject(np.array([(width - 1) / 2, (height - 1) / 2]))
+    step = 1e-3
+    return np.asarray(
+        (camera.project(origin - step * axis_rig) - camera.project(origin + step * axis_rig))
+        / (2 * step)
+    )
+
+
+def learn_look(
+    images: Iterable[NDArray[Any]],
+    travel_px: Array,
+    *,
+    polarity: Polarity,
+    diameter_px: float,
+) -> DotLook | None:
+    """From a sample of whole images; None where no strip is seen.
+
+    travel_px : (2,) along which the strip passes through the image, any length.
+    A strip shows in several images at the same distance from the line of travel; bubbles do not.
+    """
+    across = np.array([-travel_px[1], travel_px[0]]) / np.linalg.norm(travel_px)
+    rows, shape, count = [], (0, 0), 0
+    for image in images:
+        found = _round_dots(image, polarity, diameter_px)
+        rows.append(np.column_stack([np.full(len(found), count), found]))
+        shape, count = image.shape, count + 1
+    seen = np.concatenate(rows) if rows else np.zeros((0, 1 + len(_COLUMNS)))
+    groups = _bands(seen, across, diameter_px)
+    if not groups:
+        return None
+    kept = seen[np.concatenate(groups)]
+    a, b, contrast, chi2, blur = np.median(kept[:, 5:10], axis=0)
+    windows = tuple(
+        _window(seen[group, 1:3] @ across, across, diameter_px, shape) for group in groups
+    )
+    return DotLook(
+        polarity, diameter_px, windows, float(a), float(b), float(contrast), float(chi2),
+        float(blur),
+    )  # fmt: skip
+
+
+def find_dots(image: NDArray[Any], look: DotLook) -> DotSightings:
+    """The whole dots of one frame that look like the strip's."""
+    parts = [np.zeros((0, len(_COLUMNS)))]
+    for window in look.windows:
+        found = _round_dots(image[window], look.polarity, look.diameter_px)
+        free = [_is_free(image[window], dot, look) for dot in found]
+        found = found[np.array(free, bool)]
+        found[:, :2] += (window[1].start, window[0].start)
+        parts.append(found)
+    dots = np.concatenate(parts)
+    good = (np.abs(dots[:, 4] / look.a_px - 1) < _SIZE) & (
+        np.abs(dots[:, 5] / look.b_px - 1) < _SIZE
+    )
+    good &= np.abs(dots[:, 6] / look.contrast - 1) < _CONTRAST
+    good &= dots[:, 7] < _MISFIT * max(look.chi2_dof, _LEAST_MISFIT)
+    size = np.array(image.shape[::-1]) - 1
+    margin = look.margin_px - 0.5
+    good &= np.all((dots[:, :2] > margin) & (dots[:, :2] < size - margin), axis=1)
+    kept = _single(dots[good], look.diameter_px)
+    sigma = np.sqrt((kept[:, 2] + kept[:, 3]) / 2)
+    return DotSightings(kept[:, :2], np.hypot(sigma, _SYSTEMATIC_PX))
+
+
+_COLUMNS = (
+    *("u_px", "v_px", "suu_px2", "svv_px2", "a_px", "b_px", "contrast", "chi2_dof", "blur_px"),
+    *("inner_level", "outer_level"),
+)
+
+
+def _is_free(image: NDArray[Any], dot: Array, look: DotLook) -> bool:
+    """Whether the screen shows all round a dot: neither a bubble's rim nor its bright heart."""
+    u, v, inner, outer = dot[0], dot[1], dot[9], dot[10]
+    first = look.a_px + 3 * look.blur_px
+    last = first + max(3.0, 0.8 * look.a_px)
+    low = np.maximum(np.floor(np.array([u, v]) - last).astype(int), 0)
+    high = np.ceil(np.array([u, v]) + last).astype(int) + 1
+    window = image[low[1] : high[1], low[0] : high[0]]
+    rows, columns = np.indices(window.shape)
+    distance = np.hypot(columns + low[0] - u, rows + low[1] - v)
+    ring = window[(distance > first) & (distance < last)]
+    off = np.abs(np.quantile(ring, (_RING_TAIL, 1 - _RING_TAIL)) - outer)
+    return bool(ring.size > 0 and off.max() < _RING_STEP * abs(outer - inner))
+
+
+def _round_dots(image: NDArray[Any], polarity: Polarity, diameter_px: float) -> Array:
+    """(n, 11) _COLUMNS of the dots of about the right size."""
+    low, high = (share * diameter_px for share in _FIRST_SIZE)
+    if min(image.shape) < 8:
+        return np.zeros((0, len(_COLUMNS)))
+    dots = measure_dots(
+        image, polarity=polarity, min_diameter_px=max(low, 3.0), max_diameter_px=high + 2.0
+    ).dots
+    inner, outer = (dots[name].to_numpy(float) for name in ("inner_level", "outer_level"))
+    contrast = np.abs(outer - inner) / np.maximum(np.maximum(inner, outer), 1e-9)
+    table = dots.assign(contrast=contrast)[list(_COLUMNS)].to_numpy(float)
+    size = 2 * np.sqrt(table[:, 4] * table[:, 5])
+    good = (size > low) & (size < high) & (table[:, 5] > _LEAST_ROUND * table[:, 4])
+    good &= (contrast > _LEAST_CONTRAST) & ~dots["ring"].to_numpy(bool)
+    return np.asarray(table[good & np.isfinite(table).all(1)])
+
+
+def _bands(seen: Array, across: Array, diameter_px: float) -> list[NDArray[np.int64]]:
+    """Rows of ``seen`` by strip: dots at one distance from the line of travel in several images."""
+    if not len(seen):
+        return []
+    place = seen[:, 1:3] @ across
+    order = np.argsort(place)
+    cuts = np.flatnonzero(np.diff(place[order]) > 1.5 * diameter_px) + 1
+    groups = np.split(order, cuts)
+    frames = [len(set(seen[g, 0])) for g in groups]
+    least = min(_LEAST_FRAMES, int(seen[:, 0].max()) + 1)
+    enough = max(least, _LEAST_SHARE * max(frames))
+    counts = [len(g) for g in groups]
+    return [g for g, f, n in zip(groups, frames, counts) if f >= enough and n >= 0.2 * max(counts)]
+
+
+def _window(place: Array, across: Array, diameter_px: float, shape: Sequence[int]) -> Window:
+    """The part of the image within reach of the band between the least and greatest ``place``."""
+    reach = 1.5 * diameter_px + 6
+    low, high = float(place.min()) - reach, float(place.max()) + reach
+    height, width = shape
+    v, u = np.mgrid[0:height:4, 0:width:4]
+    at = u * across[0] + v * across[1]
+    inside = (at >= low - 4) & (at <= high + 4)
+    rows, columns = np.flatnonzero(inside.any(1)) * 4, np.flatnonzero(inside.any(0)) * 4
+    return (
+        slice(int(rows[0]), min(int(rows[-1]) + 4, height)),
+        slice(int(columns[0]), min(int(columns[-1]) + 4, width)),
+    )
+
+
+def _single(dots: Array, diameter_px: float) -> Array:
+    """Each dot once, where windows overlap."""
+    kept: list[Array] = []
+    for dot in dots:
+        if all(np.hypot(*(dot[:2] - other[:2])) > diameter_px / 2 for other in kept):
+            kept.append(dot)
+    return np.array(kept).reshape(-1, len(_COLUMNS))

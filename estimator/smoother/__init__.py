@@ -1,1 +1,0 @@
-"""The smoothing graph: bubbles, carriage and camera offsets from all that was measured."""

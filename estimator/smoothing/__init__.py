@@ -1,0 +1,5 @@
+"""The smoothing graph: bubble motion and rig shake told apart, with a verdict.
+
+In: ``Tracks``, a ``Calibration``, sensors. Out: a ``Smoothing`` and its files. Read ``smooth``
+first.
+"""

@@ -1,0 +1,131 @@
+"""The smoothing graph in GTSAM: its factors, the order of elimination, its marginals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import CalibrationError
+from telerig.estimator.smoothing.graph.blocks import Blocks, Linear
+from telerig.estimator.smoothing.graph.marginals import Marginals, marginal_covariances
+from telerig.estimator.smoothing.graph.state import Frame
+from telerig.factors.motion import add_linear_factors
+
+Array = NDArray[np.float64]
+
+_NOTHING = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class EliminatedGraph:
+    """net : `gtsam.GaussianBayesNet`, one key a conditional.  vector : the solution."""
+
+    frame: Frame
+    net: Any
+    vector: Array
+
+    def log_det(self) -> float:
+        """log |R|; QR leaves signs on the diagonal."""
+        diagonals = (np.diagonal(self.net.at(i).R()) for i in range(self.net.size()))
+        return float(sum(np.log(np.abs(d)).sum() for d in diagonals))
+
+    def blocks(self) -> Blocks:
+        """Marginal covariances of all increments, and of shake with bubbles at the same frame."""
+        frame = self.frame
+        base, counts = frame.base(), frame.counts()
+        families = [range(base[i], base[i] + n * (d > 0)) for i, (n, d) in enumerate(counts)]
+        at_frames = frame.nodes.of_frame.tolist() if counts[0][1] else []
+        rows = base[1] + np.arange(frame.rows)
+        pairs = list(zip(frame.node_of_row.tolist(), rows.tolist())) if counts[0][1] else []
+        sizes = [d for n, d in counts for _ in range(n)]
+        wanted = set(at_frames).union(*families[1:])
+        found: Marginals = marginal_covariances(self.net, sizes, wanted, pairs)
+        own = []
+        for keys, (number, size) in zip([at_frames, *families[1:]], counts):
+            number = number if keys is not at_frames else len(frame.nodes.of_frame)
+            own.append(np.array([found.own[k] for k in keys]).reshape(number, size, size))
+        cross = np.array([found.cross[pair] for pair in pairs])
+        return Blocks(own, cross.reshape(frame.rows, counts[0][1], counts[1][1]))
+
+
+def eliminate(frame: Frame, factors: list[Linear], *, cholesky: bool) -> EliminatedGraph:
+    """The graph of all factors, solved: by QR, or by Cholesky where that does not refuse.
+
+    Raises CalibrationError where it is undetermined.
+    """
+    import gtsam
+
+    graph = gtsam.GaussianFactorGraph()
+    for linear in factors:
+        add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
+    _add_bonds(graph, frame)
+    net, solution = _eliminated(graph, _ordering(frame), cholesky)
+    return EliminatedGraph(frame, net, solution.vector())
+
+
+def _add_bonds(graph: Any, frame: Frame) -> None:
+    """Empty factors between shake and bubbles where no image joins them.
+
+    Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
+    its first row on would share none.
+    """
+    size = frame.counts()[0][1]
+    seen = frame.row(frame.problem.observations.item, frame.problem.observations.frame)
+    alone = np.setdiff1d(np.arange(frame.rows), seen)
+    if not size or not len(alone):
+        return
+    keys = (frame.node_of_row[alone], frame.base()[1] + alone)
+    blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, frame.bubble.size))
+    add_linear_factors(graph, keys, blocks, np.zeros((len(alone), 1)))
+
+
+def _eliminated(graph: Any, ordering: Any, cholesky: bool) -> tuple[Any, Any]:
+    """Bayes net and solution."""
+    import gtsam
+
+    try:
+        if cholesky:
+            try:
+                net = graph.eliminateSequential(ordering)
+                return net, net.optimize()
+            except RuntimeError:
+                pass
+        net = graph.eliminateSequential(ordering, gtsam.EliminateQR)
+        return net, net.optimize()
+    except RuntimeError as error:
+        raise CalibrationError(
+            f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
+            todo="check the priors: every component needs a positive intensity",
+        ) from error
+
+
+def _ordering(frame: Frame) -> Any:
+    """Time order; what ends (a bubble's mean, a mark) right after it was last seen; rest last."""
+    import gtsam
+
+    base, problem = frame.base(), frame.problem
+    nodes = np.arange(len(frame.nodes.t_s)) if frame.shake.size else np.zeros(0, np.int64)
+    rows = np.arange(frame.rows)
+    last_row = frame.node_of_row[frame.first_row[1:] - 1] if len(problem.bubbles) else _NOTHING
+    last_mark = np.zeros(len(problem.marks), np.int64)
+    seen = frame.nodes.of_frame[problem.references.frame]
+    np.maximum.at(last_mark, problem.references.item, seen)
+    keys = [nodes, base[1] + rows, base[2] + np.arange(len(problem.bubbles))]
+    when = [nodes, frame.node_of_row, last_row]
+    keys.append(base[5] + np.arange(len(problem.marks)))
+    when.append(last_mark)
+    rank = np.repeat(np.arange(4), [len(k) for k in keys])
+    joined = np.concatenate(keys).astype(np.int64)
+    order = np.lexsort((joined, rank, np.concatenate(when)))
+    out = gtsam.Ordering()
+    for key in joined[order].tolist():
+        out.push_back(key)
+    counts = frame.counts()
+    for family in (3, 4, 6):
+        number, size = counts[family]
+        for key in range(base[family], base[family] + number * (size > 0)):
+            out.push_back(key)
+    return out

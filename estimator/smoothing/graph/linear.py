@@ -1,0 +1,269 @@
+"""The linear factors of one Gauss-Newton pass, as arrays: motion, images, sensors, priors.
+
+Every factor is whitened and stated for increments: |sum_k A_k d_k - b|^2, where the increments of
+shake and bubble states are in their whitening basis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.estimator.calibration.solver.covariance import rig_jacobian
+from telerig.estimator.smoothing.graph.blocks import Linear, log_det_of, repeated
+from telerig.estimator.smoothing.graph.linear_sensors import accelerometers, encoder
+from telerig.estimator.smoothing.graph.state import Frame, State
+from telerig.estimator.smoothing.problem.problem import Observations
+from telerig.factors import measurements
+from telerig.factors.measurements import whitener_of
+from telerig.factors.motion import start
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def priors_and_motion(frame: Frame, state: State) -> list[Linear]:
+    """Everything but the measurements."""
+    out = _shake_motion(frame, state) + _bubble_motion(frame, state)
+    return out + _constant_priors(frame, state)
+
+
+def _shake_motion(frame: Frame, state: State) -> list[Linear]:
+    layout = frame.shake
+    if not layout.size:
+        return []
+    keys = np.arange(len(frame.nodes.t_s))
+    steps = frame.shake_motion
+    deviation = state.shake.copy()
+    at = 0
+    for i, component in enumerate(layout.components):
+        if component.memoryless:
+            deviation[:, at] -= frame.nominal_mm
+        elif i == 0 and frame.problem.stage is not None:
+            deviation[:, at] -= frame.nominal_mm[0]
+        at += component.size
+    residual = steps.residual(deviation[:-1], deviation[1:], np.zeros(0))
+    blocks = steps.in_basis(np.append(steps.index[1:], -1))
+    between = Linear((keys[:-1], keys[1:]), blocks, -residual, steps.log_det[steps.index])
+    covariance, _ = start(layout.components)
+    whitener = whitener_of(covariance)
+    first = Linear(
+        (keys[:1],),
+        ((whitener @ frame.shake_basis(0))[None],),
+        -(whitener @ deviation[0])[None],
+        log_det_of(whitener)[None],
+    )
+    return [first, between]
+
+
+def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
+    problem, layout = frame.problem, frame.bubble
+    if not problem.bubbles:
+        return []
+    base = frame.base()
+    firsts, rows = frame.first_row[:-1], frame.moving_rows
+    covariance, by_input = start(layout.components)
+    whitener = whitener_of(covariance)
+    places = np.array([b.start_mm for b in problem.bubbles])
+    means = state.means[:, :3]
+    off = state.bubbles[firsts] - means @ by_input.T
+    off[:, [0, 2, 4]] -= places
+    numbers = np.arange(len(firsts))
+    wide = _with_columns(-whitener @ by_input, frame.mean_size)
+    begin = Linear(
+        (base[1] + firsts, base[2] + numbers),
+        (whitener @ frame.bubble_basis(firsts), repeated(wide, len(firsts))),
+        -off @ whitener.T,
+        np.full(len(firsts), log_det_of(whitener)),
+    )
+    if not len(rows):
+        return [begin]
+    steps, owner = frame.bubble_motion, frame.bubble_of_row[rows]
+    residual = steps.residual(state.bubbles[rows], state.bubbles[rows + 1], means[owner])
+    i = steps.index
+    blocks = (
+        *steps.in_basis(frame.row_basis[rows + 1]),
+        _with_columns(steps.by_input, frame.mean_size)[i],
+    )
+    keys = (base[1] + rows, base[1] + rows + 1, base[2] + owner)
+    return [begin, Linear(keys, blocks, -residual, steps.log_det[i])]
+
+
+def _constant_priors(frame: Frame, state: State) -> list[Linear]:
+    model, problem, base = frame.model, frame.problem, frame.base()
+    scale, delay = frame.sensor_flags
+    out = [_prior(base[2], state.means[:, :3], model.bubble.mean_sigma_mm_s, frame.mean_size)]
+    if frame.mean_size == 4:
+        value = np.concatenate([state.means[:, :3], state.means[:, 3:]], 1)
+        sigma = np.full(4, model.bubble.mean_sigma_mm_s)
+        out = [_prior(base[2], value, sigma)]
+    if problem.accelerometers:
+        extra = [model.accelerometer_scale_sigma] * scale
+        sigma = np.array([[a.bias_sigma_mm_s2] * 3 + extra for a in problem.accelerometers])
+        out.append(_prior(base[3], state.sensors, sigma))
+        if delay:
+            given = np.array([a.delay_s for a in problem.accelerometers])
+            _, first = np.unique(frame.clock_of, return_index=True)
+            value = state.clocks + (frame.delays_s - given)[first, None]
+            out.append(_prior(base[6], value, model.accelerometer_delay_sigma_s))
+    sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
+    sigmas = np.concatenate([sigmas[np.array(frame.encoder_flags)], np.ones(frame.share_size)])
+    out.append(_prior(base[4], np.concatenate([state.encoder, state.calibration])[None], sigmas))
+    if problem.marks:
+        guess = np.array([m.guess_mm for m in problem.marks])
+        sigma = np.array([[m.sigma_mm] for m in problem.marks])
+        out.append(_prior(base[5], state.marks - guess, sigma))
+    return [p for p in out if p.rhs.size]
+
+
+def _prior(base: int, value: Array, sigma: ArrayLike, size: int | None = None) -> Linear:
+    count, width = value.shape
+    scale = np.broadcast_to(1 / np.asarray(sigma, float), (count, width))
+    block = scale[:, :, None] * np.eye(width)
+    keys = base + np.arange(count)
+    return Linear((keys,), (block,), -value * scale, np.log(scale).sum(-1))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Predictions of images: whitened residuals (M, 2), for the robust weights."""
+
+    linear: list[Linear]
+    residual: Array
+
+
+def images(frame: Frame, state: State, weight: Array) -> Seen:
+    """Pixels of the bubbles; weight (M,)."""
+    problem, layout = frame.problem, frame.bubble
+    obs = problem.observations
+    rows = frame.row(obs.item, obs.frame)
+    states = state.bubbles[rows]
+    points = states @ layout.position.T
+    basis = frame.bubble_basis(rows)
+    by_point = layout.position @ basis
+    shift = np.einsum("mid,md->mi", layout.wander[obs.camera], states)
+    extra = layout.wander[obs.camera] @ basis
+    keys = frame.base()[1] + rows
+    return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
+
+
+def references(frame: Frame, state: State, weight: Array) -> Seen:
+    """Pixels of the marks fixed to the tank; weight (R,)."""
+    obs = frame.problem.references
+    points = state.marks[obs.item]
+    keys = frame.base()[5] + obs.item
+    extra, shift = np.zeros((len(obs), 2, 3)), np.zeros((len(obs), 2))
+    by_point = repeated(np.eye(3), len(obs))
+    return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
+
+
+def _seen(
+    frame: Frame,
+    state: State,
+    obs: Observations,
+    weight: Array,
+    points: Array,
+    by_state: Array,
+    keys: Ints,
+    shift: Array,
+    extra: Array,
+) -> Seen:
+    """``points`` (M, 3) of keys whose states move them by ``by_state``, their images ``extra``."""
+    problem, layout, base = frame.problem, frame.shake, frame.base()
+    inflation = frame.model.pixel_inflation
+    whitener = whitener_of(obs.covariance_px2) / inflation
+    out, residual = [], np.zeros((len(obs), 2))
+    at_frames = frame.shake_at_frames(state.shake)
+    position, gain, by_scale = measurements.carriage_position(
+        at_frames @ layout.position, state.encoder_scale(frame)
+    )
+    for c, camera in enumerate(problem.cameras):
+        mine = np.flatnonzero(obs.camera == c)
+        if not len(mine):
+            continue
+        node = frame.nodes.of_frame[obs.frame[mine]]
+        shake = at_frames[obs.frame[mine]]
+        seen = measurements.image_of_point(
+            camera, points[mine], position[obs.frame[mine]], problem.axis,
+            shake @ layout.offset[c].T, shake @ layout.pitch[c],
+        )  # fmt: skip
+        by_shake = (
+            seen.by_offset @ layout.offset[c]
+            + seen.by_position[..., None] * (gain * layout.position)
+            + seen.by_pitch[..., None] * layout.pitch[c]
+        )
+        if frame.to_frames is not None:
+            by_shake = by_shake @ frame.to_frames[obs.frame[mine]]
+        off = seen.uv_px + shift[mine] - obs.uv_px[mine]
+        by_rig = np.zeros((len(mine), 2, 0))
+        if problem.calibration is not None and len(state.calibration):
+            by_rig = _by_calibration(frame, c, points[mine], position[obs.frame[mine]], shake)
+            off += by_rig @ state.calibration
+        by_travel = seen.by_position * by_scale[obs.frame[mine], None]
+        w = whitener[mine]
+        residual[mine] = np.einsum("mij,mj->mi", w, off)
+        root = np.sqrt(weight[mine])
+        w = w * root[:, None, None]
+        blocks = (
+            w @ (seen.by_point @ by_state[mine] + extra[mine]),
+            w @ (by_shake @ frame.shake_basis(node)),
+            w @ np.concatenate([frame.by_scale(by_travel), by_rig], -1),
+        )
+        rhs = -residual[mine] * root[:, None]
+        log_det = log_det_of(whitener[mine])
+        linear = Linear((keys[mine], node, base[4]), blocks, rhs, log_det, weight[mine])
+        out.append(linear)
+    return Seen(out, residual)
+
+
+def _by_calibration(
+    frame: Frame, camera: int, points: Array, position: Array, shake: Array
+) -> Array:
+    """(M, 2, r) pixels by the unit directions of the calibration's uncertainty."""
+    problem, share = frame.problem, frame.problem.calibration
+    assert share is not None
+    rig = points - position[:, None] * problem.axis - shake @ frame.shake.offset[camera].T
+    rows = rig_jacobian(problem.cameras, share.free, rig)[..., 2 * camera : 2 * camera + 2, :]
+    return np.asarray(rows @ share.root)
+
+
+def speeds(frame: Frame, state: State) -> list[Linear]:
+    """How constant the bubbles' speed is, if that is part of the model."""
+    sigma = frame.model.bubble.speed_sigma_mm_s
+    if sigma is None or not frame.rows:
+        return []
+    layout, base = frame.bubble, frame.base()
+    owner = frame.bubble_of_row
+    velocity = state.bubbles @ layout.velocity.T
+    value, by_velocity, by_speed = measurements.speed_residual(
+        velocity, state.means[owner, 3], frame.problem.up
+    )
+    by_mean = np.zeros((len(owner), 1, 4))
+    by_mean[:, 0, 3] = by_speed / sigma
+    every = frame.bubble_basis(np.arange(frame.rows))
+    by_state = (by_velocity @ layout.velocity)[:, None] @ every / sigma
+    keys = (base[1] + np.arange(frame.rows), base[2] + owner)
+    log_det = np.full(len(owner), -np.log(sigma))
+    return [Linear(keys, (by_state, by_mean), -value[:, None] / sigma, log_det)]
+
+
+def all_factors(frame: Frame, state: State, weights: tuple[Array, Array]) -> list[Linear]:
+    """Every factor of the graph; weights of the bubbles' and of the marks' pixels."""
+    out = priors_and_motion(frame, state)
+    out += images(frame, state, weights[0]).linear + references(frame, state, weights[1]).linear
+    return out + encoder(frame, state) + accelerometers(frame, state) + speeds(frame, state)
+
+
+def pixel_residuals(frame: Frame, state: State) -> tuple[Array, Array]:
+    """Whitened residuals of the bubbles' (M, 2) and of the marks' pixels (R, 2)."""
+    problem = frame.problem
+    ones = np.ones(len(problem.observations)), np.ones(len(problem.references))
+    return images(frame, state, ones[0]).residual, references(frame, state, ones[1]).residual
+
+
+def _with_columns(block: Array, columns: int) -> Array:
+    """Zero columns added on the right."""
+    missing = columns - block.shape[-1]
+    return np.concatenate([block, np.zeros((*block.shape[:-1], missing))], -1)

@@ -1,0 +1,123 @@
+"""How well the stage's travel is known, and what that leaves open of places in the lab.
+
+Images and sensors on the stage see what moves past them, so an error of the encoder's scale or of
+the travel axis moves bubbles and carriage together and leaves no trace in any residual. Such
+constants are not estimated: their covariance is added to that of the places (a consider, or
+Schmidt, parameter). Marks fixed to the tank do tell the scale; there it is a variable of the graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.problem.problem import ShakeModel, Travel
+from telerig.rig.pose import across
+
+Array = NDArray[np.float64]
+
+SCALE_SIGMA = 1e-3
+"""Of an encoder of which nothing is said: lead screws, belts, thermal growth."""
+_FAR = 3.0
+
+
+def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
+    """What `stage_axis/` showed (calibration.json's ``stage``), else what rig.toml says.
+
+    described : `StageDescription` or None, which means upwards in the images.
+    """
+    if calibrated:
+        return Travel(
+            np.asarray(calibrated["axis"], float),
+            np.asarray(calibrated["basis"], float),
+            float(calibrated["encoder_scale"]),
+            np.asarray(calibrated["joint_covariance"], float),
+            "stage_axis",
+        )
+    axis, stated = np.array([0.0, -1.0, 0.0]), None
+    if described is not None:
+        axis, stated = np.asarray(described.axis, float), described.scale_sigma
+    axis = axis / np.linalg.norm(axis)
+    basis = across(axis)
+    sigma = SCALE_SIGMA if stated is None else stated
+    source: Literal["rig.toml", "assumed"] = "assumed" if stated is None else "rig.toml"
+    return Travel(axis, basis, 0.0, np.diag([0.0, 0.0, sigma**2]), source)
+
+
+def default_scale_sigma(travel: Travel | None) -> float:
+    """Prior of the encoder's scale where marks tell it.
+
+    Not wider for that: a lens that is not quite telecentric and sees marks at unknown depths tells
+    the scale hardly at all. See `widened`.
+    """
+    return SCALE_SIGMA if travel is None else float(np.sqrt(travel.covariance[2, 2]))
+
+
+def widened(solution: Solution) -> float | None:
+    """The prior's sd for a scale that the run puts far outside an assumed one; None: it stays.
+
+    Twice the estimate, which the narrow prior has drawn towards 0.
+    """
+    prior, travel = solution.frame.model.encoder_scale_sigma, solution.frame.problem.travel
+    assumed = travel is None or travel.source == "assumed"
+    if not solution.frame.encoder_flags[0] or not assumed:
+        return None
+    off = abs(solution.state.encoder_scale(solution.frame))
+    return 2 * off if off > _FAR * prior else None
+
+
+def left_open(solution: Solution) -> tuple[Array, Array]:
+    """(rows, 3) variances of the bubbles' positions and velocities from scale and axis."""
+    at = solution.frame.frame_of_row
+    places, speeds = carriage(solution)
+    return _variance(solution, places[at]), _variance(solution, speeds[at])
+
+
+def carriage(solution: Solution) -> tuple[Array, Array]:
+    """(F,) position (mm) and velocity (mm/s) along the axis at the frames, scale taken off."""
+    frame, t = solution.frame, solution.frame.problem.t_s
+    readings = frame.shake_at_frames(solution.state.shake) @ frame.shake.position
+    position = readings / (1 + solution.state.encoder_scale(frame))
+    return position, np.asarray(np.gradient(position, t))
+
+
+def carriage_sigma(solution: Solution, states_sigma: Array) -> Array:
+    """(F,) sd of the carriage's position, from that of the readings' states (F,) and the scale."""
+    position, _ = carriage(solution)
+    return np.asarray(np.hypot(states_sigma, position * scale_sigma(solution)))
+
+
+def scale_sigma(solution: Solution) -> float:
+    """Posterior sd of the encoder's scale: of the variable, or what was known before."""
+    frame, found = solution.frame, solution.covariances
+    if frame.encoder_flags[0]:
+        return 0.0 if found is None else float(np.sqrt(found.encoder[0, 0]))
+    travel = frame.problem.travel
+    return 0.0 if travel is None else float(np.sqrt(travel.covariance[2, 2]))
+
+
+def total_scale(solution: Solution) -> float:
+    """(reading - travel) / travel: the calibrated scale and what the run adds to it."""
+    travel = solution.frame.problem.travel
+    before = 0.0 if travel is None else travel.scale
+    return float((1 + before) * (1 + solution.state.encoder_scale(solution.frame)) - 1)
+
+
+def considered(travel: Travel, model: ShakeModel) -> Array:
+    """(3, 3) covariance of (tilts, scale), without the scale where it is a variable."""
+    keep = np.array([1.0, 1.0, float(model.encoder_scale_sigma == 0)])
+    return np.asarray(travel.covariance * np.outer(keep, keep))
+
+
+def _variance(solution: Solution, along: Array) -> Array:
+    """(n, 3) variances of ``axis * along`` (n,)."""
+    travel, stage = solution.frame.problem.travel, solution.frame.problem.stage
+    if travel is None or stage is None:
+        return np.zeros((len(along), 3))
+    turn = np.column_stack([travel.basis, -travel.axis])
+    each = np.diagonal(turn @ considered(travel, solution.frame.model) @ turn.T)
+    return np.asarray(along[:, None] ** 2 * each)

@@ -1,0 +1,261 @@
+"""Values of everything in the graph, and the keys under which GTSAM knows them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.estimator.smoothing.graph.layout import (
+    BubbleLayout,
+    Nodes,
+    ShakeLayout,
+    bubble_layout,
+    carry,
+    nodes_of,
+    shake_layout,
+)
+from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+from telerig.factors.motion import Motion, motion
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class State:
+    """shake : (N, Ds), the carriage in units of the encoder's reading.
+
+    bubbles : (sum of lengths, Db), one bubble after the other.
+    means : (K, 3), or (K, 4) with the constant speed.  sensors : (A, 3 or 4) bias, scale.
+    encoder : (0..2,) scale, delay.  calibration : (r,).  marks : (Q, 3).  clocks : (G, 0 or 1)
+    delay of the accelerometers' clocks beyond that at which the nodes are placed.
+    """
+
+    shake: Array
+    bubbles: Array
+    means: Array
+    sensors: Array
+    encoder: Array
+    calibration: Array
+    marks: Array
+    clocks: Array
+
+    def encoder_scale(self, frame: Frame) -> float:
+        """0 where it is held."""
+        return float(self.encoder[0]) if frame.encoder_flags[0] else 0.0
+
+    def encoder_delay_s(self, frame: Frame) -> float:
+        """0 where it is held."""
+        return float(self.encoder[-1]) if frame.encoder_flags[1] else 0.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The fixed part of one linearisation: layouts, nodes and the keys' order.
+
+    nominal_mm : (N,) the carriage's prior mean.  delays_s : (A,) at which the nodes are placed.
+    clock_of : (A,) sensors with the same stamps share a clock.
+    first_row : (K + 1,) where each bubble's rows begin.  sizes : dimension of each family of keys.
+    """
+
+    problem: SmoothingProblem
+    model: ShakeModel
+    shake: ShakeLayout
+    bubble: BubbleLayout
+    nodes: Nodes
+    delays_s: Array
+    clock_of: Ints
+    nominal_mm: Array
+    first_row: Ints
+    node_of_row: Ints
+    bubble_of_row: Ints
+    frame_of_row: Ints
+    shake_motion: Motion
+    bubble_motion: Motion
+    moving_rows: Ints
+
+    def shake_basis(self, node: ArrayLike) -> Array:
+        """(..., D, D) basis of the increments at nodes (...)."""
+        return np.asarray(self.shake_motion.basis[_basis_index(self.shake_motion.index, node)])
+
+    @cached_property
+    def to_frames(self) -> Array | None:
+        """(F, D, D) from the shake's state at its node to that at the frame; None: the same."""
+        return carry(self.shake.components, self.nodes.frame_late_s)
+
+    @cached_property
+    def to_encoder(self) -> Array | None:
+        """(E, D, D) from the shake's state at its node to that at each reading."""
+        return carry(self.shake.components, self.nodes.encoder_late_s)
+
+    def shake_at_frames(self, shake: Array) -> Array:
+        """(F, D) states at the frames from those at the nodes (N, D)."""
+        states = shake[self.nodes.of_frame]
+        if self.to_frames is None:
+            return np.asarray(states)
+        return np.asarray((self.to_frames @ states[..., None])[..., 0])
+
+    @cached_property
+    def row_basis(self) -> Ints:
+        """(rows,) which basis of the bubbles' motion each row has."""
+        out = np.full(self.rows, len(self.bubble_motion.basis) - 1)
+        out[self.moving_rows] = self.bubble_motion.index
+        return out
+
+    def bubble_basis(self, row: ArrayLike) -> Array:
+        """(..., D, D) basis of the increments of bubble rows (...)."""
+        return np.asarray(self.bubble_motion.basis[self.row_basis[np.asarray(row)]])
+
+    @property
+    def rows(self) -> int:
+        return int(self.first_row[-1])
+
+    def row(self, bubble: Ints, frame: Ints) -> Ints:
+        first = np.array([b.first for b in self.problem.bubbles], np.int64)
+        return np.asarray(self.first_row[bubble] + frame - first[bubble])
+
+    @property
+    def mean_size(self) -> int:
+        return 3 if self.model.bubble.speed_sigma_mm_s is None else 4
+
+    @property
+    def sensor_flags(self) -> tuple[bool, bool]:
+        model = self.model
+        return model.accelerometer_scale_sigma > 0, model.accelerometer_delay_sigma_s > 0
+
+    @property
+    def encoder_flags(self) -> tuple[bool, bool]:
+        """Whether the encoder's scale and its delay are variables."""
+        read = self.problem.stage is not None
+        model = self.model
+        return read and model.encoder_scale_sigma > 0, read and model.encoder_delay_sigma_s > 0
+
+    def by_scale(self, column: Array) -> Array:
+        """(..., n, 0 to 2) derivatives by the encoder's scale and delay, from (..., n) by scale."""
+        both = np.stack([column, np.zeros_like(column)], -1)
+        return np.asarray(both[..., np.array(self.encoder_flags)])
+
+    @property
+    def encoder_size(self) -> int:
+        return sum(self.encoder_flags)
+
+    @property
+    def share_size(self) -> int:
+        """Directions of the calibration's uncertainty."""
+        share = self.problem.calibration
+        return 0 if share is None else int(share.root.shape[1])
+
+    def counts(self) -> list[tuple[int, int]]:
+        """(number, dimension) of the keys of each family, in the order of `State`.
+
+        Encoder and calibration are one key: a factor takes three at most.
+        """
+        problem = self.problem
+        return [
+            (len(self.nodes.t_s), self.shake.size),
+            (self.rows, self.bubble.size),
+            (len(problem.bubbles), self.mean_size),
+            (len(problem.accelerometers), 3 + self.sensor_flags[0]),
+            (1, self.encoder_size + self.share_size),
+            (len(problem.marks), 3),
+            (int(self.clock_of.max(initial=-1)) + 1, int(self.sensor_flags[1])),
+        ]
+
+    def base(self) -> list[int]:
+        """The first key of each family."""
+        return [0, *(int(n) for n in np.cumsum([n for n, _ in self.counts()]))]
+
+
+def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> Frame:
+    """Lay everything out for given delays of the accelerometers."""
+    nodes = nodes_of(problem, model, delays_s.tolist())
+    stage = problem.stage
+    nominal = np.zeros(len(nodes.t_s))
+    if stage is not None:
+        nominal = np.interp(nodes.t_s, stage.t_s, stage.position_mm)
+    lengths = np.array([len(b) for b in problem.bubbles], np.int64)
+    first_row = np.r_[0, np.cumsum(lengths)].astype(np.int64)
+    frames = [np.arange(b.first, b.last + 1) for b in problem.bubbles]
+    frame_of_row = np.concatenate([*frames, np.zeros(0, np.int64)]).astype(np.int64)
+    shake = shake_layout(problem, model)
+    bubble = bubble_layout(model.bubble, len(problem.cameras))
+    moving = np.setdiff1d(np.arange(len(frame_of_row)), first_row[1:] - 1)
+    t = problem.t_s[frame_of_row]
+    return Frame(
+        problem, model, shake, bubble, nodes, delays_s, clocks_of(problem), nominal, first_row,
+        nodes.of_frame[frame_of_row],
+        np.repeat(np.arange(len(lengths)), lengths),
+        frame_of_row,
+        motion(shake.components, np.diff(nodes.t_s)),
+        motion(bubble.components, t[moving + 1] - t[moving]),
+        moving,
+    )  # fmt: skip
+
+
+def clocks_of(problem: SmoothingProblem) -> Ints:
+    """(A,) number of each sensor's clock: those with the same stamps were sampled together."""
+    known: dict[tuple[bytes, float], int] = {}
+    numbers = [
+        known.setdefault((a.t_s.tobytes(), a.delay_s), len(known)) for a in problem.accelerometers
+    ]
+    return np.array(numbers, np.int64)
+
+
+def _basis_index(index: Ints, node: ArrayLike) -> Ints:
+    return np.asarray(np.append(index, -1)[np.asarray(node)])
+
+
+def first_guess(frame: Frame) -> State:
+    """Bubbles where the cameras first saw them, the carriage where the encoder was, no shake."""
+    problem = frame.problem
+    shapes = frame.counts()
+    values = [np.zeros(shape) for shape in shapes]
+    shake, bubbles, means = values[0], values[1], values[2]
+    if problem.stage is not None:
+        _guess_carriage(frame, shake)
+    for k, bubble in enumerate(problem.bubbles):
+        rows = slice(frame.first_row[k], frame.first_row[k + 1])
+        t = problem.t_s[bubble.first : bubble.last + 1]
+        slope = np.zeros(3)
+        if len(bubble) > 1:
+            slope = np.polyfit(t - t.mean(), bubble.guess_mm, 1)[0]
+        for axis in range(3):
+            bubbles[rows, 2 * axis] = bubble.guess_mm[:, axis]
+            bubbles[rows, 2 * axis + 1] = slope[axis]
+        means[k, :3] = slope
+        means[k, 3:] = max(float(np.linalg.norm(slope)), 1.0)
+    if len(problem.marks):
+        values[5][:] = [m.guess_mm for m in problem.marks]
+    encoder, calibration = np.split(values[4][0], [frame.encoder_size])
+    return State(shake, bubbles, means, values[3], encoder, calibration, *values[5:])
+
+
+def _guess_carriage(frame: Frame, shake: Array) -> None:
+    t, s = frame.nodes.t_s, frame.nominal_mm
+    shake[:, 0] = s
+    if not frame.shake.components[0].memoryless:
+        shake[:, 1] = np.gradient(s, t)
+
+
+def moved(frame: Frame, state: State, step: Array) -> State:
+    """The state after an increment, keys in their order."""
+    counts = [n * d for n, d in frame.counts()]
+    parts = np.split(step, np.cumsum(counts)[:-1])
+    shaped = [p.reshape(n, d) for p, (n, d) in zip(parts, frame.counts())]
+    return State(
+        state.shake + times(frame.shake_basis(np.arange(len(shaped[0]))), shaped[0]),
+        state.bubbles + times(frame.bubble_basis(np.arange(len(shaped[1]))), shaped[1]),
+        state.means + shaped[2],
+        state.sensors + shaped[3],
+        state.encoder + shaped[4][0, : frame.encoder_size],
+        state.calibration + shaped[4][0, frame.encoder_size :],
+        state.marks + shaped[5],
+        state.clocks + shaped[6],
+    )
+
+
+def times(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])

@@ -1,0 +1,118 @@
+"""What is learned together: the channels of a group, and which hyper-parameters they determine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoothing.learning.lines_of_sight import Channel, pooled
+from telerig.estimator.smoothing.learning.parameters import FORCE, names_of
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel, Triple
+
+Array = NDArray[np.float64]
+Where = int | str
+
+BUBBLE = "bubble"
+
+
+@dataclass(frozen=True)
+class Learning:
+    """What may be learned.
+
+    most_modes : lines of one kind (common, each arm, bubble) at most, in the vertical and across.
+    hold : patterns of names (see ``parameters``) that keep the start's values,
+        "modes.*" for instance for a rig that is known. The forces' corner, which all modes
+        share, is held with any mode of which all is held.
+    target : the tracks are those of a target standing still in the lab, not of bubbles.
+    force_hz : corner of the modes' force to begin with, None for a white one, which gets a corner
+        where the data ask for it.
+    """
+
+    most_modes: int = 3
+    hold: tuple[str, ...] = ()
+    target: bool = False
+    force_hz: float | None = None
+
+
+@dataclass(frozen=True)
+class Group:
+    """Channels learned together.
+
+    pattern : (3,) share of a line's RMS along the rig's axes.  wheres : what a line could be.
+    fast : the channels as their likelihood is worked out, see `pooled`.
+    """
+
+    channels: tuple[Channel, ...]
+    pattern: Triple
+    wheres: tuple[Where, ...]
+    up: Array
+
+    @cached_property
+    def fast(self) -> tuple[Channel, ...]:
+        return tuple(part for channel in self.channels for part in pooled(channel))
+
+
+def groups_of(channels: Sequence[Channel], options: Learning, up: Array) -> list[Group]:
+    """The shared coordinate, and what lies across it, alike whichever way; up : (3,)."""
+    if not channels:
+        return []
+    bubble: tuple[Where, ...] = () if options.target else (BUBBLE,)
+    shared = channels[0]
+    own: tuple[Where, ...] = shared.cameras if len(shared.cameras) > 1 else ()
+    square = shared.direction**2
+    groups = [Group((shared,), _pattern(square), (CARRIAGE, *own, *bubble), up)]
+    if len(channels) > 1:
+        directions = np.array([c.direction for c in channels[1:]])
+        across = np.diagonal(np.linalg.pinv(directions) @ directions)
+        groups.append(Group(tuple(channels[1:]), _pattern(across), (CARRIAGE, *bubble), up))
+    return groups
+
+
+def _pattern(square: Array) -> Triple:
+    x, y, z = (float(np.sqrt(s)) if s > 1e-3 else 0.0 for s in square)
+    return x, y, z
+
+
+def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) -> list[str]:
+    """Names of what this group determines and nobody holds."""
+    names = []
+    for name in names_of(model):
+        if is_held(name, model, options):
+            continue
+        if name == FORCE:
+            if any(_concerns(group, model, f"modes.{i}.rms_mm") for i in _with_corner(model)):
+                names.append(name)
+        elif name.startswith(("modes", "bubble.zigzags", "broad_bands")):
+            if _concerns(group, model, name):
+                names.append(name)
+        elif first and not (options.target and name.startswith("bubble")):
+            names.append(name)
+    return names
+
+
+def is_held(name: str, model: ShakeModel, options: Learning) -> bool:
+    """Whether the user keeps that hyper-parameter as it is."""
+    names = [name]
+    if name == FORCE:
+        names += [f"modes.{i}.force_hz" for i in range(len(model.modes))]
+    return any(fnmatch(n, pattern) for n in names for pattern in options.hold)
+
+
+def _with_corner(model: ShakeModel) -> list[int]:
+    return [i for i, mode in enumerate(model.modes) if mode.force_hz is not None]
+
+
+def _concerns(group: Group, model: ShakeModel, name: str) -> bool:
+    """Whether a line moves along the group's directions more than along the others."""
+    parts = name.split(".")
+    lines = model.bubble.zigzags if parts[0] == "bubble" else getattr(model, parts[0])
+    rms = np.asarray(lines[int(parts[-2])].rms_mm)
+    inside = np.asarray(group.pattern) > 0.7
+    if parts[0] == "bubble" and group.channels[0].moving.sum() == 0:
+        return False
+    return bool(rms[inside].max(initial=0.0) > rms[~inside].max(initial=0.0))

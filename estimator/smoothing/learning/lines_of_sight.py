@@ -1,0 +1,241 @@
+"""One coordinate at a time: what the cameras say along each direction that they see.
+
+For cameras without distortion of the second order in shake, a pixel is a linear function of the
+bubble's place across the line of sight. Along one direction d seen by camera j it says
+d . (bubble - offset_j), the encoder added. The coordinate that two cameras share (their common
+perpendicular) makes one channel, each camera's other coordinate another. Learning and the swaps of
+labels work on channels: a few states each, where the whole graph has dozens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
+from telerig.factors.measurements import image_of_point
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MOST_BUBBLES = 6
+"""So many bubbles, those seen longest, are what the rig's shake is learned from."""
+_PARALLEL = 0.02
+_ACROSS = 0.2
+_PRESENT = 0.75
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Measurements of one coordinate.
+
+    direction : (3,) unit vector in rig axes.  cameras : indices of those that see it.
+    t_s : (F,).  value_mm, weight : (F, P) measured d . (item - offset) less ``start_mm``, and
+    1 / variance, 0 where nothing was seen; P = pairs of an item and a camera.
+    item, camera : (P,) of each pair, the camera as index into ``cameras``.
+    moving : (I,) False for what is fixed to the tank.  first : (I,) frame it was first seen.
+    start_mm : (I,).  start_sigma_mm : (I,) prior of a fixed item's place.
+    bubble : (I,) index into the problem's bubbles, -1 for marks.
+    pooled : number of bubbles whose mean the moving item is.  shaken : False for differences of
+    bubbles, (F, P, R) values that no shake reaches.
+    """
+
+    direction: Array
+    cameras: tuple[int, ...]
+    t_s: Array
+    value_mm: Array
+    weight: Array
+    item: Ints
+    camera: Ints
+    moving: NDArray[np.bool_]
+    first: Ints
+    start_mm: Array
+    start_sigma_mm: Array
+    bubble: Ints
+    pooled: int = 1
+    shaken: bool = True
+
+    @property
+    def samples(self) -> int:
+        return int((self.weight > 0).sum())
+
+
+def seen_channels(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, ...]]]:
+    """Directions (3,) with the cameras that see them; the shared one first, if there is one."""
+    depths = np.array([c.camera_from_rig.rotation[2] for c in problem.cameras])
+    cross = np.cross(depths[0], depths[-1])
+    length = float(np.linalg.norm(cross))
+    if length < _PARALLEL:
+        rotation = problem.cameras[0].camera_from_rig.rotation
+        every = tuple(range(len(depths)))
+        return [(_signed(rotation[1]), every), (_signed(rotation[0]), every)]
+    shared = cross / length
+    out = [(_signed(shared), tuple(np.flatnonzero(np.abs(depths @ shared) < _ACROSS).tolist()))]
+    for j, depth in enumerate(depths):
+        lateral = np.cross(depth, shared)
+        out.append((_signed(lateral / np.linalg.norm(lateral)), (j,)))
+    return out
+
+
+def _signed(direction: Array) -> Array:
+    """The same line, its largest component positive."""
+    return np.asarray(direction * np.sign(direction[np.abs(direction).argmax()]))
+
+
+def channels_of(
+    problem: SmoothingProblem,
+    weights: tuple[Array, Array] | None = None,
+    *,
+    fixed: bool = False,
+    most_bubbles: int = MOST_BUBBLES,
+) -> tuple[Channel, ...]:
+    """The problem's channels, of the bubbles that were seen longest and all marks.
+
+    weights : of the bubbles' and the marks' pixels, those below 0.5 are left out.
+    fixed : the tracks are those of a target that stands still in the lab.
+    """
+    bubbles, marks = problem.observations, problem.references
+    if weights is not None:
+        bubbles, marks = bubbles.of(weights[0] > 0.5), marks.of(weights[1] > 0.5)
+    seen = np.bincount(bubbles.item, minlength=len(problem.bubbles))
+    chosen = np.sort(np.argsort(-seen, kind="stable")[:most_bubbles])
+    position = np.zeros(len(problem.t_s))
+    if problem.stage is not None:
+        position = np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm)
+    out = []
+    for direction, cameras in seen_channels(problem):
+        parts = [_bubble_rows(problem, bubbles, chosen, position, direction, cameras)]
+        parts.append(_mark_rows(problem, marks, len(chosen), position, direction, cameras))
+        out.append(_channel(problem, direction, cameras, parts, chosen, fixed))
+    return tuple(out)
+
+
+_Rows = tuple[Ints, Ints, Ints, Array, Array]
+"""Item, frame, camera (as index into the channel's), value (mm), variance (mm^2)."""
+
+
+def _bubble_rows(
+    problem: SmoothingProblem, obs: Observations, chosen: Ints, position: Array, direction: Array,
+    cameras: tuple[int, ...],
+) -> _Rows:  # fmt: skip
+    number = np.full(len(problem.bubbles), -1)
+    number[chosen] = np.arange(len(chosen))
+    obs = obs.of(number[obs.item] >= 0)
+    firsts = np.array([b.first for b in problem.bubbles], np.int64)
+    lengths = np.array([len(b) for b in problem.bubbles], np.int64)
+    guesses = np.concatenate([*(b.guess_mm for b in problem.bubbles), np.zeros((0, 3))])
+    begin = np.r_[0, np.cumsum(lengths)]
+    points = guesses[begin[obs.item] + obs.frame - firsts[obs.item]]
+    rows = _along(problem, obs, points, position, direction, cameras)
+    return (number[rows[0]], *rows[1:])
+
+
+def _mark_rows(
+    problem: SmoothingProblem, obs: Observations, offset: int, position: Array, direction: Array,
+    cameras: tuple[int, ...],
+) -> _Rows:  # fmt: skip
+    places = np.array([m.guess_mm for m in problem.marks]).reshape(-1, 3)
+    rows = _along(problem, obs, places[obs.item], position, direction, cameras)
+    return (rows[0] + offset, *rows[1:])
+
+
+def _along(
+    problem: SmoothingProblem, obs: Observations, points: Array, position: Array, direction: Array,
+    cameras: tuple[int, ...],
+) -> _Rows:  # fmt: skip
+    """Pixels turned into lab coordinates along the direction, linearised at ``points``."""
+    parts: list[_Rows] = []
+    for index, c in enumerate(cameras):
+        mine = np.flatnonzero(obs.camera == c)
+        if not len(mine):
+            continue
+        s = position[obs.frame[mine]]
+        seen = image_of_point(problem.cameras[c], points[mine], s, problem.axis, np.zeros(3))
+        back = direction @ np.linalg.pinv(seen.by_point)
+        off = obs.uv_px[mine] - seen.uv_px
+        value = points[mine] @ direction + (back * off).sum(-1)
+        variance = ((back[:, None] @ obs.covariance_px2[mine])[:, 0] * back).sum(-1)
+        camera = np.full(len(mine), index)
+        parts.append((obs.item[mine], obs.frame[mine], camera, value, variance))
+    if not parts:
+        none = np.zeros(0, np.int64)
+        return none, none, none, np.zeros(0), np.zeros(0)
+    item, frame, camera, value, variance = (np.concatenate(p) for p in zip(*parts))
+    return item, frame, camera, value, variance
+
+
+def _channel(
+    problem: SmoothingProblem, direction: Array, cameras: tuple[int, ...], parts: list[_Rows],
+    chosen: Ints, fixed: bool,
+) -> Channel:  # fmt: skip
+    item, frame, camera, value, variance = (np.concatenate(p) for p in zip(*parts))
+    count = len(chosen) + len(problem.marks)
+    pair = item * len(cameras) + camera
+    pairs = np.unique(pair)
+    place = np.searchsorted(pairs, pair)
+    first = np.full(count, len(problem.t_s))
+    np.minimum.at(first, item, frame)
+    start = np.zeros(count)
+    for k, bubble in enumerate(chosen):
+        start[k] = problem.bubbles[bubble].start_mm @ direction
+    for k, mark in enumerate(problem.marks):
+        start[len(chosen) + k] = mark.guess_mm @ direction
+    values = np.zeros((len(problem.t_s), len(pairs)))
+    weight = np.zeros_like(values)
+    values[frame, place] = value - start[item]
+    weight[frame, place] = 1 / variance
+    sigma = np.r_[np.full(len(chosen), 100.0), [m.sigma_mm for m in problem.marks]]
+    moving = np.arange(count) < (0 if fixed else len(chosen))
+    bubble_of = np.r_[chosen, np.full(len(problem.marks), -1)].astype(np.int64)
+    return Channel(
+        direction, cameras, problem.t_s, values, weight, pairs // len(cameras),
+        pairs % len(cameras), moving, np.minimum(first, len(problem.t_s) - 1), start, sigma,
+        bubble_of,
+    )  # fmt: skip
+
+
+def pooled(channel: Channel) -> tuple[Channel, ...]:
+    """The mean of the bubbles, and their differences, where all were seen nearly all of the time.
+
+    For bubbles alike in noise and presence the two are independent, and the likelihood is that of
+    a single bubble twice, whatever their number. Few missing pixels are bridged by straight lines:
+    good enough to learn from. Other channels come back as they are.
+    """
+    movers = np.flatnonzero(channel.moving)
+    cameras, count = len(channel.cameras), len(movers)
+    pairs = np.flatnonzero(channel.moving[channel.item])
+    seen = channel.weight[:, pairs] > 0
+    if count < 2 or len(movers) < len(channel.moving) or len(pairs) != count * cameras:
+        return (channel,)
+    if seen.mean(0).min() < _PRESENT:
+        return (channel,)
+    whole, weight = _bridged(channel.t_s, channel.value_mm[:, pairs], channel.weight[:, pairs])
+    value = whole.reshape(-1, count, cameras)
+    each = weight.reshape(-1, count, cameras).mean(1)
+    one = np.zeros(cameras, np.int64)
+    alike = replace(
+        channel, item=one, camera=np.arange(cameras), moving=np.array([True]),
+        first=channel.first[movers].min(keepdims=True), start_mm=np.zeros(1),
+        start_sigma_mm=channel.start_sigma_mm[movers[:1]], bubble=np.array([-1]),
+    )  # fmt: skip
+    mean = replace(alike, value_mm=value.mean(1), weight=each * count, pooled=count)
+    turn = contrasts(count)
+    apart = np.einsum("rk,fkc->fcr", turn, value)
+    return mean, replace(alike, value_mm=apart, weight=each, shaken=False)
+
+
+def contrasts(count: int) -> Array:
+    """(count - 1, count) orthonormal rows that are blind to the mean (Helmert)."""
+    full = np.linalg.qr(np.c_[np.ones(count), np.eye(count)[:, : count - 1]])[0]
+    return np.asarray(full[:, 1:].T)
+
+
+def _bridged(t_s: Array, value: Array, weight: Array) -> tuple[Array, Array]:
+    """Values (F, P) with their gaps closed; weights (F, P), the same at all frames."""
+    out = value.copy()
+    for column in range(value.shape[1]):
+        good = weight[:, column] > 0
+        out[:, column] = np.interp(t_s, t_s[good], value[good, column])
+    return out, np.broadcast_to(weight.mean(0), weight.shape)

@@ -1,0 +1,252 @@
+"""Whose is a spectral line, the bubble's or the rig's? Moving lines, and what that costs.
+
+A line seen in one bubble is seen alike whoever owns it: the likelihood does not change when it is
+moved. Several bubbles, marks or sensors tell. What the images cannot tell is shared between both
+owners: with half of the variance each, the posterior says that the share is unknown, and its
+covariance holds the spread between the two readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoothing.learning.likelihood import Fit, evidence, maximise
+from telerig.estimator.smoothing.learning.lines_of_sight import Channel
+from telerig.estimator.smoothing.learning.parameters import prior_of
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel, Zigzag
+
+Array = NDArray[np.float64]
+
+AMBIGUOUS_NATS = 5.0
+HARMONIC_NATS = 7.0
+_SAME_HZ = 0.02
+_HARMONIC = 0.12
+_REFIT_NATS = 40.0
+_ZIGZAG_MM = 0.3
+_ZIGZAG_HZ = (3.0, 12.0)
+_SHARES = np.linspace(0.0, 1.0, 6)
+_NEAR_HZ, _ELSEWHERE_HZ = 0.1, 0.25
+_MORE = 3
+_LEAST_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class LineLabel:
+    """A line and what its other reading costs.
+
+    owner : "rig" or "bubble".  index : into the model's modes or zigzags.
+    cost_nats : by how much the data prefer this owner to the other, refitted; what is known
+    beforehand (the zigzag's second harmonic) is in ``prior_nats``.
+    """
+
+    owner: str
+    index: int
+    frequency_hz: float
+    rms_mm: float
+    cost_nats: float
+    prior_nats: float = 0.0
+
+    @property
+    def ambiguous(self) -> bool:
+        return self.cost_nats + self.prior_nats < AMBIGUOUS_NATS
+
+
+def labels(
+    channels: Sequence[Channel], model: ShakeModel, pattern: Sequence[float], up: Array
+) -> list[LineLabel]:
+    """The lines of these channels that could be the rig's as a whole or the bubbles'.
+
+    pattern : (3,) the directions along rig axes in which lines are moved.  up : (3,).
+    """
+    if not any(c.moving.any() for c in channels):
+        return []
+    at = evidence(channels, model)
+    out = []
+    for i, mode in enumerate(model.modes):
+        if _lies_in(mode.rms_mm, pattern) and _is_common(mode, channels):
+            cost = _cost(channels, model, moved_to_bubble(model, i), at)
+            label = LineLabel("rig", i, mode.frequency_hz, max(mode.rms_mm), cost)
+            out.append(label)
+    differential = any(m.camera != CARRIAGE for m in model.modes)
+    for i, line in enumerate(model.bubble.zigzags):
+        if _lies_in(line.rms_mm, pattern):
+            cost = _cost(channels, model, moved_to_rig(model, i), at)
+            prior = _own_motion_nats(model, i, differential, up)
+            out.append(LineLabel("bubble", i, line.frequency_hz, max(line.rms_mm), cost, prior))
+    return out
+
+
+def _is_common(mode: RigMode, channels: Sequence[Channel]) -> bool:
+    """Seen by all cameras of a channel alike: only then a bubble can look the same."""
+    if mode.camera == CARRIAGE:
+        return True
+    return all(c.cameras == (mode.camera,) for c in channels if mode.camera in c.cameras)
+
+
+def _lies_in(rms_mm: Sequence[float], pattern: Sequence[float]) -> bool:
+    rms, inside = np.asarray(rms_mm), np.asarray(pattern) > 0.7
+    return bool(rms[inside].max(initial=0.0) > rms[~inside].max(initial=0.0))
+
+
+def _cost(channels: Sequence[Channel], model: ShakeModel, other: ShakeModel, at: float) -> float:
+    """Loss of log likelihood, the lines refitted where that could matter."""
+    loss = at - evidence(channels, other)
+    if AMBIGUOUS_NATS / 2 < loss < _REFIT_NATS:
+        loss = min(loss, at - maximise(channels, other, _line_names(other), steps=8).log_evidence)
+    return float(loss)
+
+
+def _line_names(model: ShakeModel) -> list[str]:
+    stems = [f"modes.{i}" for i in range(len(model.modes))]
+    stems += [f"bubble.zigzags.{i}" for i in range(len(model.bubble.zigzags))]
+    return [f"{s}.{f}" for s in stems for f in ("frequency_hz", "rms_mm")]
+
+
+def _own_motion_nats(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
+    """What is known of bubbles before any image: wide swings are theirs, and twice their frequency.
+
+    The second harmonic is doubted where the cameras shake against each other, which shows a rig
+    that may well shake as a whole.
+    """
+    line = model.bubble.zigzags[index]
+    swings = [z for z in model.bubble.zigzags if is_zigzag(z, up)]
+    if line in swings:
+        return float("inf")
+    second = any(abs(line.frequency_hz / (2 * z.frequency_hz) - 1) < _HARMONIC for z in swings)
+    return HARMONIC_NATS if second and not differential else 0.0
+
+
+def is_zigzag(line: Zigzag, up: Array) -> bool:
+    """A wide swing across the vertical, at the frequency of bubbles' paths."""
+    rms, upright = np.asarray(line.rms_mm), np.abs(up)
+    across = float(np.linalg.norm(rms * (1 - upright)))
+    wide = across > _ZIGZAG_MM and across > float(np.linalg.norm(rms * upright))
+    return wide and _ZIGZAG_HZ[0] < line.frequency_hz < _ZIGZAG_HZ[1]
+
+
+def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
+    """A share of a mode's variance given to the bubbles; all of it: the mode goes."""
+    mode = model.modes[index]
+    rms = _times(mode.rms_mm, np.sqrt(share))
+    added = Zigzag(mode.frequency_hz, mode.damping, rms, mode.force_hz)
+    kept = replace(mode, rms_mm=_times(mode.rms_mm, np.sqrt(1 - share)))
+    rest = (kept,) if share < 1 else ()
+    modes = (*model.modes[:index], *rest, *model.modes[index + 1 :])
+    zigzags = _joined(model.bubble.zigzags, added)
+    return replace(model, modes=modes, bubble=replace(model.bubble, zigzags=zigzags))
+
+
+def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
+    """A share of a bubble line's variance given to a mode of the whole rig."""
+    line = model.bubble.zigzags[index]
+    rms = _times(line.rms_mm, np.sqrt(share))
+    added = RigMode(line.frequency_hz, line.damping, rms, force_hz=line.force_hz)
+    kept = replace(line, rms_mm=_times(line.rms_mm, np.sqrt(1 - share)))
+    rest = (kept,) if share < 1 else ()
+    zigzags = (*model.bubble.zigzags[:index], *rest, *model.bubble.zigzags[index + 1 :])
+    bubble = replace(model.bubble, zigzags=zigzags)
+    return replace(model, modes=(*model.modes, added), bubble=bubble)
+
+
+def _joined(lines: tuple[Zigzag, ...], added: Zigzag) -> tuple[Zigzag, ...]:
+    """With the variances of equal lines added up."""
+    for i, line in enumerate(lines):
+        near = abs(line.frequency_hz / added.frequency_hz - 1) < _SAME_HZ
+        near &= line.force_hz == added.force_hz
+        if near and np.isclose(line.damping, added.damping, rtol=_SAME_HZ):
+            x, y, z = np.hypot(line.rms_mm, added.rms_mm).tolist()
+            return (*lines[:i], replace(line, rms_mm=(x, y, z)), *lines[i + 1 :])
+    return (*lines, added)
+
+
+def _times(rms_mm: Sequence[float], factor: float) -> tuple[float, float, float]:
+    x, y, z = (float(factor * r) for r in rms_mm)
+    return x, y, z
+
+
+def shared(model: ShakeModel, found: Sequence[LineLabel]) -> ShakeModel:
+    """Every ambiguous line given half to the rig, half to the bubbles."""
+    for label in sorted(found, key=lambda one: -one.index):
+        if label.ambiguous and label.owner == "bubble":
+            model = moved_to_rig(model, label.index, 0.5)
+    for label in found:
+        if label.ambiguous and label.owner == "rig":
+            model = moved_to_bubble(model, label.index, 0.5)
+    return model
+
+
+def doubted(
+    channels: Sequence[Channel], model: ShakeModel, pattern: Sequence[float], up: Array
+) -> ShakeModel:
+    """Beside a line of several bubbles, the rig given what of it the data leave open.
+
+    The bubbles' differences show their own line; a rig's line of the same frequency adds to what
+    they have in common, where a share of 1 / bubbles is theirs anyway, and a few cycles do not
+    tell it from none. Its RMS is the root of the posterior's mean square, under a flat prior up
+    to the bubbles' own, less where the rig's main line is seen elsewhere. Wide swings across the
+    vertical are the bubbles'.
+    """
+    own = [m for m in model.modes if _lies_in(m.rms_mm, pattern) and not _is_half(m, model)]
+    for index, line in enumerate(model.bubble.zigzags):
+        common = [m.frequency_hz for m in model.modes if m.camera == CARRIAGE]
+        seen = any(abs(f / line.frequency_hz - 1) < _NEAR_HZ for f in common)
+        if seen or not _lies_in(line.rms_mm, pattern) or is_zigzag(line, up):
+            continue
+        rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=line.force_hz)
+        found = np.array([_beside(channels, model, index, rig, s).log_posterior for s in _SHARES])
+        weight = np.exp(found - found.max()) * expected(line, own)
+        share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
+        if share > _LEAST_SHARE:
+            model = _beside(channels, model, index, rig, share).model
+    return model
+
+
+def _beside(
+    channels: Sequence[Channel], model: ShakeModel, index: int, rig: RigMode, share: float
+) -> Fit:
+    """A share of that line given to the rig, beside the bubbles' own, which is fitted again.
+
+    Found without it, the bubbles' line is too wide: it had to be what they have in common, too.
+    """
+    stem = f"bubble.zigzags.{index}"
+    names = [f"{stem}.{last}" for last in ("frequency_hz", "damping", "rms_mm")]
+    if share > 0:
+        mode = replace(rig, rms_mm=_times(rig.rms_mm, share))
+        model = replace(model, modes=(*model.modes, mode))
+    return maximise(channels, model, names, steps=6)
+
+
+def _is_half(mode: RigMode, model: ShakeModel) -> bool:
+    """Of an ambiguous line, whose other half is the bubbles'."""
+    return any(z.frequency_hz == mode.frequency_hz for z in model.bubble.zigzags)
+
+
+def expected(line: Zigzag, own: Sequence[RigMode]) -> Array:
+    """Prior weights of lines of the rig beside one of the bubbles', by their `_SHARES` of its RMS.
+
+    All alike where the rig shows no line of its own elsewhere (a quarter of the frequency away):
+    its main one must be somewhere. One that is weaker than the strongest there, or any where that
+    is as strong as the arms', would be one more, and lie just here by chance: with the probability
+    that one of `_MORE` falls so near under the prior of modes. What it loses goes to none (the
+    first).
+    """
+    away = [max(m.rms_mm) for m in own if m.camera == CARRIAGE and _is_elsewhere(m, line)]
+    strongest = max(away, default=0.0)
+    if not strongest:
+        return np.ones(len(_SHARES))
+    arms = max((max(m.rms_mm) for m in own if m.camera != CARRIAGE), default=np.inf)
+    missing = 1 - min(strongest / arms, 1.0) ** 4
+    each = 2 * _NEAR_HZ * prior_of("modes.*.frequency_hz").density(line.frequency_hz)
+    chance = 1 - (1 - each) ** _MORE
+    size = np.minimum(_SHARES * max(line.rms_mm) / strongest, 1.0)
+    weight = chance + (1 - chance) * missing * size**2
+    weight[0] = len(weight) - weight[1:].sum()
+    return np.asarray(weight)
+
+
+def _is_elsewhere(mode: RigMode, line: Zigzag) -> bool:
+    return abs(mode.frequency_hz / line.frequency_hz - 1) >= _ELSEWHERE_HZ

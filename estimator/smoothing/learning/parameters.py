@@ -1,0 +1,139 @@
+"""Hyper-parameters by name: reading, replacing and bounding numbers inside a `ShakeModel`.
+
+Names are paths: ``modes.0.frequency_hz``, ``bubble.zigzags.1.rms_mm``, ``pixel_inflation``. An RMS
+with three components is one number, its largest component; setting it keeps the proportions. The
+corner of the modes' force is one for all, ``modes.force_hz``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from typing import Any
+
+import numpy as np
+
+from telerig.errors import InputError
+from telerig.estimator.smoothing.problem.problem import ShakeModel
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Log-normal prior of a positive number within bounds; step is what the optimiser calls 1."""
+
+    low: float
+    high: float
+    median: float
+    log_sigma: float
+    step: float
+
+    def log_density(self, value: float) -> float:
+        """Up to a constant."""
+        return float(-0.5 * (np.log(value / self.median) / self.log_sigma) ** 2)
+
+    def density(self, value: float) -> float:
+        """Probability per unit of the value's logarithm."""
+        return float(np.exp(self.log_density(value)) / (self.log_sigma * np.sqrt(2 * np.pi)))
+
+    def log_slope(self, value: float) -> float:
+        """Derivative of the log density by the number's logarithm."""
+        return float(-np.log(value / self.median) / self.log_sigma**2)
+
+
+FORCE = "modes.force_hz"
+"""Corner of the force that drives the modes, one for all."""
+
+PRIORS: dict[str, Prior] = {
+    FORCE: Prior(10.0, 1000.0, 60.0, 1.5, 0.2),
+    "modes.*.frequency_hz": Prior(1.0, 150.0, 15.0, 1.5, 0.02),
+    "modes.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
+    "modes.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
+    "broad_bands.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
+    "bubble.zigzags.*.frequency_hz": Prior(1.0, 60.0, 8.0, 1.0, 0.02),
+    "bubble.zigzags.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
+    "bubble.zigzags.*.rms_mm": Prior(1e-3, 20.0, 0.3, 2.0, 0.2),
+    "bubble.velocity_sigma_mm_s": Prior(0.5, 200.0, 10.0, 0.5, 0.2),
+    "bubble.velocity_tau_s": Prior(0.02, 5.0, 0.3, 0.5, 0.3),
+    "pixel_inflation": Prior(0.3, 5.0, 1.0, 0.3, 0.02),
+}
+"""Priors by pattern of the name."""
+
+
+def prior_of(name: str) -> Prior:
+    """Raises InputError for a name that no pattern covers."""
+    for pattern, prior in PRIORS.items():
+        if fnmatch(name, pattern):
+            return prior
+    raise InputError(
+        f"{name!r} is no hyper-parameter that is learned", todo=f"use one of {', '.join(PRIORS)}"
+    )
+
+
+def value_of(model: ShakeModel, name: str) -> float:
+    """The number under that name. Raises InputError for an unknown one."""
+    found: Any = model
+    if name == FORCE and model.force_hz is not None:
+        return model.force_hz
+    try:
+        for part in name.split("."):
+            found = found[int(part)] if part.isdigit() else getattr(found, part)
+    except (AttributeError, IndexError, TypeError) as error:
+        raise InputError(f"the model has no {name!r}", todo="see names_of(model)") from error
+    return float(max(found)) if isinstance(found, tuple) else float(found)
+
+
+def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]) -> ShakeModel:
+    """The model with these numbers replaced."""
+    out: Any = model
+    for name, value in zip(names, values):
+        if name == FORCE:
+            out = with_force(out, float(value))
+        else:
+            out = _replaced(out, name.split("."), float(value))
+    assert isinstance(out, ShakeModel)
+    return out
+
+
+def with_force(model: ShakeModel, force_hz: float) -> ShakeModel:
+    """The model with that corner of all forces that have one."""
+    modes = tuple(m if m.force_hz is None else replace(m, force_hz=force_hz) for m in model.modes)
+    zigzags = tuple(
+        z if z.force_hz is None else replace(z, force_hz=force_hz) for z in model.bubble.zigzags
+    )
+    return replace(model, modes=modes, bubble=replace(model.bubble, zigzags=zigzags))
+
+
+def forced(model: ShakeModel, force_hz: float | None) -> ShakeModel:
+    """The model with that corner of all modes' forces, None: all white."""
+    return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
+
+
+def _replaced(node: Any, path: list[str], value: float) -> Any:
+    if not path:
+        if isinstance(node, tuple):
+            largest = max(node)
+            return tuple(value * v / largest for v in node)
+        return value
+    head, rest = path[0], path[1:]
+    if head.isdigit():
+        index = int(head)
+        return (*node[:index], _replaced(node[index], rest, value), *node[index + 1 :])
+    return replace(node, **{head: _replaced(getattr(node, head), rest, value)})
+
+
+def names_of(model: ShakeModel) -> list[str]:
+    """Every hyper-parameter of the model that can be learned."""
+    out: list[str] = []
+    fields = ("frequency_hz", "damping", "rms_mm")
+    out += [f"modes.{i}.{f}" for i in range(len(model.modes)) for f in fields]
+    if model.force_hz is not None:
+        out.append(FORCE)
+    out += [f"broad_bands.{i}.rms_mm" for i in range(len(model.broad_bands))]
+    out += [f"bubble.zigzags.{i}.{f}" for i in range(len(model.bubble.zigzags)) for f in fields]
+    return [*out, "bubble.velocity_sigma_mm_s", "bubble.velocity_tau_s", "pixel_inflation"]
+
+
+def log_prior(model: ShakeModel, names: Sequence[str]) -> float:
+    """Sum of the named parameters' log prior densities, up to a constant."""
+    return sum(prior_of(n).log_density(value_of(model, n)) for n in names)

@@ -1,0 +1,124 @@
+"""The pose between the cameras as a variable of the smoothing graph, and what the run makes of it.
+
+The graph carries the calibration's uncertainty in unit directions. To refine the rig, the prior
+of a movement is added to it in the directions that gaps tell; images, shake and bubbles then
+settle it together, and its posterior is read back. The wander of the bubbles' centres belongs to
+the model, else it would count as a movement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.rig_drift.drift import (
+    DriftPrior,
+    RigChange,
+    described,
+    drift_covariance,
+    moved_pose,
+    share_of_drift,
+)
+from telerig.estimator.rig_drift.from_pairs import LEAST_PAIRS, rig_change
+from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration.result.calibration import Calibration
+
+Array = NDArray[np.float64]
+
+_LEAST_WANDER_PX = 5e-3
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """drift : (6, 6) prior of a movement.  tangent : (6,) it, from the gaps alone.
+
+    wander_px, wander_s : of the bubbles' centres in one image.
+    """
+
+    drift: Array
+    tangent: Array
+    wander_px: float
+    wander_s: float
+
+
+def refinement_of(
+    tracks: Any, calibration: Calibration, wanted: bool | DriftPrior
+) -> Refinement | None:
+    """None unless wanted. Raises InputError for runs without two cameras or with too few pairs."""
+    if not wanted:
+        return None
+    prior = wanted if isinstance(wanted, DriftPrior) else DriftPrior()
+    found = None if tracks is None else rig_change(tracks, calibration, prior)
+    if found is None:
+        raise InputError(
+            f"the rig cannot be refined from fewer than {LEAST_PAIRS} pairs of two cameras",
+            where="refine_rig",
+            todo="smooth without --refine-rig",
+        )
+    change, noise = found
+    scale = float(np.mean([c["scale_px_per_mm"] for c in calibration.cameras]))
+    drift = drift_covariance((calibration.cameras[0], calibration.cameras[1]), prior)
+    wander = noise.wander_mm * scale / np.sqrt(2)
+    return Refinement(drift, change.tangent, wander, noise.wander_s)
+
+
+def for_learning(problem: SmoothingProblem, refinement: Refinement) -> SmoothingProblem:
+    """The problem with the movement that gaps show taken off, as learning holds the cameras."""
+    first, second = problem.cameras
+    pose = moved_pose(second.camera_from_rig.inverse(), refinement.tangent).inverse()
+    return replace(problem, cameras=(first, replace(second, camera_from_rig=pose)))
+
+
+def with_wander(model: ShakeModel, refinement: Refinement) -> ShakeModel:
+    """The model with the centres' wander, unless it has one or there is none."""
+    if model.bubble.wander_px > 0 or refinement.wander_px < _LEAST_WANDER_PX:
+        return model
+    px, tau_s = refinement.wander_px, refinement.wander_s
+    return replace(model, bubble=replace(model.bubble, wander_px=px, wander_tau_s=tau_s))
+
+
+def refined_change(solution: Solution, calibration: Calibration) -> RigChange | None:
+    """The movement's posterior; None where the graph does not hold it."""
+    problem, found = solution.frame.problem, solution.covariances
+    share = problem.calibration
+    if share is None or share.drift is None or found is None:
+        return None
+    root = share.root
+    rig = root @ solution.state.calibration
+    unfelt = share.covariance - root @ root.T
+    covariance = unfelt + root @ found.calibration @ root.T
+    before = share.covariance.copy()
+    before[-6:, -6:] -= share.drift
+    tangent, own = share_of_drift(rig, covariance, before, share.drift)
+    pair = (problem.cameras[0], problem.cameras[1])
+    place = np.concatenate([b.guess_mm for b in problem.bubbles]).mean(0)
+    positions = np.concatenate([_positions(problem)[b.first : b.last + 1] for b in problem.bubbles])
+    place = place - positions.mean() * problem.axis
+    pose = moved_pose(calibration.cameras[1].camera_from_rig.inverse(), rig[-6:])
+    return described(pair, tangent, own, share.drift, place, len(problem.observations) // 2, pose)
+
+
+def _positions(problem: SmoothingProblem) -> Array:
+    if problem.stage is None:
+        return np.zeros(len(problem.t_s))
+    return np.asarray(np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm))
+
+
+def change_words(change: RigChange, first: str) -> str:
+    """What `telerig smooth --refine-rig` says of it."""
+    if not change.moved:
+        return (
+            f"no movement of camera {change.camera!r} against {first!r} since the calibration "
+            f"beyond chance ({change.size_words()})"
+        )
+    return (
+        f"camera {change.camera!r} has moved against {first!r} since the calibration, "
+        f"{change.size_words()}; the trajectories are corrected for it"
+    )

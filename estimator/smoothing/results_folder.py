@@ -1,0 +1,149 @@
+"""A tracked run smoothed into its results folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from telerig.errors import InputError
+from telerig.estimator.calibration.refractive_windows import forgotten_walls
+from telerig.estimator.sensors.checks import check_sensors
+from telerig.estimator.smoothing.smooth import smooth
+from telerig.estimator.tracking.detection import read_batch
+from telerig.estimator.tracking.tracks import Tracks, load_tracks
+from telerig.io.files.atomic import atomic_folder, write_json_atomic
+from telerig.io.files.provenance import run_record
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration.result.calibration import Calibration
+    from telerig.estimator.smoothing.result import Smoothing
+    from telerig.io.dataset.run import RunData
+
+Stage = Callable[[str, int, int], None]
+
+_TRACKED = ("tracks.csv", "detections.csv", "events.csv", "references.csv", "tracking.json")
+
+
+def smooth_run(
+    run: RunData,
+    calibration: Calibration,
+    tracks: Path,
+    folder: Path,
+    *,
+    model: str = "auto",
+    refine_rig: bool = False,
+    inputs: Sequence[Path] = (),
+    report: bool = True,
+    stage: Stage | None = None,
+) -> Smoothing:
+    """Smooth and write trajectories.csv, shake.csv, smoothing.json, results.h5, run.json, report.
+
+    tracks : `tracks.csv`, or the folder that `telerig track` wrote.
+    refine_rig : see `telerig.smooth`.
+    Files appear together at the end. Raises InputError when there are no tracks, or
+    not all of their cameras are in the calibration.
+    """
+    begun = time.perf_counter()
+    followed, source = read_tracks(tracks, run.path)
+    _check_cameras(followed, calibration)
+    run, marks = with_followed_references(run, source.parent)
+    warnings = [
+        *forgotten_walls(run.rig, calibration),
+        *([] if refine_rig else _moved(followed)),
+        *check_sensors(run, tracks=followed, calibration=calibration),
+    ]
+    percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
+    found = smooth(
+        followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig
+    )
+    found = replace(found, summary={**found.summary, "warnings": warnings})
+    tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
+    record = run_record(
+        "smooth", run.path, [*tables, source, *marks, *inputs],
+        {"model": model, "refine_rig": refine_rig},
+        {"smooth": time.perf_counter() - begun},
+    )  # fmt: skip
+    tracked = source.parent / "run.json"
+    if tracked.is_file():
+        before = json.loads(tracked.read_bytes())
+        record["tracks"] = before.get("tracks", before)
+    with atomic_folder(folder) as staged:
+        found.save(staged)
+        write_json_atomic(staged / "run.json", record)
+        if report:
+            _report(staged, folder, source.parent)
+    return found
+
+
+def _check_cameras(tracks: Tracks | Any, calibration: Calibration) -> None:
+    """Raises InputError when a camera by which the run was tracked is not in the calibration."""
+    used = list(getattr(tracks, "summary", {}).get("image_size_px") or [])
+    have = [camera.name for camera in calibration.cameras]
+    if set(used) - set(have):
+        raise InputError(
+            f"the run was tracked with cameras {', '.join(used)}, the calibration has "
+            f"{', '.join(have)}",
+            todo="give the calibration that the run was tracked with, or track again",
+        )
+
+
+def _moved(tracks: Tracks | Any) -> list[str]:
+    """What `telerig track` found of a movement of the cameras, for trajectories that keep it."""
+    change = getattr(tracks, "summary", {}).get("rig_change") or {}
+    if not change.get("moved"):
+        return []
+    return [
+        f"camera {change['camera']!r} had moved since the calibration by which the run was tracked "
+        f"(by {1e3 * change['offset_mm']:+.0f} um along the shared coordinate): positions are off "
+        "by it; calibrate again and track again, or smooth with --refine-rig"
+    ]
+
+
+def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:
+    """What `telerig track` wrote, or a bare table of tracks; and the file it came from."""
+    if path.is_dir():
+        if not (path / "tracks.csv").is_file():
+            raise InputError(
+                "there are no tracks", where=str(path), todo=f"run `telerig track {run}` first"
+            )
+        return load_tracks(path), path / "tracks.csv"
+    if not path.is_file():
+        raise InputError("there is no such file", where=str(path), todo="give tracks.csv")
+    return read_batch(path), path
+
+
+def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list[Path]]:
+    """The run with the marks that `telerig track` followed in its images, and their file; a run's
+    own references.csv goes before them."""
+    file = tracked / "references.csv"
+    if run.references is not None or not file.is_file() or tracked.resolve() == run.path:
+        return run, []
+    from telerig.io.dataset.run_tables import read_references_csv
+
+    sizes = dict(run.image_sizes_px)
+    table = read_references_csv(file, list(run.cameras), sizes, run.frame_count)
+    return replace(run, references=table), [file]
+
+
+def _report(staged: Path, folder: Path, tracked: Path) -> None:
+    """The run's page, smoothing first; it needs the tracks beside it."""
+    from telerig.io.report.run.report import write_track_report
+
+    borrowed = []
+    for place in (folder, tracked):
+        for name in (*_TRACKED, "overlays", "binary"):
+            source, target = place / name, staged / name
+            if source.exists() and not target.exists():
+                copy = shutil.copytree if source.is_dir() else shutil.copy2
+                copy(source, target)
+                borrowed.append(target)
+    if (staged / "tracking.json").is_file():
+        write_track_report(staged)
+    if folder.resolve() == tracked.resolve():
+        for target in borrowed:
+            shutil.rmtree(target) if target.is_dir() else target.unlink()

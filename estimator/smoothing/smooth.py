@@ -1,0 +1,238 @@
+"""`telerig.smooth`: the motion of the bubbles and the shake of the rig, told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
+from telerig.estimator.smoothing.graph.stage_travel import travel_of
+from telerig.estimator.smoothing.learning.adapted_priors import adapted
+from telerig.estimator.smoothing.learning.default_priors import default_model
+from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import inflated
+from telerig.estimator.smoothing.learning.learn import learn
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    Observations,
+    ShakeModel,
+    SmoothingProblem,
+)
+from telerig.estimator.smoothing.problem.sensors import (
+    accelerometers_of,
+    calibration_share,
+    references_of,
+    stage_of,
+    thinned,
+)
+from telerig.estimator.smoothing.problem.tracks import Tracked, bubbles_of, read_tracks
+from telerig.estimator.smoothing.refined_pose import (
+    Refinement,
+    change_words,
+    for_learning,
+    refined_change,
+    refinement_of,
+    with_wander,
+)
+from telerig.estimator.smoothing.result import Smoothing, summary_of
+from telerig.estimator.smoothing.tables import shake as shake_table
+from telerig.estimator.smoothing.tables import trajectories
+from telerig.estimator.smoothing.verdict.identifiability import judge
+
+if TYPE_CHECKING:
+    from telerig.estimator.calibration.result.calibration import Calibration
+    from telerig.estimator.rig_drift.drift import DriftPrior
+
+Array = NDArray[np.float64]
+Learn = Callable[[SmoothingProblem], ShakeModel]
+
+_COARSE_STEP_S = 2e-3
+_ENCODER_SIGMA_MM = 0.005
+_LEAST_LEARNED_S = 0.2
+"""In less time a slow shake shows no period, and would be learned not to be there."""
+
+
+def smooth(
+    tracks: Any,
+    calibration: Calibration,
+    *,
+    stage: Any = None,
+    accelerometers: Any = None,
+    references: Any = None,
+    model: ShakeModel | Learn | str = "auto",
+    rig: Any = None,
+    t_s: ArrayLike | None = None,
+    options: Options | None = None,
+    progress: Progress | None = None,
+    refine_rig: bool | DriftPrior = False,
+) -> Smoothing:
+    """Smooth a run: every bubble in the lab, every camera's shake, with what is known of them.
+
+    tracks : `Tracks`, a table like tracks.csv, or None to estimate offsets alone.
+    stage : a table t_s, position_mm, or the `RunData` that holds all of the run's records, which
+        then are used where nothing else is given.
+    accelerometers : a table t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2, whose sensors ``rig``
+        describes, or a mapping of name to {t_s, a_m_s2 (N, 3), mounted_on, axes,
+        noise_density_ug_sqrt_hz}.
+    references : a table frame, camera, mark, u_px, v_px[, sigma_px].
+    model : "auto" (defaults for the information at hand; learned modes for images alone),
+        "default", a `ShakeModel`, or a function that makes one.
+    rig : the description in rig.toml: travel axis (where the calibration has no stage), how well
+        the encoder's scale is known, sensors. t_s : (F,) frame times, else those of
+        the tracks.
+    refine_rig : estimate with it how the cameras have moved against each other since the
+        calibration (``summary["rig_change"]``); a `DriftPrior` says how far they may have.
+
+    Raises InputError for tables that cannot be used together.
+    """
+    refinement = refinement_of(getattr(tracks, "table", tracks), calibration, refine_rig)
+    problem, tracked, encoder_sigma = problem_of(
+        tracks, calibration, stage=stage, accelerometers=accelerometers,
+        references=references, rig=rig, t_s=t_s,
+        drift=None if refinement is None else refinement.drift,
+    )  # fmt: skip
+    options = options or Options()
+    chosen = _chosen(problem, model, encoder_sigma, refinement)
+    if isinstance(model, ShakeModel):
+        solution = solve(problem, chosen, options, progress)
+    else:
+        solution = _adapted_solution(problem, chosen, options, progress)
+        chosen = solution.frame.model
+        if chosen.learned:
+            solution = inflated(solution)
+    verdict = judge(problem, chosen, solution) if problem.bubbles else {}
+    summary = summary_of(solution)
+    change = refined_change(solution, calibration)
+    if change is not None:
+        words = change_words(change, problem.cameras[0].name)
+        summary["rig_change"] = {**change.as_dict(), "words": words}
+    return Smoothing(
+        trajectories(solution, None if tracked is None else tracked.table),
+        shake_table(solution),
+        verdict,
+        summary,
+        chosen,
+        solution,
+    )
+
+
+def _chosen(
+    problem: SmoothingProblem,
+    model: ShakeModel | Learn | str,
+    encoder_sigma_mm: float,
+    refinement: Refinement | None,
+) -> ShakeModel:
+    if refinement is None or isinstance(model, ShakeModel):
+        return choose_model(problem, model, encoder_sigma_mm)
+    chosen = choose_model(for_learning(problem, refinement), model, encoder_sigma_mm)
+    return with_wander(chosen, refinement)
+
+
+def problem_of(
+    tracks: Any,
+    calibration: Calibration,
+    *,
+    stage: Any = None,
+    accelerometers: Any = None,
+    references: Any = None,
+    rig: Any = None,
+    t_s: ArrayLike | None = None,
+    drift: Array | None = None,
+) -> tuple[SmoothingProblem, Tracked | None, float]:
+    """The smoothing problem of these tables, the tracks read, and the encoder's sd (mm).
+
+    drift : (6, 6) prior of a movement of the second camera since the calibration.
+    """
+    if hasattr(stage, "frame_count"):
+        run = stage
+        stage, rig, t_s = run.stage, run.rig if rig is None else rig, run.t_s
+        accelerometers = run.accelerometers if accelerometers is None else accelerometers
+        references = run.references if references is None else references
+    if references is None:
+        references = getattr(tracks, "references", None)
+    cameras = calibration.cameras
+    frame_times = None if t_s is None else np.asarray(t_s, float)
+    tracked = None if tracks is None else read_tracks(tracks, cameras, frame_times)
+    times = frame_times if tracked is None else tracked.t_s
+    if times is None:
+        raise InputError(
+            "without tracks nothing says when the frames are",
+            where="smooth",
+            todo="give t_s, the times at which offsets are wanted",
+        )
+    up, encoder_sigma = _stage_geometry(rig)
+    travel = travel_of(calibration.stage, None if rig is None else rig.stage)
+    axis = travel.axis
+    record = stage_of(stage, times)
+    if record is not None and travel.scale:
+        record = replace(record, position_mm=record.position_mm / (1 + travel.scale))
+    positions = np.zeros(len(times))
+    if record is not None:
+        positions = np.interp(times, record.t_s, record.position_mm)
+    marks, seen = references_of(references, cameras, times, positions, axis)
+    bubbles = () if tracked is None else bubbles_of(tracked, positions, axis)
+    share = None
+    if tracked is not None:
+        points = tracked.table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+        some = points[np.linspace(0, len(points) - 1, min(len(points), 200)).astype(int)]
+        noise = np.median(np.sqrt(tracked.observations.covariance_px2[:, 0, 0]))
+        share = calibration_share(calibration, some, float(noise), drift)
+    problem = SmoothingProblem(
+        cameras, times, axis, up, bubbles,
+        Observations.none() if tracked is None else tracked.observations,
+        record, accelerometers_of(accelerometers, rig, cameras, times), marks, seen, share,
+        travel,
+    )  # fmt: skip
+    return problem, tracked, encoder_sigma
+
+
+def _stage_geometry(rig: Any) -> tuple[Array, float]:
+    """Up, and the encoder's sd; without a description, upwards in the images."""
+    described = None if rig is None else rig.stage
+    if described is None:
+        return np.array([0.0, -1.0, 0.0]), _ENCODER_SIGMA_MM
+    up = np.asarray(described.up, float)
+    return up / np.linalg.norm(up), float(described.position_sigma_mm)
+
+
+def choose_model(
+    problem: SmoothingProblem, model: ShakeModel | Learn | str, encoder_sigma_mm: float
+) -> ShakeModel:
+    """The hyper-parameters: given, default or learned. Raises InputError for an unknown word."""
+    if isinstance(model, ShakeModel):
+        return model
+    if callable(model):
+        return model(problem)
+    if model not in ("auto", "default"):
+        raise InputError(
+            f"model is {model!r}", where="smooth", todo='give "auto", "default" or a ShakeModel'
+        )
+    default = default_model(problem, encoder_sigma_mm)
+    arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
+    known = len(problem.references) > 0 or len(arms) == len(problem.cameras)
+    if model == "auto" and not known and _longest_s(problem) >= _LEAST_LEARNED_S:
+        return learn(problem, default)
+    return default
+
+
+def _longest_s(problem: SmoothingProblem) -> float:
+    """Time from a bubble's first frame to its last, the longest; 0 without bubbles."""
+    t = problem.t_s
+    return max((float(t[b.last] - t[b.first]) for b in problem.bubbles), default=0.0)
+
+
+def _adapted_solution(
+    problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress | None
+) -> Solution:
+    """A first solution with few sensor samples sets noise, RMS and delays of the second."""
+    sensors = problem.accelerometers
+    coarse = replace(problem, accelerometers=thinned(sensors, _COARSE_STEP_S))
+    first = solve(coarse, model, options, progress)
+    better = adapted(first)
+    if better is None and not sensors:
+        return first
+    return solve(problem, better or model, options, progress, start=first)

@@ -1,0 +1,129 @@
+"""The smoother's tables: trajectories.csv and shake.csv."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoothing.baselines import central_velocity, rts
+from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.stage_travel import carriage, carriage_sigma, left_open
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+AXES = ("x", "y", "z")
+LONGEST_RTS = 5000
+"""Tracks with more frames get no RTS baseline: filterpy takes longer than the whole graph."""
+
+
+def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFrame:
+    """One row for every frame between a bubble's first and last detection; lab frame.
+
+    The standard deviations hold what is not known of the encoder's scale and the travel axis.
+    """
+    import pandas as pd
+
+    frame, problem = solution.frame, solution.frame.problem
+    if not problem.bubbles:
+        return pd.DataFrame({name: [] for name in ("frame", "particle", "t_s")})
+    layout, covariances = frame.bubble, solution.covariances
+    states = solution.state.bubbles
+    columns: dict[str, Any] = {
+        "frame": frame.frame_of_row,
+        "particle": np.array([b.particle for b in problem.bubbles])[frame.bubble_of_row],
+        "t_s": problem.t_s[frame.frame_of_row],
+    }
+    columns |= _named(states @ layout.position.T, "{}_mm")
+    columns |= _named(states @ layout.velocity.T, "v{}_mm_s")
+    if covariances is not None:
+        place, speed = left_open(solution)
+        sigma = _sigma(layout.position, covariances.bubbles)
+        columns |= _named(np.sqrt(sigma**2 + place), "s{}_mm")
+        sigma = _sigma(layout.velocity, covariances.bubbles)
+        columns |= _named(np.sqrt(sigma**2 + speed), "sv{}_mm_s")
+    columns["observed"] = _observed(solution)
+    if tracks is not None:
+        columns |= _baselines(solution, tracks)
+    return pd.DataFrame(columns)
+
+
+def _named(values: Array, pattern: str) -> dict[str, Array]:
+    return {pattern.format(axis): values[:, i] for i, axis in enumerate(AXES)}
+
+
+def _sigma(rows: Array, covariance: Array) -> Array:
+    """(n, 3) standard deviations of rows (3, d) or (n, 3, d) of states with (n, d, d)."""
+    return np.asarray(np.sqrt(((rows @ covariance) * rows).sum(-1).clip(0)))
+
+
+def _observed(solution: Solution) -> NDArray[np.int64]:
+    """1 where a camera saw the bubble and the pixel was not an outlier."""
+    frame, obs = solution.frame, solution.frame.problem.observations
+    out = np.zeros(frame.rows, np.int64)
+    kept = solution.weights[0] > 0.5
+    out[frame.row(obs.item[kept], obs.frame[kept])] = 1
+    return out
+
+
+def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
+    """Naive and RTS positions and velocities; the diameter that the tracker found."""
+    frame, problem = solution.frame, solution.frame.problem
+    number = {b.particle: i for i, b in enumerate(problem.bubbles)}
+    item = tracks["particle"].map(number).to_numpy(np.int64)
+    seen = tracks["frame"].to_numpy(np.int64)
+    rows = frame.row(np.asarray(item), np.asarray(seen))
+    position = np.zeros(len(problem.t_s))
+    if problem.stage is not None:
+        position = np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm)
+    naive = np.full((frame.rows, 3), np.nan)
+    naive[rows] = tracks[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    naive[rows] += position[seen, None] * problem.axis
+    covariance = np.tile(1e-4 * np.eye(3), (frame.rows, 1, 1))
+    names = [["sxx", "sxy", "sxz"], ["sxy", "syy", "syz"], ["sxz", "syz", "szz"]]
+    if f"{names[0][0]}_mm2" in tracks:
+        for i, line in enumerate(names):
+            for j, name in enumerate(line):
+                covariance[rows, i, j] = tracks[f"{name}_mm2"].to_numpy(float)
+    velocity, plain = np.full_like(naive, np.nan), np.full((2, *naive.shape), np.nan)
+    for k in range(len(problem.bubbles)):
+        mine = slice(frame.first_row[k], frame.first_row[k + 1])
+        t = problem.t_s[frame.frame_of_row[mine]]
+        velocity[mine] = central_velocity(t, naive[mine])
+        if 1 < len(t) <= LONGEST_RTS:
+            plain[:, mine] = rts(t, naive[mine], covariance[mine], frame.model.bubble)
+    out = _named(naive, "naive_{}_mm") | _named(velocity, "naive_v{}_mm_s")
+    out |= _named(plain[0], "rts_{}_mm") | _named(plain[1], "rts_v{}_mm_s")
+    if "d_eq_mm" in tracks:
+        diameter = np.full(frame.rows, np.nan)
+        diameter[rows] = tracks["d_eq_mm"].to_numpy(float)
+        out["d_eq_mm"] = diameter
+    return out
+
+
+def shake(solution: Solution) -> pd.DataFrame:
+    """One row a frame: carriage and each camera's offset from it, rig axes.
+
+    Along its depth a camera's own shake is unseen: the estimate is 0 and its sd the prior's.
+    """
+    import pandas as pd
+
+    frame, problem, layout = solution.frame, solution.frame.problem, solution.frame.shake
+    states, covariances = frame.shake_at_frames(solution.state.shake), solution.covariances
+    columns: dict[str, Any] = {"frame": np.arange(len(states)), "t_s": problem.t_s}
+    for c, camera in enumerate(problem.cameras):
+        columns |= _named(states @ layout.offset[c].T, f"{camera.name}_{{}}_mm")
+        if covariances is not None:
+            sigma = _sigma(layout.offset[c], covariances.shake)
+            unseen = np.diagonal(layout.unseen_variance_mm2[c])
+            columns |= _named(np.sqrt(sigma**2 + unseen), f"s{camera.name}_{{}}_mm")
+    if problem.stage is not None:
+        columns["position_mm"], _ = carriage(solution)
+        if covariances is not None:
+            sigma = _sigma(layout.position[None], covariances.shake)[:, 0]
+            columns["sposition_mm"] = carriage_sigma(solution, sigma)
+    return pd.DataFrame(columns)

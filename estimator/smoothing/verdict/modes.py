@@ -1,0 +1,234 @@
+"""The table of what shakes: frequency, damping, RMS, where, and what a mechanic could do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_LOWEST_HZ = 2.0
+_MOST_PEAKS = 3
+_LEAST_SHARE = 0.08
+_SIGNIFICANT = 3.0
+_LEAST_SAMPLES = 32
+_BLUR = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+"""One record's spectrum of a random vibration is speckled: a line is not one of its grains."""
+_BLUR_HALF = 1.0
+_ALIKE = 0.7
+_STRONGER = 2.0
+SEEN_BY = "seen only by "
+"""Of a line on an axis that one camera sees: its arm's, or common to all."""
+
+
+def shake_modes(solution: Solution) -> list[dict[str, Any]]:
+    """Rows {where, frequency_hz, damping, rms_mm (x, y, z), source, remedy}, strongest first.
+
+    Modes of the model as they are (source "model"); without any, peaks in the spectrum of the
+    estimated offsets (source "estimate"); peaks of the carriage about its travel are the servo's.
+    """
+    frame = solution.frame
+    names = [c.name for c in frame.problem.cameras]
+    if frame.model.modes:
+        rows = [_from_model(mode, names) for mode in frame.model.modes]
+    else:
+        rows = _from_offsets(solution, names)
+    rows += _from_carriage(solution)
+    return sorted(rows, key=lambda row: -max(row["rms_mm"]))
+
+
+def _from_model(mode: RigMode, names: Sequence[str]) -> dict[str, Any]:
+    where = "common" if mode.camera == CARRIAGE else f"arm {names[mode.camera]}"
+    return _row(where, mode.frequency_hz, mode.damping, mode.rms_mm, "model")
+
+
+def _row(
+    where: str, frequency_hz: float, damping: float, rms_mm: Sequence[float], source: str
+) -> dict[str, Any]:
+    return {
+        "where": where,
+        "frequency_hz": float(frequency_hz),
+        "damping": float(damping),
+        "rms_mm": [float(r) for r in rms_mm],
+        "source": source,
+        "remedy": remedy(where, frequency_hz, damping),
+    }
+
+
+def remedy(where: str, frequency_hz: float, damping: float) -> str:
+    """What would make this mode smaller."""
+    if where == "servo":
+        return "tune the stage's controller: more damping, a softer ramp, less gain at this line"
+    if where.startswith(SEEN_BY):
+        text = "one camera alone sees this axis, so whether its arm or the whole rig swings is not "
+        text += "known: an accelerometer on the carriage would tell"
+    elif where == "common":
+        text = "all cameras move alike: stiffen the mount between carriage and camera bridge, "
+        text += "or lighten what hangs on it"
+    else:
+        text = f"the {where} swings by itself: shorten or brace it, or counterweight its camera"
+    if damping < 0.02:
+        text += "; it rings: a layer of damping helps as much as stiffness"
+    if frequency_hz < 5:
+        text += "; so slow a swing is also driven by the travel: ramp the stage up more softly"
+    return text
+
+
+def _from_offsets(solution: Solution, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Lines of the cameras' offsets: who moves shows where two cameras see the same axis.
+
+    There the cameras move alike (common), one alone or both independently (arms). An axis that one
+    camera sees shares in the lines found so; a line that shows nowhere else has no known owner.
+    """
+    frame, found = solution.frame, solution.covariances
+    if not frame.shake.size or not frame.model.broad_bands:
+        return []
+    rows = frame.shake.offset[:-1]
+    offsets = np.einsum("cid,fd->cfi", rows, frame.shake_at_frames(solution.state.shake))
+    noise = 0.0
+    if found is not None:
+        variance = np.einsum("cid,fde,cie->", rows, found.shake, rows, optimize=True)
+        noise = float(variance) / len(rows) / len(frame.problem.t_s)
+    spectra = _spectra(frame.problem.t_s, offsets)
+    if spectra is None:
+        return []
+    seen = np.abs(rows).sum(-1) > 0
+    shared = seen.sum(0) > 1
+    out: list[dict[str, Any]] = []
+    for line in _lines(spectra, spectra.own[:, shared].sum((0, 1)), noise):
+        out += _owned(spectra, line, seen, shared, names)
+    for camera, name in enumerate(names):
+        alone = seen[camera] & ~shared
+        for line in _lines(spectra, spectra.own[camera, alone].sum(0), noise):
+            if not any(_same_line(line, row) for row in out):
+                rms = np.sqrt(line.power(spectra.own[camera])) * alone
+                out.append(line.row(f"{SEEN_BY}{name}", rms))
+    return out
+
+
+@dataclass(frozen=True)
+class _Spectra:
+    """frequency_hz (F,), own (C, 3, F) and cross (C, C, 3, F) densities of (C, n, 3) series."""
+
+    frequency_hz: Array
+    own: Array
+    cross: Array
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A peak: its bins, and the half width from which its damping follows."""
+
+    frequency_hz: float
+    half_hz: float
+    near: slice
+    step_hz: float
+
+    def power(self, density: Array) -> Array:
+        return np.asarray(density[..., self.near].sum(-1) * self.step_hz)
+
+    def row(self, where: str, rms_mm: Array) -> dict[str, Any]:
+        damping = self.half_hz / self.frequency_hz
+        return _row(where, self.frequency_hz, damping, rms_mm.tolist(), "estimate")
+
+
+def _owned(
+    spectra: _Spectra, line: _Line, seen: Bools, shared: Bools, names: Sequence[str]
+) -> list[dict[str, Any]]:
+    """The line as common, or as the arms'."""
+    own, cross = line.power(spectra.own), line.power(spectra.cross)
+    among = cross[:, :, shared].sum(-1)
+    sd = np.sqrt(np.clip(np.diagonal(among), 0, None))
+    strongest, weakest = int(sd.argmax()), int(sd.argmin())
+    lone = sd[strongest] > _STRONGER * sd[weakest]
+    if not lone and among[strongest, weakest] > _ALIKE * sd[strongest] * sd[weakest]:
+        rms = np.sqrt((own * seen).sum(0) / np.maximum(seen.sum(0), 1))
+        return [line.row("common", rms)]
+    arms = [strongest] if lone else range(len(names))
+    return [line.row(f"arm {names[c]}", np.sqrt(own[c]) * seen[c]) for c in arms]
+
+
+def _same_line(line: _Line, row: dict[str, Any]) -> bool:
+    reach = 2 * max(line.half_hz, row["damping"] * row["frequency_hz"]) + line.step_hz
+    return bool(abs(line.frequency_hz - row["frequency_hz"]) <= reach)
+
+
+def _spectra(t_s: Array, series: Array) -> _Spectra | None:
+    """Of (C, n, 3) at times (n,); None for a short record or one without motion."""
+    step = float(np.median(np.diff(t_s)))
+    if len(t_s) < _LEAST_SAMPLES or not np.any(series):
+        return None
+    grid = np.arange(t_s[0], t_s[-1] + step / 2, step)
+    even = np.array([[np.interp(grid, t_s, v) for v in one.T] for one in series])
+    window = np.hanning(len(grid) + 1)[:-1]
+    wave = np.fft.rfft((even - even.mean(-1, keepdims=True)) * window, axis=-1)
+    cross = np.real(np.einsum("cif,dif->cdif", wave, wave.conj()))
+    cross *= 2 * step / (window**2).sum()
+    own = np.einsum("ccif->cif", cross)
+    frequency = np.asarray(np.fft.rfftfreq(len(grid), step), np.float64)
+    return _Spectra(frequency, own, cross)
+
+
+def _lines(spectra: _Spectra, total: Array, noise_mm2: float) -> list[_Line]:
+    """Peaks of a density (F,) that hold a good share of its variance and rise above its noise."""
+    frequency = spectra.frequency_hz
+    width = float(frequency[1])
+    variance = float(total.sum() * width)
+    even = np.convolve(total, _BLUR, mode="same")
+    peak = np.r_[False, (even[1:-1] > even[:-2]) & (even[1:-1] >= even[2:]), False]
+    peak &= frequency >= max(_LOWEST_HZ, 2 * width)
+    out: list[_Line] = []
+    for i in sorted(np.flatnonzero(peak), key=lambda at: -even[at]):
+        reach = 2 * _half_width(even, int(i))
+        near = slice(max(i - reach, 0), i + reach + 1)
+        power = float(total[near].sum() * width)
+        if len(out) == _MOST_PEAKS or any(line.near.start <= i < line.near.stop for line in out):
+            continue
+        if even[near].max() > even[i]:  # a bump on the flank of another line
+            continue
+        if power < _LEAST_SHARE * variance or power < _SIGNIFICANT * noise_mm2 / 10:
+            continue
+        half = max(reach / 2 - _BLUR_HALF, 1.0)
+        out.append(_Line(float(frequency[i]), half * width, near, width))
+    return out
+
+
+def _half_width(total: Array, peak: int) -> int:
+    """Bins from a peak to where it has half of its height."""
+    below = np.flatnonzero(total[peak:] < total[peak] / 2)
+    above = np.flatnonzero(total[peak::-1] < total[peak] / 2)
+    sides = [side[0] for side in (below, above) if len(side)]
+    return int(max(1, min(sides, default=1)))
+
+
+def _from_carriage(solution: Solution) -> list[dict[str, Any]]:
+    """Following errors: lines of the encoder's record after a smooth travel is taken off."""
+    problem, model = solution.frame.problem, solution.frame.model
+    if problem.stage is None:
+        return []
+    t, position = problem.stage.t_s, problem.stage.position_mm
+    late = t > t[0] + 0.2 * (t[-1] - t[0])
+    if late.sum() < 64:
+        return []
+    t, position = t[late], position[late]
+    x = 2 * (t - t[0]) / (t[-1] - t[0]) - 1
+    rest = position - np.polynomial.Chebyshev.fit(x, position, 5)(x)
+    noise = _encoder_noise(model)
+    spectra = _spectra(t, (rest[:, None] * np.abs(problem.axis))[None])
+    if spectra is None:
+        return []
+    lines = _lines(spectra, spectra.own.sum((0, 1)), noise**2)
+    rows = [line.row("servo", np.sqrt(line.power(spectra.own[0]))) for line in lines]
+    return [row for row in rows if max(row["rms_mm"]) > _SIGNIFICANT * noise][:1]
+
+
+def _encoder_noise(model: ShakeModel) -> float:
+    return model.encoder_sigma_mm

@@ -1,0 +1,235 @@
+"""One frame of the confirmed tracks: pair, spread the doubtful into hypotheses, update."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.tracking.association.hypotheses import (
+    Branch,
+    Cluster,
+    History,
+    merge_key,
+    merged,
+)
+from telerig.estimator.tracking.association.likelihoods import (
+    Pairs,
+    alternatives,
+    gate2,
+    gated_pairs,
+    joint_score,
+    settle_shift,
+)
+from telerig.estimator.tracking.filter.state import Common, Track
+from telerig.estimator.tracking.filter.types import FrameMeasurements, Ids, TrackerSettings
+
+Array = NDArray[np.float64]
+
+_SLACK_NATS = 6.0
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A frame to be worked in: the measurements that are free, and when it was taken."""
+
+    frame: int
+    t_s: float
+    measured: FrameMeasurements
+    columns: Ids
+    settings: TrackerSettings
+
+
+@dataclass(frozen=True)
+class Child:
+    """A branch to be: from ``parents``, its edges (index into the pairs, -1: missed) per track."""
+
+    score: float
+    parents: tuple[Branch, ...]
+    edges: tuple[int, ...]
+
+
+class Association:
+    """The pairings of one frame, and the common shift that goes with the best of them."""
+
+    def __init__(
+        self,
+        clusters: Sequence[Cluster],
+        scan: Scan,
+        common: Common,
+    ) -> None:
+        self.clusters, self.scan, self.prior = clusters, scan, common
+        rows = [
+            (c, b, t)
+            for c, cluster in enumerate(clusters)
+            for b, branch in enumerate(cluster.branches)
+            for t in branch.tracks
+        ]
+        self.cluster_of = np.array([c for c, _, _ in rows], int)
+        first = np.array([b == 0 for _, b, _ in rows], bool)
+        self.row_of = {id(t): i for i, (_, _, t) in enumerate(rows)}
+        self.tracks = [t for _, _, t in rows]
+        pairs = gated_pairs(self.tracks, scan.measured, scan.columns, common, scan.settings)
+        self.common, self.chosen = settle_shift(pairs, len(rows), first, common)
+        self.pairs = pairs
+        self.picked = np.flatnonzero(first[pairs.row] & (self.chosen[pairs.row] == pairs.column))
+        self.edges = self._allowed()
+
+    def mean_gain(self, others: Sequence[Array]) -> Array | None:
+        """(n, 3) mean filter gain of the bubbles that are updated; None if there are none."""
+        p = [self.tracks[i].filter.P[:, :3] for i in self.pairs.row[self.picked]]
+        gains = [a @ b for a, b in zip(p, self.pairs.information[self.picked])]
+        return np.mean([*others, *gains], axis=0) if others or gains else None
+
+    def _allowed(self) -> Ids:
+        """Pairings inside their gate, the shift being told by the other clusters alone."""
+        pairs, owner = self.pairs, self.cluster_of[self.pairs.row]
+        information = np.zeros((len(self.clusters), 3, 3))
+        np.add.at(information, owner[self.picked], pairs.information[self.picked])
+        pull = np.zeros((len(self.clusters), 3))
+        left = pairs.innovation_mm - self.prior.shift_mm
+        pulls = np.einsum("eij,ej->ei", pairs.information, left)
+        np.add.at(pull, owner[self.picked], pulls[self.picked])
+        prior = self.prior.covariance_mm2
+        others = information.sum(0) - information
+        outside = prior @ np.linalg.inv(np.eye(3) + others @ prior)
+        shift = np.einsum("cij,cj->ci", outside, pull.sum(0) - pull)[owner]
+        total = np.linalg.inv(pairs.covariance_mm2 + outside[owner])
+        off = left - shift
+        near = np.einsum("ei,eij,ej->e", off, total, off) <= gate2(self.scan.settings)
+        return np.flatnonzero(near)
+
+    def components(self) -> list[tuple[list[int], list[int]]]:
+        """Clusters that share a measurement, each with its edges (indices into the pairs)."""
+        parent = list(range(len(self.clusters)))
+
+        def root(i: int) -> int:
+            while parent[i] != i:
+                i = parent[i]
+            return i
+
+        holder: dict[int, int] = {}
+        for e in self.edges:
+            c = int(self.cluster_of[self.pairs.row[e]])
+            other = holder.setdefault(int(self.pairs.column[e]), c)
+            a, b = sorted((root(c), root(other)))
+            parent[b] = a
+        groups: dict[int, tuple[list[int], list[int]]] = {}
+        for i in range(len(parent)):
+            groups.setdefault(root(i), ([], []))[0].append(i)
+        for e in self.edges:
+            groups[root(int(self.cluster_of[self.pairs.row[e]]))][1].append(int(e))
+        return list(groups.values())
+
+    def outside(self, members: Sequence[int]) -> Common:
+        """The common shift as the bubbles outside some clusters tell it."""
+        others = self.picked[~np.isin(self.cluster_of[self.pairs.row[self.picked]], members)]
+        return self.prior.informed(
+            self.pairs.innovation_mm[others], self.pairs.covariance_mm2[others]
+        )
+
+
+def children(found: Association, members: Sequence[int], edges: Sequence[int]) -> list[Child]:
+    """The likely ways to continue some clusters together, equal recent pasts merged, best first."""
+    settings, pairs = found.scan.settings, found.pairs
+    outside = found.outside(members)
+    score = pairs.scores(outside.shift_mm)
+    by_row: dict[int, list[int]] = {}
+    for e in edges:
+        by_row.setdefault(int(pairs.row[e]), []).append(e)
+    raw: list[Child] = []
+    for parents in _combinations([found.clusters[m] for m in members], settings):
+        rows = [found.row_of[id(t)] for b in parents for t in b.tracks]
+        options = [
+            [(int(pairs.column[e]), float(score[e])) for e in by_row.get(r, [])] for r in rows
+        ]
+        start = sum(b.weight for b in parents)
+        for taken, _ in alternatives(options, settings.prune_nats + _SLACK_NATS):
+            chosen = tuple(
+                next((e for e in by_row.get(r, []) if pairs.column[e] == c), -1)
+                for r, c in zip(rows, taken)
+            )
+            used = np.array([e for e in chosen if e >= 0], int)
+            raw.append(Child(start + joint_score(pairs, used, outside), parents, chosen))
+    scored = ((c.score, _key(c, pairs, found.scan.frame), i) for i, c in enumerate(raw))
+    return [Child(w, raw[i].parents, raw[i].edges) for w, i in merged(scored, settings)]
+
+
+def _combinations(
+    clusters: Sequence[Cluster], settings: TrackerSettings
+) -> list[tuple[Branch, ...]]:
+    every = product(*(c.branches for c in clusters))
+    ranked = sorted(every, key=lambda branches: -sum(b.weight for b in branches))
+    return ranked[: settings.max_hypotheses]
+
+
+def _key(child: Child, pairs: Pairs, frame: int) -> tuple[object, ...]:
+    return merge_key(list(_histories(child, pairs, frame).values()))
+
+
+def _histories(child: Child, pairs: Pairs, frame: int) -> History:
+    tracks = [(b, t) for b in child.parents for t in b.tracks]
+    return {
+        t.particle: [
+            *b.history.get(t.particle, []),
+            (frame, int(pairs.column[e]) if e >= 0 else -1),
+        ]
+        for (b, t), e in zip(tracks, child.edges)
+    }
+
+
+def grow(found: Association, members: Sequence[int], child: Child, mean_gain: Array) -> Branch:
+    """The branch of a child, its tracks updated with the common shift as it tells it."""
+    pairs, scan = found.pairs, found.scan
+    used = np.array([e for e in child.edges if e >= 0], int)
+    common = found.outside(members).informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
+    tracks = [t.copy() for b in child.parents for t in b.tracks]
+    for track, e in zip(tracks, child.edges):
+        column = int(pairs.column[e]) if e >= 0 else -1
+        continue_track(track, column, scan, common, mean_gain)
+    return Branch(child.score, tracks, _histories(child, pairs, scan.frame))
+
+
+def continue_track(track: Track, column: int, scan: Scan, common: Common, mean_gain: Array) -> None:
+    """Update in place with a measurement's column, or -1."""
+    if column < 0:
+        track.missed(common.shift, mean_gain, common.covariance_mm2)
+        return
+    measured = scan.measured
+    track.update(
+        measured.points_mm[column],
+        measured.covariance_mm2[column],
+        common.shift,
+        mean_gain,
+        common.covariance_mm2,
+    )
+    track.saw(scan.frame, scan.t_s, float(measured.d_eq_mm[column]))
+
+
+def advance(
+    clusters: Sequence[Cluster], scan: Scan, common: Common, other_gains: Sequence[Array] = ()
+) -> tuple[list[Cluster], Common, Array | None]:
+    """The clusters after this frame (not decided yet), the common part, the mean gain.
+
+    other_gains : (n, 3) each, of the bubbles that were updated already.
+
+    Tracks without a rival are updated in place. A cluster whose history is not empty is open.
+    """
+    found = Association(clusters, scan, common)
+    mean_gain = found.mean_gain(other_gains)
+    gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
+    out = []
+    for members, edges in found.components():
+        first = clusters[members[0]]
+        if len(members) == 1 and not first.open and len(first.tracks) == 1 and len(edges) < 2:
+            track = first.tracks[0]
+            column = int(found.chosen[found.row_of[id(track)]]) if edges else -1
+            continue_track(track, column, scan, found.common, gain)
+            out.append(Cluster([Branch(0.0, [track], {track.particle: [(scan.frame, column)]})]))
+            continue
+        every = children(found, members, edges)
+        out.append(Cluster([grow(found, members, child, gain) for child in every]))
+    return out, found.common, mean_gain

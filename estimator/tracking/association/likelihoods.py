@@ -1,0 +1,201 @@
+"""Which measurement may continue which track, and how likely each way of pairing them is.
+
+A pairing's score is its log-likelihood ratio against "the track was missed and the measurement is
+new": log P_D / (1 - P_D) + log N(innovation) - log(density of what is new) + the size's say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.special import chdtri
+
+from telerig.estimator.tracking.filter.state import Common, Track
+from telerig.estimator.tracking.filter.types import FrameMeasurements, Ids, TrackerSettings
+
+Array = NDArray[np.float64]
+
+_LOG_2PI = float(np.log(2 * np.pi))
+_SIZE_SPAN_MM = 5.0
+_SHIFT_ROUNDS = 5
+_MAX_NODES = 4000
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairings inside the widest gate: row of a track, column of a measurement, both (E,).
+
+    innovation_mm : (E, 3) without the common shift; covariance_mm2 : (E, 3, 3) of bubble and
+    measurement; information : its inverse; constant : (E,) the score's part without position.
+    """
+
+    row: Ids
+    column: Ids
+    innovation_mm: Array
+    covariance_mm2: Array
+    information: Array
+    constant: Array
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def distance2(self, shift_mm: Array) -> Array:
+        """(E,) squared Mahalanobis distances, the common shift taken off."""
+        left = self.innovation_mm - shift_mm
+        return np.asarray(np.einsum("ei,eij,ej->e", left, self.information, left))
+
+    def scores(self, shift_mm: Array) -> Array:
+        return self.constant - self.distance2(shift_mm) / 2
+
+
+@lru_cache(maxsize=64)
+def gate2(settings: TrackerSettings, dimensions: int = 3) -> float:
+    return float(chdtri(dimensions, 1 - settings.gate_probability))
+
+
+def gated_pairs(
+    tracks: Sequence[Track],
+    measured: FrameMeasurements,
+    columns: Ids,
+    common: Common,
+    settings: TrackerSettings,
+) -> Pairs:
+    """Pairings of tracks with the measurements ``columns`` inside the gate, shift unknown."""
+    if not len(tracks) or not len(columns):
+        none = np.zeros(0, np.int64)
+        return Pairs(none, none, *(np.zeros((0, 3, 3)[:k]) for k in (2, 3, 3, 1)))
+    x = np.array([t.filter.x[:3] for t in tracks])
+    p = np.array([t.filter.P[:3, :3] for t in tracks])
+    z, r = measured.points_mm[columns], measured.covariance_mm2[columns]
+    between = z[None] - x[:, None]
+    spread = np.trace(p, axis1=1, axis2=2)[:, None] + np.trace(r, axis1=1, axis2=2)[None]
+    reach2 = gate2(settings) * (spread + np.trace(common.covariance_mm2))
+    row, local = np.nonzero(((between - common.shift_mm) ** 2).sum(-1) <= reach2)
+    innovation, covariance = between[row, local], p[row] + r[local]
+    total = np.linalg.inv(covariance + common.covariance_mm2)
+    left = innovation - common.shift_mm
+    near = np.einsum("ei,eij,ej->e", left, total, left) <= gate2(settings)
+    row, local, innovation, covariance = (a[near] for a in (row, local, innovation, covariance))
+    column = columns[local]
+    constant = _constant(tracks, row, measured, column, covariance, settings)
+    return Pairs(row, column, innovation, covariance, np.linalg.inv(covariance), constant)
+
+
+def _constant(
+    tracks: Sequence[Track],
+    row: Ids,
+    measured: FrameMeasurements,
+    column: Ids,
+    covariance: Array,
+    settings: TrackerSettings,
+) -> Array:
+    seen = settings.detection_probability
+    density = -1.5 * _LOG_2PI - np.log(np.linalg.det(covariance)) / 2
+    base = np.log(seen / (1 - seen) / settings.new_per_mm3)
+    sure = np.log(np.clip(measured.confidence[column], 1e-3, 1.0))
+    expected = np.array([t.d_eq_mm for t in tracks])[row]
+    alive = alive_score(np.array([t.misses for t in tracks]), settings)[row]
+    return np.asarray(
+        base + density + sure + alive + size_score(expected, measured.d_eq_mm[column], settings)
+    )
+
+
+def alive_score(misses: Ids, settings: TrackerSettings) -> Array:
+    """(K,) log probability that a track not seen for so many frames is only missed, not gone."""
+    missed = (1 - settings.detection_probability) * settings.missed_again_probability ** (
+        np.maximum(misses, 1) - 1.0
+    )
+    return -np.log1p(misses * settings.end_probability / missed)
+
+
+def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:
+    """(E,) log density of the size against one uniform over 5 mm; 0 where a size is unknown."""
+    sigma = settings.size_scatter * expected_mm
+    off = np.minimum(((measured_mm - expected_mm) / sigma) ** 2 / 2, settings.size_cap_nats)
+    score = np.log(_SIZE_SPAN_MM / sigma) - _LOG_2PI / 2 - off
+    return np.where(np.isfinite(score), score, 0.0)
+
+
+def best_assignment(rows: int, row: Ids, column: Ids, score: Array) -> Ids:
+    """(rows,) column of each row, -1 where staying without is better; the best in total."""
+    out = np.full(rows, -1)
+    if not len(row):
+        return out
+    cost = np.zeros((rows, int(column.max()) + 1))
+    cost[row, column] = np.minimum(-score, 0.0)
+    at, to = linear_sum_assignment(cost)
+    good = cost[at, to] < 0
+    out[at[good]] = to[good]
+    return out
+
+
+def settle_shift(
+    pairs: Pairs, rows: int, best_rows: NDArray[np.bool_], common: Common
+) -> tuple[Common, Ids]:
+    """The shift common to all and the assignment that goes with it, by turns; (rows,) columns."""
+    now, chosen = common, np.full(rows, -1)
+    usable = np.flatnonzero(best_rows[pairs.row])
+    for turn in range(_SHIFT_ROUNDS):
+        score = pairs.scores(now.shift_mm)[usable]
+        if turn == 0:
+            score = score + pairs.distance2(now.shift_mm)[usable] / 2 - _wide(pairs, usable, now)
+        found = best_assignment(rows, pairs.row[usable], pairs.column[usable], score)
+        if turn and np.array_equal(found, chosen):
+            break
+        chosen = found
+        picked = usable[chosen[pairs.row[usable]] == pairs.column[usable]]
+        now = common.informed(pairs.innovation_mm[picked], pairs.covariance_mm2[picked])
+    return now, chosen
+
+
+def _wide(pairs: Pairs, edges: Ids, common: Common) -> Array:
+    """Half the squared distance with the common shift's spread: fair before the shift is known."""
+    left = pairs.innovation_mm[edges] - common.shift_mm
+    total = np.linalg.inv(pairs.covariance_mm2[edges] + common.covariance_mm2)
+    return np.asarray(np.einsum("ei,eij,ej->e", left, total, left) / 2)
+
+
+def joint_score(pairs: Pairs, edges: Ids, common: Common) -> float:
+    """Log score of some pairings together, the common shift integrated out."""
+    if not len(edges):
+        return 0.0
+    left = pairs.innovation_mm[edges] - common.shift_mm
+    pull = np.einsum("eij,ej->i", pairs.information[edges], left)
+    total = pairs.information[edges].sum(0)
+    mixed = np.eye(3) + common.covariance_mm2 @ total
+    gained = pull @ np.linalg.solve(mixed, common.covariance_mm2 @ pull) / 2
+    own = pairs.scores(common.shift_mm)[edges].sum()
+    return float(own + gained - np.log(np.linalg.det(mixed)) / 2)
+
+
+def alternatives(
+    options: Sequence[Sequence[tuple[int, float]]], within_nats: float
+) -> list[tuple[tuple[int, ...], float]]:
+    """Every way to give each row one of its (column, score) options or none, near the best.
+
+    Depth first with a bound; the columns of each row (-1: none) and the total score.
+    """
+    ordered = [sorted(o, key=lambda item: -item[1]) for o in options]
+    bound = np.cumsum([max([0.0, *(s for _, s in o)]) for o in ordered[::-1]])[::-1].tolist() + [0]
+    found: list[tuple[tuple[int, ...], float]] = []
+    best, nodes = -np.inf, 0
+    stack: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
+    while stack and nodes < _MAX_NODES:
+        taken, score = stack.pop()
+        nodes += 1
+        depth = len(taken)
+        if score + bound[depth] < best - within_nats:
+            continue
+        if depth == len(ordered):
+            best = max(best, score)
+            found.append((taken, score))
+            continue
+        stack.append(((*taken, -1), score))
+        free = [(c, s) for c, s in ordered[depth] if c not in taken]
+        stack.extend(((*taken, c), score + s) for c, s in reversed(free))
+    return [(taken, score) for taken, score in found if score >= best - within_nats]

@@ -1,0 +1,39 @@
+"""Which calibration a run is tracked with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from telerig.errors import InputError
+from telerig.estimator.calibration.result.calibration import Calibration, load_calibration
+
+
+def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:
+    """The calibration and the files it came from.
+
+    files : None takes the dataset's own; one calibration.json or its folder; or the two camera
+    files of OpenLPT (.txt), first camera first.
+    Raises InputError when there is none, or the files do not go together.
+    """
+    if not files:
+        default = run.resolve().parent.parent / "results" / "calibration" / "calibration.json"
+        if not default.is_file():
+            raise InputError(
+                "there is no calibration",
+                where=str(default),
+                todo="run `telerig calibrate` on the dataset, or give one with --calibration",
+            )
+        return load_calibration(default), [default]
+    if len(files) == 1 and files[0].suffix != ".txt":
+        return load_calibration(files[0]), [p for p in files if p.is_file()]
+    if len(files) == 2 and all(p.suffix == ".txt" for p in files):
+        from telerig.estimator.calibration.result.imported import calibration_from_cameras
+        from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
+
+        cameras, _ = read_openlpt_cameras(list(files))
+        return calibration_from_cameras(cameras, name="OpenLPT"), list(files)
+    raise InputError(
+        f"--calibration was given {len(files)} times: {', '.join(p.name for p in files)}",
+        todo="give one calibration.json, or two OpenLPT camera files (.txt)",
+    )

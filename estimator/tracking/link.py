@@ -1,0 +1,303 @@
+"""Detections to tracks, frame by frame: pairs across the views, ids in time, points in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from telerig.estimator.bubbles.outline.types import Prediction
+from telerig.estimator.bubbles.pairing.matching import match_pairs
+from telerig.estimator.bubbles.pairing.types import PairModel
+from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
+from telerig.estimator.tracking.backtracking import follow_back
+from telerig.estimator.tracking.filter.types import (
+    NO_PARTICLE,
+    FrameMeasurements,
+    FrameResult,
+    SingleMeasurements,
+    TrackEvent,
+)
+from telerig.estimator.tracking.frame_rows import Frame, Pairs, Pixels, given_ids
+from telerig.estimator.tracking.occluded_bubbles import FRAMES_AFTER, FRAMES_BEFORE, shared_rows
+from telerig.estimator.tracking.tracker import Tracker
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import stacked_jacobian, triangulate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
+_UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+_PER_CAMERA = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
+_PAIRS_AT_ONCE = 512
+_LEAST_FOR_OFFSET = 3
+
+WANDER = (21 / 8) ** 0.5
+"""Shift of an outline's centre, as a share of the radius, by a body's third harmonics of unit
+standard deviation (unit mean square over the sphere; their k = 1 part along a great circle)."""
+
+
+@dataclass(frozen=True)
+class Linked:
+    """Finished rows of `tracks.csv` and `detections.csv`."""
+
+    tracks: pd.DataFrame
+    detections: pd.DataFrame
+
+
+@dataclass
+class Linker:
+    """Turns frames of detections into finished rows; holds the frames still open, and a few."""
+
+    cameras: tuple[Camera, Camera]
+    model: PairModel
+    tracker: Tracker
+    shape_sigma: Array | None
+    events: list[TrackEvent] = field(default_factory=list)
+    _open: dict[int, Frame] = field(default_factory=dict)
+    _closed: list[Frame] = field(default_factory=list)
+    _before: list[Frame] = field(default_factory=list)
+    _waiting: int = 0
+
+    def add(
+        self,
+        number: int,
+        t_s: float,
+        position_mm: float | None,
+        tables: tuple[pd.DataFrame, pd.DataFrame],
+    ) -> Linked | None:
+        """One frame; returns rows when enough of them are final."""
+        predicted = self.tracker.predict(t_s, position_mm)
+        pairs = pair_frame(tables, self.cameras, self.model, predicted)
+        lonely = _unpaired(tables, pairs)
+        pixels = _pixels(tables[0], self._wander), _pixels(tables[1], self._wander)
+        measured, offset_px = _measured(self.cameras, tables, pixels, pairs, lonely)
+        result = self.tracker.update(number, t_s, measured, position_mm)
+        self._open[number] = Frame(
+            number,
+            t_s,
+            tables,
+            pixels,
+            offset_px,
+            pairs,
+            lonely,
+            measured,
+            result.alone,
+            result.motion,
+        )
+        self._settle(result)
+        enough = self._waiting >= _PAIRS_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
+        return self._flush(FRAMES_AFTER) if enough else None
+
+    @property
+    def _wander(self) -> float:
+        """How far a bubble's shape may move its outline's centre, as a share of its radius."""
+        sigma = DEFAULT_SHAPE_SIGMA if self.shape_sigma is None else self.shape_sigma
+        return WANDER * float(sigma[0])
+
+    def finish(self) -> Linked | None:
+        """The rows still open at the end of the run."""
+        result = self.tracker.finish()
+        if result is not None:
+            self._settle(result)
+        return self._flush(0) if self._closed else None
+
+    def _settle(self, result: FrameResult) -> None:
+        self.events.extend(result.events)
+        for ids in result.settled:
+            frame = self._open.pop(ids.frame)
+            frame.settle(ids)
+            self._closed.append(frame)
+            self._waiting += 1 + len(frame.pairs.first)
+
+    def _flush(self, ahead: int) -> Linked:
+        """Rows of all closed frames but the last few, which tell where hidden bubbles went."""
+        done = self._closed[: len(self._closed) - ahead]
+        self._closed, self._waiting = self._closed[len(done) :], 0
+        window = (self._before, done, self._closed)
+        settings, changeable = self.tracker.settings, {f.number for f in (*done, *self._closed)}
+        follow_back([*chain(*window)], changeable, self.cameras, settings)
+        hidden = shared_rows(*window, self.cameras, settings)
+        self._before = [*self._before, *done][-FRAMES_BEFORE:]
+        found = self._tracks(done)
+        if hidden:
+            found = pd.concat(
+                [found, pd.DataFrame(hidden, columns=found.columns)], ignore_index=True
+            )
+            found = found.sort_values(["frame", "particle"], kind="stable", ignore_index=True)
+        return Linked(found, _detections(done))
+
+    def _tracks(self, frames: Sequence[Frame]) -> pd.DataFrame:
+        parts = [
+            [f.tables[c].iloc[(f.pairs.first, f.pairs.second)[c]] for f in frames] for c in (0, 1)
+        ]
+        first, second = (pd.concat(part, ignore_index=True) for part in parts)
+        bodies = fit_bodies(
+            first,
+            second,
+            self.cameras,
+            shape_sigma=self.shape_sigma,
+            gap_sigma_px=float(np.hypot(self.model.frame_px, self.model.rms_px[0])),
+        )
+        many = [len(f.pairs.first) for f in frames]
+        table = pd.DataFrame(
+            {
+                "frame": np.repeat([f.number for f in frames], many),
+                "particle": np.concatenate([f.particle for f in frames]),
+                "t_s": np.repeat([f.t_s for f in frames], many),
+            }
+        )
+        table[["x_mm", "y_mm", "z_mm"]] = bodies.points_mm
+        table[COVARIANCE_MM2] = bodies.covariance_mm2[:, _UPPER[0], _UPPER[1]]
+        shape = _shape_share_px2(self.cameras, bodies)
+        for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
+            values = rows[_PER_CAMERA].to_numpy(float)
+            values[:, 2:] += shape[:, c][:, [0, 0, 1], [0, 1, 1]]
+            table[[f"{camera.name}_{name}" for name in _PER_CAMERA]] = values
+            table[f"{camera.name}_du_px"] = bodies.du_px[:, c]
+            table[f"{camera.name}_dv_px"] = bodies.dv_px[:, c]
+        table["ray_miss_mm"] = bodies.ray_miss_mm
+        table["d_eq_mm"], table["sd_eq_mm"] = bodies.d_eq_mm, bodies.d_eq_sd_mm
+        table["confidence"] = np.concatenate([f.pairs.confidence for f in frames])
+        table["centre"] = bodies.used
+        table[[f"silhouettes_{x}_mm" for x in "xyz"]] = bodies.silhouette_points_mm
+        ambiguous = np.concatenate([f.pairs.ambiguous for f in frames])
+        table["flags"] = _joined_flags(first["flags"], second["flags"], ambiguous)
+        return table[table["particle"] != NO_PARTICLE].reset_index(drop=True)
+
+
+def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
+    """(M, 2, 2, 2) per camera: what the bubble's shape adds to its centre's covariance."""
+    out = np.zeros((len(bodies.points_mm), 2, 2, 2))
+    known = np.isfinite(bodies.covariance_mm2).all((1, 2))
+    share = (bodies.covariance_mm2 - bodies.silhouette_covariance_mm2)[known]
+    values, vectors = np.linalg.eigh(share)
+    share = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2)
+    _, jacobian, _ = stacked_jacobian(cameras, bodies.points_mm[known])
+    for c in range(2):
+        view = jacobian[:, 2 * c : 2 * c + 2]
+        out[known, c] = view @ share @ np.swapaxes(view, -1, -2)
+    return out
+
+
+def pair_frame(
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+    cameras: tuple[Camera, Camera],
+    model: PairModel,
+    predicted: Prediction | None,
+) -> Pairs:
+    """Given ids pair up as they are; the rest is matched."""
+    ids = [given_ids(table) for table in tables]
+    common = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1])
+    rows = [np.array([np.flatnonzero(i == p)[0] for p in common], np.int64) for i in ids]
+    free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
+    if not (len(free[0]) and len(free[1])):
+        sure = np.ones(len(common))
+        return Pairs(rows[0], rows[1], sure, np.zeros(len(common), bool), common.astype(np.int64))
+    found = match_pairs(
+        tables[0].iloc[free[0]], tables[1].iloc[free[1]], cameras, model, predicted=predicted
+    )
+    none = np.full(len(found), NO_PARTICLE)
+    return Pairs(
+        np.concatenate([rows[0], free[0][found.first]]),
+        np.concatenate([rows[1], free[1][found.second]]),
+        np.concatenate([np.ones(len(common)), found.confidence]),
+        np.concatenate([np.zeros(len(common), bool), found.ambiguous]),
+        np.concatenate([common, none]).astype(np.int64),
+    )
+
+
+def _unpaired(tables: tuple[pd.DataFrame, pd.DataFrame], pairs: Pairs) -> tuple[Index, Index]:
+    first, second = (
+        np.setdiff1d(np.arange(len(table)), taken)
+        for table, taken in zip(tables, (pairs.first, pairs.second))
+    )
+    return first, second
+
+
+def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
+    """(N, 2) centres and (N, 2, 2) covariances, with the share of the unknown shape."""
+    covariance = table[["suu_px2", "suv_px2", "suv_px2", "svv_px2"]].to_numpy(float)
+    radius = np.nan_to_num(table["d_eq_px"].to_numpy(float)) / 2
+    shape = (wander * radius)[:, None, None] ** 2 * np.eye(2)
+    return table[["u_px", "v_px"]].to_numpy(float), covariance.reshape(-1, 2, 2) + shape
+
+
+def _measured(
+    cameras: tuple[Camera, Camera],
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+    pixels: tuple[Pixels, Pixels],
+    pairs: Pairs,
+    lonely: tuple[Index, Index],
+) -> tuple[FrameMeasurements, Array]:
+    """What the tracker gets, and (2, 2) how far off each camera shows what both see."""
+    (uv_a, cov_a), (uv_b, cov_b) = pixels
+    found = triangulate(
+        cameras, (uv_a[pairs.first], uv_b[pairs.second]), (cov_a[pairs.first], cov_b[pairs.second])
+    )
+    expected, _, _ = stacked_jacobian(cameras, found.points_mm)
+    left = np.hstack([uv_a[pairs.first], uv_b[pairs.second]]) - expected
+    offset = np.zeros((2, 2))
+    if len(left) >= _LEAST_FOR_OFFSET:
+        offset = np.median(left, axis=0).reshape(2, 2)
+    singles = SingleMeasurements(
+        np.repeat([0, 1], [len(i) for i in lonely]).astype(np.int64),
+        np.concatenate([uv_a[lonely[0]] - offset[0], uv_b[lonely[1]] - offset[1]]),
+        np.concatenate([cov_a[lonely[0]], cov_b[lonely[1]]]),
+    )
+    measured = FrameMeasurements.create(
+        found.points_mm,
+        found.covariance_mm2,
+        d_eq_mm=_diameter_mm(cameras, tables, pairs, found.points_mm),
+        confidence=pairs.confidence,
+        particle=pairs.particle,
+        singles=singles,
+    )
+    return measured, offset
+
+
+def _diameter_mm(
+    cameras: tuple[Camera, Camera],
+    tables: tuple[pd.DataFrame, pd.DataFrame],
+    pairs: Pairs,
+    points_mm: Array,
+) -> Array:
+    """(M,) geometric mean of the two views' equivalent diameters, NaN where unknown."""
+    if not len(points_mm) or not all("d_eq_px" in table for table in tables):
+        return np.full(len(points_mm), np.nan)
+    _, jacobian, _ = stacked_jacobian(cameras, points_mm)
+    product = np.ones(len(points_mm))
+    for c, rows in enumerate((pairs.first, pairs.second)):
+        view = jacobian[:, 2 * c : 2 * c + 2]
+        px_per_mm = np.linalg.det(view @ np.swapaxes(view, -1, -2)) ** 0.25
+        product *= tables[c]["d_eq_px"].to_numpy(float)[rows] / px_per_mm
+    return np.sqrt(product)
+
+
+def _detections(frames: Sequence[Frame]) -> pd.DataFrame:
+    """Every detection with the id of its track, blank where it has none."""
+    tables = []
+    for frame in frames:
+        for c, table in enumerate(frame.tables):
+            particle = frame.owners(c)
+            known = pd.array(particle, dtype="Int64")
+            known[particle == NO_PARTICLE] = pd.NA
+            tables.append(table.assign(particle=known))
+    joined = pd.concat(tables, ignore_index=True)
+    leading = ["frame", "camera", "particle"]
+    return joined[leading + [name for name in joined if name not in leading]]
+
+
+def _joined_flags(
+    first: pd.Series[str], second: pd.Series[str], ambiguous: NDArray[np.bool_]
+) -> list[str]:
+    """The flags of both views, each word once."""
+    return [
+        "|".join(sorted({*filter(None, (a or "").split("|") + (b or "").split("|"))} | extra))
+        for a, b, extra in zip(first, second, ({"ambiguous"} if x else set() for x in ambiguous))
+    ]

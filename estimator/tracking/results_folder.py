@@ -1,0 +1,231 @@
+"""Write the results folder of a tracked run while it is being tracked."""
+
+from __future__ import annotations
+
+import heapq
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from telerig.errors import InputError
+from telerig.estimator.bubbles.detect import find_bubbles, outline_points
+from telerig.estimator.rig_drift.from_pairs import PairCollector
+from telerig.estimator.tracking.detection import Progress, Scene, make_scene
+from telerig.estimator.tracking.link import Linked
+from telerig.estimator.tracking.track import (
+    TrackingStream,
+    TrackOptions,
+    add_counts,
+    check_calibration,
+    count_rows,
+    numbered_particles,
+    stage_axis,
+    summary_of,
+    tracking_stream,
+)
+from telerig.estimator.tracking.tracks import events_table
+from telerig.io.dataset.tables import write_table
+from telerig.io.files.atomic import atomic_folder, write_json_atomic
+from telerig.io.files.provenance import run_record
+from telerig.io.machine.parallel import ordered_map, quick_workers
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.estimator.calibration.result.calibration import Calibration
+    from telerig.io.dataset.run import RunData
+
+WORST_FRAMES = 8
+_OUTLINE_POINTS = 72
+_GREEN, _ORANGE = (40, 200, 70), (255, 140, 40)
+
+
+@dataclass
+class _Worst:
+    """The frames that a person should look at first."""
+
+    heap: list[tuple[float, int, str]] = field(default_factory=list)
+
+    def add(self, part: Linked) -> None:
+        flags = part.tracks["flags"]
+        unsure = part.tracks.assign(
+            doubt=1 - part.tracks["confidence"], ambiguous=flags.str.contains("ambiguous")
+        ).groupby("frame")[["doubt", "ambiguous"]]
+        sums = unsure.sum()
+        found = part.detections[np.isfinite(part.detections["u_px"].to_numpy(float))]
+        lonely = found["particle"].isna().groupby(found["frame"]).sum()
+        merged = found["flags"].str.contains("merged").groupby(found["frame"]).sum()
+        for frame in sorted(set(part.detections["frame"])):
+            doubt, ambiguous = sums.loc[frame] if frame in sums.index else (0.0, 0)
+            parts = {
+                "without partner or track": float(lonely.get(frame, 0)),
+                "merged": float(merged.get(frame, 0)),
+                "ambiguous pairs": float(ambiguous),
+            }
+            why = ", ".join(f"{int(n)} {what}" for what, n in parts.items() if n)
+            score = sum(parts.values()) + float(doubt)
+            heapq.heappush(self.heap, (score, -int(frame), why or "least sure pairs"))
+            if len(self.heap) > WORST_FRAMES:
+                heapq.heappop(self.heap)
+
+    def frames(self) -> list[dict[str, Any]]:
+        ranked = sorted(self.heap, reverse=True)
+        return [{"frame": -f, "score": round(s, 3), "why": why} for s, f, why in ranked]
+
+
+def write_tracking(
+    run: RunData,
+    calibration: Calibration,
+    folder: Path,
+    *,
+    options: TrackOptions,
+    record: Mapping[str, Any],
+    report: bool = True,
+    stage: Progress | None = None,
+) -> dict[str, Any]:
+    """Track a run into ``folder``; returns the content of tracking.json.
+
+    Detections made before an interruption are taken up again from ``.<folder>.work`` beside it.
+    Result files appear together at the end. Raises InputError for bubbles that were given names
+    when there is to be a report: it numbers them.
+    """
+    if report and run.detections is not None:
+        _check_ids(run.detections)
+    work = folder.parent / f".{folder.name}.work"
+    with atomic_folder(folder) as staged:
+        stream = tracking_stream(run, calibration, work, options, stage)
+        pairs = PairCollector(calibration)
+        counts, worst = _write_rows(stream, staged, pairs)
+        summary = summary_of(run, calibration, stream, counts, pairs.found())
+        summary["worst_frames"] = worst.frames()
+        write_json_atomic(staged / "tracking.json", summary)
+        write_table(events_table(stream.events), staged / "events.csv")
+        table = stream.followed.table if stream.followed is not None else None
+        if table is not None:
+            shutil.copyfile(table, staged / "references.csv")
+        write_json_atomic(staged / "run.json", _record(run, options, record))
+        if run.detections is None:
+            cameras = check_calibration(run, calibration)
+            axis = stage_axis(run, calibration)
+            strips = stream.followed.strips if stream.followed is not None else None
+            scene = stream.scene or make_scene(
+                run, cameras, axis, options.min_diameter_px, strips=strips
+            )
+            _write_pictures(scene, summary, staged)
+        if report:
+            from telerig.io.report.run.report import write_track_report
+
+            write_track_report(staged)
+    if table is None:
+        (folder / "references.csv").unlink(missing_ok=True)
+    shutil.rmtree(work, ignore_errors=True)
+    return summary
+
+
+def _check_ids(detections: pd.DataFrame) -> None:
+    names = numbered_particles(detections)[1]
+    if names:
+        raise InputError(
+            f"particle {names[0]!r} is no whole number, and the report needs numbers",
+            where="detections.csv",
+            todo="number the bubbles, or track with --no-report",
+        )
+
+
+def _write_rows(
+    stream: TrackingStream, staged: Path, pairs: PairCollector
+) -> tuple[dict[str, Any], _Worst]:
+    counts, worst, begun = count_rows([]), _Worst(), False
+    for part in stream.rows:
+        for name, table in (("tracks", part.tracks), ("detections", part.detections)):
+            with (staged / f"{name}.csv").open("a", encoding="utf-8", newline="") as file:
+                table.to_csv(file, index=False, header=not begun, lineterminator="\n")
+        begun = True
+        add_counts(counts, part)
+        worst.add(part)
+        pairs.add(part.tracks)
+    return counts, worst
+
+
+def _record(run: RunData, options: TrackOptions, record: Mapping[str, Any]) -> dict[str, Any]:
+    tables = list(run.path.glob("*.csv")) + list(run.path.glob("*.toml"))
+    content = run_record(
+        str(record.get("command", "track")),
+        run.path,
+        [*tables, *record.get("inputs", [])],
+        {**record.get("options", {}), "track": repr(options)},
+        record.get("seconds", {}),
+    )
+    known, files, size = set(tables), 0, 0
+    for path in run.path.rglob("*"):
+        if path.is_file() and path not in known:
+            files, size = files + 1, size + path.stat().st_size
+    content["images"] = {"files": files, "bytes": size}
+    return content
+
+
+def _write_pictures(scene: Scene, summary: Mapping[str, Any], staged: Path) -> None:
+    """overlays/<camera>/<frame>.jpg and binary/<camera>/<frame>.png of the worst frames."""
+    frames = [int(w["frame"]) for w in summary["worst_frames"]]
+    tasks = [(c, f, _labels(staged, c, f)) for f in frames for c in scene.run.cameras]
+    draw = partial(_draw, scene, staged)
+    for _ in ordered_map(draw, tasks, quick_workers(len(tasks))):
+        pass
+
+
+def _labels(staged: Path, camera: str, frame: int) -> pd.DataFrame:
+    import pandas as pd
+
+    chunks = pd.read_csv(
+        staged / "detections.csv", usecols=["frame", "camera", "particle", "u_px", "v_px"],
+        dtype={"camera": str}, chunksize=20_000,
+    )  # fmt: skip
+    found = [c[(c["frame"] == frame) & (c["camera"] == camera)] for c in chunks]
+    return pd.concat(found, ignore_index=True)
+
+
+def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> None:
+    from telerig.io.report.overlays.bubbles import draw_binary, draw_bubble_overlay
+
+    camera, frame, labels = task
+    image, plain = scene.run.image(camera, frame), scene.image(camera, frame)
+    if image is None or plain is None:
+        return
+    level = scene.backgrounds[camera].at(tuple(scene.shift_px[camera][frame]))
+    bubbles = find_bubbles(plain, background=level, min_diameter_px=scene.min_diameter_px)
+    found, rejected = bubbles.accepted, bubbles.rejected
+    outlines = [outline_points(row, _OUTLINE_POINTS) for _, row in found.iterrows()]
+    named = [_particle(labels, row) for _, row in found.iterrows()]
+    words = [f"{n} {row['flags']}".strip() for n, (_, row) in zip(named, found.iterrows())]
+    colours = [_GREEN if n else _ORANGE for n in named]
+    places = rejected[["u_px", "v_px", "radius_px"]].to_numpy(float).tolist()
+    marks = [(u, v, r, str(why)) for (u, v, r), why in zip(places, rejected["reason"])]
+    picture = draw_bubble_overlay(image, outlines, words, colours, rejected=marks)
+    _write_image(staged / "overlays" / camera / f"{frame:06d}.jpg", picture[..., ::-1])
+    _write_image(
+        staged / "binary" / camera / f"{frame:06d}.png", draw_binary(image.shape, outlines)
+    )
+
+
+def _particle(labels: pd.DataFrame, row: pd.Series[Any]) -> str:
+    """The id of the track that holds this detection, "" for none."""
+    near = np.hypot(labels["u_px"] - row["u_px"], labels["v_px"] - row["v_px"])
+    if not len(near) or not near.min() < 1e-6:
+        return ""
+    particle = labels["particle"].iloc[int(near.argmin())]
+    return "" if np.isnan(particle) else f"{int(particle)}"
+
+
+def _write_image(path: Path, picture: Any) -> None:
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    written, encoded = cv2.imencode(path.suffix, picture)
+    if not written:
+        raise InputError("the picture could not be encoded", where=str(path))
+    path.write_bytes(encoded.tobytes())

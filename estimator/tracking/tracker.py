@@ -1,0 +1,351 @@
+"""Bubbles followed through time in the rig frame, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+from telerig.estimator.bubbles.outline.types import Prediction
+from telerig.estimator.tracking import checkpoint
+from telerig.estimator.tracking.association.advance import Scan, advance
+from telerig.estimator.tracking.association.hypotheses import Broken, Cluster, Decision, decide
+from telerig.estimator.tracking.association.labelled_tracks import follow_given
+from telerig.estimator.tracking.association.ledger import Ledger
+from telerig.estimator.tracking.association.single_camera import continue_alone, seen_alone
+from telerig.estimator.tracking.filter.motion import Transition, state_size, transition
+from telerig.estimator.tracking.filter.stage_input import StageMotion
+from telerig.estimator.tracking.filter.state import Common, Track, predict
+from telerig.estimator.tracking.filter.types import (
+    NO_PARTICLE,
+    FrameMeasurements,
+    FrameResult,
+    Ids,
+    Motion,
+    SeenAlone,
+    TrackerSettings,
+    TrackEvent,
+)
+from telerig.estimator.tracking.lifecycle.birth import born, extend, hopeless
+from telerig.estimator.tracking.lifecycle.death import ended, split_off
+from telerig.rig.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+class Tracker:
+    """Measurements of one frame after the other in, particle ids out.
+
+    cameras : those of the rig; only single-camera measurements need them.
+    axis_rig : the stage's travel direction in the rig frame, also the bubbles' way up.
+    first_id : of the first particle; larger than any id that is given with the measurements.
+
+    Write ids to tables from `FrameResult.settled` and `finish`: a frame stays open while a
+    conflict or a birth in it is undecided, at most ``window_frames`` or ``confirm_frames``.
+    Memory does not grow with the run.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera] = (),
+        axis_rig: ArrayLike = (0.0, -1.0, 0.0),
+        settings: TrackerSettings | None = None,
+        *,
+        first_id: int = 0,
+    ) -> None:
+        axis = np.asarray(axis_rig, float)
+        if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
+            raise InputError(
+                f"axis_rig = {axis.tolist()}", todo="give a direction of three numbers"
+            )
+        unit = (axis / np.linalg.norm(axis)).tolist()
+        self.cameras = tuple(cameras)
+        self.axis: tuple[float, float, float] = (unit[0], unit[1], unit[2])
+        self.settings = TrackerSettings() if settings is None else settings
+        self.next_id = first_id
+        self.clusters: list[Cluster] = []
+        self.given: list[Track] = []
+        self.tentative: list[Track] = []
+        self.common = Common.start(state_size(self.settings))
+        self.stage = StageMotion()
+        self.ledger = Ledger()
+        self.last: tuple[int, float] | None = None
+
+    def predict(self, t_s: float, position_mm: float | None = None) -> Prediction:
+        """Where the confirmed tracks are expected; changes nothing.
+
+        Raises InputError when t_s is not after the last frame's.
+        """
+        tracks = self._confirmed()
+        p, x = self.common.covariance, np.zeros((0, len(self.common.shift)))
+        spread = np.zeros((0, 3, 3))
+        if tracks and self.last is not None:
+            stage = StageMotion(**self.stage.to_dict())
+            step, control, found = self._motion(stage, t_s, position_mm)
+            x = np.array([t.filter.x for t in tracks])
+            x[:, 3:6] += found
+            x = x @ step.matrix.T + control
+            own = np.array([t.filter.P for t in tracks]) + p
+            own = step.matrix @ own @ step.matrix.T + step.noise + step.common_noise
+            spread = own[:, :3, :3]
+        ids = np.array([t.particle for t in tracks], np.int64)
+        return Prediction(ids, x[:, :3], spread, np.array([t.d_eq_mm for t in tracks]))
+
+    def update(
+        self,
+        frame: int,
+        t_s: float,
+        measured: FrameMeasurements,
+        position_mm: float | None = None,
+    ) -> FrameResult:
+        """One frame; position_mm is the encoder's reading, None or NaN where there is none.
+
+        Raises InputError when frame or t_s do not increase, or a single-camera measurement names
+        a camera that the tracker does not have.
+        """
+        self._check(frame, t_s, measured)
+        motion = self._predict_all(t_s, position_mm)
+        self.last = (frame, t_s)
+        self.ledger.open_frame(frame, t_s, len(measured), len(measured.singles))
+        events: list[TrackEvent] = []
+        gains = self._follow_given(frame, t_s, measured, events)
+        free = np.flatnonzero(measured.particle == NO_PARTICLE)
+        scan = Scan(frame, t_s, measured, free, self.settings)
+        grown, common, gain = advance(self.clusters, scan, self.common, gains)
+        claimed = self._decide(grown, scan, events)
+        moved = None if motion is None else motion.shifted(common.shift, common.covariance_mm2)
+        alone = self._single(scan, common)
+        self._births(scan, np.setdiff1d(free, claimed), common, gain, events)
+        self._deaths(scan, events)
+        now = self.ledger.now(frame)
+        settled, gaps = self.ledger.settle(self._open_since(frame))
+        self.ledger.forget({t.particle for t in self._confirmed()})
+        return FrameResult(frame, *now, (*events, *gaps), settled, alone, moved)
+
+    def finish(self) -> FrameResult | None:
+        """Settle the frames still open, conflicts as if their time were over; None if no frame.
+
+        The result's own ids are empty: no measurements came with it.
+        """
+        if self.last is None:
+            return None
+        events: list[TrackEvent] = []
+        nothing = FrameMeasurements.create(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        frame, t_s = self.last
+        scan = Scan(frame, t_s, nothing, np.zeros(0, np.int64), self.settings)
+        self._decide(self.clusters, scan, events, at_once=True)
+        self.tentative = []
+        settled, gaps = self.ledger.settle(frame + 1)
+        none = np.zeros(0, np.int64)
+        return FrameResult(frame, none, none, (*events, *gaps), settled)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The whole state in plain numbers and lists, for JSON; exact."""
+        return checkpoint.to_dict(self)
+
+    def restore(self, stored: dict[str, Any]) -> None:
+        """Go on from `to_dict` of a tracker with the same settings, bit by bit.
+
+        Raises InputError when the settings or the axis differ.
+        """
+        checkpoint.restore(self, stored)
+
+    def _confirmed(self) -> list[Track]:
+        return [*self.given, *(t for c in self.clusters for t in c.tracks)]
+
+    def _every(self) -> list[Track]:
+        own = [t for c in self.clusters for b in c.branches for t in b.tracks]
+        return [*self.given, *own, *self.tentative]
+
+    def _open_since(self, frame: int) -> int:
+        starts = [c.since_frame for c in self.clusters if c.open]
+        starts += [t.born_frame for t in self.tentative]
+        return min([frame + 1, *starts])
+
+    def _check(self, frame: int, t_s: float, measured: FrameMeasurements) -> None:
+        if not np.isfinite(t_s):
+            raise InputError(f"time {t_s}", where=f"frame {frame}", todo="give a time in s")
+        if self.last is not None and not (frame > self.last[0] and t_s > self.last[1]):
+            raise InputError(
+                f"frame {frame} at {t_s} s follows frame {self.last[0]} at {self.last[1]} s",
+                todo="give frames in order, with times that increase",
+            )
+        cameras = measured.singles.camera
+        if cameras.size and not (cameras.min() >= 0 and cameras.max() < len(self.cameras)):
+            raise InputError(
+                f"single-camera measurements of camera {cameras.max()}",
+                where=f"frame {frame}",
+                todo=f"the tracker has {len(self.cameras)} cameras, counted from 0",
+            )
+
+    def _motion(
+        self, stage: StageMotion, t_s: float, position_mm: float | None
+    ) -> tuple[Transition, Array, Array]:
+        """The step, the control input (n,) and what to add to velocities before it (3,)."""
+        assert self.last is not None
+        dt = t_s - self.last[1]
+        if not dt > 0:
+            raise InputError(f"time {t_s} s after {self.last[1]} s", todo="times must increase")
+        moved = stage.step(position_mm, t_s, dt)
+        axis = np.array(self.axis)
+        step = transition(self.settings, self.axis, round(dt, 12), moved.known, stage.in_lab)
+        control = step.drift.copy()
+        control[:3] -= axis * moved.moved_mm
+        return step, control, axis * moved.found_speed_mm_s
+
+    def _predict_all(self, t_s: float, position_mm: float | None) -> Motion | None:
+        if self.last is None:
+            self.stage.step(position_mm, t_s, 0.0)
+            return None
+        step, control, found = self._motion(self.stage, t_s, position_mm)
+        self.common = self.common.predicted(step)
+        for track in self._every():
+            if found.any():
+                track.filter.x = track.filter.x + np.pad(found, (3, len(control) - 6))
+            predict(track, step, control)
+        return Motion(step.matrix, step.noise, step.matrix[:, 3:6] @ found + control)
+
+    def _follow_given(
+        self, frame: int, t_s: float, measured: FrameMeasurements, events: list[TrackEvent]
+    ) -> list[Array]:
+        columns = np.flatnonzero(measured.particle != NO_PARTICLE)
+        scan = Scan(frame, t_s, measured, columns, self.settings)
+        self.common, gains, fresh = follow_given(self.given, scan, self.common)
+        for column in columns.tolist():
+            self.ledger.write([(frame, column)], int(measured.particle[column]))
+        for column in fresh:
+            track = self._new(scan, column)
+            track.particle = int(measured.particle[column])
+            self.given.append(track)
+            self._event(events, "birth", scan, (track.particle,), "id given with the data")
+        self.next_id = max([self.next_id, *(measured.particle + 1).tolist()])
+        return gains
+
+    def _new(self, scan: Scan, column: int) -> Track:
+        """A track at a measurement, with the mean velocity of what rises."""
+        velocity = np.array(self.axis) * (self.settings.rise_mm_s if self.stage.in_lab else 0.0)
+        return born(scan, column, velocity, self.stage.in_lab, self._confirmed())
+
+    def _event(
+        self,
+        events: list[TrackEvent],
+        kind: str,
+        scan: Scan,
+        particles: tuple[int, ...],
+        reason: str,
+    ) -> None:
+        events.append(TrackEvent(kind, scan.frame, scan.t_s, particles, reason))
+
+    def _take_id(self) -> int:
+        self.next_id += 1
+        return self.next_id - 1
+
+    def _decide(
+        self,
+        grown: Sequence[Cluster],
+        scan: Scan,
+        events: list[TrackEvent],
+        *,
+        at_once: bool = False,
+    ) -> Ids:
+        """Settle what can be settled; the columns of this frame that some track claims."""
+        claimed, out = [], []
+        for cluster in grown:
+            histories = [h for b in cluster.branches for h in b.history.values()]
+            claimed += [c for h in histories for f, c in h[-1:] if f == scan.frame and c >= 0]
+            verdict = decide(cluster, scan.frame, self.settings, at_once=at_once)
+            for track, entries in verdict.free:
+                self.ledger.write(entries, track.particle)
+                out.append(Cluster.of(track))
+            self._resolved(verdict, scan, events)
+            if verdict.broken:
+                out += [Cluster.of(t) for t in self._broken(verdict, scan, events)]
+            if verdict.still is not None:
+                out.append(verdict.still)
+                for particle, entries in verdict.still.branches[0].history.items():
+                    self.ledger.write(entries[-1:], particle)
+        self.clusters = out
+        return np.unique(np.array(claimed, np.int64))
+
+    def _resolved(self, verdict: Decision, scan: Scan, events: list[TrackEvent]) -> None:
+        waited = [(t.particle, len(entries)) for t, entries in verdict.free if len(entries) > 1]
+        if waited:
+            reason = f"conflict of {max(n for _, n in waited)} frames decided"
+            self._event(events, "resolved", scan, tuple(p for p, _ in waited), reason)
+
+    def _broken(self, verdict: Decision, scan: Scan, events: list[TrackEvent]) -> list[Track]:
+        """New ids for the tracks that go on behind a conflict."""
+        self.ledger.write((e for b in verdict.broken for e in b.entries), NO_PARTICLE)
+        old = tuple(b.track.particle for b in verdict.broken)
+        out = [self._renamed(b) for b in verdict.broken]
+        new = [t for t in out if t is not None]
+        reason = (
+            f"continuation not safe: the runner-up is {verdict.runner_up_nats:.1f} nats behind "
+            f"(margin {self.settings.margin_nats:g})"
+        )
+        self._event(events, "break", scan, (*old, *(t.particle for t in new)), reason)
+        return new
+
+    def _renamed(self, broken: Broken) -> Track | None:
+        self.ledger.write(broken.kept, broken.track.particle)
+        if not broken.new:
+            return None
+        broken.track.particle = self._take_id()
+        self.ledger.write(broken.new, broken.track.particle)
+        return broken.track
+
+    def _single(self, scan: Scan, common: Common) -> SeenAlone:
+        """Confirmed tracks that were missed in this frame, continued by one camera alone."""
+        closed = [c.tracks[0] for c in self.clusters if not c.open]
+        missed = [t for t in closed if t.seen_frame < scan.frame]
+        found = continue_alone(missed, scan, self.cameras, common.covariance_mm2)
+        for track, single in found:
+            self.ledger.write_single(scan.frame, single, track.particle)
+        return seen_alone(found, common.covariance_mm2)
+
+    def _births(
+        self,
+        scan: Scan,
+        free: Ids,
+        common: Common,
+        gain: Array | None,
+        events: list[TrackEvent],
+    ) -> None:
+        """Tentative tracks go on, are confirmed or given up; what is left starts new ones."""
+        rest = Scan(scan.frame, scan.t_s, scan.measured, free, scan.settings)
+        going, common, gain = extend(self.tentative, rest, common, gain)
+        n = len(common.shift)
+        self.common = common.applied(np.zeros((n, 3)) if gain is None else gain)
+        used = [c for t in going for f, c in t.history[-1:] if f == scan.frame]
+        self.tentative = []
+        for track in going:
+            if len(track.history) >= self.settings.confirm_hits:
+                self._confirm(track, scan, events)
+            elif not hopeless(track, scan.frame, self.settings):
+                self.tentative.append(track)
+        fresh = np.setdiff1d(free, np.array(used, np.int64)).tolist()
+        self.tentative += [self._new(scan, column) for column in fresh]
+        if self.settings.confirm_hits == 1:
+            for track in self.tentative:
+                self._confirm(track, scan, events)
+            self.tentative = []
+
+    def _confirm(self, track: Track, scan: Scan, events: list[TrackEvent]) -> None:
+        track.particle = self._take_id()
+        self.ledger.write(track.history, track.particle)
+        reason = f"first seen in frame {track.history[0][0]}"
+        self._event(events, "birth", scan, (track.particle,), reason)
+        events += split_off(track, self._confirmed(), scan)
+        track.history, track.parent = [], None
+        self.clusters.append(Cluster.of(track))
+
+    def _deaths(self, scan: Scan, events: list[TrackEvent]) -> None:
+        closed = [c.tracks[0] for c in self.clusters if not c.open] + self.given
+        dead, found = ended(closed, self._confirmed(), scan)
+        events += found
+        if dead:
+            self.clusters = [c for c in self.clusters if c.tracks[0].particle not in dead]
+            self.given = [t for t in self.given if t.particle not in dead]

@@ -1,0 +1,83 @@
+"""Tracks of a run: every detection, every 3-D point, what happened, and how it was decided."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from telerig.errors import InputError
+from telerig.estimator.tracking.detection import read_batch
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.estimator.tracking.filter.types import TrackEvent
+
+EVENT_COLUMNS = ["frame", "t_s", "kind", "particles", "reason"]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """detections : every bubble found, with the id of its track, blank where it has none.
+
+    table : one row per frame and bubble seen by both cameras, see docs/files.md; rig frame.
+    events : births, deaths, gaps, breaks, splits and mergers, each with its reason.
+    summary : numbers and sentences of tracking.json.
+    references : dots of a strip fixed to the tank, found in the images; None where there is none.
+    """
+
+    name: str
+    detections: pd.DataFrame
+    table: pd.DataFrame
+    events: pd.DataFrame
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    references: pd.DataFrame | None = None
+
+    def __len__(self) -> int:
+        """Number of tracks."""
+        return int(self.table["particle"].nunique())
+
+    def save(self, folder: str | Path) -> None:
+        """Write detections.csv, tracks.csv, events.csv, tracking.json; references.csv if any."""
+        from telerig.io.dataset.tables import write_table
+        from telerig.io.files.atomic import write_json_atomic
+
+        out = Path(folder)
+        for name in ("detections", "tracks", "events"):
+            write_table(
+                self.table if name == "tracks" else getattr(self, name), out / f"{name}.csv"
+            )
+        if self.references is not None:
+            write_table(self.references, out / "references.csv")
+        write_json_atomic(out / "tracking.json", dict(self.summary))
+
+
+def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
+    """In the order of time."""
+    import pandas as pd
+
+    rows = [
+        (e.frame, e.t_s, e.kind, " ".join(str(p) for p in e.particles), e.reason)
+        for e in sorted(events, key=lambda e: e.frame)
+    ]
+    return pd.DataFrame(rows, columns=EVENT_COLUMNS)
+
+
+def load_tracks(folder: str | Path) -> Tracks:
+    """Read what `telerig track` wrote. Raises InputError when it is not there."""
+    import json
+
+    place = Path(folder)
+    files = [place / n for n in ("detections.csv", "tracks.csv", "events.csv", "tracking.json")]
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"there is no {file.name}", where=str(place), todo="run telerig track")
+    summary = json.loads(files[3].read_text(encoding="utf-8"))
+    detections, table, events = (read_batch(file) for file in files[:3])
+    marks = place / "references.csv"
+    references = read_batch(marks) if marks.is_file() else None
+    return Tracks(
+        str(summary.get("run", place.name)), detections, table, events, summary, references
+    )

@@ -1,0 +1,305 @@
+"""A dataset folder: its rig file, its calibration views or dots, its runs. Images stay on disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from telerig.errors import InputError
+from telerig.io.dataset.tables import read_dots_csv
+from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
+from telerig.io.rig_file.description import RigDescription, suggestion
+from telerig.io.rig_file.rig_file import read_rig_toml
+from telerig.rig.target import Target
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.io.dataset.run import RunData
+
+Source = Literal["images", "dots"]
+
+_FOLDERS = ["calibration", "stage_axis", "runs", "truth", "results"]
+_LAYOUT = "put images at calibration/<camera>/<view>.tif, or dots in calibration/dots.csv"
+
+
+@dataclass(frozen=True)
+class View:
+    """One pose of the target. image_paths : by camera; empty when the source is dots.csv."""
+
+    name: str
+    image_paths: Mapping[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording: the folder `runs/<name>`."""
+
+    name: str
+    path: Path
+
+    def load(self, **options: Any) -> RunData:
+        """Its tables and frames; options as for `telerig.io.dataset.run.load_run`."""
+        from telerig.io.dataset.run import load_run
+
+        return load_run(self.path, **options)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """What `load_dataset` found.
+
+    views : in natural order of their names. source : where the views come from; None when no
+    views were asked for and none could be chosen. notes : what a user should know, in words.
+    """
+
+    path: Path
+    rig: RigDescription
+    views: tuple[View, ...]
+    runs: Mapping[str, Run]
+    source: Source | None
+    notes: list[str] = field(default_factory=list)
+    table: pd.DataFrame | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def target(self) -> Target:
+        return self.rig.target
+
+    @property
+    def results(self) -> Path:
+        """Where commands write unless told otherwise."""
+        return self.path / "results"
+
+    def dots(self) -> pd.DataFrame:
+        """The table of `calibration/dots.csv`, see `telerig.io.dataset.tables.read_dots_csv`.
+
+        Raises InputError when the views are images: their dots must be detected first.
+        """
+        if self.table is None:
+            raise InputError(
+                "the views are images, no dots.csv was read",
+                where=str(self.path),
+                todo="detect the dots first (telerig detect)",
+            )
+        return self.table.copy()
+
+    def image(self, view: View, camera: str | int) -> Image:
+        """The view's image from one camera, of the size that `rig.toml` states.
+
+        Raises InputError when the camera has no image of the view, or one that cannot be used.
+        """
+        name = self.rig.camera_name(camera)
+        if name not in view.image_paths:
+            raise InputError(
+                f"camera {name} has no image of view {view.name}",
+                where=str(self.path / "calibration" / name),
+                todo="add the image, or go by view.image_paths",
+            )
+        size = self.rig.cameras[name].image_size_px
+        return read_image(view.image_paths[name], expected_size_px=size)
+
+    @cached_property
+    def truth(self) -> dict[str, Any] | None:
+        """The simulator's `truth/truth.json`; None in a real dataset. Never for estimators."""
+        file = self.path / "truth" / "truth.json"
+        if not file.is_file():
+            return None
+        try:
+            content = json.loads(file.read_bytes())
+        except ValueError as error:
+            raise InputError(
+                f"is not valid JSON: {error}", where=str(file), todo="simulate the dataset again"
+            ) from error
+        return dict(content)
+
+
+def load_dataset(
+    path: str | PathLike[str],
+    source: Source | None = None,
+    *,
+    need_views: bool = True,
+) -> Dataset:
+    """Read a dataset's rig file and list what else it holds; no image is decoded.
+
+    source : "images" or "dots" when `calibration/` holds both.
+    need_views : False for work on runs with a calibration from elsewhere; then a dataset without
+    views, or with views of two kinds, is no error.
+    Raises InputError for a folder that is not a dataset or views that cannot be told apart.
+    """
+    folder = _dataset_folder(Path(path))
+    rig = read_rig_toml(folder / "rig.toml")
+    runs = _runs(folder / "runs")
+    chosen = _choose_source(folder, rig, source, need_views)
+    notes: list[str] = []
+    views: tuple[View, ...] = ()
+    table = None
+    if chosen == "images":
+        views = _image_views(folder / "calibration", rig, notes)
+    elif chosen == "dots":
+        table = read_dots_csv(folder / "calibration" / "dots.csv", rig)
+        views = tuple(View(name) for name in sorted(set(table["view"]), key=natural))
+        _note_single(table.groupby("view")["camera"].agg(set).to_dict(), rig, notes)
+    else:
+        notes.append("no calibration views were read")
+    return Dataset(folder, rig, views, runs, chosen, notes, table)
+
+
+def _dataset_folder(path: Path) -> Path:
+    where = str(path)
+    if path.is_file():
+        raise InputError(
+            "is a file, not a dataset folder", where=where, todo=f"give its folder, {path.parent}"
+        )
+    if not path.is_dir():
+        near = _near(path)
+        raise InputError(
+            "there is no such dataset folder",
+            where=where,
+            todo=near or "check the path, or make one with `telerig init` or `telerig simulate`",
+        )
+    if not (path / "rig.toml").is_file():
+        inner = [p.parent.name for p in sorted(path.glob("*/rig.toml"))]
+        todo = f"the dataset may be {path / inner[0]}; if not, " if inner else ""
+        raise InputError(
+            "has no rig.toml, so it is not a dataset",
+            where=where,
+            todo=todo + "write one with `telerig init`",
+        )
+    return path
+
+
+def _near(path: Path) -> str:
+    if not path.parent.is_dir():
+        return ""
+    todo = suggestion(path.name, [p.name for p in path.parent.iterdir() if p.is_dir()])
+    return todo if todo.startswith("did") else ""
+
+
+def _runs(folder: Path) -> dict[str, Run]:
+    found = [p for p in _entries(folder) if p.is_dir()]
+    return {p.name: Run(p.name, p) for p in found}
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What a folder holds in natural order, hidden entries left out; nothing if it is not there."""
+    if not folder.is_dir():
+        return []
+    found = (p for p in folder.iterdir() if not p.name.startswith("."))
+    return sorted(found, key=lambda p: natural(p.name))
+
+
+def _choose_source(
+    folder: Path, rig: RigDescription, source: str | None, need_views: bool
+) -> Source | None:
+    calibration = folder / "calibration"
+    has_dots = (calibration / "dots.csv").is_file()
+    has_images = any(list_images(p) for p in _entries(calibration) if p.is_dir())
+    has: dict[Source, bool] = {"images": has_images, "dots": has_dots}
+    if source is not None and source not in has:
+        raise InputError(
+            f"source is {source!r}", where=str(folder), todo='give "images" or "dots" (--from)'
+        )
+    wanted: list[Source] = [s for s in has if source in (None, s)]
+    found = [s for s in wanted if has[s]]
+    if len(found) == 1:
+        return found[0]
+    if not need_views and source is None:
+        return None
+    if found:
+        raise InputError(
+            "holds both images and dots.csv, and which to use is not said",
+            where=str(calibration),
+            todo="choose with --from images or --from dots",
+        )
+    raise _no_views(folder, rig, wanted)
+
+
+def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> InputError:
+    calibration = folder / "calibration"
+    kind = {"images": "images in calibration/<camera>/", "dots": "calibration/dots.csv"}
+    what = f"there are no views: no {' and no '.join(kind[s] for s in wanted)}"
+    todo = _LAYOUT
+    if not calibration.is_dir():
+        others = [p.name for p in _entries(folder) if p.is_dir() and p.name not in _FOLDERS]
+        near = [name for name in others if suggestion(name, _FOLDERS) == _meant("calibration")]
+        todo = f"rename {near[0]} to calibration" if near else todo
+    elif list_images(calibration):
+        todo = f"move the images in calibration/ into calibration/{rig.first}/"
+    return InputError(what, where=str(folder), todo=todo)
+
+
+def _meant(name: str) -> str:
+    return f"did you mean {name}?"
+
+
+def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tuple[View, ...]:
+    by_view: dict[str, dict[str, Path]] = {}
+    for entry in _entries(calibration):
+        if not entry.is_dir():
+            if entry.name != "dots.csv":
+                notes.append(f"calibration/{entry.name} is in no camera's folder: not used")
+        elif entry.name not in rig.cameras:
+            raise InputError(
+                f"there is no camera {entry.name!r} in rig.toml",
+                where=str(entry),
+                todo=suggestion(entry.name, list(rig.cameras)),
+            )
+        else:
+            for stem, file in _stems(entry, notes).items():
+                by_view.setdefault(stem, {})[entry.name] = file
+    _check_case(by_view, calibration)
+    _note_single({view: set(paths) for view, paths in by_view.items()}, rig, notes)
+    return tuple(
+        View(name, {c: by_view[name][c] for c in rig.cameras if c in by_view[name]})
+        for name in sorted(by_view, key=natural)
+    )
+
+
+def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
+    """The images of one camera by view name; what is no image is noted."""
+    images = list_images(folder)
+    strange = [p.name for p in _entries(folder) if p not in images]
+    if strange:
+        notes.append(
+            f"calibration/{folder.name}: not used, as they are no images "
+            f"({' '.join(EXTENSIONS)}): {', '.join(strange)}"
+        )
+    stems: dict[str, Path] = {}
+    for file in images:
+        if file.stem in stems:
+            raise InputError(
+                f"{stems[file.stem].name} and {file.name} are the same view twice",
+                where=str(folder),
+                todo="the name without its extension is the view: remove or rename one",
+            )
+        stems[file.stem] = file
+    return stems
+
+
+def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
+    """Names that differ only in case are one view on some file systems and two on others."""
+    spelled: dict[str, str] = {}
+    for view in by_view:
+        other = spelled.setdefault(view.casefold(), view)
+        if other != view:
+            files = [next(iter(by_view[name].values())) for name in (other, view)]
+            names = " and ".join(f.relative_to(calibration).as_posix() for f in files)
+            raise InputError(
+                f"{names} differ only in upper and lower case",
+                where=str(calibration),
+                todo="spell a view's name alike for both cameras, or rename one",
+            )
+
+
+def _note_single(cameras_of: Mapping[Any, set[str]], rig: RigDescription, notes: list[str]) -> None:
+    """Views of one camera alone say nothing about the other: tell it."""
+    for camera in rig.cameras if len(rig.cameras) > 1 else ():
+        alone = sorted((str(v) for v, seen in cameras_of.items() if seen == {camera}), key=natural)
+        if alone:
+            count = f"{len(alone)} view{'s' if len(alone) > 1 else ''}"
+            notes.append(f"{count} of camera {camera} alone: {', '.join(alone)}")

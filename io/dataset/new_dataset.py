@@ -1,0 +1,64 @@
+"""A new dataset: its folders, and a rig.toml with a comment on every line that needs one."""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+from pathlib import Path
+from string import Template
+
+from telerig.errors import InputError
+from telerig.io.files.atomic import write_text_atomic
+from telerig.io.rig_file.rig_file import description_from_toml
+
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
+_NOT_IN_TOML = re.compile(r'["\\\x00-\x1f\x7f]')
+
+
+def new_dataset(
+    folder: Path,
+    *,
+    cameras: tuple[str, str] = ("left", "right"),
+    image_size_px: tuple[int, int] = (512, 512),
+    scale_px_per_mm: float = 10.0,
+    angle_deg: float = 90.0,
+) -> list[Path]:
+    """Make the folders of a dataset and its rig.toml; returns what was made, rig.toml first.
+
+    image_size_px : (width, height). angle_deg : from the first camera's axis to the second's.
+    What is there already stays: folders are completed, a rig.toml is never written over.
+    Raises InputError for a folder that has one, or values that no rig can have.
+    """
+    place = Path(folder)
+    rig = place / "rig.toml"
+    if rig.exists():
+        raise InputError("there is a rig.toml already", where=str(rig), todo="edit it")
+    _check(cameras, image_size_px, scale_px_per_mm)
+    template = (resources.files("telerig.io.dataset") / "rig_template.toml").read_text(
+        encoding="utf-8"
+    )
+    text = Template(template).substitute(
+        name=_NOT_IN_TOML.sub("", place.resolve().name), first=cameras[0], second=cameras[1],
+        width=image_size_px[0], height=image_size_px[1], scale=float(scale_px_per_mm),
+        angle=float(angle_deg),
+    )  # fmt: skip
+    description_from_toml(text, where=str(rig))
+    write_text_atomic(rig, text)
+    folders = [place / "calibration" / name for name in cameras] + [place / "runs"]
+    for made in folders:
+        made.mkdir(parents=True, exist_ok=True)
+    return [rig, *folders]
+
+
+def _check(cameras: tuple[str, str], size: tuple[int, int], scale: float) -> None:
+    for name in cameras:
+        if not _NAME.fullmatch(name) or name == "carriage":
+            raise InputError(
+                f"camera name {name!r}", todo="use letters, digits, _ and -; not 'carriage'"
+            )
+    if cameras[0] == cameras[1]:
+        raise InputError("both cameras have one name", todo="name them apart")
+    if min(size) < 16:
+        raise InputError(f"image size {size[0]} x {size[1]}", todo="give width x height in pixels")
+    if not scale > 0:
+        raise InputError(f"scale {scale} px/mm", todo="give a positive number")

@@ -1,0 +1,275 @@
+"""Load a recording of bubbles: find its frames, read its tables, check them together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.dataset.frame_pairing import Pairing, pair_frames
+from telerig.io.dataset.run_data import RunData, RunSource, outside_record
+from telerig.io.dataset.run_tables import (
+    read_accelerometer_csv,
+    read_detections_csv,
+    read_frames_csv,
+    read_references_csv,
+    read_run_toml,
+    read_stage_csv,
+)
+from telerig.io.images.frames import PAGE_EXTENSIONS, FrameSource, open_frames
+from telerig.io.images.read import list_images
+from telerig.io.images.video import VIDEO_EXTENSIONS
+from telerig.io.rig_file.description import RigDescription, suggestion
+from telerig.io.rig_file.rig_file import read_rig_toml
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["RunData", "load_run"]
+
+Array = NDArray[np.float64]
+
+
+def load_run(
+    path: str | PathLike[str],
+    *,
+    rig: RigDescription | None = None,
+    source: RunSource | None = None,
+    cameras: Sequence[str] | None = None,
+    image_sizes_px: Mapping[str, tuple[int, int]] | None = None,
+    pair_by: Pairing = "auto",
+    skip_unreadable: bool | None = None,
+) -> RunData:
+    """Read a run's tables and find its frames; only the first and last images are decoded.
+
+    path : `DATASET/runs/NAME`, or any folder that holds the same files.
+    rig : None looks for `rig.toml` two folders up.
+    source : "images" or "detections" where the folder has both.
+    cameras, image_sizes_px : from a calibration, where there is no rig.toml.
+    pair_by : how images of several cameras come together, see `pair_frames`.
+    skip_unreadable : True leaves out every frame that cannot be read, False none; by default only
+    the last of a recording, which is cut short when the disk is full or the power fails.
+
+    Raises InputError, with the file, the row or frame, and what to do.
+    """
+    folder = _run_folder(Path(path))
+    rig = rig or _rig_above(folder)
+    names = list(cameras) if cameras else _cameras_of(rig, folder)
+    sizes = {name: c.image_size_px for name, c in rig.cameras.items()} if rig else {}
+    sizes |= dict(image_sizes_px or {})
+    notes: list[str] = []
+    images = _choose_source(folder, names, source) == "images"
+    sources = _open_sources(folder, names) if images else {}
+    positions = _paired(folder, sources, pair_by, notes) if images else {}
+    sizes |= {n: _size(s) for n, s in sources.items() if n not in sizes}
+    count = len(positions[names[0]]) if images else None
+    detections = None if images else _detections(folder, names, sizes, notes)
+    t_s = _times(folder, names, count, detections, notes)
+    stage = _table(folder / "stage.csv", read_stage_csv)
+    sensors = list(rig.accelerometers) if rig else None
+    run = RunData(
+        name=folder.name,
+        path=folder,
+        cameras=tuple(names),
+        frame_count=len(t_s),
+        t_s=t_s,
+        position_mm=None if stage is None else _stage_positions(stage, t_s, notes),
+        image_sizes_px=sizes,
+        source="images" if images else "detections",
+        rig=rig,
+        stage=stage,
+        accelerometers=_table(
+            folder / "accelerometer.csv", lambda file: read_accelerometer_csv(file, sensors)
+        ),
+        references=_table(
+            folder / "references.csv",
+            lambda file: read_references_csv(file, names, sizes, len(t_s)),
+        ),
+        detections=detections,
+        notes=notes,
+        skip_unreadable=skip_unreadable,
+        sources=sources,
+        positions=positions,
+    )
+    return _looked_at(run)
+
+
+def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
+    if rig is None or not rig.cameras:
+        raise InputError(
+            "there is no rig.toml two folders up, so the cameras are not known",
+            where=str(folder),
+            todo="put the run into DATASET/runs/, or give a calibration (--calibration FILE)",
+        )
+    return list(rig.cameras)
+
+
+def _run_folder(path: Path) -> Path:
+    if path.is_dir():
+        return path.resolve()
+    if path.exists():
+        raise InputError(
+            "is a file, not a run's folder", where=str(path), todo=f"give its folder, {path.parent}"
+        )
+    others = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
+    raise InputError(
+        "there is no such run",
+        where=str(path),
+        todo=suggestion(path.name, sorted(others)) if others else "check the path",
+    )
+
+
+def _rig_above(folder: Path) -> RigDescription | None:
+    file = folder.parent.parent / "rig.toml"
+    return read_rig_toml(file) if file.is_file() else None
+
+
+def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSource:
+    if source not in (None, "images", "detections"):
+        todo = 'give "images" or "detections" (--from)'
+        raise InputError(f"source is {source!r}", where=str(folder), todo=todo)
+    table = (folder / "detections.csv").is_file()
+    images = bool(_recordings(folder))
+    if source is None and table and images:
+        raise InputError(
+            "holds both images and detections.csv, and which to use is not said",
+            where=str(folder),
+            todo="choose with --from images or --from detections",
+        )
+    if table and source != "images":
+        return "detections"
+    if images and source != "detections":
+        return "images"
+    wanted = "no detections.csv" if source == "detections" else "no images"
+    raise InputError(
+        f"there are {wanted}" if source == "images" or not source else f"there is {wanted}",
+        where=str(folder),
+        todo=f"put frames at {names[0]}/*.tif, {names[0]}.tif or {names[0]}.avi, "
+        "or detections into detections.csv",
+    )
+
+
+def _recordings(folder: Path) -> dict[str, Path]:
+    """Whatever in the folder looks like a camera's frames, by its name without extension."""
+    found = {}
+    for entry in sorted(folder.iterdir()):
+        frames = entry.suffix.lower() in PAGE_EXTENSIONS + VIDEO_EXTENSIONS and entry.is_file()
+        if not entry.name.startswith(".") and (frames or (entry.is_dir() and list_images(entry))):
+            found[entry.name if entry.is_dir() else entry.stem] = entry
+    return found
+
+
+def _open_sources(folder: Path, names: list[str]) -> dict[str, FrameSource]:
+    """Raises InputError for a camera without frames, and for frames of no known camera."""
+    strangers = {name: p for name, p in _recordings(folder).items() if name not in names}
+    for name, entry in strangers.items():
+        raise InputError(
+            f"there is no camera {name!r} in the rig",
+            where=str(entry),
+            todo=suggestion(name, names) + " Else move it out of the run's folder.",
+        )
+    sources = {name: open_frames(folder, name) for name in names}
+    for name, source in sources.items():
+        if source is None:
+            raise InputError(
+                f"camera {name} has no frames",
+                where=str(folder),
+                todo=f"put them at {name}/*.tif, {name}.tif or {name}.avi",
+            )
+    return {name: source for name, source in sources.items() if source is not None}
+
+
+def _paired(
+    folder: Path, sources: Mapping[str, FrameSource], pair_by: Pairing, notes: list[str]
+) -> dict[str, NDArray[np.int64]]:
+    file, missing = folder / "frames.csv", None
+    if file.is_file():
+        table = read_frames_csv(file, None, list(sources))
+        if "missing" in table:
+            dropped = table["missing"].str.split("|")
+            missing = {n: np.array([n in names for names in dropped], bool) for n in sources}
+    positions, found = pair_frames(sources, pair_by, missing, str(folder))
+    notes += found
+    return positions
+
+
+def _size(source: FrameSource) -> tuple[int, int]:
+    height, width = source.read(0).shape
+    return width, height
+
+
+def _detections(
+    folder: Path, names: list[str], sizes: Mapping[str, tuple[int, int]], notes: list[str]
+) -> pd.DataFrame:
+    file = folder / "frames.csv"
+    count = len(read_frames_csv(file, None, names)) if file.is_file() else None
+    table = read_detections_csv(folder / "detections.csv", names, sizes, count)
+    if not all(name in sizes for name in names):
+        notes.append("the images' sizes are not known: detections outside them are not noticed")
+    silent = [name for name in names if name not in set(table["camera"])]
+    notes += [f"detections.csv has nothing of camera {name}" for name in silent]
+    return table
+
+
+def _times(
+    folder: Path,
+    names: list[str],
+    count: int | None,
+    detections: pd.DataFrame | None,
+    notes: list[str],
+) -> Array:
+    file, settings = folder / "frames.csv", folder / "run.toml"
+    if file.is_file():
+        if settings.is_file():
+            read_run_toml(settings)
+            notes.append("the frames' times are those of frames.csv, not of run.toml")
+        return np.asarray(read_frames_csv(file, count, names)["t_s"], float)
+    if count is None:
+        count = 0 if detections is None else int(detections["frame"].max()) + 1
+    if settings.is_file():
+        rate, start = read_run_toml(settings)
+        return start + np.arange(count) / rate
+    if count == 1:
+        notes.append("neither frames.csv nor run.toml: the only frame is taken at 0 s")
+        return np.zeros(1)
+    raise InputError(
+        "has neither frames.csv nor run.toml, so the frames have no times",
+        where=str(folder),
+        todo="write run.toml with frame_rate_hz = 500.0, or frames.csv with frame,t_s",
+    )
+
+
+def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array:
+    t, position = stage["t_s"].to_numpy(float), stage["position_mm"].to_numpy(float)
+    at = np.interp(t_s, t, position, left=np.nan, right=np.nan)
+    outside = np.flatnonzero(np.isnan(at))
+    if outside.size:
+        notes.append(outside_record(t_s, outside) + "; their stage position is not known")
+    step = np.diff(t)
+    wide = np.flatnonzero(step > 10 * np.median(step))
+    hit = [i for i in wide if np.any((t_s > t[i]) & (t_s < t[i + 1]))]
+    if hit:
+        notes.append(
+            f"stage.csv is silent for {step[hit[0]]:.3g} s from {t[hit[0]]:.6g} s on"
+            + (f", and {len(hit) - 1} times more" if len(hit) > 1 else "")
+            + ": positions there are interpolated"
+        )
+    return np.asarray(at, float)
+
+
+def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | None:
+    return read(file) if file.is_file() else None
+
+
+def _looked_at(run: RunData) -> RunData:
+    """Each camera's first and last image are decoded, so that wrong sizes and cuts show at once."""
+    for name, positions in run.positions.items():
+        present = np.flatnonzero(positions >= 0)
+        for frame in present[[0, -1]] if present.size else ():
+            run.image(name, int(frame))
+    return run

@@ -1,0 +1,188 @@
+"""The tables of a dataset, checked against its rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from telerig.errors import InputError
+from telerig.io.files.csv_table import Column, fail_rows, read_table, write_table
+from telerig.io.rig_file.description import RigDescription, suggestion
+from telerig.io.rig_file.target import FARTHEST
+from telerig.rig.target import Target
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["DOTS_COLUMNS", "Column", "fail_rows", "read_dots_csv", "read_table", "write_table"]
+
+DEFAULT_SIGMA_PX = 0.02
+"""Standard deviation of a dot's centre where the table does not state it."""
+
+OUTSIDE_PX = 3.0
+"""A centre may lie this far outside the image: rounding, half-seen dots, an earlier crop."""
+
+_COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
+DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *_COVARIANCE]
+
+
+def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFrame:
+    """The dots of `calibration/dots.csv`, or of `results/calibration/dots.csv`.
+
+    Columns `DOTS_COLUMNS` (and chi2_dof if the file has it): view and camera text; dot the id of
+    `rig.target`, also on an unbounded grid, where the file's own dot is opaque and row, column
+    count; covariance from suu_px2, suv_px2, svv_px2, else sigma_px, else `DEFAULT_SIGMA_PX`;
+    ``attrs["sigma_known"]`` tells whether the file stated it. Rows keep the file's order.
+    Raises InputError, with the row (header = 1) and the column, for anything that cannot be.
+    """
+    file = Path(path)
+    table = read_table(file, _columns(rig.target))
+    check_cameras(table, list(rig.cameras), file)
+    check_pixels(table, {name: c.image_size_px for name, c in rig.cameras.items()}, file)
+    if rig.target.bounded:
+        _check_dots(table, rig.target, file)
+    else:
+        _number_unbounded(table, rig.target, file)
+    _check_repeats(table, rig.target, file)
+    known = fill_covariance(table, file, DEFAULT_SIGMA_PX, of="the dot's centre")
+    columns = DOTS_COLUMNS + [name for name in ("chi2_dof",) if name in table]
+    dots = table[columns].reset_index(drop=True)
+    dots.attrs["sigma_known"] = known
+    return dots
+
+
+def _columns(target: Target) -> list[Column]:
+    unbounded = not target.bounded
+    return [
+        Column("view", "text"),
+        Column("camera", "text"),
+        Column("dot", "text" if unbounded else "whole", blank=unbounded),
+        Column("u_px"),
+        Column("v_px"),
+        Column("sigma_px", required=False),
+        Column("row", "whole", required=unbounded),
+        Column("column", "whole", required=unbounded),
+        *(Column(name, required=False) for name in _COVARIANCE),
+        Column("chi2_dof", required=False, blank=True),
+    ]
+
+
+def check_cameras(table: pd.DataFrame, names: list[str], file: Path) -> None:
+    """Raise InputError for the first row whose camera is not one of ``names``."""
+    unknown = ~table["camera"].isin(names).to_numpy()
+    name = str(table["camera"][unknown].iloc[0]) if unknown.any() else ""
+    what = f"there is no camera {name!r} in rig.toml"
+    fail_rows(unknown, table, (file, "camera"), lambda i: what, suggestion(name, names))
+
+
+def check_pixels(table: pd.DataFrame, sizes_px: Mapping[str, tuple[int, int]], file: Path) -> None:
+    """Raise InputError for the first row whose pixel lies outside its camera's image."""
+    sizes = np.array([sizes_px[name] for name in table["camera"]], float).reshape(-1, 2)
+    for column, size in zip(("u_px", "v_px"), sizes.T):
+        _check_inside(table, column, size, file)
+
+
+def _check_inside(table: pd.DataFrame, column: str, size: Any, file: Path) -> None:
+    value = table[column].to_numpy()
+    outside = (value < -0.5 - OUTSIDE_PX) | (value > size - 0.5 + OUTSIDE_PX)
+    todo = "correct the cell, or image_size_px = [width, height] in rig.toml"
+    fail_rows(
+        outside,
+        table,
+        (file, column),
+        lambda i: f"is {value[i]:g}, outside the image of {size[i]:.0f} px",
+        todo,
+    )
+
+
+def _number_unbounded(table: pd.DataFrame, target: Target, file: Path) -> None:
+    """The ids of `Target` in place of the file's opaque ones, from row and column."""
+    for column in ("row", "column"):
+        far = table[column].abs().to_numpy() > FARTHEST
+        todo = f"rows and columns count from the origin mark, within +-{FARTHEST}"
+        fail_rows(far, table, (file, column), lambda i: "is too far from the origin mark", todo)
+    table["dot"] = target.id_from_row_column(table["row"], table["column"])
+
+
+def _check_dots(table: pd.DataFrame, target: Target, file: Path) -> None:
+    """Check the ids; check row and column against them, or fill them in."""
+    dot, ids = table["dot"].to_numpy(), target.ids()
+    numbers = f"its {len(ids)} dots are numbered from {ids.min()} to {ids.max()}"
+    missing = ", missing marks left out" if target.mark_style == "missing" else ""
+    fail_rows(
+        ~target.known_id(dot),
+        table,
+        (file, "dot"),
+        lambda i: f"is {dot[i]}, which the target of rig.toml does not have",
+        numbers + missing,
+    )
+    for column, expected in zip(("row", "column"), target.row_column_from_id(dot)):
+        if column in table:
+            _check_place(table, column, expected, file)
+        table[column] = expected
+
+
+def _check_place(table: pd.DataFrame, column: str, expected: Any, file: Path) -> None:
+    given, dot = table[column].to_numpy(), table["dot"].to_numpy()
+    fail_rows(
+        given != expected,
+        table,
+        (file, column),
+        lambda i: f"is {given[i]}, but dot {dot[i]} lies in {column} {expected[i]}",
+        "dot = row * columns + column, from 0; correct one of them, or rig.toml",
+    )
+
+
+def _check_repeats(table: pd.DataFrame, target: Target, file: Path) -> None:
+    keys = ["view", "camera", "dot"]
+    again = table.duplicated(keys).to_numpy()
+    if not again.any():
+        return
+    this = table[again].iloc[0]
+    earlier = table.index[(table[keys] == this[keys]).all(axis=1)][0]
+    place = f"at row {this['row']}, column {this['column']}"
+    dot = f"dot {this['dot']}" if target.bounded else f"the dot {place}"
+    what = f"{dot} of view {this['view']!r}, camera {this['camera']!r} is in row {earlier} already"
+    fail_rows(again, table, (file, "dot"), lambda i: what, "keep one of the two rows")
+
+
+def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *, of: str) -> bool:
+    """Set the covariance columns from what the file has; whether it stated the noise.
+
+    of : what the standard deviation belongs to, for errors. Raises InputError for what is no
+    covariance.
+    """
+    given = [name for name in _COVARIANCE if name in table]
+    if 0 < len(given) < 3:
+        missing = ", ".join(name for name in _COVARIANCE if name not in table)
+        raise InputError(
+            f"has {', '.join(given)} without {missing}",
+            where=f"{file} row 1",
+            todo="give all three columns, or sigma_px alone",
+        )
+    if given:
+        _check_covariance(table, file)
+        return True
+    known = "sigma_px" in table
+    sigma = table["sigma_px"].to_numpy() if known else np.full(len(table), default_sigma_px)
+    todo = f"give the standard deviation of {of}, or leave the column out"
+    fail_rows(
+        sigma <= 0, table, (file, "sigma_px"), lambda i: f"is {sigma[i]:g}, not positive", todo
+    )
+    table["suu_px2"], table["suv_px2"], table["svv_px2"] = sigma**2, 0.0 * sigma, sigma**2
+    return known
+
+
+def _check_covariance(table: pd.DataFrame, file: Path) -> None:
+    uu, uv, vv = (table[name].to_numpy() for name in _COVARIANCE)
+    fail_rows(
+        (uu <= 0) | (vv <= 0) | (uu * vv <= uv**2),
+        table,
+        (file, "suu_px2"),
+        lambda i: f"[[{uu[i]:g}, {uv[i]:g}], [{uv[i]:g}, {vv[i]:g}]] is no covariance",
+        "variances must be positive and suu svv > suv^2",
+    )

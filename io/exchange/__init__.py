@@ -1,0 +1,1 @@
+"""Cameras and trajectories in the formats of other programs: ``importing`` and ``export``."""

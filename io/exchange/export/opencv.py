@@ -1,0 +1,182 @@
+"""Cameras as OpenCV's 3 x 4 projection matrices in a YAML file that cv2.FileStorage reads.
+
+An undistorted camera of this library is a 3 x 4 matrix exactly: affine (last row 0 0 0 1) when it
+is telecentric. Distortion stays apart, in OpenCV's own coefficients, so that cv2.undistortPoints
+followed by cv2.triangulatePoints gives what telerig does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
+from telerig.io.files.atomic import atomic_path
+from telerig.rig.camera import Camera
+from telerig.rig.distortion import COEFFICIENTS
+from telerig.rig.projection import standing_wall
+from telerig.rig.windows import ideal_jacobians
+
+Array = NDArray[np.float64]
+
+_OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "", "", "", "s1", "s2", "s3", "s4")
+_POINTS_PER_EDGE = 25
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """One camera. Pixels = (matrix @ (x, y, z, 1)) divided by its last row; mm in the rig frame.
+
+    undistorted : (3, 4) exact but for the lens distortion; misfit of leaving that out.
+    affine : (3, 4) the best matrix with last row 0 0 0 1, and its misfit.
+    camera_matrix (3, 3), distortion (12,) : for cv2.undistortPoints with P = camera_matrix, or
+        None where OpenCV's model has no place for this camera's skew or sensor tilt.
+    """
+
+    camera: str
+    image_size_px: tuple[int, int]
+    undistorted: Array
+    undistorted_misfit: Misfit
+    affine: Array
+    affine_misfit: Misfit
+    camera_matrix: Array | None
+    distortion: Array | None
+
+
+def undistorted_matrix(camera: Camera) -> Array:
+    """(3, 4) projection of the camera without its distortion, in closed form.
+
+    Behind a glass wall it is exact for kappa = 0 only.
+    """
+    q = np.array([camera["tilt_x"], camera["tilt_y"]])
+    tilt = np.eye(3)
+    tilt[:2, :2] += np.outer(q, q) / (1 + np.sqrt(1 + q @ q))
+    tilt[2, :2] = -camera["image_convergence_per_mm"] * q
+    scale = camera["scale_px_per_mm"]
+    pixel = np.array(
+        [
+            [scale, scale * camera["skew"], camera["centre_u_px"]],
+            [0, scale * camera["aspect"], camera["centre_v_px"]],
+            [0, 0, 1],
+        ]
+    )
+    pose = camera.camera_from_rig
+    placed = np.vstack([np.c_[pose.rotation, pose.translation_mm], [0, 0, 0, 1]])
+    return np.asarray(pixel @ tilt @ _telecentric_matrix(camera) @ placed)
+
+
+def _telecentric_matrix(camera: Camera) -> Array:
+    """(3, 4) telecentric coordinates of a camera point.
+
+    Behind a wall that of all rays near the origin's, which spread n_air / n_water as fast.
+    """
+    kappa, out = camera["kappa_per_mm"], np.eye(3, 4)
+    out[2] = [0, 0, kappa, 1]
+    if camera.wall is not None:
+        wall = standing_wall(camera.intrinsics, camera.wall)
+        seen = ideal_jacobians(np.zeros(3), kappa, wall)
+        spread = kappa * wall.ratios[1] * np.sqrt(np.linalg.det(seen.by_point[:, :2]))
+        out[2, 2] = spread
+        out[:2] = np.c_[seen.by_point + np.outer(seen.value, [0, 0, spread]), seen.value]
+    return out
+
+
+def projected(matrix: Array, points_mm: Array) -> Array:
+    """(..., 3) -> (..., 2) by a (3, 4) matrix."""
+    image = points_mm @ matrix[:, :3].T + matrix[:, 3]
+    return np.asarray(image[..., :2] / image[..., 2:])
+
+
+def camera_matrices(
+    cameras: Sequence[Camera], volume: Volume | None = None
+) -> tuple[Matrices, ...]:
+    """The matrices of every camera; misfits over what all of them see of the volume.
+
+    volume : None takes `working_volume`. Raises InputError when the cameras do not see it.
+    """
+    points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
+    return tuple(_matrices(camera, points) for camera in cameras)
+
+
+def _matrices(camera: Camera, points: Array) -> Matrices:
+    seen, exact = camera.project(points), undistorted_matrix(camera)
+    if np.array_equal(exact[2], [0, 0, 0, 1]) and not _is_distorted(camera):
+        affine = exact
+    else:
+        design = np.c_[points, np.ones(len(points))]
+        affine = np.vstack([np.linalg.lstsq(design, seen, rcond=None)[0].T, [0, 0, 0, 1]])
+    matrix, distortion = _opencv_distortion(camera)
+    return Matrices(
+        camera.name,
+        camera.image_size_px,
+        exact,
+        Misfit.between(projected(exact, points), seen),
+        affine,
+        Misfit.between(projected(affine, points), seen),
+        matrix,
+        distortion,
+    )
+
+
+def _is_distorted(camera: Camera) -> bool:
+    return any(camera[name] != 0 for name in COEFFICIENTS)
+
+
+def _opencv_distortion(camera: Camera) -> tuple[Array | None, Array | None]:
+    if any(camera[name] != 0 for name in ("skew", "tilt_x", "tilt_y")):
+        return None, None
+    focal = camera["scale_px_per_mm"] * camera.rho_mm
+    matrix = np.array(
+        [
+            [focal, 0, camera["centre_u_px"]],
+            [0, focal * camera["aspect"], camera["centre_v_px"]],
+            [0, 0, 1],
+        ]
+    )
+    return matrix, np.array([camera[name] if name else 0.0 for name in _OPENCV_ORDER])
+
+
+def write_opencv(matrices: Sequence[Matrices], path: str | PathLike[str]) -> None:
+    """One YAML file with a map for each camera; every float keeps all its digits.
+
+    Raises InputError when it cannot be written.
+    """
+    import cv2
+
+    with atomic_path(path) as temporary:
+        storage = cv2.FileStorage(
+            str(temporary), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML
+        )
+        try:
+            storage.write("frame", "rig: the first camera's frame, mm")
+            storage.write("pixel_origin", "centre of the top-left pixel is (0, 0)")
+            storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
+            for one in matrices:
+                _write_camera(storage, one)
+            storage.endWriteStruct()
+        finally:
+            storage.release()
+
+
+def _write_camera(storage: object, one: Matrices) -> None:
+    import cv2
+
+    write = storage.write  # type: ignore[attr-defined]
+    storage.startWriteStruct("", cv2.FILE_NODE_MAP)  # type: ignore[attr-defined]
+    write("name", one.camera)
+    write("image_width", one.image_size_px[0])
+    write("image_height", one.image_size_px[1])
+    write("undistorted", one.undistorted)
+    write("undistorted_rms_px", one.undistorted_misfit.rms_px)
+    write("undistorted_max_px", one.undistorted_misfit.max_px)
+    write("affine", one.affine)
+    write("affine_rms_px", one.affine_misfit.rms_px)
+    write("affine_max_px", one.affine_misfit.max_px)
+    if one.camera_matrix is not None and one.distortion is not None:
+        write("camera_matrix", one.camera_matrix)
+        write("distortion_coefficients", one.distortion.reshape(1, -1))
+    storage.endWriteStruct()  # type: ignore[attr-defined]

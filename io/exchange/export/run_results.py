@@ -1,0 +1,135 @@
+"""What a run's results folder holds, as every export of trajectories takes it."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.files.csv_table import Column, read_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LAB = (
+    "lab: axes of the rig frame, origin where the rig frame's origin is at stage position 0 and "
+    "without shake"
+)
+RIG = "rig: the first camera's frame, which rides on the stage; shake and travel are still in it"
+
+_UNITS = {
+    "_mm_s2": "mm s-2", "_mm_s": "mm s-1", "_mm2": "mm2", "_mm": "mm", "_m_s2": "m s-2",
+    "_px2": "px2", "_px": "px", "_rad": "rad", "_s": "s",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """points : one row per frame and bubble, sorted by particle, then frame; see docs/files.md.
+
+    frame : `LAB` (smoothed) or `RIG` (tracked only), in words. shake : the cameras' shake, or None.
+    verdict : of the smoothing, and what it warns of; "" where nothing was smoothed.
+    """
+
+    name: str
+    frame: str
+    points: pd.DataFrame
+    shake: pd.DataFrame | None = None
+    verdict: str = ""
+    source: str = ""
+
+
+def read_results(folder: str | PathLike[str]) -> RunResults:
+    """`trajectories.csv` of a smoothed run, else `tracks.csv`.
+
+    Raises InputError when the folder has neither, or a table that cannot be read.
+    """
+    place = Path(folder)
+    names = [n for n in ("trajectories.csv", "tracks.csv") if (place / n).is_file()]
+    if not names:
+        raise InputError(
+            "has neither trajectories.csv nor tracks.csv",
+            where=str(place),
+            todo="run `telerig track`, then `telerig smooth`, or name the run with --run",
+        )
+    required = [Column("frame", "whole"), Column("particle", "text"), Column("t_s")]
+    required += [Column(f"{axis}_mm") for axis in "xyz"]
+    points = _whole_particles(read_table(place / names[0], required, extra=True))
+    shake = place / "shake.csv"
+    return RunResults(
+        name=place.name,
+        frame=LAB if names[0] == "trajectories.csv" else RIG,
+        points=points.sort_values(["particle", "frame"], kind="stable").reset_index(drop=True),
+        shake=read_table(shake, [Column("frame", "whole")], extra=True)
+        if shake.is_file() and names[0] == "trajectories.csv"
+        else None,
+        verdict=_verdict(place / "smoothing.json") if names[0] == "trajectories.csv" else "",
+        source=names[0],
+    )
+
+
+def _whole_particles(points: pd.DataFrame) -> pd.DataFrame:
+    """Ids as whole numbers where all of them are; given names stay text, so does "007"."""
+    text = points["particle"].astype(str)
+    if text.str.fullmatch(r"0|-?[1-9]\d{0,17}").all():
+        return points.assign(particle=text.astype(np.int64))
+    return points.assign(particle=text.astype(object))
+
+
+def _verdict(file: Path) -> str:
+    if not file.is_file():
+        return ""
+    try:
+        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"cannot be read ({error})", where=str(file), todo="run `telerig smooth` again"
+        ) from error
+    flags = ", ".join(str(flag) for flag in found.get("flags", []))
+    return str(found.get("verdict", "")) + (f" ({flags})" if flags else "")
+
+
+def unit_of(column: str) -> str:
+    """UDUNITS name of a column's unit, from the end of its name; "1" where it has none."""
+    return next((unit for end, unit in _UNITS.items() if column.endswith(end)), "1")
+
+
+def numbered(points: pd.DataFrame) -> tuple[NDArray[np.int64], list[str]]:
+    """(N,) whole numbers for the particles, and their names in the order of these numbers.
+
+    Ids that are whole numbers stay as they are, and there are no names.
+    """
+    import pandas as pd
+
+    if points["particle"].dtype.kind == "i":
+        return points["particle"].to_numpy(np.int64), []
+    codes, names = pd.factorize(points["particle"])
+    return codes.astype(np.int64), [str(name) for name in names]
+
+
+def facts(results: RunResults) -> dict[str, str]:
+    """What every file says of its content."""
+    try:
+        made_by = f"telerig {version('telerig')}"
+    except PackageNotFoundError:
+        made_by = "telerig, not installed"
+    return {
+        "run": results.name,
+        "frame": results.frame,
+        "source": f"{made_by}, {results.source}",
+        "verdict": results.verdict or "none: tracked, not smoothed",
+    }
+
+
+def identifier(name: str) -> str:
+    """A name that MATLAB takes for a field: letters, digits, underscores, a letter first."""
+    plain = re.sub(r"\W", "_", name, flags=re.ASCII)
+    return (plain if plain[:1].isalpha() else f"n_{plain}")[:63]

@@ -1,0 +1,138 @@
+"""Soloff's polynomial camera: cubic in x and y, quadratic in z, 19 terms for u and for v.
+
+S. M. Soloff, R. J. Adrian and Z.-C. Liu, Meas. Sci. Technol. 8:1441 (1997), equation 8. PIV
+programs take it in place of a camera model. It is fitted to the calibrated camera over the working
+volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
+from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
+from telerig.io.files.atomic import write_text_atomic
+from telerig.rig.camera import Camera
+
+Array = NDArray[np.float64]
+
+POWERS = (
+    (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1),
+    (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2),
+    (3, 0, 0), (2, 1, 0), (1, 2, 0), (0, 3, 0), (2, 0, 1), (1, 1, 1), (0, 2, 1), (1, 0, 2),
+    (0, 1, 2),
+)  # fmt: skip
+"""Exponents of x, y, z in the order of the paper's a0 ... a18."""
+
+CUBIC_Z = (0, 0, 3)
+"""The 20th term, which the paper leaves out: a camera that looks along x has its image along z."""
+
+FIT_POINTS_PER_EDGE = 21
+CHECK_POINTS_PER_EDGE = 34
+
+
+@dataclass(frozen=True)
+class Soloff:
+    """coefficients : (19, 2), or (20, 2) with `CUBIC_Z` last, for u and v in px; x, y, z in mm of
+    the rig frame.
+
+    misfit : against the camera, at points that were not fitted.
+    """
+
+    camera: str
+    coefficients: Array
+    misfit: Misfit
+    volume: Volume
+
+    def project(self, points_mm: ArrayLike) -> Array:
+        """(..., 3) rig points -> (..., 2) pixels."""
+        return terms(np.asarray(points_mm, float), len(self.coefficients)) @ self.coefficients
+
+
+def terms(points_mm: Array, count: int = len(POWERS)) -> Array:
+    """(..., 3) -> (..., count) monomials in the order of `POWERS`, then `CUBIC_Z`."""
+    powers = np.array([*POWERS, CUBIC_Z][:count])
+    return np.asarray(np.prod(points_mm[..., None, :] ** powers, axis=-1))
+
+
+def fit_soloff(
+    cameras: Sequence[Camera], volume: Volume | None = None, *, full_cubic: bool = False
+) -> tuple[Soloff, ...]:
+    """One polynomial for each camera, by least squares over what all cameras see of the volume.
+
+    full_cubic : add the term z^3 (20 terms), for programs that take the exponents from the file.
+    volume : None takes `working_volume`. Raises InputError when the cameras do not see it.
+    """
+    box = volume or working_volume(cameras)
+    fitted = seen_points(cameras, box, FIT_POINTS_PER_EDGE)
+    checked = seen_points(cameras, box, CHECK_POINTS_PER_EDGE)
+    unit = float(np.abs(fitted).max())
+    powers = [*POWERS, CUBIC_Z] if full_cubic else list(POWERS)
+    scale = unit ** -np.sum(powers, axis=1, dtype=float)
+    design = terms(fitted / unit, len(powers))
+    check = terms(checked, len(powers))
+    out = []
+    for camera in cameras:
+        solution = np.linalg.lstsq(design, camera.project(fitted), rcond=None)[0]
+        coefficients = solution * scale[:, None]
+        misfit = Misfit.between(check @ coefficients, camera.project(checked))
+        out.append(Soloff(camera.name, coefficients, misfit, box))
+    return tuple(out)
+
+
+def write_soloff(fit: Soloff, path: str | PathLike[str], first_pixel: float = 0.0) -> None:
+    """A CSV of the terms below a header in words: volume, units, pixel origin, fit error.
+
+    first_pixel : the coordinate that the other program gives the centre of the top-left pixel: 0
+    as here, 0.5 where it counts from the pixel's corner, 1 in MATLAB. Read it back with
+    `read_soloff`.
+    """
+    shifted = fit.coefficients.copy()
+    shifted[0] += first_pixel
+    head = [
+        f"Soloff polynomial ({len(shifted)} terms) of camera {fit.camera}",
+        "u_px = sum of u * x^i y^j z^k, v_px likewise; x, y, z in mm in the rig frame",
+        f"pixel: u right, v down; the centre of the top-left pixel is ({first_pixel:g}, "
+        f"{first_pixel:g})",
+        f"fitted over {fit.volume.words()}, as far as every camera sees it; void outside",
+        f"error against the calibrated camera: rms_px = {fit.misfit.rms_px!r}, "
+        f"max_px = {fit.misfit.max_px!r} at {fit.misfit.points} points that were not fitted",
+    ]
+    rows = [
+        f"{i},{j},{k},{float(u)!r},{float(v)!r}"
+        for (i, j, k), (u, v) in zip([*POWERS, CUBIC_Z], shifted)
+    ]
+    text = "".join(f"# {line}\n" for line in head) + "i,j,k,u,v\n" + "\n".join(rows) + "\n"
+    write_text_atomic(path, text)
+
+
+def read_soloff(path: str | PathLike[str]) -> Array:
+    """(19, 2) or (20, 2) coefficients in the order of `POWERS`, pixel origin as the file has it.
+
+    Raises InputError for a file that does not hold these terms.
+    """
+    file = Path(path)
+    try:
+        table = np.loadtxt(file, delimiter=",", comments=("#", "i"), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"cannot be read ({error})", where=str(file), todo="export again"
+        ) from error
+    powers = np.array([*POWERS, CUBIC_Z])[: len(table)]
+    if (
+        len(table) < len(POWERS)
+        or table.shape[1:] != (5,)
+        or not np.array_equal(table[:, :3], powers)
+    ):
+        raise InputError(
+            "does not hold the 19 terms in the order of telerig",
+            where=str(file),
+            todo="export again",
+        )
+    return np.asarray(table[:, 3:])

@@ -1,0 +1,123 @@
+"""Trajectories as HDF5, MATLAB and trackpy tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from telerig.errors import InputError
+from telerig.io.exchange.export.opencv import undistorted_matrix
+from telerig.io.exchange.export.run_results import RunResults, facts, identifier, numbered, unit_of
+from telerig.io.files.atomic import atomic_path
+from telerig.io.files.csv_table import write_table
+from telerig.rig.camera import Camera
+from telerig.rig.projection import PARAMETERS
+from telerig.rig.windows import Wall
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def write_hdf5(
+    results: RunResults, path: str | PathLike[str], cameras: Sequence[Camera] = ()
+) -> None:
+    """Groups ``trajectories``, ``shake`` and ``cameras``: a dataset per column with its unit.
+
+    Raises InputError when the file cannot be written.
+    """
+    import h5py
+
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(facts(results))
+        for name, table in (("trajectories", results.points), ("shake", results.shake)):
+            if table is None:
+                continue
+            group = file.create_group(name)
+            group.attrs["columns"] = list(table.columns)
+            for column in table.columns:
+                values = table[column].to_numpy()
+                kind = h5py.string_dtype() if values.dtype == object else values.dtype
+                data = group.create_dataset(column, data=values, dtype=kind, compression="gzip")
+                data.attrs["units"] = unit_of(column)
+        for camera in cameras:
+            group = file.create_group(f"cameras/{camera.name}")
+            for key, value in _camera(camera).items():
+                group.attrs[key] = value
+
+
+def write_mat(
+    results: RunResults, path: str | PathLike[str], cameras: Sequence[Camera] = ()
+) -> None:
+    """MATLAB 5 file: structs ``trajectories`` and ``shake`` of columns, ``cameras``, ``info``.
+
+    Names that MATLAB does not take are changed (`identifier`), text columns are cells.
+    Raises InputError when two names become one, or the file cannot be written.
+    """
+    from scipy.io import savemat
+
+    content: dict[str, Any] = {"info": facts(results), "trajectories": _fields(results.points)}
+    if results.shake is not None:
+        content["shake"] = _fields(results.shake)
+    if cameras:
+        content["cameras"] = _unique({c.name: _camera(c) for c in cameras})
+    with atomic_path(path) as temporary:
+        savemat(
+            str(temporary), content, appendmat=False, long_field_names=True, do_compression=True,
+            oned_as="column",
+        )  # fmt: skip
+
+
+def _fields(table: pd.DataFrame) -> dict[str, Any]:
+    return _unique({str(column): table[column].to_numpy() for column in table.columns})
+
+
+def _unique(content: dict[str, Any]) -> dict[str, Any]:
+    out = {identifier(name): value for name, value in content.items()}
+    if len(out) != len(content):
+        raise InputError(
+            f"MATLAB cannot tell some of these names apart: {', '.join(content)}",
+            todo="export to HDF5, which MATLAB reads with h5read",
+        )
+    return out
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "image_size_px": np.array(camera.image_size_px),
+        "parameter_names": ", ".join(PARAMETERS),
+        "parameters": camera.intrinsics,
+        "rho_mm": camera.rho_mm,
+        "rotation_camera_from_rig": camera.camera_from_rig.rotation,
+        "translation_camera_from_rig_mm": camera.camera_from_rig.translation_mm,
+        "undistorted_matrix": undistorted_matrix(camera),
+        "pixel_origin": "centre of the top-left pixel is (0, 0)",
+        **({} if camera.wall is None else _wall(camera.wall)),
+    }
+
+
+def _wall(wall: Wall) -> dict[str, Any]:
+    return {f"wall_{name}": np.array(value) for name, value in wall.as_dict().items()}
+
+
+def trackpy_table(results: RunResults) -> pd.DataFrame:
+    """Columns frame, particle, x, y, z (mm, so mpp = 1 in trackpy), then all the others.
+
+    Particles that have names instead of numbers are numbered; ``particle_name`` keeps the names.
+    """
+    points = results.points
+    numbers, names = numbered(points)
+    table = points[["frame"]].assign(particle=numbers)
+    for axis in "xyz":
+        table[axis] = points[f"{axis}_mm"]
+    if names:
+        table["particle_name"] = points["particle"]
+    others = [c for c in points if c not in ("frame", "particle", "x_mm", "y_mm", "z_mm")]
+    return table.join(points[others]).sort_values(["frame", "particle"]).reset_index(drop=True)
+
+
+def write_trackpy(results: RunResults, path: str | PathLike[str]) -> None:
+    """`trackpy_table` as CSV. Raises InputError when it cannot be written."""
+    write_table(trackpy_table(results), path)

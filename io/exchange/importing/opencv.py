@@ -1,0 +1,139 @@
+"""OpenCV's stereo calibrations (YAML, XML or JSON of cv2.FileStorage) as cameras of this library.
+
+Names are those of OpenCV's samples (stereo_calib: M1 D1 M2 D2 R T; calibration: camera_matrix,
+distortion_coefficients) and a few common others. R and T take points of the first camera into the
+second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+
+Array = NDArray[np.float64]
+
+_MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "camera_matrix{}", "mtx{}")
+_DISTORTION = ("D{}", "distCoeffs{}", "dist_coeffs_{}", "distortion_coefficients_{}", "dist{}",
+               "distortion_coefficients{}")  # fmt: skip
+_ROTATION = ("R", "rotation_matrix", "rotation", "R12")
+_TRANSLATION = ("T", "translation_vector", "translation", "T12", "t")
+
+
+def read_opencv_cameras(
+    paths: Sequence[str | PathLike[str]],
+    *,
+    image_size_px: tuple[int, int] | None = None,
+    unit_mm: float = 1.0,
+    names: Sequence[str] = ("left", "right"),
+) -> tuple[tuple[Camera, ...], Pose]:
+    """Two pinhole cameras, and `rig_from_world`, the world being OpenCV's first camera.
+
+    paths : one file with everything, or several: intrinsics and extrinsics, or one file for each
+    camera (in their order) and one with R and T. image_size_px : (width, height), needed where no
+    file has image_width and image_height. unit_mm : the unit of T, in mm: the length that was
+    given to OpenCV as 1 (1000 for metres).
+
+    Raises InputError when something is missing, and for distortion beyond k1 k2 p1 p2 k3 s1..s4.
+    """
+    if not unit_mm > 0:
+        raise InputError(f"unit_mm is {unit_mm}", todo="give the length of OpenCV's unit in mm")
+    files = [Path(p) for p in paths]
+    contents = [_content(file) for file in files]
+    joint = {name: value for content in contents for name, value in content.items()}
+    where = ", ".join(str(file) for file in files)
+    single = [c for c in contents if "camera_matrix" in c]
+    if len(single) == 2:
+        matrices = [c["camera_matrix"] for c in single]
+        bent = [c.get("distortion_coefficients", np.zeros(5)) for c in single]
+    else:
+        matrices = [_one(joint, _MATRIX, i, where) for i in (1, 2)]
+        bent = [_one(joint, _DISTORTION, i, where, np.zeros(5)) for i in (1, 2)]
+    rotation = _one(joint, _ROTATION, 0, where)
+    if rotation.size == 3:
+        rotation = rotation_from_rotvec(rotation.reshape(3))
+    shift = _one(joint, _TRANSLATION, 0, where).reshape(-1) * unit_mm
+    size = image_size_px or _size(joint, where)
+    if rotation.shape != (3, 3) or shift.shape != (3,) or any(m.shape != (3, 3) for m in matrices):
+        raise InputError(
+            "R, T or a camera matrix is not of its size",
+            where=where,
+            todo="give R as (3, 3) or a rotation vector, T with 3 numbers, matrices (3, 3)",
+        )
+    pinholes = [
+        Pinhole(f"{where} camera {i + 1}", size, matrix, *pose, np.asarray(d, float).reshape(-1))
+        for i, (matrix, pose, d) in enumerate(
+            zip(matrices, [(np.eye(3), np.zeros(3)), (rotation, shift)], bent)
+        )
+    ]
+    return cameras_from_pinholes(pinholes, list(names))
+
+
+def _content(file: Path) -> dict[str, Array]:
+    """Every matrix and number at the root of the file."""
+    import cv2
+
+    if not file.is_file():
+        raise InputError("there is no such file", where=str(file), todo="check the path")
+    try:
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+        root = storage.root()
+        out = {}
+        for name in root.keys():  # noqa: SIM118
+            node = root.getNode(name)
+            if node.isInt() or node.isReal():
+                out[name] = np.array(node.real())
+            elif node.isMap() and node.mat() is not None:
+                out[name] = np.asarray(node.mat(), float)
+            elif node.isSeq():
+                out[name] = np.array([node.at(i).real() for i in range(node.size())])
+        storage.release()
+    except (cv2.error, SystemError) as error:
+        raise InputError(
+            f"OpenCV cannot read it ({error})",
+            where=str(file),
+            todo="write it with cv2.FileStorage: YAML, XML or JSON",
+        ) from error
+    return out
+
+
+def _one(
+    content: dict[str, Array],
+    names: Sequence[str],
+    number: int,
+    where: str,
+    default: Array | None = None,
+) -> Array:
+    wanted = [name.format(number) for name in names]
+    found = [content[name] for name in wanted if name in content]
+    if found:
+        return found[0]
+    if default is not None:
+        return default
+    raise InputError(
+        f"has none of {', '.join(wanted)}",
+        where=where,
+        todo=f"rename the matrix, or add the file that has it; there are: {', '.join(content)}",
+    )
+
+
+def _size(content: dict[str, Array], where: str) -> tuple[int, int]:
+    for name in ("image_size", "imageSize", "size"):
+        if name in content and content[name].size == 2:
+            width, height = content[name].reshape(-1)
+            return int(width), int(height)
+    if {"image_width", "image_height"} <= set(content):
+        return int(content["image_width"]), int(content["image_height"])
+    raise InputError(
+        "does not tell the image size",
+        where=where,
+        todo="give image_size_px=(width, height), on the command line --image-size",
+    )

@@ -1,0 +1,242 @@
+"""OpenPTV's `.ori` and `.addpar` files as cameras of this library.
+
+OpenPTV (liboptv: imgcoord, trafo, calibration): photogrammetric axes, x right, y up, the camera
+looks along -z; sensor coordinates in mm; Brown's distortion about the *sensor's* centre, after the
+principal point (xh, yh) has been added; then scx and she; pixels counted from the corner of the
+top-left one. Exact without distortion, and with it where xh = yh = 0; otherwise the distortion is
+fitted about the principal point, and a note says how well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes
+from telerig.rig import projection
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+
+Array = NDArray[np.float64]
+
+WORST_FIT_PX = 0.5
+"""A camera whose distortion cannot be fitted better than this is refused."""
+
+_FREE = ("scale_px_per_mm", "aspect", "skew", "centre_u_px", "centre_v_px",
+         "k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What OpenPTV keeps in ptv.par. pixel_size_mm : (width, height) of a pixel."""
+
+    image_size_px: tuple[int, int]
+    pixel_size_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Orientation:
+    """position (3,) mm, rotation (3, 3) world_from_camera; distortion k1 k2 k3 p1 p2 scx she."""
+
+    path: Path
+    position: Array
+    rotation: Array
+    principal: Array
+    distance: float
+    added: Array
+
+
+def read_openptv_cameras(
+    paths: Sequence[str | PathLike[str]],
+    sensor: Sensor,
+    names: Sequence[str] | None = None,
+) -> tuple[tuple[Camera, ...], Pose, tuple[str, ...]]:
+    """Cameras of `.ori` files (with the `.addpar` beside each), `rig_from_world`, and notes.
+
+    sensor : of all cameras; see `read_ptv_par`. names : default the files' names up to the first
+    point. Raises InputError for files that cannot be read and for distortion that cannot be
+    fitted within `WORST_FIT_PX`.
+    """
+    files = [_read(Path(p)) for p in paths]
+    if not files:
+        raise InputError("no .ori files", todo="name at least one")
+    labels = [f.path.name.split(".")[0] for f in files] if names is None else list(names)
+    cameras, rig_from_world = cameras_from_pinholes([_pinhole(f, sensor) for f in files], labels)
+    notes = [f"{f.path.name}: no .addpar beside it, distortion taken as none" for f in files
+             if not _added_path(f.path).is_file()]  # fmt: skip
+    out = []
+    for file, camera in zip(files, cameras):
+        if np.any(file.added[:5]) and np.any(file.principal):
+            camera, words = _fitted(file, camera, sensor)
+            notes.append(words)
+        out.append(camera)
+    turn = out[0].camera_from_rig
+    back = turn.inverse()
+    in_rig = [
+        replace(c, camera_from_rig=c.camera_from_rig @ back if i else Pose.identity())
+        for i, c in enumerate(out)
+    ]
+    return tuple(in_rig), turn @ rig_from_world, tuple(notes)
+
+
+def read_ptv_par(path: str | PathLike[str]) -> Sensor:
+    """Image and pixel size of OpenPTV's ptv.par.
+
+    Raises InputError when it cannot be read, and for refraction (indices that differ): a pinhole
+    camera does not have it.
+    """
+    file = Path(path)
+    words = _text(file).split("\n")
+    try:
+        count = int(words[0])
+        values = [float(w) for w in words[1 + 2 * count :] if w.strip()]
+        width, height, pixel_x, pixel_y = values[3:7]
+        interlaced, *indices = values[7:11]
+    except (ValueError, IndexError) as error:
+        raise InputError(
+            f"is not a ptv.par of OpenPTV ({error})",
+            where=str(file),
+            todo="give the image size and the pixel size instead",
+        ) from error
+    if interlaced != 0:
+        raise InputError(
+            "is of an interlaced camera", where=str(file), todo="give full frames (chfield 0)"
+        )
+    if max(indices) - min(indices) > 1e-9:
+        raise InputError(
+            f"has refraction (indices {', '.join(f'{n:g}' for n in indices)})",
+            where=str(file),
+            todo="calibrate in the medium with telerig: a pinhole cannot stand for the glass wall",
+        )
+    return Sensor((int(width), int(height)), (pixel_x, pixel_y))
+
+
+def _read(path: Path) -> _Orientation:
+    values = _numbers(path, 21)
+    omega, phi, kappa = values[3:6]
+    turns = [rotation_from_rotvec(angle * axis) for angle, axis in
+             zip((omega, phi, kappa), np.eye(3))]  # fmt: skip
+    added = _added_path(path)
+    bent = _numbers(added, 7)[:7] if added.is_file() else np.array([0.0] * 5 + [1.0, 0.0])
+    if not values[17] > 0:
+        raise InputError(
+            f"its principal distance is {values[17]:g} mm", where=str(path), todo="it must be > 0"
+        )
+    return _Orientation(
+        path, values[:3], turns[0] @ turns[1] @ turns[2], values[15:17], float(values[17]), bent
+    )
+
+
+def _added_path(path: Path) -> Path:
+    return path.with_suffix(".addpar")
+
+
+def _numbers(path: Path, least: int) -> Array:
+    try:
+        values = np.array([float(word) for word in _text(path).split()])
+    except ValueError as error:
+        raise InputError(
+            f"holds what is no number ({error})", where=str(path), todo="export it again"
+        ) from error
+    if len(values) < least or not np.isfinite(values).all():
+        raise InputError(
+            f"holds {len(values)} numbers, {least} are needed",
+            where=str(path),
+            todo="give an .ori file (its .addpar is found beside it)",
+        )
+    return values
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", where=str(path), todo="check it") from error
+
+
+def _pixel_from_metric(file: _Orientation, sensor: Sensor) -> Array:
+    """(3, 3) from distorted sensor coordinates in mm, y down, to telerig's pixels."""
+    scx, she = file.added[5:]
+    (width, height), (pixel_x, pixel_y) = sensor.image_size_px, sensor.pixel_size_mm
+    return np.array(
+        [
+            [scx / pixel_x, np.sin(she) / pixel_x, width / 2 - 0.5],
+            [0, np.cos(she) / pixel_y, height / 2 - 0.5],
+            [0, 0, 1],
+        ]
+    )
+
+
+def _pinhole(file: _Orientation, sensor: Sensor) -> Pinhole:
+    if min(*sensor.image_size_px, *sensor.pixel_size_mm) <= 0:
+        raise InputError(
+            f"image {sensor.image_size_px} px, pixel {sensor.pixel_size_mm} mm",
+            where=str(file.path),
+            todo="give the sizes in ptv.par, all positive",
+        )
+    (x, y), distance = file.principal, file.distance
+    k1, k2, k3, p1, p2 = file.added[:5]
+    exact = np.zeros(5) if x or y else np.array(
+        [k1 * distance**2, k2 * distance**4, -p2 * distance, p1 * distance, k3 * distance**6]
+    )  # fmt: skip
+    lens = np.array([[distance, 0, x], [0, distance, -y], [0, 0, 1]])
+    rotation = np.diag([1.0, -1.0, -1.0]) @ file.rotation.T
+    matrix = _pixel_from_metric(file, sensor) @ lens
+    where = str(file.path)
+    return Pinhole(where, sensor.image_size_px, matrix, rotation, -rotation @ file.position, exact)
+
+
+def _fitted(file: _Orientation, camera: Camera, sensor: Sensor) -> tuple[Camera, str]:
+    """The camera with its distortion fitted over the image, with a turn about its axis."""
+    from scipy.optimize import least_squares
+
+    width, height = sensor.image_size_px
+    edges = [np.linspace(0, size - 1, 25) for size in (width, height)]
+    straight_px = np.stack(np.meshgrid(*edges), -1).reshape(-1, 2)
+    points = projection.ideal_from_pixel(straight_px, camera.intrinsics, camera.rho_mm)
+    points = np.c_[points, np.zeros(len(points))]
+    wanted = _distorted_px(file, straight_px, sensor)
+    inside = np.all((wanted > -1) & (wanted < np.array(sensor.image_size_px)), axis=-1)
+    points, wanted = points[inside], wanted[inside]
+
+    def moved(x: Array) -> tuple[Camera, Array]:
+        free = {name: camera[name] + value for name, value in zip(_FREE, x)}
+        turn = Pose(rotation_from_rotvec(np.array([0, 0, x[-1]])), np.zeros(3))
+        return camera.with_parameters(**free), turn.apply(points)
+
+    def miss(x: Array) -> Array:
+        changed, turned = moved(x)
+        uv = projection.pixel_from_camera(turned, changed.intrinsics, camera.rho_mm)
+        return np.asarray((uv - wanted).reshape(-1))
+
+    found = least_squares(miss, np.zeros(len(_FREE) + 1), x_scale="jac", xtol=1e-15, ftol=1e-15)
+    worst = float(np.linalg.norm(miss(found.x).reshape(-1, 2), axis=-1).max())
+    if worst > WORST_FIT_PX:
+        raise InputError(
+            f"its distortion is {worst:.2g} px from any that this library has",
+            where=str(file.path),
+            todo="calibrate with telerig",
+        )
+    changed, _ = moved(found.x)
+    turn = Pose(rotation_from_rotvec(np.array([0, 0, found.x[-1]])), np.zeros(3))
+    words = f"{file.path.name}: distortion fitted about the principal point, to {worst:.2g} px"
+    return replace(changed, camera_from_rig=turn @ camera.camera_from_rig), words
+
+
+def _distorted_px(file: _Orientation, straight_px: Array, sensor: Sensor) -> Array:
+    """OpenPTV's distortion between pixels without and with it."""
+    matrix = _pixel_from_metric(file, sensor)
+    flat = np.linalg.solve(matrix[:2, :2], (straight_px - matrix[:2, 2]).T).T
+    x, y = flat[:, 0], -flat[:, 1]
+    k1, k2, k3, p1, p2 = file.added[:5]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bent_x = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    bent_y = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    return np.stack([bent_x, -bent_y], -1) @ matrix[:2, :2].T + matrix[:2, 2]

@@ -1,0 +1,4 @@
+"""Simulated devices on pseudo-terminals, to practise recording with.
+
+Read ``devices`` first.
+"""

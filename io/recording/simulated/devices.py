@@ -1,0 +1,217 @@
+"""Sensors to practise with: each speaks over a pseudo-terminal, as a real one over its port."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+
+from telerig.io.recording.log import END, RECEIVED, Entry, LogHeader, RawLog
+from telerig.io.recording.protocols import poll_command
+from telerig.io.recording.simulated.signals import (
+    Ints,
+    SimulatedDevice,
+    answer,
+    damage,
+    messages,
+    stage_position_mm,
+)
+from telerig.io.rig_file.device_description import DeviceDescription
+
+_POLLED_WAIT_S = 0.05
+_BUFFER_S = 0.25
+"""What a device keeps while the host is busy and its port takes no more; then readings are lost."""
+
+
+@dataclass
+class Truth:
+    """What a simulated device did. start_ns : host's time of its reading 0.
+
+    sent : how many readings were made. spoilt : numbers of readings that a fault damaged.
+    overrun : numbers of those that found the port's buffer full (nobody reads fast enough).
+    away_s : (from, to) of each unplug, in host's seconds from the start.
+    """
+
+    start_ns: int = 0
+    sent: int = 0
+    spoilt: list[int] = field(default_factory=list)
+    overrun: list[int] = field(default_factory=list)
+    away_s: list[tuple[float, float]] = field(default_factory=list)
+
+
+class PseudoTerminal:
+    """A port under a name of its own, which stays the same when it is plugged in again."""
+
+    def __init__(self, name: Path) -> None:
+        self.name = name
+        self.master = self._slave = -1
+
+    def plug(self) -> None:
+        import tty
+
+        self.master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self.master, False)
+        beside = self.name.with_name(f".{self.name.name}.new")
+        beside.symlink_to(os.ttyname(self._slave))
+        beside.replace(self.name)
+
+    def unplug(self) -> None:
+        if self.master >= 0:
+            self.name.unlink(missing_ok=True)
+            os.close(self._slave)
+            os.close(self.master)
+            self.master = self._slave = -1
+
+    def write(self, data: bytes) -> int:
+        """How many of the bytes went into the port's buffer."""
+        written = 0
+        deadline = time.monotonic() + _BUFFER_S
+        while written < len(data):
+            try:
+                written += os.write(self.master, data[written:])
+            except OSError as error:
+                if error.errno != errno.EAGAIN or time.monotonic() > deadline:
+                    return written
+                select.select([], [self.master], [], 0.05)
+        return written
+
+
+class _Runner(threading.Thread):
+    def __init__(self, sim: SimulatedDevice, port: PseudoTerminal, rng: Generator) -> None:
+        super().__init__(name=f"simulate {sim.device.name}", daemon=True)
+        self.truth = Truth()
+        self._sim, self._port, self._rng = sim, port, rng
+        self._stop_asked = threading.Event()
+
+    def stop(self) -> None:
+        self._stop_asked.set()
+        self.join(2.0)
+
+    def run(self) -> None:
+        self.truth.start_ns = time.monotonic_ns()
+        unplugs = sorted(self._sim.faults.unplug_s)
+        command = poll_command(self._sim.device)
+        while not self._stop_asked.is_set():
+            if unplugs and self._elapsed_s() > unplugs[0]:
+                unplugs.pop(0)
+                self._go_away()
+            if command is None:
+                self._stream()
+            else:
+                self._answer(command)
+        self._port.unplug()
+
+    def _elapsed_s(self) -> float:
+        return (time.monotonic_ns() - self.truth.start_ns) * 1e-9
+
+    def _go_away(self) -> None:
+        begin = self._elapsed_s()
+        self._port.unplug()
+        self._stop_asked.wait(self._sim.faults.away_s)
+        self.truth.away_s.append((begin, self._elapsed_s()))
+        self.truth.sent = self._sim.first_after(self._elapsed_s())
+        self._port.plug()
+
+    def _stream(self) -> None:
+        pause = float(self._rng.uniform(0, self._sim.jitter_s))
+        self._stop_asked.wait(max(pause, 0.5 / self._sim.rate_hz))
+        number, pieces, data = _made(self._sim, self.truth, self._elapsed_s(), self._rng)
+        written = self._port.write(data)
+        if written < len(data):
+            ends = np.cumsum([len(piece) for piece in pieces])
+            self.truth.overrun += number[ends > written].tolist()
+
+    def _answer(self, command: bytes) -> None:
+        if not select.select([self._port.master], [], [], _POLLED_WAIT_S)[0]:
+            return
+        try:
+            asked = os.read(self._port.master, 4096).count(command)
+        except OSError:
+            self._stop_asked.wait(_POLLED_WAIT_S)
+            return
+        for _ in range(asked):
+            place = float(stage_position_mm(np.asarray(self._elapsed_s())))
+            self._stop_asked.wait(float(self._rng.uniform(0, self._sim.jitter_s)))
+            self._port.write(answer(self._sim.device, place))
+            self.truth.sent += 1
+
+
+class SimulatedPorts:
+    """Context manager: devices speak while it is open. `devices` have their ports filled in."""
+
+    def __init__(self, sims: Sequence[SimulatedDevice], folder: Path, rng: Generator) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.sims = [_at(sim, folder) for sim in sims]
+        ports = [PseudoTerminal(Path(sim.device.port)) for sim in self.sims]
+        streams = rng.spawn(len(self.sims))
+        for port in ports:
+            port.plug()
+        self._runners = [_Runner(*parts) for parts in zip(self.sims, ports, streams)]
+
+    @property
+    def devices(self) -> list[DeviceDescription]:
+        return [sim.device for sim in self.sims]
+
+    @property
+    def truths(self) -> list[Truth]:
+        return [runner.truth for runner in self._runners]
+
+    def __enter__(self) -> SimulatedPorts:
+        for runner in self._runners:
+            runner.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for runner in self._runners:
+            runner.stop()
+
+
+def _made(
+    sim: SimulatedDevice, truth: Truth, host_s: float, rng: Generator
+) -> tuple[Ints, list[bytes], bytes]:
+    """Numbers of the readings since the last call, the bytes of each, and what the line makes."""
+    until = sim.first_after(host_s)
+    number = np.arange(truth.sent, until)
+    number = number[~np.isin(number, sim.faults.skip)]
+    truth.sent = until
+    pieces = messages(sim, number)
+    data, spoilt = damage(pieces, sim.faults, 1 / sim.rate_hz, rng)
+    truth.spoilt += number[spoilt].tolist()
+    return number, pieces, data
+
+
+def _at(sim: SimulatedDevice, folder: Path) -> SimulatedDevice:
+    return replace(sim, device=replace(sim.device, port=str(folder / sim.device.name)))
+
+
+def simulated_log(
+    path: Path, sims: Sequence[SimulatedDevice], seconds: float, rng: Generator
+) -> list[Truth]:
+    """The raw log that streaming devices would give, made at once; least delay is near 0."""
+    header = LogHeader(0, "simulated", (), tuple(sim.device for sim in sims))
+    truths, entries = [], []
+    for index, sim in enumerate(sims):
+        truth = Truth()
+        truths.append(truth)
+        count = int(2.5 * seconds / sim.jitter_s) + 1
+        for flush_s in np.cumsum(rng.uniform(0, sim.jitter_s, count)):
+            if flush_s > seconds:
+                break
+            _, _, data = _made(sim, truth, float(flush_s), rng)
+            if data:
+                entries.append(Entry(RECEIVED, index, int(flush_s * 1e9), data))
+    with RawLog(path, header) as log:
+        for entry in sorted(entries, key=lambda e: e.time_ns):
+            log.append(entry)
+        log.append(Entry(END, 0, int(seconds * 1e9), b""))
+        log.flush()
+    return truths

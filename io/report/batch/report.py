@@ -1,0 +1,228 @@
+"""The report of a batch: what was done, what failed and why, how good the results are."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from telerig.errors import InputError
+from telerig.io.files.atomic import write_text_atomic
+from telerig.io.report.page.figures import CAMERA_COLOURS, LEFT_OUT, Picture, drawing, svg
+from telerig.io.report.page.number_format import ABSENT, is_number, number
+from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
+from telerig.io.report.page.series_plot import above, room_left
+
+Job = Mapping[str, Any]
+
+KINDS = {"calibrate": "calibrated", "track": "tracked", "smooth": "smoothed"}
+_DONE = "done"
+_COLOUR = {"calibrate": CAMERA_COLOURS[0], "track": CAMERA_COLOURS[1], "smooth": CAMERA_COLOURS[2]}
+_LONGEST_WORDS = 600
+
+
+@dataclass(frozen=True)
+class Line:
+    """A dataset's calibration or a run: cells for the page, with links to the reports."""
+
+    name: str
+    link: str
+    cells: tuple[str, ...]
+    failed: bool
+
+
+def write_batch_report(folder: Path, out: Path | None = None) -> Path:
+    """Write report.html beside batch.json, or into ``out``; returns its path.
+
+    Raises InputError for a folder without a batch, or one that cannot be read.
+    """
+    file = Path(folder) / "batch.json"
+    try:
+        jobs = [_checked(job) for job in json.loads(file.read_bytes())["jobs"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"holds no batch that can be read: {error}", where=str(file),
+            todo="run `telerig batch` with --out of this folder",
+        ) from error  # fmt: skip
+    place = Path(folder) if out is None else Path(out)
+    write_text_atomic(place / "report.html", render(jobs, place))
+    return place / "report.html"
+
+
+def _checked(job: Any) -> Job:
+    for name in ("dataset", "run", "kind", "status", "words"):
+        if not isinstance(job[name], str):
+            raise ValueError(f"a job garbles {name!r}")
+    if not isinstance(job.get("figures") or {}, dict):
+        raise ValueError("a job garbles 'figures'")
+    return dict(job)
+
+
+def render(jobs: Sequence[Job], folder: Path) -> str:
+    """The page as text. folder : where it will lie, for the links."""
+    failed = [j for j in jobs if j["status"] != _DONE]
+    context = {
+        "name": Path(folder).resolve().name,
+        "headline": _headline(jobs, failed),
+        "colour": "good" if not failed else ("rejected" if len(failed) == len(jobs) else "usable"),
+        "figures": _key_numbers(jobs),
+        "failures": [_failure(j) for j in failed],
+        "calibrations": [_calibration(j, folder) for j in jobs if j["kind"] == "calibrate"],
+        "runs": _runs(jobs, folder),
+        "pictures": [p for p in drawn_over_cores(_drawings(jobs)) if p is not None],
+    }
+    return render_page("template_batch.html", context, "")
+
+
+def _headline(jobs: Sequence[Job], failed: Sequence[Job]) -> str:
+    runs = {(j["dataset"], j["run"]) for j in jobs if j["run"]}
+    lost = {(j["dataset"], j["run"]) for j in failed if j["run"]}
+    datasets = len({j["dataset"] for j in jobs})
+    words = f"{len(runs) - len(lost)} of {len(runs)} runs done" if runs else "No runs"
+    return f"{words}, {datasets} dataset" + ("s" if datasets != 1 else "")
+
+
+def _key_numbers(jobs: Sequence[Job]) -> list[Figure]:
+    figures = []
+    for kind, word in KINDS.items():
+        mine = [j for j in jobs if j["kind"] == kind]
+        if mine:
+            counts = Counter(j["status"] for j in mine)
+            rest = ", ".join(f"{n} {s}" for s, n in counts.items() if s != _DONE)
+            figures.append(Figure(word, f"{counts[_DONE]} of {len(mine)}", rest or "none failed"))
+    seconds = [float(j["seconds"]) for j in jobs if is_number(j.get("seconds"))]
+    if seconds:
+        hosts = len({j.get("host") for j in jobs if j.get("host")})
+        machines = f", {hosts} machine" + ("s" if hosts > 1 else "") if hosts else ""
+        remark = f"longest job {max(seconds):.0f} s{machines}"
+        figures.append(Figure("work", f"{sum(seconds) / 60:.3g} min", remark))
+    return figures
+
+
+def _failure(job: Job) -> Row:
+    run = f", run {job['run']}" if job["run"] else ""
+    words = str(job["words"]).strip()[:_LONGEST_WORDS]
+    return Row((f"{job['dataset']}{run}", f"{job['kind']} {job['status']}", words))
+
+
+def _calibration(job: Job, folder: Path) -> Line:
+    found = job.get("figures") or {}
+    share: Any = found.get("share_kept")
+    cells = (
+        str(found.get("verdict") or job["status"]),
+        str(found.get("lens_model") or ABSENT),
+        str(found.get("views") or ABSENT),
+        f"{100 * share:.1f}%" if is_number(share) else ABSENT,
+        _text(found.get("rms_px")),
+    )
+    link = _link(job, folder, "calibration")
+    return Line(Path(job["dataset"]).name, link, cells, job["status"] != _DONE)
+
+
+def _runs(jobs: Sequence[Job], folder: Path) -> list[Line]:
+    lines: dict[tuple[str, str], dict[str, Job]] = {}
+    for job in jobs:
+        if job["run"]:
+            lines.setdefault((job["dataset"], job["run"]), {})[job["kind"]] = job
+    return [_run(dataset, run, kinds, folder) for (dataset, run), kinds in lines.items()]
+
+
+def _run(dataset: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
+    tracked, smoothed = (kinds.get(k, {}).get("figures") or {} for k in ("track", "smooth"))
+    failed = [j for j in kinds.values() if j["status"] != _DONE]
+    verdict = smoothed.get("verdict") or (
+        f"{failed[0]['kind']} {failed[0]['status']}" if failed else ABSENT
+    )
+    sd = [smoothed.get(f"s{x}_um") for x in "xyz"]
+    cells = (
+        str(verdict),
+        _text(tracked.get("frames")),
+        _text(tracked.get("tracks")),
+        _text(tracked.get("points")),
+        ", ".join(map(_text, sd)) if any(map(is_number, sd)) else ABSENT,
+    )
+    link = _link(next(iter(kinds.values())), folder, run)
+    return Line(f"{Path(dataset).name} / {run}", link, cells, bool(failed))
+
+
+def _text(value: Any) -> str:
+    return number(value) if is_number(value) else ABSENT
+
+
+def _link(job: Job, folder: Path, results: str) -> str:
+    """From the batch's page to the report, where there is one: relative if the disk allows it."""
+    target = Path(job["dataset"]) / "results" / results / "report.html"
+    if not target.is_file():
+        return ""
+    try:
+        return Path(os.path.relpath(target, Path(folder).resolve())).as_posix()
+    except ValueError:
+        return target.as_uri()
+
+
+def _drawings(jobs: Sequence[Job]) -> list[Callable[[], Picture | None]]:
+    return [
+        partial(_values, jobs, "calibrate", ("rms_px",), "Calibrations", "residual RMS / px",
+                "One point a dataset: a rig that was touched, or a bad target, stands out."),
+        partial(_values, jobs, "smooth", ("sx_um", "sy_um", "sz_um"), "Smoothed runs",
+                "sd of position / µm", "Median of each run, in the order of the batch: x, y, z."),
+        partial(_times, jobs),
+    ]  # fmt: skip
+
+
+def _values(
+    jobs: Sequence[Job], kind: str, names: Sequence[str], title: str, label: str, caption: str
+) -> Picture | None:
+    mine = [j for j in jobs if j["kind"] == kind]
+    values = np.array([[_float((j.get("figures") or {}).get(n)) for n in names] for j in mine])
+    if not np.isfinite(values).any():
+        return None
+    with drawing(2.4) as (figure, axes):
+        for i, name in enumerate(names):
+            axes.plot(np.arange(1, len(mine) + 1), values[:, i], "o", ms=3.5,
+                      color=CAMERA_COLOURS[i], label=name.split("_")[0])  # fmt: skip
+        for at in np.flatnonzero(~np.isfinite(values).any(1)):
+            axes.axvline(at + 1, color=LEFT_OUT, lw=0.8)
+        axes.set(xlabel="in the order of the batch", ylabel=label)
+        axes.set_xlim(0.5, len(mine) + 0.5)
+        _finish(axes, legend=len(names) > 1)
+        return Picture(title, svg(figure), caption + " A red line: no result.")
+
+
+def _times(jobs: Sequence[Job]) -> Picture | None:
+    timed = [j for j in jobs if is_number(j.get("seconds"))]
+    if not timed:
+        return None
+    with drawing(2.4) as (figure, axes):
+        for kind, colour in _COLOUR.items():
+            seconds = [float(j["seconds"]) for j in timed if j["kind"] == kind]
+            if seconds:
+                axes.plot(np.arange(1, len(seconds) + 1), seconds, "o", ms=3.5, color=colour,
+                          label=kind)  # fmt: skip
+        axes.set(xlabel="job", ylabel="time / s")
+        _finish(axes, legend=True)
+        caption = "Wall time of every job, of those taken from the journal too."
+        return Picture("Time", svg(figure), caption)
+
+
+def _finish(axes: Any, *, legend: bool) -> None:
+    """From zero, whole numbers of jobs, and the legend over the points."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_ylim(0, None)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    room_left(axes)
+    if legend:
+        above(axes)
+    axes.grid(True)
+
+
+def _float(value: Any) -> float:
+    return float(value) if is_number(value) else float("nan")

@@ -1,0 +1,111 @@
+"""How to hold the target next: as each camera would see it, and in plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.report.calibration.results import CalibrationResults
+from telerig.io.report.calibration.rig import draw_plan
+from telerig.io.report.calibration.rig_outline import common_plane
+from telerig.io.report.page.figures import (
+    MODEL,
+    MUTED,
+    WIDTH_IN,
+    Picture,
+    camera_colour,
+    drawing,
+    svg,
+)
+
+Array = NDArray[np.float64]
+
+_MOST_MARKERS = 2000
+_GAP = 0.06
+"""Between the two images, as a share of the width."""
+
+
+def next_pictures(results: CalibrationResults) -> list[Picture]:
+    """Two pictures of the best pose; none in folders of before, or when no pose was found."""
+    advice = (results.content.get("diagnostics") or {}).get("next_view") or {}
+    if not advice.get("poses") or len(results.cameras) != 2:
+        return []
+    pose = np.array(advice["poses"][0]["rig_from_target"], float).reshape(4, 4)
+    return [_images(results, pose, advice), _plan(results, pose)]
+
+
+def _corners(results: CalibrationResults) -> Array:
+    """(4, 3) of the plate in the target's frame, half a spacing round the dots."""
+    xy = results.points_mm[:, :2]
+    low, high = xy.min(0), xy.max(0)
+    low, high = (low - (m := float((high - low).max()) / 12), high + m)
+    return np.array(
+        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
+    )
+
+
+def _moved(pose: Array, points_mm: Array) -> Array:
+    return np.asarray(points_mm @ pose[:3, :3].T + pose[:3, 3])
+
+
+def _images(results: CalibrationResults, pose: Array, advice: Mapping[str, Any]) -> Picture:
+    corners = _moved(pose, _corners(results))
+    dots = _moved(pose, results.points_mm)
+    marked = np.isin(results.dot_ids, advice.get("marks") or [])
+    width = (1 - 3 * _GAP) / 2
+    ratio = max(c.image_size_px[1] / c.image_size_px[0] for c in results.cameras)
+    height_in = WIDTH_IN * width * ratio + 0.45
+    with drawing(height_in) as (figure, first):
+        for i, (camera, axes) in enumerate(
+            zip(results.cameras, (first, figure.add_axes((0, 0, 1, 1))))
+        ):
+            axes.set_position((_GAP + i * (width + _GAP), 0.03, width, 1 - 0.45 / height_in))
+            _frame(axes, camera.image_size_px, f"camera {camera.name} sees")
+            table = results.residuals
+            uv = table.loc[(table["camera"] == camera.name) & table["kept"], ["u_px", "v_px"]]
+            raster = len(uv) > _MOST_MARKERS
+            axes.plot(*uv.to_numpy().T, ".", color=MUTED, alpha=0.45, markersize=3,
+                      markeredgewidth=0, rasterized=raster)  # fmt: skip
+            outline = camera.project(corners)
+            axes.fill(*outline.T, color=camera_colour(i), alpha=0.12, linewidth=0)
+            axes.plot(*outline[[0, 1, 2, 3, 0]].T, color=camera_colour(i), linewidth=0.8)
+            seen = camera.project(dots)
+            for which, size in ((~marked, 4.0), (marked, 7.0)):
+                axes.plot(*seen[which].T, "o", color=camera_colour(i), markersize=size,
+                          markeredgewidth=0, rasterized=raster)  # fmt: skip
+            axes.plot(*outline[:2].T, color=MODEL, linewidth=2.2, solid_capstyle="butt")
+        source = svg(figure)
+    caption = (
+        "The target as both cameras would see it (large: marks; red: the edge beside row 0, or of "
+        "smallest y); grey: where dots were so far. Some degrees and millimetres more or less do "
+        "not matter."
+    )
+    return Picture("How to hold it next", source, caption)
+
+
+def _frame(axes: Any, size_px: tuple[int, int], title: str) -> None:
+    width, height = size_px
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    axes.set_aspect("equal")
+    axes.spines[["top", "right"]].set_visible(True)
+    axes.set_title(title, fontsize=8.5)
+
+
+def _plan(results: CalibrationResults, pose: Array) -> Picture:
+    plane = common_plane(results).T
+    corners = _moved(pose, _corners(results)) @ plane
+    with drawing(4.2) as (figure, axes):
+        draw_plan(axes, results)
+        axes.fill(*corners.T, color=MODEL, alpha=0.15, linewidth=0)
+        axes.plot(*corners[[0, 1, 2, 3, 0]].T, color=MODEL, linewidth=1.4, label="next")
+        axes.plot(*corners[:2].T, color=MODEL, linewidth=3.0, solid_capstyle="butt")
+        axes.legend(loc="upper right")
+        source = svg(figure)
+    caption = (
+        "The same in plan, seen along the common perpendicular of the optical axes, left and right "
+        f"as camera {results.cameras[0].name} sees them; grey: the views so far."
+    )
+    return Picture("Where to hold it next", source, caption)

@@ -1,0 +1,137 @@
+"""The report of a calibration: one page that needs no network, made from a results folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from telerig.io.files.atomic import write_text_atomic
+from telerig.io.report.calibration import tables as tables
+from telerig.io.report.calibration.coverage import coverage, tilts
+from telerig.io.report.calibration.dot_fit import dot_pictures
+from telerig.io.report.calibration.next_view import next_pictures
+from telerig.io.report.calibration.residuals import residual_field, residual_histogram
+from telerig.io.report.calibration.results import CalibrationResults, read_results
+from telerig.io.report.calibration.rig import rig_plan
+from telerig.io.report.calibration.scene import dots_are_drawn, scene_json
+from telerig.io.report.calibration.target import target_pictures
+from telerig.io.report.calibration.uncertainty import trust_pictures
+from telerig.io.report.page.contact_sheet import contact_sheet
+from telerig.io.report.page.figures import Picture
+from telerig.io.report.page.number_format import ABSENT, flat_rows, is_number
+from telerig.io.report.page.page import drawn_over_cores, render_page
+
+_COLOURS = {"GOOD": "good", "USABLE": "usable", "REJECTED": "rejected"}
+_SHOWN = {
+    "schema", "kind", "name", "pixel_origin", "units", "gauge", "verdict", "cameras", "target",
+    "views", "covariance", "model", "twin", "statistics", "diagnostics", "notes",
+    "stage",
+}  # fmt: skip
+
+
+def write_calibration_report(
+    results_folder: Path, out: Path | None = None, *, dot: list[Picture] | None = None
+) -> Path:
+    """Write report.html into a calibration's results folder, or into ``out``; returns its path.
+
+    It reads nothing but that folder: calibration.json and residuals.csv, and if they are there
+    dots.csv, covariance.npz, run.json, overlays/<camera>/<view>.jpg and dot_example.npz. The page
+    is written whole or not at all. Raises InputError for a folder that holds no calibration, or
+    files that cannot be read or do not fit together.
+
+    dot : what `dot_pictures` made of that dot_example.npz before; None draws it now.
+    """
+    folder = Path(results_folder)
+    page = render(read_results(folder), dot)
+    file = (folder if out is None else Path(out)) / "report.html"
+    write_text_atomic(file, page)
+    return file
+
+
+def render(results: CalibrationResults, dot: list[Picture] | None = None) -> str:
+    """The page as text. dot : as for `write_calibration_report`."""
+    context = _words(results) | _tables(results) | _pictures(results, dot)
+    return render_page("template_calibration.html", context, scene_json(results))
+
+
+def _words(results: CalibrationResults) -> dict[str, Any]:
+    content = results.content
+    verdict = content["verdict"]
+    twin = content.get("twin") or {}
+    costs = [twin.get("cost"), twin.get("other_cost")]
+    return {
+        "name": content.get("name") or "calibration",
+        "status": verdict["status"],
+        "colour": _COLOURS.get(str(verdict["status"]).split(",")[0].split()[0], "usable"),
+        "reasons": verdict.get("reasons") or [],
+        "cameras": results.camera_names,
+        "model": content.get("model") or {},
+        "twin": twin,
+        "twin_costs": [f"{c:.10g}" if is_number(c) else ABSENT for c in costs],
+        "gauge": content.get("gauge") or ABSENT,
+        "weak": (content.get("diagnostics") or {}).get("weak") or [],
+        "notes": content.get("notes") or [],
+        "absent": results.absent,
+        "trust_words": _trust_words(results),
+        "comparison": results.comparison,
+        "advice": (content.get("diagnostics") or {}).get("next_view") or {},
+        "dots_drawn": dots_are_drawn(results),
+    }
+
+
+def _trust_words(results: CalibrationResults) -> list[str]:
+    """What halves and residuals say; nothing for folders of before."""
+    diagnostics = results.content.get("diagnostics") or {}
+    halves, structure = (diagnostics.get(k) or {} for k in ("halves", "structure"))
+    found = [str(halves["words"])] if "words" in halves else []
+    found += [str(words) for words in structure.get("words") or []]
+    return [words[0].upper() + words[1:] + "." for words in found if words]
+
+
+def _tables(results: CalibrationResults) -> dict[str, Any]:
+    stage = tables.stage_rows(results)
+    shown = _SHOWN if stage else _SHOWN - {"stage"}
+    extra = {k: v for k, v in results.content.items() if k not in shown and v != {}}
+    return {
+        "figures": tables.key_numbers(results),
+        "parameters": tables.parameter_rows(results),
+        "pose": tables.pose_rows(results),
+        "stage": stage,
+        "stage_words": (results.content.get("stage") or {}).get("notes") or [],
+        "ladder": tables.ladder_rows(results),
+        "worst": tables.worst_rows(results),
+        "changes": tables.change_rows(results),
+        "left_out": int((~results.residuals["kept"]).sum()),
+        "lowered": int((results.residuals["weight"] < 1).sum()),
+        "measured": len(results.residuals),
+        "statistics": list(flat_rows(results.statistics)),
+        "extra": list(flat_rows(extra)),
+        "run": list(flat_rows(results.run)),
+    }
+
+
+def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[str, Any]:
+    every = range(len(results.cameras))
+    drawings: list[tuple[str, Callable[[], Any]]] = [  # what takes long comes first
+        ("trust", partial(trust_pictures, results)),
+        ("target", partial(target_pictures, results)),
+        ("next", partial(next_pictures, results)),
+        *(("fields", partial(residual_field, results, i)) for i in every),
+        ("spread", partial(residual_histogram, results)),
+        ("plan", partial(rig_plan, results)),
+        *(("covered", partial(coverage, results, i)) for i in every),
+        ("covered", partial(tilts, results)),
+        ("sheet", partial(contact_sheet, results)),
+    ]
+    if dot is None:
+        drawings.insert(0, ("dot", partial(dot_pictures, results.dot_example)))
+    drawn = drawn_over_cores([d for _, d in drawings])
+    pictures: dict[str, Any] = {"fields": [], "covered": [], "spread": [], "dot": dot}
+    for (place, _), picture in zip(drawings, drawn):
+        if place in ("fields", "covered", "spread"):
+            pictures[place].append(picture)
+        else:
+            pictures[place] = picture
+    return pictures

@@ -1,0 +1,299 @@
+"""The report's tables: what calibration.json says, in words and with units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import GeometryError
+from telerig.io.report.calibration.results import CalibrationResults
+from telerig.io.report.page.number_format import ABSENT, is_number, number, share, with_sd
+from telerig.io.report.page.page import Figure, Row
+from telerig.rig import projection
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
+from telerig.rig.projection import PARAMETERS
+
+Array = NDArray[np.float64]
+
+WORST = 15
+_MANY_SD = 3.0
+_WORDS = {
+    "scale_px_per_mm": "scale, px/mm",
+    "aspect": "aspect, v scale over u scale",
+    "skew": "skew",
+    "centre_u_px": "image centre u, px",
+    "centre_v_px": "image centre v, px",
+    "kappa_per_mm": "residual perspective κ, 1/mm",
+    "k1": "radial distortion 1",
+    "k2": "radial distortion 2",
+    "k3": "radial distortion 3",
+    "p1": "tangential distortion 1",
+    "p2": "tangential distortion 2",
+    "s1": "thin prism 1",
+    "s2": "thin prism 2",
+    "s3": "thin prism 3",
+    "s4": "thin prism 4",
+    "tilt_x": "sensor tilt about v, tangent",
+    "tilt_y": "sensor tilt about u, tangent",
+    "image_convergence_per_mm": "image-side convergence, 1/mm",
+    "wall_x_rad": "wall's normal from the stated one, x",
+    "wall_y_rad": "wall's normal from the stated one, y",
+}
+
+
+def key_numbers(results: CalibrationResults) -> list[Figure]:
+    """What a reader wants first."""
+    s = results.statistics
+    per_camera = [f"{n} {number(s.get(f'rms_{n}_px'))}" for n in results.camera_names]
+    kept, measured = s.get("dots_kept"), s.get("dots_measured")
+    figures = [
+        Figure("Residual", f"{number(s.get('rms_px'))} px", f"RMS; {', '.join(per_camera)} px"),
+        Figure(
+            "Chi-square",
+            f"{number(s.get('chi2_dof'))} per dof",
+            f"1 is expected; {number(s.get('degrees_of_freedom'))} degrees of freedom",
+        ),
+        Figure(
+            "Dots kept",
+            share(kept, measured),
+            f"{number(kept)} of {number(measured)} in {len(results.views)} views",
+        ),
+    ]
+    return figures + _space_numbers(results, s)
+
+
+def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Figure]:
+    if len(results.cameras) < 2:
+        return [Figure("In space", "no depth", "one camera never sees the depth along its axis")]
+    precision = f"{number(s.get('space_sd_um'))} µm"
+    remark = (
+        f"1 sd per axis of a triangulated point; dots are {number(s.get('space_rms_um'))} µm RMS "
+        f"from the fit, rays miss by {number(s.get('ray_miss_rms_um'))} µm"
+    )
+    angle = with_sd(s.get("axes_angle_deg"), s.get("axes_angle_sd_deg"))
+    figures = [
+        Figure("In space", precision, remark),
+        Figure("Angle between axes", f"{angle} °", "1 sd; between the optical axes"),
+    ]
+    if "perspective_centres_distance_mm" in s:
+        distance = f"{number(s['perspective_centres_distance_mm'], 6)} mm"
+        figures.append(Figure("Base", distance, "between the centres of perspective"))
+    return figures
+
+
+def parameter_rows(results: CalibrationResults) -> list[Row]:
+    """One row per parameter, one cell per camera: value +- sd, or that it was held."""
+    cameras = list(results.content["cameras"].values())
+    rows = []
+    for name in PARAMETERS:
+        if name.startswith("wall_") and not results.content.get("walls"):
+            continue
+        cells = [_parameter_cell(camera, name) for camera in cameras]
+        free = any(name in camera.get("free", []) for camera in cameras)
+        rows.append(Row((f"{_WORDS[name]} ({name})", *cells), faint=not free))
+    largest = [_largest_distortion(camera) for camera in results.cameras]
+    perspective = [f"{number(1e6 * c['kappa_per_mm'])} ppm" for c in results.cameras]
+    return [
+        *rows,
+        Row(("largest distortion in the image", *largest)),
+        Row(("scale lost per mm of depth", *perspective)),
+        Row(("field of view, mm", *(_field(camera) for camera in results.cameras))),
+    ]
+
+
+def _parameter_cell(camera: Mapping[str, Any], name: str) -> str:
+    value = camera["parameters"].get(name, 0.0)
+    if name not in camera.get("free", []):
+        return f"{number(value, 7)} (held)"
+    return with_sd(value, (camera.get("standard_deviations") or {}).get(name))
+
+
+def _field(camera: Camera) -> str:
+    width, height = np.array(camera.image_size_px) / camera["scale_px_per_mm"]
+    return f"{number(float(width))} x {number(float(height / camera['aspect']))}"
+
+
+def _largest_distortion(camera: Camera) -> str:
+    """How far distortion and sensor tilt move a point, at most, within the image."""
+    grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 9) for n in camera.image_size_px)), -1)
+    straight = camera.with_parameters(**dict.fromkeys(PARAMETERS[PARAMETERS.index("k1") :], 0.0))
+    try:
+        ideal = projection.ideal_from_pixel(grid, camera.intrinsics, camera.rho_mm)
+    except GeometryError:
+        return "not invertible in the whole image"
+    points = np.concatenate([ideal, np.zeros((*ideal.shape[:-1], 1))], -1)
+    moved = grid - projection.pixel_from_camera(points, straight.intrinsics, camera.rho_mm)
+    return f"{number(float(np.hypot(moved[..., 0], moved[..., 1]).max()))} px"
+
+
+def pose_rows(results: CalibrationResults) -> list[Row]:
+    """The second camera against the first; empty for one camera."""
+    if len(results.cameras) < 2:
+        return []
+    second = results.cameras[1]
+    pose = second.camera_from_rig
+    nominal = (results.content.get("twin") or {}).get("nominal_rotvec_deg")
+    turn, place = _tangent_sd(results, "r", "_rad"), _tangent_sd(results, "t", "_mm")
+    statistics = results.statistics
+    return [
+        Row(("angle between the axes (°)", with_sd(statistics.get("axes_angle_deg"),
+                                                  statistics.get("axes_angle_sd_deg"))), True),
+        Row(("distance between the axes (mm)", _gap(results, pose))),
+        Row((f"{second.name}_from_{results.cameras[0].name} as rotation vector (°)",
+             _fixed(np.degrees(pose.rotvec_rad), 5))),
+        Row(("the same, nominal (rig.toml)", _fixed(nominal, 1))),
+        Row((f"sd of turns about {second.name}'s x, y, z (°)", _fixed(_degrees(turn), 5))),
+        Row((f"{second.name}_from_{results.cameras[0].name} translation (mm)",
+             _fixed(pose.translation_mm, 5))),
+        Row((f"sd of shifts along {second.name}'s x, y, z (mm)", _fixed(place, 5))),
+    ]  # fmt: skip
+
+
+_STAGE = {
+    "axis", "axis_covariance_rad2", "encoder_scale", "encoder_scale_sd", "wander_sigma_mm",
+    "position_sigma_mm",
+}  # fmt: skip
+
+
+def stage_rows(results: CalibrationResults) -> list[Row]:
+    """Travel axis and encoder scale from `stage_axis/`; empty without it."""
+    stage = results.content.get("stage") or {}
+    if not _STAGE.issubset(stage):
+        return []
+    tilts = np.sqrt(np.diagonal(np.array(stage["axis_covariance_rad2"], float)))
+    scale, sd = (1e6 * float(stage[key]) for key in ("encoder_scale", "encoder_scale_sd"))
+    across, along = (1e3 * float(stage[f"{k}_sigma_mm"]) for k in ("wander", "position"))
+    return [
+        Row(("direction of travel in the rig frame", _fixed(stage["axis"], 6))),
+        Row(("sd of its two tilts (°)", _fixed(_degrees([float(t) for t in tilts]), 5))),
+        Row(("encoder reads too much (ppm of the travel)", with_sd(scale, sd)), True),
+        Row(("scatter of the readings along the axis (µm)", number(along, 2))),
+        Row(("the carriage's wander across it (µm)", number(across, 2))),
+        Row(("chi² per degree of freedom of the dots", number(stage.get("chi2_dof"), 3))),
+    ]
+
+
+def _degrees(radians: list[float] | None) -> list[float] | None:
+    return None if radians is None else [float(np.degrees(r)) for r in radians]
+
+
+def _rig_block(results: CalibrationResults, names: list[str]) -> Array | None:
+    block = results.content.get("covariance") or {}
+    known = list(block.get("names", []))
+    if not set(names) <= set(known):
+        return None
+    index = [known.index(name) for name in names]
+    return np.array(block["matrix"], float)[np.ix_(index, index)]
+
+
+def _tangent_names(results: CalibrationResults, kind: str, unit: str) -> list[str]:
+    return [f"{results.cameras[1].name}.{kind}{axis}{unit}" for axis in "xyz"]
+
+
+def _tangent_sd(results: CalibrationResults, kind: str, unit: str) -> list[float] | None:
+    block = _rig_block(results, _tangent_names(results, kind, unit))
+    return None if block is None else [float(s) for s in np.sqrt(np.diag(block))]
+
+
+def _gap(results: CalibrationResults, camera_from_rig: Pose) -> str:
+    """Length of the common perpendicular; the tangent is of rig_from_second, in its own axes."""
+    across = np.cross([0.0, 0.0, 1.0], camera_from_rig.rotation[2])
+    if np.linalg.norm(across) < 1e-6:
+        return "the axes are parallel"
+    across /= np.linalg.norm(across)
+    gap = abs(float(across @ camera_from_rig.inverse().translation_mm))
+    block = _rig_block(results, _tangent_names(results, "t", "_mm"))
+    if block is None:
+        return number(gap, 5)
+    inside = camera_from_rig.rotation @ across
+    return with_sd(gap, float(np.sqrt(inside @ block @ inside)))
+
+
+def _fixed(values: Any, decimals: int) -> str:
+    if values is None:
+        return ABSENT
+    return "(" + ", ".join(f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in values) + ")"
+
+
+def ladder_rows(results: CalibrationResults) -> list[Row]:
+    """The steps of the ladder of lens models, taken or not; empty when the model was given."""
+    model = results.content.get("model") or {}
+    return [
+        Row(
+            (
+                _step_name(rung), *(_or_blank(rung.get(key), digits) for key, digits in _STEP),
+                _chance(rung.get("p_value")), _held_out(rung), _said(rung),
+            ),
+            strong=rung.get("model") == model.get("name"),
+            faint=not rung.get("taken", True),
+        )
+        for rung in model.get("ladder") or []
+    ]  # fmt: skip
+
+
+_STEP = (("parameters", 3), ("rms_px", 4), ("chi2_dof", 3), ("chi2_gain", 3), ("bic_gain", 3))
+
+
+def _step_name(rung: Mapping[str, Any]) -> str:
+    added = ", ".join(rung.get("added") or [])
+    return f"+ {added} ({rung.get('camera')})" if added else str(rung.get("model"))
+
+
+def _or_blank(value: Any, digits: int) -> str:
+    return number(value, digits) if is_number(value) else ""
+
+
+def _chance(p_value: Any) -> str:
+    if not is_number(p_value):
+        return ""
+    return "< 10⁻¹²" if p_value < 1e-12 else number(p_value, 2)
+
+
+def _held_out(rung: Mapping[str, Any]) -> str:
+    after, before = rung.get("held_out"), rung.get("held_out_before")
+    if not is_number(after):
+        return ""
+    started = is_number(before) and bool(rung.get("added"))
+    return f"{number(before)} → {number(after)}" if started else number(after)
+
+
+def _said(rung: Mapping[str, Any]) -> str:
+    return str(rung.get("words") or ("taken" if rung.get("added") else ""))
+
+
+def worst_rows(results: CalibrationResults) -> list[Row]:
+    """The dots that agree least: the down-weighted ones first, then by their residual."""
+    table = results.residuals
+    whitened = "whitened_u" in table
+    columns = ["whitened_u", "whitened_v"] if whitened else ["du_px", "dv_px"]
+    size = np.hypot(*table[columns].to_numpy().T)
+    order = np.lexsort((-size, table["kept"].to_numpy()))
+    return [
+        Row(
+            (
+                str(dot.view), str(dot.camera), str(dot.dot), f"{dot.row}, {dot.column}",
+                f"{dot.du_px:+.4f}", f"{dot.dv_px:+.4f}", f"{dot.length_px:.4f}",
+                f"{dot.weight:.3g}", str(dot.reason),
+            ),
+            strong=not bool(dot.kept),
+        )
+        for dot in table.iloc[order[:WORST]].itertuples()
+    ]  # fmt: skip
+
+
+def change_rows(results: CalibrationResults) -> list[Row]:
+    """Of comparison.json: each quantity, its change with standard deviation, in deviations."""
+    rows = []
+    for change in results.comparison.get("changes") or []:
+        deviations = change.get("deviations")
+        cells = (
+            str(change["quantity"]),
+            f"{with_sd(change['change'], change['sd'])} {change['unit']}",
+            f"{deviations:.1f}" if is_number(deviations) else ABSENT,
+        )
+        rows.append(Row(cells, strong=is_number(deviations) and abs(deviations) > _MANY_SD))
+    return rows

@@ -1,0 +1,283 @@
+"""The film of both cameras' images side by side, with outlines, numbers and tails drawn in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.files.csv_table import Column
+from telerig.io.machine.parallel import ordered_map, quick_workers
+from telerig.io.report.film.files import Progress, write_film
+from telerig.io.report.page.results_tables import optional_columns
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Images = Callable[[str, int], NDArray[Any] | None]
+Colour = tuple[int, int, int]
+
+MOST_FRAMES = 1_000
+TAIL_FRAMES = 24
+WIDTH_PX = 640
+_GIF_WIDTH_PX = 800
+_RATE_HZ = 25.0
+_STRIP_PX, _GAP_PX = 30, 4
+_BITS = 4
+_ALONE: Colour = (250, 190, 20)
+_COLOURS: tuple[Colour, ...] = (
+    (20, 110, 255), (235, 70, 0), (15, 165, 60), (205, 40, 200), (225, 25, 60), (0, 165, 175),
+    (150, 120, 0), (120, 70, 240),
+)  # fmt: skip
+_SHAPE = [f"{part}{k}_px" for k in range(3, 7) for part in "cs"]
+_ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
+_LOOKED_AT = 5
+
+
+@dataclass(frozen=True)
+class Found:
+    """A bubble in an image: its outline (N, 2) px, its track's number or None, its tail (M, 2)."""
+
+    outline_px: Array
+    particle: int | None
+    tail_px: Array
+
+
+@dataclass(frozen=True)
+class ViewFrame:
+    """One frame: time in s (None: not known) and, per camera, what was found."""
+
+    frame: int
+    t_s: float | None
+    found: tuple[tuple[Found, ...], ...]
+
+
+def write_views_film(
+    results_folder: Path,
+    files: Sequence[Path],
+    *,
+    images: Images,
+    image_sizes_px: Mapping[str, tuple[int, int]],
+    frame_count: int,
+    t_s: Array | None = None,
+    stage: Progress | None = None,
+) -> tuple[str, ...]:
+    """Film the cameras' images with what was found in them; what to know, in words.
+
+    results_folder : a tracked run's; detections.csv is read. images : gives the grey image (H, W)
+    of a camera and frame, or None where there is none; it is called from several processes.
+    image_sizes_px : (width, height) by camera, in the order of the film. t_s : (frame_count,).
+
+    25 frames a second; of a run of more than 1,000 frames every k-th is shown. Raises InputError
+    for a folder without detections.csv, and files that cannot be written.
+    """
+    cameras = tuple(image_sizes_px)
+    table = read_outlines(Path(results_folder) / "detections.csv", cameras)
+    step = -(-frame_count // MOST_FRAMES)
+    frames = list(view_frames(table, cameras, range(0, frame_count, step), t_s))
+    shades = {name: _shades(images, name, frame_count) for name in cameras}
+    draw = partial(draw_views, images, dict(image_sizes_px), shades)
+    pictures = ordered_map(draw, frames, quick_workers(len(frames)))
+    write_film(
+        pictures, len(frames), files, rate_hz=_RATE_HZ, what="both views", stage=stage,
+        gif_width_px=_GIF_WIDTH_PX, palette=_palette(),
+    )  # fmt: skip
+    return (f"both views: every {step}. of {frame_count} frames is shown",) if step > 1 else ()
+
+
+def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
+    """detections.csv with the columns of the outlines; blank shape coefficients are 0."""
+    if not file.is_file():
+        raise InputError(
+            "is not there, so nothing can be drawn into the images", where=str(file),
+            todo="track the run again (`telerig track`)",
+        )  # fmt: skip
+    numbers = [Column(name, required=False, blank=True) for name in (*_ELLIPSE, *_SHAPE)]
+    keys = [Column("frame", "whole"), Column("camera", "text")]
+    table: pd.DataFrame = optional_columns(
+        file, [*keys, Column("particle", "text", blank=True), *numbers]
+    )
+    absent: dict[str, Any] = {name: 0.0 for name in _SHAPE if name not in table}
+    absent |= {name: np.nan for name in _ELLIPSE if name not in table}
+    table = table.assign(**absent)
+    table[_SHAPE] = table[_SHAPE].fillna(0.0)
+    seen = np.isfinite(table[["u_px", "v_px"]].to_numpy(float)).all(1)
+    found: pd.DataFrame = table.loc[seen & table["camera"].isin(cameras).to_numpy(bool)]
+    return found.reset_index(drop=True)
+
+
+def outlines_px(table: pd.DataFrame, points: int = 72) -> Array:
+    """(N, points, 2) px: ellipse and normal displacement, as docs/files.md defines them.
+
+    Without semi-axes there is no outline: a small circle round the place.
+    """
+    phi = np.linspace(0, 2 * np.pi, points, endpoint=False)
+    u, v, a, b, angle = table[_ELLIPSE].to_numpy(float).T[:, :, None]
+    bare = ~np.isfinite(a * b * angle)
+    a, b, angle = (np.where(bare, x, y) for x, y in ((6.0, a), (6.0, b), (0.0, angle)))
+    normal = np.stack([b * np.cos(phi), a * np.sin(phi)], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    shape = table[_SHAPE].to_numpy(float)
+    waves = np.array([wave(k * phi) for k in range(3, 7) for wave in (np.cos, np.sin)])
+    local = np.stack([a * np.cos(phi), b * np.sin(phi)], -1) + (shape @ waves)[..., None] * normal
+    x, y = local[..., 0], local[..., 1]
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([u + cos * x - sin * y, v + sin * x + cos * y], -1)
+
+
+def view_frames(
+    table: pd.DataFrame, cameras: Sequence[str], frames: Sequence[int], t_s: Array | None
+) -> Iterator[ViewFrame]:
+    """What to draw, frame by frame. A tail is the bubble's last `TAIL_FRAMES` places."""
+    outlines = outlines_px(table)
+    where = {
+        key: np.asarray(rows) for key, rows in table.groupby(["frame", "camera"]).indices.items()
+    }
+    centres = table[["u_px", "v_px"]].to_numpy(float)
+    number, names = table["frame"].to_numpy(np.int64), table["particle"].to_numpy()
+    order = np.argsort(number, kind="stable")
+    tracks = table.iloc[order].groupby(["camera", "particle"]).indices
+    paths = {key: order[rows] for key, rows in tracks.items()}
+    for frame in frames:
+        views = []
+        for camera in cameras:
+            found = []
+            for row in where.get((frame, camera), np.zeros(0, np.int64)):
+                name = str(names[row])
+                tail = np.zeros((0, 2))
+                if name:
+                    path = paths[camera, names[row]]
+                    late = path[(number[path] <= frame) & (number[path] >= frame - TAIL_FRAMES)]
+                    tail = centres[late]
+                found.append(Found(outlines[row], int(float(name)) if name else None, tail))
+            views.append(tuple(found))
+        yield ViewFrame(frame, None if t_s is None else float(t_s[frame]), tuple(views))
+
+
+def draw_views(
+    images: Images,
+    sizes_px: Mapping[str, tuple[int, int]],
+    shades: Mapping[str, tuple[float, float]],
+    frame: ViewFrame,
+) -> Picture:
+    """(h, w, 3) RGB, even sides: the views side by side, a strip of words above."""
+    parts = []
+    for camera, found in zip(sizes_px, frame.found):
+        image = images(camera, frame.frame)
+        parts.append(_view(image, sizes_px[camera], shades[camera], found, camera))
+    height = max(part.shape[0] for part in parts)
+    width = sum(part.shape[1] for part in parts) + _GAP_PX * (len(parts) - 1)
+    page = np.full((height + height % 2, width + width % 2, 3), 255, np.uint8)
+    left = 0
+    for i, part in enumerate(parts):
+        page[: part.shape[0], left : left + part.shape[1]] = part
+        if i + 1 == len(parts):
+            time = "" if frame.t_s is None else f", {frame.t_s:.3f} s"
+            _words(page, f"frame {frame.frame}{time}", (left + part.shape[1] - 10, 15), "rm")
+        left += part.shape[1] + _GAP_PX
+    return page
+
+
+def _view(
+    image: NDArray[Any] | None,
+    size_px: tuple[int, int],
+    shades: tuple[float, float],
+    found: Sequence[Found],
+    camera: str,
+) -> Picture:
+    import cv2
+
+    factor = min(1.0, WIDTH_PX / size_px[0])
+    width, height = round(size_px[0] * factor), round(size_px[1] * factor)
+    page = np.full((height + _STRIP_PX, width, 3), 255, np.uint8)
+    picture = page[_STRIP_PX:]
+    if image is None:
+        picture[:] = 128
+        _words(page, "no image", (width / 2, _STRIP_PX + height / 2), "mm")
+    else:
+        low, high = shades
+        grey = np.clip((image.astype(np.float32) - low) * (255 / max(high - low, 1e-9)), 0, 255)
+        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        picture[:] = np.round(small).astype(np.uint8)[..., None]
+    labels = []
+    drawing = np.ascontiguousarray(picture)
+    for bubble in found:
+        colour = _ALONE if bubble.particle is None else _bright(bubble.particle)
+        _tail(drawing, (bubble.tail_px + 0.5) * factor - 0.5, colour)
+        ring = (bubble.outline_px + 0.5) * factor - 0.5
+        cv2.polylines(drawing, [_fixed(ring)], True, colour, 1, cv2.LINE_AA, _BITS)
+        if bubble.particle is not None:
+            place = float(ring[:, 0].max()) + 5, float(ring[:, 1].mean()) + _STRIP_PX
+            labels.append((str(bubble.particle), place, colour))
+    picture[:] = drawing
+    _words(page, camera, (10, 15), "lm")
+    for words, place, colour in labels:
+        _words(page, words, place, "lm", colour)
+    return page
+
+
+def _tail(picture: Picture, points: Array, colour: Colour) -> None:
+    """Where the bubble came from; each place is a small dot on the line."""
+    import cv2
+
+    if len(points) > 1:
+        cv2.polylines(picture, [_fixed(points)], False, colour, 1, cv2.LINE_AA, _BITS)
+    for point in _fixed(points):
+        cv2.circle(picture, (int(point[0]), int(point[1])), 24, colour, -1, cv2.LINE_AA, _BITS)
+
+
+def _fixed(points: Array) -> NDArray[np.int32]:
+    return np.round(points * (1 << _BITS)).astype(np.int32).reshape(-1, 2)
+
+
+def _bright(particle: int) -> Colour:
+    """One to a track, to be seen on a dark bubble and on a light background."""
+    return _COLOURS[particle % len(_COLOURS)]
+
+
+def _palette() -> list[Colour]:
+    """For a GIF: grey, and the lines' colours with what lies between them and black or white."""
+    greys = [(g, g, g) for g in np.linspace(0, 255, 140).astype(int).tolist()]
+    mixed = [
+        tuple(round(share * part + (1 - share) * ground) for part in colour)
+        for colour in (*_COLOURS, _ALONE)
+        for share, ground in ((1.0, 0), (0.5, 0), (0.4, 230), (0.7, 230))
+    ]
+    return [*greys, *((c[0], c[1], c[2]) for c in mixed)]
+
+
+def _shades(images: Images, camera: str, frame_count: int) -> tuple[float, float]:
+    """Black and white for the whole film: from a few of its images."""
+    some = np.unique(np.linspace(0, frame_count - 1, _LOOKED_AT).astype(int))
+    seen = [image for image in (images(camera, int(f)) for f in some) if image is not None]
+    if not seen:
+        return 0.0, 255.0
+    ends = np.array([np.percentile(image, [0.1, 99.9]) for image in seen])
+    return float(ends[:, 0].min()), float(ends[:, 1].max())
+
+
+def _words(
+    page: Picture,
+    words: str,
+    place: tuple[float, float],
+    anchor: str,
+    colour: Colour = (28, 31, 36),
+) -> None:
+    from PIL import Image, ImageDraw
+
+    from telerig.io.report.film.drawing import font
+
+    canvas = Image.fromarray(page)
+    ImageDraw.Draw(canvas).text(
+        place, words, fill=colour, font=font(14), anchor=anchor, stroke_width=2,
+        stroke_fill=(255, 255, 255),
+    )  # fmt: skip
+    page[:] = np.asarray(canvas)

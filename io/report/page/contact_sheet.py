@@ -1,0 +1,100 @@
+"""The overlays of all views and cameras, within the bytes that a page may carry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from telerig.errors import InputError
+from telerig.io.report.calibration.results import CalibrationResults
+from telerig.io.report.page.figures import data_uri
+from telerig.io.report.page.results_files import read_picture
+
+BUDGET_BYTES = 1_500_000
+"""Of JPEG: with the page's other parts a report stays below 8 MB."""
+
+SMALL_WIDTH_PX = 420
+_SMALL_QUALITY = 70
+_PNG = b"\x89PNG"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One picture: ``source`` a data URI, "" when it is only linked; ``link`` "" without a file."""
+
+    camera: str
+    source: str
+    link: str
+
+
+@dataclass(frozen=True)
+class ContactSheet:
+    """views : (view, its cells by camera); ``shrunk`` when the pictures were made smaller."""
+
+    views: tuple[tuple[str, tuple[Cell, ...]], ...]
+    shrunk: bool
+
+    @property
+    def linked(self) -> int:
+        """How many pictures the page links to instead of carrying them."""
+        return sum(bool(c.link and not c.source) for _, cells in self.views for c in cells)
+
+
+def contact_sheet(results: CalibrationResults) -> ContactSheet:
+    """The overlays of a calibration. Raises InputError for a picture that cannot be read."""
+    views = list(results.views) if results.overlays else []
+    return picture_sheet(views, results.camera_names, results.overlays)
+
+
+def picture_sheet(
+    rows: Sequence[str],
+    columns: Sequence[str],
+    files: Mapping[tuple[str, str], Path],
+    *,
+    small_width_px: int = SMALL_WIDTH_PX,
+    budget_bytes: int | None = None,
+) -> ContactSheet:
+    """As they are if they fit; else smaller; else those of the last rows linked only.
+
+    files : (column, row) -> JPEG or PNG, <results>/<kind>/<folder>/<name>. budget_bytes : of all
+    pictures, `BUDGET_BYTES` unless told.
+    Raises InputError for a picture that cannot be read.
+    """
+    pictures = {key: read_picture(file) for key, file in files.items()}
+    left = BUDGET_BYTES if budget_bytes is None else budget_bytes
+    shrunk = sum(map(len, pictures.values())) > left
+    if shrunk:
+        pictures = {key: _smaller(p, files[key], small_width_px) for key, p in pictures.items()}
+    views = []
+    for row in rows:
+        cells = []
+        for column in columns:
+            picture = pictures.get((column, row), b"")
+            left -= len(picture)
+            kind = "image/png" if picture.startswith(_PNG) else "image/jpeg"
+            source = data_uri(kind, picture) if picture and left >= 0 else ""
+            link = "/".join(files[column, row].parts[-3:]) if picture else ""
+            cells.append(Cell(column, source, link))
+        views.append((row, tuple(cells)))
+    return ContactSheet(tuple(views), shrunk)
+
+
+def _smaller(picture: bytes, file: Path, width_px: int) -> bytes:
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_ANYCOLOR)
+    if image is None:
+        raise InputError(
+            "is no JPEG or PNG picture", where=str(file), todo="remove this file, or make it again"
+        )
+    factor = width_px / image.shape[1]
+    if factor < 1:
+        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    if picture.startswith(_PNG):
+        _, small = cv2.imencode(".png", image)
+    else:
+        _, small = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY])
+    return min(small.tobytes(), picture, key=len)

@@ -1,0 +1,1 @@
+"""The smoothing section of a run's page. Read ``section`` first."""

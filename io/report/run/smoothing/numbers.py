@@ -1,0 +1,216 @@
+"""What the tables of a smoothed run add up to: spreads, spectra, lines of the shake."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.report.run.smoothing.results import AXES, PLACE, SPEED, SmoothingResults
+from telerig.io.report.run.tracking.numbers import median, rms
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+LEAST_FRAMES = 32
+_LONGEST_SEGMENT = 1024
+_MOST_TRACKS = 20
+_FINITE_SHARE = 0.7
+_HANN_WIDTH = 1.44
+"""Full width at half power of Hann's window, in steps of frequency."""
+
+_LINE_SHARE = 0.05
+_ABOVE_FLOOR = 8.0
+_PROMINENT = 0.6
+_ALIKE = 0.7
+_STRONGER = 2.0
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """One-sided power densities (F, 3) per axis at (F,) Hz; ``step_hz`` as far as it resolves."""
+
+    frequency_hz: Array
+    density: Array
+    step_hz: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """A peak of the shake's spectrum.
+
+    width_hz : over which another peak is not another line.
+    damping : of a single mode as wide as the peak; ``upper`` where the spectrum resolves no less.
+    where : "common", "apart" (both cameras, not alike), or a camera's name.  alone : no other
+    camera sees the axis.
+    """
+
+    axis: str
+    frequency_hz: float
+    damping: float
+    upper: bool
+    rms_um: float
+    where: str
+    alone: bool
+    width_hz: float
+
+
+def column(table: pd.DataFrame, name: str) -> Array:
+    """The column's values, NaN where the file has none."""
+    if name not in table:
+        return np.full(len(table), np.nan)
+    return table[name].to_numpy(float)
+
+
+def axis_sd(results: SmoothingResults, pattern: str = PLACE) -> list[float | None]:
+    """Median sd of the bubbles per axis, in mm or mm/s; None where it is not known."""
+    return [median(column(results.trajectories, "s" + pattern.format(axis))) for axis in AXES]
+
+
+def taken_away(
+    results: SmoothingResults, kind: str = "naive_", pattern: str = PLACE
+) -> list[float | None]:
+    """RMS of a baseline minus smoothed per axis, in mm or mm/s."""
+    table = results.trajectories
+    return [
+        rms(column(table, kind + pattern.format(a)) - column(table, pattern.format(a)))
+        for a in AXES
+    ]
+
+
+def shake_rms_um(results: SmoothingResults, camera: str, axis: str) -> float | None:
+    """Of the estimate about its mean; None where the camera does not see it."""
+    if axis in results.unseen(camera) or not len(results.shake):
+        return None
+    return float(1e3 * np.std(column(results.shake, f"{camera}_{axis}_mm")))
+
+
+def segment(frames: int) -> int:
+    """Frames of a segment of Welch's estimate: about five of them, half overlapping."""
+    return min(frames, _LONGEST_SEGMENT, max(64, frames // 3))
+
+
+def velocity_spectrum(results: SmoothingResults, kind: str = "") -> Spectrum | None:
+    """Mean over the longest tracks of the velocity's density, (mm/s)²/Hz.
+
+    kind : "", "naive_" or "rts_". None where no track is long enough or the columns are empty.
+    """
+    tracks = [results.track(k) for k in results.bubbles[:_MOST_TRACKS]]
+    if not tracks or len(tracks[0]) < LEAST_FRAMES:
+        return None
+    length = segment(len(tracks[0]))
+    names = [kind + SPEED.format(axis) for axis in AXES]
+    found, weights = [], []
+    for track in tracks:
+        values = np.stack([column(track, name) for name in names], 1)
+        if len(track) >= length and np.isfinite(values).all(1).mean() >= _FINITE_SHARE:
+            frequency, density = _welch(track["t_s"].to_numpy(float), values, length)
+            found.append(density)
+            weights.append(len(track))
+    if not found:
+        return None
+    same = [d for d in found if d.shape == found[0].shape]
+    mean = np.average(same, axis=0, weights=weights[: len(same)])
+    return Spectrum(frequency, np.asarray(mean), float(frequency[1]))
+
+
+def shake_spectrum(results: SmoothingResults, camera: str) -> Spectrum | None:
+    """Density of a camera's shake per axis, µm²/Hz. None for a short run."""
+    values = _shake_um(results, camera)
+    if len(values) < LEAST_FRAMES:
+        return None
+    time = results.shake["t_s"].to_numpy(float)
+    frequency, density = _welch(time, values, segment(len(values)))
+    return Spectrum(frequency, density, float(frequency[1]))
+
+
+def _shake_um(results: SmoothingResults, camera: str) -> Array:
+    return 1e3 * np.stack([column(results.shake, f"{camera}_{axis}_mm") for axis in AXES], 1)
+
+
+def _welch(t_s: Array, values: Array, length: int) -> tuple[Array, Array]:
+    from scipy.signal import detrend, welch
+
+    even, rate_hz = evenly(t_s, values)
+    level = np.asarray(detrend(even, axis=0))
+    frequency, density = welch(level, rate_hz, nperseg=min(length, len(even)), axis=0)
+    return np.asarray(frequency), np.asarray(density)
+
+
+def evenly(t_s: Array, values: Array) -> tuple[Array, float]:
+    """Columns of (N, K) at even times, straight lines over what is missing; and the rate in Hz."""
+    step = float(np.median(np.diff(t_s)))
+    count = min(round((t_s[-1] - t_s[0]) / step) + 1, 4 * len(t_s))
+    wanted = np.linspace(t_s[0], t_s[-1], count)
+    columns = []
+    for one in values.T:
+        there = np.isfinite(one)
+        columns.append(np.interp(wanted, t_s[there], one[there]) if there.any() else 0 * wanted)
+    return np.stack(columns, 1), (count - 1) / (t_s[-1] - t_s[0])
+
+
+def shake_lines(results: SmoothingResults) -> list[Line]:
+    """The peaks that hold a noticeable share of the shake, strongest first."""
+    if len(results.shake) < LEAST_FRAMES:
+        return []
+    out: list[Line] = []
+    for axis in AXES:
+        cameras = [c for c in results.cameras if axis in results.seen(c)]
+        if cameras:
+            out += _lines_of(results, axis, cameras)
+    return sorted(out, key=lambda line: -line.rms_um)
+
+
+def _lines_of(results: SmoothingResults, axis: str, cameras: Sequence[str]) -> list[Line]:
+    from scipy.signal import csd, detrend, find_peaks, peak_widths
+
+    time, place = results.shake["t_s"].to_numpy(float), AXES.index(axis)
+    values = np.stack([_shake_um(results, camera)[:, place] for camera in cameras], 1)
+    even, rate = evenly(time, values)
+    level, length = np.asarray(detrend(even, axis=0)), min(segment(len(time)), len(even))
+    pairs = [
+        csd(level[:, i], level[:, j], rate, nperseg=length)[1]
+        for i in range(len(cameras))
+        for j in range(len(cameras))
+    ]
+    cross = np.real(np.array(pairs)).reshape(len(cameras), len(cameras), -1)
+    step = rate / length
+    each = np.einsum("iif->if", cross)
+    density = each.mean(0)
+    peaks, shape = find_peaks(density, prominence=0)
+    stands_out = shape["prominences"] > _PROMINENT * density[peaks]
+    peaks = peaks[stands_out & (density[peaks] > _ABOVE_FLOOR * np.median(density))]
+    widths = peak_widths(density, peaks, rel_height=0.5)[0]
+    variance = density.sum() * step
+    out = []
+    for peak, width in zip(peaks, widths):
+        near = slice(max(1, int(peak - 1.5 * width)), int(peak + 1.5 * width) + 2)
+        inside = cross[:, :, near].sum(-1) * step
+        if np.trace(inside) / len(cameras) < _LINE_SHARE * variance:
+            continue
+        own = np.sqrt(max(width**2 - _HANN_WIDTH**2, 0.0)) * step
+        narrow = width < 1.3 * _HANN_WIDTH
+        width_hz = _HANN_WIDTH * step if narrow else own
+        out.append(Line(
+            axis, float(peak * step), float(width_hz / (2 * peak * step)), bool(narrow),
+            float(np.sqrt(np.diagonal(inside).max())), _where(inside, cameras), len(cameras) == 1,
+            float(max(width, _HANN_WIDTH) * step),
+        ))  # fmt: skip
+    return out
+
+
+def _where(covariance: Array, cameras: Sequence[str]) -> str:
+    """Who moves, from the covariance of the cameras' shake about a line."""
+    if len(cameras) == 1:
+        return cameras[0]
+    sd = np.sqrt(np.diagonal(covariance))
+    strongest, weakest = int(np.argmax(sd)), int(np.argmin(sd))
+    if sd[strongest] > _STRONGER * sd[weakest]:
+        return cameras[strongest]
+    alike = covariance[strongest, weakest] / (sd[strongest] * sd[weakest])
+    return "common" if alike > _ALIKE else "apart"

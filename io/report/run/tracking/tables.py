@@ -1,0 +1,261 @@
+"""A tracked run in words: the verdict, key numbers, events, flags."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.report.page.number_format import ABSENT, is_number, number, sentence, share
+from telerig.io.report.page.page import Figure, Row
+from telerig.io.report.run.tracking.numbers import (
+    NORMAL_MEDIAN,
+    frame_count,
+    learnt_sd_mm,
+    median,
+    ray_miss_ratio,
+    ray_miss_sd_mm,
+    rms,
+    track_lengths,
+)
+from telerig.io.report.run.tracking.results import TrackResults
+
+Array = NDArray[np.float64]
+
+MOST_EVENTS = 60
+_MISS_TOO_LARGE = 3.0
+_MATCHED_TOO_FEW = 0.5
+_AMBIGUOUS = "ambiguous"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``colour`` : good, usable or rejected; ``sentences`` : good or bad; ``warnings`` : bad."""
+
+    headline: str
+    colour: str
+    sentences: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def verdict(results: TrackResults) -> Verdict:
+    """How much was found, how well it is known, and what is wrong."""
+    points, tracks = len(results.tracks), len(track_lengths(results))
+    frames = frame_count(results)
+    if not points:
+        headline = f"No bubble was followed in {_many(frames, 'frame')}"
+        return Verdict(headline, "rejected", (_matched_words(results),), _warnings(results))
+    headline = (
+        f"{_many(tracks, 'track')}, {_many(points, 'position')} in space, {_many(frames, 'frame')}"
+    )
+    warnings = _warnings(results)
+    sentences = (_matched_words(results), _precision_words(results), _miss_words(results))
+    return Verdict(headline, "usable" if warnings else "good", sentences, warnings)
+
+
+def _many(count: int, word: str) -> str:
+    return f"{number(count)} {word}{'' if count == 1 else 's'}"
+
+
+def _matched(results: TrackResults) -> tuple[int, int] | None:
+    """Detections that belong to a bubble seen by both cameras, of all."""
+    found = len(results.detections) or results.content.get("detections")
+    if not isinstance(found, int) or found <= 0:
+        return None
+    return min(len(results.cameras) * len(results.tracks), found), found
+
+
+def _matched_words(results: TrackResults) -> str:
+    matched = _matched(results)
+    if matched is None:
+        return "How many bubbles the single images held is not known."
+    part, whole = matched
+    return (
+        f"{number(whole)} bubbles were found in single images; {share(part, whole)} of them have "
+        "a partner in the other camera and a track."
+    )
+
+
+def _precision_words(results: TrackResults) -> str:
+    x, y, z = (number(median(column), 2) for column in results.sd_um.T)
+    return (
+        f"A position is known to {x}, {y} and {z} µm in x, y and z (1 sd, median), "
+        "without what the calibration itself is off."
+    )
+
+
+def _miss_words(results: TrackResults) -> str:
+    miss = 1e3 * results.tracks["ray_miss_mm"].to_numpy(float)
+    typical, ratio = median(np.abs(miss)), ray_miss_ratio(results, ray_miss_sd_mm(results))
+    text = f"The two rays of a bubble miss each other by {number(typical, 2)} µm (median), "
+    if ratio is None:
+        return text + "there are too few points to say what that should be."
+    text += f"{number(ratio, 2)} times what the outlines' noise predicts."
+    whole = ray_miss_ratio(results, _with_learnt(results), centred=True)
+    if ratio > _MISS_TOO_LARGE and whole is not None and whole < _MISS_TOO_LARGE:
+        text += (
+            f" The cameras' shake against each other ({number(results.pairs.get('frame_px'), 2)} "
+            f"px from frame to frame) and the scatter of the pairs "
+            f"({number(results.pairs.get('scatter_px'), 2)} px), as learnt from this run, account "
+            "for that; they are not in the covariances of tracks.csv."
+        )
+    return text
+
+
+def _with_learnt(results: TrackResults) -> Array | None:
+    """(N,) sd of the ray miss from the outlines' noise, shake and scatter."""
+    noise, learnt = ray_miss_sd_mm(results), learnt_sd_mm(results)
+    return None if noise is None else np.asarray(np.hypot(noise, learnt or 0.0))
+
+
+def _warnings(results: TrackResults) -> tuple[str, ...]:
+    pairs, words = results.pairs, []
+    if pairs.get("calibration_problem"):
+        told = [str(w) for w in pairs.get("words") or []]
+        words += [w for w in told if "calibration" in w.lower()] or [
+            "The cameras disagree along their shared axis: this is a calibration problem."
+        ]
+    ratio = ray_miss_ratio(results, _with_learnt(results), centred=bool(words))
+    if ratio is not None and ratio > _MISS_TOO_LARGE:
+        scatter = "Even without their common offset, rays" if words else "Rays"
+        words.append(
+            f"{scatter} miss by {number(ratio, 2)} times what the outlines' noise predicts: the "
+            "calibration, the pairs or the shapes of the bubbles are worse than the covariances "
+            "in tracks.csv say."
+        )
+    matched = _matched(results)
+    if matched is not None and matched[0] < _MATCHED_TOO_FEW * matched[1]:
+        words.append(
+            "More than half of the bubbles have no partner in the other camera or no track: look "
+            "at the worst frames below."
+        )
+    stated = [sentence(str(text)) for text in results.content.get("warnings") or []]
+    return (*stated, *words)
+
+
+def key_numbers(results: TrackResults) -> list[Figure]:
+    """What a reader wants first."""
+    lengths, tracks = track_lengths(results), results.tracks
+    matched = _matched(results) or (None, None)
+    size = tracks["d_eq_mm"].to_numpy(float)
+    miss = 1e3 * tracks["ray_miss_mm"].to_numpy(float)
+    sd = ray_miss_sd_mm(results)
+    frames = frame_count(results)
+    ambiguous = word_counts(tracks["flags"])[_AMBIGUOUS]
+    each = len(tracks) / frames if frames else None
+    return [
+        Figure("Tracks", number(len(lengths)),
+               f"median length {number(round(median(lengths.astype(float)) or 0))} points, longest "
+               f"{number(int(lengths.max())) if len(lengths) else ABSENT}"),
+        Figure("Bubbles in a frame", number(each, 3), f"in space, mean of {number(frames)} frames"),
+        Figure("Matched", share(*matched),
+               f"{number(matched[0])} of {number(matched[1])} bubbles in single images"),
+        Figure("Position, 1 sd", f"{number(median(results.sd_um.max(axis=1)), 2)} µm",
+               "median over the worst axis of each point; the calibration's share not counted"),
+        Figure("Ray miss", f"{number(median(np.abs(miss)), 2)} µm",
+               f"median; {number(None if sd is None else _normal_median(sd), 2)} µm from the "
+               f"outlines' noise; RMS {number(rms(miss), 2)} µm"),
+        Figure("Diameter", f"{number(median(size), 3)} mm", "median, sphere of equal volume"),
+        Figure("Ambiguous", share(ambiguous, len(tracks)),
+               f"{number(ambiguous)} pairs that another pairing explains almost as well"),
+        Figure("Centre", _centres(results), "of volume, or the mean of the two silhouettes"),
+    ]  # fmt: skip
+
+
+def _normal_median(sd_mm: Array) -> float | None:
+    """Median of |miss| in µm that this noise gives."""
+    middle = median(sd_mm)
+    return None if middle is None else 1e3 * NORMAL_MEDIAN * middle
+
+
+def _centres(results: TrackResults) -> str:
+    counts = Counter(word for word in results.tracks["centre"] if word)
+    whole = sum(counts.values())
+    ordered = counts.most_common(1)
+    return f"{share(ordered[0][1], whole)} {ordered[0][0]}" if ordered else ABSENT
+
+
+def word_counts(flags: Iterable[str]) -> Counter[str]:
+    """How often each of the words joined by | occurs."""
+    whole = Counter(flags)
+    counts: Counter[str] = Counter()
+    for text, times in whole.items():
+        for word in filter(None, text.split("|")):
+            counts[word] += times
+    return counts
+
+
+def pair_rows(results: TrackResults) -> list[tuple[str, str]]:
+    """What the two views of a bubble have in common, as learnt from the run."""
+    pairs = results.pairs
+    if not pairs:
+        return []
+    stages = ("as it is", "after a constant", "after the whole bias", "for pairs left out of it")
+    bias = [number(b) for b in _as_list(pairs.get("bias_px"))]
+    rows = [("offset along the shared axis, px", ", ".join(bias) or ABSENT)]
+    rows += [("scatter of a pair, px", number(pairs.get("scatter_px")))]
+    rows += [("shift common to a frame, px", number(pairs.get("frame_px")))]
+    values = _as_list(pairs.get("rms_px"))
+    return rows + [(f"RMS {stage}, px", number(value)) for stage, value in zip(stages, values)]
+
+
+def _as_list(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list) else [value] if is_number(value) else []
+
+
+def flag_rows(results: TrackResults) -> list[Row]:
+    """Flags of bubbles and reasons for frames without one: a row each, a column per camera."""
+    found = results.detections
+    counts = {c: word_counts(found["flags"][found["camera"] == c]) for c in results.cameras}
+    words = sorted({word for count in counts.values() for word in count})
+    rows = [
+        Row((f"flag: {word}", *(number(counts[c][word]) for c in results.cameras)))
+        for word in words
+    ]
+    without = results.content.get("frames_without_bubbles") or {}
+    reasons = sorted({str(reason) for by in without.values() for reason in by or {}})
+    rows += [
+        Row((f"frames without: {reason}",
+             *(number((without.get(c) or {}).get(reason, 0)) for c in results.cameras)))
+        for reason in reasons
+    ]  # fmt: skip
+    seen = {c: found["camera"] == c for c in results.cameras}
+    alone = {c: int(found["particle"][seen[c]].isna().sum()) for c in results.cameras}
+    total = Row(("bubbles found", *(number(int(seen[c].sum())) for c in results.cameras)), True)
+    lonely = Row(("of them in no track", *(number(alone[c]) for c in results.cameras)))
+    return [total, lonely, *rows]
+
+
+def event_rows(results: TrackResults) -> list[Row]:
+    """The first events: frame, time, what, which bubbles, why."""
+    return [
+        Row((str(e.frame), f"{e.t_s:.4f}", str(e.kind), str(e.particles).replace(" ", ", "),
+             str(e.reason)))
+        for e in results.events.head(MOST_EVENTS).itertuples()
+    ]  # fmt: skip
+
+
+def event_words(results: TrackResults) -> str:
+    """How many of each kind there were."""
+    given = results.content.get("events") or {}
+    counts = given or results.events["kind"].value_counts().to_dict()
+    told = [f"{kind}: {number(n)}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])]
+    rest = len(results.events) - MOST_EVENTS
+    text = ", ".join(told) + "." if told else "Nothing is known of any event."
+    if rest > 0:
+        text += f" The first {MOST_EVENTS} are listed, {number(rest)} more are in events.csv."
+    return text
+
+
+def worst_words(results: TrackResults) -> dict[str, str]:
+    """Frame as six digits -> why it is shown; in the file's order, pictured frames after that."""
+    worst = {
+        f"{w['frame']:06d}": str(w.get("why") or "")
+        for w in results.content.get("worst_frames") or []
+    }
+    pictured = sorted({frame for _, frame in results.pictures})
+    return worst | {frame: "" for frame in pictured if frame not in worst}

@@ -1,0 +1,228 @@
+"""The true rig, the true target and hand-held poses of a simulated calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.simulation.calibration.presets import CameraConfig, SimulationConfig
+from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_DIRECTIONS = 4000
+_TRIES = 2000
+
+
+@dataclass(frozen=True)
+class TrueTarget:
+    """ids : (N,); points_mm : (N, 3) true centres in the target's frame; plate : as rendered.
+
+    scale_distance_mm : the known distance as measured; None when the target has none.
+    """
+
+    ids: NDArray[np.int64]
+    points_mm: Array
+    diameter_mm: Array
+    plate: Plate
+    scale_distance_mm: float | None
+
+
+@dataclass(frozen=True)
+class View:
+    """One pose of the target; ``cameras`` are the names of those that see it."""
+
+    name: str
+    rig_from_target: Pose
+    cameras: tuple[str, ...]
+
+
+def nominal_rotation(config: SimulationConfig) -> Array:
+    """(3, 3) second_from_first as the rig file states it."""
+    return rotation_from_rotvec([0.0, np.radians(config.angle_deg), 0.0])
+
+
+def true_cameras(config: SimulationConfig) -> Mapping[str, Camera]:
+    """The cameras by name; the rig's origin is where the optical axes come closest.
+
+    Raises InputError unless there are one or two cameras of different names.
+    """
+    names = [camera.name for camera in config.cameras]
+    if len(set(names)) != len(names) or not 1 <= len(names) <= 2:
+        raise InputError(f"a simulated rig of cameras {names}", todo="give one or two, named apart")
+    poses = [Pose.identity(), _second_from_rig(config)]
+    return {c.name: _camera(c, pose) for c, pose in zip(config.cameras, poses)}
+
+
+def _second_from_rig(config: SimulationConfig) -> Pose:
+    rotation = rotation_from_rotvec(np.radians(config.mount_rotvec_deg)) @ nominal_rotation(config)
+    between = np.cross(rotation[:, 2], [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(between))
+    if length < 1e-6:
+        return Pose(rotation, np.zeros(3))
+    return Pose(rotation, config.axis_gap_mm * between / length)
+
+
+def _camera(config: CameraConfig, camera_from_rig: Pose) -> Camera:
+    width, height = config.image_size_px
+    parameters = {
+        "centre_u_px": (width - 1) / 2 + config.centre_offset_px[0],
+        "centre_v_px": (height - 1) / 2 + config.centre_offset_px[1],
+    } | dict(config.parameters)
+    return Camera.create(
+        config.name,
+        config.image_size_px,
+        config.scale_px_per_mm,
+        camera_from_rig=camera_from_rig,
+        rho_mm=float(np.hypot(width, height)) / 2 / config.nominal_scale_px_per_mm,
+        **parameters,
+    )
+
+
+def true_target(config: SimulationConfig, rng: np.random.Generator) -> TrueTarget:
+    """Print the target: displaced dots, a plate round them, dirt, and the measured distance."""
+    target = config.target
+    ids = _all_ids(config)
+    nominal = target.nominal_mm(ids)
+    sigma = np.array([target.print_sigma_mm, target.print_sigma_mm, target.flatness_sigma_mm])
+    points = nominal + config.print_factor * sigma * rng.standard_normal(nominal.shape)
+    diameter = target.diameter_mm(ids)
+    ring = target.is_mark(ids) & (target.mark_style == "ring")
+    margin = config.plate_margin_mm + diameter.max() / 2
+    low, high = nominal[:, :2].min(0) - margin, nominal[:, :2].max(0) + margin
+    white_dots = target.polarity == "white_on_black"
+    dirt = np.c_[rng.uniform(low, high, (config.dirt, 2)), np.zeros(config.dirt)]
+    plate = Plate(
+        points,
+        diameter,
+        np.where(ring, config.ring_hole_ratio * diameter, 0.0),
+        outline_mm=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
+        thickness_mm=target.plate_thickness_mm if target.two_sided else 0.0,
+        index=target.plate_index,
+        dot_albedo=config.white if white_dots else config.black,
+        plate_albedo=config.black if white_dots else config.white,
+        background_albedo=config.background,
+        dirt_mm=dirt,
+        dirt_diameter_mm=rng.uniform(*config.dirt_diameter_mm, config.dirt),
+        dirt_albedo=0.6 * config.black + 0.4 * config.white,
+    )
+    return TrueTarget(ids, points, diameter, plate, _measured_distance(config, ids, points, rng))
+
+
+def _all_ids(config: SimulationConfig) -> NDArray[np.int64]:
+    target, margin = config.target, config.margin_dots
+    if target.bounded:
+        return target.ids()
+    rows = np.arange(-margin, target.rows + margin)
+    columns = np.arange(-margin, target.columns + margin)
+    ids = target.id_from_row_column(*(a.ravel() for a in np.meshgrid(rows, columns, indexing="ij")))
+    missing = target.is_mark(ids) & (target.mark_style == "missing")
+    return ids[~missing]
+
+
+def _measured_distance(
+    config: SimulationConfig, ids: NDArray[np.int64], points: Array, rng: np.random.Generator
+) -> float | None:
+    if config.target.scale_dots is None:
+        return None
+    ends = [points[ids == dot] for dot in config.target.scale_dots]
+    if any(len(end) != 1 for end in ends):
+        raise InputError(f"scale dots {config.target.scale_dots} are not on the target")
+    true = float(np.linalg.norm(ends[0] - ends[1]))
+    return true + config.target.scale_sigma_mm * float(rng.standard_normal())
+
+
+def hand_held_views(
+    config: SimulationConfig,
+    cameras: Mapping[str, Camera],
+    target: TrueTarget,
+    rng: np.random.Generator,
+) -> list[View]:
+    """Random poses by rejection. Raises InputError when no pose meets the demands."""
+    names = tuple(cameras)
+    digits = len(str(config.views - 1))
+    views = []
+    for i in range(config.views):
+        single = config.views - 1 - i < config.single_camera_views and len(names) > 1
+        seeing = (names[i % len(names)],) if single else names
+        normals = _plate_normals(config, [cameras[n] for n in seeing], rng)
+        pose = _visible_pose(config, [cameras[n] for n in seeing], target, normals, rng)
+        views.append(View(f"view{i:0{max(2, digits)}d}", pose, seeing))
+    return views
+
+
+def _plate_normals(
+    config: SimulationConfig, cameras: list[Camera], rng: np.random.Generator
+) -> Array:
+    """(N, 3) directions of the target's z in the rig, spread evenly over the tilts allowed."""
+    directions = rng.standard_normal((_DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    axes = np.array([camera.camera_from_rig.rotation[2] for camera in cameras])
+    cosine = directions @ axes.T
+    if config.target.two_sided:
+        cosine = np.abs(cosine)
+    low, high = np.cos(np.radians(config.tilt_deg[1])), np.cos(np.radians(config.tilt_deg[0]))
+    allowed = directions[np.all((cosine >= low) & (cosine <= high), 1)]
+    if len(allowed) < 3:
+        raise InputError(
+            f"no plate can be tilted by {config.tilt_deg[0]:g} to {config.tilt_deg[1]:g} deg "
+            f"towards every camera when they stand {config.angle_deg:g} deg apart",
+            todo="widen tilt_deg (for opaque plates the tilts add up to the angle), "
+            "choose an angle of 20 to 110 deg, or a two-sided target",
+        )
+    return allowed
+
+
+def _visible_pose(
+    config: SimulationConfig,
+    cameras: list[Camera],
+    target: TrueTarget,
+    normals: Array,
+    rng: np.random.Generator,
+) -> Pose:
+    middle = config.target.nominal_mm(_block_ids(config)).mean(0)
+    marks = config.target.is_mark(target.ids) & config.marks_visible
+    for _ in range(_TRIES):
+        rotation = _rotation(normals[rng.integers(len(normals))], config.roll_deg, rng)
+        place = np.asarray(config.shift_mm) * rng.uniform(-1, 1, 3)
+        pose = Pose(rotation, place - rotation @ middle)
+        seen = [wholly_inside(camera, pose, target, config.border_px) for camera in cameras]
+        if all(s.mean() >= config.visible_fraction and np.all(s[marks]) for s in seen):
+            return pose
+    raise InputError(
+        f"no pose out of {_TRIES} shows {100 * config.visible_fraction:g} % of the dots",
+        todo="make the target smaller, or shift_mm, visible_fraction or border_px",
+    )
+
+
+def _block_ids(config: SimulationConfig) -> NDArray[np.int64]:
+    target = config.target
+    if target.bounded:
+        return target.ids()
+    corners = np.array([[0, 0], [target.rows - 1, target.columns - 1]])
+    return target.id_from_row_column(corners[:, 0], corners[:, 1])
+
+
+def _rotation(normal: Array, roll_deg: float, rng: np.random.Generator) -> Array:
+    """rig_from_target with the given z; without roll, its x is as near to the rig's as can be."""
+    start = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.99 else np.array([0.0, 0.0, 1.0])
+    x = start - normal * (start @ normal)
+    x /= np.linalg.norm(x)
+    upright = np.stack([x, np.cross(normal, x), normal], 1)
+    roll = np.radians(roll_deg) * rng.uniform(-1, 1)
+    return np.asarray(upright @ rotation_from_rotvec([0.0, 0.0, roll]))
+
+
+def wholly_inside(camera: Camera, pose: Pose, target: TrueTarget, border_px: float) -> Bools:
+    """(N,) whether each dot, its rim included, lies inside the image and off its border."""
+    uv = pixel_from_plate(camera, pose, target.points_mm, target.plate)
+    radius = 1.03 * target.diameter_mm / 2 * camera["scale_px_per_mm"] * max(1, camera["aspect"])
+    room = np.minimum(uv, np.array(camera.image_size_px) - 1 - uv).min(-1)
+    return np.asarray(room >= radius + border_px)

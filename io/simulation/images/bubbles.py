@@ -1,0 +1,227 @@
+"""Backlit images of bubbles, by geometry alone: exact coverage of fine cells, then the optics.
+
+Each silhouette is cut exactly against a grid of sub-pixel cells in a window of its own, filled
+with the bubble's transmission (dark rim, bright heart), blurred by its own Gaussian, smeared
+along its motion and integrated over the pixels. Overlapping bubbles multiply.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.images.outline_raster import cell_coverage, pixel_weights, refined
+from telerig.io.simulation.images.backlight import Screen, Specks
+from telerig.io.simulation.images.bodies import outline_moments
+
+Array = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+CELLS = 4
+"""Fine cells per pixel and direction."""
+
+_REACH = 4.5
+_HEART_REACH = 3.2
+_RING_REACH = 4.0
+_STILL_PX = 0.02
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a bubble's inside looks, in transmission.
+
+    rim : of the dark part. heart : of the bright middle at its brightest (rim: no heart).
+    heart_radius : where the heart is half as bright, over the silhouette's radius.
+    heart_sharpness : exponent of the heart's fall; 2.5 as in real images, 20 and more a disc.
+    heart_offset : (2,) of the heart's middle from the silhouette's, over the radius.
+    ring : transmission of a faint ring at ring_radius, ring_width wide (over the radius), up to
+    twice as bright below and fading above.
+    """
+
+    rim: float = 0.1
+    heart: float = 0.9
+    heart_radius: float = 0.33
+    heart_sharpness: float = 2.5
+    heart_offset: tuple[float, float] = (0.0, 0.0)
+    ring: float = 0.04
+    ring_radius: float = 0.69
+    ring_width: float = 0.05
+
+    def transmission(self, du: Array, dv: Array, axes: Array) -> Float32:
+        """(len(dv), len(du)) at offsets in px from the silhouette's centroid.
+
+        axes : (2, 2) px, maps the unit circle to the ellipse of the silhouette's moments.
+        """
+        inverse = np.linalg.inv(axes)
+        metric = inverse.T @ inverse
+        out = np.full((len(dv), len(du)), self.rim, np.float32)
+        if self.heart > self.rim:
+            shift = axes @ self.heart_offset
+            square = _square(du - shift[0], dv - shift[1], metric / self.heart_radius**2)
+            inner = square < _HEART_REACH**2
+            fall = np.exp(-np.log(2.0) * square[inner] ** (self.heart_sharpness / 2))
+            out[inner] += (self.heart - self.rim) * fall
+        if self.ring > 0:
+            square = _square(du, dv, metric)
+            low, high = self.ring_radius + _RING_REACH * self.ring_width * np.array([-1, 1])
+            near = (square > max(low, 0.0) ** 2) & (square < high**2)
+            off = (np.sqrt(square[near]) - self.ring_radius) / self.ring_width
+            below = np.broadcast_to(dv[:, None], near.shape)[near] / np.hypot(*np.diag(axes))
+            out[near] += self.ring * (1 + np.tanh(3 * below)) * np.exp(-(off**2) / 2)
+        return out
+
+
+def _square(du: Array, dv: Array, metric: Array) -> Float32:
+    """(len(dv), len(du)) squared length of the offsets in a metric (2, 2)."""
+    u, v, m = du.astype(np.float32), dv.astype(np.float32)[:, None], metric.astype(np.float32)
+    return np.asarray(np.maximum((m[0, 0] * u + 2 * m[0, 1] * v) * u + m[1, 1] * v * v, 0))
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """A bubble as one camera sees it in one frame.
+
+    outline_px : (N, 2) as `telerig.io.simulation.images.bodies.outline_px` gives it.
+    blur_px : Gaussian sigma, defocus included; smear_px : (2,) motion during the exposure.
+    """
+
+    outline_px: Array
+    look: Look
+    blur_px: float
+    smear_px: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Part of an image: absorption (rows, columns) whose first pixel is (row, column)."""
+
+    row: int
+    column: int
+    absorption: Float32
+
+
+def absorption_patch(bubble: Silhouette) -> Patch:
+    """The share of light that one bubble takes, in the window that it can reach."""
+    outline = bubble.outline_px
+    first = np.floor(outline.min(0) + 0.5).astype(int)
+    count = np.floor(outline.max(0) + 0.5).astype(int) - first + 1
+    edges = max(512, 16 * int(count.max()))
+    fine_outline = (refined(outline, edges) - first + 0.5) * CELLS
+    fine_outline = np.clip(fine_outline, 0.0, count * CELLS)
+    covered = cell_coverage(fine_outline, (int(count[1]) * CELLS, int(count[0]) * CELLS))
+    fine = covered.astype(np.float32) * (1 - _inside(bubble, first, count))
+    smear = np.asarray(bubble.smear_px, float)
+    length = float(np.linalg.norm(smear))
+    pad = int(np.ceil(_REACH * bubble.blur_px + length / 2)) + 1
+    nodes, weights = _exposure(length, bubble.blur_px)
+    total = np.zeros(count[::-1] + 2 * pad, np.float32)
+    for node, weight in zip(nodes, weights):
+        by_u, by_v = (
+            pixel_weights(int(n) * CELLS, CELLS, pad, bubble.blur_px, float(node * shift))
+            for n, shift in zip(count, smear)
+        )
+        total += np.float32(weight) * (by_v @ fine @ by_u.T)
+    return Patch(int(first[1]) - pad, int(first[0]) - pad, total)
+
+
+def _inside(bubble: Silhouette, first: NDArray[np.int64], count: NDArray[np.int64]) -> Float32:
+    """(cells_v, cells_u) transmission behind the outline, at the fine cells' centres."""
+    _, centre, second = outline_moments(bubble.outline_px)
+    values, vectors = np.linalg.eigh(second)
+    axes = vectors * 2 * np.sqrt(values) @ vectors.T
+    u, v = (start + (np.arange(n * CELLS) + 0.5) / CELLS - 0.5 for start, n in zip(first, count))
+    return bubble.look.transmission(u - centre[0], v - centre[1], axes)
+
+
+def _exposure(length_px: float, blur_px: float) -> tuple[Array, Array]:
+    """Gauss-Legendre moments of the exposure (-1/2..1/2), closer than the blur, and weights."""
+    if length_px < _STILL_PX:
+        return np.zeros(1), np.ones(1)
+    nodes, weights = np.polynomial.legendre.leggauss(2 + int(2 * length_px / max(blur_px, 0.3)))
+    return nodes / 2, weights / 2
+
+
+def transmission(size_px: tuple[int, int], bubbles: Sequence[Silhouette]) -> Float32:
+    """(height, width) share of the light that all bubbles together let through."""
+    width, height = size_px
+    out = np.ones((height, width), np.float32)
+    for bubble in bubbles:
+        reach = _REACH * bubble.blur_px + 2
+        if np.any(bubble.outline_px.max(0) < -reach) or np.any(
+            bubble.outline_px.min(0) > np.array(size_px) - 1 + reach
+        ):
+            continue
+        _multiply(out, absorption_patch(bubble))
+    return out
+
+
+def _multiply(out: Float32, patch: Patch) -> None:
+    top, left = max(patch.row, 0), max(patch.column, 0)
+    bottom = min(patch.row + patch.absorption.shape[0], out.shape[0])
+    right = min(patch.column + patch.absorption.shape[1], out.shape[1])
+    if bottom > top and right > left:
+        taken = patch.absorption[
+            top - patch.row : bottom - patch.row, left - patch.column : right - patch.column
+        ]
+        out[top:bottom, left:right] *= 1 - taken
+
+
+def render_bubbles(
+    size_px: tuple[int, int],
+    bubbles: Sequence[Silhouette],
+    screen: Screen,
+    *,
+    screen_shift_px: Array,
+    window_dirt: Specks | None = None,
+    lens_dirt: Specks | None = None,
+    lab_shift_px: Array | None = None,
+    gain: float = 1.0,
+) -> Float32:
+    """(height, width) noise-free grey levels as fractions of full scale.
+
+    screen_shift_px, lab_shift_px : (2,) how far the screen and what is fixed to the lab (dirt on
+    the tank's windows) have moved in the image since stage position 0.
+    """
+    image = screen.image(size_px, np.asarray(screen_shift_px, float))
+    image *= transmission(size_px, bubbles)
+    if window_dirt is not None and lab_shift_px is not None:
+        window_dirt.darken(image, lab_shift_px)
+    if lens_dirt is not None:
+        lens_dirt.darken(image, np.zeros(2))
+    image *= np.float32(gain)
+    return image
+
+
+def exposed(
+    grey: NDArray[np.floating],
+    rng: np.random.Generator,
+    *,
+    read_noise: float,
+    shot_noise: float,
+    bit_depth: int,
+    left_aligned: bool = False,
+) -> Image:
+    """Noisy integers as a camera delivers them, clipped at full scale; grey in fractions of it.
+
+    read_noise : standard deviation; shot_noise : standard deviation at full scale.
+    left_aligned : data of fewer than 16 bits stand in the high bits of 16, as many cameras write.
+    Raises InputError for a bit depth outside 8..16.
+    """
+    if not 8 <= bit_depth <= 16:
+        raise InputError(f"a bit depth of {bit_depth}", todo="choose 8 to 16 bits")
+    full = np.float32(2**bit_depth - 1)
+    levels = rng.standard_normal(grey.shape, dtype=np.float32)
+    bright = np.clip(grey, 0, 1).astype(np.float32, copy=False)
+    levels *= np.sqrt(np.float32(read_noise**2) + np.float32(shot_noise**2) * bright)
+    levels += grey
+    levels *= full
+    np.clip(np.rint(levels, out=levels), 0, full, out=levels)
+    if bit_depth == 8:
+        return levels.astype(np.uint8)
+    aligned = levels.astype(np.uint16) << (16 - bit_depth if left_aligned else 0)
+    return aligned.astype(np.uint16, copy=False)

@@ -1,0 +1,279 @@
+"""Grey images of a dotted plate, made by geometry alone.
+
+Nothing here knows the luminance model that the dot fit uses. Sub-pixel cells are traced back
+through the camera onto the plate, tested against each dot's disc, and the coverage is blurred and
+integrated over the pixels. Distortion, residual perspective and sensor tilt therefore bend the
+outline of a dot as they would in a lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from telerig.errors import InputError
+from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate, plate_from_pixel
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
+
+Array = NDArray[np.float64]
+
+SUPERSAMPLING = 8
+"""Cells per pixel and direction; cells on an outline are cut by its tangent besides."""
+_NODES = 5
+_RIM = 24
+
+
+@dataclass(frozen=True)
+class Light:
+    """Smooth multiplicative light, and an additive glare, over one image.
+
+    gain : at the image's centre; gradient : (2,) relative change per half diagonal along u and v;
+    vignetting : relative loss in the corners.
+    glare : (u_px, v_px, radius_px, strength) of a Gaussian spot in fractions of full scale.
+    """
+
+    gain: float = 1.0
+    gradient: tuple[float, float] = (0.0, 0.0)
+    vignetting: float = 0.0
+    glare: tuple[float, float, float, float] | None = None
+
+
+def render(
+    camera: Camera, rig_from_target: Pose, plate: Plate, light: Light, *, blur_px: float
+) -> Array:
+    """(height, width) noise-free grey levels in fractions of full scale.
+
+    blur_px : standard deviation of the isotropic Gaussian point spread function.
+    """
+    width, height = camera.image_size_px
+    dots = disc_coverage(
+        camera, rig_from_target, plate, plate.dots_mm, plate.diameter_mm, plate.hole_mm, blur_px
+    )
+    grey = _plate_and_background(camera, rig_from_target, plate, blur_px)
+    grey += (plate.dot_albedo - plate.plate_albedo) * dots
+    if plate.dirt_mm is not None and plate.dirt_diameter_mm is not None:
+        clean = np.zeros(len(plate.dirt_mm))
+        dirt = disc_coverage(
+            camera, rig_from_target, plate, plate.dirt_mm, plate.dirt_diameter_mm, clean, blur_px
+        )
+        dirt = np.minimum(dirt, 1)
+        grey += dirt * (plate.dirt_albedo - grey)
+    return _lit(grey, light, width, height)
+
+
+def digitise(
+    grey: Array,
+    rng: np.random.Generator,
+    *,
+    read_noise: float,
+    shot_noise: float = 0.0,
+    bit_depth: int = 8,
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Grey levels in fractions of full scale -> integers with noise, clipped at full scale.
+
+    read_noise : standard deviation; shot_noise : standard deviation at full scale (it grows with
+    the root of the grey level). Raises InputError for a bit depth outside 8..16.
+    """
+    if not 8 <= bit_depth <= 16:
+        raise InputError(f"a bit depth of {bit_depth}", todo="choose 8 to 16 bits")
+    sigma = np.sqrt(read_noise**2 + shot_noise**2 * np.clip(grey, 0, 1))
+    noisy = grey + sigma * rng.standard_normal(grey.shape)
+    full = 2**bit_depth - 1
+    levels = np.clip(np.rint(noisy * full), 0, full)
+    kind = np.uint8 if bit_depth == 8 else np.uint16
+    return np.asarray(levels.astype(kind))
+
+
+def disc_coverage(
+    camera: Camera,
+    rig_from_target: Pose,
+    plate: Plate,
+    centres_mm: Array,
+    diameter_mm: Array,
+    hole_mm: Array,
+    blur_px: float,
+) -> Array:
+    """(height, width) share of each pixel that discs cover, blurred; 1 well inside a disc.
+
+    centres_mm : (N, 3); diameter_mm, hole_mm : (N,). Each disc is traced in a window of its own.
+    """
+    width, height = camera.image_size_px
+    near = _near_image(camera, rig_from_target, plate, centres_mm, diameter_mm, blur_px)
+    centres, diameter, hole = centres_mm[near], diameter_mm[near], hole_mm[near]
+    first, count = _windows(camera, rig_from_target, plate, centres, diameter)
+    nodes = _window_nodes(camera, rig_from_target, plate, centres, first, count)
+    pad = int(np.ceil(5 * blur_px)) + 1
+    out = np.zeros((height + 2 * pad, width + 2 * pad))
+    for corner, size, local, outer, inner in zip(first, count, nodes, diameter, hole):
+        fine = _cell_coverage(local, size, outer / 2)
+        if inner > 0:
+            fine -= _cell_coverage(local, size, inner / 2)
+        rows, columns = (_pixel_weights(int(n), pad, blur_px) for n in size[::-1])
+        _add_clipped(out, rows @ fine @ columns.T, int(corner[1]), int(corner[0]))
+    return out[pad : pad + height, pad : pad + width]
+
+
+def _near_image(
+    camera: Camera, pose: Pose, plate: Plate, centres: Array, diameter: Array, blur_px: float
+) -> NDArray[np.bool_]:
+    """(N,) whether a disc can reach the image; decided on the plate, never by far projections."""
+    width, height = camera.image_size_px
+    edge = np.linspace(0, 1, 9)
+    side = np.stack(np.meshgrid(edge * (width - 1), edge * (height - 1)), -1).reshape(-1, 2)
+    seen = plate_from_pixel(camera, pose, side, plate)
+    low, high = seen.min(0), seen.max(0)
+    reach = diameter[:, None] + (6 * blur_px + 2) * (high - low) / min(width, height)
+    inside = (centres[:, :2] > low - reach) & (centres[:, :2] < high + reach)
+    return np.asarray(inside.all(1))
+
+
+def _windows(
+    camera: Camera, pose: Pose, plate: Plate, centres: Array, diameter: Array
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(N, 2) first pixel and (N, 2) number of pixels of the box round each disc, as (u, v)."""
+    angle = np.arange(_RIM) * 2 * np.pi / _RIM
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM)], -1)
+    points = centres[:, None, :] + 0.51 * diameter[:, None, None] * rim
+    uv = pixel_from_plate(camera, pose, points, plate)
+    first = np.floor(uv.min(1)).astype(np.int64)
+    return first, np.ceil(uv.max(1)).astype(np.int64) - first + 1
+
+
+def _window_nodes(
+    camera: Camera,
+    pose: Pose,
+    plate: Plate,
+    centres: Array,
+    first: NDArray[np.int64],
+    count: NDArray[np.int64],
+) -> Array:
+    """(N, 2, nodes, nodes) x, y from each disc's centre, at Chebyshev nodes of its window."""
+    along = (first[:, None, :] - 0.5) + count[:, None, :] * (1 + _chebyshev(_NODES)[:, None]) / 2
+    uv = np.empty((len(centres), _NODES, _NODES, 2))
+    uv[..., 0], uv[..., 1] = along[:, None, :, 0], along[:, :, None, 1]
+    xy = plate_from_pixel(camera, pose, uv, plate, centres[:, None, None, 2])
+    return np.moveaxis(xy - centres[:, None, None, :2], -1, 1)
+
+
+def _cell_coverage(nodes: Array, size: NDArray[np.int64], radius_mm: float) -> Array:
+    """(cells_v, cells_u) share of every cell of a window that lies in the disc."""
+    columns, rows = _interpolation(int(size[0])), _interpolation(int(size[1]))
+    x, y = rows @ nodes @ columns.T
+    square = x * x + y * y
+    coverage = (square < radius_mm**2).astype(float)
+    jacobian = _mean_jacobian(x, y)
+    reach = 0.75 * float(np.linalg.norm(jacobian))
+    band = np.abs(square - radius_mm**2) < reach * (2 * radius_mm + reach)
+    distance = np.sqrt(square[band])
+    outward = np.stack([x[band], y[band]], -1) / np.maximum(distance, 1e-12)[:, None]
+    coverage[band] = _half_plane_share(radius_mm - distance, outward @ jacobian)
+    return np.asarray(coverage)
+
+
+def _mean_jacobian(x: Array, y: Array) -> Array:
+    """(2, 2) mean change of plate coordinates (mm) per cell, as d(x, y) / d(u, v)."""
+    by_u = [np.mean(a[:, -1] - a[:, 0]) / (a.shape[1] - 1) for a in (x, y)]
+    by_v = [np.mean(a[-1] - a[0]) / (a.shape[0] - 1) for a in (x, y)]
+    return np.array([by_u, by_v]).T
+
+
+def _half_plane_share(depth: Array, slope: Array) -> Array:
+    """(N,) share of a unit cell on the inner side of a straight edge.
+
+    depth : (N,) signed distance of the cell's centre inside the edge, in the units of slope;
+    slope : (N, 2) change of that distance per cell along u and v.
+    """
+    steep = np.abs(slope).max(-1)
+    flat = np.abs(slope).min(-1)
+    corner = np.maximum((steep + flat) / 2 - np.abs(depth), 0.0)
+    small = np.where(
+        np.abs(depth) >= (steep - flat) / 2,
+        corner**2 / (2 * steep * np.maximum(flat, 1e-300)),
+        0.5 - np.abs(depth) / steep,
+    )
+    return np.asarray(np.where(depth > 0, 1 - small, small))
+
+
+def _add_clipped(out: Array, patch: Array, row: int, column: int) -> None:
+    """Add a patch at (row, column), leaving out what falls beside the array."""
+    top, left = max(row, 0), max(column, 0)
+    bottom = min(row + patch.shape[0], out.shape[0])
+    right = min(column + patch.shape[1], out.shape[1])
+    if bottom > top and right > left:
+        out[top:bottom, left:right] += patch[
+            top - row : bottom - row, left - column : right - column
+        ]
+
+
+@lru_cache(maxsize=512)
+def _pixel_weights(count: int, pad: int, blur_px: float) -> Array:
+    """(count + 2 pad, cells): Gaussian blur and integration over the pixel, of a row of cells.
+
+    The averaging inside a cell already blurs by 1/12 of its width squared, which is taken off.
+    """
+    cells = (np.arange(count * SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
+    distance = np.arange(-pad, count + pad)[:, None] - cells
+    sigma = np.sqrt(max(blur_px**2 - 1 / (12 * SUPERSAMPLING**2), 0.0))
+    if sigma == 0:
+        return np.asarray((np.abs(distance) < 0.5) / SUPERSAMPLING)
+    share = ndtr((distance + 0.5) / sigma) - ndtr((distance - 0.5) / sigma)
+    return np.asarray(share / SUPERSAMPLING)
+
+
+def _chebyshev(count: int) -> Array:
+    return -np.cos(np.pi * (np.arange(count) + 0.5) / count)
+
+
+@lru_cache(maxsize=512)
+def _interpolation(count: int) -> Array:
+    """(cells, nodes): Lagrange polynomials of the window's nodes at its cells."""
+    cells = (np.arange(count * SUPERSAMPLING) + 0.5) / (count * SUPERSAMPLING)
+    return _lagrange(2 * cells - 1, _chebyshev(_NODES))
+
+
+def _lagrange(at: Array, nodes: Array) -> Array:
+    """(N,), (K,) -> (N, K)."""
+    gap = nodes[:, None] - nodes
+    np.fill_diagonal(gap, 1.0)
+    factors = np.repeat((at[:, None] - nodes)[:, None, :], len(nodes), 1)
+    factors[:, np.arange(len(nodes)), np.arange(len(nodes))] = 1.0
+    return np.asarray(np.prod(factors / gap, -1))
+
+
+def _plate_and_background(camera: Camera, pose: Pose, plate: Plate, blur_px: float) -> Array:
+    """(height, width) the bare plate before its surroundings; straight edges, blurred."""
+    width, height = camera.image_size_px
+    if plate.outline_mm is None:
+        return np.full((height, width), plate.plate_albedo)
+    nodes = _chebyshev(2 * _NODES)
+    u, v = (width - 1) / 2 * (1 + nodes), (height - 1) / 2 * (1 + nodes)
+    at_nodes = plate_from_pixel(camera, pose, np.stack(np.meshgrid(u, v), -1), plate)
+    columns = _lagrange(np.linspace(-1, 1, width), nodes)
+    rows = _lagrange(np.linspace(-1, 1, height), nodes)
+    x0, y0, x1, y1 = plate.outline_mm
+    share = np.ones((height, width))
+    for axis, low, high in ((0, x0, x1), (1, y0, y1)):
+        place = rows @ at_nodes[..., axis] @ columns.T
+        by_v, by_u = np.gradient(place)
+        spread = np.hypot(by_u, by_v) * np.sqrt(blur_px**2 + 1 / 12)
+        share *= ndtr((place - low) / spread) * ndtr((high - place) / spread)
+    return plate.background_albedo + share * (plate.plate_albedo - plate.background_albedo)
+
+
+def _lit(grey: Array, light: Light, width: int, height: int) -> Array:
+    half_diagonal = np.hypot(width, height) / 2
+    u = (np.arange(width) - (width - 1) / 2) / half_diagonal
+    v = (np.arange(height)[:, None] - (height - 1) / 2) / half_diagonal
+    field = 1 + light.gradient[0] * u + light.gradient[1] * v - light.vignetting * (u**2 + v**2)
+    lit = light.gain * field * grey
+    if light.glare is not None:
+        u_px, v_px, radius, strength = light.glare
+        du = (np.arange(width) - u_px) / radius
+        dv = (np.arange(height)[:, None] - v_px) / radius
+        lit += strength * np.exp(-(du**2 + dv**2) / 2)
+    return np.asarray(lit)

@@ -1,0 +1,125 @@
+"""A strip of dots fixed to the tank in a simulated run: its places, its pictures and its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.simulation.images.bubbles import Look, Silhouette
+from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
+from telerig.rig.camera import Camera
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.random import Generator
+
+Array = NDArray[np.float64]
+
+_OUTLINE_POINTS = 128
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One camera's dots: (K, 3) lab places in mm, all facing the camera, of one diameter."""
+
+    camera: Camera
+    lab_mm: Array
+    diameter_mm: float
+    look: Look
+
+    def seen(self, rig_from_lab_mm: Array) -> tuple[NDArray[np.int64], Array]:
+        """Numbers of the dots that reach into the image, and their (M, 2) centres in px."""
+        rig = self.lab_mm + rig_from_lab_mm
+        size = np.array(self.camera.image_size_px) - 1
+        reach = self.diameter_mm * self.camera["scale_px_per_mm"]
+        height_mm = size[1] / self.camera["scale_px_per_mm"]
+        near = np.flatnonzero(np.abs(rig @ AXIS_RIG) < height_mm)
+        uv = self.camera.project(rig[near])
+        inside = np.all((uv > -reach) & (uv < size + reach), -1)
+        return near[inside], uv[inside]
+
+    def silhouettes(
+        self, rig_from_lab_mm: Array, travel_mm: Array, blur_px: float
+    ) -> list[Silhouette]:
+        """What the renderer draws. travel_mm : (3,) of the tank in the rig during the exposure."""
+        chosen, uv = self.seen(rig_from_lab_mm)
+        rig = self.lab_mm[chosen] + rig_from_lab_mm
+        after = self.camera.project(rig + travel_mm / 2)
+        smear = after - self.camera.project(rig - travel_mm / 2)
+        outlines = self.camera.project(rig[:, None] + self._rim_mm(uv))
+        return [
+            Silhouette(outline, self.look, blur_px, (float(s[0]), float(s[1])))
+            for outline, s in zip(outlines, smear)
+        ]
+
+    def _rim_mm(self, uv_px: Array) -> Array:
+        """(M, N, 3) the dots' rims about their centres, across the rays that see them."""
+        ray = self.camera.unproject(uv_px)[1]
+        first = np.cross(ray, AXIS_RIG)
+        first /= np.linalg.norm(first, axis=-1, keepdims=True)
+        second = np.cross(ray, first)
+        angle = np.arange(_OUTLINE_POINTS) * 2 * np.pi / _OUTLINE_POINTS
+        turn = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+        return np.asarray(self.diameter_mm / 2 * turn)
+
+
+def random_strips(scene: RunScene, rng: Generator) -> list[Strip]:
+    """Each camera's own strip, over all the height that it sees during the run."""
+    chosen = scene.config.strip
+    if chosen is None:
+        return []
+    out = []
+    for camera in scene.cameras.values():
+        places = strip_places(
+            camera, scene.position_mm, chosen.dots, rng, at=chosen.at, jitter=chosen.jitter
+        )
+        depth = rng.uniform(-1, 1) * chosen.depth_mm * camera.camera_from_rig.rotation[2]
+        look = Look(rim=chosen.transmission, heart=0.0, ring=0.0)
+        out.append(Strip(camera, places + depth, chosen.diameter_mm, look))
+    return out
+
+
+def strip_places(
+    camera: Camera, position_mm: Array, count: int, rng: Generator, *, at: float, jitter: float
+) -> Array:
+    """(K, 3) lab places of a strip along the travel at uneven heights.
+
+    count : in view at a time. at : where it stands, on a side drawn by ``rng``, from the image's
+    middle over half its width. jitter : of the heights, over their spacing.
+    """
+    size = np.array(camera.image_size_px) - 1
+    height_mm = size[1] / camera["scale_px_per_mm"]
+    pitch = height_mm / count
+    low, high = position_mm.min() - 0.6 * height_mm, position_mm.max() + 0.6 * height_mm
+    heights = np.arange(low, high, pitch)
+    heights = heights + jitter * pitch * rng.uniform(-1, 1, len(heights))
+    side = rng.choice([-1.0, 1.0]) * at
+    origin, _ = camera.unproject(size / 2 * np.array([1 + side, 1.0]))
+    foot = origin - AXIS_RIG * (origin @ AXIS_RIG)
+    return np.asarray(foot + heights[:, None] * AXIS_RIG)
+
+
+def strip_truth(scene: RunScene, strips: Sequence[Strip]) -> pd.DataFrame:
+    """`truth/runs/<run>/references.csv`: every dot that reaches into an image.
+
+    frame, camera, dot (its number in that camera's strip), u_px, v_px of the projected centre,
+    x_lab_mm, y_lab_mm, z_lab_mm, and whole: 1 when no part of it lies outside the image.
+    """
+    import pandas as pd
+
+    parts = []
+    for j, (name, strip) in enumerate(zip(scene.cameras, strips)):
+        size = np.array(strip.camera.image_size_px) - 1
+        radius = strip.diameter_mm * strip.camera["scale_px_per_mm"] / 2
+        for frame in range(scene.config.frames):
+            dots, uv = strip.seen(scene.rig_from_lab_mm(j, frame))
+            whole = np.all((uv > radius - 0.5) & (uv < size - radius + 0.5), -1)
+            lab = strip.lab_mm[dots]
+            columns = {"frame": frame, "camera": name, "dot": dots, "u_px": uv[:, 0]}
+            columns |= {"v_px": uv[:, 1], **{f"{x}_lab_mm": lab[:, i] for i, x in enumerate("xyz")}}
+            parts.append(pd.DataFrame(columns | {"whole": whole.astype(int)}))
+    return pd.concat(parts, ignore_index=True)

@@ -1,0 +1,333 @@
+"""A simulated run before any camera looks: bubbles, carriage and shaking arms in time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.simulation.images.bodies import Bodies, bodies_about
+from telerig.io.simulation.run.fleet import Fleet, random_fleet
+from telerig.io.simulation.run.motion import (
+    Path,
+    Shake,
+    constant_speed_path,
+    constant_speed_rise_mm_s,
+    mode_acceleration,
+    rig_mode,
+    rig_shake,
+    stage_trajectory,
+    stochastic_paths,
+)
+from telerig.io.simulation.run.presets import MotionConfig, RunConfig
+from telerig.rig.camera import Camera
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+
+Array = NDArray[np.float64]
+
+AXIS_RIG = np.array([0.0, -1.0, 0.0])
+"""True travel of the stage in rig axes: upwards."""
+_ACROSS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_TRIES = 400
+_CLEARANCE = 1.1
+
+
+@dataclass(frozen=True)
+class Carriage:
+    """The stage on a fine time grid, from the first frame to one frame after the last.
+
+    t_s, position_mm, velocity_mm_s, acceleration_mm_s2 : (N,); shake : of each camera, (C, N, 3).
+    stride : fine samples per frame; frames : which of the N samples are frames.
+    """
+
+    t_s: Array
+    stride: int
+    position_mm: Array
+    velocity_mm_s: Array
+    acceleration_mm_s2: Array
+    shake: Shake
+
+    @property
+    def frames(self) -> slice:
+        return slice(0, len(self.t_s) - 1, self.stride)
+
+
+@dataclass(frozen=True)
+class RunScene:
+    """Everything true of a run.
+
+    t_s, position_mm, velocity_mm_s : (F,) at the frames; shake_mm, shake_mm_s : (C, F, 3).
+    lab_mm, lab_mm_s : (B, F, 3) centres of volume and their velocities.
+    closest_s : (pairs,) when each pair passes; empty without pairs.
+    """
+
+    config: RunConfig
+    cameras: Mapping[str, Camera]
+    carriage: Carriage
+    fleet: Fleet
+    lab_mm: Array
+    lab_mm_s: Array
+    closest_s: Array
+
+    @property
+    def t_s(self) -> Array:
+        return self.carriage.t_s[self.carriage.frames]
+
+    @property
+    def position_mm(self) -> Array:
+        return self.carriage.position_mm[self.carriage.frames]
+
+    @property
+    def velocity_mm_s(self) -> Array:
+        return self.carriage.velocity_mm_s[self.carriage.frames]
+
+    @property
+    def shake_mm(self) -> Array:
+        return self.carriage.shake.offset_mm[:, self.carriage.frames]
+
+    @property
+    def shake_mm_s(self) -> Array:
+        return self.carriage.shake.velocity_mm_s[:, self.carriage.frames]
+
+    def rig_from_lab_mm(self, camera: int, frame: int) -> Array:
+        """(3,) to add to a lab point to have it where a camera sees it, in rig axes."""
+        return np.asarray(-AXIS_RIG * self.position_mm[frame] - self.shake_mm[camera, frame])
+
+    def bodies_lab(self, frame: int, chosen: NDArray[np.int64]) -> Bodies:
+        """Some of the bubbles, (M,), in the lab frame."""
+        fleet, t = self.fleet, self.t_s[frame]
+        swing = np.cos(2 * np.pi * fleet.swing_hz[chosen] * t + fleet.swing_rad[chosen])
+        modes = fleet.modes_static[chosen] + fleet.modes_swing[chosen] * swing
+        spin = 2 * np.pi * fleet.spin_hz[chosen] * t + fleet.spin_rad[chosen]
+        rotation = _facing(self.lab_mm_s[chosen, frame], spin)
+        return bodies_about(
+            self.lab_mm[chosen, frame],
+            rotation,
+            fleet.semi_axes_mm[chosen],
+            modes,
+            d_eq_mm=fleet.d_eq_mm[chosen],
+        )
+
+
+def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) -> RunScene:
+    """Draw a run. Raises InputError when the bubbles asked for do not fit."""
+    stage_rng, path_rng, place_rng, shape_rng = rng.spawn(4)
+    speed = config.stage.follow * _mean_rise(config.motion)
+    carriage = _carriage(config, len(cameras), speed, stage_rng)
+    position = carriage.position_mm[carriage.frames]
+    size_mm = _view_mm(config)
+    count = _bubble_count(config, position, size_mm)
+    fleet = random_fleet(config.bubble, count, shape_rng)
+    paths = _paths(config, count, path_rng)
+    lab, velocity, closest = _lab_paths(config, paths, path_rng)
+    start = _starts(config, lab, position, fleet.d_eq_mm, size_mm, place_rng)
+    return RunScene(config, cameras, carriage, fleet, lab + start[:, None], velocity, closest)
+
+
+def _view_mm(config: RunConfig) -> Array:
+    """(2,) nominal width and height of the first camera's view."""
+    first = config.calibration.cameras[0]
+    return np.array(first.image_size_px) / first.nominal_scale_px_per_mm
+
+
+def _mean_rise(motion: MotionConfig) -> float:
+    rise = float(np.mean(motion.rise_mm_s))
+    if motion.path == "stochastic":
+        return rise
+    amplitude = float(np.mean(motion.lateral_mm))
+    both = (amplitude, amplitude if motion.path == "helix" else 0.0)
+    return constant_speed_rise_mm_s(rise, float(np.mean(motion.lateral_hz)), both)
+
+
+def _carriage(config: RunConfig, cameras: int, speed_mm_s: float, rng: Generator) -> Carriage:
+    stage = config.stage
+    rate = max(stage.encoder_rate_hz, stage.accelerometer_rate_hz if stage.accelerometers else 0)
+    stride = max(1, int(np.ceil(rate / config.frame_rate_hz - 1e-9)))
+    step = 1 / (config.frame_rate_hz * stride)
+    steps = config.frames * stride + 1
+    t = np.asarray(step * np.arange(steps), float)
+    position, velocity, acceleration = stage_trajectory(t, speed_mm_s, stage.ramp_s)
+    servo_rng, shake_rng = rng.spawn(2)
+    if stage.servo_rms_mm > 0:
+        servo = rig_mode(stage.servo_rms_mm, stage.servo_hz, stage.servo_damping, stage.force_hz)
+        states = servo.paths(step, steps, servo_rng)[0]
+        position, velocity = position + states[:, 0], velocity + states[:, 1]
+        acceleration = acceleration + mode_acceleration(states, servo)
+    along = np.abs(AXIS_RIG)
+    rms = stage.shake_mm / np.sqrt(2) * (along + stage.shake_lateral * (1 - along))
+    shake = rig_shake(
+        step,
+        steps,
+        shake_rng,
+        cameras=cameras,
+        rms_mm=rms,
+        frequency_hz=stage.shake_hz,
+        common_share=stage.shake_common,
+        arm_ratio=stage.shake_arm_ratio,
+        damping=stage.shake_damping,
+        force_hz=stage.force_hz,
+    )
+    return Carriage(t, stride, position, velocity, acceleration, shake)
+
+
+def _drift(config: RunConfig, position_mm: Array) -> float:
+    """How far bubbles rise through the view during the run, in the mean."""
+    duration = (config.frames - 1) / config.frame_rate_hz
+    return _mean_rise(config.motion) * duration - float(position_mm[-1] - position_mm[0])
+
+
+def _passing(config: RunConfig) -> bool:
+    """Whether bubbles pass through the view, or the stage follows them."""
+    return config.stage.follow != 1.0
+
+
+def _bubble_count(config: RunConfig, position_mm: Array, size_mm: Array) -> int:
+    """Bubbles that exist, so that ``config.bubbles`` are in view at a time."""
+    if not _passing(config):
+        return config.bubbles
+    height = float(size_mm[1])
+    reach = height + abs(_drift(config, position_mm)) + config.bubble.d_eq_mm[1]
+    pairs = 2 if config.motion.pairs else 1
+    return pairs * round(config.bubbles * reach / height / pairs)
+
+
+def _paths(config: RunConfig, count: int, rng: Generator) -> Path:
+    """One path for each bubble, or for each pair."""
+    motion = config.motion
+    paths = count // 2 if motion.pairs else count
+    random_rng, regular_rng = rng.spawn(2)
+    rise = regular_rng.uniform(*motion.rise_mm_s, paths)
+    regular = motion.path != "stochastic"
+    still = (0.0, 1.0, 1.0)
+    random = stochastic_paths(
+        1 / config.frame_rate_hz,
+        config.frames,
+        random_rng,
+        rise_mm_s=0 * rise if regular else rise,
+        wander_mm_s=motion.wander_mm_s,
+        wander_tau_s=motion.wander_tau_s,
+        height_oscillation=still if regular else motion.height_oscillation,
+        lateral_oscillation=still if regular else motion.lateral_oscillation,
+    )
+    if not regular or paths == 0:
+        return random
+    each = [_regular_path(config, float(speed), regular_rng) for speed in rise]
+    return Path(
+        random.height_mm + np.stack([p.height_mm for p in each]),
+        random.lateral_mm + np.stack([p.lateral_mm for p in each]),
+        random.height_mm_s + np.stack([p.height_mm_s for p in each]),
+        random.lateral_mm_s + np.stack([p.lateral_mm_s for p in each]),
+    )
+
+
+def _regular_path(config: RunConfig, speed_mm_s: float, rng: Generator) -> Path:
+    motion = config.motion
+    amplitude = float(rng.uniform(*motion.lateral_mm))
+    hand = float(rng.choice([-1.0, 1.0]))
+    helix = motion.path == "helix"
+    path = constant_speed_path(
+        np.arange(config.frames) / config.frame_rate_hz,
+        speed_mm_s,
+        float(rng.uniform(*motion.lateral_hz)),
+        (amplitude, amplitude if helix else 0.0),
+        azimuth_rad=float(rng.uniform(0, 2 * np.pi)),
+        phase_rad=float(rng.uniform(0, 2 * np.pi)),
+    )
+    mirror = np.array([1.0, hand])
+    return Path(
+        path.height_mm, path.lateral_mm * mirror, path.height_mm_s, path.lateral_mm_s * mirror
+    )
+
+
+def _lab_paths(config: RunConfig, paths: Path, rng: Generator) -> tuple[Array, Array, Array]:
+    """(B, F, 3) places from each start and velocities, and when each pair passes."""
+    place = paths.height_mm[..., None] * AXIS_RIG + paths.lateral_mm @ _ACROSS
+    speed = paths.height_mm_s[..., None] * AXIS_RIG + paths.lateral_mm_s @ _ACROSS
+    if not config.motion.pairs:
+        return place, speed, np.zeros(0)
+    return _pair_paths(config, place, speed, rng)
+
+
+def _pair_paths(
+    config: RunConfig, place: Array, speed: Array, rng: Generator
+) -> tuple[Array, Array, Array]:
+    """Bubbles 2k and 2k + 1 about path k, passing each other in a straight line."""
+    motion, pairs = config.motion, len(place)
+    t = np.arange(config.frames) / config.frame_rate_hz
+    middle = rng.uniform(0.25, 0.75, pairs) * t[-1]
+    gap = motion.closest_mm * (across := _unit(rng.standard_normal((pairs, 3))))
+    along = _unit(np.cross(across, rng.standard_normal((pairs, 3))))
+    closing = np.sqrt(motion.apart_mm**2 - motion.closest_mm**2) / motion.apart_s
+    half_gap = (gap[:, None] + closing * (t - middle[:, None])[..., None] * along[:, None]) / 2
+    half_speed = np.broadcast_to(closing * along[:, None] / 2, speed.shape)
+    shape = (2 * pairs, *place.shape[1:])
+    places = np.stack([place + half_gap, place - half_gap], 1).reshape(shape)
+    speeds = np.stack([speed + half_speed, speed - half_speed], 1).reshape(shape)
+    return places, speeds, middle
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _starts(
+    config: RunConfig, lab: Array, position: Array, d_eq: Array, size_mm: Array, rng: Generator
+) -> Array:
+    """(B, 3) offsets so that bubbles fill the view and never touch; pairs share theirs."""
+    group = 2 if config.motion.pairs else 1
+    rise = lab @ AXIS_RIG - position + position[0]
+    some = np.unique(np.linspace(0, config.frames - 1, 60).astype(int))
+    starts = np.zeros((len(lab), 3))
+    for first in range(0, len(lab), group):
+        member = slice(first, first + group)
+        mean_rise = float(rise[member].mean())
+        others = lab[:first, some] + starts[:first, None]
+        room = _CLEARANCE * (d_eq[:first] + d_eq[member].max()) / 2
+        for _ in range(_TRIES):
+            start = _start(config, size_mm, position[0], mean_rise, rng)
+            gaps = [
+                np.linalg.norm(others - lab[i, some] - start, axis=-1).min(-1)
+                for i in range(first, first + group)
+            ]
+            if all(np.all(gap > room) for gap in gaps):
+                break
+        else:
+            raise InputError(
+                f"{len(lab)} bubbles do not fit the view without touching each other",
+                where=f"simulation {config.name!r}",
+                todo="ask for fewer or smaller bubbles, or more spread",
+            )
+        starts[member] = start
+    return starts
+
+
+def _start(
+    config: RunConfig, size_mm: Array, position_mm: float, mean_rise_mm: float, rng: Generator
+) -> Array:
+    width, height = size_mm
+    spread = np.asarray(config.motion.spread) * width / 2
+    across = rng.uniform(-1, 1, 2) * spread
+    if _passing(config):
+        reach = 2 * mean_rise_mm
+        margin = config.bubble.d_eq_mm[1] / 2
+        low, high = -height / 2 - max(reach, 0) - margin, height / 2 - min(reach, 0) + margin
+        up = rng.uniform(low, high)
+    else:
+        up = rng.uniform(-0.5, 0.5) * height * min(config.motion.spread) - mean_rise_mm
+    return np.asarray((up + position_mm) * AXIS_RIG + across @ _ACROSS)
+
+
+def _facing(velocity: Array, spin_rad: Array) -> Array:
+    """(M, 3, 3) lab_from_body with z along the velocity, turned about it."""
+    z = _unit(velocity)
+    start = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
+    x = _unit(start - z * np.sum(start * z, -1, keepdims=True))
+    y = np.cross(z, x)
+    cosine, sine = np.cos(spin_rad)[:, None], np.sin(spin_rad)[:, None]
+    return np.stack([x * cosine + y * sine, y * cosine - x * sine, z], -1)

@@ -1,0 +1,348 @@
+"""A simulated run as files: images or detections, clocks, sensors, and the truth beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.files.atomic import plain, write_json_atomic
+from telerig.io.files.csv_table import write_table
+from telerig.io.rig_file.description import (
+    CARRIAGE,
+    AccelerometerDescription,
+    ReferencesDescription,
+    RigDescription,
+    StageDescription,
+)
+from telerig.io.simulation.images.backlight import Screen, Specks, random_screen, random_specks
+from telerig.io.simulation.images.bodies import MODES
+from telerig.io.simulation.images.bubbles import Silhouette, exposed, render_bubbles
+from telerig.io.simulation.run.mark_strip import Strip, random_strips, strip_truth
+from telerig.io.simulation.run.presets import ImageConfig, RunConfig
+from telerig.io.simulation.run.scene import AXIS_RIG, RunScene, run_scene
+from telerig.io.simulation.run.sensors import accelerometer_table, references_table, stage_table
+from telerig.io.simulation.run.views import CameraView, camera_view, linear_projection, truth_rows
+from telerig.io.simulation.simulate import seed_of, write_calibration
+from telerig.io.simulation.stage_axis import write_stage_axis
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import pandas as pd
+    from numpy.random import Generator
+
+    Writer = Callable[[str, int, NDArray[Any]], None]
+
+Array = NDArray[np.float64]
+Views = dict[str, CameraView]
+
+RUN_TRUTH_SCHEMA = 1
+
+LEAST_ACCELEROMETER_SIGMA = 1e-4
+"""What the rig file states of a perfect accelerometer, as it must state a positive number."""
+
+
+def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images: bool) -> None:
+    """Write a whole dataset into an empty folder: the calibration and `runs/<preset>/`.
+
+    rng : its children draw calibration, run, sensors, pictures and detections apart, so that the
+    same seed gives the same bubbles with images or without.
+    """
+    seed = seed_of(rng)
+    calibration_rng, scene_rng, sensor_rng, image_rng, table_rng, stage_rng = rng.spawn(6)
+
+    def complete(rig: RigDescription) -> RigDescription:
+        return _with_run_parts(rig, config)
+
+    cameras, target = write_calibration(
+        config.calibration, folder, calibration_rng, images=images, complete=complete
+    )
+    if config.stage.axis_views:
+        write_stage_axis(config, cameras, target, folder, stage_rng, images=images)
+    scene = run_scene(config, cameras, scene_rng)
+    strips = random_strips(scene, rng.spawn(1)[0]) if config.strip and images else []
+    run = folder / "runs" / config.name
+    lost = _lost_frames(scene, image_rng)
+    _write_clocks_and_sensors(scene, run, lost, sensor_rng, marks=not strips)
+    truth: list[dict[str, Any]] = []
+    detections: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        if images:
+            write = stack.enter_context(_image_files(run, config.image, list(cameras)))
+            picture = _Pictures(scene, image_rng, strips)
+        for frame in range(config.frames):
+            views = {name: camera_view(scene, frame, j) for j, name in enumerate(cameras)}
+            truth.append(truth_rows(scene, frame, views))
+            for j, (name, view) in enumerate(views.items()):
+                if lost[j, frame]:
+                    continue
+                if images:
+                    write(name, frame, picture.image(frame, j, view))
+                else:
+                    size = cameras[name].image_size_px
+                    rows = _detected(config, frame, name, view, scene, size, table_rng)
+                    detections.append(rows)
+    if not images:
+        write_table(_joined(detections), run / "detections.csv")
+    known = folder / "truth" / "runs" / config.name
+    _write_truth(scene, known, seed, truth, lost)
+    if strips:
+        write_table(strip_truth(scene, strips), known / "references.csv")
+
+
+def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
+    """The rig file of a rig with a stage, and the sensors and marks that the run has."""
+    x, y, z = (float(a) for a in AXIS_RIG)
+    stage = StageDescription((x, y, z), (x, y, z), max(config.stage.encoder_sigma_mm, 1e-4))
+    unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    sensors = {}
+    for mount in config.stage.accelerometers:
+        name = mount if mount == CARRIAGE else f"arm_{mount}"
+        sensors[name] = AccelerometerDescription(
+            name,
+            mount,
+            unit,
+            max(config.stage.accelerometer_density_ug, LEAST_ACCELEROMETER_SIGMA),
+            max(config.stage.accelerometer_bias_m_s2, LEAST_ACCELEROMETER_SIGMA),
+        )
+    marks = ReferencesDescription() if config.table.references else None
+    if config.strip is not None:
+        marks = ReferencesDescription(dot_diameter_mm=config.strip.diameter_mm)
+    return replace(rig, stage=stage, accelerometers=sensors, references=marks)
+
+
+def _write_clocks_and_sensors(
+    scene: RunScene, run: Path, lost: NDArray[np.bool_], rng: Generator, *, marks: bool
+) -> None:
+    """marks : False where the marks are in the images, to be found there."""
+    import pandas as pd
+
+    encoder_rng, accelerometer_rng, mark_rng = rng.spawn(3)
+    run.mkdir(parents=True, exist_ok=True)
+    frames = pd.DataFrame({"frame": np.arange(scene.config.frames), "t_s": scene.t_s})
+    if lost.any():
+        names = np.array(list(scene.cameras))
+        frames["missing"] = ["|".join(names[gone]) for gone in lost.T]
+    write_table(frames, run / "frames.csv")
+    write_table(stage_table(scene, encoder_rng), run / "stage.csv")
+    if scene.config.stage.accelerometers:
+        write_table(accelerometer_table(scene, accelerometer_rng), run / "accelerometer.csv")
+    if marks and scene.config.table.references:
+        write_table(references_table(scene, mark_rng), run / "references.csv")
+
+
+def _lost_frames(scene: RunScene, rng: Generator) -> NDArray[np.bool_]:
+    """(C, F) frames that a camera drops; each camera keeps its first one."""
+    lost = rng.random((len(scene.cameras), scene.config.frames)) < scene.config.image.dropped
+    lost[:, 0] = False
+    return np.asarray(lost)
+
+
+class _Pictures:
+    """The surroundings of the bubbles in each camera, drawn once, and each frame's light."""
+
+    def __init__(self, scene: RunScene, rng: Generator, strips: Sequence[Strip]) -> None:
+        self.scene, self.strips = scene, strips
+        image = scene.config.image
+        names = list(scene.cameras)
+        look_rng, light_rng, *self.noise = rng.spawn(2 + len(names))
+        self.gain = np.exp(image.flicker * light_rng.standard_normal(scene.config.frames))
+        self.lab_shift = np.stack([_lab_shift_px(scene, j) for j in range(len(names))])
+        sizes = [camera.image_size_px for camera in scene.cameras.values()]
+        self.sizes = sizes
+        self.screens = [_screen(image, look_rng) for _ in names]
+        self.lens = [_lens_dirt(image, size, look_rng) for size in sizes]
+        self.window = [
+            _window_dirt(image, size, shift, look_rng) for size, shift in zip(sizes, self.lab_shift)
+        ]
+
+    def image(self, frame: int, index: int, view: CameraView) -> NDArray[Any]:
+        """(height, width) what camera ``index`` records."""
+        image = self.scene.config.image
+        lab_shift = self.lab_shift[index, frame]
+        grey = render_bubbles(
+            self.sizes[index],
+            view.silhouettes(self.scene) + self._marks(frame, index),
+            self.screens[index],
+            screen_shift_px=lab_shift if image.screen_fixed_to == "lab" else np.zeros(2),
+            window_dirt=self.window[index],
+            lens_dirt=self.lens[index],
+            lab_shift_px=lab_shift,
+            gain=float(self.gain[frame]),
+        )
+        return exposed(
+            grey,
+            self.noise[index],
+            read_noise=image.read_noise,
+            shot_noise=image.shot_noise,
+            bit_depth=image.bit_depth,
+            left_aligned=image.left_aligned,
+        )
+
+    def _marks(self, frame: int, index: int) -> list[Silhouette]:
+        if not self.strips:
+            return []
+        scene, image = self.scene, self.scene.config.image
+        velocity = AXIS_RIG * scene.velocity_mm_s[frame] + scene.shake_mm_s[index, frame]
+        return self.strips[index].silhouettes(
+            scene.rig_from_lab_mm(index, frame), -velocity * image.exposure_s, image.blur_px
+        )
+
+
+def _lab_shift_px(scene: RunScene, index: int) -> Array:
+    """(F, 2) how far what stands still in the lab has moved in the image since position 0."""
+    _, slope = linear_projection(list(scene.cameras.values())[index])
+    frames = range(scene.config.frames)
+    return np.stack([scene.rig_from_lab_mm(index, frame) for frame in frames]) @ slope.T
+
+
+def _screen(image: ImageConfig, rng: Generator) -> Screen:
+    return random_screen(
+        rng,
+        level=image.screen,
+        gradient=image.gradient,
+        vignetting=image.vignetting,
+        texture=image.texture,
+    )
+
+
+def _lens_dirt(image: ImageConfig, size: tuple[int, int], rng: Generator) -> Specks:
+    low, high = np.zeros(2), np.array(size) - 1.0
+    return random_specks(rng, image.lens_dirt, low, high, sigma_px=(1.5, 9.0), depth=(0.01, 0.06))
+
+
+def _window_dirt(
+    image: ImageConfig, size: tuple[int, int], shift_px: Array, rng: Generator
+) -> Specks:
+    """Specks over all that the camera ever sees of the window."""
+    low = -shift_px.max(0)
+    high = np.array(size) - 1.0 - shift_px.min(0)
+    share = float(np.prod(high - low) / np.prod(size))
+    count = round(image.window_dirt * share)
+    return random_specks(rng, count, low, high, sigma_px=(0.7, 2.2), depth=(0.05, 0.5))
+
+
+@contextmanager
+def _image_files(run: Path, image: ImageConfig, cameras: list[str]) -> Iterator[Writer]:
+    """A function (camera, frame, pixels) that writes single files, or pages of one per camera."""
+    import tifffile
+
+    run.mkdir(parents=True, exist_ok=True)
+    if image.pages:
+        with ExitStack() as stack:
+            files = {
+                name: stack.enter_context(tifffile.TiffWriter(run / f"{name}.tif"))
+                for name in cameras
+            }
+
+            def add_page(name: str, frame: int, pixels: NDArray[Any]) -> None:
+                files[name].write(pixels, contiguous=False, metadata=None, software="telerig")
+
+            yield add_page
+        return
+    for name in cameras:
+        (run / name).mkdir()
+
+    def write_file(name: str, frame: int, pixels: NDArray[Any]) -> None:
+        file = run / name / f"{frame:06d}.tif"
+        tifffile.imwrite(file, pixels, metadata=None, software="telerig")
+
+    yield write_file
+
+
+def _detected(
+    config: RunConfig,
+    frame: int,
+    camera: str,
+    view: CameraView,
+    scene: RunScene,
+    size_px: tuple[int, int],
+    rng: Generator,
+) -> dict[str, Any]:
+    """Rows of `detections.csv` of one image, in random order: whole bubbles and false ones."""
+    table = config.table
+    found = np.flatnonzero(view.whole & (rng.random(len(view.particle)) >= table.missed))
+    false = int(rng.poisson(table.false_per_image))
+    centre = view.centre_px if table.centre == "volume" else view.silhouette_px
+    a, b, angle = (value[found] for value in view.ellipse_px())
+    radius = rng.choice(a, false) if len(a) else np.full(false, 5.0)
+    uv = np.concatenate([centre[found], rng.uniform(0, np.array(size_px) - 1.0, (false, 2))])
+    uv += table.sigma_px * rng.standard_normal(uv.shape)
+    order = rng.permutation(len(uv))
+    area = np.concatenate([view.area_px2[found], np.pi * radius**2])
+    columns = {
+        "frame": np.full(len(uv), frame),
+        "camera": np.full(len(uv), camera),
+        "particle": np.concatenate([view.particle[found].astype(str), np.full(false, "")]),
+        "u_px": uv[:, 0],
+        "v_px": uv[:, 1],
+        "sigma_px": np.full(len(uv), max(table.sigma_px, 1e-4)),
+        "a_px": np.concatenate([a, radius]),
+        "b_px": np.concatenate([b, radius]),
+        "angle_rad": np.concatenate([angle, np.zeros(false)]),
+        "area_px2": area,
+        "d_eq_px": np.sqrt(4 / np.pi * area),
+    }
+    if not table.particle_ids:
+        del columns["particle"]
+    return {name: values[order] for name, values in columns.items()}
+
+
+def _joined(parts: list[dict[str, Any]]) -> pd.DataFrame:
+    import pandas as pd
+
+    if not parts:
+        return pd.DataFrame()
+    return pd.DataFrame({key: np.concatenate([part[key] for part in parts]) for key in parts[0]})
+
+
+def _write_truth(
+    scene: RunScene,
+    folder: Path,
+    seed: dict[str, Any],
+    rows: list[dict[str, Any]],
+    lost: NDArray[np.bool_],
+) -> None:
+    import pandas as pd
+
+    write_table(_joined(rows), folder / "bubbles.csv")
+    columns: dict[str, Any] = {
+        "frame": np.arange(scene.config.frames),
+        "t_s": scene.t_s,
+        "position_mm": scene.position_mm,
+    }
+    for j, name in enumerate(scene.cameras):
+        for axis, letter in enumerate("xyz"):
+            columns[f"{name}_shake_{letter}_mm"] = scene.shake_mm[j, :, axis]
+        columns[f"{name}_lost"] = lost[j].astype(int)
+    write_table(pd.DataFrame(columns), folder / "cameras.csv")
+    write_json_atomic(folder / "truth.json", _summary(scene, seed))
+
+
+def _summary(scene: RunScene, seed: dict[str, Any]) -> Mapping[str, Any]:
+    fleet, config = scene.fleet, plain(scene.config)
+    if config["strip"] is None:
+        del config["strip"]
+    return {
+        "schema": RUN_TRUTH_SCHEMA,
+        "pixel_origin": "centre",
+        "seed": seed,
+        "axis_rig": AXIS_RIG,
+        "modes": MODES,
+        "particles": {
+            "d_eq_mm": fleet.d_eq_mm,
+            "semi_axes_proportions": fleet.semi_axes_mm,
+            "modes_static": fleet.modes_static,
+            "modes_swing": fleet.modes_swing,
+            "swing_hz": fleet.swing_hz,
+            "spin_hz": fleet.spin_hz,
+        },
+        "pairs_closest_s": scene.closest_s,
+        "config": config,
+    }

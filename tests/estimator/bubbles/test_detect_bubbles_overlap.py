@@ -1,0 +1,118 @@
+"""Touching and overlapping bubbles, and the real pair with its peer's list."""
+
+from __future__ import annotations
+
+import sys
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from places import REAL, ROOT
+
+from telerig.estimator.bubbles.detect import detect_bubbles
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from bubble_outline_renderer import Drawn, draw
+
+Array = NDArray[np.float64]
+PAIR = REAL / "bubble_pair"
+WHITE = 3000.0
+
+
+def seen(bubbles: list[Drawn], shape: tuple[int, int], seed: int = 0) -> pd.DataFrame:
+    rng = np.random.default_rng(seed)
+    clean = draw(bubbles, shape, blur_px=1.0)
+    image = np.round(WHITE * (clean + 0.01 * rng.standard_normal(shape))).clip(0).astype(np.uint16)
+    return detect_bubbles(image, background=np.full(shape, WHITE, np.float32))
+
+
+def misses(table: pd.DataFrame, bubbles: list[Drawn]) -> Array:
+    truth = np.array([bubble.ellipse[:2] for bubble in bubbles])
+    gap = table[["u_px", "v_px"]].to_numpy()[None] - truth[:, None]
+    distance: Array = np.min(np.hypot(gap[..., 0], gap[..., 1]), axis=1)
+    return distance
+
+
+@pytest.mark.parametrize("heart", [0.0, 0.4])
+@pytest.mark.parametrize(("distance", "allowed"), [(1.0, 1.5), (1.3, 0.8), (1.7, 0.25)])
+def test_overlapping_pair_is_split(distance: float, allowed: float, heart: float) -> None:
+    radius, half = 18.0, 9.0 * distance
+    first = Drawn((50.2 - half * 0.8, 50.6 - half * 0.6, radius, radius, 0.0), heart=heart)
+    second = Drawn((50.2 + half * 0.8, 50.6 + half * 0.6, 16.0, 16.0, 0.0), heart=heart)
+    table = seen([first, second], (102, 104))
+    assert len(table) == 2
+    assert all("overlap" in flags for flags in table["flags"])
+    assert np.max(misses(table, [first, second])) < allowed
+
+
+def test_hidden_outlines_are_less_certain_than_whole_ones() -> None:
+    first = Drawn((45.0, 50.0, 18.0, 18.0, 0.0))
+    second = Drawn((70.0, 50.0, 16.0, 16.0, 0.0))
+    alone = seen([first], (100, 120)).iloc[0]
+    table = seen([first, second], (100, 120))
+    partly = table.iloc[int(np.argmin(np.abs(table["u_px"] - 45.0)))]
+    assert partly["suu_px2"] > 4.0 * alone["suu_px2"]
+    assert partly["svv_px2"] > alone["svv_px2"]
+
+
+def test_chain_of_three_gives_the_middle_one_both_its_arcs() -> None:
+    bubbles = [Drawn((40.0 + 24.0 * i, 48.0 + 3.0 * i, 15.0, 15.0, 0.0)) for i in range(3)]
+    table = seen(bubbles, (100, 130))
+    assert len(table) == 3
+    assert np.max(misses(table, bubbles)) < 0.35
+
+
+def test_touching_bubbles_stay_exact() -> None:
+    bubbles = [
+        Drawn((40.0, 50.0, 15.0, 15.0, 0.0)),
+        Drawn((70.3, 50.0, 15.0, 15.0, 0.0)),
+    ]
+    table = seen(bubbles, (100, 110))
+    assert len(table) == 2
+    assert np.max(misses(table, bubbles)) < 0.05
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_blob_that_cannot_be_split_is_called_merged(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    middle = np.array([60.0, 60.0])
+    heap = [
+        Drawn((*(middle + rng.uniform(-22, 22, 2)), *(2 * (rng.uniform(4.0, 6.0),)), 0.0))
+        for _ in range(40)
+    ]
+    table = seen(heap, (120, 120))
+    assert any("merged" in flags for flags in table["flags"])
+    alone = table[~table["flags"].str.contains("merged")]
+    assert np.all(alone["a_px"] < 13.0)
+
+
+def test_close_pair_that_shows_no_notch_is_no_clean_single() -> None:
+    bubbles = [
+        Drawn((48.0, 50.0, 12.0, 12.0, 0.0)),
+        Drawn((58.5, 50.0, 11.0, 11.0, 0.0)),
+    ]
+    table = seen(bubbles, (100, 110))
+    split = len(table) == 2 and np.max(misses(table, bubbles)) < 2.0
+    assert split or "merged" in table["flags"].iloc[0]
+
+
+@pytest.mark.skipif(not PAIR.exists(), reason="the real images are not here")
+@pytest.mark.parametrize("camera", [1, 2])
+def test_real_pair_agrees_with_its_list(camera: int) -> None:
+    listed = pd.read_csv(PAIR / "bb3d_list.csv")
+    sound = np.setdiff1d(np.arange(36), [4, 12, 13, 25, 26])
+    names = [f"cam{camera - 1}_{part}" for part in ("x(col)", "y(row)", "r(px)")]
+    circles = listed[names].to_numpy()
+    image = cv2.imread(str(PAIR / f"cam{camera}frame000000.tif"), cv2.IMREAD_UNCHANGED)
+    table = detect_bubbles(image)
+    gap = table[["u_px", "v_px"]].to_numpy()[None] - circles[:, None, :2]
+    distance = np.hypot(gap[..., 0], gap[..., 1])
+    nearest, miss = np.argmin(distance, axis=1), np.min(distance, axis=1)
+    radius = np.sqrt(table["a_px"] * table["b_px"]).to_numpy()[nearest]
+    assert np.all(miss < 3.0)
+    assert np.median(miss[sound]) < 0.25
+    assert np.sqrt(np.mean(miss[sound] ** 2)) < 0.30
+    assert np.median(np.abs(radius - circles[:, 2])[sound]) < 0.15
+    assert len(table) <= 50

@@ -1,0 +1,224 @@
+"""Matching across views: random scenes against their truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from matching_scenes import frame, recall_and_precision, rig, table, truth
+from places import REAL
+
+from telerig.errors import InputError
+from telerig.estimator.bubbles.outline.types import Prediction
+from telerig.estimator.bubbles.pairing.assignment import best_assignment
+from telerig.estimator.bubbles.pairing.matching import match_pairs
+from telerig.estimator.bubbles.pairing.model import default_model, estimate_pair_model
+
+PAIR = REAL / "bubble_pair"
+
+
+def test_what_has_no_good_partner_is_left_out() -> None:
+    rows, columns = best_assignment(np.array([[3.0, 2.9], [2.8, -4.0], [-1.0, -2.0]]))
+    assert list(zip(rows.tolist(), columns.tolist())) == [(0, 1), (1, 0)]
+    assert len(best_assignment(-np.ones((2, 3)))[0]) == 0
+
+
+# Pairs
+
+
+def test_twenty_bubbles() -> None:
+    rng = np.random.default_rng(10)
+    frames = [frame(rng)[0] for _ in range(25)]
+    model = estimate_pair_model(frames, rig())
+    assert not model.calibration_problem
+    assert abs(model.mean_gap_px[0]) < 0.05
+    pairs = [match_pairs(a, b, rig(), model) for a, b in frames]
+    recall, precision = recall_and_precision(frames, pairs)
+    assert recall >= 0.98 and precision >= 0.98
+    sigmas = np.concatenate([p.gap_sigma for p in pairs])
+    assert np.std(sigmas) == pytest.approx(1, abs=0.12)
+
+
+def test_confidence_comes_true_and_history_helps_where_all_look_alike() -> None:
+    rng = np.random.default_rng(11)
+    made = [frame(rng, sigma=1.0, spread=0.005) for _ in range(25)]
+    frames = [m[0] for m in made]
+    model = estimate_pair_model(frames, rig())
+    pairs = [match_pairs(a, b, rig(), model) for a, b in frames]
+    confidence = np.concatenate([p.confidence for p in pairs])
+    right = np.concatenate([truth(f, p) for f, p in zip(frames, pairs)])
+    unsure = confidence < 0.95
+    assert unsure.sum() > 20, "the scene must be hard for this test to mean something"
+    expected, spread = confidence.sum(), np.sqrt((confidence * (1 - confidence)).sum())
+    assert abs(right.sum() - expected) < 4 * spread
+    assert right[confidence > 0.99].mean() > 0.98
+    assert right[unsure].mean() < 0.9
+    ambiguous = np.concatenate([p.ambiguous for p in pairs])
+    assert ambiguous[~right].mean() > 0.8, "wrong pairs are flagged"
+
+    known = []
+    for (a, b), points, radius in made:
+        covariance = np.tile(0.05**2 * np.eye(3), (len(points), 1, 1))
+        guess = points + rng.normal(0, 0.05, points.shape)
+        track = Prediction(100 + np.arange(len(points)), guess, covariance, 2 * radius)
+        known.append(match_pairs(a, b, rig(), model, predicted=track))
+    with_history = recall_and_precision(frames, known)
+    without = recall_and_precision(frames, pairs)
+    assert min(with_history) >= 0.98 and sum(with_history) > sum(without)
+    for tables, found in zip(frames, known):
+        right = truth(tables, found) & (found.particle >= 0)
+        who = tables[0]["bubble"].to_numpy()[found.first]
+        np.testing.assert_array_equal(found.particle[right], 100 + who[right])
+
+
+@pytest.mark.parametrize("bias", [2.0, -6.0])
+def test_a_biased_calibration_is_survived_and_reported(bias: float) -> None:
+    rng = np.random.default_rng(12)
+    tables, _, _ = frame(rng, 31, shift=bias)
+    model = estimate_pair_model([tables], rig())
+    assert model.calibration_problem
+    assert model.mean_gap_px[0] == pytest.approx(bias, abs=0.15)
+    assert any("calibration problem" in w and f"{bias:+.0f}"[0] in w for w in model.words)
+    pairs = match_pairs(*tables, rig(), model)
+    recall, precision = recall_and_precision([tables], [pairs])
+    assert recall >= 0.98 and precision >= 0.98
+
+
+def test_a_bias_that_changes_over_the_volume_is_followed() -> None:
+    rng = np.random.default_rng(13)
+    points = rng.uniform([-30, -19, -30], [30, 19, 30], (60, 3))
+    offset = 1.5 + 1.2 * points[:, 0] / 30 - 1.0 * (points[:, 2] / 30) ** 2
+    tables, _, _ = frame(rng, shift=offset, at=points, seen=1.0, clutter=2.0)
+    model = estimate_pair_model([tables], rig())
+    bias, _ = model.bias(points)
+    assert np.sqrt(np.mean((bias - offset) ** 2)) < 0.15
+    assert len(model.bias_px) == 10 and "changes over the volume" in " ".join(model.words)
+    assert min(recall_and_precision([tables], [match_pairs(*tables, rig(), model)])) >= 0.95
+
+
+def test_cameras_that_shake_against_each_other() -> None:
+    rng = np.random.default_rng(14)
+    shifts = rng.normal(0, 2, 20)
+    frames = [frame(rng, shift=s)[0] for s in shifts]
+    model = estimate_pair_model(frames, rig())
+    assert model.frame_px == pytest.approx(np.std(shifts), rel=0.3)
+    assert "shake" in " ".join(model.words)
+    pairs = [match_pairs(a, b, rig(), model) for a, b in frames]
+    assert min(recall_and_precision(frames, pairs)) >= 0.98
+    found = np.array([p.frame_shift_px for p in pairs]) + model.bias_px[0]
+    np.testing.assert_allclose(found, shifts, atol=0.2)
+
+
+def test_two_alike_at_one_height_are_never_a_silent_guess() -> None:
+    cameras = rig()
+    points = np.array([[-5.0, 3.0, 8.0], [9.0, 3.0, -4.0], [0.0, -9.0, 0.0]])
+    tables = [table(c.project(points)) for c in cameras]
+    pairs = match_pairs(tables[0], tables[1], cameras, default_model(cameras))
+    by_row = dict(zip(pairs.first.tolist(), range(3)))
+    for row in (0, 1):
+        k = by_row[row]
+        assert pairs.ambiguous[k] and 0.4 < pairs.confidence[k] < 0.51
+        other = [a for a in pairs.alternatives[k] if a.first == row and a.second >= 0]
+        assert other[0].probability == pytest.approx(pairs.confidence[k], abs=0.01)
+        assert {pairs.second[k], other[0].second} == {0, 1}
+    assert not pairs.ambiguous[by_row[2]] and pairs.confidence[by_row[2]] > 0.95
+    assert pairs.alternatives[by_row[2]] == ()
+    track = Prediction(
+        np.array([7, 8]), points[:2], np.tile(0.04 * np.eye(3), (2, 1, 1)), np.full(2, 1.6)
+    )
+    known = match_pairs(tables[0], tables[1], cameras, default_model(cameras), predicted=track)
+    np.testing.assert_array_equal(known.first, known.second)
+    assert (known.confidence > 0.95).all() and not known.ambiguous.any()
+    assert known.particle.tolist() == [7, 8, -1]
+
+
+def test_size_and_contrast_decide_where_the_gap_cannot() -> None:
+    cameras = rig()
+    points = np.array([[-5.0, 3.0, 8.0], [9.0, 3.02, -4.0]])
+    tables = [table(c.project(points), [[14.0, 14.0], [18.0, 18.0]], 0.5) for c in cameras]
+    frames = [frame(np.random.default_rng(i))[0] for i in range(5)]
+    model = estimate_pair_model(frames, cameras)
+    pairs = match_pairs(tables[0], tables[1], cameras, model)
+    np.testing.assert_array_equal(pairs.first, pairs.second)
+    assert not pairs.ambiguous.any()
+    np.testing.assert_allclose(pairs.height_ratio, 1, atol=1e-9)
+    cut = [t.assign(flags="border") for t in tables]
+    assert match_pairs(cut[0], cut[1], cameras, model).ambiguous.all(), "cut sizes say nothing"
+
+
+def test_impossible_sizes_are_left_alone() -> None:
+    cameras = rig()
+    points = np.array([[-5.0, 3.0, 8.0]])
+    frames = [frame(np.random.default_rng(i))[0] for i in range(5)]
+    model = estimate_pair_model(frames, cameras)
+    tables = [table(c.project(points), size) for c, size in zip(cameras, (12.0, 20.0))]
+    pairs = match_pairs(tables[0], tables[1], cameras, model)
+    assert len(pairs) == 0 and list(pairs.lonely_first) == [0] and list(pairs.lonely_second) == [0]
+
+
+def test_the_order_of_rows_does_not_matter() -> None:
+    rng = np.random.default_rng(15)
+    (first, second), _, _ = frame(rng)
+    model = estimate_pair_model([(first, second)], rig())
+    one = match_pairs(first, second, rig(), model)
+    order = rng.permutation(len(second))
+    two = match_pairs(first, second.iloc[order], rig(), model)
+    np.testing.assert_array_equal(order[two.second], one.second)
+    np.testing.assert_allclose(two.confidence, one.confidence, rtol=1e-9)
+
+
+# Bad input
+
+
+def test_nothing_to_match() -> None:
+    cameras, empty = rig(), table(np.zeros((0, 2)))
+    model = estimate_pair_model([(empty, empty), (table([[3, 4]]), empty)], cameras)
+    assert "nothing learnt" in model.words[0] and model.pairs == 0
+    pairs = match_pairs(empty, table([[600, 400]]), cameras, model)
+    assert len(pairs) == 0 and list(pairs.lonely_second) == [0] and pairs.alternatives == ()
+    assert estimate_pair_model([], cameras).pairs == 0
+
+
+def test_one_bubble_is_matched_and_its_bias_not_oversold() -> None:
+    cameras = rig()
+    tables = [table(c.project(np.array([[1.0, 2.0, 3.0]]))) for c in cameras]
+    model = estimate_pair_model([(tables[0], tables[1])], cameras)
+    assert any("Too few pairs" in w for w in model.words)
+    assert len(match_pairs(tables[0], tables[1], cameras, model)) == 1
+
+
+def test_bad_tables_and_cameras() -> None:
+    good, cameras = table([[600, 400]]), rig()
+    model = default_model(cameras)
+    with pytest.raises(InputError, match="svv_px2"):
+        match_pairs(good.drop(columns="svv_px2"), good, cameras, model)
+    with pytest.raises(InputError, match="no finite centre"):
+        match_pairs(good, good.assign(u_px=np.nan), cameras, model)
+    with pytest.raises(InputError, match="same direction"):
+        match_pairs(good, good, rig(1.0), model)
+    with pytest.raises(InputError, match="same direction"):
+        estimate_pair_model([(good, good)], rig(179.0))
+
+
+@pytest.mark.skipif(not PAIR.is_dir(), reason="the real pair is not here")
+def test_the_real_pairs_listed_circles() -> None:
+    from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
+
+    read, _ = read_openlpt_cameras([PAIR / "cam1.txt", PAIR / "cam2.txt"])
+    cameras = (read[0], read[1])
+    listed = pd.read_csv(PAIR / "bb3d_list.csv")
+    rng = np.random.default_rng(0)
+    order = [rng.permutation(len(listed)) for _ in range(2)]
+    tables = []
+    for c in (0, 1):
+        rows = listed.iloc[order[c]]
+        radius = rows[f"cam{c}_r(px)"].to_numpy()
+        uv = rows[[f"cam{c}_x(col)", f"cam{c}_y(row)"]].to_numpy()
+        tables.append(table(uv, np.stack([radius, radius], -1), 0.2))
+    model = estimate_pair_model([(tables[0], tables[1])], cameras)
+    pairs = match_pairs(tables[0], tables[1], cameras, model)
+    found = [o[i] for o, i in zip(order, (pairs.first, pairs.second))]
+    same = set(found[0][found[0] == found[1]].tolist())
+    unsound = {4, 12, 13, 25, 26}
+    assert len(same - unsound) >= 30 and not same & unsound
+    assert model.calibration_problem and 1.4 < abs(model.mean_gap_px[0]) < 2.2

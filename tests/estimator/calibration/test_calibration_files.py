@@ -1,0 +1,211 @@
+"""Calibrations as files: what is written is read back, what is foreign is refused in words."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.errors import InputError
+from telerig.estimator.calibration.result.calibration import Calibration, load_calibration
+
+
+@pytest.fixture(scope="module")
+def calibration(scene: Any) -> Calibration:
+    made = scene("near_telecentric", 3, outlier_share=0.02)
+    return made.calibrate("kappa+radial", name="tank 2", notes=["a note"])
+
+
+@pytest.fixture
+def saved(calibration: Calibration, tmp_path: Path) -> Path:
+    calibration.save(tmp_path / "calibration")
+    return tmp_path / "calibration"
+
+
+def assert_same(a: Calibration, b: Calibration) -> None:
+    assert [c.name for c in a.cameras] == [c.name for c in b.cameras]
+    for x, y in zip(a.cameras, b.cameras):
+        np.testing.assert_array_equal(x.intrinsics, y.intrinsics)
+        np.testing.assert_array_equal(x.camera_from_rig.rotation, y.camera_from_rig.rotation)
+        shifts = (c.camera_from_rig.translation_mm for c in (x, y))
+        np.testing.assert_array_equal(*shifts)
+        assert (x.image_size_px, x.rho_mm) == (y.image_size_px, y.rho_mm)
+    np.testing.assert_array_equal(a.dot_ids, b.dot_ids)
+    np.testing.assert_array_equal(a.target_points_mm, b.target_points_mm)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+    assert a.covariance_names == b.covariance_names
+    assert (a.free, a.name, a.notes) == (b.free, b.name, b.notes)
+    assert list(a.target_poses) == list(b.target_poses)
+    for x, y in zip(a.target_poses.values(), b.target_poses.values()):
+        np.testing.assert_array_equal(x.rotation, y.rotation)
+    for part in ("verdict", "statistics", "twin", "model", "diagnostics"):
+        assert json.dumps(getattr(a, part), default=float) == json.dumps(getattr(b, part))
+
+
+def test_round_trip(calibration: Calibration, saved: Path) -> None:
+    for path in (saved, saved / "calibration.json", str(saved)):
+        loaded = load_calibration(path)
+        assert_same(calibration, loaded)
+        assert loaded.joint_names == calibration.joint_names
+        np.testing.assert_array_equal(loaded.joint_covariance, calibration.joint_covariance)
+
+
+def test_the_loaded_rig_measures_the_same(calibration: Calibration, saved: Path) -> None:
+    loaded = load_calibration(saved)
+    points = np.random.default_rng(0).uniform(-10, 10, (20, 3))
+    pixels = [calibration.project(c, points) for c in (0, 1)]
+    np.testing.assert_array_equal(loaded.project("right", points), pixels[1])
+    for method in ("ml", "midpoint"):
+        a, b = (c.triangulate(*pixels, method=method) for c in (calibration, loaded))
+        np.testing.assert_array_equal(a.points_mm, b.points_mm)
+        np.testing.assert_array_equal(a.covariance_mm2, b.covariance_mm2)
+    assert loaded.report() == calibration.report()
+
+
+def test_a_second_save_of_the_loaded_is_the_same_file(saved: Path, tmp_path: Path) -> None:
+    load_calibration(saved).save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_text() == (saved / "calibration.json").read_text()
+    assert (tmp_path / "covariance.npz").is_file()
+    assert not (tmp_path / "dots.csv").exists()
+
+
+def test_the_file_says_what_others_rely_on(calibration: Calibration, saved: Path) -> None:
+    text = (saved / "calibration.json").read_text(encoding="utf-8")
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    data = json.loads(text)
+    assert data["schema"] == 1
+    assert data["pixel_origin"] == "centre"
+    assert "axes come closest" in data["gauge"]
+    assert list(data["cameras"]) == ["left", "right"]
+    assert data["twin"]["decided_by"] == "nominal rotation"
+    size = len(data["covariance"]["names"])
+    assert np.shape(data["covariance"]["matrix"]) == (size, size)
+    sd = data["cameras"]["left"]["standard_deviations"]["k1"]
+    assert sd == pytest.approx(calibration.sd("left.k1"))
+
+
+def test_tables(calibration: Calibration, saved: Path) -> None:
+    dots, residuals = (pd.read_csv(saved / f"{n}.csv") for n in ("dots", "residuals"))
+    assert list(dots.columns)[:7] == ["view", "camera", "dot", "row", "column", "u_px", "v_px"]
+    assert list(residuals.columns) == [
+        "view", "camera", "dot", "row", "column", "u_px", "v_px", "du_px", "dv_px", "weight",
+        "reason",
+    ]  # fmt: skip
+    assert len(residuals) == calibration.statistics["dots_measured"]
+    out = residuals["weight"] < 1
+    assert out.sum() > 0
+    assert residuals.loc[out, "reason"].str.contains("standard deviations").all()
+    assert residuals.loc[~out, "reason"].isna().all()
+
+
+def test_residuals_are_measured_minus_projected(calibration: Calibration) -> None:
+    table = calibration.residuals
+    where = dict(zip(calibration.dot_ids, calibration.target_points_mm))
+    for row in table.iloc[::17].itertuples():
+        rig = calibration.target_poses[row.view].apply(np.atleast_2d(where[row.dot]))
+        gap = np.array([row.u_px, row.v_px]) - calibration.project(row.camera, rig)[0]
+        np.testing.assert_allclose([row.du_px, row.dv_px], gap, atol=1e-9)
+
+
+def test_it_loads_without_the_full_covariance(calibration: Calibration, saved: Path) -> None:
+    (saved / "covariance.npz").unlink()
+    loaded = load_calibration(saved)
+    assert_same(calibration, loaded)
+    assert loaded.joint_covariance.shape == (0, 0)
+
+
+def test_saving_without_the_full_covariance_leaves_no_old_one(
+    calibration: Calibration, saved: Path
+) -> None:
+    replace(calibration, joint_names=(), joint_covariance=np.zeros((0, 0))).save(saved)
+    assert load_calibration(saved).joint_names == ()
+
+
+def test_a_covariance_of_another_calibration_is_refused(
+    calibration: Calibration, saved: Path
+) -> None:
+    other = replace(calibration, joint_covariance=2 * calibration.joint_covariance)
+    other.save(saved.parent / "other")
+    (saved / "covariance.npz").write_bytes((saved.parent / "other" / "covariance.npz").read_bytes())
+    with pytest.raises(InputError, match="covariance"):
+        load_calibration(saved)
+
+
+def test_missing(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "none.json", tmp_path / "no" / "folder"):
+        with pytest.raises(InputError, match="no calibration here"):
+            load_calibration(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "not json", "[]", "{}", "null", '{"kind": "something else", "schema": 1}',
+        '{"kind": "telerig calibration", "schema": 1}',
+        '{"kind": "telerig calibration", "schema": "one"}',
+    ],
+)  # fmt: skip
+def test_foreign_files(text: str, tmp_path: Path) -> None:
+    file = tmp_path / "calibration.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"calibration\.json.*not a calibration"):
+        load_calibration(file)
+
+
+def test_binary_file(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.json"
+    file.write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="not a calibration"):
+        load_calibration(file)
+
+
+def edited(folder: Path, change: Any) -> Path:
+    file = folder / "calibration.json"
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))
+    return file
+
+
+def test_newer_schema(saved: Path) -> None:
+    file = edited(saved, lambda d: d.update(schema=2))
+    with pytest.raises(InputError, match=r"newer(.|\n)*update telerig"):
+        load_calibration(file)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d["cameras"]["left"].update(rho_mm="wide"),
+        lambda d: d["cameras"]["left"]["parameters"].pop("k3"),
+        lambda d: d["cameras"]["right"]["camera_from_rig"].update(rotation="none"),
+        lambda d: d["target"].update(points_mm=[[1, 2]]),
+        lambda d: d["covariance"].update(matrix=[[1.0, 2.0], [3.0]]),
+        lambda d: d["cameras"]["left"].update(image_size_px=[512]),
+        lambda d: d.update(cameras=[1, 2]),
+    ],
+)
+def test_damaged_files(change: Any, saved: Path) -> None:
+    with pytest.raises(InputError, match="not a calibration"):
+        load_calibration(edited(saved, change))
+
+
+def test_damaged_covariance(saved: Path) -> None:
+    (saved / "covariance.npz").write_bytes(b"not a zip archive")
+    with pytest.raises(InputError, match=r"covariance\.npz"):
+        load_calibration(saved)
+
+
+def test_two_views_and_a_chosen_model_can_be_saved(scene: Any, tmp_path: Path) -> None:
+    """Nothing in the file may be NaN, even where there was too little to compute it from."""
+    made = scene("paper", 1, views=2)
+    made.calibrate("auto").save(tmp_path / "few")
+    text = (tmp_path / "few" / "calibration.json").read_text()
+    assert "NaN" not in text
+    assert load_calibration(tmp_path / "few").statistics["views"] == 2

@@ -1,0 +1,67 @@
+"""The centre of a projected disc against the area centroid of its projected rim."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from telerig.estimator.calibration.result_from_fit import cameras_from_state
+from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
+from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.start import known_target
+from telerig.rig.pose import Pose
+from telerig.rig.projection import INDEX
+
+
+def polygon_centroid(rim: Any) -> Any:
+    """Area centroid of a closed polygon (shoelace formula)."""
+    x, y = (rim - rim.mean(0)).T
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    centre = [((a + np.roll(a, -1)) * cross).sum() / (3 * cross.sum()) for a in (x, y)]
+    return np.array(centre) + rim.mean(0)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"kappa_per_mm": 1 / 400},
+        {"kappa_per_mm": -1e-4, "k1": 0.02, "p1": 1e-3},
+        {"tilt_x": 0.1, "image_convergence_per_mm": 1 / 600},
+    ],
+    ids=["perspective", "distorted", "tilted"],
+)
+def test_against_the_rim(lens: dict[str, float], scene: Any) -> None:
+    made = scene("paper", 3, views=3)
+    problem = problem_from_dots(made.dots, made.cameras, made.target)
+    state = known_target.stereo_states(problem, problem.nominal_mm)[0]
+    intrinsics = state.intrinsics.copy()
+    for name, value in lens.items():
+        intrinsics[:, INDEX[name]] = value
+    state = replace(state, intrinsics=intrinsics)
+    shift = eccentricity_px(problem, state)
+    cameras = cameras_from_state(problem, state)
+    angle = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    largest = 0.0
+    for i in range(0, len(problem.view), 7):
+        dot = problem.dot[i]
+        radius = problem.target.diameter_mm(problem.dot_ids[dot]) / 2
+        pose = state.rig_from_target[problem.view[i]]
+        place = Pose(pose[:3, :3], pose[:3, 3])
+        camera = cameras[problem.camera[i]]
+        rim = camera.project(place.apply(state.dots_mm[dot] + radius * circle))
+        centre = camera.project(place.apply(state.dots_mm[dot][None]))[0]
+        expected = polygon_centroid(rim) - centre
+        np.testing.assert_allclose(shift[i], expected, atol=2e-5)
+        largest = max(largest, float(np.linalg.norm(expected)))
+    assert largest > 5e-4
+
+
+def test_an_affine_camera_has_none(scene: Any) -> None:
+    made = scene("paper", 3, views=3)
+    problem = problem_from_dots(made.dots, made.cameras, made.target)
+    state = known_target.stereo_states(problem, problem.nominal_mm)[0]
+    np.testing.assert_allclose(eccentricity_px(problem, state), 0, atol=1e-9)

@@ -1,0 +1,276 @@
+"""Choosing a lens model for each camera: against real fits, brute force, and simulated truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from telerig.errors import CalibrationError
+from telerig.estimator.calibration.lens import choice as model_choice
+from telerig.estimator.calibration.lens.cross_validation import FOLDS, held_out_chi2, pose_only
+from telerig.estimator.calibration.lens.search import (
+    UNDETERMINED,
+    Landscape,
+    Lens,
+    additions,
+    possible,
+    search,
+    steps_to,
+)
+from telerig.estimator.calibration.lens.start_values import model_start
+from telerig.estimator.calibration.self_calibration import choose_model
+from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.problem import Problem, nominal_state
+from telerig.factors.projection import whitened_error
+from telerig.io.simulation.calibration.presets import preset
+from telerig.rig.lens_models import GROUPS, name_of
+
+RICH = model_choice.rich_lens(mono=False, strong=False)
+LENS: dict[str, dict[str, float]] = {
+    "none": {},
+    "radial": {"k1": -1e-3},
+    "k1+k2": {"k1": 2e-3, "k2": -2e-3},
+    "brown": {"k1": 2e-3, "k2": 2e-3, "p1": 4e-4, "p2": -3e-4},
+    "prism": {"k1": 3e-3, "k2": -3e-3, "p1": 5e-4, "p2": 4e-4, "s1": -9e-4, "s3": 9e-4},
+    "kappa+radial": {"kappa_per_mm": 6e-5, "k1": 2e-3},
+    "affine": {"aspect": 1.001, "skew": -5e-4},
+    "tilt+radial": {"tilt_x": 0.1, "tilt_y": -0.05, "image_convergence_per_mm": 1e-3, "k1": 2e-3},
+}
+BILATERAL = {"tilt_x": 0.1, "tilt_y": 0.06}
+
+
+def made_of(scene: Any, left: dict[str, float], right: dict[str, float], seed: int = 1) -> Any:
+    """The preset `paper` with other lenses, centred."""
+    config = preset("paper")
+    cameras = tuple(
+        replace(c, parameters=lens, centre_offset_px=(0.0, 0.0))
+        for c, lens in zip(config.cameras, (left, right))
+    )
+    return scene(replace(config, cameras=cameras), seed)
+
+
+def problem_of(made: Any) -> Problem:
+    problem = problem_from_dots(made.dots, made.cameras, made.target)
+    return replace(problem, solver="schur")
+
+
+def start_of(made: Any, problem: Problem) -> Any:
+    """The true poses and dots, nominal lenses."""
+    state = nominal_state(problem)
+    cameras = [made.true_cameras[c.name].rig_from_camera for c in problem.cameras]
+    views = [made.true_views[v].rig_from_target for v in problem.views]
+    matrices = [np.array([_matrix(p) for p in poses]) for poses in (cameras, views)]
+    return replace(state, rig_from_camera=matrices[0], rig_from_target=matrices[1])
+
+
+def _matrix(pose: Any) -> Any:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = pose.rotation, pose.translation_mm
+    return out
+
+
+@pytest.fixture(scope="module")
+def fitted(scene: Any) -> tuple[Problem, Any, Landscape]:
+    """A rig with k1 alone: the rich problem, its fit, its landscape."""
+    made = made_of(scene, LENS["radial"], LENS["radial"])
+    problem = problem_of(made).with_model(name_of(RICH))
+    rich = solve(problem, start_of(made, problem))
+    return problem, rich, Landscape.of(problem, rich)
+
+
+# --- the landscape, and the search over it ------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("none", "none"), ("radial", "none"), ("radial", "kappa+radial"), ("brown", "affine+radial"),
+     ("p+s", "radial"), ("affine+k1+k2", "k1+s")],
+)  # fmt: skip
+def test_the_landscape_is_what_fits_find(names: tuple[str, str], fitted: Any) -> None:
+    problem, rich, landscape = fitted
+    model = problem.with_model(names)
+    cost = solve(model, model_start(model, rich.state)).cost
+    lenses = tuple(Lens(model_choice._lens_of(free)) for free in model.free)
+    promised = landscape.rise(lenses)
+    found = 2 * (cost - rich.cost) / landscape.variance
+    assert promised == pytest.approx(found, rel=2e-3, abs=0.02)
+    assert landscape.least == pytest.approx(2 * rich.cost / landscape.variance, rel=1e-6)
+
+
+def test_a_tilts_homography_is_in_the_landscape(scene: Any) -> None:
+    """At first order: the real tilt costs what its two directions promise, within a few units."""
+    made = made_of(scene, LENS["tilt+radial"], LENS["none"])
+    problem = problem_of(made).with_model(name_of(RICH))
+    rich = solve(problem, start_of(made, problem))
+    landscape = Landscape.of(problem, rich)
+    tilted, flat = (landscape.rise((lens, Lens())) for lens in (
+        Lens({"tilt", "k1"}), Lens({"affine", "k1"})))  # fmt: skip
+    model = problem.with_model(("tilt+radial", "none"))
+    cost = solve(model, model_start(model, rich.state)).cost
+    assert tilted == pytest.approx(2 * (cost - rich.cost) / landscape.variance, abs=30)
+    assert flat > 100 * max(tilted, 1.0)
+
+
+def test_the_search_finds_what_brute_force_does(fitted: Any) -> None:
+    """On landscapes with a few groups really there, weak and strong."""
+    _, _, real = fitted
+    options = possible(Lens({"kappa", "affine", "k1", "k2", "p"}))
+    rng = np.random.default_rng(3)
+    factor = np.linalg.cholesky(real.covariance + 1e-12 * np.diag(np.diag(real.covariance)))
+    for _ in range(4):
+        z = rng.normal(0, 1, len(factor)) + rng.choice([0, 0, 5], len(factor))
+        landscape = replace(real, offset=factor @ z)
+        best = min(product(options, options), key=landscape.cost)
+        assert landscape.cost(search(landscape, [options, options])) == landscape.cost(best)
+
+
+def test_the_way_goes_up_one_group_at_a_time(fitted: Any) -> None:
+    _, _, landscape = fitted
+    chosen = (Lens({"k1", "k2", "p"}), Lens({"kappa", "k1"}))
+    steps = steps_to(landscape, chosen, (Lens(), Lens()))
+    assert steps[-1][2] == chosen and len(steps) == 5
+    assert {steps[0][:2], steps[1][:2]} == {(0, "k1"), (1, "k1")}
+    order = [(camera, group) for camera, group, _ in steps]
+    assert order.index((0, "k1")) < order.index((0, "k2"))
+    options = possible(RICH)
+    groups = {group for _, group, _ in additions((Lens({"k1"}), Lens()), [options, options])}
+    assert groups == {"kappa", "affine", "tilt", "k1", "k2", "p", "s"}
+
+
+def test_what_the_views_do_not_determine_is_not_chosen(fitted: Any) -> None:
+    """A k2 that the data want at ten sd, but whose sd is the prior's."""
+    _, _, real = fitted
+    i = real.names.index((0, "k2"))
+    prior = real.prior.copy()
+    prior[i] = np.sqrt(real.covariance[i, i])
+    offset = real.offset.copy()
+    offset += 10 * real.covariance[:, i] / prior[i]
+    options = [possible(RICH)] * 2
+    wanted = search(replace(real, offset=offset), options)
+    assert "k2" in wanted[0]
+    vague = replace(real, offset=offset, prior=0.5 * prior)
+    assert vague.sd_over_prior(wanted, 0, "k2") > UNDETERMINED
+    assert "k2" not in model_choice._determined(vague, options)[0]
+
+
+# --- views that were left out -------------------------------------------------------------------
+
+
+def test_one_step_predicts_like_a_whole_fit(fitted: Any) -> None:
+    problem, rich, _ = fitted
+    model = problem.with_model(("radial", "none"))
+    state = solve(model, model_start(model, rich.state)).state
+    per_view = held_out_chi2(model, state)
+    assert np.isfinite(per_view).all()
+    for fold in range(FOLDS):
+        left_out = np.arange(len(model.views))[fold::FOLDS]
+        mine = np.isin(model.view, left_out)
+        trained = solve(model.subset(~mine), state).state
+        test = model.subset(mine)
+        final = pose_only(test, replace(trained, rig_from_target=state.rig_from_target))
+        obs = test.observations()
+        squares = (whitened_error(final, obs, model.rho_mm) ** 2).sum(-1)
+        expected = [squares[obs.view == v].mean() for v in left_out]
+        np.testing.assert_allclose(per_view[left_out], expected, rtol=5e-3)
+
+
+def test_a_last_step_that_predicts_worse_is_taken_back(fitted: Any) -> None:
+    _, rich, _ = fitted
+    held_out = [4.0, 2.0, 1.9, 2.1, 2.2]
+    fits = [
+        model_choice.Fit((Lens(), Lens()), 2, 1.0, 10, 0.01, np.full(3, h), rich.state)
+        for h in held_out
+    ]
+    steps = [model_choice.Step(0, ("k1",), f.lenses, 50.0, 40.0, True, "", f) for f in fits]
+    after = model_choice._with_held_out(steps)
+    assert [s.taken for s in after] == [True, True, True, False, False]
+    assert after[3].words == "left-out views are predicted 10.5% worse"
+
+
+# --- simulated truth ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [("none", "none"), ("k1+k2", "kappa+radial"), ("brown", "none"), ("affine", "tilt+radial"),
+     ("prism", "radial")],
+)  # fmt: skip
+def test_each_camera_gets_its_own(left: str, right: str, scene: Any) -> None:
+    made = made_of(scene, LENS[left], LENS[right])
+    problem = problem_of(made)
+    _, choice = choose_model(problem, start_of(made, problem), ("auto", "auto"))
+    assert choice.chosen.names == (left, right), choice.words
+    step = choice.steps[-1]
+    assert not step.taken and step.worth < 0 and step.words.startswith("held: ")
+
+
+def test_a_bilateral_tilt_is_a_stretch_and_says_so(scene: Any) -> None:
+    made = made_of(scene, BILATERAL, {})
+    calibration = made.calibrate("auto")
+    assert calibration.model["by_camera"] == {"left": "affine", "right": "none"}
+    assert "no image can tell which" in calibration.model["words"]
+    size = float(np.hypot(*BILATERAL.values()))
+    said = f"stretched by {100 * (np.sqrt(1 + size**2) - 1):.2g} %"
+    assert said in calibration.model["words"]
+    assert made.space_rms_um(calibration) < 1.5
+
+
+def test_a_tilted_sensor_is_not_taken_for_outliers(scene: Any) -> None:
+    made = scene("scheimpflug", 1, outlier_share=0.05)
+    calibration = made.calibrate("auto")
+    np.testing.assert_array_equal(made.weights(calibration) < 1, made.outlier)
+    assert calibration.model["name"] == "left=tilt+radial,right=affine+radial"
+    assert made.space_rms_um(calibration) < 1.2
+
+
+# --- what the user says, and what is written ----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("model", "names"),
+    [
+        ("left=brown,right=none", ("brown", "none")),
+        ({"left": "none", "right": "kappa"}, ("none", "kappa")),
+        (("tangential", "auto"), ("tangential", "radial")),
+    ],
+)
+def test_the_user_may_fix_it(model: Any, names: tuple[str, str], scene: Any) -> None:
+    made = made_of(scene, LENS["radial"], LENS["radial"])
+    calibration = made.calibrate(model)
+    assert tuple(calibration.model["by_camera"].values()) == names
+    expected = tuple(("scale_px_per_mm", *_parameters(name)) for name in names)
+    assert calibration.free == expected
+    if "auto" not in model:
+        assert calibration.model["ladder"] == [] and "as asked" in calibration.model["words"]
+    with pytest.raises(CalibrationError, match="camera 'top'"):
+        made.calibrate({"top": "brown"})
+
+
+def _parameters(name: str) -> tuple[str, ...]:
+    lens = {"brown": ("k1", "k2", "p"), "tangential": ("k1", "p"), "radial": ("k1",)}
+    return tuple(p for g in lens.get(name, (name,) if name != "none" else ()) for p in GROUPS[g])
+
+
+def test_the_table_says_what_each_step_bought(scene: Any) -> None:
+    calibration = made_of(scene, LENS["brown"], LENS["radial"]).calibrate("auto")
+    rows = json.loads(json.dumps(calibration.model["ladder"], allow_nan=False))
+    taken = [row for row in rows if row["taken"]]
+    assert rows[: len(taken)] == taken
+    assert taken[0]["added"] == [] and taken[0]["model"] == "none"
+    assert taken[-1]["model"] == calibration.model["name"] == "left=brown,right=radial"
+    added = sorted((row["camera"], *row["added"]) for row in taken[1:])
+    assert added == [("left", "k1"), ("left", "k2"), ("left", "p1", "p2"), ("right", "k1")]
+    for before, row in pairwise(taken):
+        assert row["parameters"] == before["parameters"] + len(row["added"])
+        assert row["chi2_gain"] > row["bic_gain"] > 0 and row["p_value"] < 1e-4
+        assert row["held_out_before"] == before["held_out"]
+        assert row["held_out_before"] is None or row["held_out"] < row["held_out_before"]
+        assert row["rms_px"] < before["rms_px"] and row["bic"] < before["bic"]
+    for row in rows[len(taken) :]:
+        assert row["bic_gain"] < 0 or "worse" in row["words"]

@@ -1,0 +1,110 @@
+"""Symmetric targets: images numbered after different turns are brought to agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from telerig.estimator.calibration.start.symmetric_target import turns
+from telerig.rig.target import Target
+
+SQUARE = Target(
+    rows=5, columns=5, pitch_mm=(5.0, 5.0), dot_diameter_mm=2.0, scale_dots=(0, 24)
+)  # fmt: skip
+
+
+def turned(scene: Any, seed: int = 0, *, images: bool = True) -> tuple[Any, Any]:
+    """Every image (or every view) numbered after a random turn; and (M,) the turns."""
+    rng = np.random.default_rng(seed)
+    labels, dots = turns(scene.target), scene.dots.copy()
+    by = ["view", "camera"] if images else ["view"]
+    turn = np.zeros(len(dots), int)
+    for _, group in dots.groupby(by):
+        turn[group.index] = rng.integers(len(labels))
+    dots["dot"] = np.array(labels)[turn, dots["dot"].to_numpy()]
+    return scene.with_dots(dots), turn
+
+
+def settled(calibration: Any, scene: Any, true_ids: Any) -> list[int]:
+    """The one turn that the final numbering differs from the truth by; empty if there is none."""
+    columns = ["view", "camera", "u_px", "v_px"]
+    final = calibration.dots.sort_values(columns)["dot"].to_numpy()
+    order = scene.dots.sort_values(columns).index.to_numpy()
+    truth = np.asarray(true_ids)[order]
+    return [k for k, label in enumerate(turns(scene.target)) if np.array_equal(label[truth], final)]
+
+
+def test_turns_are_turns() -> None:
+    for target, order in ((SQUARE, 4), (replace(SQUARE, columns=7), 2)):
+        labels = turns(target)
+        assert len(labels) == order
+        np.testing.assert_array_equal(labels[0], np.arange(target.rows * target.columns))
+        nominal = target.nominal_mm(target.ids())[:, :2]
+        centred = nominal - nominal.mean(0)
+        for k, label in enumerate(labels):
+            angle = 2 * np.pi * k / order
+            spin = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            places = centred @ spin.T
+            assert min(
+                np.abs(centred[label] - places).max(), np.abs(centred[label] - centred @ spin).max()
+            ) < 1e-9  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("target", [None, SQUARE], ids=["2-fold", "4-fold"])
+def test_images_turned_at_random(seed: int, target: Target | None, scene: Any) -> None:
+    changes = {} if target is None else {"target": target}
+    right = scene("symmetric", seed, **changes)
+    made, turn = turned(right, seed)
+    assert len(set(turn)) == len(turns(made.target))
+    calibration = made.calibrate("radial")
+    assert settled(calibration, made, right.dots["dot"]) != []
+    assert calibration.statistics["noise_floor_px"] == 0
+    assert calibration.statistics["share_kept"] > 0.995
+    assert any("numbered so that both cameras and all views agree" in n for n in calibration.notes)
+
+
+def test_outliers_do_not_confuse_the_turns(scene: Any) -> None:
+    right = scene("symmetric", 1, outlier_share=0.05)
+    made, _ = turned(right, 1)
+    calibration = made.calibrate("radial")
+    assert settled(calibration, made, right.dots["dot"]) != []
+    wrong = calibration.dots.sort_values(["view", "camera", "u_px", "v_px"])
+    weights = calibration.residuals.loc[wrong.index, "weight"].to_numpy()
+    order = made.dots.sort_values(["view", "camera", "u_px", "v_px"]).index.to_numpy()
+    np.testing.assert_array_equal(weights < 1, made.outlier[order])
+
+
+def test_one_camera(scene: Any) -> None:
+    right = scene("symmetric", 1)
+    mine = right.dots["camera"] == "left"
+    right = replace(
+        right, dots=right.dots[mine].reset_index(drop=True), cameras=right.cameras[:1],
+        nominal_rotvec_deg=None,
+    )  # fmt: skip
+    made, _ = turned(right, 2)
+    calibration = made.calibrate("radial")
+    assert settled(calibration, made, right.dots["dot"]) != []
+    assert calibration.statistics["noise_floor_px"] == 0
+
+
+def test_a_perfect_print_leaves_the_turns_undecided_but_harmless(scene: Any) -> None:
+    made, _ = turned(scene("symmetric", 1, print_factor=0.0), 1)
+    calibration = made.calibrate("radial")
+    assert made.space_rms_um(calibration) < 1.0
+    assert any("too small to tell the turns apart" in n for n in calibration.notes)
+
+
+def test_a_known_distance_that_a_turn_moves_is_trusted_less(scene: Any) -> None:
+    """On a square target nobody knows which diagonal was measured."""
+    made, _ = turned(scene("symmetric", 2, target=SQUARE), 2)
+    calibration = made.calibrate("radial")
+    assert any("may be that of another pair" in n for n in calibration.notes)
+    scale_sd = calibration.sd("left.scale_px_per_mm") / calibration.cameras[0]["scale_px_per_mm"]
+    error = calibration.cameras[0]["scale_px_per_mm"] / made.true_cameras["left"]["scale_px_per_mm"]
+    assert abs(error - 1) < 3 * scale_sd
+    oblong = scene("symmetric", 2).calibrate("radial")
+    assert not any("another pair" in n for n in oblong.notes)

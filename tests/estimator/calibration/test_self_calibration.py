@@ -1,0 +1,306 @@
+"""Self-calibration from tables of dots to a rig, against simulated truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.calibrate import nominal_cameras
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.io.simulation.simulate import simulate
+from telerig.rig.camera import Camera
+
+
+@pytest.fixture(scope="module")
+def paper(scene: Any) -> Any:
+    return scene("paper", 1)
+
+
+# --- what must work ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("preset", "model", "chosen", "limit_um"),
+    [
+        ("paper", "auto", {"radial"}, 1.0),
+        ("near_telecentric", "auto", {"kappa+radial", "kappa+tangential"}, 1.2),
+        ("scheimpflug", "auto", {"left=tilt+radial,right=affine+radial"}, 1.2),
+        ("symmetric", "radial", {"radial"}, 1.0),
+        ("two_sided", "radial", {"radial"}, 1.5),
+    ],
+)
+def test_presets(preset: str, model: str, chosen: set[str], limit_um: float, scene: Any) -> None:
+    made = scene(preset, 5)
+    calibration = made.calibrate(model)
+    assert calibration.verdict["status"] == "GOOD", calibration.report()
+    assert calibration.model["name"] in chosen
+    assert calibration.statistics["noise_floor_px"] == 0
+    assert 0.8 < calibration.statistics["chi2_dof"] < 1.2
+    assert calibration.statistics["share_kept"] > 0.99
+    assert made.space_rms_um(calibration) < limit_um
+    assert calibration.twin["decided_by"] == "nominal rotation"
+
+
+def test_through_the_files_of_the_simulator(tmp_path: Any) -> None:
+    dataset = simulate("paper", rng=np.random.default_rng(3), out=tmp_path / "set", images=False)
+    rig = dataset.rig
+    calibration = self_calibrate(
+        dataset.dots(),
+        nominal_cameras(rig),
+        dataset.target,
+        nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
+    )
+    truth = dataset.truth
+    assert truth is not None
+    for camera in calibration.cameras:
+        expected = truth["cameras"][camera.name]["parameters"]
+        sd = calibration.sd(f"{camera.name}.scale_px_per_mm")
+        assert abs(camera["scale_px_per_mm"] - expected["scale_px_per_mm"]) < 4 * sd
+        assert abs(camera["k1"] - expected["k1"]) < 4 * calibration.sd(f"{camera.name}.k1")
+    axis = np.array(truth["cameras"]["right"]["camera_from_rig"]["rotation"])[2]
+    s = calibration.statistics
+    off = s["axes_angle_deg"] - np.degrees(np.arccos(axis[2]))
+    assert abs(off) < 4 * s["axes_angle_sd_deg"]
+
+
+def test_unbounded_target(scene: Any) -> None:
+    """Every view shows another part of a grid without an edge."""
+    made = scene("unbounded", 2, views=5, margin_dots=1, shift_mm=(6.0, 6.0, 6.0))
+    calibration = made.calibrate("radial")
+    assert calibration.verdict["status"].startswith(("GOOD", "USABLE"))
+    assert made.space_rms_um(calibration) < 1.5
+
+
+def test_dense_target(scene: Any) -> None:
+    """400 dots, of which every third row and column is measured."""
+    made = scene("dense", 1, views=6)
+    made = made.changed(lambda d: d[(d["row"] % 3 == 2) & (d["column"] % 3 == 2)])
+    ends = made.target.id_from_row_column([5, 14], [5, 14])
+    truth = [made.true_dots_mm[int(e)] for e in ends]
+    target = replace(
+        made.target,
+        scale_dots=(int(ends[0]), int(ends[1])),
+        scale_distance_mm=float(np.linalg.norm(truth[0] - truth[1])),
+    )
+    calibration = replace(made, target=target).calibrate("tangential")
+    assert calibration.verdict["status"] == "GOOD", calibration.report()
+    assert made.space_rms_um(calibration) < 1.0
+
+
+def test_unknown_dots(paper: Any) -> None:
+    """Places good to 3 mm only: the shape of the target comes from the images."""
+    made = replace(paper, target=replace(paper.target, print_sigma_mm=3.0))
+    dots = made.dots.copy()
+    calibration = made.with_dots(dots).calibrate("radial")
+    assert calibration.verdict["status"] == "GOOD"
+    assert made.space_rms_um(calibration) < 1.0
+    truth = np.array([made.true_dots_mm[int(d)] for d in calibration.dot_ids])
+    offset = calibration.target_points_mm - truth
+    error = offset - offset.mean(0)
+    assert 1e3 * np.sqrt((error**2).mean()) < 2.0
+
+
+def test_unknown_dots_of_another_shape(paper: Any) -> None:
+    """The nominal table may be off by more than a millimetre: only its order matters."""
+    rng = np.random.default_rng(0)
+    ids = np.arange(15)
+    wrong = paper.target.nominal_mm(ids)[:, :2] + rng.normal(0, 1.5, (15, 2))
+    target = replace(paper.target, layout="points", points_mm=wrong, marks=(), print_sigma_mm=5.0)
+    calibration = replace(paper, target=target).calibrate("radial")
+    assert paper.space_rms_um(calibration) < 1.0
+
+
+def one_camera(scene: Any) -> Any:
+    mine = scene.dots["camera"] == "left"
+    return replace(
+        scene, dots=scene.dots[mine], cameras=scene.cameras[:1], nominal_rotvec_deg=None,
+        outlier=scene.outlier[mine.to_numpy()],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_one_camera(seed: int, scene: Any) -> None:
+    """The tilts' signs follow from the dots' relief: with wrong ones the floor is 0.1 px."""
+    made = one_camera(scene("paper", seed, outlier_share=0.03))
+    calibration = made.calibrate("radial")
+    s = calibration.statistics
+    assert s["noise_floor_px"] == 0
+    assert s["chi2_dof"] < 1.25
+    np.testing.assert_array_equal(made.weights(calibration) < 1, made.outlier)
+    left = calibration.cameras[0]
+    truth = made.true_cameras["left"]
+    assert abs(left["scale_px_per_mm"] - truth["scale_px_per_mm"]) < 4 * calibration.sd(
+        "left.scale_px_per_mm"
+    )
+    with pytest.raises(CalibrationError, match="one camera cannot triangulate"):
+        calibration.triangulate(np.zeros(2), np.zeros(2))
+
+
+def test_views_of_one_camera_only(scene: Any) -> None:
+    made = scene("paper", 3, single_camera_views=6)
+    calibration = made.calibrate("radial")
+    assert calibration.statistics["share_kept"] == 1
+    assert calibration.statistics["noise_floor_px"] == 0
+    assert made.space_rms_um(calibration) < 1.0
+    assert calibration.verdict["status"] == "USABLE, with warnings"
+    assert sum("gives no stereo" in n for n in calibration.notes) == 6
+
+
+@pytest.mark.parametrize("preset", ["paper", "near_telecentric"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_outliers(preset: str, seed: int, scene: Any) -> None:
+    """5 % of the dots are off by 20 px: all are found, no other is blamed."""
+    made = scene(preset, seed, outlier_share=0.05)
+    assert made.outlier.sum() > 10
+    model = "radial" if preset == "paper" else "kappa+radial"
+    calibration = made.calibrate(model)
+    np.testing.assert_array_equal(made.weights(calibration) < 1, made.outlier)
+    assert calibration.statistics["noise_floor_px"] == 0
+    assert made.space_rms_um(calibration) < 1.2
+    named = calibration.residuals.loc[calibration.residuals["weight"] < 1, "reason"]
+    assert named.str.contains("standard deviations").all()
+
+
+def test_the_user_says_how_far_off_a_dot_may_be(paper: Any) -> None:
+    """One dot 4 standard deviations away stays by default, and is left out at a limit of 3.4."""
+    sound = paper.calibrate("radial")
+    row = 40
+    sigma = np.sqrt(paper.dots["suu_px2"].iloc[row])
+    off = sound.residuals["du_px"].iloc[row]
+    moved = paper.changed(lambda d: _shifted(d, row, 4.6 * sigma * np.sign(off) - off))
+    usual, strict = moved.calibrate("radial"), moved.calibrate("radial", outlier_sd=3.4)
+    left = strict.residuals[strict.residuals["weight"] < 1]
+    assert (usual.residuals["weight"] == 1).all()
+    assert left.index.tolist() == [row]
+    assert "limit 3.4" in left["reason"].iloc[0]
+    for wrong in (2.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="cannot be told as outliers"):
+            paper.calibrate("radial", outlier_sd=wrong)
+
+
+def _shifted(dots: pd.DataFrame, row: int, by_px: float) -> pd.DataFrame:
+    dots.iloc[row, dots.columns.get_loc("u_px")] += by_px
+    return dots
+
+
+def test_a_fifth_of_outliers_is_found_but_rejected(scene: Any) -> None:
+    made = scene("paper", 1, outlier_share=0.2)
+    calibration = made.calibrate("radial")
+    np.testing.assert_array_equal(made.weights(calibration) < 1, made.outlier)
+    assert calibration.verdict["status"] == "REJECTED"
+    assert "of the dots agree" in calibration.verdict["reasons"][0]
+    assert made.space_rms_um(calibration) < 1.0
+
+
+def test_it_is_deterministic(paper: Any) -> None:
+    a, b = (paper.calibrate("auto") for _ in range(2))
+    shuffled = paper.changed(lambda d: d.sample(frac=1, random_state=1)).calibrate("auto")
+    for other in (b, shuffled):
+        for x, y in zip(a.cameras, other.cameras):
+            np.testing.assert_array_equal(x.intrinsics, y.intrinsics)
+        np.testing.assert_array_equal(a.joint_covariance, other.joint_covariance)
+        assert a.report() == other.report()
+
+
+def test_the_start_does_not_need_the_nominal_scale(paper: Any) -> None:
+    far = [Camera.create(c.name, c.image_size_px, 14.0, rho_mm=c.rho_mm) for c in paper.cameras]
+    calibration = replace(paper, cameras=far).calibrate("radial")
+    assert paper.space_rms_um(calibration) < 1.0
+
+
+@pytest.mark.parametrize("dots_free", ["3d", "plane", "nominal"])
+def test_what_dots_may_do(dots_free: str, scene: Any) -> None:
+    """20 um off in the plane and out of it: held dots show in the residuals and in space."""
+    made = scene("paper", 2)
+    calibration = made.calibrate("radial", dots_free=dots_free)
+    error = made.space_rms_um(calibration)
+    assert (error > 2.0) == (dots_free == "nominal")
+    assert (calibration.statistics["noise_floor_px"] > 0.03) == (dots_free != "3d")
+
+
+# --- the mirror twin --------------------------------------------------------------------------
+
+
+def test_both_twins_cost_the_same_and_are_shown(paper: Any) -> None:
+    calibration = paper.calibrate("radial")
+    twin = calibration.twin
+    assert twin["cost"] == pytest.approx(twin["other_cost"], rel=1e-6)
+    assert "0.9 degrees from the kept twin, 179" in twin["words"]
+    assert "mirror twin" in calibration.report()
+
+
+def test_the_nominal_side_decides(paper: Any) -> None:
+    right, wrong = (paper.calibrate("radial", nominal_rotvec_deg=(0, a, 0)) for a in (70.0, -70.0))
+    assert right.statistics["cost"] == pytest.approx(wrong.statistics["cost"], rel=1e-9)
+    points = np.random.default_rng(0).uniform(-10, 10, (50, 3))
+    pixels = [right.project(c, points) for c in (0, 1)]
+    mirrored = wrong.triangulate(*pixels).points_mm
+    np.testing.assert_allclose(mirrored, points * [1, 1, -1], atol=1e-6)
+
+
+@pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.0, 180.0, 0.0), (90.0, 0.0, 0.0)])
+def test_a_tie_is_an_error(rotvec: Any, paper: Any) -> None:
+    with pytest.raises(CalibrationError, match=r"mirror twins are \d+ and \d+ degrees.*too alike"):
+        paper.calibrate("radial", nominal_rotvec_deg=rotvec)
+
+
+def test_no_nominal_rotation_is_an_error(paper: Any) -> None:
+    with pytest.raises(CalibrationError, match="nothing says on which side"):
+        paper.calibrate("radial", nominal_rotvec_deg=None)
+
+
+def test_the_plate_of_a_two_sided_target_decides(scene: Any) -> None:
+    made = scene("two_sided", 1, outlier_share=0.03)
+    alone = made.calibrate("radial", nominal_rotvec_deg=None)
+    assert alone.twin["decided_by"] == "refraction in the plate"
+    assert made.space_rms_um(alone) < 1.5
+    with pytest.raises(CalibrationError, match="refraction in the two-sided plate"):
+        made.calibrate("radial", nominal_rotvec_deg=(0, -150, 0))
+
+
+def test_strong_perspective_decides_and_contradicts(scene: Any) -> None:
+    """Lenses of 400 mm working distance: farther is smaller, in one of the twins only."""
+    made = scene("paper", 2)
+    cameras = []
+    for c in made.true_cameras.values():
+        cameras.append(c.with_parameters(kappa_per_mm=1 / 400, k1=0.0))
+    rows = []
+    for name, view in made.true_views.items():
+        for camera in cameras:
+            ids = np.array(list(made.true_dots_mm))
+            points = view.rig_from_target.apply(np.array(list(made.true_dots_mm.values())))
+            uv = camera.project(points)
+            rows.append(pd.DataFrame({"view": name, "camera": camera.name, "dot": ids,
+                                      "u_px": uv[:, 0], "v_px": uv[:, 1]}))  # fmt: skip
+    dots = pd.concat(rows, ignore_index=True)
+    rng = np.random.default_rng(1)
+    dots[["u_px", "v_px"]] += 0.01 * rng.standard_normal((len(dots), 2))
+    dots = dots.assign(suu_px2=1e-4, svv_px2=1e-4, suv_px2=0.0)
+    lens = made.with_dots(dots)
+    calibration = lens.calibrate("auto", nominal_rotvec_deg=None)
+    assert calibration.twin["decided_by"] == "perspective"
+    assert calibration.twin["other_cost"] == pytest.approx(calibration.twin["cost"], rel=0.05)
+    truth = {c.name: c for c in cameras}
+    assert replace(lens, true_cameras=truth).space_rms_um(calibration) < 1.5
+    with pytest.raises(CalibrationError, match="perspective of the lenses"):
+        lens.calibrate("auto", nominal_rotvec_deg=(0, -90, 0))
+    telecentric = lens.calibrate("radial")
+    assert telecentric.verdict["status"] == "REJECTED"
+    assert any("does not describe" in r for r in telecentric.verdict["reasons"])
+
+
+def test_outliers_leave_no_trace_in_the_dots_eccentricity(scene: Any) -> None:
+    """The correction comes from a fit of its own, which must not see them either."""
+    made = scene("paper", 3, outlier_share=0.05)
+    sound = made.with_dots(made.dots[~made.outlier])
+    found, expected = made.calibrate("auto"), sound.calibrate("auto")
+    for camera in ("left", "right"):
+        for name in ("scale_px_per_mm", "k1"):
+            key = f"{camera}.{name}"
+            pair = [next(c for c in k.cameras if c.name == camera)[name] for k in (found, expected)]
+            assert abs(pair[0] - pair[1]) < 0.2 * expected.sd(key), key

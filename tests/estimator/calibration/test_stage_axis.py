@@ -1,0 +1,188 @@
+"""Travel axis and encoder scale from views of a static target, against truth and Monte Carlo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.stage.fit import Dots, State, derivatives
+from telerig.estimator.calibration.stage.stage_axis import StageAxis, stage_axis_of
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+
+AXIS = np.array([0.03, -0.999, 0.02]) / np.linalg.norm([0.03, -0.999, 0.02])
+READINGS = np.linspace(-15.0, 15.0, 11)
+SIGMA_PX = 0.02
+TARGET = Pose(rotation_from_rotvec([0.2, -0.75, 0.1]), np.array([1.0, -2.0, 3.0]))
+PLACES = np.array([[7.0 * c - 14, 7.0 * r - 7, 0.0] for r in range(3) for c in range(5)])
+
+
+def calibration_of(**lens: float) -> Calibration:
+    angle = np.deg2rad(80.0)
+    turn = rotation_from_rotvec([0.0, angle, 0.0])
+    size = (900, 900)
+    pair = (
+        Camera.create("left", size, 10.0, **lens),
+        Camera.create("right", size, 10.2, camera_from_rig=Pose(turn, np.zeros(3)), **lens),
+    )
+    return Calibration(
+        pair, np.arange(15), PLACES, {}, np.zeros((6, 6)), ("",) * 6, ((), ()), "test"
+    )
+
+
+CALIBRATION = calibration_of()
+
+
+def views(
+    rng: np.random.Generator,
+    *,
+    calibration: Calibration = CALIBRATION,
+    scale: float = 0.01,
+    sigma_px: float = SIGMA_PX,
+    reading_sigma_mm: float = 0.001,
+    wander_mm: float = 0.0,
+) -> tuple[pd.DataFrame, dict[str, float]]:
+    """Dots at each stop: travel = reading / (1 + scale), errors of the carriage added."""
+    parts, positions = [], {}
+    for v, stop in enumerate(READINGS):
+        travel = stop / (1 + scale)
+        wander = wander_mm * rng.standard_normal(3)
+        place = travel * AXIS + wander - AXIS * (AXIS @ wander)
+        positions[f"v{v}"] = stop + reading_sigma_mm * rng.standard_normal()
+        points = TARGET.apply(PLACES) - place
+        for camera in calibration.cameras:
+            uv = camera.project(points) + sigma_px * rng.standard_normal((len(points), 2))
+            parts.append(
+                pd.DataFrame({"view": f"v{v}", "camera": camera.name, "dot": np.arange(15),
+                              "u_px": uv[:, 0], "v_px": uv[:, 1], "sigma_px": sigma_px or 0.02})
+            )  # fmt: skip
+    return pd.concat(parts, ignore_index=True), positions
+
+
+def tangent_error(found: StageAxis) -> Any:
+    """(3,) axis in the found tangent basis, and scale: truth 1 %."""
+    return np.array([*(found.basis.T @ AXIS), 0.01 - found.scale])
+
+
+@pytest.mark.parametrize("lens", [{}, {"kappa_per_mm": 1e-3, "k1": -3e-3}])
+def test_exact_without_noise(lens: dict[str, float]) -> None:
+    calibration = calibration_of(**lens)
+    table, positions = views(
+        np.random.default_rng(1), calibration=calibration, sigma_px=0.0, reading_sigma_mm=0.0
+    )
+    found = stage_axis_of(calibration, table, positions)
+    np.testing.assert_allclose(found.axis_rig, AXIS, atol=1e-10)
+    assert found.scale == pytest.approx(0.01, abs=1e-10)
+    np.testing.assert_allclose(found.rig_from_target.rotation, TARGET.rotation, atol=1e-9)
+    np.testing.assert_allclose(found.rig_from_target.translation_mm, [1, -2, 3], atol=1e-8)
+    np.testing.assert_allclose(found.basis.T @ np.c_[found.basis, AXIS], np.eye(2, 3), atol=1e-9)
+
+
+def test_a_scale_error_of_one_percent_is_found_to_100_ppm() -> None:
+    for seed in range(20):
+        found = stage_axis_of(CALIBRATION, *views(np.random.default_rng(seed)))
+        assert found.scale == pytest.approx(0.01, abs=1e-4)
+        assert found.scale_sd < 5e-5
+        assert 0.6 < found.chi2_dof < 1.5
+
+
+def test_covariance_equals_the_monte_carlo_spread() -> None:
+    """100 draws: squared errors over the stated covariance are chi-square with 3 degrees."""
+    rng = np.random.default_rng(5)
+    found = [stage_axis_of(CALIBRATION, *views(rng)) for _ in range(100)]
+    errors = np.array([tangent_error(f) for f in found])
+    scores = [e @ np.linalg.solve(f.joint_covariance, e) for e, f in zip(errors, found)]
+    assert np.mean(scores) == pytest.approx(3.0, abs=4 * np.sqrt(6 / 100))
+    assert np.std(errors[:, 2]) == pytest.approx(found[0].scale_sd, rel=0.25)
+    assert found[0].scale_sd == pytest.approx(np.sqrt(found[0].joint_covariance[2, 2]))
+
+
+def test_the_calibrations_uncertainty_is_carried_in() -> None:
+    """Scales known to 1e-3 of both cameras, alike, make the travel and so the scale uncertain."""
+    unsure = replace(
+        CALIBRATION,
+        free=(("scale_px_per_mm",), ("scale_px_per_mm",)),
+        covariance=np.zeros((8, 8)),
+    )
+    both = np.array([10.0, 10.2]) * 1e-3
+    unsure.covariance[:2, :2] = np.outer(both, both)
+    table, positions = views(np.random.default_rng(2))
+    sure = stage_axis_of(CALIBRATION, table, positions)
+    found = stage_axis_of(unsure, table, positions)
+    assert np.sqrt(found.scale_sd**2 - sure.scale_sd**2) == pytest.approx(1.01e-3, rel=0.02)
+    assert found.scale == sure.scale
+
+
+def test_outliers_and_a_wrong_reading() -> None:
+    table, positions = views(np.random.default_rng(3))
+    clean = stage_axis_of(CALIBRATION, table, positions)
+    rng = np.random.default_rng(4)
+    hit = rng.choice(len(table), 10, replace=False)
+    table.loc[hit, "u_px"] += 15.0
+    positions["v5"] += 0.5
+    found = stage_axis_of(CALIBRATION, table, positions)
+    assert found.scale == pytest.approx(0.01, abs=1.5e-4)
+    assert abs(found.scale - clean.scale) < 4 * clean.scale_sd
+    words = " ".join(found.words)
+    assert "of view v5 is off by 0.49" in words
+    assert "10 of 330 dots" in words
+
+
+def test_a_stage_that_wanders_says_so() -> None:
+    """5 um across and 5 um in the reading, 1 um stated: the covariance grows to cover it."""
+    rng = np.random.default_rng(6)
+    scores, told = [], 0
+    for _ in range(40):
+        table, positions = views(rng, reading_sigma_mm=0.005, wander_mm=0.005)
+        found = stage_axis_of(CALIBRATION, table, positions)
+        error = tangent_error(found)
+        scores.append(error @ np.linalg.solve(found.joint_covariance, error))
+        told += any("wanders" in w for w in found.words)
+    assert told > 33
+    assert np.median(scores) < 5.0
+
+
+def test_jacobian_by_differences() -> None:
+    calibration = calibration_of(kappa_per_mm=1e-3, k1=-3e-3)
+    view = np.repeat([0, 1], 15)
+    dots = Dots(("a", "b"), np.array([-7.0, 9.0]), view, view, np.tile(PLACES, (2, 1)),
+                np.zeros((30, 2)), np.tile(np.eye(2), (30, 1, 1)))  # fmt: skip
+    state = State(TARGET, AXIS / 1.01)
+
+    def predicted(x: Any) -> Any:
+        moved = TARGET @ Pose(rotation_from_rotvec(x[:3]), x[3:6])
+        at = State(moved, state.slope + x[6:])
+        return -derivatives(calibration.cameras, ((), ()), dots, at)[0]
+
+    _, _, analytic, _ = derivatives(calibration.cameras, ((), ()), dots, state)
+    for k in range(9):
+        step = np.eye(9)[k] * 1e-5
+        numeric = (predicted(step) - predicted(-step)) / 2e-5
+        np.testing.assert_allclose(analytic[..., k], numeric, atol=2e-6)
+
+
+def test_what_cannot_be_used() -> None:
+    table, positions = views(np.random.default_rng(1))
+    with pytest.raises(InputError, match="view 'v3' has no position"):
+        stage_axis_of(CALIBRATION, table, {k: v for k, v in positions.items() if k != "v3"})
+    with pytest.raises(InputError, match="did you mean left"):
+        stage_axis_of(CALIBRATION, table.replace({"camera": {"left": "lefd"}}), positions)
+    with pytest.raises(CalibrationError, match="one camera"):
+        stage_axis_of(CALIBRATION, table[table["camera"] == "left"], positions)
+    with pytest.raises(CalibrationError, match="no travel"):
+        stage_axis_of(CALIBRATION, table[table["view"] == "v3"], positions)
+    twice = pd.DataFrame({"view": ["v1", "v1"], "position_mm": [0.0, 1.0]})
+    with pytest.raises(InputError, match="two positions"):
+        stage_axis_of(CALIBRATION, table, twice)
+    with pytest.raises(InputError, match="not finite"):
+        stage_axis_of(CALIBRATION, table, positions | {"v2": np.nan})
+    extra = pd.concat([table, table.iloc[:4].assign(dot=77)])
+    assert "4 dots are not in the calibration: not used" in (
+        stage_axis_of(CALIBRATION, extra, positions).words
+    )

@@ -1,0 +1,127 @@
+"""`stage_axis/` of a dataset: dots.csv, images, and what is wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+
+import telerig
+from telerig.errors import InputError
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.stage.input import stage_axis_from
+from telerig.io.dataset.dataset import Dataset
+from telerig.io.rig_file.description import StageDescription
+from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
+from telerig.io.simulation.calibration.scene import true_cameras, true_target
+from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.simulate import view_image
+from telerig.rig.pose import Pose, rotation_from_rotvec
+
+AXIS = np.array([0.01, -1.0, 0.02]) / np.linalg.norm([0.01, -1.0, 0.02])
+TURN = rotation_from_rotvec([0.1, -0.7, 0.05])
+POSE = Pose(TURN, np.array([0.5, -1.0, 2.0]) - TURN @ [14.0, 7.0, 0.0])
+STOPS = {"low": -5.0, "middle": 0.0, "high": 5.0, "top": 8.0}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    config = run_preset("rise", frames=3)
+    config = replace(config, calibration=replace(config.calibration, views=2))
+    telerig.simulate(config, rng=np.random.default_rng(1), out=tmp_path / "d", images=False)
+    (tmp_path / "d" / "stage_axis").mkdir()
+    rows = pd.DataFrame({"view": list(STOPS), "position_mm": list(STOPS.values())})
+    rows.to_csv(tmp_path / "d" / "stage_axis" / "positions.csv", index=False)
+    return tmp_path / "d"
+
+
+def calibration(dataset: Dataset) -> Calibration:
+    """True cameras and the nominal target."""
+    cameras = list(true_cameras(run_preset("rise").calibration).values())
+    ids = dataset.target.ids()
+    return replace(
+        calibration_from_cameras(cameras, name="truth"),
+        dot_ids=ids,
+        target_points_mm=dataset.target.nominal_mm(ids),
+    )
+
+
+def dots(dataset: Dataset) -> pd.DataFrame:
+    parts = []
+    for view, stop in STOPS.items():
+        points = POSE.apply(dataset.target.nominal_mm(dataset.target.ids())) - AXIS * stop / 1.01
+        for camera in calibration(dataset).cameras:
+            uv = camera.project(points)
+            parts.append(
+                pd.DataFrame(
+                    {"view": view, "camera": camera.name, "dot": dataset.target.ids(),
+                     "u_px": uv[:, 0], "v_px": uv[:, 1], "sigma_px": 0.02}
+                )
+            )  # fmt: skip
+    return pd.concat(parts)
+
+
+def test_dots_and_positions(folder: Path) -> None:
+    dataset = telerig.load_dataset(folder)
+    dots(dataset).to_csv(folder / "stage_axis" / "dots.csv", index=False)
+    found = stage_axis_from(dataset, calibration(dataset))
+    assert found is not None
+    np.testing.assert_allclose(found.axis_rig, AXIS, atol=1e-9)
+    assert found.scale == pytest.approx(0.01, abs=1e-9)
+    assert not any("rig.toml" in w for w in found.words)
+
+
+def test_images(folder: Path) -> None:
+    """Rendered with noise: the dots are detected, and the scale found within its error."""
+    rng = np.random.default_rng(2)
+    dataset = telerig.load_dataset(folder)
+    config = replace(run_preset("rise").calibration, print_factor=0.0)
+    target = true_target(config, rng)
+    known = calibration(dataset)
+    for camera in known.cameras:
+        (folder / "stage_axis" / camera.name).mkdir()
+        for view, stop in STOPS.items():
+            pose = Pose(POSE.rotation, POSE.translation_mm - AXIS * stop / 1.01)
+            image = view_image(config, camera, target, pose, rng)
+            tifffile.imwrite(folder / "stage_axis" / camera.name / f"{view}.tif", image)
+    found = stage_axis_from(dataset, known)
+    assert found is not None
+    assert found.scale == pytest.approx(0.01, abs=max(4 * found.scale_sd, 1e-4))
+    assert found.scale_sd < 3e-4
+    np.testing.assert_allclose(found.axis_rig, AXIS, atol=1e-3)
+
+
+def test_a_stage_that_runs_the_other_way(folder: Path) -> None:
+    rig = read_rig_toml(folder / "rig.toml")
+    stage = StageDescription((0, 1, 0), (0, -1, 0), 0.001)
+    write_rig_toml(replace(rig, stage=stage), folder / "rig.toml")
+    dataset = telerig.load_dataset(folder)
+    dots(dataset).to_csv(folder / "stage_axis" / "dots.csv", index=False)
+    found = stage_axis_from(dataset, calibration(dataset))
+    assert found is not None
+    assert any("turn its sign" in w for w in found.words)
+
+
+def test_no_folder_no_stage_axis(folder: Path) -> None:
+    (folder / "stage_axis").rename(folder / "elsewhere")
+    dataset = telerig.load_dataset(folder)
+    assert stage_axis_from(dataset, calibration(dataset)) is None
+
+
+def test_what_is_missing(folder: Path) -> None:
+    dataset = telerig.load_dataset(folder)
+    with pytest.raises(InputError, match="neither images nor dots"):
+        stage_axis_from(dataset, calibration(dataset))
+    dots(dataset).to_csv(folder / "stage_axis" / "dots.csv", index=False)
+    (folder / "stage_axis" / "left").mkdir()
+    tifffile.imwrite(folder / "stage_axis" / "left" / "low.tif", np.zeros((512, 512), np.uint8))
+    with pytest.raises(InputError, match="both images and dots"):
+        stage_axis_from(dataset, calibration(dataset))
+    (folder / "stage_axis" / "positions.csv").unlink()
+    with pytest.raises(InputError, match=r"no positions\.csv"):
+        stage_axis_from(dataset, calibration(dataset))

@@ -1,0 +1,217 @@
+"""Can the covariance be believed? Two calibrations, two halves, structure in residuals, maps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.quality.comparison import _chance, compare_calibrations
+from telerig.estimator.calibration.quality.residual_tests import residual_tests
+from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
+
+STILL = range(10, 20)
+
+
+@pytest.fixture(scope="module")
+def at_rest(scene: Any) -> list[Any]:
+    """Calibrations of one rig that did not move, by other targets and views."""
+    return [scene("paper", seed).calibrate() for seed in STILL]
+
+
+def test_a_rig_at_rest_has_not_moved(at_rest: list[Any]) -> None:
+    found = [compare_calibrations(a, b) for a, b in zip(at_rest[0::2], at_rest[1::2])]
+    assert not any(c.moved or c.differs for c in found)
+    deviations = np.array([[q.deviations for q in c.changes] for c in found])
+    assert 0.6 < np.sqrt(np.mean(deviations**2)) < 1.5
+    ratio = [c.field.rms_um / c.field.predicted_um for c in found]
+    assert 0.4 < np.sqrt(np.mean(np.square(ratio))) < 1.6
+    assert "no movement" in found[0].words()
+    assert found[0].as_dict()["verdict"] == "SAME"
+
+
+def test_a_movement_is_found_with_its_size(scene: Any, at_rest: list[Any]) -> None:
+    """The second camera turned by 300 urad about the rig's z axis, and shifted by 12 um."""
+    after = scene(
+        "paper", 40, axis_gap_mm=0.312, mount_rotvec_deg=(0.4 + np.degrees(3e-4), -0.7, 0.5)
+    ).calibrate()
+    found = compare_calibrations(at_rest[0], after)
+    assert found.moved
+    assert found.as_dict()["verdict"] == "MOVED"
+    turn = np.array([q.change for q in found.changes[:3]])
+    sd = np.array([q.sd for q in found.changes[:3]])
+    before, now = (c.cameras[1].camera_from_rig.rotation for c in (at_rest[0], after))
+    assert np.linalg.norm(turn) == pytest.approx(
+        1e6 * np.arccos((np.trace(before.T @ now) - 1) / 2), rel=1e-3
+    )
+    assert np.all(np.abs(turn - [0.0, 0.0, -300.0]) < 4.5 * sd + 5.0)
+    shift = found.changes[3]
+    assert abs(abs(shift.change) - 12.0) < 4 * shift.sd
+    assert "the rig moved: 1" in found.words()
+
+
+def test_chance_does_not_judge_what_the_second_order_fills() -> None:
+    """A direction ten thousand times better known than the largest error is no evidence."""
+    root = np.diag([1.0, 0.2, 1e-4])
+    assert _chance(np.array([0.5, 0.1, 0.01]), root) > 0.3
+    assert _chance(np.array([0.5, 1.1, 0.01]), root) < 1e-3
+
+
+def test_a_calibration_beside_itself_says_nothing_of_the_rig(at_rest: list[Any]) -> None:
+    assert "same views" in compare_calibrations(at_rest[0], at_rest[0]).words()
+
+
+def test_exchanged_cameras_and_other_lenses_are_named(scene: Any, at_rest: list[Any]) -> None:
+    made = scene("paper", 41)
+    names = made.dots["camera"].map({"left": "right", "right": "left"})
+    exchanged = made.with_dots(made.dots.assign(camera=names)).calibrate()
+    assert "exchanged" in compare_calibrations(at_rest[0], exchanged).words()
+    larger = at_rest[1].cameras[0]["scale_px_per_mm"] * 1.001
+    zoomed = at_rest[1].cameras[0].with_parameters(scale_px_per_mm=larger)
+    after = replace(at_rest[1], cameras=(zoomed, at_rest[1].cameras[1]))
+    words = compare_calibrations(at_rest[0], after).words()
+    assert "the magnification changed" in words and "scale of camera left" in words
+    assert "exchanged" not in words
+
+
+def test_media_that_differ_are_said(at_rest: list[Any]) -> None:
+    wet = replace(at_rest[1], medium="water")
+    assert "earlier one was made in air, this one in the water" in (
+        compare_calibrations(at_rest[0], wet).words()
+    )
+
+
+def test_other_rigs_are_refused(at_rest: list[Any], scene: Any) -> None:
+    one = at_rest[0]
+    renamed = replace(one, cameras=(one.cameras[0], replace(one.cameras[1], name="top")))
+    with pytest.raises(InputError, match=r"different rigs.*right 512x512.*top 512x512"):
+        compare_calibrations(one, renamed)
+    turned = replace(one, cameras=one.cameras[::-1])
+    with pytest.raises(InputError, match=r"same order in rig\.toml"):
+        compare_calibrations(one, turned)
+    alone = replace(one, cameras=one.cameras[:1])
+    with pytest.raises(InputError, match="one camera"):
+        compare_calibrations(alone, alone)
+
+
+def test_halves_agree_when_the_model_is_right(at_rest: list[Any]) -> None:
+    found = [c.diagnostics["halves"] for c in at_rest]
+    ratio = [h["rms_um"] / h["predicted_um"] for h in found]
+    assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.5
+    assert sum(h["agree"] for h in found) >= len(found) - 1
+    assert found[0]["views"] == [6, 6]
+    assert np.shape(found[0]["points_mm"]) == np.shape(found[0]["shift_um"])
+
+
+def test_halves_know_that_the_targets_size_is_common_to_both(scene: Any) -> None:
+    """The pitch alone sets the scale: a print error of 20 um that no half can see as its own."""
+    ratio = []
+    for seed in range(30, 34):
+        made = scene("paper", seed)
+        target = replace(made.target, scale_dots=None, scale_distance_mm=None)
+        halves = replace(made, target=target).calibrate().diagnostics["halves"]
+        ratio.append(halves["rms_um"] / halves["predicted_um"])
+    assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.6
+
+
+def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:
+    """Distortion of half a pixel at the corner, calibrated without."""
+    found = scene("dense", 3, sigma_px=0.02, views=8).calibrate("none")
+    assert not found.diagnostics["halves"]["agree"]
+    structure = found.diagnostics["structure"]
+    assert not structure["sound"]
+    assert any("the lens model lacks a term" in words for words in structure["words"])
+    assert "! two halves" in found.report()
+
+
+def test_halves_need_views(scene: Any) -> None:
+    few = scene("paper", 1, views=7).calibrate()
+    assert "7 views are too few" in few.diagnostics["halves"]["words"]
+
+
+def _structure(problem: Any, residuals: Any) -> dict[str, Any]:
+    leverage = np.full((len(residuals), 2, 2), 0.0)
+    return residual_tests(problem, residuals, leverage)
+
+
+class _Dots:
+    """Twelve images of 40 dots each, in two cameras."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        count = 12 * 2 * 40
+        self.view = np.repeat(np.arange(12), 80)
+        self.camera = np.tile(np.repeat([0, 1], 40), 12)
+        self.uv_px = rng.uniform(0, 511, (count, 2))
+        self.views = tuple(f"v{i}" for i in range(12))
+        self.cameras = [_Camera("left"), _Camera("right")]
+
+    def observations(self) -> Any:
+        return self
+
+
+class _Camera:
+    image_size_px = (512, 512)
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
+def test_noise_has_no_structure() -> None:
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(40):
+        dots = _Dots(rng)
+        found.append(_structure(dots, rng.standard_normal((960, 2))))
+    assert sum(not f["sound"] for f in found) <= 1
+    chances = np.array([t["p_value"] for f in found for t in f["tests"] if t["name"] != "view"])
+    assert 0.35 < np.mean(chances < 0.5) < 0.65
+    assert np.mean(chances < 0.05) < 0.09
+
+
+def test_each_structure_is_named() -> None:
+    rng = np.random.default_rng(1)
+    dots = _Dots(rng)
+    noise = rng.standard_normal((960, 2))
+    left = dots.camera == 0
+
+    region = noise + 2.0 * ((dots.uv_px[:, :1] < 120) & left[:, None])
+    assert "row" in _only(_structure(dots, region), "region", "left")
+    direction = np.where(left[:, None], noise * [1.6, 1.0], noise)
+    assert "along" in _only(_structure(dots, direction), "direction", "left")
+    view = noise * np.where((dots.view == 4) & left, 2.0, 1.0)[:, None]
+    assert "'v4'" in _only(_structure(dots, view), "view", "left")
+    wave = np.stack([np.sin(dots.uv_px[:, 0] / 30 + dots.view), np.cos(dots.uv_px[:, 1] / 30)], -1)
+    together = noise + 1.5 * wave * left[:, None]
+    assert "neighbouring" in _only(_structure(dots, together), "neighbours", "left")
+
+
+def _only(found: dict[str, Any], name: str, camera: str) -> str:
+    """The words of that test, which objects; the other camera is sound."""
+    assert not found["sound"]
+    limit = 1e-3 / len(found["tests"])
+    objecting = [t for t in found["tests"] if t["p_value"] < limit]
+    assert {t["camera"] for t in objecting} == {camera}
+    (mine,) = [t for t in objecting if t["name"] == name]
+    return str(mine["words"])
+
+
+def test_the_map_is_the_scatter_of_triangulated_points(at_rest: list[Any]) -> None:
+    """Measurement: Monte-Carlo over pixels. Calibration: over rigs drawn from its covariance."""
+    calibration, rng = at_rest[0], np.random.default_rng(3)
+    found = uncertainty_map(calibration, sigma_px=0.05, steps=3)
+    point = found.points_mm[[0]]
+    pixels = [calibration.project(c, point) for c in (0, 1)]
+    noisy = [p + 0.05 * rng.standard_normal((4000, 2)) for p in pixels]
+    points = calibration.triangulate(*noisy, sigma_px=0.05).points_mm
+    assert np.allclose(np.cov(points.T), found.measurement_mm2[0], atol=0.08 * 0.005**2)
+    whole = calibration.triangulate(*pixels, sigma_px=0.05).covariance_mm2[0]
+    assert np.allclose(found.calibration_mm2[0] + found.measurement_mm2[0], whole, rtol=1e-9)
+
+
+def test_the_map_needs_two_cameras(at_rest: list[Any]) -> None:
+    one = at_rest[0]
+    with pytest.raises(CalibrationError, match="no camera 1"):
+        uncertainty_map(replace(one, cameras=one.cameras[:1]))

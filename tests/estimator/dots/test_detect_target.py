@@ -1,0 +1,147 @@
+"""From images to numbered dots: drawn plates with known truth, and real printed ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from places import REAL
+from scipy.ndimage import gaussian_filter
+
+from telerig.errors import DetectionError, InputError
+from telerig.estimator.dots.detect_target import MEASURED, detect_target, find_target
+from telerig.rig.target import Target
+
+Array = NDArray[np.float64]
+
+PLATE = REAL / "dic_stereo_dots"
+
+DESIGN = Target(
+    rows=3,
+    columns=5,
+    pitch_mm=(7.0, 7.0),
+    dot_diameter_mm=2.4,
+    marks=((1, 2), (1, 3), (0, 2)),
+    mark_diameter_mm=3.6,
+)
+RING = replace(DESIGN, mark_style="ring", mark_diameter_mm=None)
+PRINTED = Target(
+    rows=8,
+    columns=10,
+    pitch_mm=(3.5, 3.5),
+    dot_diameter_mm=1.35,
+    polarity="black_on_white",
+    marks=((0, 0), (0, 5), (3, 0)),
+    mark_style="ring",
+    extent="unbounded",
+)
+
+
+def pixel_from_mm(scale: float, tilt_deg: float, roll_deg: float, mirrored: bool) -> Array:
+    """(2, 2) affine part of a telecentric view."""
+    r, t = np.deg2rad([roll_deg, tilt_deg])
+    turn = np.array([[np.cos(r), -np.sin(r)], [np.sin(r), np.cos(r)]])
+    return scale * np.diag([1.0, np.cos(t)]) @ turn @ np.diag([-1.0 if mirrored else 1.0, 1.0])
+
+
+def draw(
+    target: Target, affine: Array, size_px: int = 480, seed: int = 0
+) -> tuple[NDArray[np.uint8], Array]:
+    """An 8-bit image of the target, and the true centre (N, 2) of each dot, by supersampling."""
+    ids = target.ids()
+    xy = target.nominal_mm(ids)[:, :2]
+    offset = (size_px - 1) / 2 - affine @ xy.mean(0)
+    step = (np.arange(size_px * 4) + 0.5) / 4 - 0.5
+    uv = np.stack(np.meshgrid(step, step), -1)
+    places = (uv - offset) @ np.linalg.inv(affine).T
+    column = np.clip(np.round(places[..., 0] / target.pitch_mm[0]), 0, target.columns - 1)
+    row = np.clip(np.round(places[..., 1] / target.pitch_mm[1]), 0, target.rows - 1)
+    nearest = (row * target.columns + column).astype(int)
+    away = np.linalg.norm(places - target.nominal_mm(nearest)[..., :2], axis=-1)
+    inside = away < target.diameter_mm(nearest) / 2
+    if target.mark_style == "ring":
+        inside &= ~(target.is_mark(nearest) & (away < target.dot_diameter_mm / 5))
+    cover = gaussian_filter(inside.reshape(size_px, 4, size_px, 4).mean((1, 3)), 0.8)
+    if target.polarity == "black_on_white":
+        cover = 1 - cover
+    noise = np.random.default_rng(seed).normal(0, 1.5, cover.shape)
+    return np.clip(30 + 180 * cover + noise, 0, 255).astype(np.uint8), xy @ affine.T + offset
+
+
+@pytest.mark.parametrize(
+    ("target", "tilt_deg", "roll_deg", "mirrored"),
+    [
+        (DESIGN, 0, 5, False),
+        (DESIGN, 65, 290, False),
+        (RING, 50, 130, True),
+        (replace(DESIGN, polarity="black_on_white"), 35, 200, True),
+    ],
+)
+def test_drawn_plates_are_numbered_at_their_centres(
+    target: Target, tilt_deg: float, roll_deg: float, mirrored: bool
+) -> None:
+    image, centres = draw(target, pixel_from_mm(12.0, tilt_deg, roll_deg, mirrored))
+    found = find_target(image, target)
+    assert found.table["dot"].tolist() == list(range(15))
+    np.testing.assert_allclose(found.table[["u_px", "v_px"]], centres, atol=0.1)
+    np.testing.assert_array_equal(found.table["row"] * 5 + found.table["column"], np.arange(15))
+    assert found.numbering.handedness == (-1 if mirrored else 1)
+    assert found.numbering.marks_found.tolist() == [7, 8, 2]
+
+
+def test_columns_of_the_table() -> None:
+    image, _ = draw(DESIGN, pixel_from_mm(12.0, 20, 0, False))
+    table = detect_target(image, DESIGN)
+    assert list(table.columns) == ["dot", "row", "column", *MEASURED]
+    assert np.all(table[["suu_px2", "svv_px2"]] > 0)
+
+
+def test_dots_off_the_grid_are_rejected_with_the_reason() -> None:
+    image, _ = draw(DESIGN, pixel_from_mm(12.0, 20, 0, False))
+    v, u = np.mgrid[:480, :480]
+    image[(u - 240) ** 2 + (v - 440) ** 2 < 14**2] = 210
+    found = find_target(image, DESIGN)
+    assert len(found.table) == 15
+    odd = found.rejected[found.rejected["reason"] == "not on the grid"]
+    np.testing.assert_allclose(odd[["u_px", "v_px"]], [[240, 440]], atol=0.5)
+
+
+def test_an_undecided_image_is_an_error_that_counts_the_marks() -> None:
+    plain = replace(RING, marks=((1, 2), (1, 3)))
+    image, _ = draw(plain, pixel_from_mm(12.0, 20, 0, False))
+    assert find_target(image, RING).numbering.ambiguous
+    with pytest.raises(DetectionError, match="2 of 3 marks were found"):
+        detect_target(image, RING)
+    assert not find_target(image, RING, handedness=1).numbering.ambiguous
+
+
+def test_an_empty_image_is_an_error() -> None:
+    noise = np.random.default_rng(0).normal(100, 2, (200, 200)).astype(np.uint8)
+    with pytest.raises(DetectionError, match=r"no dots|too few"):
+        detect_target(noise, DESIGN)
+    with pytest.raises(InputError):
+        detect_target(np.zeros((5, 5, 3)), DESIGN)
+
+
+@pytest.mark.skipif(not PLATE.is_dir(), reason="the real images of ../shared/real are not here")
+@pytest.mark.parametrize("camera", [0, 1])
+def test_real_printed_grid_is_numbered_from_its_rings(camera: int) -> None:
+    import cv2
+
+    image = cv2.imread(str(PLATE / f"CalB-sys2-0014_{camera}.jpeg"), cv2.IMREAD_GRAYSCALE)
+    half = np.asarray(image, float).reshape(1024, 2, 1224, 2).mean((1, 3))
+    found = find_target(half.astype(np.uint8), PRINTED)
+    table = found.table
+    assert 80 <= len(table) <= 91
+    assert table["column"].between(-2, 8).all()
+    assert table["row"].between(-2, 6).all()
+    assert not found.numbering.ambiguous
+    assert len(found.numbering.marks_found) == 3
+    assert found.numbering.handedness == -1
+    row, column, one = table["row"], table["column"], np.ones(len(table))
+    bilinear = np.column_stack([one, row, column, row * column, row**2, column**2])
+    for axis in ("u_px", "v_px"):
+        fit = np.linalg.lstsq(bilinear, table[axis], rcond=None)[0]
+        assert np.abs(bilinear @ fit - table[axis]).max() < 4

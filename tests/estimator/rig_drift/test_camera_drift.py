@@ -1,0 +1,376 @@
+"""A camera that has moved since the calibration: what gaps tell of it, and how well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+
+import telerig
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.bubbles.pairing.model import default_model
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.rig_drift.drift import (
+    DriftPrior,
+    RigChange,
+    drift_covariance,
+    free_directions,
+    gaps_of,
+    moved_pose,
+    offset_roll_pitch,
+    share_of_drift,
+)
+from telerig.estimator.rig_drift.from_pairs import PairCollector, rig_change, with_change
+from telerig.estimator.rig_drift.gap_noise import Noise, Series, learned_noise
+from telerig.estimator.smoothing.problem.problem import RigMode, ShakeModel
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.run.presets import run_preset
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import triangulate
+
+Array = NDArray[np.float64]
+Pair = tuple[Camera, Camera]
+
+NAMES = tuple(f"right.{p}" for p in ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm"))
+SHAKE_HZ, SHAKE_DAMPING = 19.2, 0.03
+
+
+def rig(angle_deg: float = 90.0, kappa_per_mm: float = 0.0) -> Pair:
+    """Cameras without distortion, at an angle."""
+    config = replace(run_preset("rise").calibration, angle_deg=angle_deg)
+    values = {"kappa_per_mm": kappa_per_mm}
+    cameras = tuple(replace(c, parameters=values) for c in config.cameras)
+    first, second = true_cameras(replace(config, cameras=cameras)).values()
+    return first, second
+
+
+def calibration(cameras: Pair, sd: tuple[float, float] = (2e-5, 5e-4)) -> Calibration:
+    """One that is sure of its pose to sd (rad, mm)."""
+    covariance = np.diag(np.repeat(np.square(sd), 3))
+    return Calibration(
+        cameras, np.zeros(0, np.int64), np.zeros((0, 3)), {}, covariance, NAMES, ((), ())
+    )
+
+
+def moved(cameras: Pair, tangent: Array) -> Pair:
+    pose = moved_pose(cameras[1].camera_from_rig.inverse(), tangent)
+    return cameras[0], replace(cameras[1], camera_from_rig=pose.inverse())
+
+
+def along_gap(cameras: Pair, offset_mm: float, roll_rad: float, pitch_rad: float) -> Array:
+    """(6,) a movement of that offset at the rig's origin, roll and pitch, and nothing else."""
+    return np.asarray(
+        np.linalg.pinv(offset_roll_pitch(cameras, np.zeros(3)))
+        @ np.array([offset_mm, roll_rad, pitch_rad])
+    )
+
+
+def oscillation(t_s: Array, rms_mm: float, rng: np.random.Generator) -> Array:
+    """A mass on a damped spring, driven by white noise; drawn from its covariance."""
+    omega = 2 * np.pi * SHAKE_HZ
+    decay, turn = SHAKE_DAMPING * omega, omega * np.sqrt(1 - SHAKE_DAMPING**2)
+    lag = np.abs(t_s[:, None] - t_s)
+    covariance = np.exp(-decay * lag) * (np.cos(turn * lag) + decay / turn * np.sin(turn * lag))
+    root = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(t_s)))
+    return np.asarray(rms_mm * root @ rng.standard_normal(len(t_s)))
+
+
+@dataclass(frozen=True)
+class Run:
+    """One bubble that circles while the cameras shake against each other along the rig's y."""
+
+    frames: int = 300
+    rate_hz: float = 100.0
+    noise_px: float = 0.1
+    shake_mm: float = 0.1
+    radius_mm: float = 8.0
+
+    def tracks(self, cameras: Pair, true: Pair, rng: np.random.Generator) -> pd.DataFrame:
+        t = np.arange(self.frames) / self.rate_hz
+        angle = 2 * np.pi * 1.7 * t + rng.uniform(0, 6)
+        points = np.stack(
+            [self.radius_mm * np.cos(angle), 5 * (t - t.mean()), self.radius_mm * np.sin(angle)], -1
+        )
+        uv = []
+        for camera in true:
+            shift = oscillation(t, self.shake_mm / np.sqrt(2), rng)[:, None] * [0.0, 1.0, 0.0]
+            seen = camera.project(points - shift)
+            uv.append(seen + self.noise_px * rng.standard_normal(seen.shape))
+        found = triangulate(cameras, (uv[0], uv[1]), self.noise_px)
+        table = pd.DataFrame({"frame": np.arange(len(t)), "particle": 0, "t_s": t})
+        table[["x_mm", "y_mm", "z_mm"]] = found.points_mm
+        table["ray_miss_mm"] = found.ray_miss_mm
+        for camera, pixels in zip(cameras, uv):
+            table[[f"{camera.name}_u_px", f"{camera.name}_v_px"]] = pixels
+            for name, value in (("suu", 1.0), ("suv", 0.0), ("svv", 1.0)):
+                table[f"{camera.name}_{name}_px2"] = value * self.noise_px**2
+        return table
+
+
+@pytest.mark.parametrize("angle", [45.0, 90.0, 130.0])
+def test_telecentric_gaps_tell_three_components_at_any_angle(angle: float) -> None:
+    cameras = rig(angle)
+    directions = free_directions(drift_covariance(cameras, DriftPrior()))
+    assert directions.shape == (6, 3)
+    points = np.random.default_rng(0).uniform(-15, 15, (200, 3))
+    n = np.cross(*(c.camera_from_rig.rotation[2] for c in cameras))
+    n /= np.linalg.norm(n)
+    pose = cameras[1].camera_from_rig
+    turn_about_n, shift_along_depth = np.zeros(6), np.zeros(6)
+    turn_about_n[:3] = 1e-4 * pose.rotation @ n
+    shift_along_depth[5] = 0.05
+    shift_across = np.concatenate([np.zeros(3), 0.05 * np.cross(pose.rotation @ n, [0, 0, 1.0])])
+    for unseen in (turn_about_n, shift_along_depth, shift_across):
+        true = moved(cameras, unseen)
+        first, second = (c.project(points) for c in true)
+        assert np.abs(triangulate(cameras, (first, second), 0.1).ray_miss_mm).max() < 2e-7
+
+
+def test_perspective_lenses_tell_more() -> None:
+    assert free_directions(drift_covariance(rig(90.0, 1 / 300), DriftPrior())).shape == (6, 5)
+
+
+@pytest.mark.parametrize(("angle", "kappa"), [(90.0, 0.0), (60.0, 0.0), (90.0, 1e-5)])
+def test_gaps_against_rays_of_cameras_that_really_moved(angle: float, kappa: float) -> None:
+    cameras = rig(angle, kappa)
+    points = np.random.default_rng(1).uniform(-15, 15, (100, 3))
+    tangent = np.array([5e-5, -3e-5, 4e-5, 0.02, 0.015, -0.01])
+    true = moved(cameras, tangent)
+    pixels = np.stack([c.project(points) for c in true], 1)
+    gaps = gaps_of(cameras, ((), ()), points, pixels)
+    crossing = triangulate(cameras, (pixels[:, 0], pixels[:, 1]), 0.1)
+    assert np.allclose(np.abs(gaps.gap_mm), np.abs(crossing.ray_miss_mm), atol=3e-6)
+    assert np.allclose(gaps.by_rig @ tangent, gaps.gap_mm, atol=3e-6)
+    n = np.cross(*(c.camera_from_rig.rotation[2] for c in cameras))
+    n /= np.linalg.norm(n)
+    before, after = (c[1].camera_from_rig.inverse() for c in (cameras, true))
+    carried = after.apply(cameras[1].camera_from_rig.apply(points))
+    back = before.apply(cameras[1].camera_from_rig.apply(points))
+    assert np.allclose((carried - back) @ n, gaps.gap_mm, atol=4e-6)
+
+
+def test_offset_roll_and_pitch_are_those_of_the_body() -> None:
+    cameras = rig()
+    tangent = along_gap(cameras, 0.02, 3e-5, -4e-5)
+    values = offset_roll_pitch(cameras, np.zeros(3)) @ tangent
+    assert np.allclose(values, [0.02, 3e-5, -4e-5])
+    pose = cameras[1].camera_from_rig.inverse()
+    shift = moved_pose(pose, tangent).translation_mm - pose.translation_mm
+    n = np.cross(*(c.camera_from_rig.rotation[2] for c in cameras))
+    assert shift @ n / np.linalg.norm(n) == pytest.approx(0.02, abs=1e-4)
+
+
+@pytest.mark.parametrize("shake_mm", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
+def test_coverage_with_and_without_shake(shake_mm: float) -> None:
+    """20 um and 50 urad come back with errors that their covariance says; 8 runs each."""
+    rng = np.random.default_rng(5)
+    cameras = rig()
+    prior = DriftPrior()
+    basis = np.linalg.pinv(free_directions(drift_covariance(cameras, prior)))
+    nees, called = [], 0
+    for _ in range(8):
+        known = calibration(cameras)
+        wrong = np.sqrt(np.diagonal(known.covariance)) * rng.standard_normal(6)
+        tangent = along_gap(cameras, 0.02, 3e-5, 4e-5)
+        run = Run(shake_mm=shake_mm, frames=250)
+        found = rig_change(run.tracks(cameras, moved(cameras, wrong + tangent), rng), known, prior)
+        assert found is not None
+        change, _ = found
+        called += change.moved
+        assert abs(change.values[0] - 0.02) < 4 * change.sigmas[0] < 0.03
+        error = basis @ (change.tangent - tangent)
+        spread = basis @ change.covariance @ basis.T
+        nees.append(error @ np.linalg.solve(spread, error) / 3)
+    assert 0.4 < np.mean(nees) < 1.9
+    assert called >= (6 if shake_mm else 8)
+
+
+def test_no_movement_is_no_movement() -> None:
+    rng = np.random.default_rng(6)
+    cameras = rig()
+    known = calibration(cameras)
+    for shake_mm in (0.0, 0.1) * 3:
+        wrong = np.sqrt(np.diagonal(known.covariance)) * rng.standard_normal(6)
+        tracks = Run(shake_mm=shake_mm, frames=200).tracks(cameras, moved(cameras, wrong), rng)
+        found = rig_change(tracks, known)
+        assert found is not None and not found[0].moved
+
+
+def test_a_poor_calibration_is_not_a_movement() -> None:
+    """20 um off is nothing for a calibration that is sure to 30 um; a sure one has moved."""
+    cameras = rig()
+    rng = np.random.default_rng(7)
+    tracks = Run().tracks(cameras, moved(cameras, along_gap(cameras, 0.02, 0.0, 0.0)), rng)
+    poor, good = (
+        rig_change(tracks, calibration(cameras, sd)) for sd in ((1e-3, 0.03), (2e-5, 5e-4))
+    )
+    assert poor is not None and good is not None
+    assert not poor[0].moved and good[0].moved
+
+
+def test_wrong_pairs_do_not_count() -> None:
+    cameras = rig()
+    rng = np.random.default_rng(8)
+    tracks = Run(shake_mm=0.02).tracks(
+        cameras, moved(cameras, along_gap(cameras, 0.02, 0.0, 0.0)), rng
+    )
+    some = rng.random(len(tracks)) < 0.06
+    shift = rng.uniform(2, 30, some.sum())
+    tracks.loc[some, "right_v_px"] += shift
+    tracks.loc[some, "ray_miss_mm"] -= shift / 10
+    found = rig_change(tracks, calibration(cameras))
+    assert found is not None
+    change, _ = found
+    assert abs(change.values[0] - 0.02) < 4 * change.sigmas[0] < 0.012
+    assert change.pairs < len(tracks) - 0.8 * some.sum()
+
+
+def test_the_noise_is_learned() -> None:
+    rng = np.random.default_rng(9)
+    t = np.arange(500) / 100
+    gap = oscillation(t, 0.1, rng) + 0.01 * rng.standard_normal(len(t))
+    ones = np.ones(len(t))
+    frames = np.arange(len(t))
+    series = Series(frames, 0 * frames, t, gap, ones, ones[:, None])
+    noise = learned_noise([series])
+    (rms, decay, hz), *rest = noise.shake
+    assert not rest
+    assert hz == pytest.approx(SHAKE_HZ, rel=0.03)
+    assert rms == pytest.approx(0.1, rel=0.4)
+    assert decay == pytest.approx(1 / (SHAKE_DAMPING * 2 * np.pi * SHAKE_HZ), rel=0.6)
+    assert np.hypot(noise.white_mm, noise.wander_mm) == pytest.approx(0.01, rel=0.5)
+
+
+def test_noise_covariance_of_two_bubbles() -> None:
+    """Shake is common, wander and white noise are not."""
+    noise = Noise(0.01, 0.02, 0.1, ((0.1, 0.5, 10.0),))
+    frames = np.array([0, 0, 1, 1])
+    series = Series(
+        frames, np.array([0, 1, 0, 1]), frames * 0.1, np.zeros(4), np.ones(4), np.eye(4)
+    )
+    found = noise.covariance(series)
+    assert found[0, 0] == pytest.approx(0.01**2 + 0.02**2 + 0.1**2)
+    assert found[0, 1] == pytest.approx(0.1**2)
+    later = 0.1**2 * np.exp(-0.2)
+    assert found[0, 3] == pytest.approx(later)
+    assert found[0, 2] == pytest.approx(later + 0.02**2 * np.exp(-1))
+
+
+def test_the_share_of_a_movement_is_gaussian_conditioning() -> None:
+    """Against the joint posterior of calibration error and movement, worked out at once."""
+    rng = np.random.default_rng(10)
+    drift = drift_covariance(rig(), DriftPrior())
+    root = 1e-3 * rng.standard_normal((8, 8))
+    before = root @ root.T
+    rows, sigma, seen = rng.standard_normal((5, 8)), 0.02, rng.standard_normal(5) * 0.05
+    both = np.zeros((14, 14))
+    both[:8, :8], both[8:, 8:] = before, drift
+    by_both = np.concatenate([rows, rows[:, 2:]], 1)
+    gain = both @ by_both.T @ np.linalg.inv(by_both @ both @ by_both.T + sigma**2 * np.eye(5))
+    mean, left = gain @ seen, both - gain @ by_both @ both
+    total = np.concatenate([np.eye(8), np.eye(8)[:, 2:]], 1)
+    tangent, covariance = share_of_drift(total @ mean, total @ left @ total.T, before, drift)
+    assert np.allclose(tangent, mean[8:], atol=1e-9)
+    assert np.allclose(covariance, left[8:, 8:], atol=1e-11)
+
+
+def test_words_say_it_once() -> None:
+    cameras = rig()
+    rng = np.random.default_rng(11)
+    known = calibration(cameras)
+    pairs = PairCollector(known)
+    still = PairCollector(known)
+    pairs.add(Run().tracks(cameras, moved(cameras, along_gap(cameras, 0.08, 0, 0)), rng))
+    still.add(Run().tracks(cameras, cameras, rng))
+    model = replace(
+        default_model(cameras), words=("This is a calibration problem: off by 0.8 px.", "More.")
+    )
+    said = with_change(model, pairs.found(), known)
+    assert said["calibration_problem"]
+    assert said["words"][0] == "More." and len(said["words"]) == 2
+    assert "'right' has moved against 'left'" in said["words"][1]
+    assert "--refine-rig" in said["words"][1] and "positions are off by it" in said["words"][1]
+    assert with_change(model, still.found(), known)["words"] == list(model.words)
+    assert PairCollector(known).found() is None
+
+
+def test_numbers_are_cut_where_their_deviation_has_two_digits() -> None:
+    values, sigmas = np.array([0.0885, -2.0249e-3, 5.04e-5]), np.array([9.51e-4, 5e-5, 5.4e-5])
+    six = np.zeros(6)
+    change = RigChange(
+        "right", six, np.diag(six), six[:3], values, sigmas, np.array([0.2, 5e-3, 5e-3]), 0.0, 100
+    )
+    assert change.size_words() == (
+        "by +88.50 +- 0.95 um along the shared coordinate, rolled by -2025 +- 50 urad, "
+        "pitched by +50 +- 54 urad"
+    )
+
+
+def test_smoothing_without_refinement_warns_of_a_movement() -> None:
+    from telerig.estimator.smoothing.results_folder import _moved
+
+    summary = {"rig_change": {"camera": "right", "moved": True, "offset_mm": 0.0885}}
+    (words,) = _moved(SimpleNamespace(summary=summary))
+    assert "'right' had moved" in words and "by +88 um" in words and "--refine-rig" in words
+    assert not _moved(SimpleNamespace(summary={})) and not _moved(object())
+
+
+def test_smoothing_refuses_the_calibration_of_fewer_cameras() -> None:
+    from telerig.estimator.smoothing.results_folder import _check_cameras
+
+    known = calibration(rig())
+    tracks = SimpleNamespace(summary={"image_size_px": {"left": [1, 1], "right": [1, 1]}})
+    _check_cameras(tracks, known)
+    _check_cameras(object(), known)
+    with pytest.raises(InputError, match="tracked with cameras left, right, the calibration has"):
+        _check_cameras(tracks, replace(known, cameras=known.cameras[:1]))
+
+
+def test_refused() -> None:
+    with pytest.raises(InputError, match="drift prior"):
+        DriftPrior(rotation_rad=0.0)
+    first, _ = rig()
+    with pytest.raises(CalibrationError, match="one line"):
+        drift_covariance((first, first), DriftPrior())
+    cameras = rig()
+    few = Run(frames=8).tracks(cameras, cameras, np.random.default_rng(0))
+    assert rig_change(few, calibration(cameras)) is None
+    with pytest.raises(InputError, match="refine-rig"):
+        telerig.smooth(few, calibration(cameras), refine_rig=True)
+
+
+def test_the_graph_refines_the_rig_with_the_shake() -> None:
+    """The movement is found beside the shake; positions along the shared axis lose its bias."""
+    cameras = rig()
+    rng = np.random.default_rng(12)
+    tangent = along_gap(cameras, 0.06, 3e-5, 4e-5)
+    run = Run(frames=150, shake_mm=0.03)
+    tracks = run.tracks(cameras, moved(cameras, tangent), rng)
+    model = ShakeModel(
+        modes=tuple(
+            RigMode(SHAKE_HZ, SHAKE_DAMPING, (0.0, 0.03 / np.sqrt(2), 0.0), c, None) for c in (0, 1)
+        )
+    )
+    known = calibration(cameras)
+    plain, refined = (
+        telerig.smooth(tracks, known, model=model, refine_rig=wanted) for wanted in (False, True)
+    )
+    assert "rig_change" not in plain.summary
+    change = refined.summary["rig_change"]
+    assert change["moved"] and "has moved against 'left'" in change["words"]
+    values = offset_roll_pitch(cameras, np.array(change["place_mm"])) @ tangent
+    assert abs(change["offset_mm"] - values[0]) < 4 * change["soffset_mm"] < 0.02
+    height = 5 * (np.arange(run.frames) / run.rate_hz - (run.frames - 1) / 2 / run.rate_hz)
+    bias = [float((s.trajectories["y_mm"] - height).mean()) for s in (plain, refined)]
+    assert abs(bias[0]) > 0.02 and abs(bias[1]) < 0.006
+    direct = rig_change(tracks, known)
+    assert direct is not None
+    assert abs(change["offset_mm"] - direct[0].values[0]) < 2 * change["soffset_mm"]
+    pose = np.array(change["rig_from_camera"]["translation_mm"])
+    true = moved(cameras, tangent)[1].camera_from_rig.inverse().translation_mm
+    was = cameras[1].camera_from_rig.inverse().translation_mm
+    assert np.linalg.norm(pose - true) < 0.3 * np.linalg.norm(was - true)

@@ -1,0 +1,102 @@
+"""Checks of sensors on records made up: what is a fault, and what only looks like one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import telerig
+from telerig.estimator.sensors.accelerometer_checks import (
+    clippings,
+    fitting_axes,
+    motion_correlation,
+)
+from telerig.estimator.sensors.checks import check_encoder, check_sensors
+from telerig.estimator.sensors.encoder_checks import encoder_faults
+from telerig.io.simulation.run.presets import run_preset
+
+
+def test_jumps_outside_the_frames_only_warn() -> None:
+    t = np.arange(1000) / 1000
+    position = 280 * t + np.where(t > 0.8, 5.0, 0.0)
+    words = check_encoder(t, position, np.arange(0.1, 0.7, 0.002))
+    assert len(words) == 1
+    assert "+5 mm at 0.801 s" in words[0]
+
+
+def test_hard_but_real_motion_is_no_jump() -> None:
+    """Starts, stops and a stick-slip motion, with 1 um noise, at three rates."""
+    rng = np.random.default_rng(1)
+    for rate in (50, 200, 1000):
+        t = np.arange(0, 3, 1 / rate)
+        speed = np.interp(t, [0, 0.5, 0.7, 1.5, 1.6, 3], [0, 0, 280, 280, 0, 0])
+        slip = 0.2 * np.abs(((8 * t) % 1.0) - 0.5)
+        position = np.cumsum(speed) / rate + slip + 0.001 * rng.standard_normal(len(t))
+        assert encoder_faults(t, position) == []
+        counts = np.round(position / 0.01) * 0.01
+        assert encoder_faults(t, counts) == []
+
+
+def test_a_jump_is_found_under_a_hunting_servo() -> None:
+    """0.1 mm RMS at 15 Hz: jumps of 50 um at 1 kHz and 0.5 mm at 100 Hz stand out, none besides."""
+    for rate, size in ((1000, 0.05), (100, 0.5)):
+        rng = np.random.default_rng(7)
+        t = np.arange(0, 2, 1 / rate)
+        noise = 0.001 * rng.standard_normal(len(t))
+        position = 280 * t + 0.14 * np.sin(2 * np.pi * 15 * t) + noise
+        assert encoder_faults(t, position) == []
+        at = len(t) // 3
+        position[at:] += size
+        (fault,) = encoder_faults(t, position)
+        assert fault.t_s == t[at]
+        assert fault.size_mm == pytest.approx(size, rel=0.5)
+
+
+def test_coarse_readings_are_not_clipped() -> None:
+    """A 12 bit sensor in rest repeats its values, in the shape of its noise."""
+    rng = np.random.default_rng(2)
+    for noise in (0.3, 1.0, 3.0):
+        samples = np.round(noise * rng.standard_normal((5000, 3))) * 0.01
+        assert clippings(samples) == []
+
+
+def test_fitting_axes_against_every_mounting() -> None:
+    """For each of the 24 mountings the axes found turn the gravity that is read upwards."""
+    from scipy.spatial.transform import Rotation
+
+    up = np.array([0.0, -1.0, 0.0])
+    for turn in Rotation.create_group("O").as_matrix():
+        fits = fitting_axes(turn @ (9.81 * up) + [0.1, -0.2, 0.15], np.eye(3), up)
+        assert fits is not None
+        np.testing.assert_allclose(fits.T @ turn @ up, up, atol=1e-9)
+        assert np.linalg.det(fits) == pytest.approx(1.0)
+    tilted = Rotation.from_euler("xyz", [40, 30, 0], degrees=True).as_matrix()
+    assert fitting_axes(tilted @ up, np.eye(3), up) is None
+
+
+def test_the_carriages_motion_is_felt_along_its_axis() -> None:
+    rng = np.random.default_rng(4)
+    t = np.arange(0, 1.5, 1 / 2000)
+    bend = -0.1 * (2 * np.pi * 15) ** 2 * np.sin(2 * np.pi * 15 * t)
+    position = 280 * t + 0.1 * np.sin(2 * np.pi * 15 * t)
+    reading = 0.1 * rng.standard_normal((len(t), 3))
+    reading[:, 2] -= bend / 1000
+    stage = slice(None, None, 2)
+    noisy = position[stage] + 0.001 * rng.standard_normal(len(t[stage]))
+    found = motion_correlation(t, reading, t[stage], noisy)
+    assert found is not None
+    assert found[2] < -0.9
+    assert abs(found[0]) < 0.4
+
+
+@pytest.mark.parametrize("name", ["S0", "S4", "S5", "S6", "rise"])
+def test_good_runs_of_other_scenarios(name: str, tmp_path: Path) -> None:
+    """Slow frames, hard shake, a start from rest: no false alarm."""
+    config = run_preset(name, frames=60)
+    stage = replace(config.stage, accelerometers=("left", "right", "carriage"))
+    config = replace(config, stage=stage, calibration=replace(config.calibration, views=2))
+    telerig.simulate(config, rng=np.random.default_rng(8), out=tmp_path / "d", images=False)
+    assert check_sensors(telerig.load_run(tmp_path / "d" / "runs" / name)) == []

@@ -1,0 +1,57 @@
+"""Shake across the vertical, which bubbles' wide swings hide: how much of it is expected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shake_learning_data import SWING_HZ, run, true_model
+
+from telerig.estimator.smoothing.learning.default_priors import default_model
+from telerig.estimator.smoothing.learning.groups import groups_of
+from telerig.estimator.smoothing.learning.learn import Learning, as_likely, learn
+from telerig.estimator.smoothing.learning.likelihood import evidence
+from telerig.estimator.smoothing.learning.lines_of_sight import channels_of
+from telerig.estimator.smoothing.learning.parameters import with_values
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
+
+NAME = "modes.3.rms_mm"
+
+
+@pytest.mark.parametrize("seed", [41, 42, 43])
+def test_an_rms_that_the_data_hardly_determine_is_the_root_of_its_mean_square(seed: int) -> None:
+    """Against a fine integral over the same evidence and prior."""
+    problem, _, _ = run(np.random.default_rng(seed), bubbles=3, seconds=1.0)
+    group = groups_of(channels_of(problem), Learning(), problem.up)[1]
+    hidden = RigMode(1.2 * SWING_HZ, 0.03, (0.1, 0.0, 0.1), CARRIAGE, None)
+    model = replace(true_model(), modes=(*true_model().modes, hidden))
+    found = as_likely(group.fast, model, NAME, 0.1)
+    fine = np.linspace(-3.25, 2.25, 221)
+    values = 0.1 * np.exp(fine)
+    log = np.array([evidence(group.fast, with_values(model, [NAME], [v])) for v in values])
+    weight = np.exp(log - log.max() - fine**2 / 2)
+    assert found == pytest.approx(np.sqrt(weight @ values**2 / weight.sum()), rel=0.05)
+
+
+def test_where_nothing_tells_it_is_the_priors() -> None:
+    model = replace(true_model(), modes=(*true_model().modes, RigMode(9.0, 0.03, (0.1, 0.0, 0.1))))
+    found = as_likely((), model, NAME, 0.1)
+    ratio = np.random.default_rng(1).normal(size=200_000)
+    ratio = ratio[(ratio > -3.25) & (ratio < 2.25)]
+    assert found == pytest.approx(0.1 * np.sqrt(np.mean(np.exp(2 * ratio))), rel=0.02)
+
+
+def test_a_rig_that_bubbles_swings_hide_is_not_taken_for_still() -> None:
+    """Modes that are found in the vertical may move across, too; held ones stay as they are."""
+    problem, _, _ = run(np.random.default_rng(44), bubbles=2, seconds=1.2, common_hz=8.0)
+    found = learn(problem, default_model(problem), Learning(most_modes=1))
+    upright = [m for m in found.modes if max(m.rms_mm) == m.rms_mm[1]]
+    across = [m for m in found.modes if m not in upright and m.frequency_hz < 12]
+    assert upright and across
+    hidden, seen = (next(m for m in modes if m.camera == CARRIAGE) for modes in (across, upright))
+    assert max(hidden.rms_mm) > 0.4 * max(seen.rms_mm)
+    start = replace(true_model(), name="mine")
+    held = learn(problem, start, Learning(hold=("modes.*",), most_modes=0))
+    rms = [max(m.rms_mm) for m in held.modes if m.rms_mm[1] < max(m.rms_mm)]
+    np.testing.assert_allclose(rms[:3], [0.5 * max(m.rms_mm) for m in start.modes])

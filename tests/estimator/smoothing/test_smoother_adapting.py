@@ -1,0 +1,91 @@
+"""What the second pass of a default smoothing takes from the first: the shake's spectrum."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from telerig.estimator.smoothing.learning.adapted_priors import fitted_floor
+from telerig.estimator.smoothing.learning.default_priors import DEFAULT_FLOOR, rescaled
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel
+from telerig.factors.state_space import broad_band, broad_band_density, discretise
+
+RATE_HZ, RMS_MM = 500.0, 0.3
+BAND = {"low_hz": 12.0, "high_hz": 60.0}
+
+
+def _offsets(floor: float, seconds: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and (F, 2, 3) offsets of two cameras drawn from the process itself, depth unseen."""
+    rng = np.random.default_rng(seed)
+    component = broad_band(RMS_MM, floor=floor, **BAND)
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    steps = discretise(component, np.diff(t)[:1])
+    transition, root = steps.transition[0], np.linalg.inv(steps.whitener[0])
+    start = np.linalg.cholesky(component.start_covariance + 1e-15 * np.eye(component.size))
+    x = np.einsum("ij,cj->ci", start, rng.normal(size=(4, component.size)))
+    out = np.zeros((len(t), 2, 3))
+    for i in range(len(t)):
+        out[i, :, :2] = (x @ component.position).reshape(2, 2)
+        x = x @ transition.T + rng.normal(size=x.shape) @ root.T
+    return t, out
+
+
+def _bands(floor: float = DEFAULT_FLOOR) -> tuple[BroadBand, ...]:
+    return tuple(BroadBand((RMS_MM,) * 3, camera, floor=floor, **BAND) for camera in range(2))
+
+
+@pytest.mark.parametrize(("floor", "tail"), [(0.0, 2), (0.05, 2), (0.3, 3)])
+def test_the_density_is_that_of_the_state_space(floor, tail):
+    component = broad_band(RMS_MM, floor=floor, tail=tail, **BAND)
+    frequency = np.array([0.2, 3.0, 12.0, 70.0])
+    identity = np.eye(component.size)
+    gain = [
+        component.position
+        @ np.linalg.solve(2j * np.pi * f * identity - component.drift, component.noise)
+        for f in frequency
+    ]
+    expected = 2 * (np.abs(gain) ** 2).sum(-1)
+    density = broad_band_density(frequency, RMS_MM, floor=floor, tail=tail, **BAND)
+    assert density == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_density_holds_the_variance():
+    frequency = np.linspace(0, 3000, 600_001)
+    density = broad_band_density(frequency, RMS_MM, floor=0.1, **BAND)
+    assert np.trapezoid(density, frequency) == pytest.approx(RMS_MM**2, rel=1e-3)
+
+
+@pytest.mark.parametrize("floor", [0.05, 0.12, 0.3])
+def test_the_floor_is_found_within_a_factor_of_one_and_a_half(floor):
+    found = [fitted_floor(*_offsets(floor, 4.0, seed), _bands()) for seed in range(8)]
+    assert np.exp(np.mean(np.log(found))) == pytest.approx(floor, rel=0.35)
+    assert np.mean(np.abs(np.log(np.array(found) / floor)) < np.log(1.6)) >= 0.75
+
+
+def test_a_short_run_or_a_common_band_says_nothing():
+    assert fitted_floor(*_offsets(0.1, 0.5, 0), _bands()) is None
+    common = BroadBand((RMS_MM,) * 3, CARRIAGE, floor=0.1, **BAND)
+    assert fitted_floor(*_offsets(0.1, 4.0, 0), (common, *_bands())) is None
+    assert fitted_floor(*_offsets(0.1, 4.0, 0), _bands(floor=0.0)) is None
+
+
+def test_uneven_times_are_evened_out():
+    t, offsets = _offsets(0.1, 4.0, 3)
+    rng = np.random.default_rng(1)
+    keep = np.sort(rng.choice(len(t), int(0.9 * len(t)), replace=False))
+    whole, part = fitted_floor(t, offsets, _bands()), fitted_floor(t[keep], offsets[keep], _bands())
+    assert part == pytest.approx(whole, rel=0.15)
+
+
+@pytest.mark.parametrize(("frequency_hz", "tail", "high_hz"), [(12.0, 2, 60.0), (40.0, 3, 80.0)])
+def test_strong_shake_has_a_steeper_tail(frequency_hz, tail, high_hz):
+    """Accelerations of 2 and 19 m/s^2."""
+    model = ShakeModel(broad_bands=_bands())
+    for band in rescaled(model, np.full((2, 3), RMS_MM), frequency_hz).broad_bands:
+        assert (band.tail, band.high_hz, band.low_hz) == (tail, high_hz, frequency_hz)
+
+
+def test_the_floor_of_strong_shake_is_not_taken_from_what_the_prior_has_shrunk():
+    strong = tuple(replace(b, tail=3) for b in _bands())
+    assert fitted_floor(*_offsets(0.1, 4.0, 0), _bands()) is not None
+    assert fitted_floor(*_offsets(0.1, 4.0, 0), strong) is None

@@ -1,0 +1,181 @@
+"""How well the stage's travel is known, carried into a smoothed run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from shake_learning_data import ARM_HZ, CAMERAS, COMMON_HZ, UP, run
+
+from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
+from telerig.estimator.smoothing.graph.stage_travel import left_open, total_scale, travel_of
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    Accelerometer,
+    BroadBand,
+    Bubble,
+    CarriageModel,
+    Mark,
+    Observations,
+    RigMode,
+    ShakeModel,
+    SmoothingProblem,
+    Stage,
+    Travel,
+)
+from telerig.estimator.smoothing.smooth import problem_of
+from telerig.estimator.smoothing.tables import shake, trajectories
+from telerig.estimator.smoothing.verdict.modes import shake_modes
+from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra
+from telerig.io.rig_file.description import StageDescription
+
+Array = NDArray[np.float64]
+
+BASIS = np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+SPEED = 100.0
+STILL = ShakeModel(encoder_sigma_mm=0.002)
+
+
+def travel(scale_sd: float, tilt_sd: float = 0.0, axis: Array = UP) -> Travel:
+    return Travel(axis, BASIS, 0.0, np.diag([tilt_sd, tilt_sd, scale_sd]) ** 2, "stage_axis")
+
+
+def problem(scale: float = 0.0, *, marks: bool = False, axis: Array = UP) -> SmoothingProblem:
+    """One bubble that rises at the stage's speed; the encoder reads (1 + scale) too much."""
+    rng = np.random.default_rng(4)
+    t = np.arange(120) / 200
+    lab = np.array([1.0, 2.0, -1.0]) + SPEED * t[:, None] * UP
+    places = np.array([[0.0, -20.0, 0.0], [5.0, -30.0, 5.0]]) if marks else np.zeros((0, 3))
+    fixed = np.broadcast_to(places[:, None], (len(places), len(t), 3))
+
+    def seen(points: Array, sigma: float) -> Observations:
+        item, frame = np.indices(points.shape[:2]).reshape(2, -1)
+        rig = (points - SPEED * t[:, None] * UP).reshape(-1, 3)
+        uv = np.concatenate([c.project(rig) for c in CAMERAS])
+        uv = uv + sigma * rng.normal(size=uv.shape)
+        camera = np.repeat([0, 1], len(item))
+        covariance = np.tile(sigma**2 * np.eye(2), (len(uv), 1, 1))
+        return Observations(np.tile(item, 2), np.tile(frame, 2), camera, uv, covariance)
+
+    reading = (1 + scale) * SPEED * t + 0.002 * rng.normal(size=len(t))
+    return SmoothingProblem(
+        CAMERAS, t, axis, UP, (Bubble(7, 0, len(t) - 1, lab[0], lab),), seen(lab[None], 0.2),
+        Stage(t, reading),
+        marks=tuple(Mark(f"m{k}", p + 0.1) for k, p in enumerate(places)),
+        references=seen(fixed, 0.1) if marks else Observations.none(),
+    )  # fmt: skip
+
+
+def place(solution: Solution) -> Array:
+    return np.asarray(solution.state.bubbles @ solution.frame.bubble.position.T)
+
+
+def test_what_is_left_open_is_how_far_the_answer_moves() -> None:
+    """By brute force: readings scaled by an sd, and an axis tilted by one."""
+    known = problem()
+    solution = solve(replace(known, travel=travel(1e-3)), STILL)
+    assert known.stage is not None
+    scaled = replace(known, stage=replace(known.stage, position_mm=known.stage.position_mm / 1.001))
+    moved = place(solve(scaled, STILL)) - place(solution)
+    variance, speed = left_open(solution)
+    np.testing.assert_allclose(np.sqrt(variance[:, 1]), np.abs(moved[:, 1]), atol=2e-4)
+    assert np.sqrt(variance[-1, 1]) == pytest.approx(1e-3 * SPEED * known.t_s[-1], rel=0.01)
+    np.testing.assert_allclose(np.sqrt(speed[5:-5, 1]), 1e-3 * SPEED, rtol=0.05)
+    assert not variance[:, [0, 2]].any()
+
+    tilt = 2e-3
+    tilted = solve(replace(known, axis=UP + tilt * BASIS[:, 0]), STILL)
+    variance, _ = left_open(solve(replace(known, travel=travel(0.0, tilt)), STILL))
+    moved = np.abs(place(tilted) - place(solution))
+    np.testing.assert_allclose(np.sqrt(variance[:, 0]), moved[:, 0], atol=2e-4)
+
+
+def test_standard_deviations_hold_it() -> None:
+    sure, unsure = (
+        solve(replace(problem(), travel=one), STILL) for one in (None, travel(1e-3, 1e-3))
+    )
+    a, b = trajectories(sure, None), trajectories(unsure, None)
+    np.testing.assert_array_equal(a["y_mm"], b["y_mm"])
+    for axis in "xyz":
+        growth = np.sqrt(b[f"s{axis}_mm"] ** 2 - a[f"s{axis}_mm"] ** 2)
+        np.testing.assert_allclose(growth, 1e-3 * SPEED * a["t_s"], atol=5e-5)
+    last = shake(unsure)["sposition_mm"].iloc[-1]
+    assert last == pytest.approx(1e-3 * SPEED * problem().t_s[-1], rel=0.02)
+
+
+def test_marks_tell_the_scale_and_the_carriage_is_where_it_was() -> None:
+    model = replace(STILL, encoder_scale_sigma=0.01)
+    off = replace(problem(0.01, marks=True), travel=travel(0.01))
+    solution = solve(off, model)
+    assert total_scale(solution) == pytest.approx(0.01, abs=3e-4)
+    truth = SPEED * off.t_s
+    np.testing.assert_allclose(shake(solution)["position_mm"], truth, atol=0.03)
+    assert not left_open(solution)[0].any()
+
+
+def test_without_marks_the_prior_rules_a_free_scale() -> None:
+    """A carriage with dynamics, and sensors: nothing there speaks of the scale."""
+    free = replace(
+        STILL,
+        encoder_scale_sigma=0.01,
+        carriage=CarriageModel("force", acceleration_rms_mm_s2=1.0, servo=(0.1, 15.0, 0.3)),
+    )
+    solution = solve(problem(0.01), free)
+    assert solution.covariances is not None
+    scale, sd = solution.state.encoder[0], np.sqrt(solution.covariances.encoder[0, 0])
+    assert abs(scale) < 1.5 * sd
+    assert sd == pytest.approx(0.01, rel=0.1)
+
+
+def test_calibrated_stage_goes_before_rig_toml() -> None:
+    axis = np.array([0.01, -1.0, 0.0]) / np.linalg.norm([0.01, -1.0, 0.0])
+    stage = {
+        "axis": axis.tolist(), "basis": BASIS.tolist(), "encoder_scale": 0.02,
+        "joint_covariance": (1e-10 * np.eye(3)).tolist(),
+    }  # fmt: skip
+    described = StageDescription((0, -1, 0), (0, -1, 0), 0.001, 0.004)
+    calibration: Any = SimpleNamespace(cameras=CAMERAS, stage=stage, covariance=np.zeros((0, 0)))
+    table = pd.DataFrame({"t_s": [0.0, 1.0], "position_mm": [0.0, 102.0]})
+    rig = SimpleNamespace(stage=described, accelerometers={})
+    found, _, _ = problem_of(None, calibration, stage=table, rig=rig, t_s=[0.0, 0.5, 1.0])
+    np.testing.assert_allclose(found.axis, axis)
+    assert found.stage is not None and found.stage.position_mm[-1] == pytest.approx(100)
+    stated = travel_of({}, described)
+    assert (stated.source, stated.covariance[2, 2]) == ("rig.toml", pytest.approx(1.6e-5))
+    assert travel_of({}, None).source == "assumed"
+
+
+def test_accelerometer_spectra_before_and_after() -> None:
+    """A 20 Hz vibration goes into the model; what is left is the sensor's noise."""
+    rng = np.random.default_rng(6)
+    t = np.arange(1200) / 1000
+    push = 3000 * np.sin(2 * np.pi * 20 * t)[:, None] * UP
+    sigma = 300.0
+    reading = push + 9810 * UP + sigma * rng.normal(size=(len(t), 3))
+    sensor = Accelerometer("carriage", CARRIAGE, t - 0.2, reading, np.eye(3), sigma)
+    model = replace(STILL, modes=(RigMode(20.0, 0.05, (0.1, 0.2, 0.1), CARRIAGE),))
+    solution = solve(replace(problem(), accelerometers=(sensor,)), model, Options(robust=False))
+    found = accelerometer_spectra(solution)["carriage"]
+    frequency, before, after = (np.array(found[k]) for k in ("frequency_hz", "reading", "residual"))
+    assert frequency[before.argmax()] == pytest.approx(20, abs=1.5)
+    assert after.max() < 0.1 * before.max()
+    assert found["noise"] == pytest.approx(3 * 2 * (sigma / 1000) ** 2 / 1000, rel=0.01)
+    assert np.median(after[frequency > 300]) == pytest.approx(found["noise"], rel=0.4)
+
+
+def test_arms_that_shake_alone_and_together() -> None:
+    """Labels of lines read from estimated offsets, three seeds: who moves, and nothing twice."""
+    bands = ShakeModel(broad_bands=tuple(BroadBand((0.2,) * 3, j) for j in range(2)))
+    for seed in (21, 22, 23):
+        given, _, _ = run(np.random.default_rng(seed), seconds=3.0, rate_hz=100.0, marks=3)
+        rows = shake_modes(solve(given, bands))
+        for row in rows:
+            lines = {"common": COMMON_HZ, "arm left": ARM_HZ, "arm right": ARM_HZ}
+            assert row["frequency_hz"] == pytest.approx(lines[row["where"]], abs=1.5)
+        expected = ["common"] if seed == 21 else ["arm left", "arm right", "common"]
+        assert sorted(r["where"] for r in rows) == expected  # 21: nine tenths of it are common

@@ -1,0 +1,145 @@
+"""Residuals beside those that the model would leave: drawn, tested, and what they tell of noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import kstest
+from shake_learning_data import run, true_model
+
+from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
+from telerig.estimator.smoothing.graph.state import frame_of
+from telerig.estimator.smoothing.learning.adapted_priors import adapted, leverages
+from telerig.estimator.smoothing.problem.problem import Observations, ShakeModel, SmoothingProblem
+from telerig.estimator.smoothing.verdict.residual_draws import drawn_residuals, stretch_of
+from telerig.estimator.smoothing.verdict.whiteness import pixel_whiteness
+
+Array = NDArray[np.float64]
+
+TRUE = true_model()
+TRUE = replace(TRUE, modes=tuple(replace(m, force_hz=60.0) for m in TRUE.modes))
+
+
+def solved(problem: SmoothingProblem, model: ShakeModel = TRUE) -> Solution:
+    return solve(problem, model, Options(robust=False))
+
+
+def stated(problem: SmoothingProblem, times: float) -> SmoothingProblem:
+    """The same pixels, their stated standard deviation so many times as large."""
+    obs = problem.observations
+    whole = obs.item, obs.frame, obs.camera, obs.uv_px, times**2 * obs.covariance_px2
+    return replace(problem, observations=Observations(*whole))
+
+
+@pytest.mark.parametrize(("seed", "kept"), [(31, 1.0), (32, 1.0), (33, 0.7), (34, 0.5)])
+def test_residuals_of_the_right_model_are_as_expected(seed: int, kept: float) -> None:
+    """They are not white: the fit follows part of the noise."""
+    problem, _, _ = run(np.random.default_rng(seed), bubbles=2, seconds=1.5, kept=kept)
+    found = pixel_whiteness(solved(problem))
+    assert list(found) == ["left", "right"]
+    for one in found.values():
+        assert one["verdict"] == "as expected" and one["p"] > 1e-3
+        assert one["expected"][0] < -0.05
+        np.testing.assert_allclose(one["autocorrelation"], one["expected"], atol=0.2)
+        assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.1)
+
+
+def test_p_is_uniform_where_the_model_is_right() -> None:
+    """Residuals drawn from the model itself, judged by others: a false alarm as often as said."""
+    problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=1.0, kept=0.7)
+    solution = solved(problem)
+    stretch = stretch_of(solution.frame, 100)
+    assert stretch is not None
+    others = drawn_residuals(solution, stretch, 60, np.random.default_rng(2))
+    found = []
+    for k in range(60):
+        residuals = solution.residuals[0].copy()
+        for which, drawn in others:
+            residuals[which] = drawn[..., k]
+        one = pixel_whiteness(replace(solution, residuals=(residuals, solution.residuals[1])))
+        found += [one["left"]["p"], one["right"]["p"]]
+    assert kstest(found, "uniform").pvalue > 0.01
+
+
+def test_drawn_residuals_are_as_small_as_the_covariances_say() -> None:
+    """An independent way: variance left = 1 - leverage, from the posterior's covariance."""
+    problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=0.4)
+    solution = solved(problem)
+    stretch = stretch_of(solution.frame, 40)
+    assert stretch is not None and stretch.inner == (0, 79)
+    drawn = drawn_residuals(solution, stretch, 400, np.random.default_rng(1))
+    for (which, residuals), (some, leverage) in zip(drawn, leverages(solution), strict=True):
+        np.testing.assert_array_equal(which, some)
+        np.testing.assert_allclose((residuals**2).mean(-1), 1 - leverage, atol=0.25)
+        np.testing.assert_allclose((residuals**2).mean((0, 2)), 1 - leverage.mean(0), rtol=0.02)
+
+
+def test_a_centre_that_wanders_is_seen() -> None:
+    rng = np.random.default_rng(36)
+    problem, _, _ = run(rng, bubbles=1, seconds=2.0, sigma_px=0.2)
+    obs = problem.observations
+    wander = np.zeros((2, 400, 2))
+    for k in range(1, 400):
+        wander[:, k] = 0.8 * wander[:, k - 1] + 0.4 * rng.normal(size=(2, 2))
+    pixels = obs.uv_px + wander[obs.camera, obs.frame]
+    moved = Observations(obs.item, obs.frame, obs.camera, pixels, obs.covariance_px2)
+    for one in pixel_whiteness(solved(replace(problem, observations=moved))).values():
+        assert one["verdict"] == "correlated" and one["p"] < 1e-5
+        assert one["rms_sigmas"] > 1.4 * one["expected_rms_sigmas"]
+
+
+def test_too_few_frames_are_not_judged() -> None:
+    problem, _, _ = run(np.random.default_rng(37), bubbles=1, seconds=0.15)
+    assert pixel_whiteness(solved(problem)) == {}
+
+
+def tracks(problem: SmoothingProblem, spans: list[tuple[int, int]]) -> SmoothingProblem:
+    """Each bubble seen in its span of frames only."""
+    obs, bubbles, keep = problem.observations, [], np.zeros(len(problem.observations), bool)
+    for k, (first, last) in enumerate(spans):
+        guess = problem.bubbles[k].guess_mm[first : last + 1]
+        bubbles.append(replace(problem.bubbles[k], first=first, last=last, guess_mm=guess))
+        keep |= (obs.item == k) & (obs.frame >= first) & (obs.frame <= last)
+    whole = (a[keep] for a in (obs.item, obs.frame, obs.camera, obs.uv_px, obs.covariance_px2))
+    return replace(problem, bubbles=tuple(bubbles), observations=Observations(*whole))
+
+
+def test_tracks_one_after_the_other_and_pauses() -> None:
+    """Later bubbles count like the first; a rig without shake has no state where none is seen."""
+    problem, _, _ = run(np.random.default_rng(38), bubbles=20, seconds=3.0)
+    short = tracks(problem, [(30 * k, 30 * k + 29) for k in range(20)])
+    for one in pixel_whiteness(solved(short)).values():
+        assert one["verdict"] == "as expected"
+        assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.12)
+    apart = tracks(replace(problem, bubbles=problem.bubbles[:2]), [(0, 99), (500, 599)])
+    still = solved(apart, TRUE.without_shake())
+    assert still.frame.shake.size == 0
+    assert list(pixel_whiteness(still)) == ["left", "right"]
+
+
+def test_a_stretch_is_short_and_what_is_too_much_is_not_judged() -> None:
+    problem, _, _ = run(np.random.default_rng(38), bubbles=3, seconds=2.5, marks=2)
+    frame = solved(problem).frame
+    width = frame.shake.size + 3 * frame.bubble.size
+    for middle, first, inner in ((250, 150, (162, 337)), (0, 0, (0, 187)), (499, 300, (312, 499))):
+        stretch = stretch_of(frame, middle)
+        assert stretch is not None
+        assert stretch.size == 200 * width and stretch.inner == inner
+        inside = np.flatnonzero(stretch.column[:500] >= 0)
+        assert (inside[0], inside[-1]) == (first, first + 199)
+    crowd, _, _ = run(np.random.default_rng(38), bubbles=40, seconds=0.3)
+    assert stretch_of(frame_of(crowd, TRUE, np.zeros(0)), 30) is None
+
+
+@pytest.mark.parametrize(("times", "wanted"), [(0.6, 1 / 0.6), (1.0, 1.0), (2.0, 1.0)])
+def test_noise_that_is_stated_too_small_is_found(times: float, wanted: float) -> None:
+    """One that is stated too large is believed: outlines err slowly, which looks like motion."""
+    problem, _, _ = run(np.random.default_rng(40), bubbles=2, seconds=1.5)
+    better = adapted(solved(stated(problem, times)))
+    found = 1.0 if better is None else better.pixel_inflation
+    assert found == pytest.approx(wanted, rel=0.1)
+    if wanted == 1.0:
+        assert better is None

@@ -1,0 +1,230 @@
+"""A run from images or detections to tracks: against the simulator's truth, stopped, resumed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import telerig
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.tracking import detection
+from telerig.estimator.tracking.results_folder import write_tracking
+from telerig.estimator.tracking.track import TrackOptions
+from telerig.estimator.tracking.tracks import Tracks
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.run.presets import run_preset
+from telerig.scripts.main import app
+
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def rise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One bubble from images; the calibration views are not needed."""
+    folder = tmp_path_factory.mktemp("rise") / "data"
+    config = run_preset("rise", frames=FRAMES)
+    telerig.simulate(config, rng=np.random.default_rng(11), out=folder)
+    shutil.rmtree(folder / "calibration")
+    truth_calibration().save(folder / "results" / "calibration")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(rise: Path) -> Tracks:
+    return telerig.track(telerig.load_run(rise / "runs" / "rise"), truth_calibration())
+
+
+def truth_calibration(preset: str = "rise") -> Calibration:
+    return calibration_from_cameras(
+        list(true_cameras(run_preset(preset).calibration).values()), name="truth"
+    )
+
+
+def truth_of(data: Path, run: str) -> pd.DataFrame:
+    return pd.read_csv(data / "truth" / "runs" / run / "bubbles.csv")
+
+
+def tracked(data: Path, folder: Path, **changes: Any) -> dict[str, Any]:
+    run = replace(telerig.load_run(data / "runs" / "rise"), **changes)
+    return write_tracking(
+        run, truth_calibration(), folder, options=TrackOptions(), record={}, report=False
+    )
+
+
+def test_one_bubble_is_one_track_at_the_true_pixels(rise: Path, whole: Tracks) -> None:
+    assert len(whole) == 1
+    table = whole.table.merge(truth_of(rise, "rise"), on="frame", suffixes=("", "_true"))
+    assert len(table) == FRAMES
+    for camera in ("left", "right"):
+        for x in "uv":
+            error = table[f"{camera}_{x}_px"] - table[f"{camera}_silhouette_{x}_px"]
+            assert np.sqrt((error**2).mean()) < 0.25
+    assert np.allclose(table["d_eq_mm"], table["d_eq_mm_true"], rtol=0.03)
+
+
+def test_detections_alone_give_the_same_track(rise: Path, whole: Tracks, tmp_path: Path) -> None:
+    bare = tmp_path / "data" / "runs" / "rise"
+    bare.mkdir(parents=True)
+    shutil.copy(rise / "rig.toml", tmp_path / "data" / "rig.toml")
+    for name in ("frames.csv", "stage.csv"):
+        shutil.copy(rise / "runs" / "rise" / name, bare / name)
+    columns = ["frame", "camera", "u_px", "v_px"]
+    whole.detections[columns].to_csv(bare / "detections.csv", index=False)
+    again = telerig.track(telerig.load_run(bare), truth_calibration())
+    names = ["left_u_px", "left_v_px", "right_u_px", "right_v_px"]
+    assert np.allclose(again.table[names], whole.table[names])
+    assert set(again.table["centre"]) == {"silhouettes"}
+
+
+def test_given_ids_pass_through(rise: Path, whole: Tracks) -> None:
+    run = telerig.load_run(rise / "runs" / "rise")
+    given = whole.detections[["frame", "camera", "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]]
+    for text, expected in (("41", 41), ("bubble A", "bubble A")):
+        changed = replace(run, detections=given.assign(particle=text), source="detections")
+        again = telerig.track(changed, truth_calibration())
+        assert set(again.table["particle"]) == {expected}
+        assert set(again.detections["particle"]) == {expected}
+
+
+def test_named_bubbles_are_tracked_but_not_reported_nor_smoothed(
+    rise: Path, whole: Tracks, tmp_path: Path
+) -> None:
+    table = whole.detections.drop(columns="particle").assign(particle="first")
+    run = replace(telerig.load_run(rise / "runs" / "rise"), detections=table, source="detections")
+    asked: dict[str, Any] = {"options": TrackOptions(), "record": {}}
+    with pytest.raises(InputError, match=r"'first' is no whole number.*\n.*--no-report"):
+        write_tracking(run, truth_calibration(), tmp_path / "out", **asked)
+    assert list(tmp_path.iterdir()) == []
+    write_tracking(run, truth_calibration(), tmp_path / "out", **asked, report=False)
+    tracks = telerig.load_tracks(tmp_path / "out")
+    assert set(tracks.table["particle"]) == {"first"}
+    with pytest.raises(InputError, match="'first' is no whole number"):
+        telerig.smooth(tracks, truth_calibration())
+
+
+def test_an_interrupted_run_goes_on_and_ends_alike(
+    rise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = tmp_path / "whole"
+    tracked(rise, whole)
+    seen: list[int] = []
+    original = detection._detect
+
+    def stops(scene: Any, camera: str, frame: int) -> Any:
+        if frame == 6:
+            raise KeyboardInterrupt
+        return original(scene, camera, frame)
+
+    def counts(scene: Any, camera: str, frame: int) -> Any:
+        seen.append(frame)
+        return original(scene, camera, frame)
+
+    monkeypatch.setattr(detection, "quick_workers", lambda tasks: 1)
+    monkeypatch.setattr(detection, "_detect", stops)
+    parts = tmp_path / "parts"
+    with pytest.raises(KeyboardInterrupt):
+        tracked(rise, parts)
+    assert not parts.exists()
+    monkeypatch.setattr(detection, "_detect", counts)
+    tracked(rise, parts)
+    assert min(seen) > 0 and max(seen) == FRAMES - 1
+    for name in ("detections.csv", "tracks.csv", "events.csv"):
+        assert (parts / name).read_bytes() == (whole / name).read_bytes()
+    assert not list(tmp_path.glob(".*work"))
+
+
+def test_other_options_do_not_take_up_old_detections(rise: Path, tmp_path: Path) -> None:
+    store = detection.DetectionStore(tmp_path / "work", "one", 20, 1)
+    store.path(store.batches[0]).write_text("frame\n", encoding="utf-8")
+    same = detection.DetectionStore(tmp_path / "work", "one", 20, 1)
+    assert len(same.missing) == len(same.batches) - 1
+    other = detection.DetectionStore(tmp_path / "work", "two", 20, 1)
+    assert other.missing == other.batches
+
+
+def test_a_frame_missing_in_one_camera_is_told(rise: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(rise, data)
+    file = sorted((data / "runs" / "rise" / "right").iterdir())[5]
+    file.unlink()
+    tracks = telerig.track(telerig.load_run(data / "runs" / "rise"), truth_calibration())
+    assert sorted(tracks.table["frame"]) == [f for f in range(FRAMES) if f != 5]
+    assert tracks.summary["frames_without_bubbles"]["right"] == {"no image": 1}
+    seen = tracks.detections[tracks.detections["frame"] == 5]
+    assert set(seen[seen["camera"] == "left"]["particle"]) == set(tracks.table["particle"])
+
+
+def test_calibration_of_another_rig(rise: Path) -> None:
+    run = telerig.load_run(rise / "runs" / "rise")
+    good = truth_calibration()
+    renamed = replace(good, cameras=tuple(replace(c, name=c.name + "2") for c in good.cameras))
+    with pytest.raises(CalibrationError, match="left2"):
+        telerig.track(run, renamed)
+    larger = replace(
+        good, cameras=tuple(replace(c, image_size_px=(1280, 800)) for c in good.cameras)
+    )
+    with pytest.raises(CalibrationError, match="512 x 512"):
+        telerig.track(run, larger)
+    with pytest.raises(CalibrationError, match="two cameras"):
+        telerig.track(run, replace(good, cameras=good.cameras[:1]))
+
+
+def test_a_single_frame_is_a_track_of_one_point(rise: Path, whole: Tracks) -> None:
+    run = telerig.load_run(rise / "runs" / "rise")
+    first = whole.detections[whole.detections["frame"] == 0].assign(particle="")
+    one = replace(
+        run, detections=first, source="detections", frame_count=1, t_s=run.t_s[:1],
+        position_mm=None,
+    )  # fmt: skip
+    table = telerig.track(one, truth_calibration()).table
+    names = ["left_u_px", "right_v_px", "x_mm", "z_mm"]
+    expected = whole.table[whole.table["frame"] == 0]
+    assert len(table) == 1
+    assert np.allclose(table[names], expected[names], atol=0.05)
+
+
+def test_a_run_without_any_bubble_says_so(rise: Path) -> None:
+    run = telerig.load_run(rise / "runs" / "rise")
+    table = pd.DataFrame({"frame": [0], "camera": ["left"], "u_px": [np.nan], "v_px": [np.nan]})
+    with pytest.raises(InputError, match="no bubble"):
+        telerig.track(replace(run, detections=table, source="detections"), truth_calibration())
+
+
+def test_the_command_writes_what_the_contract_names(rise: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = CliRunner().invoke(
+        app, ["track", str(rise / "runs" / "rise"), "--out", str(out), "--quiet"]
+    )
+    assert result.exit_code == 0, result.output
+    assert "1 track, " in result.output
+    names = {"detections.csv", "tracks.csv", "events.csv", "tracking.json", "run.json"}
+    assert names | {"report.html"} <= {p.name for p in out.iterdir()}
+    summary = json.loads((out / "tracking.json").read_text(encoding="utf-8"))
+    assert summary["frames"] == FRAMES
+    loaded = telerig.load_tracks(out)
+    assert len(loaded) == 1 and len(loaded.table) == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere/runs/rise"], "there is no calibration"),
+        (["RUN", "--calibration", "a.txt"], "two OpenLPT camera files"),
+        (["RUN", "--from", "video"], "--from images"),
+    ],
+)
+def test_bad_input_of_the_command(rise: Path, arguments: list[str], words: str) -> None:
+    given = [str(rise / "runs" / "rise") if a == "RUN" else a for a in arguments]
+    result = CliRunner().invoke(app, ["track", *given])
+    assert result.exit_code == 2
+    assert words in result.output.replace("\n", " ")

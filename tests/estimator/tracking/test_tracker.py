@@ -1,0 +1,267 @@
+"""The tracker in situations with a known answer."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from tracker_runs import STILL, UP, Array, cameras, frame_of, kinds, run
+
+from telerig.errors import InputError
+from telerig.estimator.tracking.filter.types import SingleMeasurements, TrackerSettings
+from telerig.estimator.tracking.tracker import Tracker
+
+# --- association
+
+
+def test_common_shake_of_a_whole_distance_does_not_swap_neighbours() -> None:
+    """Two bubbles 0.4 mm apart; the rig jumps by 0.4 mm along their line, so that each lands
+    where the other was."""
+    rng = np.random.default_rng(0)
+    shift = np.zeros((40, 3))
+    shift[20:, 0] = 0.4
+    bubbles = np.array([[0.0, 0, 0], [0.4, 0, 0]])
+    frames = [bubbles + s + rng.normal(0, 0.01, (2, 3)) for s in shift]
+    ids, events = run(Tracker(settings=STILL), frames)
+    assert [i.tolist() for i in ids[5:]] == [ids[5].tolist()] * 35
+    assert set(ids[5].tolist()) == {0, 1} and "break" not in kinds(events)
+
+
+def passing(offset_mm: float, rng: np.random.Generator) -> list[Array]:
+    """Two bubbles on straight lines, 100 mm/s towards each other, ``offset_mm`` apart at best."""
+    t = (np.arange(60) - 30) / 500
+    a = np.stack([50 * t, 0 * t, 0 * t], -1)
+    b = np.stack([-50 * t, 0 * t, offset_mm + 0 * t], -1)
+    return [np.stack([p, q]) + rng.normal(0, 0.01, (2, 3)) for p, q in zip(a, b)]
+
+
+def test_a_straight_crossing_keeps_both_ids() -> None:
+    ids, events = run(Tracker(settings=STILL), passing(0.0, np.random.default_rng(1)))
+    assert ids[5].tolist() == ids[-1].tolist() == [0, 1]
+    assert "break" not in kinds(events)
+
+
+def ambiguous_meeting(rng: np.random.Generator) -> list[Array]:
+    """Two bubbles come from -x and +x, are unseen for 12 frames, leave along -z and +z."""
+    t = np.arange(30) / 500
+    before = [np.array([[s - 0.8, 0, 0], [0.8 - s, 0, 0]]) for s in 12 * t]
+    after = [np.array([[0, 0, -0.1 - s], [0, 0, 0.1 + s]]) for s in 12 * t]
+    frames = [*before, *[np.zeros((0, 3))] * 12, *after]
+    return [f + rng.normal(0, 0.005, f.shape) for f in frames]
+
+
+def test_a_meeting_that_nothing_can_tell_apart_breaks_both_tracks() -> None:
+    ids, events = run(Tracker(settings=STILL), ambiguous_meeting(np.random.default_rng(2)))
+    assert ids[20].tolist() == [0, 1]
+    assert set(ids[-1].tolist()).isdisjoint({0, 1, -1})
+    broken = [e for e in events if e.kind == "break"]
+    assert broken and set(broken[0].particles[:2]) == {0, 1}
+    assert "runner-up" in broken[0].reason
+
+
+def test_size_tells_apart_what_position_cannot() -> None:
+    frames = ambiguous_meeting(np.random.default_rng(2))
+    sized = [frame_of(f, d_eq_mm=[4.0, 5.5][: len(f)]) for f in frames]
+    ids, events = run(Tracker(settings=STILL), sized)
+    assert ids[20].tolist() == ids[-1].tolist() == [0, 1]
+    assert "break" not in kinds(events)
+
+
+def test_clutter_gets_no_id_and_dropouts_are_bridged() -> None:
+    rng = np.random.default_rng(4)
+    frames: list[Any] = []
+    for i in range(60):
+        bubble = np.array([[0.0, 0, 0]]) + rng.normal(0, 0.01, (1, 3))
+        frames.append(np.vstack([bubble, rng.uniform(-25, 25, (1, 3))]))
+        if i in (30, 31):
+            frames[-1] = frames[-1][1:]
+    ids, events = run(Tracker(settings=STILL), frames)
+    assert all(i[0] == 0 for n, i in enumerate(ids) if n not in (30, 31))
+    assert all(i[-1] == -1 for i in ids)
+    gap = [e for e in events if e.kind == "gap"]
+    assert len(gap) == 1 and gap[0].frame == 32 and gap[0].reason == "2 frames bridged"
+
+
+def test_birth_and_death_are_told() -> None:
+    frames = [np.zeros((1, 3))] * 20 + [np.zeros((0, 3))] * 40
+    ids, events = run(Tracker(settings=STILL), frames)
+    assert [i.tolist() for i in ids[:20]] == [[0]] * 20
+    assert kinds(events) == ["birth", "death"]
+    assert events[0].frame == 2 and events[1].t_s == pytest.approx(19 / 500 + 0.05, abs=0.0021)
+
+
+def test_split_and_merger_balance_volumes() -> None:
+    small = 5.0 / 2 ** (1 / 3)
+    one = frame_of([[0.0, 0, 0]], d_eq_mm=[5.0])
+    two = frame_of([[0.0, 0, 0], [4.0, 0, 0]], d_eq_mm=[small, small])
+    _, events = run(Tracker(settings=STILL), [one] * 20 + [two] * 20 + [one] * 60)
+    split, merge = (next(e for e in events if e.kind == k) for k in ("split", "merge"))
+    assert split.particles == (0, 1) and merge.particles == (0, 1)
+    third = frame_of([[0.0, 0, 0], [4.0, 0, 0]], d_eq_mm=[5.0, small])
+    _, events = run(Tracker(settings=STILL), [one] * 20 + [third] * 20)
+    assert "split" not in kinds(events)
+
+
+# --- stage
+
+
+@pytest.mark.parametrize("encoder", [True, False])
+def test_the_encoder_carries_tracks_over_a_jerk_of_the_stage(encoder: bool) -> None:
+    """A stage that jumps by 6 mm between two frames: the bubble moves by -axis x 6 mm."""
+    stage = np.where(np.arange(40) < 20, 0.0, 6.0)
+    frames = [-UP[None] * s for s in stage]
+    tracker = Tracker(settings=STILL)
+    ids, events = run(tracker, frames, stage=stage if encoder else np.full(40, np.nan))
+    assert ids[0].tolist() == [0]
+    assert (ids[-1].tolist() == [0]) is encoder
+    assert kinds(events).count("birth") == (1 if encoder else 2)
+
+
+def test_without_encoder_a_ramp_of_the_stage_is_followed() -> None:
+    t = np.arange(200) / 500
+    speed = np.clip(280 * t / 0.15, 0, 280)
+    moved = np.cumsum(speed) / 500
+    rng = np.random.default_rng(6)
+    base = rng.uniform(-20, 20, (5, 3))
+    frames = [base + UP * (280 * ti - s) + rng.normal(0, 0.02, (5, 3)) for ti, s in zip(t, moved)]
+    ids, events = run(Tracker(), frames, stage=np.full(200, np.nan))
+    assert kinds(events) == ["birth"] * 5
+    assert ids[0].tolist() == ids[-1].tolist()
+
+
+def test_readings_that_fail_for_a_while_are_bridged() -> None:
+    t = np.arange(150) / 500
+    stage = 300 * t + 2 * np.sin(10 * t)
+    rng = np.random.default_rng(7)
+    frames = [np.array([[0, 0, 0], [9, 0, 0]]) + UP * (280 * a - s) for a, s in zip(t, stage)]
+    frames = [f + rng.normal(0, 0.02, f.shape) for f in frames]
+    read = np.where((np.arange(150) > 60) & (np.arange(150) < 100), np.nan, stage)
+    tracker = Tracker()
+    ids, events = run(tracker, frames, stage=read)
+    assert kinds(events) == ["birth"] * 2 and ids[0].tolist() == ids[-1].tolist()
+    velocity = np.array([track.filter.x[3:6] for c in tracker.clusters for track in c.tracks])
+    assert velocity.mean(0) == pytest.approx(280 * UP, abs=12)
+
+
+# --- given ids, one camera
+
+
+def test_given_ids_pass_unchanged_and_new_ones_keep_clear() -> None:
+    a, b, other = [0.0, 0, 0], [0.05, 0, 0], [20.0, 0, 0]
+    frames = [
+        frame_of([b, other, a] if i % 2 else [a, other, b], particle=[17, -1, 5]) for i in range(30)
+    ]
+    ids, events = run(Tracker(settings=STILL), frames)
+    assert all(i.tolist() == [17, 18, 5] for i in ids)
+    assert kinds(events) == ["birth"] * 3
+
+
+@pytest.mark.parametrize("seeing", [0, 1])
+def test_one_camera_alone_keeps_a_track_alive(seeing: int) -> None:
+    pair = cameras()
+    tracker = Tracker(pair, settings=STILL)
+    points = np.stack([np.sin(np.arange(150) / 30), 0.01 * np.arange(150), np.zeros(150)], -1)
+    for i, point in enumerate(points):
+        alone = 30 <= i < 110
+        uv = pair[seeing].project(point[None])
+        singles = SingleMeasurements(np.array([seeing]), uv, np.eye(2)[None] * 0.04)
+        measured = frame_of([] if alone else [point], singles=singles if alone else None)
+        result = tracker.update(i, i / 500, measured, 0.0)
+        if alone:
+            assert result.single.tolist() == [0]
+            seen = pair[seeing].project(tracker.predict(i / 500 + 1e-6, 0.0).points_mm)
+            assert seen == pytest.approx(uv, abs=1.0)
+    assert result.particle.tolist() == [0] and tracker.next_id == 1
+
+
+# --- streaming
+
+
+def crowd(seed: int, frames: int = 120) -> list[Array]:
+    rng = np.random.default_rng(seed)
+    start, speed = rng.uniform(-4, 4, (8, 3)), rng.normal(0, 40, (8, 3))
+    out = []
+    for i in range(frames):
+        points = start + speed * i / 500 + rng.normal(0, 0.02, (8, 3))
+        clutter = rng.uniform(-5, 5, (1, 3))
+        out.append(np.vstack([points[rng.random(8) > 0.05], clutter]))
+    return [*out[:60], *ambiguous_meeting(rng), *out[60:]]
+
+
+def test_an_interrupted_run_goes_on_bit_by_bit() -> None:
+    frames = crowd(0)
+    whole = Tracker(settings=STILL)
+    resumed, was_open = Tracker(settings=STILL), 0
+    for i, points in enumerate(frames):
+        expected = whole.update(i, i / 500, frame_of(points), 0.01 * i)
+        got = resumed.update(i, i / 500, frame_of(points), 0.01 * i)
+        assert got.particle.tolist() == expected.particle.tolist()
+        assert got.events == expected.events
+        assert [s.particle.tolist() for s in got.settled] == [
+            s.particle.tolist() for s in expected.settled
+        ]
+        was_open += any(c.open for c in whole.clusters)
+        if i % 3 == 0:
+            stored = json.dumps(resumed.to_dict())
+            resumed = Tracker(settings=STILL)
+            resumed.restore(json.loads(stored))
+    assert was_open > 3
+    assert json.dumps(resumed.to_dict()) == json.dumps(whole.to_dict())
+
+
+def test_state_does_not_grow_with_the_run() -> None:
+    """A bubble that keeps jumping: a new particle every 8 frames, the old ones forgotten."""
+    settings = TrackerSettings(rise_mm_s=0.0, gap_s=0.004, gap_frames=1)
+    tracker, sizes = Tracker(settings=settings), []
+    for i in range(400):
+        tracker.update(i, i / 500, frame_of([[10.0 * (i // 8), 0, 0]]), 0.0)
+        sizes.append(len(json.dumps(tracker.to_dict())))
+    assert tracker.next_id > 40
+    assert len(tracker.to_dict()["ledger"]["seen"]) < 24
+    assert max(sizes[200:]) < 1.1 * max(sizes[:200])
+
+
+def test_predict_changes_nothing_and_empty_frames_are_fine() -> None:
+    tracker = Tracker(settings=STILL)
+    assert tracker.finish() is None
+    assert len(tracker.predict(0.0, 0.0).ids) == 0
+    for i in range(5):
+        tracker.update(i, i / 500, frame_of([[1.0, 2, 3]]), 0.0)
+    before = json.dumps(tracker.to_dict())
+    seen = tracker.predict(5 / 500, 1.0)
+    assert seen.ids.tolist() == [0]
+    assert seen.points_mm[0] == pytest.approx([1, 3, 3], abs=0.05)
+    assert json.dumps(tracker.to_dict()) == before
+    for i in range(5, 60):
+        assert tracker.update(i, i / 500, frame_of([]), None).particle.size == 0
+
+
+# --- refusals
+
+
+def test_bad_input_is_refused_in_words() -> None:
+    tracker = Tracker(cameras())
+    tracker.update(3, 0.1, frame_of([]), 0.0)
+    for frame, t in ((3, 0.2), (4, 0.1), (4, np.nan)):
+        with pytest.raises(InputError):
+            tracker.update(frame, t, frame_of([]), 0.0)
+    alone = SingleMeasurements(np.array([2]), np.zeros((1, 2)), np.eye(2)[None])
+    with pytest.raises(InputError, match="2 cameras"):
+        tracker.update(5, 0.3, frame_of([], singles=alone), 0.0)
+    with pytest.raises(InputError, match="not finite"):
+        frame_of([[np.nan, 0, 0]])
+    with pytest.raises(InputError, match="twice"):
+        frame_of(np.zeros((2, 3)), particle=[1, 1])
+    with pytest.raises(InputError, match="d_eq_mm"):
+        frame_of(np.zeros((2, 3)), d_eq_mm=[1.0])
+    with pytest.raises(InputError, match="detection_probability"):
+        TrackerSettings(detection_probability=1.0)
+    with pytest.raises(InputError, match="confirm_hits"):
+        TrackerSettings(confirm_hits=5)
+    with pytest.raises(InputError, match="axis_rig"):
+        Tracker(axis_rig=(0, 0, 0))
+    other = Tracker(settings=STILL)
+    with pytest.raises(InputError, match="other settings"):
+        other.restore(tracker.to_dict())

@@ -1,0 +1,180 @@
+"""Cameras as matrices and polynomials against OpenCV and independent evaluations."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from camera_pairs import DISTORTED, PRISM, SQUARE_ON, Array, pair, random_points
+
+from telerig.errors import InputError
+from telerig.io.exchange.export.opencv import camera_matrices, write_opencv
+from telerig.io.exchange.export.soloff import fit_soloff, read_soloff, write_soloff
+from telerig.io.exchange.export.volume import seen_points, volume_of, working_volume
+from telerig.rig.triangulation import triangulate
+
+# ------------------------------------------------------------------------------------- OpenCV
+
+
+def read_yaml(path: Path) -> list[dict[str, Array]]:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    nodes = storage.getNode("cameras")
+    out = []
+    for i in range(nodes.size()):
+        node = nodes.at(i)
+        out.append({k: node.getNode(k).mat() for k in node.keys() if not _scalar(node, k)})  # noqa: SIM118
+        out[-1] |= {k: node.getNode(k).real() for k in node.keys() if k.endswith("_px")}  # noqa: SIM118
+        assert node.getNode("name").string() in ("left", "right")
+    storage.release()
+    return out
+
+
+def _scalar(node: cv2.FileNode, key: str) -> bool:
+    return not node.getNode(key).isMap()
+
+
+def in_homogeneous(matrix: Array, points: Array) -> Array:
+    image = np.c_[points, np.ones(len(points))] @ matrix.T
+    return np.asarray(image[:, :2] / image[:, 2:])
+
+
+@pytest.mark.parametrize(
+    "parameters", [{}, {"aspect": 1.01, "skew": 0.02}, {"tilt_x": 0.1, "tilt_y": 0.05}]
+)
+def test_opencv_affine_matrix_is_the_projection(
+    parameters: dict[str, float], tmp_path: Path
+) -> None:
+    cameras = pair(**parameters)
+    write_opencv(camera_matrices(cameras), tmp_path / "rig.yml")
+    points = random_points(cameras)
+    for camera, read in zip(cameras, read_yaml(tmp_path / "rig.yml")):
+        np.testing.assert_array_equal(read["affine"][2], [0, 0, 0, 1])
+        for name in ("affine", "undistorted"):
+            pixels = in_homogeneous(read[name], points)
+            np.testing.assert_allclose(pixels, camera.project(points), rtol=0, atol=1e-10)
+            assert read[f"{name}_max_px"] < 1e-10
+        assert ("camera_matrix" in read) == (not set(parameters) & {"skew", "tilt_x"})
+
+
+def test_opencv_matrix_of_a_perspective_camera_with_tilt_is_exact() -> None:
+    cameras = pair(kappa_per_mm=1 / 250, tilt_x=0.1, tilt_y=-0.06, image_convergence_per_mm=0.002)
+    points = random_points(cameras)
+    for camera, ours in zip(cameras, camera_matrices(cameras)):
+        pixels = in_homogeneous(ours.undistorted, points)
+        np.testing.assert_allclose(pixels, camera.project(points), rtol=0, atol=1e-9)
+        assert ours.affine_misfit.max_px > 5
+
+
+def test_opencv_undistorts_and_triangulates_what_telerig_projects(tmp_path: Path) -> None:
+    cameras = pair(**DISTORTED, **PRISM, k3=0.002, aspect=1.002)
+    write_opencv(camera_matrices(cameras), tmp_path / "rig.yml")
+    points = random_points(cameras)
+    straight, matrices = [], []
+    for camera, read in zip(cameras, read_yaml(tmp_path / "rig.yml")):
+        seen = camera.project(points)
+        k = read["camera_matrix"]
+        best = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
+        coefficients = read["distortion_coefficients"]
+        if hasattr(cv2, "undistortPointsIter"):
+            flat = cv2.undistortPointsIter(
+                seen.reshape(-1, 1, 2), k, coefficients, np.eye(3), k, best
+            )
+        else:
+            flat = cv2.undistortPoints(
+                seen.reshape(-1, 1, 2), k, coefficients, R=np.eye(3), P=k, criteria=best
+            )
+        straight.append(flat.reshape(-1, 2))
+        matrices.append(read["undistorted"])
+        volume = seen_points(cameras, working_volume(cameras), 25)
+        error = in_homogeneous(read["affine"], volume) - camera.project(volume)
+        largest = np.linalg.norm(error, axis=1).max()
+        assert read["affine_max_px"] == pytest.approx(largest, rel=1e-6)
+        assert read["affine_max_px"] < read["undistorted_max_px"]
+    found = cv2.triangulatePoints(*matrices, straight[0].T, straight[1].T)
+    np.testing.assert_allclose((found[:3] / found[3]).T, points, rtol=0, atol=1e-6)
+    ours = triangulate(cameras, [c.project(points) for c in cameras], 0.1, "ml").points_mm
+    np.testing.assert_allclose((found[:3] / found[3]).T, ours, rtol=0, atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------- Soloff
+
+
+def soloff_by_hand(a: Array, x: Array, y: Array, z: Array) -> Array:
+    """Equation 8 of the paper, term by term."""
+    return np.asarray(
+        a[0] + a[1] * x + a[2] * y + a[3] * z + a[4] * x**2 + a[5] * x * y + a[6] * y**2
+        + a[7] * x * z + a[8] * y * z + a[9] * z**2 + a[10] * x**3 + a[11] * x**2 * y
+        + a[12] * x * y**2 + a[13] * y**3 + a[14] * x**2 * z + a[15] * x * y * z
+        + a[16] * y**2 * z + a[17] * x * z**2 + a[18] * y * z**2
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("parameters", [{}, {"k1": 0.004}, {"kappa_per_mm": 1 / 400}])
+def test_soloff_error_in_the_header_is_that_of_an_independent_evaluation(
+    parameters: dict[str, float], tmp_path: Path
+) -> None:
+    cameras = pair(**parameters)
+    points = np.random.default_rng(5).uniform(-25, 25, (40000, 3))
+    for camera in cameras:
+        uv = camera.project(points)
+        points = points[np.all((uv > 0) & (uv < np.array(camera.image_size_px) - 1), axis=1)]
+    inside = working_volume(cameras)
+    points = points[np.all((points > inside.lower_mm) & (points < inside.upper_mm), axis=1)]
+    for camera, fit in zip(cameras, fit_soloff(cameras)):
+        path = tmp_path / f"{camera.name}.csv"
+        write_soloff(fit, path)
+        text = path.read_text()
+        rms, largest = (
+            float(v)
+            for v in re.search(r"rms_px = (\S+), max_px = (\S+) at", text).groups()  # type: ignore[union-attr]
+        )
+        a = np.array([[float(v) for v in row.split(",")[3:]] for row in text.splitlines()[-19:]])
+        pixels = np.stack([soloff_by_hand(a[:, i], *points.T) for i in (0, 1)], -1)
+        distance = np.linalg.norm(pixels - camera.project(points), axis=1)
+        if not parameters:
+            assert largest < 1e-9 and distance.max() < 1e-9
+        else:
+            assert np.sqrt(np.mean(distance**2)) == pytest.approx(rms, rel=0.25)
+            assert distance.max() < 1.1 * largest
+        np.testing.assert_array_equal(read_soloff(path), a)
+        write_soloff(fit, path, first_pixel=1.0)
+        np.testing.assert_allclose(read_soloff(path)[0] - a[0], 1, atol=1e-12)
+
+
+def test_the_missing_cubic_term_is_what_a_camera_along_x_lacks(tmp_path: Path) -> None:
+    """Distortion k1 is a cubic; the 19 terms have no z^3, and z lies in the second image."""
+    cameras = pair(SQUARE_ON, k1=0.004)
+    nineteen, twenty = fit_soloff(cameras), fit_soloff(cameras, full_cubic=True)
+    assert nineteen[0].misfit.max_px < 1e-9 and 0.05 < nineteen[1].misfit.max_px < 0.2
+    assert max(fit.misfit.max_px for fit in twenty) < 1e-9
+    write_soloff(twenty[1], tmp_path / "right.csv")
+    points = random_points(cameras)
+    coefficients = read_soloff(tmp_path / "right.csv")
+    pixels = np.stack([soloff_by_hand(a, *points.T) for a in coefficients.T], -1)
+    pixels += np.outer(points[:, 2] ** 3, coefficients[19])
+    np.testing.assert_allclose(pixels, cameras[1].project(points), rtol=0, atol=1e-9)
+
+
+def test_soloff_reader_refuses_other_terms(tmp_path: Path) -> None:
+    path = tmp_path / "other.csv"
+    path.write_text("i,j,k,u,v\n0,0,0,1,2\n")
+    with pytest.raises(InputError, match="19 terms"):
+        read_soloff(path)
+
+
+# ------------------------------------------------------------------------------------- volume
+
+
+def test_volume_is_the_cube_both_cameras_see() -> None:
+    cameras = pair(SQUARE_ON)
+    box = working_volume(cameras)
+    edge = box.upper_mm - box.lower_mm
+    np.testing.assert_allclose(edge, 512 / 10.1)
+    assert np.all(np.abs(box.upper_mm + box.lower_mm) < 2)
+    with pytest.raises(InputError, match="in every camera's image"):
+        seen_points(cameras, volume_of([(90, 100), (0, 1), (0, 1)]), 13)
+    with pytest.raises(InputError, match="no box"):
+        volume_of([(1, 0), (0, 1), (0, 1)])

@@ -1,0 +1,156 @@
+"""The raw log: what is written reads back, damage costs its own entries, a full disk is said."""
+
+from __future__ import annotations
+
+import errno
+import os
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from telerig.errors import InputError
+from telerig.io.recording.log import (
+    MARKER,
+    RECEIVED,
+    SENT,
+    Entry,
+    LogHeader,
+    RawLog,
+    damaged_bytes,
+    read_header,
+    read_log,
+)
+from telerig.io.rig_file.device_description import DeviceDescription
+
+DEVICES = (
+    DeviceDescription("encoder", "encoder", "/dev/x", counts_per_mm=-2.5),
+    DeviceDescription("Zähler", "frames", "loop://", cameras=("left", "right")),
+)
+HEADER = LogHeader(123, "2020-01-01T00:00:00+00:00", ("left", "right"), DEVICES)
+
+
+def entries() -> list[Entry]:
+    rng = np.random.default_rng(0)
+    sizes = [0, 1, 4, 300, 17, 80, 2000, 5]
+    data = [rng.integers(0, 256, n, np.uint8).tobytes() + MARKER * (n % 2) for n in sizes]
+    return [Entry((RECEIVED, SENT)[k % 2], k % 2, 10**15 + k, d) for k, d in enumerate(data)]
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "run" / "recording.raw"
+    with RawLog(path, HEADER) as writer:
+        for entry in entries():
+            writer.append(entry)
+        writer.flush()
+    return path
+
+
+def test_what_is_written_reads_back(log: Path) -> None:
+    assert read_header(log) == HEADER
+    assert list(read_log(log)) == entries()
+    assert damaged_bytes(log) == 0
+
+
+def test_only_what_was_flushed_is_promised(tmp_path: Path) -> None:
+    writer = RawLog(tmp_path / "recording.raw", HEADER)
+    writer.append(entries()[0])
+    writer.flush()
+    writer.append(entries()[1])
+    assert list(read_log(writer.path)) == entries()[:1]
+    writer.close()
+
+
+def test_cut_off_anywhere_it_keeps_every_whole_entry(log: Path, tmp_path: Path) -> None:
+    data = log.read_bytes()
+    torn = tmp_path / "torn.raw"
+    begin = data.index(MARKER)
+    before = -1
+    for length in [*range(begin, begin + 60), *range(begin + 60, len(data) + 1, 97), len(data)]:
+        torn.write_bytes(data[:length])
+        found = list(read_log(torn))
+        assert found == entries()[: len(found)]
+        assert len(found) >= before
+        before = len(found)
+    assert before == len(entries())
+
+
+def test_zeros_that_a_power_cut_leaves_at_the_end(log: Path) -> None:
+    with log.open("ab") as stream:
+        stream.write(bytes(4096))
+    assert list(read_log(log)) == entries()
+    assert damaged_bytes(log) == 4096
+
+
+def test_damage_in_the_middle_costs_its_own_entry(log: Path) -> None:
+    data = bytearray(log.read_bytes())
+    at = data.index(entries()[3].data) + 50
+    data[at] ^= 0x10
+    log.write_bytes(data)
+    assert list(read_log(log)) == [e for k, e in enumerate(entries()) if k != 3]
+    assert damaged_bytes(log) > 300
+
+
+def test_blocks_do_not_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for size in (2500, 2100, 3001):
+        monkeypatch.setattr("telerig.io.recording.log._BLOCK", size)
+        assert list(read_log(log)) == entries()
+
+
+def test_a_recording_is_never_written_over(log: Path) -> None:
+    with pytest.raises(InputError, match=r"never written over(.|\n)*another name"):
+        RawLog(log, HEADER)
+
+
+def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = RawLog(tmp_path / "recording.raw", HEADER)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    writer.append(entries()[0])
+    with pytest.raises(InputError, match=r"disk is full(.|\n)*make room(.|\n)*--replay"):
+        writer.flush()
+    writer.close()
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(InputError, match="is a file"):
+        RawLog(tmp_path / "run" / "recording.raw", HEADER)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(b"", "no recording"), (b"t_s,position_mm\n1,2\n" * 9, "no recording")],
+)
+def test_what_is_no_log(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "x.raw"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_header(path)
+    with pytest.raises(InputError, match="check the path"):
+        read_header(tmp_path / "absent.raw")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"{}", b"[]", b"no JSON", b'{"start_ns":1,"started":"","cameras":[],"devices":[{"new":1}]}'],
+)
+def test_a_sound_header_of_another_version(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "x.raw"
+    length, crc = (n.to_bytes(4, "little") for n in (len(text), zlib.crc32(text)))
+    path.write_bytes(b"telerig recording 1\n" + length + text + crc)
+    with pytest.raises(InputError, match="does not know"):
+        read_header(path)
+
+
+def test_a_damaged_header(log: Path) -> None:
+    data = bytearray(log.read_bytes())
+    data[60] ^= 1
+    log.write_bytes(data)
+    with pytest.raises(InputError, match="damaged header"):
+        read_header(log)

@@ -1,0 +1,61 @@
+"""Outlines drawn over images, and as binary pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tracked_folder import outline
+
+from telerig.errors import InputError
+from telerig.io.report.overlays.bubbles import draw_binary, draw_bubble_overlay
+
+
+def test_binary_picture_has_the_outlines_area_and_place() -> None:
+    ring = outline(33.3, 20.8, 12.0)
+    picture = draw_binary((60, 80), [ring, np.full((5, 2), np.nan)])
+    assert picture.shape == (60, 80) and set(np.unique(picture)) == {0, 255}
+    v, u = np.nonzero(picture)
+    assert len(u) == pytest.approx(np.pi * 12**2, rel=0.01)
+    assert (u.mean(), v.mean()) == (pytest.approx(33.3, abs=0.05), pytest.approx(20.8, abs=0.05))
+    cut = draw_binary((60, 80), [outline(0, 0, 12.0)], max_width_px=40)
+    assert cut.shape == (30, 40) and np.count_nonzero(cut) == pytest.approx(
+        np.pi * 6**2 / 4 + 6, rel=0.15
+    )
+
+
+def test_overlay_draws_each_outline_where_it_is() -> None:
+    image = np.full((200, 300), 180, np.uint16)
+    rings = [outline(80.5, 90.25, 30), outline(210.0, 100.0, 20)]
+    colours = [(10, 250, 20), (20, 30, 250)]
+    picture = draw_bubble_overlay(image, rings, ["", ""], colours)
+    assert picture.dtype == np.uint8 and picture.shape[1:] == (300, 3) and len(picture) > 200
+    for channel, other, (u, v), radius in (
+        (1, 2, (80.5, 90.25), 30.0),
+        (2, 1, (210.0, 100.0), 20.0),
+    ):
+        excess = picture[:200, :, channel].astype(int) - picture[:200, :, other]
+        rows, columns = np.nonzero(excess > 60)
+        np.testing.assert_allclose(np.hypot(columns - u, rows - v), radius, atol=1.3)
+        assert columns.mean() == pytest.approx(u, abs=0.2)
+    half = draw_bubble_overlay(image, rings, ["7", "8"], colours, max_width_px=150)
+    assert half.shape[1] == 150
+
+
+def test_overlay_tells_why_something_was_rejected() -> None:
+    image = np.full((120, 200), 90.0)
+    dust = [(50.0, 40.0, 6.0, "too small"), (150.0, 60.0, float("nan"), "too small")]
+    bare = draw_bubble_overlay(image, [], [])
+    told = draw_bubble_overlay(image, [], [], rejected=dust)
+    assert len(told) > len(bare) > 120
+    rows, columns = np.nonzero(told[:120, :, 0].astype(int) - told[:120, :, 1] > 60)
+    assert {tuple(p) for p in np.c_[columns, rows] // 100} >= {(0, 0), (1, 0)}
+    with pytest.raises(InputError, match="grey image"):
+        draw_bubble_overlay(np.zeros((4, 4, 3)), [], [])
+    with pytest.raises(InputError, match="1 outlines, 0 labels"):
+        draw_bubble_overlay(image, [outline(5, 5, 3)], [])
+
+
+def test_empty_bright_image_stays_bright() -> None:
+    rng = np.random.default_rng(2)
+    image = (200 + rng.standard_normal((80, 90))).astype(np.uint8)
+    assert draw_bubble_overlay(image, [], [])[:80].min() > 150

@@ -1,0 +1,76 @@
+"""The report of a batch, from a batch.json written by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from report_page import Page
+
+from telerig.errors import InputError
+from telerig.io.report.batch.report import write_batch_report
+
+
+def _job(kind: str, run: str, status: str = "done", words: str = "", **figures: Any) -> Any:
+    job = {"kind": kind, "dataset": "/data/tank", "run": run, "status": status, "words": words}
+    return job | {"figures": figures, "seconds": 30.0, "host": "a"}
+
+
+def _write(folder: Path, jobs: Any) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "batch.json").write_text(json.dumps({"jobs": jobs}))
+    return folder
+
+
+def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
+    evil = "</script><b>no light"
+    jobs = [
+        _job("calibrate", "", verdict="GOOD", lens_model="radial", views=12, share_kept=0.995,
+             rms_px=0.0123),
+        _job("track", "rise", frames=120, tracks=7, points=800),
+        _job("smooth", "rise", verdict="RESOLVED", sx_um=23.0, sy_um=13.0, sz_um=24.0),
+        _job("track", "fall", "failed", evil),
+        _job("smooth", "fall", "left out", "needs fall.track"),
+    ]  # fmt: skip
+    file = write_batch_report(_write(tmp_path / "out", jobs))
+    page = Page(file)
+    assert page.ids == ["verdict", "key", "failures", "calibrations", "runs", "pictures"]
+    assert all(load.startswith("data:") for load in page.loads)
+    assert len(page.pictures("svg+xml")) == 3
+    for words in (
+        "1 of 2 runs done, 1 dataset", "calibrated 1 of 1 none failed",
+        "smoothed 1 of 2 1 left out", "work 2.5 min longest job 30 s, 1 machine",
+        "tank GOOD radial 12 99.5% 0.0123", "sd / µm",
+        "tank / rise RESOLVED 120 7 800 23.0, 13.0, 24.0", "tank / fall track failed",
+        f"/data/tank, run fall track failed {evil}",
+    ):  # fmt: skip
+        assert words in page.spaced, words
+    assert evil not in file.read_text(encoding="utf-8")
+    assert 'class="verdict usable"' in file.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "No such file"),
+        ("{", "Expecting"),
+        ("[]", "indices"),
+        ('{"jobs": 3}', "not iterable"),
+        ('{"jobs": [3]}', "not subscriptable"),
+        ('{"jobs": [{"dataset": "a"}]}', "'run'"),
+        ('{"jobs": [{"dataset": 3}]}', "garbles 'dataset'"),
+        (json.dumps({"jobs": [_job("track", "a") | {"figures": [3]}]}), "garbles 'figures'"),
+    ],
+)
+def test_a_batch_that_cannot_be_read_is_named(
+    tmp_path: Path, content: str | None, words: str
+) -> None:
+    if content is not None:
+        (tmp_path / "batch.json").write_text(content)
+    before = list(tmp_path.iterdir())
+    with pytest.raises(InputError, match=words) as caught:
+        write_batch_report(tmp_path)
+    assert "batch.json" in str(caught.value) and "->" in str(caught.value)
+    assert list(tmp_path.iterdir()) == before

@@ -1,0 +1,208 @@
+"""The calibration report: from files to one page, and the figures' numbers against authorities."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from calibration_folder import write_calibration_folder
+from report_page import Page, edit
+
+from telerig.errors import InputError
+from telerig.io.report.calibration.report import write_calibration_report
+from telerig.io.report.calibration.residuals import residual_field
+from telerig.io.report.calibration.results import read_results
+from telerig.io.report.calibration.tables import parameter_rows, pose_rows, worst_rows
+from telerig.io.report.page import contact_sheet as sheets
+from telerig.io.report.page.number_format import with_sd
+from telerig.rig.projection import PARAMETERS
+
+SIGMA_PX, BUMP_MM = 0.01, 0.05
+SECTIONS = [
+    *("verdict", "key", "parameters", "pose", "model", "residuals", "coverage", "worst", "target"),
+    *("overlays", "dot", "rig", "twin", "weak", "more", "origin"),
+]
+OPTIONAL = ("dots.csv", "covariance.npz", "run.json", "dot_example.npz", "overlays")
+
+_edit = partial(edit, "calibration.json")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_calibration_folder(tmp_path / "results", cameras=2)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a whole folder, which no test changes."""
+    return write_calibration_report(
+        write_calibration_folder(tmp_path_factory.mktemp("once") / "r", cameras=2)
+    )
+
+
+def test_page_is_whole_small_and_loads_nothing(report: Path) -> None:
+    page = Page(report)
+    assert report.name == "report.html" and report.stat().st_size < 8e6
+    assert page.ids == SECTIONS
+    inside = [load for load in page.loads if load.startswith("data:") or load.startswith("#")]
+    assert sorted(set(page.loads) - set(inside)) == []
+    css = report.read_text(encoding="utf-8").split("<style>")[1].split("</style>")[0]
+    assert "url(" not in css and "@import" not in css
+    assert not list(report.parent.glob(".report*"))
+
+
+def test_page_says_verdict_parameters_and_everything_else(report: Path) -> None:
+    text = Page(report).text
+    assert text.index("USABLE, with warnings") < text.index("only 6 views & <few> dots")
+    assert text.index("only 6 views & <few> dots") < text.index("Cameras")
+    for name in PARAMETERS:
+        assert (f"({name})" in text) != name.startswith("wall_")  # no wall, no word of it
+    for words in (
+        "10.00000 ±\u00a00.00034", "0.002000 ±\u00a00.000048", "90.00000 ±\u00a00.00069", "98.9 %",
+        "178 of 180", "0.510 µm", "none was enough", "99.25", "nominal rotation", "90 deviations",
+        "depth scale of the right camera is weak", "a note", "the gauge in words", "packages.numpy",
+        "9.9", "stage.scale_ppm",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+def test_pictures_are_sound_and_captioned(report: Path) -> None:
+    page = Page(report)
+    drawn = page.pictures("svg+xml")
+    assert len(drawn) == 2 + 1 + 3 + 2 + 2 + 1
+    assert len(page.pictures("png")) == 1 and len(page.pictures("jpeg")) == 2
+    html = report.read_text(encoding="utf-8")
+    assert html.count("<figcaption>") == len(drawn) + 2
+    assert html.count("no picture") == 2 * 5
+
+
+@pytest.mark.parametrize(("status", "colour"), [("GOOD", "good"), ("REJECTED", "rejected")])
+def test_verdict_has_its_colour(folder: Path, status: str, colour: str) -> None:
+    page = write_calibration_report(_edit(folder, verdict={"status": status, "reasons": []}))
+    assert f'class="verdict {colour}"' in page.read_text(encoding="utf-8")
+
+
+def test_one_camera_and_nothing_optional(tmp_path: Path) -> None:
+    folder = write_calibration_folder(tmp_path / "mono", cameras=1)
+    _edit(folder, model={}, twin={}, covariance={}, statistics={"rms_px": None})
+    for name in OPTIONAL:
+        (folder / name).rename(tmp_path / f"away {name}")
+    text = Page(write_calibration_report(folder)).text
+    for words in (
+        "one camera never sees the depth", "No other model was tried", "No pictures in this folder",
+        "No example of a dot", "There is no run.json", "residuals are shown in px only",
+        "not available px",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+def test_hostile_names_stay_text(folder: Path) -> None:
+    evil = "</script><b>x"
+    views = json.loads((folder / "calibration.json").read_text())["views"]
+    _edit(folder, name=evil, views=views | {evil: views["view00"]})
+    html = write_calibration_report(folder).read_text(encoding="utf-8")
+    assert evil not in html and "&lt;/script&gt;&lt;b&gt;x" in html
+
+
+def test_importing_the_report_draws_in_no_plotting_library() -> None:
+    code = "import sys, telerig.io.report.calibration.report; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"matplotlib", "plotly", "cv2", "jinja2"} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("calibration.json", None, "no calibration here"),
+        ("calibration.json", "{", "JSON"),
+        ("calibration.json", '{"kind": "soup"}', "not a calibration"),
+        ("calibration.json", '{"kind": "telerig calibration", "schema": 9}', "newer"),
+        ("residuals.csv", None, "residuals are missing"),
+        ("residuals.csv", "view,camera\n1,2\n", "dot"),
+        ("covariance.npz", "rubbish", "cannot be read"),
+        ("dot_example.npz", "", "cannot be read"),
+        ("run.json", "[1]", "not an object"),
+    ],
+)
+def test_bad_files_are_named_and_the_old_report_stays(
+    folder: Path, file: str, content: str | None, words: str
+) -> None:
+    (folder / "report.html").write_text("old")
+    (folder / file).unlink()
+    if content is not None:
+        (folder / file).write_text(content)
+    with pytest.raises(InputError, match=words) as caught:
+        write_calibration_report(folder)
+    assert file in str(caught.value) and "->" in str(caught.value)
+    assert (folder / "report.html").read_text() == "old"
+
+
+def test_files_that_do_not_fit_together_are_refused(folder: Path) -> None:
+    file = folder / "residuals.csv"
+    file.write_text(file.read_text().replace("view05,right,14,", "view05,middle,14,"))
+    with pytest.raises(InputError, match=r"row 181: calibration.json has no camera 'middle'"):
+        read_results(folder)
+    with pytest.raises(InputError, match="lacks or garbles 'views'"):
+        content = json.loads((folder / "calibration.json").read_text())
+        del content["views"]
+        (folder / "calibration.json").write_text(json.dumps(content))
+        read_results(folder)
+
+
+def test_whitened_residuals_are_unit_normal(folder: Path) -> None:
+    table = read_results(folder).residuals
+    white = table.loc[table["kept"], ["whitened_u", "whitened_v"]].to_numpy()
+    raw = table.loc[table["kept"], ["du_px", "dv_px"]].to_numpy()
+    inverse = np.linalg.inv(SIGMA_PX**2 * np.array([[1.0, 0.6], [0.6, 1.0]]))
+    np.testing.assert_allclose((white**2).sum(1), np.einsum("ni,ij,nj->n", raw, inverse, raw))
+    assert abs(np.corrcoef(white.T)[0, 1]) < 0.2
+
+
+def test_gap_between_axes_and_its_deviation(folder: Path) -> None:
+    rows = dict(row.cells for row in pose_rows(read_results(folder)))
+    assert rows["distance between the axes (mm)"] == with_sd(0.3, 5.0)
+
+
+def test_parameter_rows_tell_held_from_free_and_distortion_in_px(folder: Path) -> None:
+    rows = {row.cells[0]: row for row in parameter_rows(read_results(folder))}
+    assert rows["skew (skew)"].faint and rows["skew (skew)"].cells[1] == "0 (held)"
+    moved = float(rows["largest distortion in the image"].cells[1].removesuffix(" px"))
+    half_diagonal_px = np.hypot(512, 400) / 2
+    assert moved == pytest.approx(0.002 * half_diagonal_px, rel=0.02)
+
+
+def test_worst_dots_begin_with_those_left_out(folder: Path) -> None:
+    rows = worst_rows(read_results(folder))
+    assert rows[0].strong and rows[0].cells[2] == "3" and rows[0].cells[-1] == "90 deviations"
+    assert not any(row.strong for row in rows[1:])
+
+
+def test_many_residuals_become_means_of_cells(folder: Path) -> None:
+    file = folder / "residuals.csv"
+    table = pd.read_csv(file)
+    many = pd.concat([table] * 20).assign(dot=lambda t: np.arange(len(t)))
+    many.to_csv(file, index=False)
+    assert "mean of a cell" in residual_field(read_results(folder), 0).caption
+
+
+def test_pictures_beyond_the_budget_shrink_then_become_links(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = read_results(folder)
+    whole = sheets.contact_sheet(results)
+    assert not whole.shrunk and whole.linked == 0
+    size = sum(file.stat().st_size for file in results.overlays.values())
+    monkeypatch.setattr(sheets, "BUDGET_BYTES", size - 1)
+    assert sheets.contact_sheet(results).shrunk and sheets.contact_sheet(results).linked == 0
+    monkeypatch.setattr(sheets, "BUDGET_BYTES", 10)
+    assert sheets.contact_sheet(results).linked == 2
+    assert 'href="overlays/left/view01.jpg"' in write_calibration_report(folder).read_text()
+    results.overlays["left", "view01"].write_bytes(b"rubbish" * 9)
+    with pytest.raises(InputError, match=r"view01.jpg: is no JPEG"):
+        sheets.contact_sheet(results)

@@ -1,0 +1,252 @@
+"""The film of a run's path, and its geometry."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from filmed_run import (
+    FRAMES,
+    HALF_AXES_MM,
+    _ellipse,
+    decoded,
+    two_cameras,
+    write_run,
+)
+from PIL import Image
+
+from telerig.errors import GeometryError, InputError
+from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.io.report.film import drawing, geometry
+from telerig.io.report.film.drawing import draw_path, film_layout, project_px, view_matrix
+from telerig.io.report.film.film import write_path_film
+from telerig.io.report.film.geometry import (
+    FilmPath,
+    ellipsoids_from_outlines,
+    film_axes,
+    read_film_path,
+)
+from telerig.io.report.run.tracking.cameras import run_cameras
+from telerig.io.report.run.tracking.results import read_track_results
+from telerig.io.report.run.tracking.scene import scene_widening, track_scene_json
+from telerig.io.report.run.tracking.two_rays import ray_pair, rays_of_row, two_rays, typical_row
+
+BLUE = (31, 95, 168)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("film") / "results" / "rise")
+
+
+@pytest.fixture(scope="module")
+def films(run: Path) -> Iterator[Path]:
+    """Both films, at half their size to be quick."""
+    place = run / "film"
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("HEIGHT_PX", "_NARROW_PX", "_WIDE_PX"):
+            patch.setattr(drawing, name, getattr(drawing, name) // 4 * 2)
+        write_path_film(run, [place / "path.mp4", place / "path.gif"])
+        yield place
+
+
+def _path(points: Any, **changes: Any) -> FilmPath:
+    points = np.asarray(points, float)
+    n = len(points)
+    whole: dict[str, Any] = {
+        "points_mm": points, "sd_mm": np.full((n, 3), np.nan), "particle": np.zeros(n, np.int64),
+        "new": np.arange(n) == 0, "bodies": np.zeros(0, np.int64),
+        "quadrics_mm2": np.zeros((0, 3, 3)), "names": ("x", "z", "height"), "title": "",
+        "notes": (),
+    }  # fmt: skip
+    return FilmPath(**(whole | changes))
+
+
+def _is_blue(picture: np.ndarray, at: np.ndarray) -> bool:
+    u, v = np.round(at).astype(int)
+    return bool(np.abs(picture[v, u].astype(int) - BLUE).max() < 40)
+
+
+def test_the_film_goes_round_once_and_its_other_half_is_mirrored(run: Path, films: Path) -> None:
+    frames = decoded(films / "path.mp4")
+    path = read_film_path(run, two_cameras())
+    layout = film_layout(path)
+    assert len(frames) == 180
+    assert {f.shape for f in frames} == {(layout.size_px[1], layout.size_px[0], 3)}
+    end, panel = path.points_mm[-1:], layout.panels[0]
+    places = [project_px(panel, end, 2.0 * k)[0] for k in range(180)]
+    assert all(_is_blue(frames[k], places[k]) for k in (0, 20, 45, 90, 110, 179))
+    middle = project_px(panel, (panel.low_mm + panel.high_mm)[None] / 2, 0.0)[0]
+    assert abs(places[0][0] - middle[0]) > 12
+    assert places[90][0] - middle[0] == pytest.approx(middle[0] - places[0][0])
+    mirrored = np.array([2 * middle[0] - places[0][0], places[90][1]])
+    assert _is_blue(frames[90], mirrored) and not _is_blue(frames[0], mirrored)
+
+
+def test_the_gif_has_every_view_and_runs_for_ever(films: Path) -> None:
+    with Image.open(films / "path.gif") as gif:
+        assert gif.n_frames == 180 and gif.info["loop"] == 0 and gif.info["duration"] == 40
+        assert gif.width <= 640
+    assert (films / "path.gif").stat().st_size < 8e6
+    assert [f.name for f in films.iterdir() if f.name.startswith(".")] == []
+
+
+def test_axes_are_no_mirror_image() -> None:
+    up = np.array([0.1, -0.9, 0.3])
+    up /= np.linalg.norm(up)
+    right, forward, above = film_axes(up)
+    np.testing.assert_allclose(np.cross(right, above), -forward, atol=1e-12)
+    np.testing.assert_allclose(
+        film_axes(np.array([0, -1.0, 0])), [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    )
+    for angle in (0.0, 33.0, 200.0):
+        view = view_matrix(angle, 14.0)
+        np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(view) == pytest.approx(-1.0)
+
+
+def test_the_film_shows_points_where_the_first_camera_sees_them(run: Path) -> None:
+    """At angle 0 right on the screen is u of the first camera, and height is -v."""
+    path, camera = read_film_path(run, two_cameras()), two_cameras()[0]
+    results = read_track_results(run)
+    uv = camera.project(results.points_mm)
+    screen = project_px(film_layout(path).panels[0], path.points_mm, 0.0)
+    per_px = np.polyfit(uv[:, 0], screen[:, 0], 1)
+    np.testing.assert_allclose(np.polyval(per_px, uv[:, 0]), screen[:, 0], atol=1e-6)
+    assert per_px[0] > 0
+    np.testing.assert_allclose(path.points_mm[:, 2], -results.points_mm[:, 1])
+
+
+def test_bodies_are_the_ellipsoids_that_were_seen(run: Path) -> None:
+    path = read_film_path(run, two_cameras())
+    assert len(path.bodies) >= 4 and "ellipsoids" in path.notes[-1]
+    expected = np.diag(HALF_AXES_MM[[0, 2, 1]] ** 2)
+    np.testing.assert_allclose(path.quadrics_mm2 - expected, 0, atol=1e-6)
+    spheres = read_film_path(run, None)
+    radius = np.prod(HALF_AXES_MM) ** (1 / 3)
+    np.testing.assert_allclose(spheres.quadrics_mm2[0], radius**2 * np.eye(3))
+    assert "spheres" in spheres.notes[-1]
+
+
+@pytest.mark.parametrize("turn", [1.2, np.pi / 2, 2.1])
+def test_any_ellipsoid_keeps_its_two_outlines_and_is_the_largest_such(turn: float) -> None:
+    rng = np.random.default_rng(11)
+    cameras = two_cameras(turn)
+    roots = rng.standard_normal((5, 3, 3))
+    truth = roots @ np.swapaxes(roots, 1, 2) + 0.5 * np.eye(3)
+    ellipses = np.array([[_ellipse(c, q) for c in cameras] for q in truth])
+    found = ellipsoids_from_outlines(cameras, rng.uniform(-5, 5, (5, 3)), ellipses)
+    for got, true in zip(found, truth):
+        for camera in cameras:
+            p = camera.camera_from_rig.rotation[:2]
+            np.testing.assert_allclose(p @ got @ p.T, p @ true @ p.T, rtol=1e-5, atol=1e-5)
+        assert np.linalg.det(got) >= np.linalg.det(true) * (1 - 1e-6)
+        for share in (-0.1, 0.1):
+            assert np.linalg.det(got + share * (true - got)) <= np.linalg.det(got) * (1 + 1e-6)
+
+
+def test_the_band_is_two_sd_wide_times_what_the_film_says() -> None:
+    height = np.linspace(0, 30, 60)
+    straight = np.stack([0 * height, 0 * height, height], -1)
+    box = np.array([[-15.0, 0, 0], [15.0, 0, 0]])
+    points = np.concatenate([straight, box])
+    path = _path(
+        points, sd_mm=np.broadcast_to([0.02, 0.02, 0.02], points.shape),
+        new=np.isin(np.arange(62), (0, 60, 61)), particle=np.r_[np.zeros(60, int), 1, 2],
+    )  # fmt: skip
+    layout = film_layout(path)
+    (panel,) = layout.panels
+    u, v = project_px(panel, np.array([[0, 0, 20.0]]), 0.0)[0]
+    row = draw_path(path, layout, 0.0)[round(v)].astype(int)
+    tinted = np.flatnonzero(
+        row[round(u) - 40 : round(u) + 40, 2] - row[round(u) - 40 : round(u) + 40, 0] > 20
+    )
+    assert panel.band > 1
+    assert np.ptp(tinted) + 1 == pytest.approx(4 * 0.02 * panel.px_per_mm * panel.band, abs=2)
+
+
+def test_a_slender_path_has_a_second_panel_drawn_wider() -> None:
+    height = np.linspace(0, 160, 80)
+    path = _path(np.stack([2 * np.sin(height / 9), 2 * np.cos(height / 9), height], -1))
+    layout = film_layout(path)
+    assert [p.stretch for p in layout.panels] == [1, 10]
+    assert all(n % 2 == 0 for n in layout.size_px)
+    wide = layout.panels[1]
+    at = project_px(wide, np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), 0.0)
+    ratio = (at[1] - at[0])[0] / -(at[2] - at[0])[1]
+    assert ratio == pytest.approx(wide.stretch, rel=0.01)
+    assert str(wide.stretch) in wide.words
+
+
+def test_a_long_path_is_thinned_with_words(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(geometry, "MOST_POINTS", 8)
+    path = read_film_path(run, two_cameras())
+    assert len(path.points_mm) <= 9
+    assert path.notes[0] == f"{len(path.points_mm)} of {FRAMES} positions drawn"
+
+
+def test_no_track_no_film(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "results" / "rise", calibration=False)
+    header = (folder / "tracks.csv").read_text().splitlines()[0]
+    (folder / "tracks.csv").write_text(header + "\n")
+    with pytest.raises(InputError, match="no bubble was followed"):
+        write_path_film(folder, [tmp_path / "a.gif"])
+    assert not (tmp_path / "a.gif").exists()
+
+
+def test_closest_points_are_the_least_squares_ones() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        a, p, b, q = rng.standard_normal((4, 3))
+        pair = ray_pair(a, p, b, q)
+        s, t = np.linalg.lstsq(np.stack([p, -q], 1), b - a, rcond=None)[0]
+        np.testing.assert_allclose(pair.closest_mm, [a + s * p, b + t * q], atol=1e-9)
+        np.testing.assert_allclose(pair.middle_mm, (a + s * p + b + t * q) / 2, atol=1e-9)
+        between = pair.closest_mm[1] - pair.closest_mm[0]
+        assert abs(pair.miss_mm) == pytest.approx(np.linalg.norm(between))
+        assert np.sign(pair.miss_mm) == np.sign(between @ np.cross(p, q))
+    with pytest.raises(GeometryError, match="parallel"):
+        ray_pair([0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 0, 2])
+
+
+def test_the_drawn_pair_is_the_median_one_and_its_miss_that_of_the_table(run: Path) -> None:
+    results = read_track_results(run)
+    miss = results.tracks["ray_miss_mm"].to_numpy()
+    row = typical_row(results)
+    assert row is not None
+    assert np.sum(np.abs(miss) < abs(miss[row])) == FRAMES // 2
+    assert rays_of_row(results, two_cameras(), row).miss_mm == pytest.approx(miss[row], abs=1e-9)
+    picture = two_rays(results, two_cameras())
+    assert picture is not None
+    assert f"{1e3 * abs(miss[row]):.3g} µm" in picture.caption
+
+
+def test_only_the_runs_own_calibration_counts(run: Path, tmp_path: Path) -> None:
+    cameras, why = run_cameras(run, read_track_results(run))
+    assert why == "" and cameras is not None and cameras[1].name == "right"
+    alone = write_run(tmp_path / "a" / "rise", calibration=False)
+    assert "neither in this folder" in run_cameras(alone, read_track_results(alone))[1]
+    calibration_from_cameras(list(two_cameras(1.4))).save(tmp_path / "a" / "calibration")
+    none, why = run_cameras(alone, read_track_results(alone))
+    assert none is None and "not the one that the run was tracked with" in why
+    (tmp_path / "a" / "calibration" / "calibration.json").write_text("{")
+    with pytest.raises(InputError, match="JSON"):
+        run_cameras(alone, read_track_results(alone))
+
+
+def test_the_scene_of_a_slender_path_is_widened_by_what_the_page_says(run: Path) -> None:
+    results = read_track_results(run)
+    assert scene_widening(results) == 1
+    assert json.loads(track_scene_json(results))["layout"]["scene"]["aspectmode"] == "data"
+    tall = replace(results, tracks=results.tracks.assign(y_mm=10 * results.tracks["y_mm"]))
+    scene = json.loads(track_scene_json(tall))["layout"]["scene"]
+    ratio, sides = scene["aspectratio"], np.ptp(tall.points_mm, axis=0)
+    per_mm = [ratio[axis] / side for axis, side in zip("xyz", sides)]
+    assert scene["aspectmode"] == "manual" and scene_widening(tall) > 4
+    assert per_mm[0] == pytest.approx(scene_widening(tall) * per_mm[1], rel=1e-3)
+    assert per_mm[2] == pytest.approx(per_mm[0], rel=1e-3)

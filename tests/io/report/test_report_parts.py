@@ -1,0 +1,207 @@
+"""Parts of the reports: geometry against closed forms, overlays against pixels, words."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.errors import InputError
+from telerig.io.report.calibration.coverage import tilt_angles_rad
+from telerig.io.report.calibration.dot_fit import dot_pictures, edge_distance_px
+from telerig.io.report.calibration.results import CalibrationResults
+from telerig.io.report.calibration.rig_outline import common_plane, rig_outline
+from telerig.io.report.calibration.scene import scene_json
+from telerig.io.report.calibration.target import target_shape
+from telerig.io.report.overlays.dots import GREEN, RED, draw_overlay
+from telerig.io.report.page.number_format import nice_below, number, short_names, with_sd
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
+
+
+def _results() -> CalibrationResults:
+    """Two cameras at 90 degrees, a 3 x 5 grid with one dot 50 um high, three poses."""
+    turned = Pose.from_rotvec([0.0, np.pi / 2, 0.0], [0.0, 0.3, 0.0])
+    left = Camera.create("left", (512, 400), 10.0, k1=0.002)
+    right = Camera.create("right", (512, 512), 10.3, camera_from_rig=turned)
+    angles = np.radians([25.0, 155.0, 40.0])
+    views = {f"view{i:02}": Pose.from_rotvec([0.0, a, 0.0]) for i, a in enumerate(angles)}
+    lattice = np.stack(np.divmod(np.arange(15), 5), -1).astype(float)
+    points = np.c_[7.0 * lattice[:, ::-1], np.zeros(15)]
+    points[7, 2] = 0.05
+    seen = [(view, camera) for view in views for camera in ("left", "right")]
+    root = 1e-3 * np.random.default_rng(4).standard_normal((45, 45))
+    return CalibrationResults(
+        content={}, cameras=(left, right), views=views, dot_ids=np.arange(15), points_mm=points,
+        row_column=lattice, residuals=pd.DataFrame(seen, columns=["view", "camera"]),
+        component={f"dot {i // 3}.{'xyz'[i % 3]}_mm": i for i in range(45)}, joint=root @ root.T,
+        run={}, overlays={}, dot_example={}, uncertainty={}, comparison={}, absent=(),
+    )  # fmt: skip
+
+
+def test_tilt_is_the_angle_between_axis_and_normal() -> None:
+    views, tilt, direction = tilt_angles_rad(_results(), 0)
+    assert views == ["view00", "view01", "view02"]
+    np.testing.assert_allclose(np.degrees(tilt), [25.0, 25.0, 40.0], atol=1e-9)
+    np.testing.assert_allclose(np.cos(direction), [-1.0, 1.0, -1.0], atol=1e-9)
+    _, other, _ = tilt_angles_rad(_results(), 1)
+    np.testing.assert_allclose(np.degrees(other), [65.0, 65.0, 50.0], atol=1e-9)
+
+
+def test_target_shape_finds_a_bump_and_its_deviation() -> None:
+    results = _results()
+    shape = target_shape(results)
+    assert shape is not None and shape.in_plane
+    design = np.c_[results.row_column, np.ones(15)]
+    residual = np.eye(15) - design @ np.linalg.pinv(design)
+    np.testing.assert_allclose(shape.off_um[:, 2], 50 * residual[:, 7], atol=1e-9)
+    np.testing.assert_allclose(shape.off_um[:, :2], 0, atol=1e-9)
+    expected = 1e3 * np.sqrt(np.diag(residual @ results.joint[2::3, 2::3] @ residual.T))
+    np.testing.assert_allclose(shape.sd_um[:, 2], expected)
+
+
+def test_target_shape_without_nominal_places_knows_only_heights() -> None:
+    shape = target_shape(replace(_results(), row_column=np.full((15, 2), np.nan)))
+    assert shape is not None and not shape.in_plane
+    assert np.argmax(shape.off_um[:, 2]) == 7
+    few = replace(_results(), dot_ids=np.arange(4), points_mm=np.eye(4, 3), row_column=np.eye(4, 2))
+    assert target_shape(few) is None
+
+
+def test_outline_of_a_field_is_what_the_image_corners_see() -> None:
+    results = _results()
+    corners = np.array([[-0.5, -0.5], [511.5, -0.5], [511.5, 511.5], [-0.5, 511.5]])
+    for section in rig_outline(results).cameras[1].field_mm:
+        np.testing.assert_allclose(results.cameras[1].project(section), corners, atol=1e-9)
+    np.testing.assert_allclose(np.abs(common_plane(results)), [[1, 0, 0], [0, 0, 1]], atol=1e-9)
+
+
+def test_outline_of_a_perspective_camera_stays_in_front_of_its_centre() -> None:
+    results = _results()
+    near = results.cameras[0].with_parameters(kappa_per_mm=1 / 30.0)
+    outline = rig_outline(replace(results, cameras=(near,))).cameras[0]
+    width_mm = np.linalg.norm(outline.field_mm[:, 1] - outline.field_mm[:, 0], axis=1)
+    depth_mm = outline.axis_mm[:, 2] + 30.0
+    assert depth_mm.min() > 0
+    np.testing.assert_allclose(width_mm / depth_mm, 51.2 / 30.0)
+
+
+def test_scene_holds_every_dot_where_the_pose_puts_it() -> None:
+    results = _results()
+    traces = {t["name"]: t for t in json.loads(scene_json(results))["data"]}
+    dots = np.array([traces["dots"][axis] for axis in "xyz"]).T
+    expected = np.concatenate([pose.apply(results.points_mm) for pose in results.views.values()])
+    np.testing.assert_allclose(dots, expected, atol=6e-4)
+    assert traces["names of the views"]["text"] == ["00", "01", "02"]
+
+
+def _circle_example() -> dict[str, np.ndarray]:
+    v, u = np.mgrid[50:81, 100:141]
+    numbers = {"u0": 100.0, "v0": 50.0, "u_px": 120.0, "v_px": 65.0, "a_px": 8.0, "b_px": 8.0}
+    model = 20 + 200 / (1 + np.exp(2 * (np.hypot(u - 120, v - 65) - 8)))
+    images = {"patch": model + 1, "model": model}
+    return images | {k: np.array(x) for k, x in numbers.items()} | {
+        "angle_rad": np.array(0.3), "noise": np.array(0.5),
+    }  # fmt: skip
+
+
+def test_distance_from_a_circle_is_exact() -> None:
+    v, u = np.mgrid[50:81, 100:141]
+    off_centre = np.hypot(u - 120, v - 65) > 0
+    distance = edge_distance_px(_circle_example())
+    expected = np.hypot(u - 120, v - 65) - 8
+    np.testing.assert_allclose(distance[off_centre], expected[off_centre], atol=1e-9)
+
+
+def test_distance_from_an_ellipse_is_right_near_its_edge() -> None:
+    example = _circle_example() | {"a_px": np.array(12.0), "b_px": np.array(6.0)}
+    v, u = np.mgrid[50:81, 100:141]
+    turn = np.linspace(0, 2 * np.pi, 20001)
+    x, y = 12 * np.cos(turn), 6 * np.sin(turn)
+    edge = np.c_[120 + x * np.cos(0.3) - y * np.sin(0.3), 65 + x * np.sin(0.3) + y * np.cos(0.3)]
+    pixels = np.c_[u.ravel(), v.ravel()]
+    nearest = np.array([np.hypot(*(edge - pixel).T).min() for pixel in pixels])
+    distance = edge_distance_px(example).ravel()
+    near = nearest < 1.5
+    np.testing.assert_allclose(np.abs(distance[near]), nearest[near], atol=0.35)
+
+
+def test_profile_keeps_clear_of_a_neighbour_and_states_the_misfit() -> None:
+    example = _circle_example()
+    patch = example["patch"].copy()
+    patch[:, :6] = 250
+    *_, profile = dot_pictures(example | {"patch": patch})
+    assert "RMS 1.00 grey values, noise 0.500" in profile.caption
+
+
+def _overlay_tables() -> tuple[pd.DataFrame, pd.DataFrame]:
+    shape = {"a_px": 40.0, "b_px": 20.0, "angle_rad": 0.0}
+    accepted = pd.DataFrame(
+        [{"u_px": 100.0, "v_px": 90.0, **shape, "dot": 7, "row": 1, "column": 2}]
+    )
+    reasons = ["touches the image border", "touches the image border", "too blurred"]
+    rejected = pd.DataFrame(
+        [
+            {"u_px": 300.0, "v_px": 60.0 + 100 * i, **shape, "reason": r}
+            for i, r in enumerate(reasons)
+        ]
+    )
+    return accepted, rejected
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
+def test_overlay_marks_what_was_found(kind: type) -> None:
+    image = np.full((400, 400), 50, kind)
+    image[0, 0] = 51
+    picture = draw_overlay(image, *_overlay_tables(), max_width_px=400)
+    assert picture.dtype == np.uint8 and picture.shape[1] == 400 and picture.shape[0] > 440
+    np.testing.assert_allclose(picture[90, 140], GREEN, atol=60)
+    np.testing.assert_allclose(picture[70, 100], GREEN, atol=60)
+    np.testing.assert_allclose(picture[60, 340], RED, atol=60)
+    assert np.all(picture[200, 200] == picture[200, 200, 0])
+    inside = picture[80:101, 90:111].astype(int)
+    assert (inside[..., 1] - inside[..., 0] > 80).any(), "the index stands in the dot"
+    assert (picture[400:].min(axis=2) < 100).any(), "the legend has letters"
+
+
+def test_overlay_keeps_the_index_of_a_dot_inside_a_rejected_outline() -> None:
+    accepted, rejected = _overlay_tables()
+    around = rejected.assign(u_px=100.0, v_px=90.0, a_px=150.0, b_px=70.0)[:1]
+    image = np.zeros((400, 400), np.uint8)
+    alone = draw_overlay(image, accepted, rejected[:0], max_width_px=400)
+    both = draw_overlay(image, accepted, around, max_width_px=400)
+    np.testing.assert_array_equal(both[75:106, 65:136], alone[75:106, 65:136])
+    number = both[80:101, 235:265].astype(int)
+    assert ((number[..., 0] - number[..., 1] > 80).sum(axis=0) > 1).sum() >= 2
+
+
+def test_overlay_shrinks_with_its_marks() -> None:
+    picture = draw_overlay(np.zeros((400, 400), np.uint8), *_overlay_tables(), max_width_px=200)
+    assert picture.shape[1] == 200
+    green = picture[..., 1].astype(int) - picture[..., 0] > 60
+    _, columns = np.nonzero(green[:200])
+    assert 28 <= columns.min() <= 31 and 69 <= columns.max() <= 72
+
+
+def test_overlay_of_nothing_and_of_wrong_things() -> None:
+    accepted, rejected = _overlay_tables()
+    assert draw_overlay(np.zeros((50, 60)), accepted[:0], rejected[:0]).shape[1] == 60
+    with pytest.raises(InputError, match="grey image"):
+        draw_overlay(np.zeros((5, 5, 3)), accepted, rejected)
+    with pytest.raises(InputError, match="lacks reason"):
+        draw_overlay(np.zeros((5, 5)), accepted, accepted)
+
+
+def test_numbers_in_words() -> None:
+    assert with_sd(10.000072, 0.00034) == "10.00007 ±\u00a00.00034"
+    assert with_sd(1.2344e-6, 4.5e-8) == "(1.234 ±\u00a00.045)·10⁻⁶"
+    assert with_sd(1.5, None) == "1.500000" and with_sd(None, 1.0) == "not available"
+    assert [number(x) for x in (0, 12345, 0.000123, 1.5e9)] == [
+        "0", "12\u202f345", "0.000123", "1.50·10⁹",
+    ]  # fmt: skip
+    assert [nice_below(x) for x in (0.9, 1, 4.9, 5, 730, 0)] == [0.5, 1, 2, 5, 500, 1]
+    assert short_names(["view09", "view10"]) == ["09", "10"]
+    assert short_names(["a", "a1"]) == ["a", "a1"] and short_names(["one"]) == ["one"]

@@ -1,0 +1,273 @@
+"""The report of a smoothed run: from files to one page."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from report_page import Page
+from smoothed_folder import AXES, changed, read, write_folder
+
+from telerig.errors import InputError
+from telerig.io.report.page.figures import Picture
+from telerig.io.report.run import report
+from telerig.io.report.run.report import write_track_report
+from telerig.io.report.run.smoothing.numbers import shake_lines, shake_spectrum, velocity_spectrum
+from telerig.io.report.run.smoothing.section import smoothing_drawings
+from telerig.io.report.run.smoothing.wording import smoothing_verdict
+from telerig.io.report.run.tracking.results import read_track_results
+
+TRACKING = ["verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events"]
+TRACKING += ["notes", "more", "origin"]
+SMOOTHING = ["smoothing", "smoothing-key", "lab", "taken", "velocity", "shake", "spectra"]
+SMOOTHING += ["residuals", "constants", "priors"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with its page, which no test changes."""
+    folder = write_folder(tmp_path_factory.mktemp("once") / "r")
+    write_track_report(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_folder(tmp_path / "r", frames=80, bubbles=1)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's words without its drawings, which take seconds."""
+    blank = Picture("", "data:,", "")
+    monkeypatch.setattr(report, "drawn_over_cores", lambda drawings: [blank] * len(drawings))
+
+
+def _captions(folder: Path) -> str:
+    """Titles and captions of all the smoothing's drawings."""
+    drawn = [draw() for _, draw in smoothing_drawings(read(folder))]
+    return " ".join(f"{p.title}: {p.caption}" for p in drawn if p is not None)
+
+
+def _judged(folder: Path) -> Any:
+    return smoothing_verdict(read(folder), read_track_results(folder))
+
+
+def test_page_begins_with_the_smoothing_and_loads_nothing(whole: Path) -> None:
+    page = Page(whole / "report.html")
+    assert page.ids == SMOOTHING + TRACKING
+    assert (whole / "report.html").stat().st_size < 8e6
+    assert all(load.startswith("data:") for load in page.loads)
+    of_smoothing, of_tracking = 3 + 3 + 3 + 3 + 4 + 3 + 2, 2 + 3 + 4 + 1 + 3 + 2
+    assert page.pictures("svg+xml") and len(page.pictures("")) == of_smoothing + of_tracking
+
+
+def test_page_says_what_the_files_say(whole: Path) -> None:
+    text = Page(whole / "report.html").spaced
+    for words in (
+        "RESOLVED: the bubbles' motion and the rig's shake are told apart",
+        "y (vertical): told apart (13 µm).", "sd, µm 23.1 23.1 23.1",
+        "q 1.01 1.07 1.02", "η 0.9961 0.9961 0.9961",
+        "shake of left, µm 30.0", "verdict RESOLVED RESOLVED RESOLVED", "y (down)",
+        "Camera left looks along z and does not see its own shake there",
+        "Camera right looks along x", "bubbles 2 400 12 0.5 % 0.933 0.908",
+        "arm_left bias x, mm/s² 223.80 ± 0.60", "arm_left delay, ms 1.020 ± 0.031",
+        "encoder scale 1.01010 ± 0.00010", "0.0 ± 5.7 -281.0 ± 5.4 -1.4 ± 5.7",
+        "multiplied by 0.945", "default: fixed priors", "broad bands[0]: camera left",
+        "broad bands[0]: low, Hz 22.98", "3 frames without",
+        "The tracking beneath", "2 tracks",
+    ):  # fmt: skip
+        assert words in text, words
+    assert text.index("RESOLVED") < text.index("Position, 1 sd") < text.index("2 tracks")
+    html = (whole / "report.html").read_text(encoding="utf-8")
+    assert 'class="verdict good" id="smoothing"' in html
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_without_smoothing_the_page_is_of_the_tracking_alone(folder: Path) -> None:
+    (folder / "smoothing.json").unlink()
+    (folder / "trajectories.csv").write_text("rubbish")
+    page = Page(write_track_report(folder))
+    assert page.ids == TRACKING
+    assert "smooth" not in page.spaced.lower() and "report of a tracked run" in page.spaced
+
+
+@pytest.mark.parametrize(
+    ("word", "colour", "headline"),
+    [
+        ("RESOLVED", "good", "are told apart"),
+        ("PARTIAL", "usable", "told apart in part"),
+        ("UNRESOLVED", "rejected", "do not tell the bubbles' motion from the rig's shake"),
+        (None, "usable", "Not judged"),
+        ("NEW_WORD", "usable", "NEW WORD"),
+    ],
+)
+def test_each_verdict_has_its_words_colour_and_remedy(
+    folder: Path, word: str | None, colour: str, headline: str
+) -> None:
+    changed(folder, "words", "axes", "remedy", verdict=word)
+    told = _judged(folder)
+    assert (told.colour, told.warnings) == (colour, ())
+    assert headline in told.headline
+    remedied = any("strip of dots" in s and "accelerometer" in s for s in told.sentences)
+    assert remedied == (word in ("PARTIAL", "UNRESOLVED"))
+
+
+def test_the_remedy_of_the_file_is_said_once(folder: Path) -> None:
+    remedy = "fix a strip of dots to the tank"
+    changed(folder, verdict="UNRESOLVED", remedy=remedy, words="x: cannot be told apart.")
+    assert _judged(folder).sentences[-1] == f"To resolve it: {remedy}"
+    changed(folder, words=f"x: cannot be told apart. To resolve it: {remedy}.")
+    told = _judged(folder)
+    assert told.sentences[1:] == ("x: cannot be told apart.", f"To resolve it: {remedy}.")
+
+
+def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> None:
+    changed(folder, flags=["SHAKE_BELOW_NOISE"])
+    told = _judged(folder)
+    assert told.colour == "good" and "does no harm" in told.sentences[-1]
+    changed(folder, flags=["LABEL_AMBIGUOUS", "ODD_ONE"])
+    told = _judged(folder)
+    assert told.colour == "usable" and len(told.warnings) == 2
+    assert "do not say whose it is" in told.warnings[0] and "odd one" in told.warnings[1]
+
+
+def test_warnings_of_the_file_stand_beside_the_verdict(folder: Path) -> None:
+    changed(folder, warnings=["points are up to 79 um wrong; calibrate again"])
+    told = _judged(folder)
+    assert told.colour == "usable"
+    assert told.warnings == ("Points are up to 79 µm wrong; calibrate again.",)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_nothing_judged_and_nothing_optional(folder: Path) -> None:
+    changed(folder, "verdict", "axes", "words", "model", "residuals", "unseen", "cameras", "schema",
+          "bubble_means", "encoder", "accelerometers", "modes", "flags", "remedy")  # fmt: skip
+    table = pd.read_csv(folder / "trajectories.csv")
+    kept = ["frame", "particle", "t_s", *(f"{a}_mm" for a in "xyz"), *(f"v{a}_mm_s" for a in "xyz")]
+    table[kept].to_csv(folder / "trajectories.csv", index=False)
+    shake = pd.read_csv(folder / "shake.csv")
+    shake = shake[[n for n in shake if not n.startswith(("sl", "sr", "sp", "pos"))]]
+    shake.to_csv(folder / "shake.csv", index=False)
+    page = Page(write_track_report(folder))
+    assert page.ids == SMOOTHING + TRACKING
+    for words in ("Not judged", "holds no verdict per axis", "No constant of encoder"):
+        assert words in page.spaced, words
+    captions = _captions(folder)
+    assert "nan" not in f"{page.spaced} {captions}".lower().split()
+    assert "There is no naive trajectory to compare with" in captions
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_lines_that_could_be_the_others_are_listed(folder: Path) -> None:
+    line = {"owner": "bubble", "frequency_hz": 12.1, "rms_mm": 0.2, "ambiguous": True,
+            "other_owner_costs_nats": 0.42}  # fmt: skip
+    sure = line | {"owner": "rig", "frequency_hz": 31.0, "ambiguous": False,
+                   "other_owner_costs_nats": 14.04}  # fmt: skip
+    free = line | {"other_owner_costs_nats": -1e-6}
+    changed(folder, flags=["LABEL_AMBIGUOUS"],
+          axes=AXES | {"y": AXES["y"] | {"lines": [line, sure]},
+                       "z": AXES["z"] | {"lines": [free]}})  # fmt: skip
+    text = Page(write_track_report(folder)).spaced
+    assert "Whose is the line?" in text
+    assert "12.1 y, z 200, 200 0.0 bubble open" in text
+    assert "31.0 y 200 14.0 rig told by the data" in text
+
+
+def test_tables_of_another_tracking_are_named(folder: Path) -> None:
+    tracks = pd.read_csv(folder / "tracks.csv")
+    tracks.assign(particle=7).to_csv(folder / "tracks.csv", index=False)
+    told = _judged(folder)
+    assert "Bubbles 0 of trajectories.csv are not in tracks.csv" in told.warnings[-1]
+    assert told.colour == "usable"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_no_bubbles_leaves_the_shake(folder: Path) -> None:
+    (folder / "trajectories.csv").write_text("frame,particle,t_s\n")
+    changed(folder, "verdict", "axes", "words", bubbles=0)
+    page = Page(write_track_report(folder))
+    assert "No bubble was smoothed" in page.spaced and "velocity" not in page.ids
+    captions = _captions(folder)
+    assert "Shake of camera left in y" in captions and "Velocity" not in captions
+
+
+def test_short_runs_have_no_spectra(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "r", frames=20, bubbles=1)
+    results = read(folder)
+    assert shake_spectrum(results, "left") is None and velocity_spectrum(results) is None
+    assert shake_lines(results) == []
+    assert "Spectrum" not in _captions(folder) and "Velocity in y" in _captions(folder)
+
+
+def test_long_runs_stay_small(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "r", frames=2_500, bubbles=2)
+    drawn = [draw() for _, draw in smoothing_drawings(read(folder))]
+    assert sum(len(p.source) for p in drawn) < 2e6
+    text = " ".join(p.caption for p in drawn)
+    assert "Bubble 0, the longest track, 1\u202f000 frames of its middle." in text
+    assert "1\u202f000 frames of the run's middle" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_hostile_names_stay_text(folder: Path) -> None:
+    evil = "</script><b>x"
+    changed(folder, verdict=evil, flags=[evil], words=[evil],
+          accelerometers={evil: {"scale": 1.0}},
+          residuals={evil: {"pixels": 3, "outliers": 0}})  # fmt: skip
+    html = write_track_report(folder).read_text(encoding="utf-8")
+    assert evil not in html and html.count("&lt;/script&gt;&lt;b&gt;x") >= 4
+
+
+def test_importing_the_report_draws_in_no_heavy_library_nor_the_estimator() -> None:
+    code = "import sys, telerig.io.report.run.report; print(*sys.modules)"
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()
+    assert not {"matplotlib", "plotly", "scipy.signal", "jinja2"} & set(done)
+    assert not [name for name in done if name.startswith("telerig.estimator")]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("smoothing.json", "{", "JSON"),
+        ("smoothing.json", "[]", "not an object"),
+        ("smoothing.json", '{"schema": 9}', "newer"),
+        ("smoothing.json", '{"verdict": 3}', "garbles 'verdict'"),
+        ("smoothing.json", '{"flags": "A"}', "garbles 'flags'"),
+        ("smoothing.json", '{"model": []}', "garbles 'model'"),
+        ("smoothing.json", '{"cameras": ["left"]}', "smoothing.json's are ['left']"),
+        ("shake.csv", None, "cannot be read"),
+        ("shake.csv", "frame,t_s\n0,0\n", "its columns are of cameras"),
+        ("trajectories.csv", None, "cannot be read"),
+        ("trajectories.csv", "frame,particle\n1,2\n", "t_s"),
+        ("trajectories.csv", "frame,particle,t_s\n1,2,3\n", "no column x_mm"),
+        ("trajectories.csv", "frame,particle,t_s,x_mm\n1,2,3,a\n", "row 2, column x_mm"),
+        ("trajectories.csv", "frame,particle,t_s,x_mm\n1,2,3\n", "row 2: has 3 cells"),
+    ],
+)
+def test_bad_files_are_named(folder: Path, file: str, content: str | None, words: str) -> None:
+    if content is None:
+        (folder / file).unlink()
+    else:
+        (folder / file).write_text(content)
+    before = list(folder.iterdir())
+    with pytest.raises(InputError) as caught:
+        write_track_report(folder)
+    assert words in str(caught.value) and file in str(caught.value)
+    assert list(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("file", "whose"), [("shake.csv", ""), ("trajectories.csv", " of bubble 0")]
+)
+def test_times_that_do_not_increase_are_named(folder: Path, file: str, whose: str) -> None:
+    table = pd.read_csv(folder / file)
+    table.loc[30, "t_s"] = table.loc[29, "t_s"]
+    table.to_csv(folder / file, index=False)
+    with pytest.raises(InputError, match=f"times{whose} do not increase at frame 30"):
+        write_track_report(folder)

@@ -1,0 +1,200 @@
+"""The report of a smoothed run: its numbers, spectra and modes against known signals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from smoothed_folder import (
+    ALONE_HZ,
+    ALONE_UM,
+    ARM_HZ,
+    ARM_UM,
+    COMMON_HZ,
+    COMMON_UM,
+    RATE_HZ,
+    SD_MM,
+    SD_MM_S,
+    changed,
+    content,
+    read,
+    write_folder,
+)
+
+from telerig.io.report.page.series_plot import thin_band, thin_line
+from telerig.io.report.run.smoothing.numbers import (
+    axis_sd,
+    evenly,
+    shake_lines,
+    shake_rms_um,
+    shake_spectrum,
+    taken_away,
+    velocity_spectrum,
+)
+from telerig.io.report.run.smoothing.tables import constant_rows, mode_rows
+from telerig.io.report.run.smoothing.wording import axis_table
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that no test changes."""
+    return write_folder(tmp_path_factory.mktemp("once") / "r")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_folder(tmp_path / "r", frames=80, bubbles=1)
+
+
+def test_numbers_are_those_of_the_signals(whole: Path) -> None:
+    results = read(whole)
+    assert axis_sd(results) == [SD_MM] * 3 and axis_sd(results, "v{}_mm_s") == [SD_MM_S] * 3
+    away = taken_away(results)
+    moved_um = np.hypot(COMMON_UM, ARM_UM)
+    assert away[1] == pytest.approx(1e-3 * moved_um, rel=0.02)
+    assert taken_away(results, "rts_")[1] == pytest.approx(0.5e-3 * moved_um, rel=0.02)
+    assert shake_rms_um(results, "right", "y") == pytest.approx(COMMON_UM, rel=0.01)
+    assert shake_rms_um(results, "right", "x") is None
+    assert results.bubbles == (0, 1) and results.rate_hz == pytest.approx(RATE_HZ)
+
+
+def test_depth_is_read_from_the_file_else_from_what_stands_still(folder: Path) -> None:
+    results = read(folder)
+    assert (results.unseen("left"), results.unseen("right")) == (("z",), ("x",))
+    oblique = {"left": "along its depth, (0.643, 0, 0.766) in rig axes"}
+    results = read(changed(folder, unseen=oblique))
+    assert results.unseen("left") == () and results.seen("left") == ("x", "y", "z")
+    np.testing.assert_allclose(results.depth("left"), [0.643, 0, 0.766], atol=1e-3)
+    results = read(changed(folder, "unseen"))
+    assert (results.unseen("left"), results.unseen("right")) == (("z",), ("x",))
+
+
+def test_spectra_obey_parseval_and_show_the_lines(whole: Path) -> None:
+    results = read(whole)
+    shake = shake_spectrum(results, "left")
+    assert shake is not None
+    variance = shake.density.sum(0) * shake.step_hz
+    np.testing.assert_allclose(variance[0], ALONE_UM**2, rtol=0.05)
+    np.testing.assert_allclose(variance[1], COMMON_UM**2 + ARM_UM**2, rtol=0.05)
+    at = shake.frequency_hz[np.argmax(shake.density[:, 1])]
+    assert at == pytest.approx(COMMON_HZ, abs=shake.step_hz)
+    naive, smooth = velocity_spectrum(results, "naive_"), velocity_spectrum(results)
+    assert naive is not None and smooth is not None
+    near = np.argmin(np.abs(naive.frequency_hz - COMMON_HZ))
+    assert naive.density[near, 1] > 1e3 * smooth.density[near, 1]
+
+
+def test_lines_of_the_shake_are_found_and_placed(whole: Path) -> None:
+    lines = shake_lines(read(whole))
+    found = {(line.axis, round(line.frequency_hz)): line for line in lines}
+    common = min(lines, key=lambda x: abs(x.frequency_hz - COMMON_HZ))
+    arm = min(lines, key=lambda x: abs(x.frequency_hz - ARM_HZ))
+    alone = min(lines, key=lambda x: abs(x.frequency_hz - ALONE_HZ))
+    assert (common.where, common.axis, common.alone) == ("common", "y", False)
+    assert (arm.where, arm.axis) == ("left", "y")
+    assert (alone.where, alone.axis, alone.alone) == ("left", "x", True)
+    for line, hz, rms in (
+        (common, COMMON_HZ, COMMON_UM),
+        (arm, ARM_HZ, ARM_UM),
+        (alone, ALONE_HZ, ALONE_UM),
+    ):
+        assert line.rms_um == pytest.approx(rms, rel=0.1)
+        assert line.upper and line.frequency_hz == pytest.approx(hz, abs=0.5)
+    assert lines[0] is common and len(found) == len(lines)
+
+
+def test_a_damped_modes_damping_is_measured(folder: Path) -> None:
+    """White force through one oscillator of damping 0.05, against the truth."""
+    rng, zeta, hz, frames = np.random.default_rng(6), 0.05, 25.0, 20_000
+    w, dt = 2 * np.pi * hz, 1 / RATE_HZ
+    state, out = np.zeros(2), np.empty(frames)
+    damped = w * np.sqrt(1 - zeta**2)
+    c, s, e = np.cos(damped * dt), np.sin(damped * dt), np.exp(-zeta * w * dt)
+    step = e * np.array([[c + zeta * w / damped * s, s / damped],
+                         [-(w**2) / damped * s, c - zeta * w / damped * s]])  # fmt: skip
+    for i, force in enumerate(rng.standard_normal(frames)):
+        state = step @ state + [0.0, force]
+        out[i] = state[0]
+    out *= 0.1 / out.std()
+    shake = pd.DataFrame({"frame": np.arange(frames), "t_s": np.arange(frames) * dt})
+    for camera in ("left", "right"):
+        shake[[f"{camera}_x_mm", f"{camera}_y_mm", f"{camera}_z_mm"]] = 0.0
+        shake[f"{camera}_y_mm"] = out
+    shake.to_csv(folder / "shake.csv", index=False)
+    (line,) = shake_lines(read(folder))
+    assert line.where == "common" and not line.upper
+    assert line.frequency_hz == pytest.approx(hz, rel=0.04)
+    assert line.damping == pytest.approx(zeta, rel=0.35)
+    assert line.rms_um == pytest.approx(100.0, rel=0.15)
+
+
+def test_modes_of_the_model_come_with_what_a_mechanic_can_do(folder: Path) -> None:
+    modes = [
+        {"frequency_hz": 20.0, "damping": 0.03, "rms_mm": [0, 0.12, 0], "camera": -1},
+        {"frequency_hz": 32.0, "damping": 0.01, "rms_mm": [0.02, 0.05, 0], "camera": 1},
+    ]
+    pitch = {"frequency_hz": 14.0, "damping": 0.02, "rms_rad": 1e-4, "camera": 0}
+    model = content()["model"] | {"modes": modes, "pitches": [pitch]}
+    rows, words = mode_rows(
+        read(changed(folder, model=model | {"carriage": {"servo": [0.1, 15, 0.3]}}))
+    )
+    common, arm, turning, servo = (row.cells for row in rows)
+    assert common[:4] == ("all cameras alike (carriage, mount)", "20.0", "0.0300", "y: 120")
+    assert arm[0] == "arm of right" and arm[3] == "x: 20.0, y: 50.0"
+    assert "shorter" in arm[4] and "damping layer" in arm[4] and "damping layer" not in common[4]
+    assert "turning" in turning[0] and "controller" in servo[4] and "15" in servo[4]
+    assert "model" in words
+
+
+def test_a_mode_learned_axis_by_axis_is_one_row(folder: Path) -> None:
+    mode = {"where": "common", "frequency_hz": 20.36, "damping": 0.028, "source": "model"}
+    parts = [mode | {"rms_mm": [0.0, 0.075, 0.0]}, mode | {"rms_mm": [0.063, 0.0, 0.064]}]
+    rows, _ = mode_rows(read(changed(folder, modes=parts)))
+    assert [row.cells[3] for row in rows] == ["x: 63.0, y: 75.0, z: 64.0"]
+
+
+def test_given_remedies_of_the_modes_are_shown(folder: Path) -> None:
+    row = {"where": "arm left", "frequency_hz": 31.0, "damping": 0.02, "rms_mm": [0.0, 0.02, 0.0],
+           "source": "model", "remedy": "brace it <here>"}  # fmt: skip
+    servo = row | {"where": "servo", "remedy": "less gain", "source": "estimate"}
+    rows, _ = mode_rows(read(changed(folder, modes=[row, servo])))
+    assert [r.cells[0] for r in rows] == ["arm of left", "servo (following error)"]
+    assert [r.cells[4] for r in rows] == ["brace it <here>", "less gain"]
+
+
+def test_thinning_loses_no_excursion() -> None:
+    t = np.arange(50_000.0)
+    values = np.sin(t)
+    values[31_234] = 40.0
+    values[10_000:12_000] = np.nan
+    thin_t, thin = thin_line(t, values)
+    assert len(thin) < 1_000 and np.nanmax(thin) == 40.0 and np.isnan(thin).any()
+    assert np.all(np.diff(thin_t) >= 0)
+    _, low, high = thin_band(t, values - 1, values + 1)
+    assert np.nanmax(high) == 41.0 and np.nanmin(low) == pytest.approx(-2.0, abs=1e-6)
+
+
+def test_evenly_fills_gaps_with_straight_lines() -> None:
+    t = np.array([0.0, 0.1, 0.2, 0.5, 0.6])
+    even, rate = evenly(t, np.stack([2 * t, np.where(t == 0.2, np.nan, t)], 1))
+    assert rate == pytest.approx(10.0) and len(even) == 7
+    grid = np.linspace(0, 0.6, 7)
+    np.testing.assert_allclose(even, np.stack([2 * grid, grid], 1), atol=1e-12)
+
+
+def test_constants_without_sd_are_shown_bare(folder: Path) -> None:
+    sensors = {"a": {"bias_x_mm_s2": 12.345678, "scale": None, "delay_s": 0.0}}
+    rows = constant_rows(read(changed(folder, accelerometers=sensors, encoder={})))
+    assert [row.cells for row in rows] == [
+        ("a", "bias x, mm/s²", "12.35"), ("a", "scale", "not available"), ("a", "delay, ms", "0"),
+    ]  # fmt: skip
+
+
+def test_axis_table_is_complete_without_a_verdict(folder: Path) -> None:
+    heads, rows = axis_table(read(changed(folder, "axes")))
+    assert heads == ["", "x", "y (down)", "z"]
+    found = {row.cells[0]: row.cells[1:] for row in rows}
+    assert found["sd, µm"] == ("20.0",) * 3 and found["sd of velocity, mm/s"] == ("4.00",) * 3
+    assert found["shake of left, µm"][2] == "unseen" and found["shake of right, µm"][0] == "unseen"

@@ -1,0 +1,298 @@
+"""Simulated calibrations: their files, their truth, and that a person could have taken them."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+
+from telerig.errors import InputError
+from telerig.io.simulation.calibration.presets import PRESETS, CameraConfig, preset
+from telerig.io.simulation.calibration.scene import (
+    hand_held_views,
+    true_cameras,
+    true_target,
+    wholly_inside,
+)
+from telerig.io.simulation.images.plate_view import pixel_from_plate
+from telerig.io.simulation.simulate import exact_dots, simulate, view_image
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose
+
+
+@cache
+def scene(name, seed=0, **changes):
+    config = preset(name, **changes)
+    rng = np.random.default_rng(seed)
+    cameras, target = true_cameras(config), true_target(config, rng)
+    return config, cameras, target, hand_held_views(config, cameras, target, rng)
+
+
+def image_jacobian(camera, view, target):
+    """Determinant of d(u, v) / d(x, y) at the middle of the target."""
+    middle = target.points_mm.mean(0)
+    steps = middle + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    uv = pixel_from_plate(camera, view.rig_from_target, steps, target.plate)
+    return np.linalg.det(uv[1:] - uv[0])
+
+
+def tilt_deg(camera, view):
+    axis = camera.camera_from_rig.rotation[2]
+    return np.degrees(np.arccos(axis @ view.rig_from_target.rotation[:, 2]))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_paper_shows_every_dot_whole_in_every_image(seed):
+    _, cameras, target, views = scene("paper", seed)
+    assert len(views) == 12 and len(target.ids) == 15
+    for view in views:
+        assert view.cameras == ("left", "right")
+        for camera in cameras.values():
+            rim = np.linspace(0, 2 * np.pi, 40)
+            circle = np.stack([np.cos(rim), np.sin(rim), 0 * rim], -1)
+            outline = target.points_mm[:, None] + target.diameter_mm[:, None, None] / 2 * circle
+            uv = camera.project(view.rig_from_target.apply(outline.reshape(-1, 3)))
+            assert uv.min() > 5 and uv.max() < 511 - 5
+
+
+@pytest.mark.parametrize("name", [n for n in PRESETS if n != "two_sided"])
+def test_opaque_plates_show_both_cameras_their_front(name):
+    config, cameras, target, views = scene(name)
+    for view in views:
+        for camera in cameras.values():
+            assert image_jacobian(camera, view, target) > 0
+            low, high = config.tilt_deg
+            assert low - 1e-6 <= tilt_deg(camera, view) <= high + 1e-6
+
+
+def test_two_sided_plates_show_one_camera_their_back():
+    _, cameras, target, views = scene("two_sided")
+    for view in views:
+        sides = [image_jacobian(camera, view, target) > 0 for camera in cameras.values()]
+        assert sorted(sides) == [False, True]
+
+
+def test_tilts_and_depths_are_diverse():
+    _, cameras, _, views = scene("paper")
+    tilts = np.array([[tilt_deg(c, v) for c in cameras.values()] for v in views])
+    assert np.all(np.ptp(tilts, axis=0) > 15)
+    places = np.array([v.rig_from_target.apply([[14.0, 7.0, 0.0]])[0] for v in views])
+    assert np.all(places.std(0) > 2)
+    roll = [np.arctan2(*v.rig_from_target.rotation[1, :2]) for v in views]
+    assert np.hypot(np.mean(np.cos(roll)), np.mean(np.sin(roll))) < 0.7
+
+
+@pytest.mark.parametrize("angle", [20.0, 60.0, 110.0])
+def test_stereo_angle_can_be_set(angle):
+    _, cameras, target, views = scene("paper", angle_deg=angle, views=4)
+    axes = [camera.camera_from_rig.rotation[2] for camera in cameras.values()]
+    assert np.degrees(np.arccos(axes[0] @ axes[1])) == pytest.approx(angle, abs=1.0)
+    assert axes[1][0] < 0
+    for view in views:
+        assert all(image_jacobian(c, view, target) > 0 for c in cameras.values())
+        assert all(
+            wholly_inside(c, view.rig_from_target, target, 6.0).all() for c in cameras.values()
+        )
+
+
+def test_rig_origin_is_where_the_axes_come_closest():
+    _, cameras, _, _ = scene("paper")
+    right = cameras["right"].rig_from_camera
+    origin, direction = right.translation_mm, right.rotation[:, 2]
+    normal = np.cross([0, 0, 1.0], direction)
+    gap = origin @ normal / np.linalg.norm(normal)
+    along_left = np.linalg.lstsq(
+        np.stack([[0, 0, 1.0], -direction, normal], 1), origin, rcond=None
+    )[0]
+    assert abs(gap) == pytest.approx(0.3, rel=1e-9)
+    assert along_left[0] == pytest.approx(0, abs=1e-9)
+
+
+def test_print_errors_and_known_distance():
+    config = preset("unbounded", print_factor=2.0)
+    target = true_target(config, np.random.default_rng(0))
+    error = target.points_mm - config.target.nominal_mm(target.ids)
+    assert np.allclose(error.std(0), 0.04, rtol=0.06)
+    ends = [target.points_mm[target.ids == dot][0] for dot in config.target.scale_dots]
+    assert target.scale_distance_mm == pytest.approx(np.linalg.norm(ends[0] - ends[1]), abs=5e-3)
+    assert target.scale_distance_mm != np.linalg.norm(ends[0] - ends[1])
+
+
+def test_unbounded_grid_fills_the_image_and_shows_its_marks():
+    config, cameras, target, views = scene("unbounded")
+    for view in views:
+        for camera in cameras.values():
+            inside = wholly_inside(camera, view.rig_from_target, target, 0.0)
+            assert inside[config.target.is_mark(target.ids)].all()
+            row, column = config.target.row_column_from_id(target.ids[inside])
+            assert inside.sum() > 40 and row.min() < 0 and column.max() > 5
+
+
+def test_dense_loses_some_dots_at_the_border():
+    _, cameras, target, views = scene("dense")
+    share = [
+        wholly_inside(c, v.rig_from_target, target, 6.0).mean()
+        for v in views
+        for c in cameras.values()
+    ]
+    assert min(share) >= 0.7 and min(share) < 1
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_renders_dots_where_the_truth_says(name):
+    config, cameras, target, views = scene(name)
+    exact = exact_dots(config, cameras, target, views[:1])
+    for camera in cameras.values():
+        image = view_image(
+            replace(config, noise=0.0, light_gradient=0.0, dirt=0),
+            camera,
+            target,
+            views[0].rig_from_target,
+            np.random.default_rng(1),
+        )
+        width, height = camera.image_size_px
+        assert image.shape == (height, width) and image.dtype == np.uint8
+        mine = exact[(exact["camera"] == camera.name) & (exact["inside"] == 1)]
+        plain = mine[~config.target.is_mark(mine["dot"].to_numpy())]
+        uv = np.rint(plain[["u_px", "v_px"]].to_numpy()).astype(int)
+        at_dots = image[uv[:, 1], uv[:, 0]].astype(float)
+        middle = (config.black + config.white) / 2 * 255
+        white = config.target.polarity == "white_on_black"
+        assert len(at_dots) > 10
+        assert np.mean((at_dots > middle) == white) > 0.98
+
+
+def test_dataset_without_images(tmp_path):
+    config = preset("paper", views=4, sigma_px=0.05)
+    dataset = simulate(config, rng=np.random.default_rng(5), out=tmp_path / "set", images=False)
+    measured = pd.read_csv(tmp_path / "set" / "calibration" / "dots.csv")
+    exact = pd.read_csv(tmp_path / "set" / "truth" / "dots.csv")
+    assert list(measured) == ["view", "camera", "dot", "u_px", "v_px", "sigma_px", "row", "column"]
+    both = measured.merge(exact, on=["view", "camera", "dot", "row", "column"])
+    assert len(both) == len(measured) == 4 * 2 * 15
+    error = both[["u_px_x", "v_px_x"]].to_numpy() - both[["u_px_y", "v_px_y"]].to_numpy()
+    assert error.std() == pytest.approx(0.05, rel=0.15)
+    assert list(dataset.rig.cameras) == ["left", "right"]
+    assert dataset.rig.second_from_first_rotvec_deg == (0.0, 90.0, 0.0)
+    assert dataset.rig.target.scale_distance_mm == dataset.truth["target"]["scale_distance_mm"]
+
+
+def test_truth_reproduces_the_exact_dots(tmp_path):
+    simulate("near_telecentric", rng=np.random.default_rng(2), out=tmp_path, images=False)
+    truth = json.loads((tmp_path / "truth" / "truth.json").read_text())
+    exact = pd.read_csv(tmp_path / "truth" / "dots.csv")
+    points = dict(zip(truth["target"]["dot"], truth["target"]["points_mm"]))
+    for (view, name), rows in exact.groupby(["view", "camera"]):
+        values = truth["cameras"][name]
+        parameters = dict(values["parameters"])
+        pose = values["camera_from_rig"]
+        camera = Camera.create(
+            name,
+            tuple(values["image_size_px"]),
+            parameters.pop("scale_px_per_mm"),
+            camera_from_rig=Pose.from_rotvec(
+                np.radians(pose["rotvec_deg"]), pose["translation_mm"]
+            ),
+            rho_mm=values["rho_mm"],
+            **parameters,
+        )
+        place = truth["views"][view]["rig_from_target"]
+        moved = Pose(np.array(place["rotation"]), np.array(place["translation_mm"]))
+        uv = camera.project(moved.apply([points[d] for d in rows["dot"]]))
+        assert np.allclose(uv, rows[["u_px", "v_px"]], atol=1e-9)
+    assert truth["config"]["name"] == "near_telecentric" and truth["seed"]["entropy"] == 2
+
+
+def test_same_seed_same_bytes(tmp_path):
+    config = preset("paper", views=2, dirt=3, glare=0.2)
+    files = []
+    for name in ("a", "b"):
+        simulate(config, rng=np.random.default_rng(7), out=tmp_path / name)
+        found = sorted(p for p in (tmp_path / name).rglob("*") if p.is_file())
+        files.append({p.relative_to(tmp_path / name): p.read_bytes() for p in found})
+    assert files[0] == files[1] and len(files[0]) == 4 + 3
+    simulate(config, rng=np.random.default_rng(8), out=tmp_path / "c")
+    assert (tmp_path / "c" / "truth" / "dots.csv").read_bytes() not in files[0].values()
+
+
+def test_images_and_tables_share_the_scene(tmp_path):
+    config = preset("symmetric", views=1)
+    for name, images in (("a", True), ("b", False)):
+        simulate(config, rng=np.random.default_rng(7), out=tmp_path / name, images=images)
+    assert (tmp_path / "a/truth/truth.json").read_bytes() == (
+        tmp_path / "b/truth/truth.json"
+    ).read_bytes()
+    assert not (tmp_path / "a/calibration/dots.csv").exists()
+    assert not list((tmp_path / "b/calibration").glob("*/*"))
+
+
+def test_one_camera_views_and_bit_depth(tmp_path):
+    config = preset("paper", views=3, single_camera_views=2, bit_depth=12)
+    simulate(config, rng=np.random.default_rng(0), out=tmp_path)
+    seen = {p.relative_to(tmp_path / "calibration").as_posix() for p in tmp_path.rglob("*.tif")}
+    assert seen == {"left/view00.tif", "right/view00.tif", "right/view01.tif", "left/view02.tif"}
+    image = tifffile.imread(tmp_path / "calibration/left/view02.tif")
+    assert image.dtype == np.uint16 and 1500 < image.max() < 4096
+
+
+def test_one_camera_alone(tmp_path):
+    config = preset("paper", views=2, cameras=(CameraConfig("mono", scale_px_per_mm=8.0),))
+    dataset = simulate(config, rng=np.random.default_rng(0), out=tmp_path, images=False)
+    assert list(dataset.rig.cameras) == ["mono"]
+    assert dataset.rig.second_from_first_rotvec_deg is None
+
+
+def test_outliers(tmp_path):
+    config = preset("dense", outlier_fraction=0.1, outlier_px=20.0, views=4)
+    simulate(config, rng=np.random.default_rng(0), out=tmp_path, images=False)
+    keys = ["view", "camera", "dot"]
+    both = pd.read_csv(tmp_path / "calibration/dots.csv").merge(
+        pd.read_csv(tmp_path / "truth/dots.csv"), on=keys
+    )
+    error = np.hypot(both["u_px_x"] - both["u_px_y"], both["v_px_x"] - both["v_px_y"])
+    assert np.mean(error > 0.1) == pytest.approx(0.1, abs=0.02)
+
+
+def test_missing_marks_are_not_there(tmp_path):
+    base = preset("paper")
+    target = replace(base.target, mark_style="missing", mark_diameter_mm=None)
+    dataset = simulate(
+        replace(base, target=target, views=1), rng=np.random.default_rng(0), out=tmp_path
+    )
+    assert len(dataset.truth["target"]["dot"]) == 12
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(InputError, match="no preset 'papr'"):
+        preset("papr")
+    with pytest.raises(InputError, match="no setting"):
+        preset("paper", angel_deg=3)
+    with pytest.raises(InputError, match="no plate can be tilted"):
+        simulate(preset("paper", angle_deg=150.0), rng=np.random.default_rng(0), out=tmp_path / "a")
+    with pytest.raises(InputError, match="no pose"):
+        simulate(preset("paper", border_px=150.0), rng=np.random.default_rng(0), out=tmp_path / "b")
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "mine.txt").write_text("x")
+    with pytest.raises(InputError, match="in use"):
+        simulate("paper", rng=np.random.default_rng(0), out=tmp_path / "c")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c"]
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [{"views": 0}, {"tilt_deg": (60.0, 20.0)}, {"outlier_fraction": 1.5}, {"blur_px": -1.0}],
+)
+def test_senseless_settings_are_refused_by_name(fault):
+    with pytest.raises(InputError, match=next(iter(fault))):
+        preset("paper", **fault)
+
+
+def test_exact_dots_for_tests_of_solvers(tmp_path):
+    dataset = simulate(
+        preset("paper", sigma_px=0.0), rng=np.random.default_rng(0), out=tmp_path, images=False
+    )
+    exact = pd.read_csv(tmp_path / "truth/dots.csv")
+    assert np.array_equal(dataset.dots()[["u_px", "v_px"]], exact[["u_px", "v_px"]])

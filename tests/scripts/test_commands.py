@@ -1,0 +1,294 @@
+"""The commands on real files: what they write, and what they say of bad input."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+import telerig
+from telerig.estimator.calibration.calibrate import run_calibration
+from telerig.scripts.calibrate import calibrate as calibrate_command
+from telerig.scripts.main import app
+
+runner = CliRunner()
+
+
+@pytest.fixture(autouse=True)
+def tracebacks_of_our_own_faults(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TELERIG_DEBUG", "1")
+
+
+def run(*arguments: str | Path, code: int = 0) -> str:
+    result = runner.invoke(app, [str(a) for a in arguments])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    text = result.output + result.stderr
+    assert result.exit_code == code, text
+    return text
+
+
+@pytest.fixture
+def small_copy(paper_copy: Path) -> Path:
+    """Seven of its views."""
+    for camera in ("left", "right"):
+        for path in images(paper_copy, camera)[7:]:
+            path.unlink()
+    return paper_copy
+
+
+def images(folder: Path, camera: str) -> list[Path]:
+    return sorted((folder / "calibration" / camera).iterdir())
+
+
+def spoil(path: Path, change) -> None:  # type: ignore[no-untyped-def]
+    tifffile.imwrite(path, change(tifffile.imread(path)))
+
+
+@pytest.fixture(scope="module")
+def calibrated(paper_images: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    out = tmp_path_factory.mktemp("out") / "calibration"
+    return out, run("calibrate", paper_images, "--out", out, "--quiet")
+
+
+def test_calibrate_writes_every_file_of_the_contract(calibrated):
+    out, text = calibrated
+    for name in ("calibration.json", "covariance.npz", "dots.csv", "residuals.csv", "report.html",
+                 "run.json"):  # fmt: skip
+        assert (out / name).is_file(), name
+    dots = pd.read_csv(out / "dots.csv")
+    assert list(dots.columns) == [
+        "view", "camera", "dot", "row", "column", "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2",
+        "chi2_dof",
+    ]  # fmt: skip
+    residuals = pd.read_csv(out / "residuals.csv")
+    assert list(residuals.columns) == [
+        "view", "camera", "dot", "row", "column", "u_px", "v_px", "du_px", "dv_px", "weight",
+        "reason",
+    ]  # fmt: skip
+    assert len(dots) == len(residuals) == 12 * 2 * 15
+    data = json.loads((out / "calibration.json").read_text())
+    assert data["pixel_origin"] == "centre" and data["gauge"]
+    assert "GOOD" in text
+    record = json.loads((out / "run.json").read_text())
+    assert (
+        set(record["inputs_sha256"]) >= {"rig.toml", "calibration/left/01.tif"}
+        or len(record["inputs_sha256"]) == 25
+    )
+
+
+def test_calibrate_says_what_moved_since_an_earlier_calibration(calibrated, small_copy):
+    earlier, _ = calibrated
+    text = run("calibrate", small_copy, "--quiet", "--compare", earlier, "--no-report")
+    out = small_copy / "results" / "calibration"
+    found = json.loads((out / "comparison.json").read_text())
+    assert found["verdict"] == "SAME" and found["earlier"] == str(earlier)
+    assert found["words"] in text.replace("\n", " ")
+    text = run("calibrate", small_copy, "--quiet", "--compare", small_copy / "none", code=2)
+    assert "none" in text
+
+
+def test_a_dataset_to_compare_with_stands_for_its_own_results(calibrated, small_copy, tmp_path):
+    earlier, _ = calibrated
+    other = tmp_path / "last-year"
+    shutil.copytree(earlier, other / "results" / "calibration")
+    text = run("calibrate", small_copy, "--quiet", "--compare", other, "--no-report")
+    assert f"since {other}: " in text.replace("\n", "")
+
+
+def test_a_calibration_of_another_rig_is_refused_before_anything_is_solved(
+    calibrated, small_copy, monkeypatch
+):
+    earlier, _ = calibrated
+    rig = small_copy / "rig.toml"
+    rig.write_text(rig.read_text().replace("right", "top"))
+    (small_copy / "calibration" / "right").rename(small_copy / "calibration" / "top")
+    monkeypatch.setattr("telerig.estimator.calibration.calibrate.run_calibration", None)
+    text = run("calibrate", small_copy, "--quiet", "--compare", earlier, code=2)
+    assert "calibrations of different rigs" in text.replace("\n", " ")
+
+
+def test_a_reader_that_has_gone_is_no_fault():
+    code = "import typer\nfrom telerig.scripts.console import errors_in_words, say\n"
+    code += "def long():\n  with errors_in_words():\n    [say('x' * 1000) for _ in range(1000)]\n"
+    code += "typer.run(long)"
+    done = subprocess.run(
+        ["bash", "-c", '"$0" -c "$1" | head -1; echo "${PIPESTATUS[0]}"', sys.executable, code],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "fault" not in done.stderr and "Traceback" not in done.stderr
+    assert done.stdout.split()[-1] == "141"
+
+
+def test_residuals_are_measured_minus_predicted(calibrated, paper_images):
+    out, _ = calibrated
+    calibration = telerig.load_calibration(out)
+    row = pd.read_csv(out / "residuals.csv", dtype={"view": str}).iloc[7]
+    index = list(calibration.dot_ids).index(row["dot"])
+    pose = calibration.target_poses[row["view"]]
+    point = pose.apply(calibration.target_points_mm[index : index + 1])
+    predicted = calibration.project(row["camera"], point)[0]
+    # up to the eccentricity of the dot's image, which is below a milli-pixel here
+    np.testing.assert_allclose(
+        row[["u_px", "v_px"]].to_numpy(float) - predicted,
+        row[["du_px", "dv_px"]].to_numpy(float),
+        atol=1e-3,
+    )
+
+
+def test_calibration_agrees_with_the_truth(calibrated, paper_images):
+    from telerig.estimator.calibration.quality.truth import compare_with_truth
+
+    out, _ = calibrated
+    truth = telerig.load_dataset(paper_images).truth
+    comparison = compare_with_truth(telerig.load_calibration(out), truth)
+    assert comparison.passed, comparison.table
+    assert comparison.space.rms_um < 1.2
+
+
+def test_a_second_run_gives_the_same_bytes(calibrated, paper_images, tmp_path):
+    out, _ = calibrated
+    run("calibrate", paper_images, "--out", tmp_path / "again", "--quiet", "--no-report")
+    for name in ("calibration.json", "residuals.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+
+
+def test_detect_says_what_it_found_and_draws_it(paper_images, tmp_path):
+    text = run("detect", paper_images, "--out", tmp_path / "found", "--quiet")
+    assert len(re.findall(r"15 dots", text)) == 24
+    assert len(list((tmp_path / "found" / "overlays").glob("*/*.jpg"))) == 24
+
+
+def test_mirrored_camera_is_named(small_copy):
+    for path in images(small_copy, "right"):
+        spoil(path, np.fliplr)
+    text = run("calibrate", small_copy, "--quiet", code=2)
+    assert "camera 'right' is mirrored against camera 'left'" in text
+    assert "two_sided" in text
+    assert not (small_copy / "results").exists()
+
+
+def test_one_mirrored_image_is_named(small_copy):
+    spoil(images(small_copy, "left")[4], np.flipud)
+    text = run("calibrate", small_copy, "--quiet", code=2)
+    name = images(small_copy, "left")[4].stem
+    assert f"camera 'left' view '{name}'" in text and "mirrored image" in text
+
+
+def test_view_of_one_camera_only_is_used_and_said(small_copy):
+    gone = images(small_copy, "right")[0]
+    gone.unlink()
+    text = run("calibrate", small_copy, "--quiet")
+    assert re.search(rf"view '?{gone.stem}'?.*(only|alone|one camera)", text), text
+
+
+def test_image_without_dots_is_left_out_with_the_reason(small_copy):
+    path = images(small_copy, "left")[2]
+    spoil(path, lambda image: np.full_like(image, 40))
+    text = run("calibrate", small_copy, "--quiet")
+    assert f"view {path.stem}, camera left left out: no dots found" in text
+
+
+def test_dots_merged_by_glare_are_rejected_and_the_rest_used(small_copy):
+    path = images(small_copy, "left")[3]
+    before = telerig.detect_target(tifffile.imread(path), telerig.load_dataset(small_copy).target)
+    pair = before[before["dot"].isin([0, 1])][["u_px", "v_px"]].to_numpy()
+
+    def glare(image):
+        out = image.copy()
+        ends = [tuple(round(x) for x in p) for p in pair]
+        cv2.line(out, ends[0], ends[1], int(image.max()), 9)
+        return out
+
+    spoil(path, glare)
+    text = run("calibrate", small_copy, "--quiet")
+    rejected = pd.read_csv(small_copy / "results/calibration/rejected.csv", dtype={"view": str})
+    dots = pd.read_csv(small_copy / "results/calibration/dots.csv", dtype={"view": str})
+    mine = dots[(dots["view"] == path.stem) & (dots["camera"] == "left")]
+    assert len(mine) == 13 and not set(mine["dot"]) & {0, 1}
+    assert len(rejected[(rejected["view"] == path.stem) & (rejected["camera"] == "left")]) >= 1
+    assert "GOOD" in text or "USABLE" in text
+
+
+def test_twelve_bits_in_sixteen(small_copy, tmp_path):
+    for camera in ("left", "right"):
+        for path in images(small_copy, camera):
+            spoil(path, lambda image: image.astype(np.uint16) * 16)
+    text = run("calibrate", small_copy, "--quiet", "--no-report")
+    assert "210 of 210 dots" in text
+
+
+def test_colour_image_is_refused(small_copy):
+    path = images(small_copy, "left")[0]
+    image = tifffile.imread(path)
+    cv2.imwrite(str(path.with_suffix(".png")), np.dstack([image, image // 2, image]))
+    path.unlink()
+    text = run("calibrate", small_copy, "--quiet", code=2)
+    assert path.with_suffix(".png").name in text and "colour" in text
+
+
+def test_truncated_image_is_refused_and_nothing_is_written(small_copy):
+    path = images(small_copy, "right")[5]
+    path.write_bytes(path.read_bytes()[:3000])
+    text = run("calibrate", small_copy, "--quiet", code=2)
+    assert path.name in text
+    assert not (small_copy / "results").exists()
+
+
+def test_wrong_size_names_both(small_copy):
+    spoil(images(small_copy, "right")[1], lambda image: image[:500])
+    text = run("calibrate", small_copy, "--quiet", code=2)
+    assert "512" in text and "500" in text
+
+
+def test_nominal_rotation_on_the_wrong_side_shows_both_twins(small_copy):
+    rig = small_copy / "rig.toml"
+    text = rig.read_text()
+    turned = re.sub(r"(right_from_left_rotvec_deg = \[).*\]", r"\g<1>0.0, -90.0, 0.0]", text)
+    assert turned != text
+    rig.write_text(turned)
+    said = run("calibrate", small_copy, "--quiet", "--no-report")
+    assert "mirror twin: cost" in said
+    calibration = telerig.load_calibration(small_copy / "results/calibration")
+    assert calibration.statistics["inter_camera_rotvec_deg"][1] < -80
+    np.testing.assert_allclose(calibration.twin["cost"], calibration.twin["other_cost"], rtol=1e-9)
+
+
+def test_existing_results_survive_a_failure(small_copy):
+    results = small_copy / "results" / "calibration"
+    results.mkdir(parents=True)
+    (results / "calibration.json").write_text("old")
+    shutil.rmtree(small_copy / "calibration" / "right")
+    for path in images(small_copy, "left")[1:]:
+        path.unlink()
+    run("calibrate", small_copy, "--quiet", code=2)
+    assert (results / "calibration.json").read_text() == "old"
+
+
+def test_unknown_preset_and_model_are_named(paper_images, tmp_path):
+    assert "paper" in run("simulate", "papper", "--out", tmp_path / "x", code=2)
+    assert "radial" in run("calibrate", paper_images, "--model", "radail", code=2)
+
+
+def test_help_of_every_command():
+    for command in ("demo", "simulate", "detect", "calibrate"):
+        assert "Exit" in run(command, "--help") or command != "calibrate"
+
+
+def test_calibrate_as_a_command_and_from_python_have_the_same_defaults() -> None:
+    command = inspect.signature(calibrate_command).parameters
+    python = inspect.signature(run_calibration).parameters
+    same = {name: name for name in ("model", "solver", "medium", "outlier_sd", "seed")}
+    for option, parameter in (same | {"dots": "dots_free"}).items():
+        assert command[option].default == python[parameter].default, option

@@ -1,0 +1,159 @@
+"""The code blocks and commands of the documentation run as they stand; the pages build."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import docs_pages
+import numpy as np
+import pytest
+
+import telerig
+from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.run.presets import run_preset
+
+ROOT = docs_pages.ROOT
+PAGES = [
+    page
+    for page in docs_pages.pages()
+    if page not in docs_pages.ELSEWHERE and docs_pages.blocks_of(page)
+]
+ALONE = ("docs/tutorial.md", "docs/tutorial-images.md", "docs/recording.md")
+"""Pages that begin in an empty folder."""
+
+
+@pytest.fixture(scope="session")
+def tank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset `tank` with the run `run1` and all results: what pages take for granted."""
+    folder = tmp_path_factory.mktemp("docs")
+    runner = docs_pages.PageRunner(folder)
+    steps = (
+        "telerig simulate rise --no-images --frames 25 --seed 1 --out tank\n"
+        "mv tank/runs/rise tank/runs/run1\n"
+        "telerig run tank --quiet --no-report\n"
+    )
+    runner.run(docs_pages.Block("tests/scripts/test_docs.py", 1, "sh", steps))
+    return folder / "tank"
+
+
+def own_sensors() -> dict[str, object]:
+    """What the worked example of smoothing.md has at hand: readings that no file of the run has."""
+    config = run_preset("rise", frames=25)
+    config = replace(config, stage=replace(config.stage, accelerometers=("left",)))
+    dataset = telerig.simulate(config, rng=np.random.default_rng(4), out=Path("data"), images=False)
+    readings = dataset.runs["rise"].load().accelerometers
+    assert readings is not None
+    (dataset.runs["rise"].path / "accelerometer.csv").unlink()
+    return {
+        "dataset": dataset,
+        "calibration": calibration_from_cameras(list(true_cameras(config.calibration).values())),
+        "left_t_s": readings["t_s"].to_numpy(),
+        "left_m_s2": readings[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy(),
+    }
+
+
+def measured_pixels(folder: Path) -> dict[str, object]:
+    """The README's pixels of a few points."""
+    calibration = telerig.load_calibration(folder / "tank" / "results" / "calibration")
+    points_mm = np.array([[1.0, 2.0, 3.0], [-2.0, 0.5, 1.0]])
+    pixels = [calibration.project(camera, points_mm) for camera in range(2)]
+    return {"uv_left_px": pixels[0], "uv_right_px": pixels[1]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES)
+def test_blocks_run(
+    page: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = docs_pages.blocks_of(page)
+    monkeypatch.chdir(tmp_path)
+    if page not in ALONE and {b.language for b in blocks} & {"sh", "python"}:
+        shutil.copytree(request.getfixturevalue("tank"), tmp_path / "tank")
+    names: dict[str, object] = {}
+    if page == "docs/smoothing.md":
+        names = own_sensors()
+    if page == "README.md":
+        shutil.copytree("tank", "tank-2")
+        names = measured_pixels(tmp_path)
+    runner = docs_pages.PageRunner(tmp_path, names)
+    for block in blocks:
+        runner.run(block)
+    assert runner.ran == sum(not b.not_run for b in blocks)
+    if page == "docs/smoothing.md":
+        check_own_sensors(runner.names["smoothing"])
+
+
+def check_own_sensors(smoothing: telerig.Smoothing) -> None:
+    assert len(smoothing.trajectories) == 25
+    assert abs(smoothing.summary["accelerometers"]["on the left arm"]["delay_s"]) < 0.01
+    assert Path("results-with-my-sensor/trajectories.csv").is_file()
+
+
+def test_every_block_is_run_or_says_why_not() -> None:
+    here = [page for page in docs_pages.pages() if page not in docs_pages.ELSEWHERE]
+    blocks = [b for page in here for b in docs_pages.blocks_of(page)]
+    assert len(blocks) > 40
+    unknown = [b.where for b in blocks if b.language not in docs_pages.LANGUAGES]
+    assert not unknown, "blocks in a language that no test runs"
+    used = Counter(b.not_run for b in blocks if b.not_run)
+    assert set(used) == set(docs_pages.NOT_RUN), "keys of blocks that are not run"
+    for page, test in docs_pages.ELSEWHERE.items():
+        assert (ROOT / page).is_file() and (ROOT / test).is_file()
+
+
+def test_no_command_hides_outside_a_block() -> None:
+    """An indented line that begins with `telerig` is a command that no test runs."""
+    hidden = []
+    for page in docs_pages.pages():
+        text = docs_pages.FENCE.sub("", (ROOT / page).read_text(encoding="utf-8"))
+        hidden += [f"{page}: {m}" for m in re.findall(r"^ {4,}telerig .*$", text, re.MULTILINE)]
+    assert not hidden
+
+
+def test_output_is_compared() -> None:
+    block = docs_pages.Block("a page", 1, "text", "written: 3.5 mm ...\n")
+    docs_pages.check_output(block, "first\nwritten: 12 mm, twice\n")
+    with pytest.raises(AssertionError, match="a page:1"):
+        docs_pages.check_output(block, "read: 12 mm\n")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    find_spec("sphinx") is None or find_spec("myst_parser") is None or find_spec("furo") is None,
+    reason="the extra 'docs' is not installed: pip install 'telerig[docs]'",
+)
+def test_pages_build_without_a_warning(tmp_path: Path) -> None:
+    """As text, which reads and links every page as HTML does; .ci/run builds the HTML."""
+    command = [sys.executable, "-m", "sphinx", "-b", "text", "-W", "--keep-going", "-q", "-j", "2"]
+    done = subprocess.run(
+        [*command, "-d", str(tmp_path / "trees"), str(ROOT / "docs"), str(tmp_path / "text")],
+        text=True, capture_output=True, timeout=600, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for page in ("index", "tutorial", "_generated/commands", "_generated/CONVENTIONS"):
+        assert (tmp_path / "text" / f"{page}.txt").is_file()
+    api = (tmp_path / "text" / "api.txt").read_text(encoding="utf-8")
+    assert "telerig.smooth(" in api and "Raises InputError" in api
+    cameras = (tmp_path / "text/_generated/reference/telerig.rig.txt").read_text(encoding="utf-8")
+    assert "class telerig.rig.camera.Camera(" in cameras and "the rig frame" in cameras
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [("record", "[until Ctrl-C]"), ("batch", "[one per core]"), ("record", "[devices.NAME]")],
+)
+def test_help_keeps_what_stands_in_brackets(command: str, words: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "telerig.scripts.main", command, "--help"],
+        text=True, capture_output=True, timeout=60, env={**os.environ, "COLUMNS": "160"},
+    )  # fmt: skip
+    assert words in done.stdout

@@ -1,0 +1,171 @@
+"""Runs the blocks of the documentation's pages, and knows those that cannot run in a test.
+
+A page is read block by block: ``sh`` runs in bash, ``python`` in one namespace a page, ``toml`` is
+read as `rig.toml`, ``text`` is what the block before it printed, numbers aside. Before a block:
+``<!-- not run: KEY -->`` with a key of `NOT_RUN`, ``<!-- exit code: N -->``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+
+from places import ROOT
+
+from telerig.io.rig_file.rig_file import description_from_toml
+
+LANGUAGES = ("sh", "python", "toml", "text", "{toctree}", "{eval-rst}")
+
+NOT_RUN = {
+    "completion": "changes the start-up file of the user's shell",
+    "dask": "needs a cluster; a test runs a scheduler and two workers",
+    "devices": "needs a laboratory; a test records simulated devices",
+    "figures": "is a layout, not a program",
+    "install": "makes an environment; .ci/run runs it literally",
+    "slurm": "needs a Slurm cluster; the script that it submits is run",
+}
+"""Why a block with this key is not run."""
+
+ELSEWHERE = {
+    "docs/exports.md": "tests/io/exchange/test_docs_exports.py",
+    "docs/reports.md": "tests/io/report/test_report_command.py",
+}
+"""Pages whose blocks run in a test of their own."""
+
+SENSOR = """
+[accelerometers.arm_left]
+mounted_on = "left"
+axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+noise_density_ug_sqrt_hz = 22.5
+"""
+"""Which tables of devices take for granted."""
+
+FENCE = re.compile(
+    r"(?P<before>(?:^<!--[^\n]*-->\n)*)^```(?P<language>[^\n]*)\n(?P<code>.*?)^```$", re.M | re.S
+)
+NUMBER = re.compile(r"[-+]?\d[\d.,]*(?:e[-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Block:
+    page: str
+    line: int
+    language: str
+    code: str
+    not_run: str = ""
+    exit_code: int = 0
+
+    @property
+    def where(self) -> str:
+        return f"{self.page}:{self.line}"
+
+
+def pages() -> list[str]:
+    """README and every page under docs/ that somebody wrote, as paths in the repository."""
+    found = [p for p in (ROOT / "docs").rglob("*.md") if "_generated" not in p.parts]
+    return sorted(p.relative_to(ROOT).as_posix() for p in [*found, ROOT / "README.md"])
+
+
+def blocks_of(page: str) -> list[Block]:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    blocks = []
+    for match in FENCE.finditer(text):
+        said = dict(re.findall(r"<!-- (not run|exit code): (.*?) -->", match["before"]))
+        blocks.append(
+            Block(
+                page,
+                text.count("\n", 0, match.start("language")) + 1,
+                match["language"].strip(),
+                match["code"],
+                said.get("not run", ""),
+                int(said.get("exit code", 0)),
+            )
+        )
+    return blocks
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """With a command `telerig` that is this very package, and a Slurm task's variables."""
+    commands = folder / ".commands"
+    commands.mkdir(exist_ok=True)
+    command = commands / "telerig"
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m telerig.scripts.main "$@"\n')
+    command.chmod(0o755)
+    slurm = {"ARRAY_TASK_ID": "1", "ARRAY_TASK_COUNT": "2", "CPUS_PER_TASK": "1"}
+    return {
+        **os.environ,
+        "PATH": f"{commands}{os.pathsep}{os.environ['PATH']}",
+        "COLUMNS": "200",
+        "TELERIG_DEBUG": "",
+        **{f"SLURM_{name}": value for name, value in slurm.items()},
+    }
+
+
+class PageRunner:
+    """One page's blocks, in order, in one folder; the current one, for Python."""
+
+    def __init__(self, folder: Path, names: dict[str, object] | None = None) -> None:
+        self.folder, self.names, self.said = folder, dict(names or {}), ""
+        self.environment = environment(folder)
+        self.ran = 0
+
+    def run(self, block: Block) -> None:
+        if block.not_run:
+            return
+        if block.language == "sh":
+            self.said = self._bash(block)
+        elif block.language == "python":
+            self.said = self._python(block)
+        elif block.language == "toml":
+            check_toml(block)
+        elif block.language == "text":
+            check_output(block, self.said)
+        self.ran += 1
+
+    def _bash(self, block: Block) -> str:
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", block.code], cwd=self.folder, env=self.environment,
+            text=True, timeout=300, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        assert done.returncode == block.exit_code, f"{block.where}: {done.stdout}"
+        return done.stdout
+
+    def _python(self, block: Block) -> str:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile("\n" * block.line + block.code, block.page, "exec"), self.names)
+        return printed.getvalue()
+
+
+def check_toml(block: Block) -> None:
+    """A whole `rig.toml` is read as one; tables of it are, added to the template."""
+    content = tomllib.loads(block.code)
+    if "schema" in content:
+        description_from_toml(block.code, where=block.where)
+    elif all(isinstance(value, dict) for value in content.values()):
+        template = (ROOT / "io" / "dataset" / "rig_template.toml").read_text(encoding="utf-8")
+        known = {"name": "rig", "first": "left", "second": "right", "angle": "90.0"}
+        known |= {"width": "512", "height": "512", "scale": "10.0"}
+        sensors = "" if "accelerometers" in content else SENSOR
+        whole = Template(template).substitute(known) + sensors + block.code
+        description_from_toml(whole, where=block.where)
+
+
+def masked(line: str) -> str:
+    return " ".join(NUMBER.sub("#", line).split())
+
+
+def check_output(block: Block, said: str) -> None:
+    """Every line of the block begins a line of the output; numbers may differ, ``...`` ends it."""
+    printed = [masked(line) for line in said.splitlines()]
+    for line in block.code.splitlines():
+        wanted = masked(line.removesuffix("...").rstrip())
+        assert any(p.startswith(wanted) for p in printed), f"{block.where}: {line!r} in\n{said}"

@@ -23,7 +23,7 @@ from telerig.io.simulation.calibration.scene import (
     true_cameras,
     true_target,
 )
-from telerig.io.simulation.simulate import exact_dots, rig_description
+from telerig.io.simulation.calibration_files import exact_dots, rig_description
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.target import Target

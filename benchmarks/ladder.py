@@ -31,10 +31,14 @@ from covariance import aligned
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.lens.start_values import model_start
-from telerig.estimator.calibration.result_from_fit import cameras_from_state
 from telerig.estimator.calibration.self_calibration import choose_model
 from telerig.estimator.calibration.solver.graph import solve
-from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal, parameter_unit
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    cameras_from_state,
+    held_at_nominal,
+    parameter_unit,
+)
 from telerig.factors.projection import State
 from telerig.io.simulation.calibration.presets import CameraConfig, SimulationConfig
 from telerig.rig.lens_models import name_of

@@ -20,7 +20,7 @@ from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
 from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.problem import held_at_nominal
 from telerig.io.simulation.calibration.presets import SimulationConfig
-from telerig.io.simulation.simulate import exact_dots
+from telerig.io.simulation.calibration_files import exact_dots
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.projection import PARAMETERS

@@ -14,7 +14,7 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.io.simulation.calibration.presets import CameraConfig, preset
 from telerig.io.simulation.calibration.scene import hand_held_views, true_cameras, true_target
-from telerig.io.simulation.simulate import exact_dots, rig_description
+from telerig.io.simulation.calibration_files import exact_dots, rig_description
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -25,8 +25,8 @@ def doctor(
     Exit code 0: nothing stands in the way, though there may be warnings. 1: something does.
     """
     with errors_in_words():
-        from telerig.estimator.doctor import check_dataset
-        from telerig.io.machine.installation import check_installation, check_ports
+        from telerig.estimator.doctor.dataset import check_dataset
+        from telerig.estimator.doctor.installation import check_installation, check_ports
 
         checks = [*check_installation(), *check_ports()]
         if dataset is not None:

@@ -113,7 +113,7 @@ def _rig(run: Path, rig: Path | None) -> RigDescription:
 
 def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
     """The rig's devices, with the ports that the command line gives."""
-    from telerig.io.rig_file.description import suggestion
+    from telerig.errors import suggestion
 
     given: dict[str, str] = {}
     for text in ports:

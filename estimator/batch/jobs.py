@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from telerig import __version__
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import load_dataset
+from telerig.version import VERSION
 
 Kind = Literal["calibrate", "track", "smooth"]
 
@@ -191,7 +191,7 @@ def fingerprint(job: Job) -> str:
 
     Images go by size and time of change, calibrations and tracks by content.
     """
-    hashed = hashlib.sha256(f"{__version__} {job.as_json()}".encode())
+    hashed = hashlib.sha256(f"{VERSION} {job.as_json()}".encode())
     place = Path(job.dataset)
     listed = [place / "rig.toml"]
     for folder in _INPUTS.get(job.kind, (f"runs/{job.run}",)):

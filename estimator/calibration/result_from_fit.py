@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.estimator.calibration.fit import Fit
 from telerig.estimator.calibration.lens.choice_record import model_rows
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import JointCovariance, aligned_covariance
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.robust import (
     lost_views,
     pixel_residuals,
     squared_distance,
 )
 from telerig.factors.projection import State
-from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.triangulation import triangulate
-
-if TYPE_CHECKING:
-    from telerig.estimator.calibration.self_calibration import Fit
 
 Array = NDArray[np.float64]
 
@@ -61,7 +58,9 @@ def calibration_from_fit(
         cameras=cameras,
         dot_ids=problem.dot_ids,
         target_points_mm=state.dots_mm,
-        target_poses={v: _pose(m) for v, m in zip(problem.views, state.rig_from_target)},
+        target_poses={
+            view: Pose(m[:3, :3], m[:3, 3]) for view, m in zip(problem.views, state.rig_from_target)
+        },
         covariance=rig_covariance,
         covariance_names=rig_names,
         free=free,
@@ -69,7 +68,7 @@ def calibration_from_fit(
         verdict=_verdict(fit, statistics),
         statistics=statistics,
         twin=_twin(fit, nominal_rotvec_deg),
-        model=model_rows(fit),
+        model=model_rows(fit.robust.problem, fit.models, fit.model_words, fit.choice),
         diagnostics={
             "gauge": GAUGE,
             "weak": weak,
@@ -86,18 +85,6 @@ def calibration_from_fit(
     )
     statistics |= _space(calibration, problem, state)
     return calibration
-
-
-def cameras_from_state(problem: Problem, state: State) -> tuple[Camera, ...]:
-    """The estimated cameras."""
-    return tuple(
-        Camera(c.name, c.image_size_px, c.rho_mm, k, _pose(m).inverse(), c.wall)
-        for c, k, m in zip(problem.cameras, state.intrinsics, state.rig_from_camera)
-    )
-
-
-def _pose(matrix: Array) -> Pose:
-    return Pose(matrix[:3, :3], matrix[:3, 3])
 
 
 def dot_table(problem: Problem) -> pd.DataFrame:

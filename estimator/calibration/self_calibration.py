@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.fit import Fit
 from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens import considered_parameters
 from telerig.estimator.calibration.lens.choice import Choice
@@ -58,31 +59,6 @@ Array = NDArray[np.float64]
 
 PLATE = "refraction in the plate"
 """What decides the mirror twin of a two-sided target when no nominal rotation is given."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Everything that a finished self-calibration knows, before it is put into words.
-
-    models : the chosen one of each camera.  choice : None when they were given.
-    centre_held : the cameras' poses with the image centres held, when perspective frees them.
-    """
-
-    robust: RobustFit
-    twin_cost: float
-    twin_by: str
-    twin_words: str
-    models: tuple[str, ...]
-    model_words: str
-    choice: Choice | None
-    centre_held: Array | None
-    pre: checks.PreCheck
-    notes: tuple[str, ...]
-
-    @property
-    def model(self) -> str:
-        """In one name."""
-        return joint_name(self.models, [c.name for c in self.robust.problem.cameras])
 
 
 def self_calibrate(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.estimator.sensors.accelerometer_checks import (
     clippings,
     dead_axes,
@@ -21,7 +21,6 @@ from telerig.estimator.sensors.accelerometer_checks import (
     without_gravity,
 )
 from telerig.estimator.sensors.encoder_checks import EncoderFault, encoder_faults
-from telerig.io.rig_file.description import suggestion
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration

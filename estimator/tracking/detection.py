@@ -153,9 +153,9 @@ def read_batch(path: Path) -> pd.DataFrame:
 
 def fingerprint(run: RunData, options: dict[str, Any]) -> str:
     """Changes when the recording, the options or the version do."""
-    from telerig import __version__
+    from telerig.version import VERSION
 
-    found = hashlib.sha256(json.dumps([__version__, options], default=str).encode())
+    found = hashlib.sha256(json.dumps([VERSION, options], default=str).encode())
     for folder, folders, names in os.walk(run.path):
         folders.sort()
         inside = Path(folder).relative_to(run.path)

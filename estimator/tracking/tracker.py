@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.outline.types import Prediction
-from telerig.estimator.tracking import checkpoint
 from telerig.estimator.tracking.association.advance import Scan, advance
 from telerig.estimator.tracking.association.hypotheses import Broken, Cluster, Decision, decide
 from telerig.estimator.tracking.association.labelled_tracks import follow_given
@@ -83,7 +82,7 @@ class Tracker:
         p, x = self.common.covariance, np.zeros((0, len(self.common.shift)))
         spread = np.zeros((0, 3, 3))
         if tracks and self.last is not None:
-            stage = StageMotion(**self.stage.to_dict())
+            stage = replace(self.stage)
             step, control, found = self._motion(stage, t_s, position_mm)
             x = np.array([t.filter.x for t in tracks])
             x[:, 3:6] += found
@@ -141,17 +140,6 @@ class Tracker:
         settled, gaps = self.ledger.settle(frame + 1)
         none = np.zeros(0, np.int64)
         return FrameResult(frame, none, none, (*events, *gaps), settled)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The whole state in plain numbers and lists, for JSON; exact."""
-        return checkpoint.to_dict(self)
-
-    def restore(self, stored: dict[str, Any]) -> None:
-        """Go on from `to_dict` of a tracker with the same settings, bit by bit.
-
-        Raises InputError when the settings or the axis differ.
-        """
-        checkpoint.restore(self, stored)
 
     def _confirmed(self) -> list[Track]:
         return [*self.given, *(t for c in self.clusters for t in c.tracks)]

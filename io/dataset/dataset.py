@@ -10,10 +10,10 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.dataset.tables import read_dots_csv
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
-from telerig.io.rig_file.description import RigDescription, suggestion
+from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.rig.target import Target
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.dataset.frame_pairing import Pairing, pair_frames
 from telerig.io.dataset.run_data import RunData, RunSource, outside_record
 from telerig.io.dataset.run_tables import (
@@ -24,7 +24,7 @@ from telerig.io.dataset.run_tables import (
 from telerig.io.images.frames import PAGE_EXTENSIONS, FrameSource, open_frames
 from telerig.io.images.read import list_images
 from telerig.io.images.video import VIDEO_EXTENSIONS
-from telerig.io.rig_file.description import RigDescription, suggestion
+from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.rig_file import read_rig_toml
 
 if TYPE_CHECKING:

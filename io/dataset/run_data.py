@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.images.frames import FrameSource
 from telerig.io.images.read import Image, check_size
-from telerig.io.rig_file.description import RigDescription, suggestion
+from telerig.io.rig_file.description import RigDescription
 
 if TYPE_CHECKING:
     import pandas as pd

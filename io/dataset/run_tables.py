@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.dataset.tables import check_cameras, check_pixels, fill_covariance
 from telerig.io.files.csv_table import Column, fail_rows, read_table
-from telerig.io.rig_file.description import suggestion
 
 if TYPE_CHECKING:
     import pandas as pd

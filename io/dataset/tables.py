@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.files.csv_table import Column, fail_rows, read_table, write_table
-from telerig.io.rig_file.description import RigDescription, suggestion
+from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.rig.target import Target
 

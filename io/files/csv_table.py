@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import atomic_path
-from telerig.io.rig_file.description import suggestion
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Literal
 
 import numpy as np
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.rig_file.device_description import DeviceDescription
 from telerig.rig.target import Polarity, Target
 from telerig.rig.windows import Wall
@@ -137,12 +136,3 @@ class RigDescription:
         raise InputError(
             f"no camera {camera!r} in the rig", where="camera", todo=suggestion(str(camera), names)
         )
-
-
-def suggestion(word: str, known: list[str]) -> str:
-    """What to do about an unknown word: the nearest known one, or all of them."""
-    lowered = {name.lower(): name for name in known}
-    near = get_close_matches(word.lower(), lowered, n=1, cutoff=0.55)
-    if near:
-        return f"did you mean {lowered[near[0]]}?"
-    return "known: " + ", ".join(known) if known else "nothing is known here: remove it"

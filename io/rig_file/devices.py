@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from telerig.io.rig_file.description import suggestion
+from telerig.errors import suggestion
 from telerig.io.rig_file.device_description import DeviceDescription
 from telerig.io.rig_file.parts import subtables
 from telerig.io.rig_file.schema import Positive, Problem, Table, validate

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from telerig.errors import suggestion
 from telerig.io.rig_file.description import (
     CARRIAGE,
     AccelerometerDescription,
@@ -18,7 +19,6 @@ from telerig.io.rig_file.description import (
     StageDescription,
     Vector,
     WallDescription,
-    suggestion,
 )
 from telerig.io.rig_file.schema import (
     AccelerometerTable,

@@ -9,15 +9,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from telerig.errors import InputError
+from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import write_text_atomic
-from telerig.io.rig_file.description import (
-    CARRIAGE,
-    SCHEMA,
-    CameraDescription,
-    RigDescription,
-    suggestion,
-)
+from telerig.io.rig_file.description import CARRIAGE, SCHEMA, CameraDescription, RigDescription
 from telerig.io.rig_file.devices import devices_from_tables
 from telerig.io.rig_file.parts import (
     accelerometers_from_tables,

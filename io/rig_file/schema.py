@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from telerig.io.rig_file.description import suggestion
+from telerig.errors import suggestion
 
 Positive = Annotated[float, Field(gt=0)]
 Triple = Annotated[list[float], Field(min_length=3, max_length=3)]

@@ -20,6 +20,7 @@ from telerig.io.rig_file.description import (
     RigDescription,
     StageDescription,
 )
+from telerig.io.simulation.calibration_files import seed_of, write_calibration
 from telerig.io.simulation.images.backlight import Screen, Specks, random_screen, random_specks
 from telerig.io.simulation.images.bodies import MODES
 from telerig.io.simulation.images.bubbles import Silhouette, exposed, render_bubbles
@@ -28,7 +29,6 @@ from telerig.io.simulation.run.presets import ImageConfig, RunConfig
 from telerig.io.simulation.run.scene import AXIS_RIG, RunScene, run_scene
 from telerig.io.simulation.run.sensors import accelerometer_table, references_table, stage_table
 from telerig.io.simulation.run.views import CameraView, camera_view, linear_projection, truth_rows
-from telerig.io.simulation.simulate import seed_of, write_calibration
 from telerig.io.simulation.stage_axis import write_stage_axis
 
 if TYPE_CHECKING:

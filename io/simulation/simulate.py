@@ -1,48 +1,20 @@
-"""Simulated datasets with their truth beside them: calibrations, and runs that come with one."""
+"""`telerig.simulate`: datasets with known truth, a calibration or a run with its calibration."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import Dataset, load_dataset
-from telerig.io.dataset.tables import write_table
-from telerig.io.files.atomic import atomic_folder, write_json_atomic
-from telerig.io.rig_file.description import CameraDescription, RigDescription
-from telerig.io.rig_file.rig_file import write_rig_toml
+from telerig.io.files.atomic import atomic_folder
 from telerig.io.simulation.calibration.presets import SimulationConfig
-from telerig.io.simulation.calibration.scene import (
-    TrueTarget,
-    View,
-    hand_held_views,
-    true_cameras,
-    true_target,
-    wholly_inside,
-)
-from telerig.io.simulation.images.plate_view import pixel_from_plate
-from telerig.io.simulation.images.plates import Light, digitise, render
+from telerig.io.simulation.calibration_files import write_calibration
 from telerig.io.simulation.run.presets import RunConfig, any_preset
-from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose
-from telerig.rig.projection import PARAMETERS
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
-
-TRUTH_SCHEMA = 1
-
-LEAST_SIGMA_PX = 1e-4
-"""What a table of exact dots states, since a standard deviation of 0 means nothing."""
+from telerig.io.simulation.run_files import write_run_dataset
 
 
 def simulate(
@@ -69,220 +41,10 @@ def simulate(
     final = _new_folder(out)
     with atomic_folder(final) as folder:
         if isinstance(settings, RunConfig):
-            from telerig.io.simulation.run_files import write_run_dataset
-
             write_run_dataset(settings, folder, rng, images=images)
         else:
             write_calibration(settings, folder, rng, images=images)
     return load_dataset(final)
-
-
-def write_calibration(
-    settings: SimulationConfig,
-    folder: Path,
-    rng: np.random.Generator,
-    *,
-    images: bool,
-    complete: Callable[[RigDescription], RigDescription] = lambda rig: rig,
-) -> tuple[Mapping[str, Camera], TrueTarget]:
-    """Write `rig.toml`, `calibration/` and `truth/`; the true cameras by name, and the target.
-
-    complete : adds to the rig file what only runs need.
-    """
-    seed = seed_of(rng)
-    scene_rng, dots_rng, image_rng = rng.spawn(3)
-    cameras = true_cameras(settings)
-    target = true_target(settings, scene_rng)
-    views = hand_held_views(settings, cameras, target, scene_rng)
-    exact = exact_dots(settings, cameras, target, views)
-    write_rig_toml(complete(rig_description(settings, target)), folder / "rig.toml")
-    truth = _truth(settings, seed, cameras, target, views)
-    write_json_atomic(folder / "truth" / "truth.json", truth)
-    write_table(exact, folder / "truth" / "dots.csv")
-    if images:
-        write_images(settings, cameras, target, views, folder / "calibration", image_rng)
-    else:
-        measured = measured_dots(settings, exact, cameras, dots_rng)
-        write_table(measured, folder / "calibration" / "dots.csv")
-    return cameras, target
-
-
-def rig_description(config: SimulationConfig, target: TrueTarget) -> RigDescription:
-    """What is known before calibration: nominal values, not the true ones."""
-    cameras = {
-        c.name: CameraDescription(
-            c.name, c.image_size_px, c.nominal_scale_px_per_mm, c.nominal_telecentricity_per_mm
-        )
-        for c in config.cameras
-    }
-    known = replace(config.target, scale_distance_mm=target.scale_distance_mm)
-    side = (0.0, float(config.angle_deg), 0.0) if len(cameras) == 2 else None
-    return RigDescription(config.name, cameras, known, second_from_first_rotvec_deg=side)
-
-
-def exact_dots(
-    config: SimulationConfig,
-    cameras: Mapping[str, Camera],
-    target: TrueTarget,
-    views: list[View],
-) -> pd.DataFrame:
-    """Noise-free pixels of the true centres, one row per view, camera and dot in the image.
-
-    `inside` is 1 where the whole dot lies in the image, ``border_px`` off its border.
-    """
-    import pandas as pd
-
-    row, column = config.target.row_column_from_id(target.ids)
-    tables = []
-    for view in views:
-        for name in view.cameras:
-            uv = pixel_from_plate(
-                cameras[name], view.rig_from_target, target.points_mm, target.plate
-            )
-            inside = wholly_inside(cameras[name], view.rig_from_target, target, config.border_px)
-            size = np.array(cameras[name].image_size_px)
-            seen = np.all((uv >= -0.5) & (uv <= size - 0.5), -1)
-            columns = {
-                "view": view.name,
-                "camera": name,
-                "dot": target.ids[seen],
-                "row": row[seen],
-                "column": column[seen],
-                "u_px": uv[seen, 0],
-                "v_px": uv[seen, 1],
-                "inside": inside[seen].astype(int),
-            }
-            tables.append(pd.DataFrame(columns))
-    return pd.concat(tables, ignore_index=True)
-
-
-def measured_dots(
-    config: SimulationConfig,
-    exact: pd.DataFrame,
-    cameras: Mapping[str, Camera],
-    rng: np.random.Generator,
-) -> pd.DataFrame:
-    """The dots that lie wholly inside, with noise and outliers."""
-    dots = exact[exact["inside"] == 1].drop(columns="inside").reset_index(drop=True)
-    uv = dots[["u_px", "v_px"]].to_numpy()
-    size = np.array([cameras[name].image_size_px for name in dots["camera"]])
-    outlier = rng.random(len(uv)) < config.outlier_fraction
-    uv = uv + config.sigma_px * rng.standard_normal(uv.shape)
-    uv += outlier[:, None] * config.outlier_px * rng.standard_normal(uv.shape)
-    dots[["u_px", "v_px"]] = np.clip(uv, 0, size - 1)
-    dots["sigma_px"] = max(config.sigma_px, LEAST_SIGMA_PX)
-    return dots[["view", "camera", "dot", "u_px", "v_px", "sigma_px", "row", "column"]]
-
-
-def write_images(
-    config: SimulationConfig,
-    cameras: Mapping[str, Camera],
-    target: TrueTarget,
-    views: list[View],
-    folder: Path,
-    rng: np.random.Generator,
-) -> None:
-    """``folder/<camera>/<view>.tif`` of every view."""
-    import tifffile
-
-    for view in views:
-        for name in view.cameras:
-            image = view_image(config, cameras[name], target, view.rig_from_target, rng)
-            file = folder / name / f"{view.name}.tif"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            tifffile.imwrite(file, image, metadata=None, software="telerig")
-
-
-def view_image(
-    config: SimulationConfig,
-    camera: Camera,
-    target: TrueTarget,
-    rig_from_target: Pose,
-    rng: np.random.Generator,
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """(height, width) one image of the target with random light and noise."""
-    light = _random_light(config, camera.image_size_px, rng)
-    grey = render(camera, rig_from_target, target.plate, light, blur_px=config.blur_px)
-    return digitise(
-        grey,
-        rng,
-        read_noise=config.noise * abs(config.white - config.black),
-        shot_noise=config.shot_noise,
-        bit_depth=config.bit_depth,
-    )
-
-
-def _random_light(
-    config: SimulationConfig, size_px: tuple[int, int], rng: np.random.Generator
-) -> Light:
-    angle = rng.uniform(0, 2 * np.pi)
-    gain = np.exp(config.exposure_spread * rng.standard_normal())
-    place = rng.uniform(0, 1, 2) * size_px
-    glare = (float(place[0]), float(place[1]), config.glare_radius_px, config.glare)
-    gradient = config.light_gradient * np.array([np.cos(angle), np.sin(angle)])
-    return Light(
-        float(gain),
-        (float(gradient[0]), float(gradient[1])),
-        config.vignetting,
-        glare if config.glare > 0 else None,
-    )
-
-
-def _truth(
-    config: SimulationConfig,
-    seed: dict[str, Any],
-    cameras: Mapping[str, Camera],
-    target: TrueTarget,
-    views: list[View],
-) -> dict[str, Any]:
-    row, column = config.target.row_column_from_id(target.ids)
-    return {
-        "schema": TRUTH_SCHEMA,
-        "pixel_origin": "centre",
-        "seed": seed,
-        "cameras": {name: _camera_truth(camera) for name, camera in cameras.items()},
-        "target": {
-            "dot": target.ids,
-            "row": row,
-            "column": column,
-            "points_mm": target.points_mm,
-            "scale_distance_mm": target.scale_distance_mm,
-        },
-        "views": {
-            view.name: {
-                "rig_from_target": _pose_truth(view.rig_from_target),
-                "cameras": view.cameras,
-            }
-            for view in views
-        },
-        "config": config,
-    }
-
-
-def _camera_truth(camera: Camera) -> dict[str, Any]:
-    return {
-        "image_size_px": camera.image_size_px,
-        "rho_mm": camera.rho_mm,
-        "parameters": {name: camera[name] for name in PARAMETERS},
-        "camera_from_rig": _pose_truth(camera.camera_from_rig),
-    }
-
-
-def _pose_truth(pose: Pose) -> dict[str, Any]:
-    return {
-        "rotation": pose.rotation,
-        "rotvec_deg": np.degrees(pose.rotvec_rad),
-        "translation_mm": pose.translation_mm,
-    }
-
-
-def seed_of(rng: np.random.Generator) -> dict[str, Any]:
-    """What it takes to make the same generator again."""
-    sequence = rng.bit_generator.seed_seq
-    entropy = getattr(sequence, "entropy", None)
-    key = getattr(sequence, "spawn_key", ())
-    children = getattr(sequence, "n_children_spawned", 0)
-    return {"entropy": entropy, "spawn_key": list(key), "children_spawned": children}
 
 
 def _new_folder(out: str | PathLike[str] | None) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
+
 
 class TelerigError(Exception):
     """Base of every error that telerig raises on purpose.
@@ -38,3 +40,12 @@ class CalibrationError(TelerigError):
 
 class GeometryError(TelerigError):
     """A point outside the region where a camera model can be evaluated or inverted."""
+
+
+def suggestion(word: str, known: list[str]) -> str:
+    """What to do about an unknown word: the nearest known one, or all of them."""
+    lowered = {name.lower(): name for name in known}
+    near = get_close_matches(word.lower(), lowered, n=1, cutoff=0.55)
+    if near:
+        return f"did you mean {lowered[near[0]]}?"
+    return "known: " + ", ".join(known) if known else "nothing is known here: remove it"

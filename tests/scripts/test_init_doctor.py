@@ -11,10 +11,10 @@ import pytest
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
-from telerig.estimator.doctor import check_dataset
+from telerig.estimator.doctor import installation
+from telerig.estimator.doctor.dataset import check_dataset
+from telerig.estimator.doctor.installation import check_installation, check_ports
 from telerig.io.dataset.new_dataset import new_dataset
-from telerig.io.machine import installation
-from telerig.io.machine.installation import check_installation, check_ports
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.io.simulation.run.presets import run_preset
 from telerig.io.simulation.simulate import simulate

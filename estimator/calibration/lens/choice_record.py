@@ -9,18 +9,20 @@ import numpy as np
 from telerig.rig.lens_models import joint_name, name_of
 
 if TYPE_CHECKING:
-    from telerig.estimator.calibration.lens.choice import Step
-    from telerig.estimator.calibration.self_calibration import Fit
+    from telerig.estimator.calibration.lens.choice import Choice, Step
+    from telerig.estimator.calibration.solver.problem import Problem
 
 
-def model_rows(fit: Fit) -> dict[str, Any]:
+def model_rows(
+    problem: Problem, models: tuple[str, ...], words: str, choice: Choice | None
+) -> dict[str, Any]:
     """The chosen model, why, and a row for each step of the ladder, taken or not."""
-    cameras = [c.name for c in fit.robust.problem.cameras]
-    steps = fit.choice.steps if fit.choice is not None else ()
+    cameras = [c.name for c in problem.cameras]
+    steps = choice.steps if choice is not None else ()
     return {
-        "name": fit.model,
-        "by_camera": dict(zip(cameras, fit.models)),
-        "words": fit.model_words,
+        "name": joint_name(models, cameras),
+        "by_camera": dict(zip(cameras, models)),
+        "words": words,
         "ladder": [_step(step, steps[max(k - 1, 0)], cameras) for k, step in enumerate(steps)],
     }
 

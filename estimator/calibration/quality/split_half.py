@@ -21,10 +21,9 @@ from telerig.estimator.calibration.quality.comparison import (
     chance_words,
     field_difference,
 )
-from telerig.estimator.calibration.result_from_fit import cameras_from_state
 from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.graph import solve
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.factors.projection import State
 from telerig.io.report.page.number_format import number
 

@@ -16,6 +16,7 @@ from telerig.errors import InputError
 from telerig.factors.projection import ImageKeys, Observations, State
 from telerig.rig.camera import Camera
 from telerig.rig.lens_models import parameters_of
+from telerig.rig.pose import Pose
 from telerig.rig.projection import INDEX, PARAMETERS
 from telerig.rig.target import Target
 
@@ -220,3 +221,11 @@ def held_at_nominal(problem: Problem, state: State) -> State:
         free = problem.free_indices(c)
         intrinsics[c, free] = state.intrinsics[c, free]
     return replace(state, intrinsics=intrinsics)
+
+
+def cameras_from_state(problem: Problem, state: State) -> tuple[Camera, ...]:
+    """The estimated cameras."""
+    return tuple(
+        Camera(c.name, c.image_size_px, c.rho_mm, k, Pose(m[:3, :3], m[:3, 3]).inverse(), c.wall)
+        for c, k, m in zip(problem.cameras, state.intrinsics, state.rig_from_camera)
+    )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import CalibrationError, InputError
+from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.stage.fit import (
     LEAST_TRAVEL_MM,
     Dots,
@@ -19,7 +19,6 @@ from telerig.estimator.calibration.stage.fit import (
     fit,
     start,
 )
-from telerig.io.rig_file.description import suggestion
 from telerig.rig.pose import Pose, across
 
 if TYPE_CHECKING:

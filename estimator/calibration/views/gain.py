@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.quality.truth import working_volume
-from telerig.estimator.calibration.result_from_fit import cameras_from_state
 from telerig.estimator.calibration.solver.covariance import JointCovariance, aligned_shift
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.views.candidate_poses import Candidates, dots_seen, observations
 from telerig.factors.projection import State, whitened_residuals
 

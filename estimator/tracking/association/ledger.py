@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -59,15 +58,3 @@ class Ledger:
         """Drop what is kept of dead particles, now and then."""
         if len(self._seen) > 2 * len(alive) + _SPARE:
             self._seen = {p: f for p, f in self._seen.items() if p in alive}
-
-    def to_dict(self) -> dict[str, Any]:
-        frames = [[f, t, p.tolist(), s.tolist()] for f, (t, p, s) in self._frames.items()]
-        return {"frames": frames, "seen": list(self._seen.items())}
-
-    @staticmethod
-    def from_dict(stored: dict[str, Any]) -> Ledger:
-        out = Ledger()
-        for f, t, p, s in stored["frames"]:
-            out._frames[f] = (t, np.array(p, np.int64), np.array(s, np.int64))
-        out._seen = {int(p): int(f) for p, f in stored["seen"]}
-        return out

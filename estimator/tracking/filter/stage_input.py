@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,6 +54,3 @@ class StageMotion:
     def _read(self, position_mm: float, t_s: float) -> None:
         self.read_mm = self.assumed_mm = float(position_mm)
         self.read_t_s = float(t_s)
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)

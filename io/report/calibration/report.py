@@ -18,7 +18,7 @@ from telerig.io.report.calibration.rig import rig_plan
 from telerig.io.report.calibration.scene import dots_are_drawn, scene_json
 from telerig.io.report.calibration.target import target_pictures
 from telerig.io.report.calibration.uncertainty import trust_pictures
-from telerig.io.report.page.contact_sheet import contact_sheet
+from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
 from telerig.io.report.page.figures import Picture
 from telerig.io.report.page.number_format import ABSENT, flat_rows, is_number
 from telerig.io.report.page.page import drawn_over_cores, render_page
@@ -135,3 +135,9 @@ def _pictures(results: CalibrationResults, dot: list[Picture] | None) -> dict[st
         else:
             pictures[place] = picture
     return pictures
+
+
+def contact_sheet(results: CalibrationResults) -> ContactSheet:
+    """The overlays of a calibration. Raises InputError for a picture that cannot be read."""
+    views = list(results.views) if results.overlays else []
+    return picture_sheet(views, results.camera_names, results.overlays)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from telerig.errors import InputError
-from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.figures import data_uri
 from telerig.io.report.page.results_files import read_picture
 
@@ -41,12 +40,6 @@ class ContactSheet:
     def linked(self) -> int:
         """How many pictures the page links to instead of carrying them."""
         return sum(bool(c.link and not c.source) for _, cells in self.views for c in cells)
-
-
-def contact_sheet(results: CalibrationResults) -> ContactSheet:
-    """The overlays of a calibration. Raises InputError for a picture that cannot be read."""
-    views = list(results.views) if results.overlays else []
-    return picture_sheet(views, results.camera_names, results.overlays)
 
 
 def picture_sheet(

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.result_from_fit import cameras_from_state
 from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.problem import cameras_from_state
 from telerig.estimator.calibration.start import known_target
 from telerig.rig.pose import Pose
 from telerig.rig.projection import INDEX

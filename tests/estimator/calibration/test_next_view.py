@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from telerig.estimator.calibration.quality.truth import working_volume
-from telerig.estimator.calibration.result_from_fit import cameras_from_state
 from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
 from telerig.estimator.calibration.solver.graph import solve
-from telerig.estimator.calibration.solver.problem import held_at_nominal
+from telerig.estimator.calibration.solver.problem import cameras_from_state, held_at_nominal
 from telerig.estimator.calibration.views.candidate_poses import Candidates, candidates, dots_seen
 from telerig.estimator.calibration.views.next_view import NextView, next_view
 from telerig.estimator.calibration.views.wording import first_views, hold_words

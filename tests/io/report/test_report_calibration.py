@@ -15,7 +15,7 @@ from calibration_folder import write_calibration_folder
 from report_page import Page, edit
 
 from telerig.errors import InputError
-from telerig.io.report.calibration.report import write_calibration_report
+from telerig.io.report.calibration.report import contact_sheet, write_calibration_report
 from telerig.io.report.calibration.residuals import residual_field
 from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.tables import parameter_rows, pose_rows, worst_rows
@@ -195,14 +195,14 @@ def test_pictures_beyond_the_budget_shrink_then_become_links(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     results = read_results(folder)
-    whole = sheets.contact_sheet(results)
+    whole = contact_sheet(results)
     assert not whole.shrunk and whole.linked == 0
     size = sum(file.stat().st_size for file in results.overlays.values())
     monkeypatch.setattr(sheets, "BUDGET_BYTES", size - 1)
-    assert sheets.contact_sheet(results).shrunk and sheets.contact_sheet(results).linked == 0
+    assert contact_sheet(results).shrunk and contact_sheet(results).linked == 0
     monkeypatch.setattr(sheets, "BUDGET_BYTES", 10)
-    assert sheets.contact_sheet(results).linked == 2
+    assert contact_sheet(results).linked == 2
     assert 'href="overlays/left/view01.jpg"' in write_calibration_report(folder).read_text()
     results.overlays["left", "view01"].write_bytes(b"rubbish" * 9)
     with pytest.raises(InputError, match=r"view01.jpg: is no JPEG"):
-        sheets.contact_sheet(results)
+        contact_sheet(results)

@@ -17,8 +17,9 @@ from telerig.io.simulation.calibration.scene import (
     true_target,
     wholly_inside,
 )
+from telerig.io.simulation.calibration_files import exact_dots, view_image
 from telerig.io.simulation.images.plate_view import pixel_from_plate
-from telerig.io.simulation.simulate import exact_dots, simulate, view_image
+from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from telerig.errors import TelerigError
 from telerig.estimator.batch.jobs import check_run_name
+from telerig.estimator.doctor.installation import Check
 from telerig.io.dataset.dataset import Dataset, load_dataset
-from telerig.io.machine.installation import Check
 
 if TYPE_CHECKING:
     from telerig.io.dataset.run_data import RunData

@@ -1,13 +1,13 @@
-"""What the bubbles' own pairs tell of a movement of the cameras against each other.
+"""A change of the pose between the two cameras, and the ray misses that it causes.
 
-The rays of a pair miss each other along the common perpendicular n of both lines of sight. The
-gap at a rig point p, when the second camera has moved by v and turned by w, is n . (v + w x p): a
-constant and a slope along both lines of sight, so of the six components of the pose between two
-telecentric cameras the gaps tell three, at any angle between them: the shift along n, and the two
-rotations about axes across n (roll about the second camera's own axis, pitch about the axis
-across that). The shifts in the plane of the lines of sight and the angle between them (rotation
-about n) move the point and leave no gap; they stay as calibrated. Perspective lenses tell more,
-and get it.
+The two rays of a pair miss each other along the common perpendicular n of both lines of sight. If
+the second camera has moved by v and turned by w, the ray miss at a rig point p is n . (v + w x p):
+a constant, and a slope along both lines of sight. Of the six components of the pose between two
+telecentric cameras three are therefore identifiable from ray misses, at any angle between them:
+the shift along n, and the two rotations about axes across n (roll about the second camera's own
+axis, pitch about the axis across that). Shifts in the plane of the lines of sight and the angle
+between them (rotation about n) move the point and cause no ray miss; they keep their calibrated
+values. With perspective lenses more components are identifiable, and they are estimated too.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.solver.covariance import POSE_COMPONENTS, rig_jacobian
@@ -33,11 +34,15 @@ Free = tuple[tuple[str, ...], ...]
 Pair = tuple[Camera, Camera]
 
 POSE = len(POSE_COMPONENTS)
-SURE = 1e-4
-"""Chance of calling a movement what is none."""
+FALSE_ALARM = 1e-4
+"""Probability of reporting a movement where there is none."""
 
-_LEAST_SEEN = 0.02
-_NOT_SEEN = 0.5
+_LEAST_EFFECT = 0.02
+"""Directions of movement count whose ray misses are larger than this share of the largest one's."""
+
+_NOT_IDENTIFIED = 0.5
+"""A rotation is not reported if its standard deviation is larger than this share of the prior's."""
+
 _GRID = 0.7
 _SINGULAR = 1e-10
 _LEAST_SINE = 0.05
@@ -45,16 +50,16 @@ _LEAST_SINE = 0.05
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """What a movement may be, before the run: standard deviations of each component.
+    """Standard deviations of each component of a movement before the run is seen.
 
-    Wide by default, so that the run alone decides; what no gap shows is not freed.
+    They are wide, so that the run decides; components without effect on ray misses stay fixed.
+    Raises InputError for values that are not positive.
     """
 
     rotation_rad: float = 5e-3
     translation_mm: float = 0.2
 
     def __post_init__(self) -> None:
-        """Raises InputError for values that are not positive."""
         if not (self.rotation_rad > 0 and self.translation_mm > 0):
             raise InputError(
                 f"a drift prior of {self.rotation_rad} rad and {self.translation_mm} mm",
@@ -66,11 +71,11 @@ class DriftPrior:
 class RigChange:
     """How the second camera has moved against the first since the calibration.
 
-    tangent, covariance : (6,), (6, 6) of rig_from_<second>, `POSE_COMPONENTS`, in the directions
-        that gaps tell; 0 in the others.
-    place_mm : (3,) where the bubbles are, in the rig; offset, roll and pitch are stated there.
+    tangent, covariance : (6,), (6, 6) of rig_from_<second>, `POSE_COMPONENTS`, in the identifiable
+        directions; 0 in the others.
+    place_mm : (3,) mean position of the bubbles in the rig frame, where the offset is stated.
     values, sigmas : (3,) offset (mm) along n, roll and pitch (rad).  prior_sigmas : before the run.
-    chance : that gaps as these come about without any movement.
+    chance : p-value, the probability of such ray misses without any movement.
     refined : rig_from_<second> of calibration and run together; None where it was not refined.
     """
 
@@ -87,18 +92,17 @@ class RigChange:
 
     @property
     def moved(self) -> bool:
-        """Whether this is beyond what calibration, shake and the bubbles' shapes explain."""
-        return self.chance < SURE
+        """Whether the ray misses exceed what calibration, shake and shapes of bubbles explain."""
+        return self.chance < FALSE_ALARM
 
     def size_words(self) -> str:
-        """The movement in numbers, what the run does not tell left out."""
-        offset, *turns = (1e6 * v for v in self.values)
-        sigma, *spreads = (1e6 * s for s in self.sigmas)
-        text = f"by {_rounded(offset / 1000, sigma / 1000)} um along the shared coordinate"
-        told = self.sigmas[1:] < _NOT_SEEN * self.prior_sigmas[1:]
-        each = zip(("rolled", "pitched"), turns, spreads, told)
-        names = [f"{n} by {_rounded(t, s)} urad" for n, t, s, seen in each if seen]
-        return ", ".join([text, *names]) if names else text + " (its rotations are not seen)"
+        """The identifiable part of the movement with its standard deviations."""
+        offset, *turns = zip(1e6 * self.values, 1e6 * self.sigmas)
+        text = f"by {_rounded(offset[0] / 1000, offset[1] / 1000)} µm along the shared coordinate"
+        identified = self.sigmas[1:] < _NOT_IDENTIFIED * self.prior_sigmas[1:]
+        each = zip(("rolled", "pitched"), turns, identified)
+        turned = [f"{name} by {_rounded(*turn)} µrad" for name, turn, known in each if known]
+        return ", ".join([text, *turned]) if turned else f"{text} (its rotations are not seen)"
 
     def as_dict(self) -> dict[str, Any]:
         """The content of ``rig_change`` in smoothing.json and tracking.json."""
@@ -112,8 +116,8 @@ class RigChange:
             "tangent": self.tangent.tolist(),
             "covariance": self.covariance.tolist(),
             "pairs": self.pairs,
-            "not_seen": "shifts in the plane of both lines of sight, and the angle between them: "
-            "as calibrated",
+            "not_seen": "Shifts in the plane of both lines of sight and the angle between them "
+            "cause no ray miss. They keep their calibrated values.",
         }
         if self.refined is not None:
             out["rig_from_camera"] = {
@@ -124,55 +128,50 @@ class RigChange:
 
 
 def _rounded(value: float, sd: float) -> str:
-    """Both cut where the standard deviation has two digits."""
+    """Value and standard deviation, rounded to two digits of the standard deviation."""
     digits = max(0, 1 - math.floor(math.log10(sd))) if sd > 0 else 2
-    return f"{value:+.{digits}f} +- {sd:.{digits}f}"
+    return f"{value:+.{digits}f} ± {sd:.{digits}f}"
 
 
 def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
-    """Unit vector n = first line of sight x second, and the rig point where both pass closest.
+    """Unit vector n = first line of sight x second, and the rig point (3,) where both pass closest.
 
     Raises CalibrationError for cameras that look along one line.
     """
-    rays = [
-        c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2)
-        for c in cameras
-    ]  # fmt: skip
+    rays = [c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2) for c in cameras]
     cross = np.cross(rays[0][1], rays[1][1])[0]
     sine = float(np.linalg.norm(cross))
     if sine < _LEAST_SINE:
         raise CalibrationError(
-            "both cameras look along one line", todo="a movement shows between two directions only"
+            "both cameras look along one line",
+            todo="a movement can be found only between cameras with different lines of sight",
         )
     middle, _ = midpoint(*rays[0], *rays[1])
     return cross / sine, middle[0]
 
 
 @dataclass(frozen=True)
-class Gaps:
-    """Gaps of pairs: (M,) mm along n, their variance, (M, P) derivatives by the rig block.
+class RayMisses:
+    """(M,) mm along n, their variance, and (M, P) derivatives by the rig block's parameters."""
 
-    points_mm : (M, 3) in the rig, where they were linearised.
-    """
-
-    gap_mm: Array
+    miss_mm: Array
     variance_mm2: Array
     by_rig: Array
-    points_mm: Array
 
 
-def gaps_of(
+def ray_misses(
     cameras: Pair,
     free: Free,
     points_mm: Array,
     uv_px: Array | None = None,
     covariance_px2: Array | None = None,
-) -> Gaps:
-    """Gaps of pixels (M, 2 cameras, 2) near rig points (M, 3); without pixels, derivatives alone.
+) -> RayMisses:
+    """Ray misses of pixels (M, 2 cameras, 2) near rig points (M, 3), linearised there.
 
-    Of a pair's four pixels one combination does not change with the point (the left null vector of
-    the projection's Jacobian): the gap, here in mm by which the second camera moves along n.
-    covariance_px2 : (M, 2, 2, 2).
+    Of a pair's four pixel coordinates one combination does not change with the point (the left
+    null vector of the projection's Jacobian): the ray miss, here as the shift of the second camera
+    along n that explains it.
+    covariance_px2 : (M, 2, 2, 2). Without pixels or covariances the results are 0.
     """
     n, _ = common_perpendicular(cameras)
     predicted, by_point, _ = stacked_jacobian(cameras, points_mm)
@@ -180,29 +179,27 @@ def gaps_of(
     scale = -np.einsum("mi,mij,j->m", null[:, 2:], by_point[:, 2:], n)
     null = null / scale[:, None]
     by_rig = np.einsum("mi,mip->mp", null, rig_jacobian(cameras, free, points_mm))
-    gap, variance = np.zeros(len(points_mm)), np.zeros(len(points_mm))
+    miss, variance = np.zeros(len(points_mm)), np.zeros(len(points_mm))
     if uv_px is not None:
-        gap = np.einsum("mi,mi->m", null, uv_px.reshape(-1, 4) - predicted)
+        miss = np.einsum("mi,mi->m", null, uv_px.reshape(-1, 4) - predicted)
     if covariance_px2 is not None:
-        halves = null.reshape(-1, 2, 2)
-        variance = np.einsum("mci,mcij,mcj->m", halves, covariance_px2, halves)
-    return Gaps(gap, variance, by_rig, points_mm)
+        by_camera = null.reshape(-1, 2, 2)
+        variance = np.einsum("mci,mcij,mcj->m", by_camera, covariance_px2, by_camera)
+    return RayMisses(miss, variance, by_rig)
 
 
 def drift_covariance(cameras: Pair, prior: DriftPrior) -> Array:
-    """(6, 6) prior covariance of a movement, in those directions alone that gaps show.
+    """(6, 6) prior covariance of a movement, in the directions alone that cause ray misses.
 
-    Judged over the volume that both cameras see: a direction counts whose gaps there are more than
-    2 % of the strongest one's.
+    The ray misses are compared over the volume that both cameras see.
     """
     _, middle = common_perpendicular(cameras)
     reach = min(min(c.image_size_px) / c["scale_px_per_mm"] / 2 for c in cameras)
     steps = _GRID * reach * np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), -1).reshape(-1, 3)
-    held: Free = ((), ())
-    rows = gaps_of(cameras, held, middle + steps).by_rig
+    rows = ray_misses(cameras, ((), ()), middle + steps).by_rig
     sigma = np.repeat([prior.rotation_rad, prior.translation_mm], 3)
     _, strength, directions = np.linalg.svd(rows * sigma)
-    seen = directions[: len(strength)][strength > _LEAST_SEEN * strength[0]]
+    seen = directions[: len(strength)][strength > _LEAST_EFFECT * strength[0]]
     return np.asarray(sigma[:, None] * (seen.T @ seen) * sigma)
 
 
@@ -237,39 +234,44 @@ def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
 
 
 def chance_of(tangent: Array, covariance: Array, prior: Array) -> float:
-    """Chance of an estimate as far from none: chi-square over the directions that the prior frees.
+    """p-value of an estimate under "no movement": chi-square over the prior's free directions.
 
-    The prior draws estimates towards none, so where it matters the chance is too large, never too
-    small.
+    The prior shrinks estimates towards 0, so the p-value errs on the large side.
     """
-    from scipy.stats import chi2
-
     basis = free_directions(prior)
     if not basis.shape[1]:
         return 1.0
     inverse = np.linalg.pinv(basis)
     value, spread = inverse @ tangent, inverse @ covariance @ inverse.T
-    return float(chi2.sf(value @ np.linalg.solve(spread, value), len(value)))
+    return float(chdtrc(len(value), value @ np.linalg.solve(spread, value)))
 
 
-def free_directions(prior: Array) -> Array:
-    """(6, k) root of the prior's covariance: unit-variance directions."""
-    scale = np.sqrt(np.diagonal(prior).clip(0))
-    unit = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(prior / unit[:, None] / unit)
-    kept = values > _SINGULAR * max(float(values[-1]), _SINGULAR)
+def free_directions(covariance: Array, singular: float = _SINGULAR) -> Array:
+    """(P, k) root of a covariance (P, P): directions of unit variance, singular ones left out.
+
+    singular : eigenvalues of the correlation matrix below this share of the largest count as 0.
+    """
+    unit = _scale(covariance)
+    values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
+    kept = values > singular * max(float(values[-1]), singular)
     return np.asarray(unit[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
 
+def _scale(covariance: Array) -> Array:
+    """(P,) standard deviations, 1 where they are 0."""
+    sd = np.sqrt(np.diagonal(covariance).clip(0))
+    return np.where(sd > 0, sd, 1.0)
+
+
 def rig_block(calibration: Calibration) -> tuple[Array, Free]:
-    """Covariance of the rig block and the free intrinsics; none for a calibration without."""
+    """Covariance of the rig block and its free intrinsics; zeros for a calibration without."""
     if calibration.covariance.size:
         return calibration.covariance, calibration.free
     return np.zeros((POSE, POSE)), ((), ())
 
 
 def with_drift(covariance: Array, drift: Array) -> Array:
-    """(P, P) covariance of the rig block, a movement of the second camera added."""
+    """(P, P) covariance of the rig block, that of a movement (6, 6) of the second camera added."""
     total = covariance.copy()
     total[-POSE:, -POSE:] += drift
     return total
@@ -280,13 +282,12 @@ def share_of_drift(
 ) -> tuple[Array, Array]:
     """The movement's part of the rig block's posterior: (6,), (6, 6).
 
-    rig, rig_covariance : (P,), (P, P) posterior of what the calibration has wrong and the movement
-    together; prior_rig : the calibration's covariance; drift : (6, 6) the movement's prior.
-    Gaussian conditioning: the movement given the sum is K times the sum, plus what K leaves open.
+    rig, rig_covariance : (P,), (P, P) posterior of the sum of calibration error and movement.
+    prior_rig : the calibration's covariance.  drift : (6, 6) the movement's prior.
+    Gaussian conditioning: the movement given the sum is K times the sum, with its covariance.
     """
     total = with_drift(prior_rig, drift)
-    scale = np.sqrt(np.diagonal(total).clip(0))
-    unit = np.where(scale > 0, scale, 1.0)
+    unit = _scale(total)
     inverse = np.linalg.pinv(total / unit[:, None] / unit, rcond=1e-13, hermitian=True)
     gain = np.zeros((POSE, len(total)))
     gain[:, -POSE:] = drift

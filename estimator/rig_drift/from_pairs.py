@@ -1,4 +1,4 @@
-"""A movement of the cameras against each other, from the pairs of a tracked run."""
+"""A movement of the cameras against each other, estimated from the pairs of a tracked run."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.wording import CALIBRATION_PROBLEM
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
     RigChange,
     chance_of,
     described,
     drift_covariance,
-    gaps_of,
+    free_directions,
+    ray_misses,
     rig_block,
     share_of_drift,
     with_drift,
 )
-from telerig.estimator.rig_drift.gap_noise import Noise, Series, information, learned_noise
+from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, information, learned_noise
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,19 +33,42 @@ Array = NDArray[np.float64]
 
 LEAST_PAIRS = 20
 LEAST_SEEN_S = 0.5
-"""In less, all bubbles together, their centres' wander is not seen for what it is: no verdict."""
+"""Least total time of all bubbles' tracks for a verdict: in less, the wander of the outlines'
+centres cannot be told from a movement."""
 
 _LEAST_CONFIDENCE = 0.9
 _DOUBTFUL = "shared|ambiguous|merged|border"
 _FAR_SIGMAS = 6.0
 _OUTLIER_SIGMAS = 4.5
+_LEAST = 4
+"""Frames of a run, and pairs of a stretch, below which nothing is estimated."""
 _MOST_ROWS = 520
 _MOST_STRETCHES = 10
 _STRETCH_S = 2.0
 _LEARNED_FROM = 2
 _PASSES = 3
+_SINGULAR = 1e-12
 _SHAPE_PX = 0.02
-"""What no outline tells of a bubble's centre, constant for each bubble, each view."""
+"""Constant error of each bubble's centre in each view that its outline does not show."""
+
+
+class PairCollector:
+    """Collects the reliable pairs of a run while it is tracked; estimates a movement at its end."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.parts: list[pd.DataFrame] = []
+
+    def add(self, tracks: pd.DataFrame) -> None:
+        names = pair_columns([c.name for c in self.calibration.cameras])
+        self.parts.append(tracks.loc[_reliable(tracks), [n for n in names if n in tracks]])
+
+    def found(self) -> RigChange | None:
+        import pandas as pd
+
+        filled = [p for p in self.parts if len(p)]
+        found = rig_change(pd.concat(filled, ignore_index=True), self.calibration) if filled else ()
+        return found[0] if found else None
 
 
 def pair_columns(cameras: Sequence[str]) -> list[str]:
@@ -55,57 +78,33 @@ def pair_columns(cameras: Sequence[str]) -> list[str]:
     return base + [f"{c}_{p}" for c in cameras for p in pixels]
 
 
-class PairCollector:
-    """The sure pairs of a run while it is tracked, and what they tell at its end."""
-
-    def __init__(self, calibration: Calibration) -> None:
-        self.calibration = calibration
-        self.parts: list[pd.DataFrame] = []
-
-    def add(self, tracks: pd.DataFrame) -> None:
-        names = pair_columns([c.name for c in self.calibration.cameras])
-        sure = _believed(tracks)
-        self.parts.append(tracks.loc[sure, [n for n in names if n in tracks]])
-
-    def found(self) -> RigChange | None:
-        import pandas as pd
-
-        filled = [p for p in self.parts if len(p)]
-        if not filled:
-            return None
-        found = rig_change(pd.concat(filled, ignore_index=True), self.calibration)
-        return None if found is None else found[0]
-
-
 def rig_change(
     tracks: pd.DataFrame, calibration: Calibration, prior: DriftPrior | None = None
 ) -> tuple[RigChange, Noise] | None:
-    """What a table of tracks tells of a movement, with the noise of its gaps.
+    """The movement estimated from a table of tracks, and the noise of its ray misses.
 
-    None for fewer than `LEAST_PAIRS` sure pairs, or without two cameras.
+    None for fewer than `LEAST_PAIRS` reliable pairs, or without two cameras.
     """
     if len(calibration.cameras) != 2 or len(tracks) < LEAST_PAIRS:
         return None
     cameras = (calibration.cameras[0], calibration.cameras[1])
-    table = _sure(tracks)
-    if len(table) < LEAST_PAIRS or table["frame"].nunique() < 4:
+    table = _without_outliers(tracks.loc[_reliable(tracks)])
+    if len(table) < LEAST_PAIRS or table["frame"].nunique() < _LEAST:
         return None
-    points = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     drift = drift_covariance(cameras, prior or DriftPrior())
     covariance, free = rig_block(calibration)
-    root = _root(with_drift(covariance, drift))
+    root = free_directions(with_drift(covariance, drift), _SINGULAR)
 
     def series_of(part: pd.DataFrame) -> Series:
-        where = part[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-        uv, spread = _pixels(part, [c.name for c in cameras])
-        gaps = gaps_of(cameras, free, where, uv, spread)
-        typical = float(np.median(gaps.variance_mm2))
+        misses = ray_misses(cameras, free, _points(part), *_pixels(part, [c.name for c in cameras]))
         return Series(
             part["frame"].to_numpy(np.int64),
             part["particle"].to_numpy(np.int64),
-            part["t_s"].to_numpy(float), gaps.gap_mm,
-            gaps.variance_mm2 / typical, gaps.by_rig @ root,
-        )  # fmt: skip
+            part["t_s"].to_numpy(float),
+            misses.miss_mm,
+            misses.variance_mm2 / float(np.median(misses.variance_mm2)),
+            misses.by_rig @ root,
+        )
 
     scale = min(c["scale_px_per_mm"] for c in cameras)
     found = _estimate(table, series_of, np.sqrt(2) * _SHAPE_PX / scale)
@@ -113,35 +112,28 @@ def rig_change(
         return None
     unit, spreads, noise, used = found
     rig = root @ unit
-    (tangent, own), (_, careful) = (
+    (tangent, own), (_, with_shapes) = (
         share_of_drift(rig, root @ spread @ root.T, covariance, drift) for spread in spreads
     )
-    change = described(cameras, tangent, own, drift, points.mean(0), used)
-    long = _seen_s(table) >= LEAST_SEEN_S
-    chance = chance_of(tangent, careful, drift) if long else 1.0
+    change = described(cameras, tangent, own, drift, _points(table).mean(0), used)
+    t = np.unique(table["t_s"].to_numpy(float))
+    seen_s = float(np.median(np.diff(t)) * len(table))
+    chance = chance_of(tangent, with_shapes, drift) if seen_s >= LEAST_SEEN_S else 1.0
     return replace(change, chance=chance), noise
 
 
-def _seen_s(table: pd.DataFrame) -> float:
-    """How long bubbles were seen, added up."""
-    t = np.unique(table["t_s"].to_numpy(float))
-    return float(np.median(np.diff(t)) * len(table))
-
-
-def _believed(tracks: pd.DataFrame) -> NDArray[np.bool_]:
-    """Rows whose pixels are both measured, of pairs that are hardly to be doubted."""
+def _reliable(tracks: pd.DataFrame) -> NDArray[np.bool_]:
+    """Rows with pixels measured in both views, of pairs with high confidence and without flags."""
     keep = np.isfinite(tracks["ray_miss_mm"].to_numpy(float))
     if "confidence" in tracks:
         keep &= ~(tracks["confidence"].to_numpy(float) < _LEAST_CONFIDENCE)
     if "flags" in tracks:
-        words = tracks["flags"].fillna("").astype(str)
-        keep &= ~words.str.contains(_DOUBTFUL).to_numpy()
+        keep &= ~tracks["flags"].fillna("").astype(str).str.contains(_DOUBTFUL).to_numpy()
     return np.asarray(keep)
 
 
-def _sure(tracks: pd.DataFrame) -> pd.DataFrame:
-    """Believed rows without gaps that are far from all others."""
-    table: pd.DataFrame = tracks.loc[_believed(tracks)]
+def _without_outliers(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows whose ray miss is not far from all others, their particles numbered from 0."""
     miss = table["ray_miss_mm"].to_numpy(float)
     if not len(miss):
         return table
@@ -153,43 +145,40 @@ def _sure(tracks: pd.DataFrame) -> pd.DataFrame:
     return kept
 
 
+def _points(table: pd.DataFrame) -> Array:
+    return table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+
+
 def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
-    """(M, 2, 2) centres, corrected where they are; (M, 2, 2, 2) covariances."""
+    """(M, 2, 2) centres with the shape's correction where it is known; (M, 2, 2, 2) covariances."""
     uv, spread = [], []
     for name in cameras:
         centre = table[[f"{name}_u_px", f"{name}_v_px"]].to_numpy(float)
-        if f"{name}_du_px" in table:
-            centre = centre + np.nan_to_num(
-                table[[f"{name}_du_px", f"{name}_dv_px"]].to_numpy(float)
-            )
+        shift = [f"{name}_du_px", f"{name}_dv_px"]
+        if shift[0] in table:
+            centre = centre + np.nan_to_num(table[shift].to_numpy(float))
         names = [f"{name}_{c}" for c in ("suu_px2", "suv_px2", "suv_px2", "svv_px2")]
         uv.append(centre)
         spread.append(table[names].to_numpy(float).reshape(-1, 2, 2))
     return np.stack(uv, 1), np.stack(spread, 1)
 
 
-def _root(covariance: Array) -> Array:
-    """(P, K) directions of unit variance."""
-    scale = np.sqrt(np.diagonal(covariance).clip(0))
-    unit = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
-    keep = values > 1e-12
-    return np.asarray(unit[:, None] * vectors[:, keep] * np.sqrt(values[keep]))
-
-
 def with_change(
     model: PairModel, change: RigChange | None, calibration: Calibration
 ) -> dict[str, Any]:
-    """What tracking.json says of the pairs, with a movement in place of a biased calibration."""
+    """The part ``pairs`` of tracking.json.
+
+    A movement of the cameras replaces the sentence on an offset of the calibration.
+    """
     words, moved = list(model.words), change is not None and change.moved
     if change is not None and moved:
-        words = [w for w in words if not w.startswith(CALIBRATION_PROBLEM)]
+        words = [w for w in words if w != model.offset_words]
         first = calibration.cameras[0].name
-        unsure = "" if np.any(calibration.covariance) else " or was never where it says"
+        unsure = "" if np.any(calibration.covariance) else " (or the calibration was never right)"
         words.append(
-            f"Calibration: camera {change.camera!r} has moved against {first!r} since{unsure}, "
-            f"{change.size_words()}. Calibrate again, or smooth with --refine-rig; until then "
-            "positions are off by it."
+            f"Camera {change.camera!r} has moved against {first!r} since the calibration{unsure}, "
+            f"{change.size_words()}. All positions are off by this movement. Calibrate again, or "
+            "smooth the run with --refine-rig."
         )
     return {
         "bias_px": model.bias_px,
@@ -202,13 +191,12 @@ def with_change(
 
 
 def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
-    """Parts of a run, of not too many pairs each, spread over it.
+    """Stretches of a run with at most about 520 pairs each, spread evenly over it.
 
     Frames are taken evenly: all of them where one bubble is followed, fewer where there are many.
     """
     frames, counts = np.unique(table["frame"].to_numpy(np.int64), return_counts=True)
-    per_frame = float(counts.mean())
-    most = max(4, int(_MOST_ROWS / per_frame))
+    most = max(4, int(_MOST_ROWS / float(counts.mean())))
     first = table.drop_duplicates("frame").sort_values("frame")["t_s"].to_numpy(float)
     step = float(np.median(np.diff(first)))
     thin = max(1, int(np.ceil(min(_STRETCH_S, float(np.ptp(first))) / step / most)))
@@ -224,42 +212,39 @@ def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
 def _estimate(
     table: pd.DataFrame, series_of: Callable[[Any], Series], shape_mm: float
 ) -> tuple[Array, tuple[Array, Array], Noise, int] | None:
-    """Unit unknowns, their covariance, the noise and the number of pairs that were kept.
+    """Unknowns of unit prior variance (K,), two covariances, the noise, the number of pairs kept.
 
-    The second covariance holds a constant shape of each bubble besides.
+    The second covariance includes the constant shape error of each bubble.
     """
     parts = [series_of(part) for part in stretches(table)]
-    some = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, _LEARNED_FROM).astype(int))]
-    noise = learned_noise(some)
-    size = parts[0].free.shape[1]
-    matrix, right = np.eye(size), np.zeros(size)
+    some = np.unique(np.linspace(0, len(parts) - 1, _LEARNED_FROM).astype(int))
+    noise = learned_noise([parts[i] for i in some])
+    size = parts[0].by_unknowns.shape[1]
     for last in range(_PASSES):
         matrix, right = np.eye(size), np.zeros(size)
-        kept, dropped = [], 0
+        kept = []
         for part in parts:
             added, value, sigmas = information(part, noise)
             matrix, right = matrix + added, right + value
-            good = np.abs(sigmas) < _OUTLIER_SIGMAS
-            dropped += int((~good).sum())
-            kept.append(part.of(good))
-        if not dropped or last == _PASSES - 1:
+            kept.append(part.of(np.abs(sigmas) < _OUTLIER_SIGMAS))
+        if last == _PASSES - 1 or list(map(len, kept)) == list(map(len, parts)):
             break
-        parts = [p for p in kept if len(p.gap_mm) >= 4]
+        parts = [p for p in kept if len(p) >= _LEAST]
         if not parts:
             return None
         noise = learned_noise(parts[:_LEARNED_FROM])
     covariance: Array = np.asarray(np.linalg.inv(matrix), np.float64)
     bubbles = len(np.unique(np.concatenate([p.bubble for p in parts])))
-    careful = covariance + _shape_share(parts, covariance, noise, shape_mm) / bubbles
-    pairs = sum(len(p.gap_mm) for p in parts)
-    return np.asarray(covariance @ right), (covariance, careful), noise, pairs
+    with_shapes = covariance + _shape_share(parts, covariance, noise, shape_mm) / bubbles
+    pairs = sum(map(len, parts))
+    return np.asarray(covariance @ right), (covariance, with_shapes), noise, pairs
 
 
 def _shape_share(parts: list[Series], covariance: Array, noise: Noise, shape_mm: float) -> Array:
-    """(K, K) what a constant gap of every bubble adds, as if all of the run were one bubble."""
+    """(K, K) added by a constant ray miss, as if all of the run were one bubble."""
     response = np.zeros(len(covariance))
     for part in parts:
-        constant = replace(part, gap_mm=np.full(len(part.gap_mm), shape_mm))
+        constant = replace(part, miss_mm=np.full(len(part), shape_mm))
         response = response + information(constant, noise)[1]
     shift = covariance @ response
     return np.outer(shift, shift)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -14,26 +15,42 @@ GRAVITY_M_S2 = 9.80665
 _UNITS = (
     ("g", 1.0),
     ("mm/s^2", 1000 * GRAVITY_M_S2),
-    ("mg, or in cm/s^2", 1000.0),
+    ("mg or cm/s^2", 1000.0),
     ("ft/s^2", GRAVITY_M_S2 / 0.3048),
 )
+"""Units that are recognised, and gravity in them. They lie so far apart that a factor of 1.5
+either way, as a hard start within a short record may cause it, does no harm; mg and cm/s^2 differ
+by 2 %, less than a bias does, and are named together."""
+
 _WITHIN = 1.5
 _FLOATING_M_S2 = 0.6
 _CLIPPED_LEAST = 5
 _CLIPPED_EXCESS = 3
+_TILTED_DEG = 20.0
 _FITS_DEG = 15.0
 _CLEAR = 0.6
 _SMOOTHED_S = 0.03
 
 
-@dataclass(frozen=True)
-class Clipping:
-    """One axis (0, 1, 2) that rests on one value: count samples, the first at index ``first``."""
-
-    axis: int
-    value: float
-    count: int
-    first: int
+def check_accelerometer(t_s: ArrayLike, reading_m_s2: ArrayLike, *, where: str) -> list[str]:
+    """Warnings about one sensor's readings (N,), (N, 3); InputError for a wrong unit."""
+    t, reading = np.asarray(t_s, float), np.asarray(reading_m_s2, float).reshape(-1, 3)
+    finite = np.isfinite(t) & np.isfinite(reading).all(1)
+    if not finite.all():
+        row = int(np.flatnonzero(~finite)[0])
+        raise InputError(f"sample {row} is not finite", where=where, todo="leave it out")
+    _check_gravity(float(np.linalg.norm(gravity_of(reading))), where)
+    words = [
+        f"{where}: {found.count} of {len(t)} samples of a{'xyz'[found.axis]} are clipped at "
+        f"{found.value:.4g} m/s^2, the first at {t[found.first]:.6g} s. The sensor's range is too "
+        "small: leave those rows out, or choose a wider range"
+        for found in clippings(reading)
+    ]
+    dead = np.flatnonzero(np.ptp(reading, axis=0) == 0)
+    return words + [
+        f"{where}: a{'xyz'[axis]} never changes: the sensor is stuck, or not connected"
+        for axis in dead
+    ]
 
 
 def gravity_of(reading: ArrayLike) -> Array:
@@ -41,29 +58,37 @@ def gravity_of(reading: ArrayLike) -> Array:
     return np.asarray(np.median(np.asarray(reading, float), axis=0))
 
 
-def unit_of(gravity: ArrayLike) -> tuple[str, float] | None:
-    """(unit, factor to m/s^2) when gravity's size shows another unit than m/s^2; else None.
-
-    gravity : (3,) as the sensor gives it. The units lie so far apart that a factor of 1.5 either
-    way, as a hard start within a short record may make it, does no harm; mg and cm/s^2 differ by
-    2 %, less than a bias does, and are named together.
-    """
-    size = float(np.linalg.norm(gravity))
+def _check_gravity(size: float, where: str) -> None:
+    """size : of the median reading, which should be gravity in m/s^2."""
     for unit, expected in _UNITS:
         if expected / _WITHIN < size < expected * _WITHIN:
-            return unit, GRAVITY_M_S2 / expected
-    return None
+            raise InputError(
+                f"the sensor reads {size:.4g} at rest, where m/s^2 would be 9.81: it is in {unit}",
+                where=where,
+                todo=f"multiply ax_m_s2, ay_m_s2, az_m_s2 by {GRAVITY_M_S2 / expected:.6g}",
+            )
+    if size < _FLOATING_M_S2:
+        raise InputError(
+            f"the sensor reads {size:.2g} m/s^2 at rest: gravity has been taken out",
+            where=where,
+            todo="give the specific force as the sensor measures it, 9.81 m/s^2 upwards at rest",
+        )
+    if not 1 / _WITHIN < size / GRAVITY_M_S2 < _WITHIN:
+        raise InputError(
+            f"the sensor reads {size:.4g} at rest, which is gravity in no unit",
+            where=where,
+            todo="check the sensor's scale: it should read 9.81 m/s^2 upwards at rest",
+        )
 
 
-def without_gravity(gravity: ArrayLike) -> bool:
-    """Whether the readings have gravity taken out, as "linear acceleration" of phones has."""
-    return float(np.linalg.norm(gravity)) < _FLOATING_M_S2
+@dataclass(frozen=True)
+class Clipping:
+    """One axis (0, 1, 2) that stays at one value: count samples, the first at index ``first``."""
 
-
-def plausible_gravity(gravity: ArrayLike) -> bool:
-    """Whether the size is that of gravity in m/s^2, within the factor of 1.5 of `unit_of`."""
-    size = float(np.linalg.norm(gravity)) / GRAVITY_M_S2
-    return 1 / _WITHIN < size < _WITHIN
+    axis: int
+    value: float
+    count: int
+    first: int
 
 
 def clippings(reading: ArrayLike) -> list[Clipping]:
@@ -82,35 +107,70 @@ def clippings(reading: ArrayLike) -> list[Clipping]:
     return out
 
 
-def dead_axes(reading: ArrayLike) -> list[int]:
-    """Axes of (N, 3) readings that never change."""
-    return [int(a) for a in np.flatnonzero(np.ptp(np.asarray(reading, float), axis=0) == 0)]
+def check_axes(reading_m_s2: ArrayLike, axes: ArrayLike, up: ArrayLike, *, where: str) -> list[str]:
+    """A warning when gravity does not point up by the stated mounting, with axes that would fit.
 
-
-def tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
-    """Angle between the gravity that is read, turned by ``axes``, and up."""
-    force = np.asarray(axes, float).T @ np.asarray(gravity, float)
-    return _angle_deg(force, np.asarray(up, float))
+    reading_m_s2 (N, 3); axes (3, 3) rows are the sensor's axes in rig coordinates; up (3,).
+    """
+    gravity = gravity_of(reading_m_s2)
+    angle = _tilt_deg(gravity, axes, up)
+    if angle < _TILTED_DEG:
+        return []
+    words = f"{where}: by its axes in rig.toml gravity points {angle:.0f} deg away from up; "
+    fits = fitting_axes(gravity, axes, up)
+    if fits is None:
+        direction = ", ".join(f"{v:.2f}" for v in gravity / np.linalg.norm(gravity))
+        return [f"{words}no exchange of axes fits: up is ({direction}) in the sensor's axes"]
+    rows = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row + 0.0) + "]" for row in fits)
+    return [f"{words}axes = [{rows}] would fit (or that turned about the vertical)"]
 
 
 def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | None:
-    """(3, 3) the given axes with rows swapped or turned round so that gravity points up.
+    """(3, 3) the given axes with rows swapped or reversed so that gravity points up.
 
-    Of the permutations with signs that keep the handedness, the one that changes fewest entries;
-    None when no one brings gravity within 15 degrees of up. Rotations about the vertical stay open.
+    Of the 24 right-handed exchanges, the one that changes the entries least; None when none brings
+    gravity within 15 degrees of up. Rotations about the vertical remain undetermined.
     """
-    given, best = np.asarray(axes, float), None
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            turned = np.array(signs)[:, None] * given[list(order)]
-            if np.linalg.det(turned) * np.linalg.det(given) < 0:
-                continue
-            if tilt_deg(gravity, turned, up) > _FITS_DEG:
-                continue
-            change = (float(np.abs(turned - given).sum()), tilt_deg(gravity, turned, up))
-            if best is None or change < best[0]:
-                best = (change, turned)
-    return None if best is None else best[1]
+    from scipy.spatial.transform import Rotation
+
+    given = np.asarray(axes, float)
+    turned = [np.rint(turn) @ given for turn in Rotation.create_group("O").as_matrix()]
+    fits = [a for a in turned if _tilt_deg(gravity, a, up) <= _FITS_DEG]
+    return min(
+        fits,
+        key=lambda a: (float(np.abs(a - given).sum()), _tilt_deg(gravity, a, up)),
+        default=None,
+    )
+
+
+def _tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
+    """Angle between the measured gravity, turned into the rig by ``axes``, and up."""
+    force, upwards = np.asarray(axes, float).T @ np.asarray(gravity, float), np.asarray(up, float)
+    across = np.linalg.norm(np.cross(force, upwards))
+    return float(np.degrees(np.arctan2(across, force @ upwards)))
+
+
+def check_motion(
+    t_s: Array, reading: Array, stage: Array, along: Array, *, where: str
+) -> list[str]:
+    """A warning when the carriage's acceleration appears on another sensor axis than stated.
+
+    t_s (N,), reading (N, 3); stage (E, 2) times and positions (mm) of the encoder; along : (3,)
+    the travel axis in sensor axes.
+    """
+    found = motion_correlation(t_s, reading, stage[:, 0], stage[:, 1]) if len(t_s) > 1 else None
+    if found is None:
+        return []
+    stated, best = float(found @ along), int(np.argmax(np.abs(found)))
+    clear = abs(found[best]) > _CLEAR and stated < abs(found[best]) / 2
+    if not (stated < -_CLEAR or clear):
+        return []
+    sign = "-" if found[best] < 0 else "+"
+    return [
+        f"{where}: the carriage's acceleration is felt along {sign}{'xyz'[best]} of the sensor "
+        f"(correlation {abs(found[best]):.2f}), not where its axes in rig.toml put the travel "
+        f"direction (correlation {stated:.2f}): check axes"
+    ]
 
 
 def motion_correlation(
@@ -131,24 +191,14 @@ def motion_correlation(
     grid = np.arange(low, high, step)
     place = _averaged(stage_t, np.asarray(position_mm, float), grid, step)
     felt = np.stack([_averaged(t, a, grid, step) for a in np.asarray(reading, float).T], -1)
-    bend = np.convolve(place, savgol_coeffs(13, 3, deriv=2, delta=step), "valid")
-    mean = np.hanning(15)[1:-1] / np.hanning(15)[1:-1].sum()
-    smooth = np.stack([np.convolve(a, mean, "valid") for a in felt.T], -1)
-    bend, smooth = bend - bend.mean(), smooth - smooth.mean(0)
-    size = np.sqrt((bend**2).sum() * (smooth**2).sum(0))
+    acceleration = np.convolve(place, savgol_coeffs(13, 3, deriv=2, delta=step), "valid")
+    window = np.hanning(15)[1:-1] / np.hanning(15)[1:-1].sum()
+    smooth = np.stack([np.convolve(a, window, "valid") for a in felt.T], -1)
+    acceleration, smooth = acceleration - acceleration.mean(), smooth - smooth.mean(0)
+    size = np.sqrt((acceleration**2).sum() * (smooth**2).sum(0))
     if not np.all(size > 0):
         return None
-    return np.asarray(smooth.T @ bend / size)
-
-
-def motion_contradicts(correlation: ArrayLike, along: ArrayLike) -> bool:
-    """Whether another direction of the sensor than the stated one follows the carriage.
-
-    correlation : (3,) of `motion_correlation`.  along : (3,) the travel axis in sensor axes.
-    """
-    found, stated = np.asarray(correlation, float), np.asarray(along, float)
-    on_axis, best = float(found @ stated), float(np.abs(found).max())
-    return on_axis < -_CLEAR or (best > _CLEAR and on_axis < best / 2)
+    return np.asarray(smooth.T @ acceleration / size)
 
 
 def _averaged(t: Array, values: Array, grid: Array, step: float) -> Array:
@@ -157,8 +207,3 @@ def _averaged(t: Array, values: Array, grid: Array, step: float) -> Array:
     ends = [np.interp(grid + s * step / 2, t, integral) for s in (-1, 1)]
     width = np.clip(grid + step / 2, t[0], t[-1]) - np.clip(grid - step / 2, t[0], t[-1])
     return np.asarray((ends[1] - ends[0]) / width)
-
-
-def _angle_deg(a: Array, b: Array) -> float:
-    across = np.linalg.norm(np.cross(a, b))
-    return float(np.degrees(np.arctan2(across, a @ b)))

@@ -1,4 +1,4 @@
-"""Faults of an encoder's record: jumps, single wrong readings, a counter that wrapped round."""
+"""Faults of an encoder's record: jumps, single wrong readings, a counter that wraps round."""
 
 from __future__ import annotations
 
@@ -6,28 +6,36 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
+
+from telerig.errors import InputError
 
 Array = NDArray[np.float64]
 
-_NOISES = 10.0
-_QUANTA = 4.0
+_SIGMAS = 10.0
+_COUNTS = 4.0
 _LEAST_MM = 0.002
-_GAP = 5.0
+_PAUSE = 5.0
+"""Steps longer than this many median steps are pauses of the record, not motion to be judged."""
+
 _RETURNS = 0.3
 _WRAP_OF_RANGE = 0.5
 _LEAST_RECORD = 6
 _LEAST_TO_LEARN = 60
-_REACH = 4
+_NEIGHBOURS = 4
 _SHARE = 0.3
+_HARMLESS_MM = 0.05
+_REAL_M_S2 = 50.0
+_SHOWN = 3
 
 
 @dataclass(frozen=True)
 class EncoderFault:
-    """t_s : of the first reading after the jump.  size_mm : what the reading gained too much.
+    """t_s : of the first reading after the jump.  size_mm : error of the reading.
 
-    kind : "jump" stays, "spike" is taken back after ``readings``, "wrap" throws the reading from
-    one end of the counter to the other.  step_s : between the readings before and after.
+    kind : a "jump" stays; a "spike" is taken back after ``readings``; at a "wrap" the counter
+    overflows to the other end of its range.  step_s : between the readings before and after.
     """
 
     t_s: float
@@ -38,113 +46,138 @@ class EncoderFault:
 
     @property
     def acceleration_m_s2(self) -> float:
-        """The least that moves the carriage by the fault's size within its step."""
+        """Least acceleration that moves the carriage by the fault's size within its step."""
         return 4e-3 * abs(self.size_mm) / self.step_s**2
+
+    def touches(self, t_s: Array, frames_t_s: Array) -> bool:
+        """Whether position differences between frames are wrong by it; t_s : of all readings."""
+        first = int(np.searchsorted(t_s, self.t_s))
+        begin = t_s[max(first - 1, 0)]
+        if self.kind == "spike":
+            end = t_s[min(first + self.readings, len(t_s) - 1)]
+            return bool(np.any((frames_t_s > begin) & (frames_t_s < end)))
+        return bool(frames_t_s[0] < self.t_s and frames_t_s[-1] > begin)
 
     @property
     def words(self) -> str:
-        """One sentence with time and size."""
+        at = f"{self.size_mm:+.4g} mm"
         if self.kind == "spike":
-            return (
-                f"{self.readings} reading(s) from {self.t_s:.6g} s on are off by "
-                f"{self.size_mm:+.4g} mm"
-            )
+            return f"{self.readings} reading(s) from {self.t_s:.6g} s on are off by {at}"
         what = "the counter wraps round" if self.kind == "wrap" else "the reading jumps"
-        return f"{what} by {self.size_mm:+.4g} mm at {self.t_s:.6g} s"
+        return f"{what} by {at} at {self.t_s:.6g} s"
+
+    @property
+    def remedy(self) -> str:
+        if self.kind == "spike":
+            return "remove those rows from stage.csv"
+        what = "unwrap the counter: " if self.kind == "wrap" else ""
+        return (
+            f"{what}subtract {self.size_mm:.6g} mm from every position from {self.t_s:.6g} s on, "
+            "or cut the run there"
+        )
+
+
+def check_encoder(
+    t_s: ArrayLike, position_mm: ArrayLike, frames_t_s: ArrayLike, *, where: str = "stage"
+) -> list[str]:
+    """Warnings about the encoder's record (E,); InputError for jumps that affect the frames."""
+    t, frames = np.asarray(t_s, float), np.asarray(frames_t_s, float)
+    faults = encoder_faults(t, position_mm)
+    grave = [
+        f
+        for f in faults
+        if abs(f.size_mm) > _HARMLESS_MM and f.acceleration_m_s2 > _REAL_M_S2
+        if f.touches(t, frames)
+    ]
+    if grave:
+        more = f" (and {len(grave) - 1} more)" if len(grave) > 1 else ""
+        raise InputError(grave[0].words + more, where=where, todo=grave[0].remedy)
+    shown = [f"{where}: {fault.words}" for fault in faults[:_SHOWN]]
+    if len(faults) > _SHOWN:
+        shown.append(f"{where}: and {len(faults) - _SHOWN} more jumps")
+    return shown
 
 
 def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]:
     """Steps that no motion makes, in the order of time.
 
     t_s, position_mm : (E,), times increasing. A step counts as a fault when its speed lies
-    outside the speeds of the two steps before and after it, by 10 times the record's own noise:
-    a hard acceleration changes the speed once, a jump changes it twice.
+    outside the speeds of the two steps before and after it, by 10 standard deviations of the
+    record's own noise: a hard acceleration changes the speed once, a jump changes it twice.
     """
     t, position = np.asarray(t_s, float), np.asarray(position_mm, float)
     if len(t) < _LEAST_RECORD:
         return []
     dt, step = np.diff(t), np.diff(position)
-    excess = _excess(dt, step)
-    unforeseen = _unforeseen(dt, step)
-    noise = 1.4826 * float(np.median(np.abs(unforeseen)))
-    odd = np.abs(unforeseen) > max(_NOISES * noise, _least(step))
-    odd &= (excess * unforeseen > 0) & (np.abs(excess) > _SHARE * np.abs(unforeseen))
-    clear = np.abs(excess) > _threshold(dt, step)
-    excess = np.where(odd & ~clear, unforeseen, excess)
-    steps = np.flatnonzero(odd | clear)
-    return _named(steps, excess, t, position)
-
-
-def _excess(dt: Array, step: Array) -> Array:
-    """(E - 1,) how far each step goes beyond what its neighbours' speeds allow (mm); 0 in gaps."""
     speed = step / dt
-    padded = np.pad(speed, 2, constant_values=np.nan)
-    near = np.stack([padded[k : k + len(speed)] for k in (0, 1, 3, 4)])
-    high, low = np.nanmax(near, 0), np.nanmin(near, 0)
-    beyond = np.maximum(speed - high, 0) + np.minimum(speed - low, 0)
-    return np.asarray(np.where(dt > _GAP * np.median(dt), 0.0, beyond * dt))
+    known = dt <= _PAUSE * np.median(dt)
+    excess = np.where(known, _excess_speed(speed) * dt, 0.0)
+    residual = np.where(known, _prediction_residual(speed) * dt, 0.0)
+    least = _least_fault(step)
+    odd = np.abs(residual) > max(_SIGMAS * _sd(residual), least)
+    odd &= (excess * residual > 0) & (np.abs(excess) > _SHARE * np.abs(residual))
+    bend = (speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * dt[1:-1]
+    clear = np.abs(excess) > max(_SIGMAS * _sd(bend - np.median(bend)), least)
+    excess = np.where(odd & ~clear, residual, excess)
+    return _classified(np.flatnonzero(odd | clear), excess, t, position)
 
 
-def _unforeseen(dt: Array, step: Array) -> Array:
-    """(E - 1,) what each step (mm) differs from the one that eight neighbours foretell.
+def _sd(values: Array) -> float:
+    """Robust standard deviation about 0."""
+    return 1.4826 * float(np.median(np.abs(values)))
 
-    The weights are those of the record itself (least squares without the steps that they miss),
-    so that an oscillation is foretold too; 0 in short records and at their ends.
+
+def _excess_speed(speed: Array) -> Array:
+    """(E - 1,) how far each speed lies outside the range of its two neighbours on each side."""
+    near = np.delete(sliding_window_view(np.pad(speed, 2, constant_values=np.nan), 5), 2, axis=1)
+    high, low = np.nanmax(near, 1), np.nanmin(near, 1)
+    return np.asarray(np.maximum(speed - high, 0) + np.minimum(speed - low, 0))
+
+
+def _prediction_residual(speed: Array) -> Array:
+    """(E - 1,) each speed less its prediction from four neighbours on each side.
+
+    The linear predictor is fitted to the record itself (least squares without the steps that it
+    misses), so that it follows an oscillation too; 0 in short records and at their ends.
     """
-    speed, reach = step / dt, _REACH
+    width = 2 * _NEIGHBOURS + 1
     if len(speed) < _LEAST_TO_LEARN:
         return np.zeros(len(speed))
-    padded = np.pad(speed, reach, mode="edge")
-    near = np.stack([padded[k : k + len(speed)] for k in range(2 * reach + 1) if k != reach], -1)
+    near = sliding_window_view(np.pad(speed, _NEIGHBOURS, mode="edge"), width)
+    near = np.delete(near, _NEIGHBOURS, axis=1)
     near = np.concatenate([near, np.ones((len(speed), 1))], -1)
     kept = np.ones(len(speed), bool)
     for _ in range(4):
         weights = np.linalg.lstsq(near[kept], speed[kept], rcond=None)[0]
-        off = speed - near @ weights
-        limit = 5 * 1.4826 * float(np.median(np.abs(off)))
-        clean = np.abs(off) <= limit
-        kept = np.convolve(~clean, np.ones(2 * reach + 1), "same") < 0.5
+        residual = speed - near @ weights
+        clean = np.abs(residual) <= 5 * _sd(residual)
+        kept = np.convolve(~clean, np.ones(width), "same") < 0.5
         if kept.sum() < _LEAST_TO_LEARN // 2:
             return np.zeros(len(speed))
-    known = dt <= _GAP * np.median(dt)
-    known[:reach] = known[-reach:] = False
-    return np.asarray(np.where(known, off * dt, 0.0))
+    residual[:_NEIGHBOURS] = residual[-_NEIGHBOURS:] = 0.0
+    return np.asarray(residual)
 
 
-def _least(step: Array) -> float:
-    """The smallest fault that is looked for (mm): some counts of the encoder."""
+def _least_fault(step: Array) -> float:
+    """The smallest fault that is looked for (mm): some counts of an encoder with coarse counts."""
     moved = np.abs(step[step != 0])
-    quantum = float(np.percentile(moved, 1)) if _counts(moved) else 0.0
-    return max(_QUANTA * quantum, _LEAST_MM)
+    coarse = len(moved) > 0 and len(np.unique(np.round(moved, 9))) < len(moved) / 4
+    return max(_COUNTS * float(np.percentile(moved, 1)) if coarse else 0.0, _LEAST_MM)
 
 
-def _threshold(dt: Array, step: Array) -> float:
-    speed = step / dt
-    bend = (speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * dt[1:-1]
-    noise = 1.4826 * float(np.median(np.abs(bend - np.median(bend))))
-    return max(_NOISES * noise, _least(step))
-
-
-def _counts(moved: Array) -> bool:
-    """Whether the steps are few multiples of one count."""
-    return len(moved) > 0 and len(np.unique(np.round(moved, 9))) < len(moved) / 4
-
-
-def _named(steps: NDArray[np.intp], excess: Array, t: Array, position: Array) -> list[EncoderFault]:
+def _classified(
+    steps: NDArray[np.intp], excess: Array, t: Array, position: Array
+) -> list[EncoderFault]:
     out: list[EncoderFault] = []
-    left = list(steps)
-    span = float(np.ptp(position))
+    left = [int(i) for i in steps]
+    pace = np.median(np.delete(np.diff(position), steps))
     while left:
         i = left.pop(0)
-        size = float(excess[i])
+        size, at, step = float(excess[i]), float(t[i + 1]), float(t[i + 1] - t[i])
         if left and left[0] - i <= 3 and abs(size + excess[left[0]]) < _RETURNS * abs(size):
-            back = left.pop(0)
-            out.append(
-                EncoderFault(float(t[i + 1]), size, "spike", float(t[i + 1] - t[i]), int(back - i))
-            )
-            continue
-        pace = np.median(np.delete(np.diff(position), steps))
-        wraps = size * pace < 0 and abs(size) > _WRAP_OF_RANGE * span
-        kind: Literal["wrap", "jump"] = "wrap" if wraps else "jump"
-        out.append(EncoderFault(float(t[i + 1]), size, kind, float(t[i + 1] - t[i])))
+            out.append(EncoderFault(at, size, "spike", step, left.pop(0) - i))
+        elif size * pace < 0 and abs(size) > _WRAP_OF_RANGE * float(np.ptp(position)):
+            out.append(EncoderFault(at, size, "wrap", step))
+        else:
+            out.append(EncoderFault(at, size, "jump", step))
     return out

@@ -49,6 +49,7 @@ class PairModel:
         and with every pair left out of its own bias.
     calibration_problem : the gaps' systematic part is beyond chance and beyond half a pixel.
     words : the finding in plain words, one sentence each.
+    offset_words : of these the sentence on a constant offset of the calibration; "" without.
     """
 
     bias_px: Array
@@ -66,6 +67,7 @@ class PairModel:
     rms_px: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     calibration_problem: bool = False
     words: tuple[str, ...] = ()
+    offset_words: str = ""
 
     def basis(self, points_mm: Array, terms: int | None = None) -> Array:
         """(..., 3) rig points -> (..., B) terms of the bias."""

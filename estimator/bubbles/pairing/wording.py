@@ -7,7 +7,6 @@ from dataclasses import replace
 from telerig.estimator.bubbles.pairing.types import PairModel
 
 LEAST_PROBLEM_PX = 0.5
-CALIBRATION_PROBLEM = "This is a calibration problem"
 _SIGNIFICANT = 4.0
 _FEW_PAIRS = 5.0
 _CLEAR_VOTE = 3.0
@@ -23,12 +22,14 @@ def describe(model: PairModel, votes: float) -> PairModel:
         f"{model.pairs:.1f} pairs; the rays of a pair miss each other by {raw:.2f} px RMS along "
         f"the shared axis, {constant:+.2f} +- {error:.2f} px on average."
     ]
+    offset = ""
     if problem:
-        words.append(
-            f"{CALIBRATION_PROBLEM}: the shared coordinate is off by {constant:+.2f} px; "
+        offset = (
+            f"This is a calibration problem: the shared coordinate is off by {constant:+.2f} px; "
             f"with that constant removed {after_constant:.2f} px RMS remain. Matching removes it; "
             "positions keep it until the rig is calibrated again."
         )
+        words.append(offset)
     if uneven:
         words.append(
             f"The offset changes over the volume: a smooth term brings {after_constant:.2f} px RMS "
@@ -47,4 +48,9 @@ def describe(model: PairModel, votes: float) -> PairModel:
             f"All gaps of a frame shift together by {model.frame_px:.2f} px RMS: the cameras shake "
             "against each other."
         )
-    return replace(model, words=tuple(words), calibration_problem=bool(problem or uneven))
+    return replace(
+        model,
+        words=tuple(words),
+        offset_words=offset,
+        calibration_problem=bool(problem or uneven),
+    )

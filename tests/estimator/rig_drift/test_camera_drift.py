@@ -1,4 +1,4 @@
-"""A camera that has moved since the calibration: what gaps tell of it, and how well."""
+"""A camera that has moved since the calibration: its estimate from ray misses."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from telerig.estimator.rig_drift.drift import (
     RigChange,
     drift_covariance,
     free_directions,
-    gaps_of,
     moved_pose,
     offset_roll_pitch,
+    ray_misses,
     share_of_drift,
 )
 from telerig.estimator.rig_drift.from_pairs import PairCollector, rig_change, with_change
-from telerig.estimator.rig_drift.gap_noise import Noise, Series, learned_noise
+from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, learned_noise
 from telerig.estimator.smoothing.problem.problem import RigMode, ShakeModel
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.run.presets import run_preset
@@ -61,7 +61,9 @@ def moved(cameras: Pair, tangent: Array) -> Pair:
     return cameras[0], replace(cameras[1], camera_from_rig=pose.inverse())
 
 
-def along_gap(cameras: Pair, offset_mm: float, roll_rad: float, pitch_rad: float) -> Array:
+def along_perpendicular(
+    cameras: Pair, offset_mm: float, roll_rad: float, pitch_rad: float
+) -> Array:
     """(6,) a movement of that offset at the rig's origin, roll and pitch, and nothing else."""
     return np.asarray(
         np.linalg.pinv(offset_roll_pitch(cameras, np.zeros(3)))
@@ -112,7 +114,9 @@ class Run:
 
 
 @pytest.mark.parametrize("angle", [45.0, 90.0, 130.0])
-def test_telecentric_gaps_tell_three_components_at_any_angle(angle: float) -> None:
+def test_three_components_are_identifiable_with_telecentric_lenses_at_any_angle(
+    angle: float,
+) -> None:
     cameras = rig(angle)
     directions = free_directions(drift_covariance(cameras, DriftPrior()))
     assert directions.shape == (6, 3)
@@ -130,32 +134,32 @@ def test_telecentric_gaps_tell_three_components_at_any_angle(angle: float) -> No
         assert np.abs(triangulate(cameras, (first, second), 0.1).ray_miss_mm).max() < 2e-7
 
 
-def test_perspective_lenses_tell_more() -> None:
+def test_more_components_are_identifiable_with_perspective_lenses() -> None:
     assert free_directions(drift_covariance(rig(90.0, 1 / 300), DriftPrior())).shape == (6, 5)
 
 
 @pytest.mark.parametrize(("angle", "kappa"), [(90.0, 0.0), (60.0, 0.0), (90.0, 1e-5)])
-def test_gaps_against_rays_of_cameras_that_really_moved(angle: float, kappa: float) -> None:
+def test_ray_misses_against_rays_of_cameras_that_really_moved(angle: float, kappa: float) -> None:
     cameras = rig(angle, kappa)
     points = np.random.default_rng(1).uniform(-15, 15, (100, 3))
     tangent = np.array([5e-5, -3e-5, 4e-5, 0.02, 0.015, -0.01])
     true = moved(cameras, tangent)
     pixels = np.stack([c.project(points) for c in true], 1)
-    gaps = gaps_of(cameras, ((), ()), points, pixels)
+    misses = ray_misses(cameras, ((), ()), points, pixels)
     crossing = triangulate(cameras, (pixels[:, 0], pixels[:, 1]), 0.1)
-    assert np.allclose(np.abs(gaps.gap_mm), np.abs(crossing.ray_miss_mm), atol=3e-6)
-    assert np.allclose(gaps.by_rig @ tangent, gaps.gap_mm, atol=3e-6)
+    assert np.allclose(np.abs(misses.miss_mm), np.abs(crossing.ray_miss_mm), atol=3e-6)
+    assert np.allclose(misses.by_rig @ tangent, misses.miss_mm, atol=3e-6)
     n = np.cross(*(c.camera_from_rig.rotation[2] for c in cameras))
     n /= np.linalg.norm(n)
     before, after = (c[1].camera_from_rig.inverse() for c in (cameras, true))
     carried = after.apply(cameras[1].camera_from_rig.apply(points))
     back = before.apply(cameras[1].camera_from_rig.apply(points))
-    assert np.allclose((carried - back) @ n, gaps.gap_mm, atol=4e-6)
+    assert np.allclose((carried - back) @ n, misses.miss_mm, atol=4e-6)
 
 
 def test_offset_roll_and_pitch_are_those_of_the_body() -> None:
     cameras = rig()
-    tangent = along_gap(cameras, 0.02, 3e-5, -4e-5)
+    tangent = along_perpendicular(cameras, 0.02, 3e-5, -4e-5)
     values = offset_roll_pitch(cameras, np.zeros(3)) @ tangent
     assert np.allclose(values, [0.02, 3e-5, -4e-5])
     pose = cameras[1].camera_from_rig.inverse()
@@ -175,7 +179,7 @@ def test_coverage_with_and_without_shake(shake_mm: float) -> None:
     for _ in range(8):
         known = calibration(cameras)
         wrong = np.sqrt(np.diagonal(known.covariance)) * rng.standard_normal(6)
-        tangent = along_gap(cameras, 0.02, 3e-5, 4e-5)
+        tangent = along_perpendicular(cameras, 0.02, 3e-5, 4e-5)
         run = Run(shake_mm=shake_mm, frames=250)
         found = rig_change(run.tracks(cameras, moved(cameras, wrong + tangent), rng), known, prior)
         assert found is not None
@@ -204,7 +208,9 @@ def test_a_poor_calibration_is_not_a_movement() -> None:
     """20 um off is nothing for a calibration that is sure to 30 um; a sure one has moved."""
     cameras = rig()
     rng = np.random.default_rng(7)
-    tracks = Run().tracks(cameras, moved(cameras, along_gap(cameras, 0.02, 0.0, 0.0)), rng)
+    tracks = Run().tracks(
+        cameras, moved(cameras, along_perpendicular(cameras, 0.02, 0.0, 0.0)), rng
+    )
     poor, good = (
         rig_change(tracks, calibration(cameras, sd)) for sd in ((1e-3, 0.03), (2e-5, 5e-4))
     )
@@ -216,7 +222,7 @@ def test_wrong_pairs_do_not_count() -> None:
     cameras = rig()
     rng = np.random.default_rng(8)
     tracks = Run(shake_mm=0.02).tracks(
-        cameras, moved(cameras, along_gap(cameras, 0.02, 0.0, 0.0)), rng
+        cameras, moved(cameras, along_perpendicular(cameras, 0.02, 0.0, 0.0)), rng
     )
     some = rng.random(len(tracks)) < 0.06
     shift = rng.uniform(2, 30, some.sum())
@@ -284,16 +290,15 @@ def test_words_say_it_once() -> None:
     known = calibration(cameras)
     pairs = PairCollector(known)
     still = PairCollector(known)
-    pairs.add(Run().tracks(cameras, moved(cameras, along_gap(cameras, 0.08, 0, 0)), rng))
+    pairs.add(Run().tracks(cameras, moved(cameras, along_perpendicular(cameras, 0.08, 0, 0)), rng))
     still.add(Run().tracks(cameras, cameras, rng))
-    model = replace(
-        default_model(cameras), words=("This is a calibration problem: off by 0.8 px.", "More.")
-    )
+    model = replace(default_model(cameras), words=("Off by 0.8 px.", "More."))
+    model = replace(model, offset_words=model.words[0])
     said = with_change(model, pairs.found(), known)
     assert said["calibration_problem"]
     assert said["words"][0] == "More." and len(said["words"]) == 2
     assert "'right' has moved against 'left'" in said["words"][1]
-    assert "--refine-rig" in said["words"][1] and "positions are off by it" in said["words"][1]
+    assert "--refine-rig" in said["words"][1] and "positions are off" in said["words"][1]
     assert with_change(model, still.found(), known)["words"] == list(model.words)
     assert PairCollector(known).found() is None
 
@@ -305,8 +310,8 @@ def test_numbers_are_cut_where_their_deviation_has_two_digits() -> None:
         "right", six, np.diag(six), six[:3], values, sigmas, np.array([0.2, 5e-3, 5e-3]), 0.0, 100
     )
     assert change.size_words() == (
-        "by +88.50 +- 0.95 um along the shared coordinate, rolled by -2025 +- 50 urad, "
-        "pitched by +50 +- 54 urad"
+        "by +88.50 ± 0.95 µm along the shared coordinate, rolled by -2025 ± 50 µrad, "
+        "pitched by +50 ± 54 µrad"
     )
 
 
@@ -347,7 +352,7 @@ def test_the_graph_refines_the_rig_with_the_shake() -> None:
     """The movement is found beside the shake; positions along the shared axis lose its bias."""
     cameras = rig()
     rng = np.random.default_rng(12)
-    tangent = along_gap(cameras, 0.06, 3e-5, 4e-5)
+    tangent = along_perpendicular(cameras, 0.06, 3e-5, 4e-5)
     run = Run(frames=150, shake_mm=0.03)
     tracks = run.tracks(cameras, moved(cameras, tangent), rng)
     model = ShakeModel(

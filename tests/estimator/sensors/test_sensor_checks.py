@@ -14,8 +14,8 @@ from telerig.estimator.sensors.accelerometer_checks import (
     fitting_axes,
     motion_correlation,
 )
-from telerig.estimator.sensors.checks import check_encoder, check_sensors
-from telerig.estimator.sensors.encoder_checks import encoder_faults
+from telerig.estimator.sensors.checks import check_sensors
+from telerig.estimator.sensors.encoder_checks import check_encoder, encoder_faults
 from telerig.io.simulation.run.presets import run_preset
 
 

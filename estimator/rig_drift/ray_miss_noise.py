@@ -1,15 +1,15 @@
-"""The gaps' own noise: pixels, the cameras' shake against each other, the bubbles' changing shapes.
+"""The noise of ray misses: pixels, differential shake of the cameras, bubbles that change shape.
 
-A Gaussian process in time, its size learned from the gaps themselves: white noise of each pair;
-damped oscillations that all pairs of a frame share (shake); a slower motion of each bubble's own,
-as its outline's centre wanders about its centre of volume (Ornstein-Uhlenbeck). Only the density
-near frequency 0 limits what is constant, and an oscillation has little there: a plain mean over
-correlated gaps would be wrong in both directions.
+A Gaussian process in time with hyper-parameters learned from the ray misses themselves: white
+noise of each pair; damped oscillations common to all pairs of a frame (shake); and for each bubble
+an Ornstein-Uhlenbeck process, as its outline's centre wanders about its centre of volume. Only the
+spectral density near 0 Hz limits the estimate of a constant, and an oscillation has little there:
+the standard error of a plain mean over correlated ray misses would be too large or too small.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,46 +27,48 @@ _WANDER_S = 0.1
 _CYCLES = 5.0
 _FACTOR_3, _FACTOR_10 = np.log(3.0), np.log(10.0)
 _INDEPENDENT = 0.5
-"""Neighbouring bins of a tapered spectrum tell the same thing."""
+"""Weight of each bin: neighbouring bins of a tapered spectrum are correlated."""
+
 _FIRST_BIN = 2
 _LEAST_FRAMES = 16
 _LEAST_CYCLES = 4.0
-"""In fewer a slow wander could pass for an oscillation, which has little that is constant."""
+"""Oscillations of fewer cycles in a stretch cannot be told from a slow wander."""
+
 _MOST_APART = 4
 
 
 @dataclass(frozen=True)
 class Series:
-    """Gaps in time. frame, bubble (M,), t_s (M,), gap_mm (M,).
+    """Ray misses in time. frame, bubble, t_s, miss_mm : (M,).
 
-    relative : (M,) variance of each over the typical one.  free : (M, K) derivatives by the
-    unknowns, of unit variance beforehand.
+    relative : (M,) variance of each over the median variance.  by_unknowns : (M, K) derivatives
+    by the unknowns, which have unit prior variance.
     """
 
     frame: Ints
     bubble: Ints
     t_s: Array
-    gap_mm: Array
+    miss_mm: Array
     relative: Array
-    free: Array
+    by_unknowns: Array
+
+    def __len__(self) -> int:
+        return len(self.miss_mm)
 
     def of(self, keep: NDArray[np.bool_]) -> Series:
-        return Series(
-            self.frame[keep], self.bubble[keep], self.t_s[keep], self.gap_mm[keep],
-            self.relative[keep], self.free[keep],
-        )  # fmt: skip
+        return Series(*(getattr(self, column.name)[keep] for column in fields(self)))
 
-    def left(self) -> Array:
-        """(M,) gaps less what the unknowns can explain at most."""
-        fit = np.linalg.lstsq(self.free, self.gap_mm, rcond=None)[0]
-        return np.asarray(self.gap_mm - self.free @ fit)
+    def residuals(self) -> Array:
+        """(M,) ray misses less their least-squares fit by the unknowns."""
+        fit = np.linalg.lstsq(self.by_unknowns, self.miss_mm, rcond=None)[0]
+        return np.asarray(self.miss_mm - self.by_unknowns @ fit)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """white_mm : of one gap.  wander_mm, wander_s : Ornstein-Uhlenbeck, of each bubble.
+    """white_mm : of one ray miss.  wander_mm, wander_s : Ornstein-Uhlenbeck, of each bubble.
 
-    shake : oscillations that all pairs share: RMS mm, correlation time s, frequency Hz.
+    shake : oscillations common to all pairs: RMS (mm), correlation time (s), frequency (Hz).
     """
 
     white_mm: float
@@ -79,7 +81,7 @@ class Noise:
         return np.asarray(self.wander_mm**2 * np.exp(-np.abs(lag_s) / self.wander_s))
 
     def common(self, lag_s: Array) -> Array:
-        """Autocovariance of the shake: masses on damped springs, driven by white noise."""
+        """Autocovariance of the shake: damped resonators driven by white noise."""
         out = np.zeros_like(lag_s)
         for rms, decay, hz in self.shake:
             lag, turn = np.abs(lag_s), 2 * np.pi * hz
@@ -88,7 +90,7 @@ class Noise:
         return out
 
     def covariance(self, series: Series) -> Array:
-        """(M, M) of gaps without what is unknown."""
+        """(M, M) of the ray misses, the unknowns held fixed."""
         t, index = np.unique(series.t_s, return_inverse=True)
         at = np.ix_(index, index)
         lag = t[:, None] - t
@@ -100,7 +102,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """A tapered periodogram and what its expectation is made of.
+    """A tapered periodogram, and the window's autocorrelation for its expectation.
 
     common, single : shares of the shake's and of a single bubble's noise in this series.
     """
@@ -112,7 +114,7 @@ class _Spectrum:
     single: float
 
     def expected(self, noise: Noise) -> Array:
-        """Of the periodogram at its frequencies: leakage and aliasing included."""
+        """Expectation of the periodogram, leakage and aliasing included."""
         lag = np.asarray(np.arange(len(self.overlap)) * self.step_s, np.float64)
         covariance = self.common * noise.common(lag) + self.single * noise.own(lag)
         covariance[0] += self.single * noise.white_mm**2
@@ -128,17 +130,18 @@ class _Spectrum:
 
 
 def learned_noise(parts: list[Series]) -> Noise:
-    """The most probable noise of stretches of a run, from the spectra of what the unknowns leave.
+    """Maximum a-posteriori noise of stretches of a run, from the spectra of their residuals.
 
-    Oscillations are added while each is worth `_BETTER_NATS`, two at most (an arm for each camera).
+    Oscillations are added while each raises the log posterior by `_BETTER_NATS`, at most two (one
+    per camera's arm).
     """
-    spread = max(float(np.concatenate([p.left() for p in parts]).std()), 1e-7)
+    spread = max(float(np.concatenate([p.residuals() for p in parts]).std()), 1e-7)
     start = np.log([spread / 2, spread / 4, _WANDER_S])
     spectra = [s for p in parts for s in _spectra(p)]
     if not spectra:
         return Noise(spread, spread / 4, _WANDER_S)
     prior: Prior = (start, np.array([_FACTOR_10, _FACTOR_10, _FACTOR_3]))
-    best, score = _climbed(spectra, start, prior)
+    best, score = _fitted(spectra, start, prior)
     for _ in range(_MOST_MODES):
         trials = []
         for hz in _peaks(spectra[0], _noise(best)):
@@ -147,17 +150,17 @@ def learned_noise(parts: list[Series]) -> Noise:
                 np.concatenate([prior[0], mode]),
                 np.concatenate([prior[1], [_FACTOR_10, _FACTOR_3, 0.1]]),
             )
-            trials.append((*_climbed(spectra, np.concatenate([best, mode]), richer), richer))
-        if not trials:
+            trials.append((*_fitted(spectra, np.concatenate([best, mode]), richer), richer))
+        found = min(trials, key=lambda t: t[1], default=None)
+        if found is None or found[1] > score - _BETTER_NATS:
             break
-        found, worth, richer = min(trials, key=lambda t: t[1])
-        if worth > score - _BETTER_NATS:
-            break
-        best, score, prior = found, worth, richer
+        best, score, prior = found
     return _noise(best)
 
 
-def _climbed(spectra: list[_Spectrum], start: Array, prior: Prior) -> tuple[Array, float]:
+def _fitted(spectra: list[_Spectrum], start: Array, prior: Prior) -> tuple[Array, float]:
+    """Logarithms of the hyper-parameters and the negative log posterior there."""
+
     def cost(log: Array) -> float:
         noise = _noise(log)
         pull = 0.5 * float((((log - prior[0]) / prior[1]) ** 2).sum())
@@ -170,13 +173,12 @@ def _climbed(spectra: list[_Spectrum], start: Array, prior: Prior) -> tuple[Arra
 
 def _noise(log: Array) -> Noise:
     white, wander, tau, *rest = (float(v) for v in np.exp(log))
-    modes = np.reshape(rest, (-1, 3))
-    return Noise(white, wander, tau, tuple((float(a), float(b), float(c)) for a, b, c in modes))
+    return Noise(white, wander, tau, tuple(zip(rest[0::3], rest[1::3], rest[2::3])))
 
 
 def _spectra(part: Series) -> list[_Spectrum]:
-    """Of the mean gap of a frame, and of what bubbles do apart from it."""
-    left = part.left()
+    """Of the mean ray miss of a frame, and of single bubbles' deviations from it."""
+    left = part.residuals()
     t, index = np.unique(part.t_s, return_inverse=True)
     if len(t) < _LEAST_FRAMES:
         return []
@@ -207,7 +209,7 @@ def _spectrum(t_s: Array, values: Array, common: float, single: float) -> _Spect
 
 
 def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
-    """Frequencies (Hz) that stand out most, over what is explained already, well apart."""
+    """Frequencies (Hz) that stand out most over the noise model's spectrum, well apart."""
     ratio = spectrum.power / spectrum.expected(noise)
     length = len(spectrum.overlap) * spectrum.step_s
     hz = np.arange(_FIRST_BIN, _FIRST_BIN + len(ratio)) / length
@@ -221,14 +223,14 @@ def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
 
 
 def information(series: Series, noise: Noise) -> tuple[Array, Array, Array]:
-    """Of the unknowns (K, K), (K,), and each gap's residual in sigmas given all others (M,).
+    """Information on the unknowns (K, K), (K,), and leave-one-out residuals in sigmas (M,).
 
-    The last without the unknowns' own uncertainty, at their best values for this stretch.
+    The residuals are taken at the best unknowns of this stretch, whose uncertainty is left out.
     """
     lower = cholesky(noise.covariance(series), lower=True, check_finite=False)
     inverse = cho_solve((lower, True), np.eye(len(lower)), check_finite=False)
-    matrix = series.free.T @ inverse @ series.free
-    right = series.free.T @ (inverse @ series.gap_mm)
+    matrix = series.by_unknowns.T @ inverse @ series.by_unknowns
+    right = series.by_unknowns.T @ (inverse @ series.miss_mm)
     best = np.linalg.solve(matrix + np.eye(len(matrix)), right)
-    off = inverse @ (series.gap_mm - series.free @ best)
+    off = inverse @ (series.miss_mm - series.by_unknowns @ best)
     return matrix, right, off / np.sqrt(np.diagonal(inverse))

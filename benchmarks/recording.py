@@ -39,7 +39,7 @@ from telerig.io.recording.simulated.signals import (
     true_values,
 )
 from telerig.io.recording.tables import write_tables
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 from telerig.io.rig_file.rig_file import write_rig_toml
 
 Array = NDArray[np.float64]

@@ -12,8 +12,7 @@ from telerig.errors import InputError
 from telerig.scripts.console import errors_in_words, say, stopped_by_signals
 
 if TYPE_CHECKING:
-    from telerig.io.rig_file.description import RigDescription
-    from telerig.io.rig_file.device_description import DeviceDescription
+    from telerig.io.rig_file.description import DeviceDescription, RigDescription
 
 
 def record(

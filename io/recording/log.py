@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from telerig.errors import InputError
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 MAGIC = b"telerig recording 1\n"
 MARKER = b"\xa7\x1e\xc0\x9d"

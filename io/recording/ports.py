@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from telerig.errors import InputError
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 WAIT_S = 0.1
 """How long a read waits for a byte before it looks whether to stop."""

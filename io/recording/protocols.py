@@ -10,7 +10,7 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.rig_file.device_description import DeviceDescription, Kind
+from telerig.io.rig_file.description import DeviceDescription, Kind
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

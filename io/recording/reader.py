@@ -11,7 +11,7 @@ from telerig.errors import InputError
 from telerig.io.recording.log import FOUND, LOST, RECEIVED, SENT, Entry
 from telerig.io.recording.ports import open_port, read_chunk
 from telerig.io.recording.protocols import poll_command
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 RETRY_S = 0.2
 """How often a lost port is tried again."""

@@ -22,7 +22,7 @@ from telerig.io.recording.log import (
     read_log,
 )
 from telerig.io.recording.protocols import Readings, parser
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -21,7 +21,7 @@ from telerig.io.recording.log import END, LOST, RECEIVED, Entry, LogHeader, RawL
 from telerig.io.recording.ports import open_port
 from telerig.io.recording.protocols import Readings, parser
 from telerig.io.recording.reader import Reader
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 LOG_NAME = "recording.raw"
 FAILED_NAME = "recording.failed.raw"

@@ -1,19 +1,21 @@
-"""What `rig.toml` states: the rig before calibration. Lengths mm, directions unit vectors."""
+"""What `rig.toml` states: the rig before calibration. Lengths mm, directions unit vectors.
+
+The types of the fields say what a table of the file may hold (`tables.read_table` checks it); an
+object that Python code makes is not checked before it is written.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
 from telerig.errors import InputError, suggestion
-from telerig.io.rig_file.device_description import DeviceDescription
 from telerig.rig.target import Polarity, Target
 from telerig.rig.windows import Wall
-
-Vector = tuple[float, float, float]
 
 SCHEMA = 1
 """The newest `schema` of rig.toml that is read, and the one that is written."""
@@ -21,58 +23,91 @@ SCHEMA = 1
 CARRIAGE = "carriage"
 """`mounted_on` of an accelerometer that sits on the stage itself; no camera may be called so."""
 
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0, description="a positive number")]
+Count = Annotated[int, Field(ge=1, description="a whole number from 1")]
+Index = Annotated[float, Field(ge=1, description="a refractive index, 1 or more")]
+Text = Annotated[str, Field(min_length=1)]
+Direction = Annotated[
+    Vector,
+    Field(description="three numbers, a direction in the rig frame, like [0.0, -1.0, 0.0]"),
+]
+
+Kind = Literal["encoder", "accelerometer", "frames"]
+Protocol = Literal["stream", "packets", "zaber", "grbl", "regex"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+class Table:
+    """No text for numbers, no NaN. A field's description completes "must be"."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(strict=True, allow_inf_nan=False)
+
 
 @dataclass(frozen=True)
-class CameraDescription:
+class CameraDescription(Table):
     """image_size_px : (width, height). scale_px_per_mm : nominal.
 
     telecentricity_per_mm : nominal residual perspective kappa; None when the file is silent.
     """
 
     name: str
-    image_size_px: tuple[int, int]
-    scale_px_per_mm: float
-    telecentricity_per_mm: float | None = None
+    image_size_px: Annotated[
+        tuple[Count, Count], Field(description="[width, height] in whole pixels")
+    ]
+    scale_px_per_mm: Annotated[Positive, Field(description="a positive number, nominal, like 10.0")]
+    telecentricity_per_mm: Annotated[
+        float | None,
+        Field(description="a number: 0.0 telecentric, 1 / working distance for a perspective lens"),
+    ] = None
 
 
 @dataclass(frozen=True)
-class StageDescription:
+class StageDescription(Table):
     """axis : nominal travel direction, up : away from gravity; unit vectors in rig axes.
 
     scale_sigma : sd of the encoder's relative scale error, 0 if it is exact; None: not stated.
     """
 
-    axis: Vector
-    up: Vector
-    position_sigma_mm: float = 0.005
-    scale_sigma: float | None = None
+    axis: Direction
+    up: Direction
+    position_sigma_mm: Positive = 0.005
+    scale_sigma: Annotated[
+        float | None,
+        Field(ge=0, lt=0.5, description="a share like 0.001: how far the scale may be off"),
+    ] = None
 
 
 @dataclass(frozen=True)
-class AccelerometerDescription:
+class AccelerometerDescription(Table):
     """axes : rows are the sensor's x, y, z as unit vectors in rig axes.
 
     mounted_on : a camera's name or "carriage". noise_density_ug_sqrt_hz : micro-g per root hertz.
     """
 
     name: str
-    mounted_on: str
-    axes: tuple[Vector, Vector, Vector]
-    noise_density_ug_sqrt_hz: float
-    bias_sigma_m_s2: float = 0.2
+    mounted_on: Annotated[str, Field(description='a camera\'s name or "carriage"')]
+    axes: Annotated[
+        tuple[Vector, Vector, Vector],
+        Field(description="three rows: the sensor's x, y, z axes in rig coordinates"),
+    ]
+    noise_density_ug_sqrt_hz: Annotated[
+        Positive, Field(description="a positive number (the data sheet's, in micro-g per root Hz)")
+    ]
+    bias_sigma_m_s2: Positive = 0.2
 
 
 @dataclass(frozen=True)
-class ReferencesDescription:
+class ReferencesDescription(Table):
     """Dots at unknown places fixed to the tank and seen by the cameras."""
 
     kind: Literal["dots"] = "dots"
     polarity: Polarity = "black_on_white"
-    dot_diameter_mm: float = 1.0
+    dot_diameter_mm: Positive = 1.0
 
 
 @dataclass(frozen=True)
-class WallDescription:
+class WallDescription(Table):
     """Plane glass between a camera and the water, in that camera's frame.
 
     normal : unit vector pointing away from the camera (z > 0).
@@ -83,25 +118,74 @@ class WallDescription:
     """
 
     camera: str
-    normal: Vector
-    indices: Vector
-    thickness_mm: float
-    distance_mm: float | None = None
-    normal_sigma_deg: float = 0.0
+    normal: Annotated[
+        Vector, Field(description="three numbers in the camera's frame, like [0.0, 0.0, 1.0]")
+    ]
+    indices: Annotated[
+        tuple[Index, Index, Index],
+        Field(description="three refractive indices of 1 or more, like [1.0, 1.52, 1.333]"),
+    ]
+    thickness_mm: Positive
+    distance_mm: Annotated[
+        float | None, Field(description="a number, negative before the origin")
+    ] = None
+    normal_sigma_deg: Annotated[float, Field(ge=0, le=10, description="degrees from 0 to 10")] = 0.0
 
     def wall(self) -> Wall:
         """For `Camera.wall`; without a distance the near face is at the camera's origin."""
-        return Wall(
-            np.array(self.normal), self.distance_mm or 0.0, self.thickness_mm, self.indices,
-            float(np.radians(self.normal_sigma_deg)),
-        )  # fmt: skip
+        sigma_rad = float(np.radians(self.normal_sigma_deg))
+        distance_mm = self.distance_mm or 0.0
+        return Wall(np.array(self.normal), distance_mm, self.thickness_mm, self.indices, sigma_rad)
+
+
+@dataclass(frozen=True)
+class DeviceDescription(Table):
+    """One serial line: `[devices.<name>]`.
+
+    kind : what it measures; an accelerometer is named as in `[accelerometers.<name>]`.
+    port : a device file, a port name or a pyserial URL. baud : ignored by USB-native devices.
+    protocol : how its bytes read, see `docs/recording.md`. pattern : its regular expression.
+    poll : what is sent to ask for one reading, `poll_hz` times a second; None for streams.
+    counts_per_mm : encoder counts (or microsteps) in 1 mm. unit_m_s2 : acceleration of one unit.
+    time_unit_s, time_bits : of the device's own clock, which wraps at 2**time_bits; 0 never.
+    checksum : "xor" demands `*hh` at a line's end, as NMEA 0183 has it.
+    latency_s : known least delay of the line, which one-way stamps cannot see; subtracted. For
+    frames stamped at the begin of their exposure add minus half the exposure.
+    axis : which of GRBL's positions. cameras : those whose frames the counter counts.
+    """
+
+    name: str
+    kind: Kind
+    port: Annotated[Text, Field(description='text like "/dev/ttyUSB0"')]
+    baud: Annotated[int, Field(ge=50, description="a whole number like 115200")] = 115200
+    protocol: Protocol = "stream"
+    pattern: Annotated[str | None, Field(description="a regular expression in single quotes")] = (
+        None
+    )
+    poll: Annotated[
+        Text | None,
+        Field(description='the text that asks for one reading, like "?" or "/1 get pos\\n"'),
+    ] = None
+    poll_hz: Positive = 50.0
+    counts_per_mm: Annotated[float | None, Field(description="a number that is not 0")] = None
+    unit_m_s2: Annotated[Positive, Field(description="a positive number: m/s^2 in one unit")] = 1.0
+    time_unit_s: Annotated[
+        Positive, Field(description="a positive number: 1e-6 for microseconds")
+    ] = 1e-6
+    time_bits: Annotated[
+        int, Field(ge=0, le=52, description="a whole number from 0 (never wraps) to 52")
+    ] = 32
+    checksum: Literal["none", "xor"] = "none"
+    latency_s: Annotated[float, Field(description="a number of seconds")] = 0.0
+    axis: Literal["x", "y", "z"] = "x"
+    cameras: Annotated[tuple[str, ...], Field(description="a list of the cameras' names")] = ()
 
 
 @dataclass(frozen=True)
 class RigDescription:
     """The whole of `rig.toml`; the first camera's frame is the rig frame.
 
-    second_from_first_rotvec_deg : nominal rotation, decides the mirror twin; None if not given.
+    second_from_first_rotvec_deg : nominal rotation, decides the mirror ambiguity; None: not given.
     stage, references : None when the file has no such table.
     devices : sensors on serial lines, by name.
     """
@@ -128,11 +212,14 @@ class RigDescription:
 
     def camera_name(self, camera: str | int) -> str:
         """The camera's name from its name or its index. Raises InputError for an unknown one."""
-        names = list(self.cameras)
-        if isinstance(camera, int) and 0 <= camera < len(names):
-            return names[camera]
-        if isinstance(camera, str) and camera in self.cameras:
-            return camera
-        raise InputError(
-            f"no camera {camera!r} in the rig", where="camera", todo=suggestion(str(camera), names)
-        )
+        return camera_named(camera, list(self.cameras), where="rig.toml")
+
+
+def camera_named(camera: str | int, names: list[str], *, where: str) -> str:
+    """One of the cameras' ``names``, from itself or its index. Raises InputError without it."""
+    if isinstance(camera, int) and 0 <= camera < len(names):
+        return names[camera]
+    if isinstance(camera, str) and camera in names:
+        return camera
+    todo = suggestion(str(camera), names)
+    raise InputError(f"there is no camera {camera!r}", where=where, todo=todo)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
-
-from pydantic import Field
+from dataclasses import replace
+from typing import Any
 
 from telerig.errors import suggestion
-from telerig.io.rig_file.device_description import DeviceDescription
-from telerig.io.rig_file.parts import subtables
-from telerig.io.rig_file.schema import Positive, Problem, Table, validate
+from telerig.io.rig_file.description import DeviceDescription
+from telerig.io.rig_file.tables import Problem, Problems, read_table, subtables
+
+Devices = dict[str, DeviceDescription]
 
 _VALUES = {
     "encoder": ({"counts"}, {"position_mm"}),
@@ -25,69 +25,44 @@ _PROTOCOLS = {
 }
 
 
-class DeviceTable(Table):
-    kind: Literal["encoder", "accelerometer", "frames"] = Field(
-        description='"encoder", "accelerometer" or "frames"'
-    )
-    port: Annotated[str, Field(min_length=1)] = Field(description='text like "/dev/ttyUSB0"')
-    baud: Annotated[int, Field(ge=50)] = Field(115200, description="a whole number like 115200")
-    protocol: Literal["stream", "packets", "zaber", "grbl", "regex"] = Field(
-        "stream", description='"stream", "packets", "zaber", "grbl" or "regex"'
-    )
-    pattern: str | None = Field(None, description="a regular expression in single quotes")
-    poll: Annotated[str, Field(min_length=1)] | None = Field(
-        None, description='the text that asks for one reading, like "?" or "/1 get pos\\n"'
-    )
-    poll_hz: Positive = Field(50.0, description="a positive number")
-    counts_per_mm: float | None = Field(None, description="a number that is not 0")
-    unit_m_s2: Positive = Field(1.0, description="a positive number: m/s^2 in one unit")
-    time_unit_s: Positive = Field(1e-6, description="a positive number: 1e-6 for microseconds")
-    time_bits: Annotated[int, Field(ge=0, le=52)] = Field(
-        32, description="a whole number from 0 (never wraps) to 52"
-    )
-    checksum: Literal["none", "xor"] = Field("none", description='"none" or "xor"')
-    latency_s: float = Field(0.0, description="a number of seconds")
-    axis: Literal["x", "y", "z"] = Field("x", description='"x", "y" or "z"')
-    cameras: list[str] | None = Field(None, description="a list of cameras' names")
+def devices_from_tables(raw: Any, cameras: list[str], problems: Problems) -> Devices:
+    """The devices by name; what is wrong with them is added to ``problems``.
 
-
-def devices_from_tables(
-    raw: dict[str, Any], cameras: list[str], problems: list[Problem]
-) -> dict[str, DeviceDescription]:
-    """The devices by name; appends what is wrong with them to ``problems``."""
-    out: dict[str, DeviceDescription] = {}
+    raw : the whole file.
+    """
+    out: Devices = {}
     sensors = raw.get("accelerometers", {})
     known = list(sensors) if isinstance(sensors, dict) else []
-    for name, content in subtables(raw.get("devices", {}), "devices", problems).items():
-        place = f"devices.{name}"
-        table, found = validate(DeviceTable, content, place)
-        problems += found
-        if table is None or found:
+    for name, content in subtables(raw, "devices", problems).items():
+        place, before = f"devices.{name}", len(problems)
+        device = read_table(DeviceDescription, content, place, problems, homes={}, name=name)
+        if device is None or len(problems) > before:
             continue
-        problems += _own_problems(place, table)
-        problems += _reference_problems(place, name, table, cameras, known)
-        given = table.model_dump(exclude={"cameras"})
-        of = tuple(table.cameras or cameras) if table.kind == "frames" else ()
-        out[name] = DeviceDescription(name, cameras=of, **given)
+        problems += _own_problems(place, device)
+        problems += _reference_problems(place, device, "cameras" in content, cameras, known)
+        of = (device.cameras or tuple(cameras)) if device.kind == "frames" else ()
+        out[name] = replace(device, cameras=of)
     problems += _shared_problems(out)
     return out
 
 
-def _own_problems(place: str, table: DeviceTable) -> Iterator[Problem]:
-    allowed = _PROTOCOLS[table.kind]
-    if table.protocol not in allowed:
-        what = f"is {table.protocol!r}, which no {table.kind} speaks"
+def _own_problems(place: str, device: DeviceDescription) -> Iterator[Problem]:
+    allowed = _PROTOCOLS[device.kind]
+    if device.protocol not in allowed:
+        what = f"is {device.protocol!r}, a protocol that no {device.kind} speaks"
         yield Problem(place, "protocol", what, "known: " + ", ".join(allowed))
-    if table.protocol == "regex":
-        yield from pattern_problems(place, table.kind, table.pattern)
+    if device.protocol == "regex":
+        yield from pattern_problems(place, device.kind, device.pattern)
     else:
         for key in ("pattern", "poll"):
-            if getattr(table, key) is not None:
-                what = f'is given, but the protocol is "{table.protocol}"'
+            if getattr(device, key) is not None:
+                what = f'is given, but the protocol is "{device.protocol}"'
                 yield Problem(place, key, what, 'remove it, or write protocol = "regex"')
-    counted = table.protocol in ("stream", "packets", "zaber") or "counts" in _groups(table.pattern)
-    if table.kind == "encoder" and counted and not table.counts_per_mm:
-        what = "is missing" if table.counts_per_mm is None else "is 0"
+    counted = device.protocol in ("stream", "packets", "zaber") or "counts" in _groups(
+        device.pattern
+    )
+    if device.kind == "encoder" and counted and not device.counts_per_mm:
+        what = "is missing" if device.counts_per_mm is None else "is 0"
         todo = "add counts_per_mm: counts of the encoder in 1 mm; negative if it counts backwards"
         yield Problem(place, "counts_per_mm", what, todo)
 
@@ -121,22 +96,23 @@ def pattern_problems(place: str, kind: str, pattern: str | None) -> Iterator[Pro
 
 
 def _reference_problems(
-    place: str, name: str, table: DeviceTable, cameras: list[str], sensors: list[str]
+    place: str, device: DeviceDescription, cameras_given: bool, cameras: list[str], known: list[str]
 ) -> Iterator[Problem]:
-    if table.kind == "accelerometer" and name not in sensors:
+    name = device.name
+    if device.kind == "accelerometer" and name not in known:
         todo = f"add [accelerometers.{name}], which says where it sits"
-        if sensors:
-            todo = f"{suggestion(name, sensors)} Else {todo}"
+        if known:
+            todo = f"{suggestion(name, known)} Else {todo}"
         yield Problem(place, "", f"there is no accelerometer {name!r}", todo)
-    for camera in table.cameras or ():
+    for camera in device.cameras:
         if camera not in cameras:
             what = f"there is no camera {camera!r}"
             yield Problem(place, "cameras", what, suggestion(camera, cameras))
-    if table.cameras is not None and table.kind != "frames":
-        yield Problem(place, "cameras", f"is given to an {table.kind}", "remove it")
+    if cameras_given and device.kind != "frames":
+        yield Problem(place, "cameras", f"is given to an {device.kind}", "remove it")
 
 
-def _shared_problems(devices: dict[str, DeviceDescription]) -> Iterator[Problem]:
+def _shared_problems(devices: Devices) -> Iterator[Problem]:
     ports: dict[str, str] = {}
     for name, device in devices.items():
         if device.port in ports:

@@ -4,27 +4,62 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from telerig.errors import InputError, suggestion
+import numpy as np
+from pydantic import Field
+
+from telerig.errors import InputError, nearest, suggestion
 from telerig.io.files.atomic import write_text_atomic
-from telerig.io.rig_file.description import CARRIAGE, SCHEMA, CameraDescription, RigDescription
-from telerig.io.rig_file.devices import devices_from_tables
-from telerig.io.rig_file.parts import (
-    accelerometers_from_tables,
-    references_from_table,
-    rotvec_from_table,
-    stage_from_table,
-    subtables,
-    walls_from_tables,
+from telerig.io.rig_file.description import (
+    CARRIAGE,
+    SCHEMA,
+    AccelerometerDescription,
+    CameraDescription,
+    ReferencesDescription,
+    RigDescription,
+    StageDescription,
+    Table,
+    Vector,
+    WallDescription,
 )
-from telerig.io.rig_file.schema import TOP_LEVEL, CameraTable, Problem, TargetTable, validate
-from telerig.io.rig_file.target import target_from_table, target_problems
+from telerig.io.rig_file.devices import devices_from_tables
+from telerig.io.rig_file.tables import Problem, Problems, field_types, read_table, subtables
+from telerig.io.rig_file.target import TargetTable, target_problems
 from telerig.io.rig_file.writer import rig_toml
 from telerig.rig.target import Target
+
+TOP_LEVEL = [
+    *("schema", "name", "cameras", "stereo", "target"),
+    *("stage", "accelerometers", "devices", "references", "walls"),
+]
+
+_GRAZING = np.cos(np.deg2rad(85.0))
+
+_HOMES = {
+    key: f"{key} belongs under [{table}]"
+    for table, kind in (
+        ("accelerometers.<name>", AccelerometerDescription),
+        ("walls.<camera>", WallDescription),
+        ("target", TargetTable),
+        ("cameras.<name>", CameraDescription),
+    )
+    for key in field_types(kind)
+} | {
+    key: f"{key} belongs at the top of the file, above the first [table]"
+    for key in ("schema", "name")
+}
+"""Where a key belongs that stands in a wrong table."""
+
+
+@dataclass(frozen=True)
+class _StereoTable(Table):
+    rotvec_deg: Annotated[
+        Vector | None, Field(description="three numbers in degrees, like [0.0, 90.0, 0.0]")
+    ] = None
 
 
 def read_rig_toml(path: str | PathLike[str]) -> RigDescription:
@@ -59,7 +94,8 @@ def description_from_toml(text: str, *, where: str, name: str = "rig") -> RigDes
             "keys follow their [table]",
         ) from error
     _check_schema(raw, where)
-    problems = list(_top_level_problems(raw))
+    problems = Problems()
+    _check_top_level(raw, problems)
     rig = _description(raw, name, problems)
     if problems or rig is None:
         raise _as_error(problems, where)
@@ -111,28 +147,29 @@ def _as_error(problems: list[Problem], where: str) -> InputError:
     return InputError("\n".join(lines), where=where, todo="correct them all, then try again")
 
 
-def _top_level_problems(raw: dict[str, Any]) -> Iterator[Problem]:
-    todos = {key: suggestion(key, TOP_LEVEL) for key in raw if key not in TOP_LEVEL}
-    for key, todo in todos.items():
-        place = (f"{key}", "") if isinstance(raw[key], dict) else ("", key)
-        yield Problem(*place, "unknown table" if place[0] else "unknown key", todo)
-    for table in ("cameras", "target"):
-        if raw.get(table, {}) == {} and f"did you mean {table}?" not in todos.values():
-            example = "[cameras.left]" if table == "cameras" else "[target]"
-            yield Problem(table, "", "is missing", f"add a table {example}; see `telerig init`")
+def _check_top_level(raw: dict[str, Any], problems: Problems) -> None:
+    unknown = [key for key in raw if key not in TOP_LEVEL]
+    for key in unknown:
+        table, name, kind = (key, "", "table") if isinstance(raw[key], dict) else ("", key, "key")
+        problems.add(table, name, f"unknown {kind}", suggestion(key, TOP_LEVEL))
+    meant = {nearest(key, TOP_LEVEL) for key in unknown}
+    for table, example in (("cameras", "[cameras.left]"), ("target", "[target]")):
+        if raw.get(table, {}) == {} and table not in meant:
+            todo = f"add a table {example}; see `telerig init`"
+            problems.add(table, "", "is missing", todo)
     if not isinstance(raw.get("name", ""), str):
-        yield Problem("", "name", f"is {raw['name']!r}", 'must be text, like name = "tank 2"')
+        problems.add("", "name", f"is {raw['name']!r}", 'must be text, like name = "tank 2"')
 
 
-def _description(raw: dict[str, Any], name: str, problems: list[Problem]) -> RigDescription | None:
-    cameras = _cameras(raw.get("cameras", {}), problems)
+def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescription | None:
+    cameras = _cameras(raw, problems)
     names = list(cameras)
     target = _target(raw, problems)
-    rotvec = rotvec_from_table(raw, names, problems)
-    stage = stage_from_table(raw, names, problems)
-    accelerometers = accelerometers_from_tables(raw, names, problems)
-    references = references_from_table(raw, problems)
-    walls = walls_from_tables(raw, cameras, problems)
+    rotvec = _rotvec_deg(raw, names, problems)
+    stage = _stage(raw, names, problems)
+    accelerometers = _accelerometers(raw, names, problems)
+    references = _references(raw, problems)
+    walls = _walls(raw, cameras, problems)
     devices = devices_from_tables(raw, names, problems)
     if problems or target is None:
         return None
@@ -149,60 +186,152 @@ def _description(raw: dict[str, Any], name: str, problems: list[Problem]) -> Rig
     )
 
 
-def _cameras(raw: Any, problems: list[Problem]) -> dict[str, CameraDescription | None]:
+def _cameras(raw: dict[str, Any], problems: Problems) -> dict[str, CameraDescription | None]:
     """Every camera named in the file, in its order; None where its table is faulty."""
     tables = subtables(raw, "cameras", problems)
-    problems += _camera_name_problems(list(tables))
+    _check_camera_names(list(tables), problems)
     cameras: dict[str, CameraDescription | None] = {}
     for name, table in tables.items():
-        checked, found = validate(CameraTable, table, f"cameras.{name}")
-        problems += found
-        cameras[name] = None
-        if checked is not None and not found:
-            width, height = checked.image_size_px
-            size, scale = (width, height), checked.scale_px_per_mm
-            cameras[name] = CameraDescription(name, size, scale, checked.telecentricity_per_mm)
+        place, before = f"cameras.{name}", len(problems)
+        camera = read_table(CameraDescription, table, place, problems, homes=_HOMES, name=name)
+        cameras[name] = camera if len(problems) == before else None
     return cameras
 
 
-def _camera_name_problems(names: list[str]) -> Iterator[Problem]:
+def _check_camera_names(names: list[str], problems: Problems) -> None:
     for name in names:
         if not re.fullmatch(r"\w[\w-]*", name):
-            yield Problem(
-                f'cameras."{name}"',
-                "",
-                "the name cannot be used for a folder",
-                "use letters, digits, _ and - only",
-            )
+            what = "the name cannot be used for a folder"
+            problems.add(f'cameras."{name}"', "", what, "use letters, digits, _ and - only")
         if name.lower() == CARRIAGE:
-            yield Problem(
-                f"cameras.{name}",
-                "",
-                f'"{CARRIAGE}" means the stage in mounted_on',
-                "give the camera another name",
-            )
+            what = f'"{CARRIAGE}" means the stage in mounted_on'
+            problems.add(f"cameras.{name}", "", what, "give the camera another name")
     if len({name.lower() for name in names}) < len(names):
-        yield Problem(
-            "cameras",
-            "",
-            "two names differ only in upper and lower case",
-            "give the cameras names that any file system keeps apart",
-        )
+        what = "two names differ only in upper and lower case"
+        todo = "give the cameras names that any file system keeps apart"
+        problems.add("cameras", "", what, todo)
     if len(names) > 2:
-        yield Problem(
-            "cameras",
-            "",
-            f"has {len(names)} cameras ({', '.join(names)}); telerig works with one or two for now",
-            "keep two; write another dataset for another pair",
+        what = (
+            f"has {len(names)} cameras ({', '.join(names)}); telerig works with one or two for now"
         )
+        todo = "keep two; write another dataset for another pair"
+        problems.add("cameras", "", what, todo)
 
 
-def _target(raw: dict[str, Any], problems: list[Problem]) -> Target | None:
+def _target(raw: dict[str, Any], problems: Problems) -> Target | None:
     if "target" not in raw:
         return None
-    table, found = validate(TargetTable, raw["target"], "target")
+    found = Problems()
+    table = read_table(TargetTable, raw["target"], "target", found, homes=_HOMES)
     faulty = {key for problem in found for key in (problem.key, *problem.involved)}
     if table is not None:
         found += target_problems(table, faulty)
     problems += found
-    return target_from_table(table) if table is not None and not found else None
+    return table.target() if table is not None and not found else None
+
+
+def _rotvec_deg(raw: dict[str, Any], names: list[str], problems: Problems) -> Vector | None:
+    if "stereo" not in raw or not names:
+        return None
+    if len(names) == 1:
+        what = f"is given, but {names[0]} is the only camera"
+        problems.add("stereo", "", what, "remove it, or add the second [cameras.<name>]")
+        return None
+    keys = {"rotvec_deg": f"{names[1]}_from_{names[0]}_rotvec_deg"}
+    table = read_table(_StereoTable, raw["stereo"], "stereo", problems, homes=_HOMES, keys=keys)
+    return table.rotvec_deg if table is not None else None
+
+
+def _stage(raw: dict[str, Any], names: list[str], problems: Problems) -> StageDescription | None:
+    if "stage" not in raw or not names:
+        return None
+    keys = {"axis": f"axis_{names[0]}", "up": f"up_{names[0]}"}
+    content, upright = raw["stage"], False
+    if isinstance(content, dict) and keys["up"] not in content:
+        content, upright = {keys["up"]: [0.0, 0.0, 1.0]} | content, True
+    stage = read_table(StageDescription, content, "stage", problems, homes=_HOMES, keys=keys)
+    if stage is None:
+        return None
+    axis = _unit(stage.axis, "stage", keys["axis"], problems)
+    up = axis if upright else _unit(stage.up, "stage", keys["up"], problems)
+    return replace(stage, axis=axis, up=up)
+
+
+def _accelerometers(
+    raw: dict[str, Any], names: list[str], problems: Problems
+) -> dict[str, AccelerometerDescription]:
+    out: dict[str, AccelerometerDescription] = {}
+    mounts = [*names, CARRIAGE]
+    for name, content in subtables(raw, "accelerometers", problems).items():
+        place = f"accelerometers.{name}"
+        sensor = read_table(
+            AccelerometerDescription, content, place, problems, homes=_HOMES, name=name
+        )
+        if sensor is None:
+            continue
+        if sensor.mounted_on not in mounts:
+            what = f'is {sensor.mounted_on!r}, which is neither a camera nor "{CARRIAGE}"'
+            problems.add(place, "mounted_on", what, suggestion(sensor.mounted_on, mounts))
+        x, y, z = (_unit(row, place, f"axes[{i}]", problems) for i, row in enumerate(sensor.axes))
+        if abs(np.linalg.det([x, y, z])) < 0.1 and all(map(any, sensor.axes)):
+            what = "has rows that lie (nearly) in one plane"
+            problems.add(place, "axes", what, "give the three directions of the sensor's axes")
+        out[name] = replace(sensor, axes=(x, y, z))
+    return out
+
+
+def _references(raw: dict[str, Any], problems: Problems) -> ReferencesDescription | None:
+    if "references" not in raw:
+        return None
+    return read_table(
+        ReferencesDescription, raw["references"], "references", problems, homes=_HOMES
+    )
+
+
+def _walls(
+    raw: dict[str, Any], cameras: dict[str, CameraDescription | None], problems: Problems
+) -> dict[str, WallDescription]:
+    out: dict[str, WallDescription] = {}
+    for name, content in subtables(raw, "walls", problems).items():
+        place = f"walls.{name}"
+        if name not in cameras:
+            what = f"there is no camera {name!r}"
+            problems.add(place, "", what, suggestion(name, list(cameras)))
+        wall = read_table(WallDescription, content, place, problems, homes=_HOMES, camera=name)
+        if wall is not None:
+            normal = _unit(wall.normal, place, "normal", problems)
+            _check_wall(place, normal, wall, cameras.get(name), problems)
+            x, y, z = (float(np.copysign(1.0, normal[2])) * component for component in normal)
+            out[name] = replace(wall, normal=(x, y, z))
+    return out
+
+
+def _check_wall(
+    place: str,
+    normal: Vector,
+    wall: WallDescription,
+    camera: CameraDescription | None,
+    problems: Problems,
+) -> None:
+    if any(wall.normal) and abs(normal[2]) < _GRAZING:
+        what = f"is {list(wall.normal)}: the camera would look along the wall"
+        todo = (
+            "give it in the camera's frame, where z points into the scene; a wall that faces the "
+            "camera is [0.0, 0.0, 1.0]"
+        )
+        problems.add(place, "normal", what, todo)
+    if camera is not None and camera.telecentricity_per_mm and wall.distance_mm is None:
+        key = f"cameras.{camera.name}.telecentricity_per_mm"
+        what = f"is missing, and needed because {key} is not 0"
+        todo = "add distance_mm from the camera's origin to the wall"
+        problems.add(place, "distance_mm", what, todo)
+
+
+def _unit(vector: Vector, table: str, key: str, problems: Problems) -> Vector:
+    """The direction of ``vector``; vectors that are unit to 1e-12 keep their digits."""
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        problems.add(table, key, "has length zero", "give a direction")
+        return 0.0, 0.0, 0.0
+    x, y, z = vector
+    return vector if abs(length - 1) < 1e-12 else (x / length, y / length, z / length)

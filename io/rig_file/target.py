@@ -4,16 +4,66 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Set
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
-from telerig.io.rig_file.schema import Problem, TargetTable
-from telerig.rig.target import Target
+from telerig.io.rig_file.description import Count, Index, Positive, Table
+from telerig.io.rig_file.tables import Problem
+from telerig.rig.target import Extent, Layout, MarkStyle, Polarity, Target
 
 FARTHEST = 4095
 """Rows and columns of an unbounded grid lie within this of the origin mark."""
 
-GRID_KEYS = ("rows", "columns", "pitch_mm")
+Cell = tuple[int, int]
+Pitch = Annotated[
+    Positive | tuple[Positive, Positive],
+    Field(description="a positive number or [x, y] of them"),
+]
+Points = Annotated[
+    tuple[tuple[float, float], ...], Field(min_length=1, description="a list of [x, y]")
+]
+
+
+@dataclass(frozen=True)
+class TargetTable(Table):
+    """The keys of [target] as the file has them; None for those that it leaves out."""
+
+    dot_diameter_mm: Positive
+    layout: Layout = "grid"
+    rows: Count | None = None
+    columns: Count | None = None
+    pitch_mm: Pitch | None = None
+    points_mm: Points | None = None
+    polarity: Polarity = "white_on_black"
+    marks: Annotated[
+        tuple[Cell, ...], Field(description="a list of [row, column] in whole numbers")
+    ] = ()
+    mark_style: MarkStyle = "large"
+    mark_diameter_mm: Positive | None = None
+    extent: Extent = "bounded"
+    print_sigma_mm: Positive = 0.02
+    flatness_sigma_mm: Positive | None = None
+    scale_dots: Annotated[
+        Cell | tuple[Cell, Cell] | None, Field(description="two dot numbers or two [row, column]")
+    ] = None
+    scale_distance_mm: Positive | None = None
+    scale_sigma_mm: Positive = 0.001
+    two_sided: bool = False
+    plate_thickness_mm: Positive | None = None
+    plate_index: Index | None = None
+
+    def target(self) -> Target:
+        """The target of a table without problems; what the file leaves out has `Target`'s value."""
+        stated = {name: value for name, value in vars(self).items() if value is not None}
+        stated.setdefault("flatness_sigma_mm", self.print_sigma_mm)
+        if self.pitch_mm is not None and not isinstance(self.pitch_mm, tuple):
+            stated["pitch_mm"] = (self.pitch_mm, self.pitch_mm)
+        if self.points_mm is not None:
+            stated["points_mm"] = np.array(self.points_mm, float)
+        return Target(**stated | {"scale_dots": _scale_ids(self)})
 
 
 def target_problems(table: TargetTable, faulty: Set[str] = frozenset()) -> list[Problem]:
@@ -28,34 +78,6 @@ def target_problems(table: TargetTable, faulty: Set[str] = frozenset()) -> list[
         known = faulty | {problem.key for problem in found}
         found += [p for p in check(table) if not known & {p.key, *p.involved}]
     return found
-
-
-def target_from_table(table: TargetTable) -> Target:
-    """The Target of a table without problems."""
-    pitch = table.pitch_mm if table.pitch_mm is not None else 1.0
-    x, y = pitch if isinstance(pitch, list) else (pitch, pitch)
-    flatness = table.flatness_sigma_mm
-    return Target(
-        layout=table.layout,
-        rows=table.rows or 0,
-        columns=table.columns or 0,
-        pitch_mm=(x, y),
-        points_mm=None if table.points_mm is None else np.array(table.points_mm, float),
-        dot_diameter_mm=table.dot_diameter_mm,
-        polarity=table.polarity,
-        marks=tuple((row, column) for row, column in table.marks),
-        mark_style=table.mark_style,
-        mark_diameter_mm=table.mark_diameter_mm,
-        extent=table.extent,
-        print_sigma_mm=table.print_sigma_mm,
-        flatness_sigma_mm=table.print_sigma_mm if flatness is None else flatness,
-        scale_dots=_scale_ids(table),
-        scale_distance_mm=table.scale_distance_mm,
-        scale_sigma_mm=table.scale_sigma_mm,
-        two_sided=table.two_sided,
-        plate_thickness_mm=table.plate_thickness_mm or 0.0,
-        plate_index=table.plate_index or 1.5,
-    )
 
 
 def _problem(key: str, what: str, todo: str, *involved: str) -> Problem:
@@ -98,7 +120,7 @@ def _missing_pitch(t: TargetTable) -> tuple[str, str]:
 
 
 def _points_problems(t: TargetTable) -> Iterator[Problem]:
-    for key in (k for k in GRID_KEYS if getattr(t, k) is not None):
+    for key in (k for k in ("rows", "columns", "pitch_mm") if getattr(t, k) is not None):
         yield _problem(
             key,
             'has no meaning with layout = "points"',
@@ -120,8 +142,7 @@ def _points_problems(t: TargetTable) -> Iterator[Problem]:
             "layout",
         )
         return
-    counts = Counter((float(x), float(y)) for x, y in t.points_mm)
-    for twice in (point for point, count in counts.items() if count > 1):
+    for twice in (point for point, count in Counter(t.points_mm).items() if count > 1):
         yield _problem("points_mm", f"has the point {list(twice)} more than once", "remove one")
 
 
@@ -139,8 +160,7 @@ def _mark_problems(t: TargetTable) -> Iterator[Problem]:
             f"marks are [row, column] from 0: {wanted}",
             *involved,
         )
-    counts = Counter((row, column) for row, column in t.marks)
-    for twice in (cell for cell, count in counts.items() if count > 1):
+    for twice in (cell for cell, count in Counter(t.marks).items() if count > 1):
         yield _problem("marks", f"has {list(twice)} more than once", "remove one")
     if t.mark_style != "large" or not t.marks:
         return
@@ -183,35 +203,30 @@ def _scale_problems(t: TargetTable) -> Iterator[Problem]:
     if t.scale_dots is None:
         return
     keys = ("rows", "columns", "layout", "extent", "points_mm")
-    cells, countable = _scale_cells(t), t.layout == "points" or t.columns is not None
+    cells = _scale_cells(t)
     if cells is None:
-        todo = (
-            "write [[row, column], [row, column]]"
-            if not countable
-            else ("write two dot numbers like [0, 14]")
-        )
-        yield _problem(
-            "scale_dots", f"is {t.scale_dots}: the dots cannot be told from it", todo, *keys
-        )
+        numbered = t.layout == "points" or t.columns is not None
+        todo = f"write two {'dot numbers like [0, 14]' if numbered else '[row, column]'}"
+        what = f"is {_as_written(t.scale_dots)}, which does not say which dots are meant"
+        yield _problem("scale_dots", what, todo, *keys)
         return
     block = (t.rows or 0) * (t.columns or 0)
     for given, cell in zip(t.scale_dots, cells):
+        what = f"has {_as_written(given)}, which is"
         counted_outside = isinstance(given, int) and t.layout == "grid" and not 0 <= given < block
         if counted_outside or not _inside(t, *cell):
-            yield _problem(
-                "scale_dots", f"has {given}, which is not on the target", _scale_range(t), *keys
-            )
-        elif t.mark_style == "missing" and list(cell) in t.marks:
-            yield _problem(
-                "scale_dots",
-                f"has {given}, which is a missing mark: no dot is there",
-                "choose two dots that are printed",
-                *keys,
-                "marks",
-                "mark_style",
-            )
+            yield _problem("scale_dots", f"{what} not on the target", _scale_range(t), *keys)
+        elif t.mark_style == "missing" and cell in t.marks:
+            todo = "choose two dots that are printed"
+            involved = (*keys, "marks", "mark_style")
+            yield _problem("scale_dots", f"{what} a missing mark: no dot is there", todo, *involved)
     if cells[0] == cells[1]:
         yield _problem("scale_dots", "names the same dot twice", "name two different dots", *keys)
+
+
+def _as_written(value: Any) -> str:
+    """A TOML list in place of Python's tuple."""
+    return str(value).replace("(", "[").replace(")", "]")
 
 
 def _scale_range(t: TargetTable) -> str:
@@ -222,25 +237,21 @@ def _scale_range(t: TargetTable) -> str:
     return todo
 
 
-def _scale_cells(t: TargetTable) -> tuple[tuple[int, int], tuple[int, int]] | None:
+def _scale_cells(t: TargetTable) -> list[Cell] | None:
     """(row, column) of both scale dots; None where the numbers cannot be read."""
-    cells: list[tuple[int, int]] = []
+    cells: list[Cell] = []
     for dot in t.scale_dots or ():
-        if not isinstance(dot, int):
-            if t.layout == "points":
-                return None
-            cells.append((dot[0], dot[1]))
-        elif t.layout == "points":
+        if isinstance(dot, int) and t.layout == "points":
             cells.append((0, dot))
-        elif t.columns is None:
-            return None
-        else:
+        elif isinstance(dot, int) and t.columns is not None:
             cells.append((dot // t.columns, dot % t.columns))
-    return cells[0], cells[1]
+        elif not isinstance(dot, int) and t.layout == "grid":
+            cells.append(dot)
+    return cells if len(cells) == 2 else None
 
 
 def _scale_ids(t: TargetTable) -> tuple[int, int] | None:
-    cells = _scale_cells(t) if t.scale_dots is not None else None
+    cells = _scale_cells(t)
     if cells is None:
         return None
     numbering = Target(layout=t.layout, columns=t.columns or 0, extent=t.extent)

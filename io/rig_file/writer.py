@@ -9,52 +9,65 @@ from typing import Any
 
 import numpy as np
 
-from telerig.io.rig_file.description import (
-    SCHEMA,
-    AccelerometerDescription,
-    CameraDescription,
-    RigDescription,
-    StageDescription,
-    WallDescription,
-)
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import SCHEMA, RigDescription, Table
 from telerig.rig.target import Target
 
 Line = tuple[str, Any, str]
 
 
+_COMMENTS = {
+    "image_size_px": "width, height",
+    "scale_px_per_mm": "nominal, 20 % is good enough",
+    "telecentricity_per_mm": (
+        "nominal residual perspective; 1 / working distance for a perspective lens"
+    ),
+    "axis": "nominal travel direction in the rig frame",
+    "up": "away from gravity",
+    "scale_sigma": "of the encoder, relative",
+    "mounted_on": 'a camera or "carriage"',
+    "axes": "rows: the sensor's x, y, z axes in rig coordinates",
+    "normal": "in the camera's frame",
+    "indices": "camera side, glass, behind",
+    "distance_mm": "of the near face on the camera's axis",
+}
+_NAMES = ("name", "camera")
+"""Fields that are the name of their table."""
+
+
 def rig_toml(rig: RigDescription) -> str:
     """The text of the rig file; keys whose value is None are left out."""
     blocks = [_lines([("schema", SCHEMA, ""), ("name", rig.name, "")])]
-    blocks += [_block(f"cameras.{_key(c.name)}", _camera(c)) for c in rig.cameras.values()]
+    blocks += [_block(f"cameras.{_key(c.name)}", _all_fields(c)) for c in rig.cameras.values()]
     if rig.second_from_first_rotvec_deg is not None:
         key = f"{rig.second}_from_{rig.first}_rotvec_deg"
-        comment = "nominal; decides the mirror twin"
+        comment = "nominal; decides the mirror ambiguity"
         blocks.append(_block("stereo", [(key, rig.second_from_first_rotvec_deg, comment)]))
     blocks.append(_block("target", _target(rig.target)))
     if rig.stage is not None:
-        blocks.append(_block("stage", _stage(rig.stage, rig.first)))
+        keys = {"axis": f"axis_{rig.first}", "up": f"up_{rig.first}"}
+        lines = [(keys.get(key, key), *rest) for key, *rest in _all_fields(rig.stage)]
+        blocks.append(_block("stage", lines))
     for sensor in rig.accelerometers.values():
-        blocks.append(_block(f"accelerometers.{_key(sensor.name)}", _accelerometer(sensor)))
-    blocks += [_block(f"devices.{_key(d.name)}", _device(d)) for d in rig.devices.values()]
+        blocks.append(_block(f"accelerometers.{_key(sensor.name)}", _all_fields(sensor)))
+    blocks += [_block(f"devices.{_key(d.name)}", _changed_fields(d)) for d in rig.devices.values()]
     if rig.references is not None:
-        r = rig.references
-        keys = ("kind", "polarity", "dot_diameter_mm")
-        blocks.append(_block("references", [(key, getattr(r, key), "") for key in keys]))
-    blocks += [_block(f"walls.{_key(w.camera)}", _wall(w)) for w in rig.walls.values()]
+        blocks.append(_block("references", _all_fields(rig.references)))
+    for wall in rig.walls.values():
+        lines = [line for line in _all_fields(wall) if line[:2] != ("normal_sigma_deg", 0.0)]
+        blocks.append(_block(f"walls.{_key(wall.camera)}", lines))
     return "\n".join(blocks)
 
 
-def _camera(camera: CameraDescription) -> list[Line]:
-    return [
-        ("image_size_px", camera.image_size_px, "width, height"),
-        ("scale_px_per_mm", camera.scale_px_per_mm, "nominal, 20 % is good enough"),
-        (
-            "telecentricity_per_mm",
-            camera.telecentricity_per_mm,
-            "nominal residual perspective; 1 / working distance for a perspective lens",
-        ),
-    ]
+def _all_fields(table: Table) -> list[Line]:
+    """A line for each field of a description; None values are left out when they are written."""
+    values = {name: value for name, value in vars(table).items() if name not in _NAMES}
+    return [(name, value, _COMMENTS.get(name, "")) for name, value in values.items()]
+
+
+def _changed_fields(table: Any) -> list[Line]:
+    """A line for each field that differs from its default."""
+    usual = {field.name: field.default for field in fields(table)}
+    return [line for line in _all_fields(table) if line[1] != usual[line[0]]]
 
 
 def _target(t: Target) -> list[Line]:
@@ -89,42 +102,6 @@ def _scale_dots(t: Target) -> Any:
     if t.scale_dots is None or t.bounded:
         return t.scale_dots
     return np.transpose(t.row_column_from_id(np.array(t.scale_dots)))
-
-
-def _stage(stage: StageDescription, first: str) -> list[Line]:
-    lines: list[Line] = [
-        (f"axis_{first}", stage.axis, "nominal travel direction in the rig frame"),
-        (f"up_{first}", stage.up, "away from gravity"),
-        ("position_sigma_mm", stage.position_sigma_mm, ""),
-    ]
-    if stage.scale_sigma is not None:
-        lines.append(("scale_sigma", stage.scale_sigma, "of the encoder, relative"))
-    return lines
-
-
-def _accelerometer(sensor: AccelerometerDescription) -> list[Line]:
-    return [
-        ("mounted_on", sensor.mounted_on, 'a camera or "carriage"'),
-        ("axes", sensor.axes, "rows: the sensor's x, y, z axes in rig coordinates"),
-        ("noise_density_ug_sqrt_hz", sensor.noise_density_ug_sqrt_hz, ""),
-        ("bias_sigma_m_s2", sensor.bias_sigma_m_s2, ""),
-    ]
-
-
-def _device(device: DeviceDescription) -> list[Line]:
-    usual = {f.name: f.default for f in fields(device)}
-    given = {key: getattr(device, key) for key in usual if key != "name"}
-    return [(key, value, "") for key, value in given.items() if value != usual[key]]
-
-
-def _wall(wall: WallDescription) -> list[Line]:
-    return [
-        ("normal", wall.normal, "in the camera's frame"),
-        ("indices", wall.indices, "camera side, glass, behind"),
-        ("thickness_mm", wall.thickness_mm, ""),
-        ("distance_mm", wall.distance_mm, "of the near face on the camera's axis"),
-        ("normal_sigma_deg", wall.normal_sigma_deg or None, ""),
-    ]
 
 
 def _block(table: str, lines: list[Line]) -> str:

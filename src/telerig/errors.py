@@ -42,10 +42,16 @@ class GeometryError(TelerigError):
     """A point outside the region where a camera model can be evaluated or inverted."""
 
 
-def suggestion(word: str, known: list[str]) -> str:
-    """What to do about an unknown word: the nearest known one, or all of them."""
+def nearest(word: str, known: list[str]) -> str | None:
+    """The known word that is spelled most like ``word``, in any case; None if none is like it."""
     lowered = {name.lower(): name for name in known}
     near = get_close_matches(word.lower(), lowered, n=1, cutoff=0.55)
+    return lowered[near[0]] if near else None
+
+
+def suggestion(word: str, known: list[str]) -> str:
+    """What to do about an unknown word: the nearest known one, or all of them."""
+    near = nearest(word, known)
     if near:
-        return f"did you mean {lowered[near[0]]}?"
+        return f"did you mean {near}?"
     return "known: " + ", ".join(known) if known else "nothing is known here: remove it"

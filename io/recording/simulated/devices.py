@@ -24,7 +24,7 @@ from telerig.io.recording.simulated.signals import (
     messages,
     stage_position_mm,
 )
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 _POLLED_WAIT_S = 0.05
 _BUFFER_S = 0.25

@@ -8,10 +8,10 @@ from telerig.io.recording.simulated.signals import SimulatedDevice
 from telerig.io.rig_file.description import (
     AccelerometerDescription,
     CameraDescription,
+    DeviceDescription,
     RigDescription,
     StageDescription,
 )
-from telerig.io.rig_file.device_description import DeviceDescription
 from telerig.rig.target import Target
 
 WRAP_AFTER_S = 10.0

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from telerig.io.recording.protocols import SYNC, xor_checksum
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

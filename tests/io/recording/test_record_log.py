@@ -22,7 +22,7 @@ from telerig.io.recording.log import (
     read_header,
     read_log,
 )
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 DEVICES = (
     DeviceDescription("encoder", "encoder", "/dev/x", counts_per_mm=-2.5),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from telerig.io.recording.protocols import Parser, Readings, parser, poll_command, xor_checksum
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 ENCODER = DeviceDescription("encoder", "encoder", "x", counts_per_mm=1.0)
 ACCELEROMETER = DeviceDescription("arm", "accelerometer", "x")

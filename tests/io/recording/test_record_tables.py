@@ -34,7 +34,7 @@ from telerig.io.recording.simulated.signals import (
     true_values,
 )
 from telerig.io.recording.tables import write_tables
-from telerig.io.rig_file.device_description import DeviceDescription
+from telerig.io.rig_file.description import DeviceDescription
 
 SECONDS = 20.0
 

@@ -76,6 +76,7 @@ def read_table(
         found[key] = Problem(table, key, "unknown key", todo, meant)
     mistyped = {key for problem in found.values() for key in problem.involved}
     content = {name: raw[key] for name, key in key_of.items() if key in raw}
+    out: AnyTable | None
     out, faults = _validated(kind, fixed | content)
     for fault in faults:
         key = key_of[str(fault["loc"][0])]

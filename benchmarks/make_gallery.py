@@ -21,13 +21,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from telerig.io.report.calibration import coverage, dot_fit, residuals, rig, target
+from telerig.io.report.calibration import dot_fit, rig, target
+from telerig.io.report.calibration import figures as calibration_figures
 from telerig.io.report.calibration.results import read_results
 from telerig.io.report.page.figures import Picture
-from telerig.io.report.run.smoothing import figures, shake
+from telerig.io.report.run.smoothing import figures
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.cameras import run_cameras
-from telerig.io.report.run.tracking.ray_miss import ray_miss_histogram
+from telerig.io.report.run.tracking.figures import ray_miss_histogram
 from telerig.io.report.run.tracking.results import read_track_results
 from telerig.io.report.run.tracking.two_rays import two_rays
 
@@ -44,10 +45,10 @@ def _as_png(figure: Figure, stream: Any, **options: Any) -> None:
 def calibration_pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
     results = read_results(folder)
     yield "rig", rig.rig_plan(results)
-    yield "coverage", coverage.coverage(results, 0)
-    yield "tilts", coverage.tilts(results)
-    yield "residuals", residuals.residual_field(results, 0)
-    yield "residual-histogram", residuals.residual_histogram(results)
+    yield "coverage", calibration_figures.coverage(results, 0)
+    yield "tilts", calibration_figures.tilts(results)
+    yield "residuals", calibration_figures.residual_field(results, 0)
+    yield "residual-histogram", calibration_figures.residual_histogram(results)
     yield "target", target.target_pictures(results)[0]
     with np.load(folder / "dot_example.npz") as example:
         yield "dot", dot_fit.dot_pictures(dict(example))[-1]
@@ -66,9 +67,9 @@ def run_pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
     up, first = 1, smoothed.cameras[0]
     yield "closer", figures.closer(smoothed, up)
     yield "velocity", figures.velocities(smoothed, up)
-    yield "shake", shake.shake_in_time(smoothed, first, "y")
+    yield "shake", figures.shake_in_time(smoothed, first, "y")
 
-    spectra = shake.shake_spectra(smoothed, first)
+    spectra = figures.shake_spectra(smoothed, first)
     if spectra is not None:
         yield "shake-spectra", spectra
 

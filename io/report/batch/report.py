@@ -15,10 +15,17 @@ import numpy as np
 
 from telerig.errors import InputError
 from telerig.io.files.atomic import write_text_atomic
-from telerig.io.report.page.figures import CAMERA_COLOURS, LEFT_OUT, Picture, drawing, svg
+from telerig.io.report.page.figures import (
+    CAMERA_COLOURS,
+    LEFT_OUT,
+    Picture,
+    above,
+    drawing,
+    room_left,
+    svg,
+)
 from telerig.io.report.page.number_format import ABSENT, is_number, number
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
-from telerig.io.report.page.series_plot import above, room_left
 
 Job = Mapping[str, Any]
 

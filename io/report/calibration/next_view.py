@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.io.report.calibration.results import CalibrationResults
-from telerig.io.report.calibration.rig import draw_plan
-from telerig.io.report.calibration.rig_outline import common_plane
+from telerig.io.report.calibration.rig import common_plane, draw_plan
 from telerig.io.report.page.figures import (
     MODEL,
     MUTED,

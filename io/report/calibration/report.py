@@ -9,15 +9,18 @@ from typing import Any
 
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.calibration import tables as tables
-from telerig.io.report.calibration.coverage import coverage, tilts
 from telerig.io.report.calibration.dot_fit import dot_pictures
+from telerig.io.report.calibration.figures import (
+    coverage,
+    residual_field,
+    residual_histogram,
+    tilts,
+    trust_pictures,
+)
 from telerig.io.report.calibration.next_view import next_pictures
-from telerig.io.report.calibration.residuals import residual_field, residual_histogram
 from telerig.io.report.calibration.results import CalibrationResults, read_results
-from telerig.io.report.calibration.rig import rig_plan
-from telerig.io.report.calibration.scene import dots_are_drawn, scene_json
+from telerig.io.report.calibration.rig import dots_are_drawn, rig_plan, scene_json
 from telerig.io.report.calibration.target import target_pictures
-from telerig.io.report.calibration.uncertainty import trust_pictures
 from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
 from telerig.io.report.page.figures import Picture
 from telerig.io.report.page.number_format import ABSENT, flat_rows, is_number

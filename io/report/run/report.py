@@ -12,23 +12,22 @@ from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.page.contact_sheet import BUDGET_BYTES, ContactSheet, picture_sheet
 from telerig.io.report.page.number_format import flat_rows
 from telerig.io.report.page.page import drawn_over_cores, plotly_javascript, render_page
+from telerig.io.report.run.smoothing.figures import PLACES, smoothing_drawings
 from telerig.io.report.run.smoothing.results import SmoothingResults, read_smoothing_results
-from telerig.io.report.run.smoothing.section import PLACES, smoothing_drawings, smoothing_words
+from telerig.io.report.run.smoothing.tables import smoothing_words
 from telerig.io.report.run.tracking import tables as tables
 from telerig.io.report.run.tracking.cameras import run_cameras
 from telerig.io.report.run.tracking.figures import (
     bubbles_in_time,
     confidence,
+    marks_followed,
     predicted_sd,
-    sizes,
-    time_series,
-)
-from telerig.io.report.run.tracking.marks import marks_followed
-from telerig.io.report.run.tracking.ray_miss import (
     ray_miss_histogram,
     ray_miss_in_space,
     seen_where,
     shared_pictures,
+    sizes,
+    time_series,
 )
 from telerig.io.report.run.tracking.results import TrackResults, binary_column, read_track_results
 from telerig.io.report.run.tracking.scene import scene_widening, track_plans, track_scene_json

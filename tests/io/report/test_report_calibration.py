@@ -15,8 +15,8 @@ from calibration_folder import write_calibration_folder
 from report_page import Page, edit
 
 from telerig.errors import InputError
+from telerig.io.report.calibration.figures import residual_field
 from telerig.io.report.calibration.report import contact_sheet, write_calibration_report
-from telerig.io.report.calibration.residuals import residual_field
 from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.tables import parameter_rows, pose_rows, worst_rows
 from telerig.io.report.page import contact_sheet as sheets

@@ -10,11 +10,10 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.report.calibration.coverage import tilt_angles_rad
 from telerig.io.report.calibration.dot_fit import dot_pictures, edge_distance_px
+from telerig.io.report.calibration.figures import tilt_angles_rad
 from telerig.io.report.calibration.results import CalibrationResults
-from telerig.io.report.calibration.rig_outline import common_plane, rig_outline
-from telerig.io.report.calibration.scene import scene_json
+from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
 from telerig.io.report.calibration.target import target_shape
 from telerig.io.report.overlays.dots import GREEN, RED, draw_overlay
 from telerig.io.report.page.number_format import nice_below, number, short_names, with_sd

@@ -16,9 +16,9 @@ from telerig.errors import InputError
 from telerig.io.report.page.figures import Picture
 from telerig.io.report.run import report
 from telerig.io.report.run.report import write_track_report
+from telerig.io.report.run.smoothing.figures import smoothing_drawings
 from telerig.io.report.run.smoothing.numbers import shake_lines, shake_spectrum, velocity_spectrum
-from telerig.io.report.run.smoothing.section import smoothing_drawings
-from telerig.io.report.run.smoothing.wording import smoothing_verdict
+from telerig.io.report.run.smoothing.tables import smoothing_verdict
 from telerig.io.report.run.tracking.results import read_track_results
 
 TRACKING = ["verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events"]

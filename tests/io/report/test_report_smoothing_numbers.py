@@ -23,7 +23,7 @@ from smoothed_folder import (
     write_folder,
 )
 
-from telerig.io.report.page.series_plot import thin_band, thin_line
+from telerig.io.report.page.figures import thin_band, thin_line
 from telerig.io.report.run.smoothing.numbers import (
     axis_sd,
     evenly,
@@ -33,8 +33,7 @@ from telerig.io.report.run.smoothing.numbers import (
     taken_away,
     velocity_spectrum,
 )
-from telerig.io.report.run.smoothing.tables import constant_rows, mode_rows
-from telerig.io.report.run.smoothing.wording import axis_table
+from telerig.io.report.run.smoothing.tables import axis_table, constant_rows, mode_rows
 
 
 @pytest.fixture(scope="module")

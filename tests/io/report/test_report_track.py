@@ -20,15 +20,18 @@ from tracked_folder import SCALE, SIGMA_PX, WORST, write_folder
 from telerig.errors import InputError
 from telerig.io.report.page import contact_sheet as sheets
 from telerig.io.report.run.report import write_track_report
-from telerig.io.report.run.tracking.figures import time_series
-from telerig.io.report.run.tracking.marks import marks_followed
+from telerig.io.report.run.tracking.figures import (
+    marks_followed,
+    ray_miss_in_space,
+    seen_where,
+    time_series,
+)
 from telerig.io.report.run.tracking.numbers import (
     learnt_sd_mm,
     per_frame,
     ray_miss_ratio,
     ray_miss_sd_mm,
 )
-from telerig.io.report.run.tracking.ray_miss import ray_miss_in_space, seen_where
 from telerig.io.report.run.tracking.results import TrackResults, read_track_results
 from telerig.io.report.run.tracking.scene import thinned, track_scene_json
 from telerig.io.report.run.tracking.tables import event_words, verdict

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,15 @@ def column(table: pd.DataFrame, name: str) -> Array:
     if name not in table:
         return np.full(len(table), np.nan)
     return table[name].to_numpy(float)
+
+
+def known_parts(results: SmoothingResults, part: str, needed: str) -> dict[str, Mapping[str, Any]]:
+    """The objects of a part of smoothing.json that hold what is needed, by name."""
+    return {
+        str(name): found
+        for name, found in results.part(part).items()
+        if isinstance(found, Mapping) and needed in found
+    }
 
 
 def axis_sd(results: SmoothingResults, pattern: str = PLACE) -> list[float | None]:

@@ -1,1 +1,4 @@
-"""The tracking section of a run's page. Read ``results`` and ``tables`` first."""
+"""The tracking section of a run's page: words and tables, numbers, figures, the 3-D scene.
+
+In: tracking.json and its tables. Out: words, rows and pictures for the template. Read ``tables``.
+"""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.report.calibration.scene import Trace, lines, scene_text
 from telerig.io.report.page.figures import Picture, drawing, png, svg
+from telerig.io.report.page.scene import Trace, lines, scene_text
 from telerig.io.report.run.tracking.results import TrackResults
 
 if TYPE_CHECKING:

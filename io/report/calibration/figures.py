@@ -1,0 +1,321 @@
+"""Pictures of a calibration: residuals and coverage of the images, tilts, uncertainty in space."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.io.report.calibration.results import CalibrationResults
+from telerig.io.report.page.figures import (
+    LEFT_OUT,
+    MODEL,
+    MUTED,
+    Picture,
+    camera_colour,
+    drawing,
+    image_axes,
+    image_height_in,
+    svg,
+)
+from telerig.io.report.page.number_format import nice_below, number, short_names
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+Array = NDArray[np.float64]
+
+MOST_ARROWS = 1200
+_ARROW_CELLS = 24
+_LONGEST = 0.12
+"""Longest arrow of a dot that was left out, in image widths; the others are drawn to scale."""
+
+
+def residual_field(results: CalibrationResults, index: int) -> Picture:
+    """Arrows from the predicted towards the measured place of every dot of one camera."""
+    camera = results.cameras[index]
+    table = results.residuals[results.residuals["camera"] == camera.name]
+    kept, left_out = table[table["kept"]], table[~table["kept"]]
+    typical = float(kept["length_px"].quantile(0.9)) if len(kept) else 0.0
+    width = camera.image_size_px[0]
+    magnified = nice_below(0.05 * width / typical) if typical > 0 else 1.0
+    start, arrow, averaged = _arrows(kept, camera.image_size_px)
+    above = 0.28
+    height = image_height_in(camera.image_size_px, above)
+    with drawing(height) as (figure, axes):
+        _shrink(axes, above / height)
+        image_axes(axes, camera.image_size_px)
+        quiver = _quiver(axes, start, arrow * magnified, camera_colour(index))
+        _quiver(axes, *_left_out_arrows(left_out, magnified, _LONGEST * width), LEFT_OUT)
+        key_px = nice_below(0.15 * width / magnified)
+        axes.quiverkey(
+            quiver, 0.02, 1 + 0.5 * above / height, key_px * magnified,
+            f"{number(key_px, 1)} px, drawn {magnified:,.0f} times as long",
+            labelpos="E", coordinates="axes", labelsep=0.06,
+        )  # fmt: skip
+        source = svg(figure)
+    return Picture(f"Residuals, camera {camera.name}", source, _field_caption(left_out, averaged))
+
+
+def _field_caption(left_out: pd.DataFrame, averaged: bool) -> str:
+    text = "Arrows in all directions are noise; arrows that swirl or point outwards together "
+    text += "are distortion that the model misses."
+    if averaged:
+        text += " There are too many dots for one arrow each: each arrow is the mean of a cell."
+    if len(left_out):
+        text += f" Red: {len(left_out)} left out, cut to {_LONGEST:.0%} of the image's width."
+    return text
+
+
+def _shrink(axes: Any, share: float) -> None:
+    box = axes.get_position()
+    axes.set_position((box.x0, box.y0, box.width, box.height - share))
+
+
+def _quiver(axes: Any, start: Array, arrow: Array, colour: str) -> Any:
+    return axes.quiver(
+        *start.T, *arrow.T, color=colour, angles="xy", scale_units="xy", scale=1,
+        width=0.0032, headwidth=4, headlength=4, headaxislength=3.5,
+    )  # fmt: skip
+
+
+def _arrows(table: pd.DataFrame, size_px: tuple[int, int]) -> tuple[Array, Array, bool]:
+    """Start and residual of each arrow; means over cells when there are too many dots."""
+    start = table[["u_px", "v_px"]].to_numpy()
+    arrow = table[["du_px", "dv_px"]].to_numpy()
+    if len(table) <= MOST_ARROWS:
+        return start, arrow, False
+    cell_px = max(size_px) / _ARROW_CELLS
+    place = np.floor((start + 0.5) / cell_px).astype(int) @ [1, 4 * _ARROW_CELLS]
+    cells, member, count = np.unique(place, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(cells), 4))
+    np.add.at(sums, member, np.c_[start, arrow])
+    means = sums / count[:, None]
+    return means[:, :2], means[:, 2:], True
+
+
+def _left_out_arrows(table: pd.DataFrame, magnified: float, longest: float) -> tuple[Array, Array]:
+    arrow = magnified * table[["du_px", "dv_px"]].to_numpy()
+    length = np.maximum(np.hypot(*arrow.T), 1e-300)[:, None]
+    return table[["u_px", "v_px"]].to_numpy(), arrow * np.minimum(1.0, longest / length)
+
+
+def residual_histogram(results: CalibrationResults) -> Picture:
+    """All residual coordinates against the normal distribution that the noise predicts."""
+    table = results.residuals
+    whitened = "whitened_u" in table
+    columns = ["whitened_u", "whitened_v"] if whitened else ["du_px", "dv_px"]
+    kept = table.loc[table["kept"], columns].to_numpy().ravel()
+    sigma = 1.0 if whitened else float(np.sqrt(np.mean(kept**2))) if len(kept) else 1.0
+    sigma = sigma or 1.0
+    edges = np.linspace(-5, 5, 41) * sigma
+    with drawing(2.9) as (figure, axes):
+        for i, name in enumerate(results.camera_names):
+            mine = table.loc[table["kept"] & (table["camera"] == name), columns].to_numpy()
+            axes.stairs(
+                _density(mine.ravel(), edges), edges, color=camera_colour(i), linewidth=1.4,
+                label=name, fill=i == 0, alpha=0.45 if i == 0 else 1,
+            )  # fmt: skip
+        x = np.linspace(edges[0], edges[-1], 120)
+        curve = np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
+        label = "unit normal" if whitened else f"normal, sigma {number(sigma)} px"
+        axes.plot(x, curve, color="black", label=label)
+        axes.set(xlabel="residual / its sigma" if whitened else "residual / px", ylabel="density")
+        axes.set(
+            xlim=(edges[0], edges[-1]), ylim=(0, 1.45 * max(curve.max(), axes.get_ylim()[1] / 1.3))
+        )
+        axes.legend(loc="upper left")
+        source = svg(figure)
+    beyond = int(np.sum(np.abs(kept) > edges[-1]))
+    caption = _histogram_caption(whitened, kept, beyond)
+    return Picture("Distribution of the residuals", source, caption)
+
+
+def _histogram_caption(whitened: bool, kept: Array, beyond: int) -> str:
+    if whitened:
+        spread = f"{np.sqrt(np.mean(kept**2)):.2f}" if len(kept) else "unknown"
+        text = (
+            "Residuals over their own predicted noise should follow the black curve, a little "
+            f"narrower because they were fitted (here {spread}); fat tails are outliers."
+        )
+    else:
+        text = "Steps should follow the curve, a normal distribution of the same RMS; fat tails"
+        text += " are outliers."
+    return text + (f" {beyond} kept values lie beyond the plot." if beyond else "")
+
+
+def _density(values: Array, edges: Array) -> Array:
+    count, _ = np.histogram(values, edges)
+    return np.asarray(count / max(len(values), 1) / np.diff(edges))
+
+
+_GRID = 6
+_MOST_MARKERS = 2000
+_MOST_LABELS = 30
+
+
+def coverage(results: CalibrationResults, index: int) -> Picture:
+    """Every kept dot of one camera over the image, and the cells that no dot reached."""
+    camera = results.cameras[index]
+    table = results.residuals
+    mine = table[(table["camera"] == camera.name) & table["kept"]]
+    uv = mine[["u_px", "v_px"]].to_numpy()
+    size = camera.image_size_px
+    edges = [np.linspace(-0.5, n - 0.5, _GRID + 1) for n in size]
+    count, _ = np.histogramdd(uv, bins=edges)
+    with drawing(image_height_in(size)) as (figure, axes):
+        image_axes(axes, size)
+        axes.pcolormesh(
+            *edges, np.where(count.T > 0, np.nan, 1.0), cmap="Reds", vmin=0, vmax=5,
+            edgecolors="#e3e5e8", linewidth=0.4,
+        )  # fmt: skip
+        axes.plot(
+            *uv.T, ".", color=camera_colour(index), markersize=5, markeredgewidth=0,
+            alpha=0.7, rasterized=len(uv) > _MOST_MARKERS,
+        )  # fmt: skip
+        source = svg(figure)
+    empty = int(np.sum(count == 0))
+    caption = (
+        f"{len(uv)} dots of all views; {empty} of {_GRID**2} cells (red) were never reached, and "
+        "there the distortion is extrapolated."
+    )
+    return Picture(f"Coverage, camera {camera.name}", source, caption)
+
+
+def tilt_angles_rad(results: CalibrationResults, index: int) -> tuple[list[str], Array, Array]:
+    """Views that a camera saw, tilt of the target against the image, and the tilt's direction.
+
+    The tilt is the angle between the optical axis and the target's normal, 0 to pi/2; the
+    direction is that of the normal towards the camera, in the image from +u towards +v.
+    """
+    camera = results.cameras[index]
+    seen = set(results.residuals.loc[results.residuals["camera"] == camera.name, "view"])
+    views = [view for view in results.views if view in seen]
+    rotations = np.array([results.views[view].rotation for view in views]).reshape(-1, 3, 3)
+    normal = (camera.camera_from_rig.rotation @ rotations)[:, :, 2]
+    normal = -np.where(normal[:, 2:] > 0, normal, -normal)
+    tilt = np.arctan2(np.hypot(normal[:, 0], normal[:, 1]), -normal[:, 2])
+    return views, tilt, np.arctan2(normal[:, 1], normal[:, 0])
+
+
+def tilts(results: CalibrationResults) -> Picture:
+    """Tilt and its direction for every view and camera, as a disc with 90 degrees at its rim."""
+    every: list[float] = []
+    with drawing(4.0) as (figure, axes):
+        _disc(axes)
+        for i, camera in enumerate(results.cameras):
+            views, tilt, direction = tilt_angles_rad(results, i)
+            radius = np.degrees(tilt)
+            every.extend(radius)
+            x, y = radius * np.cos(direction), radius * np.sin(direction)
+            axes.plot(x, y, "o^sD"[i % 4], color=camera_colour(i), markersize=5, label=camera.name)
+            if len(views) <= _MOST_LABELS:
+                for view, a, b in zip(short_names(views), x, y):
+                    axes.annotate(view, (a, b), (4, 3), textcoords="offset points", fontsize=7)
+        axes.legend(loc="upper left", bbox_to_anchor=(-0.1, 1.04))
+        source = svg(figure)
+    span = f"from {min(every):.0f} to {max(every):.0f} degrees" if every else "unknown"
+    caption = (
+        f"One mark per view: distance from the middle is the tilt ({span}), direction is where the "
+        "target leans in the image; marks should go round the disc at 20 to 70 degrees."
+    )
+    return Picture("Tilts of the target", source, caption)
+
+
+def _disc(axes: Any) -> None:
+    turn = np.linspace(0, 2 * np.pi, 91)
+    for degrees in (30, 60, 90):
+        axes.plot(degrees * np.cos(turn), degrees * np.sin(turn), color=MUTED, linewidth=0.6)
+        axes.text(0, -degrees, f"{degrees}°", color=MUTED, ha="center", va="bottom", fontsize=7.5)
+    axes.plot([-90, 90], [0, 0], [0, 0], [-90, 90], color=MUTED, linewidth=0.4)
+    axes.text(92, 0, "+u", va="center", color=MUTED)
+    axes.text(0, 93, "+v", ha="center", va="top", color=MUTED)
+    axes.set(xlim=(-100, 104), ylim=(102, -100))
+    axes.set_aspect("equal")
+    axes.axis("off")
+    box = axes.figure.bbox_inches
+    axes.set_position((0.02, 0.02, 0.96, 1 - 0.04 * box.width / box.height))
+
+
+_LEVELS = 8
+
+
+def trust_pictures(results: CalibrationResults) -> list[Picture]:
+    """What the folder has of these; a single camera has none."""
+    found = []
+    if results.uncertainty:
+        found.append(_map(results.uncertainty, "calibration_mm2", _CALIBRATION))
+        found.append(_map(results.uncertainty, "measurement_mm2", _MEASUREMENT))
+    halves = (results.content.get("diagnostics") or {}).get("halves") or {}
+    if "points_mm" in halves:
+        found.append(_halves(halves))
+    return found
+
+
+_CALIBRATION = (
+    "Uncertainty: the calibration's share",
+    "One standard deviation in um (all three axes together) of where a point lies in the rig's "
+    "frame, in the plane of the optical axes. It is the same for all points of a run that lie near "
+    "each other: differences of near points do not have it.",
+)
+_MEASUREMENT = (
+    "Uncertainty: the pixels' share",
+    "One standard deviation in um of a point whose pixels scatter like this calibration's dots "
+    "({sigma} px), drawn anew for every point; in proportion for other pixels.",
+)
+
+
+def _map(arrays: Mapping[str, Array], name: str, words: tuple[str, str]) -> Picture:
+    points = arrays["points_mm"]
+    sd_um = 1e3 * np.sqrt(np.trace(arrays[name], axis1=-2, axis2=-1))
+    level = np.abs(points[:, 1])
+    flat = level <= level.min() + 1e-6
+    x, z = (np.unique(points[flat, i]) for i in (0, 2))
+    grid = sd_um[flat].reshape(len(x), len(z))
+    with drawing(3.6) as (figure, axes):
+        if np.ptp(grid) > 1e-3 * grid.max():
+            filled = axes.contourf(x, z, grid.T, levels=_LEVELS, cmap="viridis")
+            figure.colorbar(filled, ax=axes, label="um")
+        else:
+            axes.text(0.5, 0.5, f"{number(grid.mean(), 3)} um everywhere", ha="center",
+                      va="center", transform=axes.transAxes)  # fmt: skip
+        axes.set(xlabel="x / mm", ylabel="z / mm", xlim=(x[0], x[-1]), ylim=(z[0], z[-1]))
+        axes.set_aspect("equal")
+        source = svg(figure)
+    caption = words[1].format(sigma=number(float(arrays["sigma_px"]), 3))
+    caption += f" {number(grid.min(), 3)} to {number(grid.max(), 3)} um."
+    return Picture(words[0], source, caption)
+
+
+def _halves(halves: Mapping[str, Any]) -> Picture:
+    """Arrows where the halves differ, circles of what the covariances allow."""
+    from matplotlib.patches import Circle
+
+    points, shift, sd = (
+        np.array(halves[name], float).reshape(-1, 3) for name in ("points_mm", "shift_um", "sd_um")
+    )
+    level = np.abs(points[:, 1])
+    flat = level <= level.min() + 1e-6
+    x, z = points[flat][:, [0, 2]].T
+    spacing = np.ptp(x) / max(len(np.unique(x)) - 1, 1)
+    longest = float(np.hypot(*shift[flat][:, [0, 2]].T).max())
+    factor = 0.7 * spacing / max(longest, float(sd.max()), 1e-9)
+    with drawing(3.9) as (figure, axes):
+        for a, b, s in zip(x, z, sd[flat]):
+            radius = factor * float(np.sqrt(np.mean(s[[0, 2]] ** 2)))
+            axes.add_patch(Circle((a, b), radius, facecolor=MUTED, alpha=0.25, linewidth=0))
+        axes.quiver(x, z, *(factor * shift[flat][:, [0, 2]]).T, angles="xy", scale_units="xy",
+                    scale=1, color=MODEL, width=0.006)  # fmt: skip
+        axes.set(xlabel="x / mm", ylabel="z / mm")
+        axes.set_aspect("equal", adjustable="datalim")
+        source = svg(figure)
+    caption = (
+        f"Arrows: how far {halves['views'][0]} views and the other {halves['views'][1]} put the "
+        f"same pixels apart (longest {number(longest, 2)} um); grey: one standard deviation of "
+        "that difference. They form a pattern by nature (a turn, a scale); arrows much longer than "
+        "the circles' radius in most places mean that the covariance cannot be believed."
+    )
+    return Picture("Two halves of the views", source, caption)

@@ -15,7 +15,7 @@ from telerig.estimator.doctor.installation import Check
 from telerig.io.dataset.dataset import Dataset, load_dataset
 
 if TYPE_CHECKING:
-    from telerig.io.dataset.run_data import RunData
+    from telerig.io.dataset.run import RunData
 
 FEWEST_VIEWS = 6
 _GOOD_VIEWS = 10

@@ -17,7 +17,7 @@ from telerig.estimator.sensors.encoder_checks import check_encoder
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
-    from telerig.io.dataset.run_data import RunData
+    from telerig.io.dataset.run import RunData
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from telerig.errors import InputError, suggestion
+from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import read_dots_csv
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
 from telerig.io.rig_file.description import RigDescription
@@ -156,11 +156,15 @@ def _dataset_folder(path: Path) -> Path:
             "is a file, not a dataset folder", where=where, todo=f"give its folder, {path.parent}"
         )
     if not path.is_dir():
-        near = _near(path)
+        beside = (
+            [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
+        )
+        near = nearest(path.name, beside)
+        otherwise = "check the path, or make one with `telerig init` or `telerig simulate`"
         raise InputError(
             "there is no such dataset folder",
             where=where,
-            todo=near or "check the path, or make one with `telerig init` or `telerig simulate`",
+            todo=f"did you mean {near}?" if near else otherwise,
         )
     if not (path / "rig.toml").is_file():
         inner = [p.parent.name for p in sorted(path.glob("*/rig.toml"))]
@@ -171,13 +175,6 @@ def _dataset_folder(path: Path) -> Path:
             todo=todo + "write one with `telerig init`",
         )
     return path
-
-
-def _near(path: Path) -> str:
-    if not path.parent.is_dir():
-        return ""
-    todo = suggestion(path.name, [p.name for p in path.parent.iterdir() if p.is_dir()])
-    return todo if todo.startswith("did") else ""
 
 
 def _runs(folder: Path) -> dict[str, Run]:
@@ -226,15 +223,11 @@ def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> InputE
     todo = _LAYOUT
     if not calibration.is_dir():
         others = [p.name for p in _entries(folder) if p.is_dir() and p.name not in _FOLDERS]
-        near = [name for name in others if suggestion(name, _FOLDERS) == _meant("calibration")]
+        near = [name for name in others if nearest(name, _FOLDERS) == "calibration"]
         todo = f"rename {near[0]} to calibration" if near else todo
     elif list_images(calibration):
         todo = f"move the images in calibration/ into calibration/{rig.first}/"
     return InputError(what, where=str(folder), todo=todo)
-
-
-def _meant(name: str) -> str:
-    return f"did you mean {name}?"
 
 
 def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tuple[View, ...]:

@@ -1,18 +1,18 @@
-"""Load a recording of bubbles: find its frames, read its tables, check them together."""
+"""A recording of bubbles: its frames, which stay on disk, and its tables, checked together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError, suggestion
 from telerig.io.dataset.frame_pairing import Pairing, pair_frames
-from telerig.io.dataset.run_data import RunData, RunSource, outside_record
 from telerig.io.dataset.run_tables import (
     read_accelerometer_csv,
     read_detections_csv,
@@ -22,17 +22,92 @@ from telerig.io.dataset.run_tables import (
     read_stage_csv,
 )
 from telerig.io.images.frames import PAGE_EXTENSIONS, FrameSource, open_frames
-from telerig.io.images.read import list_images
+from telerig.io.images.read import Image, check_size, list_images
 from telerig.io.images.video import VIDEO_EXTENSIONS
-from telerig.io.rig_file.description import RigDescription
+from telerig.io.rig_file.description import RigDescription, camera_named
 from telerig.io.rig_file.rig_file import read_rig_toml
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["RunData", "load_run"]
-
 Array = NDArray[np.float64]
+RunSource = Literal["images", "detections"]
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What `load_run` found.
+
+    cameras : names, the rig's first camera first. t_s : (F,) mid-exposure.
+    position_mm : (F,) the stage's position at t_s, NaN outside its record; None without stage.csv.
+    detections : None when the source is images. image_sizes_px : (width, height) by camera.
+    notes : what a user should know, in words; frames found unreadable later are added.
+    skip_unreadable : whether `image` gives None for a frame that cannot be read; None: only for
+    the last one.
+    """
+
+    name: str
+    path: Path
+    cameras: tuple[str, ...]
+    frame_count: int
+    t_s: Array
+    position_mm: Array | None
+    image_sizes_px: Mapping[str, tuple[int, int]]
+    source: RunSource
+    rig: RigDescription | None = None
+    stage: pd.DataFrame | None = field(default=None, repr=False, compare=False)
+    accelerometers: pd.DataFrame | None = field(default=None, repr=False, compare=False)
+    references: pd.DataFrame | None = field(default=None, repr=False, compare=False)
+    detections: pd.DataFrame | None = field(default=None, repr=False, compare=False)
+    notes: list[str] = field(default_factory=list)
+    skip_unreadable: bool | None = None
+    sources: Mapping[str, FrameSource] = field(default_factory=dict, repr=False, compare=False)
+    positions: Mapping[str, NDArray[np.int64]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def image(self, camera: str | int, frame: int) -> Image | None:
+        """(height, width) as stored; None when the frame is missing in that camera.
+
+        Raises InputError for a frame that cannot be read (see ``skip_unreadable``), has another
+        size, or when the run has detections in place of images.
+        """
+        name = self.camera_name(camera)
+        if name not in self.sources:
+            raise InputError(
+                "the run was loaded from detections.csv, it has no images",
+                where=str(self.path),
+                todo="load it from its images (--from images)",
+            )
+        if not 0 <= frame < self.frame_count:
+            raise InputError(
+                f"there is no frame {frame}",
+                where=str(self.path),
+                todo=f"frames count from 0 to {self.frame_count - 1}",
+            )
+        position = int(self.positions[name][frame])
+        if position < 0:
+            return None
+        source = self.sources[name]
+        try:
+            image = source.read(position)
+        except InputError as error:
+            if not self._may_skip(name, position):
+                raise
+            note = f"camera {name}, frame {frame} is left out: {error.what} ({error.where})"
+            if note not in self.notes:
+                self.notes.append(note)
+            return None
+        check_size(image, self.image_sizes_px[name], source.where(position))
+        return image
+
+    def camera_name(self, camera: str | int) -> str:
+        """The camera's name from its name or its index. Raises InputError for an unknown one."""
+        return camera_named(camera, list(self.cameras), where=str(self.path))
+
+    def _may_skip(self, camera: str, position: int) -> bool:
+        last = position == len(self.sources[camera]) - 1
+        return last and position > 0 if self.skip_unreadable is None else self.skip_unreadable
 
 
 def load_run(
@@ -249,7 +324,7 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
     at = np.interp(t_s, t, position, left=np.nan, right=np.nan)
     outside = np.flatnonzero(np.isnan(at))
     if outside.size:
-        notes.append(outside_record(t_s, outside) + "; their stage position is not known")
+        notes.append(_outside_record(t_s, outside) + "; their stage position is not known")
     step = np.diff(t)
     wide = np.flatnonzero(step > 10 * np.median(step))
     hit = [i for i in wide if np.any((t_s > t[i]) & (t_s < t[i + 1]))]
@@ -260,6 +335,14 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
             + ": positions there are interpolated"
         )
     return np.asarray(at, float)
+
+
+def _outside_record(t_s: Array, outside: NDArray[np.int64]) -> str:
+    """Which frames lie outside the stage's record, in words."""
+    first, last = int(outside[0]), int(outside[-1])
+    frames = f"frame {first}" if outside.size == 1 else f"{outside.size} frames ({first} to {last})"
+    span = f"{t_s[first]:.6g} s" + ("" if first == last else f" to {t_s[last]:.6g} s")
+    return f"{frames} at {span} lie outside the record of stage.csv"
 
 
 def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | None:

@@ -6,7 +6,7 @@ Every error names the file, the row (header = 1), the column, and what to do.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError, suggestion
-from telerig.io.dataset.tables import check_cameras, check_pixels, fill_covariance
-from telerig.io.files.csv_table import Column, fail_rows, read_table
+from telerig.io.dataset.tables import (
+    COVARIANCE,
+    check_cameras,
+    check_names,
+    check_pixels,
+    fill_covariance,
+)
+from telerig.io.files.csv_table import Column, Rows, read_table, rows_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,7 +35,6 @@ DETECTION_SIGMA_PX = 0.5
 REFERENCE_SIGMA_PX = 0.1
 """Standard deviation of a reference mark where references.csv does not state it."""
 
-_COVARIANCE = ("suu_px2", "suv_px2", "svv_px2")
 _RUN_KEYS = ["frame_rate_hz", "start_s"]
 
 
@@ -46,67 +51,54 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
         Column("missing", "text", required=False, blank=True),
     ]
     table = read_table(path, columns, extra=True)
+    rows = rows_of(table, path)
+    _check_frames(table, frame_count, rows)
     frame, t = table["frame"].to_numpy(), table["t_s"].to_numpy()
-    _check_frames(table, frame_count, path)
-    late = np.concatenate([[False], np.diff(t) <= 0])
-    fail_rows(
-        late,
-        table,
-        (path, "t_s"),
+    rows.refuse(
+        np.diff(t, prepend=-np.inf) <= 0,
+        "t_s",
         lambda i: f"is {t[i]:.9g} s at frame {frame[i]}, not later than {t[i - 1]:.9g} s before it",
         "times must increase from frame to frame",
     )
     if "missing" in table:
-        _check_missing(table, cameras, path)
+        _check_missing(table, cameras, rows)
     return table.reset_index(drop=True)
 
 
-def _check_frames(table: pd.DataFrame, frame_count: int | None, path: Path) -> None:
-    frame = table["frame"].to_numpy()
-    place, rows = (path, "frame"), np.arange(len(frame))
-    before = f"the images end with frame {(frame_count or 0) - 1}"
+def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> None:
+    frame, expected = table["frame"].to_numpy(), np.arange(len(table))
+
+    def refuse(bad: NDArray[np.bool_], what: Callable[[int], str], todo: str) -> None:
+        rows.refuse(bad, "frame", lambda i: f"is {frame[i]}{what(i)}", todo)
+
     again = table.duplicated("frame").to_numpy()
-    fail_rows(again, table, place, lambda i: f"{frame[i]} stands twice", "keep one of the rows")
-    fail_rows(frame < 0, table, place, lambda i: f"is {frame[i]}, before 0", "frames count from 0")
+    rows.refuse(again, "frame", lambda i: f"{frame[i]} stands twice", "keep one of the rows")
+    refuse(frame < 0, lambda i: ", before 0", "frames count from 0")
     if frame_count is not None:
-        fail_rows(
-            frame >= frame_count,
-            table,
-            place,
-            lambda i: f"is {frame[i]}, but {before}",
-            "remove the row, or complete the images",
-        )
-    falls = np.concatenate([[False], np.diff(frame) < 0])
-    fail_rows(
-        falls,
-        table,
-        place,
-        lambda i: f"is {frame[i]} after {frame[i - 1]}",
-        "sort the rows by frame",
-    )
-    fail_rows(
-        frame != rows,
-        table,
-        place,
-        lambda i: f"is {frame[i]}, and no row gives the time of frame {rows[i]}",
+        end = f", but the images end with frame {frame_count - 1}"
+        refuse(frame >= frame_count, lambda i: end, "remove the row, or complete the images")
+    falls = np.diff(frame, prepend=frame[0]) < 0
+    refuse(falls, lambda i: f" after {frame[i - 1]}", "sort the rows by frame")
+    refuse(
+        frame != expected,
+        lambda i: f", and no row gives the time of frame {expected[i]}",
         "add the missing row; frames count from 0",
     )
     if frame_count is not None and len(frame) < frame_count:
         raise InputError(
             f"has {len(frame)} rows, but there are images of {frame_count} frames: "
             f"frame {len(frame)} has no time",
-            where=f"{path} row {table.index[-1]}",
+            where=f"{rows.file} row {rows.numbers[-1]}",
             todo="add the missing rows, or remove the images that do not belong to the run",
         )
 
 
-def _check_missing(table: pd.DataFrame, cameras: list[str], path: Path) -> None:
+def _check_missing(table: pd.DataFrame, cameras: list[str], rows: Rows) -> None:
     named = [cell.split("|") if cell else [] for cell in table["missing"]]
     unknown = [next((c for c in names if c not in cameras), None) for names in named]
-    fail_rows(
+    rows.refuse(
         np.array([name is not None for name in unknown], bool),
-        table,
-        (path, "missing"),
+        "missing",
         lambda i: f"names {unknown[i]!r}, which is no camera of the rig",
         f"join names of cameras by |; known: {', '.join(cameras)}",
     )
@@ -164,11 +156,7 @@ def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFram
     axes = [Column(f"a{axis}_m_s2") for axis in "xyz"]
     table = read_table(path, [Column("t_s"), Column("sensor", "text"), *axes], extra=True)
     if sensors is not None:
-        unknown = ~table["sensor"].isin(sensors).to_numpy()
-        name = str(table["sensor"][unknown].iloc[0]) if unknown.any() else ""
-        what = f"there is no accelerometer {name!r} in rig.toml"
-        todo = suggestion(name, sensors) if sensors else f"add a table [accelerometers.{name}]"
-        fail_rows(unknown, table, (path, "sensor"), lambda i: what, todo)
+        check_names(table, "sensor", "accelerometer", sensors, path)
     for _, one in table.groupby("sensor"):
         _check_increasing(one, path)
     return table.reset_index(drop=True)
@@ -176,10 +164,9 @@ def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFram
 
 def _check_increasing(table: pd.DataFrame, path: Path) -> None:
     t = table["t_s"].to_numpy()
-    fail_rows(
-        np.concatenate([[False], np.diff(t) <= 0]),
-        table,
-        (path, "t_s"),
+    rows_of(table, path).refuse(
+        np.diff(t, prepend=-np.inf) <= 0,
+        "t_s",
         lambda i: f"is {t[i]:.9g} s, not later than {t[i - 1]:.9g} s in the row before",
         "sort the rows by time and keep one row for each time",
     )
@@ -228,7 +215,7 @@ def _pixel_table(
         Column("u_px"),
         Column("v_px"),
         Column("sigma_px", required=False),
-        *(Column(name, required=False) for name in _COVARIANCE),
+        *(Column(name, required=False) for name in COVARIANCE),
         *own,
     ]
     table = read_table(path, columns, extra=True)
@@ -237,10 +224,9 @@ def _pixel_table(
         check_pixels(table, sizes_px, path)
     frame = table["frame"].to_numpy()
     last = np.iinfo(np.int64).max if frame_count is None else frame_count - 1
-    fail_rows(
+    rows_of(table, path).refuse(
         (frame < 0) | (frame > last),
-        table,
-        (path, "frame"),
+        "frame",
         lambda i: f"is {frame[i]}, " + ("before 0" if frame[i] < 0 else f"the last is {last}"),
         "frames count from 0; correct the cell, or complete the times of the frames",
     )
@@ -248,39 +234,40 @@ def _pixel_table(
 
 
 def _check_repeats(table: pd.DataFrame, name: str, path: Path) -> None:
-    keys = ["frame", "camera", name]
-    again = (table.duplicated(keys) & (table[name] != "")).to_numpy()
-    fail_rows(
-        again,
-        table,
-        (path, name),
-        lambda i: (
-            f"{table[name].iloc[i]!r} stands twice in frame {table['frame'].iloc[i]} "
-            f"of camera {table['camera'].iloc[i]}"
-        ),
+    again = table.duplicated(["frame", "camera", name]) & (table[name] != "")
+    frame, camera, label = (table[key].to_numpy() for key in ("frame", "camera", name))
+    rows_of(table, path).refuse(
+        again.to_numpy(),
+        name,
+        lambda i: f"{label[i]!r} stands twice in frame {frame[i]} of camera {camera[i]}",
         "keep one of the rows, or leave the name blank where it is not known",
     )
 
 
 def _check_axes(table: pd.DataFrame, path: Path) -> None:
     given = [name for name in ("a_px", "b_px", "angle_rad") if name in table]
-    if given and not {"a_px", "b_px"} <= set(given):
-        missing = " and ".join(n for n in ("a_px", "b_px") if n not in given)
+    missing = [name for name in ("a_px", "b_px") if name not in given]
+    if given and missing:
         raise InputError(
-            f"has {', '.join(given)} without {missing}",
+            f"has {', '.join(given)} without {' and '.join(missing)}",
             where=f"{path} row 1",
             todo="give a_px, b_px and angle_rad, or none of them",
         )
     if not given:
         return
+    rows = rows_of(table, path)
     a, b = table["a_px"].to_numpy(), table["b_px"].to_numpy()
-    bad = (a <= 0) | (b <= 0) | (np.isnan(a) != np.isnan(b))
-    what = "is no pair of semi-axes"
-    todo = "give both positive, a_px >= b_px, or leave both blank"
-    fail_rows(bad, table, (path, "a_px"), lambda i: f"{a[i]:g} with b_px {b[i]:g} {what}", todo)
-    swapped = "the long semi-axis comes first: swap them and turn angle_rad by pi/2"
-    fail_rows(
-        a < b, table, (path, "a_px"), lambda i: f"is {a[i]:g}, less than b_px = {b[i]:g}", swapped
+    rows.refuse(
+        (a <= 0) | (b <= 0) | (np.isnan(a) != np.isnan(b)),
+        "a_px",
+        lambda i: f"{a[i]:g} with b_px {b[i]:g} is no pair of semi-axes",
+        "give both positive, a_px >= b_px, or leave both blank",
+    )
+    rows.refuse(
+        a < b,
+        "a_px",
+        lambda i: f"is {a[i]:g}, less than b_px = {b[i]:g}",
+        "the long semi-axis comes first: swap them and turn angle_rad by pi/2",
     )
 
 

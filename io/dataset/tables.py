@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.errors import InputError, suggestion
-from telerig.io.files.csv_table import Column, fail_rows, read_table, write_table
+from telerig.io.files.csv_table import Column, read_table, rows_of, write_table
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.rig.target import Target
@@ -18,7 +18,7 @@ from telerig.rig.target import Target
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["DOTS_COLUMNS", "Column", "fail_rows", "read_dots_csv", "read_table", "write_table"]
+__all__ = ["DOTS_COLUMNS", "Column", "read_dots_csv", "read_table", "write_table"]
 
 DEFAULT_SIGMA_PX = 0.02
 """Standard deviation of a dot's centre where the table does not state it."""
@@ -26,8 +26,8 @@ DEFAULT_SIGMA_PX = 0.02
 OUTSIDE_PX = 3.0
 """A centre may lie this far outside the image: rounding, half-seen dots, an earlier crop."""
 
-_COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
-DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *_COVARIANCE]
+COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
+DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *COVARIANCE]
 
 
 def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFrame:
@@ -66,17 +66,23 @@ def _columns(target: Target) -> list[Column]:
         Column("sigma_px", required=False),
         Column("row", "whole", required=unbounded),
         Column("column", "whole", required=unbounded),
-        *(Column(name, required=False) for name in _COVARIANCE),
+        *(Column(name, required=False) for name in COVARIANCE),
         Column("chi2_dof", required=False, blank=True),
     ]
 
 
 def check_cameras(table: pd.DataFrame, names: list[str], file: Path) -> None:
     """Raise InputError for the first row whose camera is not one of ``names``."""
-    unknown = ~table["camera"].isin(names).to_numpy()
-    name = str(table["camera"][unknown].iloc[0]) if unknown.any() else ""
-    what = f"there is no camera {name!r} in rig.toml"
-    fail_rows(unknown, table, (file, "camera"), lambda i: what, suggestion(name, names))
+    check_names(table, "camera", "camera", names, file)
+
+
+def check_names(table: pd.DataFrame, column: str, thing: str, names: list[str], file: Path) -> None:
+    """Raise InputError for the first row whose cell in ``column`` is not one of ``names``."""
+    unknown = ~table[column].isin(names).to_numpy()
+    name = str(table[column][unknown].iloc[0]) if unknown.any() else ""
+    todo = suggestion(name, names) if names else f"add a table [{thing}s.{name}]"
+    what = f"there is no {thing} {name!r} in rig.toml"
+    rows_of(table, file).refuse(unknown, column, what, todo)
 
 
 def check_pixels(table: pd.DataFrame, sizes_px: Mapping[str, tuple[int, int]], file: Path) -> None:
@@ -88,23 +94,20 @@ def check_pixels(table: pd.DataFrame, sizes_px: Mapping[str, tuple[int, int]], f
 
 def _check_inside(table: pd.DataFrame, column: str, size: Any, file: Path) -> None:
     value = table[column].to_numpy()
-    outside = (value < -0.5 - OUTSIDE_PX) | (value > size - 0.5 + OUTSIDE_PX)
-    todo = "correct the cell, or image_size_px = [width, height] in rig.toml"
-    fail_rows(
-        outside,
-        table,
-        (file, column),
+    rows_of(table, file).refuse(
+        (value < -0.5 - OUTSIDE_PX) | (value > size - 0.5 + OUTSIDE_PX),
+        column,
         lambda i: f"is {value[i]:g}, outside the image of {size[i]:.0f} px",
-        todo,
+        "correct the cell, or image_size_px = [width, height] in rig.toml",
     )
 
 
 def _number_unbounded(table: pd.DataFrame, target: Target, file: Path) -> None:
     """The ids of `Target` in place of the file's opaque ones, from row and column."""
+    todo = f"rows and columns count from the origin mark, within +-{FARTHEST}"
     for column in ("row", "column"):
         far = table[column].abs().to_numpy() > FARTHEST
-        todo = f"rows and columns count from the origin mark, within +-{FARTHEST}"
-        fail_rows(far, table, (file, column), lambda i: "is too far from the origin mark", todo)
+        rows_of(table, file).refuse(far, column, "is too far from the origin mark", todo)
     table["dot"] = target.id_from_row_column(table["row"], table["column"])
 
 
@@ -112,13 +115,11 @@ def _check_dots(table: pd.DataFrame, target: Target, file: Path) -> None:
     """Check the ids; check row and column against them, or fill them in."""
     dot, ids = table["dot"].to_numpy(), target.ids()
     numbers = f"its {len(ids)} dots are numbered from {ids.min()} to {ids.max()}"
-    missing = ", missing marks left out" if target.mark_style == "missing" else ""
-    fail_rows(
+    rows_of(table, file).refuse(
         ~target.known_id(dot),
-        table,
-        (file, "dot"),
+        "dot",
         lambda i: f"is {dot[i]}, which the target of rig.toml does not have",
-        numbers + missing,
+        numbers + (", missing marks left out" if target.mark_style == "missing" else ""),
     )
     for column, expected in zip(("row", "column"), target.row_column_from_id(dot)):
         if column in table:
@@ -128,10 +129,9 @@ def _check_dots(table: pd.DataFrame, target: Target, file: Path) -> None:
 
 def _check_place(table: pd.DataFrame, column: str, expected: Any, file: Path) -> None:
     given, dot = table[column].to_numpy(), table["dot"].to_numpy()
-    fail_rows(
+    rows_of(table, file).refuse(
         given != expected,
-        table,
-        (file, column),
+        column,
         lambda i: f"is {given[i]}, but dot {dot[i]} lies in {column} {expected[i]}",
         "dot = row * columns + column, from 0; correct one of them, or rig.toml",
     )
@@ -147,7 +147,7 @@ def _check_repeats(table: pd.DataFrame, target: Target, file: Path) -> None:
     place = f"at row {this['row']}, column {this['column']}"
     dot = f"dot {this['dot']}" if target.bounded else f"the dot {place}"
     what = f"{dot} of view {this['view']!r}, camera {this['camera']!r} is in row {earlier} already"
-    fail_rows(again, table, (file, "dot"), lambda i: what, "keep one of the two rows")
+    rows_of(table, file).refuse(again, "dot", what, "keep one of the two rows")
 
 
 def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *, of: str) -> bool:
@@ -156,9 +156,9 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
     of : what the standard deviation belongs to, for errors. Raises InputError for what is no
     covariance.
     """
-    given = [name for name in _COVARIANCE if name in table]
+    given = [name for name in COVARIANCE if name in table]
     if 0 < len(given) < 3:
-        missing = ", ".join(name for name in _COVARIANCE if name not in table)
+        missing = ", ".join(name for name in COVARIANCE if name not in table)
         raise InputError(
             f"has {', '.join(given)} without {missing}",
             where=f"{file} row 1",
@@ -169,20 +169,21 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
         return True
     known = "sigma_px" in table
     sigma = table["sigma_px"].to_numpy() if known else np.full(len(table), default_sigma_px)
-    todo = f"give the standard deviation of {of}, or leave the column out"
-    fail_rows(
-        sigma <= 0, table, (file, "sigma_px"), lambda i: f"is {sigma[i]:g}, not positive", todo
+    rows_of(table, file).refuse(
+        sigma <= 0,
+        "sigma_px",
+        lambda i: f"is {sigma[i]:g}, not positive",
+        f"give the standard deviation of {of}, or leave the column out",
     )
     table["suu_px2"], table["suv_px2"], table["svv_px2"] = sigma**2, 0.0 * sigma, sigma**2
     return known
 
 
 def _check_covariance(table: pd.DataFrame, file: Path) -> None:
-    uu, uv, vv = (table[name].to_numpy() for name in _COVARIANCE)
-    fail_rows(
+    uu, uv, vv = (table[name].to_numpy() for name in COVARIANCE)
+    rows_of(table, file).refuse(
         (uu <= 0) | (vv <= 0) | (uu * vv <= uv**2),
-        table,
-        (file, "suu_px2"),
+        "suu_px2",
         lambda i: f"[[{uu[i]:g}, {uv[i]:g}], [{uv[i]:g}, {vv[i]:g}]] is no covariance",
         "variances must be positive and suu svv > suv^2",
     )

@@ -63,7 +63,7 @@ def read_table(
     for name, cells in zip(header, content):
         column = known.get(name)
         convert = _extra if column is None else _CONVERT[column.kind]
-        values[name] = convert(cells, column or Column(name), numbers, file)
+        values[name] = convert(cells, column or Column(name), Rows(file, numbers))
     return pd.DataFrame(values, index=pd.Index(numbers, name="file_row"))
 
 
@@ -77,45 +77,35 @@ def write_table(table: pd.DataFrame, path: str | PathLike[str]) -> None:
         table.astype(flags).to_csv(temporary, index=False, encoding="utf-8", lineterminator="\n")
 
 
-def fail_rows(
-    bad: NDArray[np.bool_],
-    table: pd.DataFrame,
-    place: tuple[Path, str],
-    what: Callable[[int], str],
-    todo: str,
-) -> None:
-    """Raise InputError for the first of the ``bad`` rows, naming the others; or do nothing.
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a file, for errors. numbers : each row's number in the file, the header being 1."""
 
-    table : as `read_table` gives it, its index the rows in the file.
-    place : the file and the column.
-    what : from the position of a row in the table to what is wrong with it.
-    """
-    _fail(bad, list(table.index), *place, what, todo)
+    file: Path
+    numbers: Any
+
+    def refuse(
+        self, bad: NDArray[np.bool_], column: str, what: str | Callable[[int], str], todo: str
+    ) -> None:
+        """Raise InputError for the first of the ``bad`` rows, naming the others; or do nothing.
+
+        what : what is wrong, or a function that says it for the position of a row in the table.
+        """
+        positions = np.flatnonzero(bad)
+        if not positions.size:
+            return
+        first, *others = (self.numbers[int(i)] for i in positions)
+        text = what if isinstance(what, str) else what(int(positions[0]))
+        if others:
+            listed = ", ".join(map(str, others[:5])) + (", ..." if len(others) > 5 else "")
+            text += f" (and {len(others)} more: row {listed})"
+        where = f"{self.file} row {first}" + (f", column {column}" if column else "")
+        raise InputError(text, where=where, todo=todo)
 
 
-def _fail(
-    bad: NDArray[np.bool_],
-    numbers: Sequence[int],
-    file: Path,
-    column: str,
-    what: Callable[[int], str],
-    todo: str,
-) -> None:
-    positions = np.flatnonzero(bad)
-    if not positions.size:
-        return
-    first = int(positions[0])
-    more = ""
-    if positions.size > 1:
-        rows = ", ".join(str(numbers[i]) for i in positions[1:6])
-        more = (
-            f" (and {positions.size - 1} more: row {rows}{', ...' if positions.size > 6 else ''})"
-        )
-    raise InputError(
-        what(first) + more,
-        where=f"{file} row {numbers[first]}" + (f", column {column}" if column else ""),
-        todo=todo,
-    )
+def rows_of(table: pd.DataFrame, file: Path) -> Rows:
+    """The rows of a table that `read_table` gave, or of a part of it."""
+    return Rows(file, table.index)
 
 
 def _cells(file: Path) -> tuple[list[str], list[Sequence[str]], list[int]]:
@@ -138,11 +128,8 @@ def _cells(file: Path) -> tuple[list[str], list[Sequence[str]], list[int]]:
         counts = [line.count(",") + 1 for line in lines]
         flat = ",".join(lines).split(",")
     width = counts[0]
-    ragged = np.array(counts) != width
-    _fail(
-        ragged,
-        numbers,
-        file,
+    Rows(file, numbers).refuse(
+        np.array(counts) != width,
         "",
         lambda i: f"has {counts[i]} cells, the header has {width}",
         "complete the row; a decimal comma must be a point",
@@ -186,30 +173,19 @@ def _check_header(header: list[str], columns: Sequence[Column], extra: bool, fil
         )
 
 
-def _text(cells: Sequence[str], column: Column, numbers: list[int], file: Path) -> Any:
+def _text(cells: Sequence[str], column: Column, rows: Rows) -> Any:
     blank = np.array([not cell.strip() for cell in cells], bool)
-    _fail(
-        blank & (not column.blank),
-        numbers,
-        file,
-        column.name,
-        lambda i: "is blank",
-        "fill in the cell",
-    )
+    rows.refuse(blank & (not column.blank), column.name, "is blank", "fill in the cell")
     return np.array([cell.strip() for cell in cells], dtype=object)
 
 
-def _number(
-    cells: Sequence[str], column: Column, numbers: list[int], file: Path
-) -> NDArray[np.float64]:
+def _number(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[np.float64]:
     values = _floats(cells)
     bad = ~np.isfinite(values)
     if column.blank and bad.any():
         bad &= np.array([bool(cell.strip()) for cell in cells], bool)
-    _fail(
+    rows.refuse(
         bad,
-        numbers,
-        file,
         column.name,
         lambda i: f"is {cells[i]!r}, not a finite number" if cells[i] else "is blank",
         "correct the cell, or remove the row if there was no measurement",
@@ -217,23 +193,18 @@ def _number(
     return values
 
 
-def _whole(cells: Sequence[str], column: Column, numbers: list[int], file: Path) -> NDArray[Any]:
-    values = _number(cells, column, numbers, file)
-    _fail(
-        (values % 1 != 0) & ~np.isnan(values),
-        numbers,
-        file,
-        column.name,
-        lambda i: f"is {cells[i]!r}, not a whole number",
-        "correct the cell",
-    )
+def _whole(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
+    values = _number(cells, column, rows)
+    broken = (values % 1 != 0) & ~np.isnan(values)
+    what = "is {!r}, not a whole number"
+    rows.refuse(broken, column.name, lambda i: what.format(cells[i]), "correct the cell")
     return values if column.blank else values.astype(np.int64)
 
 
 _CONVERT: dict[str, Callable[..., Any]] = {"number": _number, "whole": _whole, "text": _text}
 
 
-def _extra(cells: Sequence[str], column: Column, numbers: list[int], file: Path) -> NDArray[Any]:
+def _extra(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
     values = _floats(cells)
     unreadable = [cell.strip().lower() not in ("", "nan") for cell in cells] & np.isnan(values)
     return np.array(cells, dtype=object) if np.any(unreadable) else values

@@ -6,9 +6,9 @@ and says nothing, so each format is checked here before, or by another decoder.
 
 from __future__ import annotations
 
+import io
 import re
 import struct
-import zlib
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
@@ -26,7 +26,6 @@ EXTENSIONS = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 _FORMATS = "telerig reads TIFF, PNG, BMP and JPEG"
 _COPY = "copy or record it again, or leave it out"
 _MONO = "save it with one grey channel; set a colour camera to a mono mode"
-_SENSOR_BITS = (8, 10, 12, 14, 16)
 
 
 def read_image(
@@ -73,46 +72,6 @@ def natural(name: str) -> tuple[Any, ...]:
     return tuple(int(p) if i % 2 else p.lower() for i, p in enumerate(parts)), name
 
 
-def effective_bits(image: Image) -> int:
-    """Bits of the sensor behind an integer image: 12 for 12-bit data at either end of 16 bits.
-
-    One of 8, 10, 12, 14, 16. Data in the low bits are told by their largest value, so a dark
-    image may be taken for one of fewer bits; data in the high bits by the zeros below them.
-    Raises InputError for a float image, which has no full scale.
-    """
-    return _bits_and_step(image)[0]
-
-
-def full_scale(image: Image) -> int:
-    """Largest grey level that the sensor can give in this image (4095, 65520, ...)."""
-    bits, step = _bits_and_step(image)
-    return ((1 << bits) - 1) * step
-
-
-def _bits_and_step(image: Image) -> tuple[int, int]:
-    if image.dtype == np.uint8:
-        return 8, 1
-    if image.dtype != np.uint16:
-        raise InputError(
-            f"a {image.dtype} image has no full scale",
-            where="image",
-            todo="give an 8- or 16-bit image",
-        )
-    values = np.flatnonzero(np.bincount(image.ravel(), minlength=1))
-    step = int(np.gcd.reduce(values)) if values.size else 0
-    if step and step % 257 == 0:
-        return 8, 257
-    unused = (step & -step).bit_length() - 1 if step and values.size >= 16 else 0
-    if unused and values[-1] >= 1 << (16 - unused):
-        bits = _sensor_bits(16 - unused)
-        return bits, 1 << (16 - bits)
-    return _sensor_bits(int(values[-1]).bit_length() if step else 16), 1
-
-
-def _sensor_bits(least: int) -> int:
-    return next(bits for bits in _SENSOR_BITS if bits >= least)
-
-
 def _bytes(file: Path) -> bytes:
     try:
         data = file.read_bytes()
@@ -154,15 +113,13 @@ def _opencv(data: bytes, file: Path) -> NDArray[Any]:
 
 
 def _png(data: bytes, file: Path) -> NDArray[Any]:
-    position, kind = 8, b""
-    while kind != b"IEND":
-        if position + 12 > len(data):
-            raise _truncated(file, f"the PNG ends after {len(data)} bytes, within its data")
-        length, kind = struct.unpack_from(">I4s", data, position)
-        position += 12 + length
-        crc = zlib.crc32(data[position - 8 - length : position - 4])
-        if position > len(data) or crc != struct.unpack_from(">I", data, position - 4)[0]:
-            raise _truncated(file, f"PNG chunk {kind!r} is incomplete or fails its checksum")
+    """Pillow compares the checksums of all chunks, which OpenCV does not."""
+    from PIL import Image as Pillow
+
+    try:
+        Pillow.open(io.BytesIO(data), formats=["PNG"]).verify()
+    except Exception as error:
+        raise _truncated(file, str(error)) from error
     return _opencv(data, file)
 
 

@@ -81,7 +81,6 @@ class _Decoder:
         self._stream = self._container.streams.video[0]
         self._stream.thread_type = "AUTO"
         self._frames: Iterator[Any] = self._container.decode(self._stream)
-        self._next: Any = None
         self._last = -(1 << 62)
 
     def frame(self, time: int) -> Any:

@@ -86,7 +86,7 @@ def checked(message: str, *words: str) -> str:
 
 
 def assert_frames(run: RunData, camera: str, frames: NDArray[Any]) -> None:
-    got = list(run.frames_of(camera))
+    got = [run.image(camera, frame) for frame in range(run.frame_count)]
     assert len(got) == len(frames)
     for image, expected in zip(got, frames):
         assert image is not None and image.dtype == expected.dtype

@@ -18,7 +18,7 @@ from telerig.estimator.calibration.result.imported import calibration_from_camer
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.smooth import smooth
-from telerig.io.dataset.run_data import RunData
+from telerig.io.dataset.run import RunData
 from telerig.io.rig_file.description import StageDescription
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.run.presets import run_preset

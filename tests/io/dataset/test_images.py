@@ -14,7 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.images.read import effective_bits, full_scale, list_images, natural, read_image
+from telerig.io.images.read import list_images, natural, read_image
 
 RNG = np.random.default_rng(5)
 GREY8 = RNG.integers(0, 256, (37, 53), dtype=np.uint8)
@@ -87,8 +87,7 @@ def test_lzw_tiff_as_opencv_writes_it(pixels: NDArray[np.uint16], tmp_path: Path
 def test_packed_12_bit_tiff(tmp_path: Path) -> None:
     (tmp_path / "a.tif").write_bytes(packed_tiff12(GREY12[:, :52]))
     image = read_image(tmp_path / "a.tif")
-    np.testing.assert_array_equal(image * (4095 / full_scale(image)), GREY12[:, :52])
-    assert effective_bits(image) == 12
+    np.testing.assert_array_equal(image >> 4, GREY12[:, :52])
 
 
 def test_bmp_and_jpeg(tmp_path: Path) -> None:
@@ -245,8 +244,6 @@ def test_float_tiff_with_finite_values(tmp_path: Path) -> None:
     image = read_image(tmp_path / "a.tif")
     assert image.dtype == np.float32
     np.testing.assert_array_equal(image, GREY12.astype(np.float32) / 3)
-    with pytest.raises(InputError, match="no full scale"):
-        effective_bits(image)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -268,28 +265,6 @@ def test_odd_pixel_types(tmp_path: Path) -> None:
     assert "thresholded" in error_of(file)
     tifffile.imwrite(file, GREY8, photometric="miniswhite")
     assert "white as 0" in error_of(file)
-
-
-@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
-def test_effective_bits_of_both_packings(bits: int) -> None:
-    low = RNG.integers(0, 2**bits, (60, 80)).astype(np.uint16)
-    low[0, 0] = 2**bits - 1
-    high = low << (16 - bits)
-    assert effective_bits(low) == effective_bits(high) == bits
-    assert full_scale(low) == low.max()
-    assert full_scale(high) == high.max()
-
-
-def test_effective_bits_of_8_bit_data() -> None:
-    assert (effective_bits(GREY8), full_scale(GREY8)) == (8, 255)
-    stretched = GREY8.astype(np.uint16) * 257
-    assert (effective_bits(stretched), full_scale(stretched)) == (8, 65535)
-    assert effective_bits(np.zeros((4, 4), np.uint16)) == 16
-
-
-def test_few_grey_levels_do_not_look_left_justified() -> None:
-    levels = np.array([[0, 1024], [2048, 3072]], np.uint16)
-    assert (effective_bits(levels), full_scale(levels)) == (12, 4095)
 
 
 def test_natural_order() -> None:

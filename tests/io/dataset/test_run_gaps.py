@@ -106,7 +106,7 @@ def test_a_missing_number_is_a_missing_frame(full_run: Path) -> None:
     (full_run / "right" / "000005.tif").unlink()
     run = load_run(full_run)
     assert run.frame_count == 6
-    assert [image is None for image in run.frames_of("right")] == [0, 1, 0, 0, 0, 1]
+    assert [run.image("right", frame) is None for frame in range(6)] == [0, 1, 0, 0, 0, 1]
     np.testing.assert_array_equal(run.image("right", 2), RIGHT[2])
     assert run.notes == ["camera right misses 2 frames: 1, 5"]
 

@@ -1,4 +1,4 @@
-"""One camera: a lens that is telecentric, nearly so, or (as the limit) perspective."""
+"""A camera whose lens is telecentric, nearly telecentric or, as the limit, perspective."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Camera:
     intrinsics : (20,) in the order of `telerig.rig.projection.PARAMETERS`.
     rho_mm : half the image diagonal in object space at nominal scale; normalises the distortion.
     camera_from_rig : pose; the identity for the first camera, whose frame is the rig frame.
-    wall : the glass it looks through; points are then in the water behind, pixels as in air.
+    wall : the window that the camera looks through; all points are then in the water behind it.
     """
 
     name: str
@@ -43,15 +43,16 @@ class Camera:
         rho_mm: float | None = None,
         **parameters: float,
     ) -> Camera:
-        """A camera from named parameters; what is not named is ideal, the centre that of the image.
+        """A camera from named parameters. Parameters that are not given are those of an ideal lens
+        centred on the image.
 
         Raises GeometryError for an unknown parameter.
         """
         unknown = set(parameters) - set(PARAMETERS)
         if unknown:
             raise GeometryError(
-                f"unknown camera parameter {sorted(unknown)}",
-                todo=f"known: {', '.join(PARAMETERS)}",
+                f"unknown camera parameter {', '.join(sorted(unknown))}",
+                todo=f"use one of {', '.join(PARAMETERS)}",
             )
         width, height = image_size_px
         values = dict.fromkeys(PARAMETERS, 0.0) | {
@@ -70,7 +71,7 @@ class Camera:
         return float(self.intrinsics[INDEX[parameter]])
 
     def with_parameters(self, **parameters: float) -> Camera:
-        """A copy with some intrinsics changed."""
+        """A copy with some intrinsics changed. Raises KeyError for an unknown parameter."""
         intrinsics = self.intrinsics.copy()
         for name, value in parameters.items():
             intrinsics[INDEX[name]] = value
@@ -83,48 +84,35 @@ class Camera:
     def project(self, points_rig_mm: ArrayLike) -> Array:
         """(..., 3) rig points -> (..., 2) pixels.
 
-        Raises GeometryError for points behind the perspective centre (1 + kappa Z <= 0), or that
-        no ray reaches through the wall.
+        Raises GeometryError for points behind the perspective centre (1 + kappa Z <= 0) and for
+        points that no ray reaches through the window.
         """
         points = self.camera_from_rig.apply(np.atleast_2d(points_rig_mm))
         if self.wall is None and np.any(1 + self["kappa_per_mm"] * points[..., 2] <= 0):
             raise GeometryError(
                 f"a point lies behind the perspective centre of camera {self.name!r} "
                 f"(z < {-1 / self['kappa_per_mm']:.1f} mm)",
-                todo="keep to points in front of the camera",
+                todo="project only points in front of the camera",
             )
         uv = projection.pixel_from_camera(points, self.intrinsics, self.rho_mm, self.wall)
         return uv.reshape(*np.shape(points_rig_mm)[:-1], 2)
 
     def pixel_jacobians(self, points_camera_mm: Array) -> tuple[Array, Array, Array]:
-        """`projection.pixel_jacobians` of this camera: (..., 3) in its own frame."""
+        """`projection.pixel_jacobians` at points (..., 3) in the camera's own frame."""
         return projection.pixel_jacobians(points_camera_mm, self.intrinsics, self.rho_mm, self.wall)
 
     def unproject(self, uv_px: ArrayLike) -> tuple[Array, Array]:
         """(..., 2) pixels -> rays in the rig frame: (..., 3) origins and (..., 3) unit directions.
 
-        Origins lie in the camera's plane Z = 0, to which rays in water are drawn on straight.
-        Raises GeometryError outside the invertible region.
+        Origins lie in the camera's plane Z = 0; rays in water are extended straight back to it.
+        Raises GeometryError for pixels where the lens model cannot be inverted.
         """
         ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), self.intrinsics, self.rho_mm)
         if self.wall is not None:
-            stands = projection.standing_wall(self.intrinsics, self.wall)
-            return self._in_rig(*windows.water_from_ideal(ideal, self["kappa_per_mm"], stands))
-        zero, one = np.zeros((*ideal.shape[:-1], 1)), np.ones((*ideal.shape[:-1], 1))
-        origin = np.concatenate([ideal, zero], -1)
-        direction = np.concatenate([self["kappa_per_mm"] * ideal, one], -1)
-        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-        return self._in_rig(origin, direction)
-
-    def _in_rig(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+            wall = projection.standing_wall(self.intrinsics, self.wall)
+            origin, direction = windows.water_from_ideal(ideal, self["kappa_per_mm"], wall)
+        else:
+            origin, direction = windows.air_rays(ideal, self["kappa_per_mm"])
+            direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
         rotation = self.camera_from_rig.rotation
         return (origin - self.camera_from_rig.translation_mm) @ rotation, direction @ rotation
-
-    def twin(self) -> Camera:
-        """The mirror twin's camera in air: mirrored pose, opposite kappa, the same pixels."""
-        pose = self.camera_from_rig.twin()
-        return replace(
-            self.with_parameters(kappa_per_mm=-self["kappa_per_mm"]),
-            camera_from_rig=pose,
-            wall=None,
-        )

@@ -21,12 +21,12 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "s": ("s1", "s3"),
     "centre": ("centre_u_px", "centre_v_px"),
 }
-"""What is freed together, in the order of the parameters in every file.
+"""Parameters that are freed together, in the order in which every file lists them.
 
-Without kappa the image centre acts through the distortion alone, where it is the same as the
-tangential terms to first order and otherwise a gauge freedom, so it is held at the middle of the
-image and p1, p2 carry a decentred lens (docs/decisions/003). s1 and s3 only: s2 and s4 are their
-like, weighted to the image's corners (docs/decisions/014).
+Without kappa the image centre acts only through the distortion, where it equals the tangential
+terms to first order and is otherwise a gauge freedom. It is therefore held at the middle of the
+image, and p1 and p2 describe a decentred lens (docs/decisions/003). s2 and s4 are never free: they
+act like s1 and s3, but nearer to the image's corners (docs/decisions/014).
 """
 DISTORTIONS: dict[str, tuple[str, ...]] = {
     "none": (),
@@ -35,7 +35,7 @@ DISTORTIONS: dict[str, tuple[str, ...]] = {
     "brown": ("k1", "k2", "p"),
     "prism": ("k1", "k2", "p", "s"),
 }
-"""Named sets of distortion groups, each of which contains the one before but for k2."""
+"""Named sets of distortion groups; each contains the one before it."""
 KNOWN = f"auto, {', '.join([*DISTORTIONS, *GROUPS])}, joined by +, or LEFT=NAME,RIGHT=NAME"
 
 Model = str | Mapping[str, str] | Sequence[str]
@@ -45,23 +45,24 @@ Model = str | Mapping[str, str] | Sequence[str]
 def groups_of(name: str) -> tuple[str, ...]:
     """The groups of a model, in the order of `GROUPS`.
 
-    Raises CalibrationError for an unknown name, and for affine with tilt, which are the same.
+    Raises CalibrationError for an unknown name, and for affine together with tilt, whose effects
+    are the same.
     """
     found: set[str] = set()
     for part in name.split("+"):
         if part not in GROUPS and part not in DISTORTIONS:
-            raise CalibrationError(f"unknown model {name!r}", todo=f"known: {KNOWN}")
+            raise CalibrationError(f"unknown model {name!r}", todo=f"use one of {KNOWN}")
         found |= set(DISTORTIONS.get(part, (part,)))
     if {"affine", "tilt"} <= found:
         raise CalibrationError(
-            f"model {name!r}: aspect and skew do the same as a tilted sensor",
-            todo="free affine or tilt, not both",
+            f"model {name!r} is ambiguous: aspect and skew do the same as a tilted sensor",
+            todo="free either affine or tilt",
         )
     return ordered(found)
 
 
 def ordered(groups: Iterable[str]) -> tuple[str, ...]:
-    """In the order of `GROUPS`."""
+    """The groups in the order of `GROUPS`."""
     return tuple(g for g in GROUPS if g in set(groups))
 
 
@@ -77,31 +78,32 @@ def name_of(groups: Iterable[str]) -> str:
 
 
 def parameters_of(name: str) -> tuple[str, ...]:
-    """Free intrinsics besides the scale."""
+    """Names of the free intrinsics besides the scale."""
     return tuple(p for g in groups_of(name) for p in GROUPS[g])
 
 
 def models_by_camera(model: Model, cameras: Sequence[str]) -> tuple[str, ...]:
-    """One name per camera, "auto" for a camera that is not named.
+    """One name per camera; "auto" for a camera that the model does not name.
 
-    Raises CalibrationError for unknown models and cameras, and for a sequence of another length.
+    Raises CalibrationError for unknown models and cameras, and for a sequence whose length is not
+    the number of cameras.
     """
     if isinstance(model, str) and "=" in model:
-        pairs = [part.partition("=") for part in model.split(",")]
-        model = {camera.strip(): name.strip() for camera, _, name in pairs}
+        model = _by_camera(model)
     if isinstance(model, Mapping):
         unknown = [name for name in model if name not in cameras]
         if unknown:
             raise CalibrationError(
-                f"a model for camera {unknown[0]!r}, which the rig does not have",
-                todo=f"its cameras are {', '.join(cameras)}",
+                f"there is a lens model for camera {unknown[0]!r}, which the rig does not have",
+                todo=f"use the rig's cameras: {', '.join(cameras)}",
             )
         names = tuple(model.get(camera, AUTO) for camera in cameras)
     else:
         names = (model,) * len(cameras) if isinstance(model, str) else tuple(model)
     if len(names) != len(cameras):
         raise CalibrationError(
-            f"{len(names)} models for {len(cameras)} cameras", todo="give one, or one a camera"
+            f"there are {len(names)} models for {len(cameras)} cameras",
+            todo="give one model, or one for each camera",
         )
     for name in names:
         if name != AUTO:
@@ -117,9 +119,16 @@ def joint_name(names: Sequence[str], cameras: Sequence[str]) -> str:
 
 
 def checked_model(model: str) -> str:
-    """A model whose cameras are not known yet; raises CalibrationError for an unknown name."""
-    for part in model.split(",") if "=" in model else [model]:
-        name = part.partition("=")[2].strip() if "=" in part else part
+    """The model itself, checked before the cameras are known.
+
+    Raises CalibrationError for an unknown name.
+    """
+    for name in _by_camera(model).values() if "=" in model else [model]:
         if name != AUTO:
             groups_of(name)
     return model
+
+
+def _by_camera(model: str) -> dict[str, str]:
+    pairs = [part.partition("=") for part in model.split(",")]
+    return {camera.strip(): name.strip() for camera, _, name in pairs}

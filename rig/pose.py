@@ -21,7 +21,7 @@ def hat(v: ArrayLike) -> Array:
 
 
 def across(direction: ArrayLike) -> Array:
-    """(3,) -> (3, 2) orthonormal vectors across it."""
+    """(3,) -> (3, 2) orthonormal vectors perpendicular to it."""
     return np.asarray(np.linalg.svd(np.asarray(direction, float)[None])[2][1:].T)
 
 
@@ -98,8 +98,3 @@ class Pose:
     def __matmul__(self, other: Pose) -> Pose:
         turned = np.einsum("...ij,...j->...i", self.rotation, other.translation_mm)
         return Pose(self.rotation @ other.rotation, turned + self.translation_mm)
-
-    def twin(self) -> Pose:
-        """The mirror twin (D R D, D t), D = diag(1, 1, -1): the same pixels when kappa = 0."""
-        flip = np.array([1.0, 1.0, -1.0])
-        return Pose(flip[:, None] * self.rotation * flip, flip * self.translation_mm)

@@ -9,8 +9,8 @@ tangent vector of the tilt and w = 1 / image distance (object-space mm):
 w = 0 is the bilateral telecentric lens (an affine stretch, even in q: the sign of the tilt is
 unobservable); w > 0 the object-side telecentric one (a homography).
 
-Behind a glass wall the first step is `telerig.rig.windows`; wall_x_rad and wall_y_rad turn the
-wall's stated normal (`Wall.turned`) and mean nothing without a wall.
+For points behind a window the first step is `telerig.rig.windows`; wall_x_rad and wall_y_rad turn
+the window's stated normal (`Wall.turned`) and have no effect without a window.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ _WALL = slice(18, 20)
 
 
 def intrinsics_from(parameters: Mapping[str, float]) -> Array:
-    """(20,) in the order of `PARAMETERS`; files from before walls lack theirs, which are then 0.
+    """(20,) in the order of `PARAMETERS`; wall_x_rad and wall_y_rad are 0 where they are missing.
 
-    Raises KeyError for any other that is missing.
+    Raises KeyError for any other parameter that is missing.
     """
     wall = dict.fromkeys(PARAMETERS[_WALL], 0.0)
     return np.array([(wall | dict(parameters))[name] for name in PARAMETERS], float)
 
 
 def standing_wall(intrinsics: Array, wall: Wall) -> Wall:
-    """The wall with its normal turned as the intrinsics say."""
+    """The window with its normal turned by wall_x_rad and wall_y_rad of the intrinsics."""
     return wall.turned(intrinsics[_WALL])
 
 
@@ -56,13 +56,13 @@ def pixel_from_camera(
 ) -> Array:
     """(..., 3) camera coordinates -> (..., 2) pixels; intrinsics (20,) ordered as `PARAMETERS`.
 
-    wall : the points are in the water behind it; then raises what `walls.ideal_from_water` does.
+    wall : the points are in the water behind it; raises what `windows.ideal_from_water` raises.
     """
     if wall is None:
         telecentric = points_mm[..., :2] / (1 + intrinsics[_KAPPA] * points_mm[..., 2:3])
     else:
-        stands = standing_wall(intrinsics, wall)
-        telecentric = windows.ideal_from_water(points_mm, float(intrinsics[_KAPPA]), stands)
+        turned = standing_wall(intrinsics, wall)
+        telecentric = windows.ideal_from_water(points_mm, float(intrinsics[_KAPPA]), turned)
     distorted = distortion.distort(telecentric / rho_mm, intrinsics[_DISTORTION]) * rho_mm
     return _pixel_from_sensor(sensor_from_distorted(distorted, intrinsics), intrinsics)
 
@@ -123,8 +123,8 @@ def pixel_jacobians(
 def _behind_wall(
     points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall
 ) -> tuple[Array, Array, Array]:
-    stands = standing_wall(intrinsics, wall)
-    seen = windows.ideal_jacobians(points_mm, float(intrinsics[_KAPPA]), stands)
+    turned = standing_wall(intrinsics, wall)
+    seen = windows.ideal_jacobians(points_mm, float(intrinsics[_KAPPA]), turned)
     uv, by_ideal, by_intrinsics = _lens_jacobians(seen.value, intrinsics, rho_mm)
     by_intrinsics[..., _KAPPA] = np.einsum("...ij,...j->...i", by_ideal, seen.by_kappa)
     by_turn = seen.by_wall[..., :2] @ wall.turn_jacobian(intrinsics[_WALL])

@@ -5,9 +5,8 @@ Dot (row r, column c) is nominally at (c * pitch_x, r * pitch_y, 0); z = x cross
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +21,10 @@ Extent = Literal["bounded", "unbounded"]
 
 _HALF = 4096
 """Rows and columns of an unbounded grid lie within +-4095 of the origin mark."""
+QUARTER_TURNS: tuple[Ints, ...] = tuple(
+    np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), k) for k in range(4)
+)
+"""Rotations of (column, row) by multiples of 90 degrees."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Target:
     """Nominal geometry of the target, as `[target]` in `rig.toml` states it.
 
     layout : "grid" or "points".
-    rows, columns : of the grid; on an unbounded grid the block that ``scale_dots`` counts in.
+    rows, columns : of the grid; on an unbounded grid the block in which ``scale_dots`` counts.
     pitch_mm : (pitch_x, pitch_y).
     points_mm : (N, 2) of the layout "points", else (0, 2).
     marks : (row, column) of each mark; of the layout "points", (0, dot).
@@ -38,7 +41,7 @@ class Target:
     scale_dots : two dot ids whose distance ``scale_distance_mm`` +- ``scale_sigma_mm`` is known;
         None when the nominal pitch itself sets the scale.
     two_sided : the plate is transparent and may be seen from behind, through
-        ``plate_thickness_mm`` of index ``plate_index``.
+        ``plate_thickness_mm`` of material with refractive index ``plate_index``.
     """
 
     layout: Layout = "grid"
@@ -121,34 +124,39 @@ class Target:
         return np.where(self.is_mark(dot), mark, self.dot_diameter_mm).astype(float)
 
     def symmetry_order(self) -> int:
-        """How many proper rotations (by multiples of 90 deg) leave the nominal target unchanged.
+        """How many rotations by multiples of 90 degrees leave the nominal target unchanged.
 
-        On an unbounded grid rotations may come with a shift. Of the layout "points": 1.
+        On an unbounded grid a rotation may be combined with a shift. It is 1 for the layout
+        "points".
         """
         if self.layout == "points":
             return 1
-        rotations = 4 if np.isclose(*self.pitch_mm) else 2
-        turns = [k for k in range(4) if 4 % rotations == 0 and k % (4 // rotations) == 0]
-        return sum(self._unchanged_by_turn(k) for k in turns)
+        return sum(self._unchanged_by(turn) for turn in QUARTER_TURNS)
 
-    def _unchanged_by_turn(self, quarter_turns: int) -> bool:
-        if quarter_turns % 2 and self.bounded and self.rows != self.columns:
+    def mirror_images_differ(self) -> bool:
+        """Whether the marks of a grid tell it from its mirror image."""
+        mirrored = (turn * np.array([[-1], [1]]) for turn in QUARTER_TURNS)
+        return bool(self.marks) and not any(self._unchanged_by(turn) for turn in mirrored)
+
+    def marks_column_row(self) -> Ints:
+        """(M, 2) column and row of each mark."""
+        return np.array(self.marks, np.int64).reshape(-1, 2)[:, ::-1]
+
+    def _unchanged_by(self, turn: Ints) -> bool:
+        """turn : (2, 2) rotation of (column, row), with or without a reflection."""
+        marks, swapped = self.marks_column_row(), turn[0, 0] == 0
+        if swapped and not np.isclose(*self.pitch_mm):
             return False
-        marks = np.array(self.marks, float).reshape(-1, 2)
-        turn = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarter_turns)
-        if not self.bounded:
-            return not len(marks) or _from_corner(marks @ turn.T) == _from_corner(marks)
-        centre = np.array([self.rows - 1, self.columns - 1]) / 2
-        turned = (marks - centre) @ turn.T + centre
-        return _rows_as_set(turned) == _rows_as_set(marks)
+        if swapped and self.bounded and self.rows != self.columns:
+            return False
+        if not len(marks):
+            return True
+        moved = marks @ turn.T
+        if self.bounded:
+            low = np.minimum(np.array([self.columns - 1, self.rows - 1]) @ turn.T, 0)
+        else:
+            low = moved.min(0) - marks.min(0)
+        return {*map(tuple, (moved - low).tolist())} == {*map(tuple, marks.tolist())}
 
     def _points(self) -> Array:
         return np.zeros((0, 2)) if self.points_mm is None else np.asarray(self.points_mm, float)
-
-
-def _from_corner(places: Array) -> set[tuple[int, ...]]:
-    return _rows_as_set(places - places.min(0))
-
-
-def _rows_as_set(rows: Iterable[Any]) -> set[tuple[int, ...]]:
-    return {tuple(round(2 * x) for x in row) for row in rows}

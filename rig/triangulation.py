@@ -125,14 +125,6 @@ def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Arr
     return np.concatenate(pixels, -1), np.concatenate(jacobians, -2), np.array(by_intrinsics)
 
 
-def _information(covariances: list[Array]) -> Array:
-    shape = covariances[0].shape[:-2]
-    out = np.zeros((*shape, 4, 4))
-    out[..., :2, :2] = np.linalg.inv(covariances[0])
-    out[..., 2:, 2:] = np.linalg.inv(covariances[1])
-    return out
-
-
 def _maximum_likelihood(
     cameras: tuple[Camera, Camera],
     uv_px: tuple[Array, Array],
@@ -228,15 +220,12 @@ def _midpoint_covariance(
     cameras: tuple[Camera, Camera], points: Array, covariances: list[Array]
 ) -> Array:
     """First order: the mid-point is the least-squares point of object-space ray distances."""
-    _, jacobian, _ = stacked_jacobian(cameras, points)
-    gain = np.zeros((*points.shape, 4))
-    projectors, inverse_maps = [], []
-    for c, camera in enumerate(cameras):
+    projectors, gains = [], []
+    for camera in cameras:
         _, direction = camera.unproject(camera.project(points))
         projectors.append(np.eye(3) - direction[..., :, None] * direction[..., None, :])
-        inverse_maps.append(np.linalg.pinv(jacobian[..., 2 * c : 2 * c + 2, :]))
+        _, jacobian, _ = stacked_jacobian((camera,), points)
+        gains.append(projectors[-1] @ np.linalg.pinv(jacobian))
     total = np.linalg.inv(projectors[0] + projectors[1])
-    for c in range(2):
-        gain[..., 2 * c : 2 * c + 2] = total @ projectors[c] @ inverse_maps[c]
-    covariance = np.linalg.inv(_information(covariances))
-    return np.asarray(gain @ covariance @ np.swapaxes(gain, -1, -2))
+    spread = sum(g @ c @ np.swapaxes(g, -1, -2) for g, c in zip(gains, covariances))
+    return np.asarray(total @ spread @ np.swapaxes(total, -1, -2))

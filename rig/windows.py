@@ -211,11 +211,17 @@ def _tangential_of_axis(wall: Wall) -> Array:
     return np.asarray(np.array([0.0, 0.0, 1.0]) - wall.normal[2] * wall.normal)
 
 
+def air_rays(ideal_mm: Array, kappa: float) -> tuple[Array, Array]:
+    """(..., 2) telecentric coordinates -> rays in air, camera frame: (..., 3) origins at depth 0
+    and (..., 3) directions (kappa x, kappa y, 1)."""
+    shape = (*ideal_mm.shape[:-1], 1)
+    origin = np.concatenate([ideal_mm, np.zeros(shape)], -1)
+    return origin, np.concatenate([kappa * ideal_mm, np.ones(shape)], -1)
+
+
 def _enter(ideal: Array, kappa: float, wall: Wall) -> tuple[Array, Array, Array]:
     """Entry points on the near face, directions (kappa x, kappa y, 1), n . unit direction."""
-    shape = (*ideal.shape[:-1], 1)
-    direction = np.concatenate([kappa * ideal, np.ones(shape)], -1)
-    origin = np.concatenate([ideal, np.zeros(shape)], -1)
+    origin, direction = air_rays(ideal, kappa)
     normal_part = direction @ wall.normal
     if not np.all(normal_part > 0):
         raise _unreached()

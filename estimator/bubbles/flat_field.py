@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.outline.regions import screen_level
+from telerig.estimator.images.checks import check_grey_image
 
 _UNIFORM_SHARE = 0.004
 _CLIPPED_SHARE = 0.5
@@ -17,22 +18,7 @@ _WHITE_SHARE = 0.98
 
 def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: float) -> NDArray[Any]:
     image = np.asarray(image)
-    if image.ndim != 2:
-        raise InputError(
-            f"a grey image has 2 dimensions, this array has {image.ndim}: {image.shape}",
-            where="image",
-            todo="convert colour images to grey first (cv2.cvtColor, or one channel of the array)",
-        )
-    if min(image.shape) < 16 or image.dtype.kind not in "uif":
-        raise InputError(
-            f"cannot look for bubbles in an array of shape {image.shape} and type {image.dtype}",
-            where="image",
-            todo="give at least 16 x 16 pixels of an integer or float type",
-        )
-    if image.dtype.kind == "f" and not np.all(np.isfinite(image)):
-        raise InputError(
-            "has pixels that are not finite", where="image", todo="replace NaN and infinity"
-        )
+    check_grey_image(image, 16, "bubbles")
     if not min_diameter_px >= 4.0:
         raise InputError(
             f"must be at least 4, not {min_diameter_px}", where="min_diameter_px", todo="try 8.0"

@@ -29,7 +29,7 @@ from telerig.estimator.dots.dataset_dots import (
     detected_together,
     with_example,
 )
-from telerig.estimator.dots.detect_target import REJECTED
+from telerig.estimator.dots.locate import REJECTED
 from telerig.io.dataset.dataset import Dataset, View, load_dataset
 
 if TYPE_CHECKING:

@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.detect_target import (
     MEASURED,
-    REJECTED,
     ambiguous_numbering,
-    numbered_table,
+    numbered,
     rejected_table,
 )
-from telerig.estimator.dots.grid.numbering import check_handedness, number_dots
-from telerig.estimator.dots.locate import DotMeasurement, measure_dots
+from telerig.estimator.dots.grid.numbering import check_handedness
+from telerig.estimator.dots.locate import measure_dots
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
-from telerig.rig.target import Target
 
 Progress = Callable[[int, int], None]
 
@@ -37,8 +35,9 @@ NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
 
 @dataclass(frozen=True)
 class ImageDots:
-    """One image: its numbered dots, its rejected candidates, and why it was left out, if it was.
+    """One image: its numbered dots and its rejected candidates.
 
+    failure : why the image was left out; empty where it was not.
     overlay : a JPEG of the image with all of them, where it was asked for.
     """
 
@@ -56,8 +55,8 @@ class ImageDots:
 class DatasetDots:
     """dots, rejected : tables of all images, first columns view and camera.
 
-    images : per image, in the order of views and cameras.  notes : words for the user.
-    example : one dot with its fit, as `dot_example` gives it, where overlays were asked for.
+    images : per image, in the order of views and cameras.  notes : sentences for the user.
+    example : one dot with its fit as `dot_example` returns it, where overlays were asked for.
     """
 
     dots: pd.DataFrame
@@ -77,9 +76,9 @@ def detect_dataset(
 ) -> DatasetDots:
     """Detect the target in every calibration image.
 
-    workers : processes; None takes one per core where that pays.
-    overlays : draw them, and fit one dot as an example.
-    meanwhile : called in this process while the others work.
+    workers : number of processes; None takes one per core where that saves time.
+    overlays : draw the overlay of each image, and fit one dot as an example.
+    meanwhile : called in this process while the worker processes run.
 
     Raises InputError for images that cannot be read, DetectionError when no image shows the
     target or when images contradict each other's handedness.
@@ -87,9 +86,9 @@ def detect_dataset(
     tasks = [(view, camera) for view in dataset.views for camera in view.image_paths]
     count = _workers(dataset, len(tasks)) if workers is None else workers
     found: list[ImageDots] = []
-    work = partial(_one_of, dataset, overlays)
+    work = partial(_detect_task, dataset, overlays)
     if count > 1:
-        _prepare(dataset, overlays, tasks[0])
+        _load_before_forking(dataset, overlays, tasks[0])
     for done, image in enumerate(ordered_map(work, tasks, count, meanwhile), 1):
         found.append(image)
         if progress is not None:
@@ -98,8 +97,8 @@ def detect_dataset(
     return with_example(dataset, together) if overlays else together
 
 
-def _prepare(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
-    """Load what copies of this process would each load at their first image."""
+def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
+    """Import the modules that each worker process would otherwise import at its first image."""
     dataset.image(*task)
     if overlays:
         import cv2  # noqa: F401
@@ -110,7 +109,18 @@ def _prepare(dataset: Dataset, overlays: bool, task: tuple[View, str]) -> None:
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:
     """The target in one image. Raises InputError for an image that cannot be read."""
-    return _one_of(dataset, overlay, (view, camera))
+    image = dataset.image(view, camera)
+    found = _numbered_image(dataset, image, view, camera)
+    if not overlay:
+        return found
+    from telerig.io.report.overlays.dots import overlay_jpeg
+
+    drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=OVERLAY_WIDTH_PX)
+    return replace(found, overlay=drawn)
+
+
+def _detect_task(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> ImageDots:
+    return detect_image(dataset, *task, overlay=overlay)
 
 
 def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
@@ -124,12 +134,12 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
         raise DetectionError(
             f"the target was found in none of {len(found)} images",
             where=str(dataset.path / "calibration"),
-            todo=f"first failure: view {failures[0].view}, camera {failures[0].camera}: "
+            todo=f"the first failure is in view {failures[0].view}, camera {failures[0].camera}: "
             f"{failures[0].failure}",
         )
     hands = {(i.view, i.camera): i.handedness for i in found if not i.failure}
     check_handedness(hands, dataset.target.two_sided)
-    notes = [f"view {i.view}, camera {i.camera} left out: {i.failure}" for i in failures]
+    notes = [f"view {i.view}, camera {i.camera} is left out: {i.failure}" for i in failures]
     notes += [f"view {i.view}, camera {i.camera}: {n}" for i in found for n in i.notes]
     return DatasetDots(
         _joined(found, "dots"), _joined(found, "rejected"), tuple(found), tuple(notes)
@@ -137,7 +147,7 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
 
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
-    """With the fit of a well-kept dot, that of median chi-square."""
+    """With the fit of a typical dot: the one whose chi-square is the median."""
     from telerig.estimator.dots.example_dot import dot_example
 
     order = np.argsort(detected.dots["chi2_dof"].to_numpy())
@@ -151,14 +161,14 @@ def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
 
 
 def _joined(images: list[ImageDots], name: str) -> pd.DataFrame:
-    tables: list[pd.DataFrame] = []
-    for image in images:
-        table = getattr(image, name).copy()
-        table.insert(0, "camera", image.camera)
-        table.insert(0, "view", image.view)
-        tables.append(table)
+    tables = [_with_image(getattr(image, name), image) for image in images]
     kept = [t for t in tables if len(t)] or tables[:1]
     return pd.concat(kept, ignore_index=True)
+
+
+def _with_image(table: pd.DataFrame, image: ImageDots) -> pd.DataFrame:
+    named = table.assign(view=image.view, camera=image.camera)
+    return named[["view", "camera", *table.columns]]
 
 
 def _workers(dataset: Dataset, images: int) -> int:
@@ -167,46 +177,28 @@ def _workers(dataset: Dataset, images: int) -> int:
     return min(cores(), images) if large else quick_workers(images)
 
 
-def _one_of(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> ImageDots:
-    image = dataset.image(*task)
-    found = _one(dataset, image, *task)
-    if not overlay:
-        return found
-    from telerig.io.report.overlays.dots import overlay_jpeg
-
-    drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=OVERLAY_WIDTH_PX)
-    return replace(found, overlay=drawn)
-
-
-def _one(dataset: Dataset, image: NDArray[Any], view: View, camera: str) -> ImageDots:
-    target: Target = dataset.target
-    smallest = _smallest_px(dataset, camera)
+def _numbered_image(dataset: Dataset, image: NDArray[Any], view: View, camera: str) -> ImageDots:
+    target = dataset.target
+    smallest_px = _smallest_px(dataset, camera)
     try:
-        measured = measure_dots(image, polarity=target.polarity, min_diameter_px=smallest)
+        measured = measure_dots(image, polarity=target.polarity, min_diameter_px=smallest_px)
     except InputError as error:
-        raise InputError(
-            error.what, where=str(view.image_paths[camera]), todo=error.todo
-        ) from error
+        where = str(view.image_paths[camera])
+        raise InputError(error.what, where=where, todo=error.todo) from error
     try:
-        numbering = number_dots(measured.dots, target)
-        if numbering.ambiguous:
-            raise ambiguous_numbering(numbering, target)
+        found = numbered(measured, target)
+        if found.numbering.ambiguous:
+            raise ambiguous_numbering(found.numbering, target)
     except DetectionError as error:
         words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
-        return ImageDots(view.name, camera, NO_DOTS, _all_rejected(measured, error.what), 0, words)
-    rejected = rejected_table(measured.dots, measured.rejected, numbering)
-    table = numbered_table(measured.dots, numbering)
-    notes = tuple(n for n in numbering.notes if "assumed" not in n)
-    return ImageDots(view.name, camera, table, rejected, numbering.handedness, notes=notes)
-
-
-def _all_rejected(measured: DotMeasurement, reason: str) -> pd.DataFrame:
-    parts = [measured.dots.assign(reason=reason)[REJECTED], measured.rejected[REJECTED]]
-    filled = [part for part in parts if len(part)]
-    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame(columns=REJECTED)
+        rejected = rejected_table(measured, slice(None), error.what)
+        return ImageDots(view.name, camera, NO_DOTS, rejected, 0, words)
+    count, handedness = len(found.numbering.equivalents), found.numbering.handedness
+    notes = (f"the target is symmetric: {count} numberings are equally good",) if count > 1 else ()
+    return ImageDots(view.name, camera, found.table, found.rejected, handedness, notes=notes)
 
 
 def _smallest_px(dataset: Dataset, camera: str) -> float:
-    """A third of the nominal dot, so that dirt is passed over; tilts foreshorten to 0.3."""
+    """About a third of the nominal diameter, which a strong tilt leaves; smaller blobs are dirt."""
     nominal = dataset.target.dot_diameter_mm * dataset.rig.cameras[camera].scale_px_per_mm
     return float(max(5.0, 0.35 * nominal))

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from telerig.errors import DetectionError
 from telerig.estimator.dots.grid.numbering import Numbering, number_dots
-from telerig.estimator.dots.locate import measure_dots
+from telerig.estimator.dots.locate import REJECTED, DotMeasurement, measure_dots
 from telerig.rig.target import Target
 
 MEASURED = [
     *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"),
     *("a_px", "b_px", "angle_rad", "chi2_dof"),
 ]
-REJECTED = ["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"]
 
 
 @dataclass(frozen=True)
@@ -26,14 +25,12 @@ class TargetDetection:
 
     table : dot, row, column and the measured columns of each numbered dot; by dot.
     rejected : u_px, v_px, a_px, b_px, angle_rad, reason of everything dot-like that was left out.
-    numbering : how the numbers came about; its positions refer to ``dots``.
-    dots : every dot that was measured, in the order it was found.
+    numbering : how the dots were numbered.
     """
 
     table: pd.DataFrame
     rejected: pd.DataFrame
     numbering: Numbering
-    dots: pd.DataFrame
 
 
 def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
@@ -51,35 +48,25 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     return found.table
 
 
-def find_target(
-    image: NDArray[Any],
-    target: Target,
-    *,
-    min_diameter_px: float = 5.0,
-    handedness: int | None = None,
-) -> TargetDetection:
-    """Like `detect_target`, with what was rejected, and with ambiguous numberings returned.
+def find_target(image: NDArray[Any], target: Target) -> TargetDetection:
+    """Like `detect_target`, with what was rejected, and with ambiguous numberings returned."""
+    return numbered(measure_dots(image, polarity=target.polarity), target)
 
-    handedness : +1 or -1 when other images tell how the target is seen.
-    """
-    measured = measure_dots(image, polarity=target.polarity, min_diameter_px=min_diameter_px)
-    numbering = number_dots(measured.dots, target, handedness=handedness)
+
+def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
+    """The measured dots with their numbers. Raises DetectionError where none can be given."""
+    numbering = number_dots(measured.dots, target)
+    rows = measured.dots.iloc[numbering.table["index"].to_numpy()][MEASURED]
+    unplaced = numbering.unplaced
     return TargetDetection(
-        table=numbered_table(measured.dots, numbering),
-        rejected=rejected_table(measured.dots, measured.rejected, numbering),
-        numbering=numbering,
-        dots=measured.dots,
+        pd.concat([numbering.table[["dot", "row", "column"]], rows.reset_index(drop=True)], axis=1),
+        rejected_table(measured, unplaced["index"].to_numpy(), unplaced["reason"].to_numpy()),
+        numbering,
     )
 
 
-def numbered_table(dots: pd.DataFrame, numbering: Numbering) -> pd.DataFrame:
-    """The measured columns of the numbered dots beside their numbers."""
-    rows = dots.iloc[numbering.table["index"].to_numpy()][MEASURED].reset_index(drop=True)
-    return pd.concat([numbering.table[["dot", "row", "column"]], rows], axis=1)
-
-
 def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
-    """The error that says which numberings are tied and what would settle them."""
+    """The error that says how many numberings are equally good and how to make one the best."""
     found, wanted = len(numbering.marks_found), len(target.marks)
     hands = set(numbering.equivalent_handedness.tolist())
     mirrored = "; some of them take the image for a mirrored one" if len(hands) > 1 else ""
@@ -91,10 +78,8 @@ def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
     )
 
 
-def rejected_table(dots: pd.DataFrame, blobs: pd.DataFrame, numbering: Numbering) -> pd.DataFrame:
-    """What was not numbered, with reasons: rejected blobs and dots off the target."""
-    index = numbering.unplaced["index"].to_numpy()
-    unplaced = dots.iloc[index].reset_index(drop=True)
-    unplaced = unplaced.assign(reason=numbering.unplaced["reason"])
-    parts = [part[REJECTED] for part in (blobs, unplaced) if len(part)]
+def rejected_table(measured: DotMeasurement, index: Any, reason: Any) -> pd.DataFrame:
+    """Rejected blobs, and the dots at positions ``index`` (n,) with their ``reason`` (n,)."""
+    dots = measured.dots.iloc[index].assign(reason=reason)[REJECTED]
+    parts = [part for part in (measured.rejected, dots) if len(part)]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=REJECTED)

@@ -1,8 +1,8 @@
-"""Dots in an image: every round mark's centre, ellipse and covariance, and why others are not.
+"""Dots in an image: the centre, ellipse and covariance of each, and why other blobs are no dots.
 
-Luminance-model fit of every candidate (design after Lavest, Viala, Dhome 1999), twice: the first
-pass yields the contrast of every dot, hence how the light falls across the image; the second
-uses that as a prior for each dot's own contrast gradient and removes the neighbours' blur.
+A luminance model is fitted to every candidate (after Lavest, Viala, Dhome 1999), twice: the first
+fits yield the contrast of every dot and so the illumination across the image; the second fits use
+it as a prior for each dot's own contrast gradient, and take the neighbours' blur away.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from telerig.estimator.dots.fit.candidates import (
     Candidate,
     Candidates,
     Polarity,
-    choose_polarity,
     edge_map,
     find_candidates,
 )
@@ -39,6 +38,7 @@ from telerig.estimator.dots.fit.rejection import (
     saturation_level,
 )
 from telerig.estimator.dots.fit.types import DotFit, Prior, Start, Window
+from telerig.estimator.images.checks import check_grey_image
 from telerig.estimator.images.noise import (
     NoiseModel,
     agreed_factor,
@@ -53,22 +53,29 @@ from telerig.io.machine.memory import keep_freed_memory
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
+Grey = NDArray[np.float32]
+
+COLUMNS = [
+    *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2", "a_px", "b_px", "angle_rad", "chi2_dof"),
+    *("inner_level", "outer_level", "blur_px", "ring", "noise"),
+]
+REJECTED = ["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"]
 
 _FIRST_SIGMA_PX = 1.0
 _PILOTS = 5
 _FEWEST_PIXELS = 25
-"""A first fit that ran out of the image leaves no window for a second one."""
+"""A dot whose first fit left the image has no window for a second one."""
 _ROUNDS = 10
 _SETTLED_SD = 0.1
+"""A dot that moves by less of its standard deviation does not make its neighbours fitted again."""
 
 
 @dataclass(frozen=True)
 class DotMeasurement:
-    """What one image holds.
+    """The dots of one image.
 
-    ``dots``: one row per accepted dot (columns of :func:`locate_dots`); ``rejected``: u_px v_px
-    a_px b_px angle_rad reason; the image's ``noise`` and the ``polarity`` that was used.
+    dots : `COLUMNS` of each accepted dot, see `locate_dots`. rejected : `REJECTED` of each
+    candidate that is no dot. noise : of the image. polarity : the one that was used.
     """
 
     dots: pd.DataFrame
@@ -104,7 +111,7 @@ def measure_dots(
 ) -> DotMeasurement:
     """Like :func:`locate_dots`, with the rejected candidates and the noise model.
 
-    max_diameter_px : larger blobs are no dots, and tell nothing of the dots' size.
+    max_diameter_px : larger blobs are no dots, and do not count in the usual size of the dots.
     """
     grey = _checked(image, polarity, min_diameter_px)
     keep_freed_memory()
@@ -117,24 +124,13 @@ def measure_dots(
     options = [
         find_candidates(edges, option, min_diameter_px).up_to(max_diameter_px) for option in wanted
     ]
-    chosen = options[0] if len(options) == 1 else choose_polarity((options[0], options[1]))
-    return _measure(grey, chosen, noise)
+    most_area = max(options, key=lambda c: sum(blob.area_px2 for blob in c.promising))
+    return _measure(grey, most_area, noise)
 
 
-def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> NDArray[np.float32]:
+def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> Grey:
     image = np.asarray(image)
-    if image.ndim != 2:
-        raise InputError(
-            f"a grey image has 2 dimensions, this array has {image.ndim}: {image.shape}",
-            where="image",
-            todo="convert colour images to grey first (cv2.cvtColor, or one channel of the array)",
-        )
-    if min(image.shape) < 8 or image.dtype.kind not in "uif":
-        raise InputError(
-            f"cannot look for dots in an array of shape {image.shape} and type {image.dtype}",
-            where="image",
-            todo="give at least 8 x 8 pixels of an integer or float type",
-        )
+    check_grey_image(image, 8, "dots")
     if polarity not in ("auto", "white_on_black", "black_on_white"):
         raise InputError(
             f"unknown polarity {polarity!r}",
@@ -143,79 +139,57 @@ def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> NDAr
         )
     if not min_diameter_px > 0:
         raise InputError(
-            f"must be positive, not {min_diameter_px}", where="min_diameter_px", todo="try 5.0"
+            f"the smallest diameter must be positive, not {min_diameter_px}",
+            where="min_diameter_px",
+            todo="use 5.0 px unless the dots are smaller",
         )
-    grey = image.astype(np.float32)
-    if not np.all(np.isfinite(grey)):
-        raise InputError(
-            "has pixels that are not finite", where="image", todo="replace NaN and infinity"
-        )
-    return grey
+    return image.astype(np.float32)
 
 
-@dataclass(frozen=True)
-class _Rejection:
-    centre_px: Array
-    shape_px: Array
-    reason: str
-
-
-def _measure(grey: NDArray[np.float32], found: Candidates, noise: NoiseModel) -> DotMeasurement:
+def _measure(grey: Grey, found: Candidates, noise: NoiseModel) -> DotMeasurement:
     saturation = saturation_level(grey)
     reference_px = reference_radius_px(found)
-    rejected: list[_Rejection] = []
+    rejected: list[tuple[Any, ...]] = []
     blobs: list[Candidate] = []
     for blob in found.blobs:
         reason = reason_against_blob(blob, grey, reference_px, saturation)
         if reason:
-            rejected.append(_Rejection(blob.centre_px, blob.shape_px, reason))
+            rejected.append((*blob.centre_px, *axes_from_shape(blob.shape_px), str(reason)))
         else:
             blobs.append(blob)
-    fits = _first_pass(grey, found, blobs, noise)
+    scene = _Scene(grey, found.labels, blobs)
+    fits = scene.first_fits(noise)
     noise = _noise_with_inner_level(noise, fits)
-    fits = _second_pass(grey, found, blobs, fits, noise)
+    fits = scene.second_fits(fits, noise)
     factor = agreed_factor(
         noise, np.array([fit.chi2_dof for fit in fits]), np.array([fit.dof for fit in fits])
     )
     fits, noise = [fit.under_noise(factor) for fit in fits], noise.scaled(factor)
     usual_contrast = float(np.median([abs(fit.contrast) for fit in fits])) if fits else 0.0
-    accepted: list[tuple[Candidate, DotFit]] = []
+    accepted: list[tuple[Any, ...]] = []
     for blob, fit in zip(blobs, fits):
         reason = reason_against_fit(fit, grey, found.polarity, usual_contrast, saturation)
         if reason:
-            rejected.append(_Rejection(fit.centre_px, fit.shape_px, reason))
+            rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
         else:
-            accepted.append((blob, fit))
+            accepted.append(_row(blob, fit, noise))
+    import pandas as pd
+
     return DotMeasurement(
-        _dots_table(accepted, noise), _rejected_table(rejected), noise, found.polarity
+        pd.DataFrame(accepted, columns=COLUMNS),
+        pd.DataFrame(rejected, columns=REJECTED),
+        noise,
+        found.polarity,
     )
 
 
-def _first_pass(
-    grey: NDArray[np.float32], found: Candidates, blobs: list[Candidate], noise: NoiseModel
-) -> list[DotFit]:
-    """Every dot by itself; the first ones tell the blur at which the others start."""
-    pilots = _look(grey, found, blobs[:_PILOTS], noise, _FIRST_SIGMA_PX)
-    if len(blobs) <= _PILOTS:
-        return pilots
-    sigma = float(np.median([fit.sigma_px for fit in pilots]))
-    return pilots + _look(grey, found, blobs[_PILOTS:], noise, sigma)
-
-
-def _look(
-    grey: NDArray[np.float32],
-    found: Candidates,
-    blobs: Sequence[Candidate],
-    noise: NoiseModel,
-    sigma: float,
-) -> list[DotFit]:
-    starts = [Start(blob.centre_px, blob.shape_px, sigma) for blob in blobs]
-    windows = [
-        dot_window(grey, found.labels, blob, start, coarse=True)
-        for blob, start in zip(blobs, starts)
-    ]
-    priors = [Prior()] * len(blobs)
-    return fit_dots(windows, starts, noise, priors, tolerance=0.3, outlier_rounds=1)
+def _row(blob: Candidate, fit: DotFit, noise: NoiseModel) -> tuple[Any, ...]:
+    """The values of `COLUMNS` of an accepted dot."""
+    blur = float(np.sqrt(max(fit.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0)))
+    (suu, suv), (_, svv) = fit.inflated_covariance_px2
+    place = (*fit.centre_px, suu, suv, svv, *axes_from_shape(fit.shape_px), fit.chi2_dof)
+    levels = (fit.background + fit.contrast, fit.background)
+    return (*place, *levels, blur, is_ring(blob), noise.sigma_at(fit.background))
 
 
 def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel:
@@ -229,31 +203,69 @@ def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel
     return with_inner_level(noise, inner, outer, ratio, pixels)
 
 
-def _second_pass(
-    grey: NDArray[np.float32],
-    found: Candidates,
-    blobs: list[Candidate],
-    fits: list[DotFit],
-    noise: NoiseModel,
-) -> list[DotFit]:
-    """Every dot again, knowing the light and its neighbours.
+@dataclass(frozen=True)
+class _Scene:
+    """The image (rows, columns), its blobs' labels, and the blobs whose dots are to be fitted."""
 
-    Dots that share pixels are fitted in turn, each beside the last fits of the others, until none
-    moves (Gauss-Seidel: the limit is the fit of all together).
-    """
-    priors = with_common_blur(contrast_gradients(fits, grey.shape), fits)
-    neighbours = close_neighbours(fits)
-    fits = list(fits)
-    again: Sequence[int] = range(len(fits))
-    for _ in range(_ROUNDS):
-        moved: list[int] = []
-        for some in _apart(again, neighbours):
-            windows = [_alone(grey, found, blobs, fits, i, neighbours[i]) for i in some]
-            moved += _refit(fits, some, windows, noise, priors, neighbours)
-        again = sorted({k for i in moved for k in (i, *neighbours[i])})
-        if not again:
-            break
-    return fits
+    grey: Grey
+    labels: NDArray[np.int32]
+    blobs: list[Candidate]
+
+    def first_fits(self, noise: NoiseModel) -> list[DotFit]:
+        """Every dot by itself; the blur of the first few is where the others start."""
+        pilots = self._coarse_fits(self.blobs[:_PILOTS], noise, _FIRST_SIGMA_PX)
+        if len(self.blobs) <= _PILOTS:
+            return pilots
+        sigma = float(np.median([fit.sigma_px for fit in pilots]))
+        return pilots + self._coarse_fits(self.blobs[_PILOTS:], noise, sigma)
+
+    def _coarse_fits(
+        self, blobs: Sequence[Candidate], noise: NoiseModel, sigma_px: float
+    ) -> list[DotFit]:
+        starts = [Start(blob.centre_px, blob.shape_px, sigma_px) for blob in blobs]
+        windows = [
+            dot_window(self.grey, self.labels, blob, start, coarse=True)
+            for blob, start in zip(blobs, starts)
+        ]
+        priors = [Prior()] * len(blobs)
+        return fit_dots(windows, starts, noise, priors, tolerance=0.3, outlier_rounds=1)
+
+    def second_fits(self, fits: list[DotFit], noise: NoiseModel) -> list[DotFit]:
+        """Every dot again, with the light and its neighbours known.
+
+        Dots that share pixels are fitted in turn, each beside the last fits of the others, until
+        none moves (Gauss-Seidel: the limit is the fit of all together).
+        """
+        priors = with_common_blur(contrast_gradients(fits, self.grey.shape), fits)
+        neighbours = close_neighbours(fits)
+        fits = list(fits)
+        again: Sequence[int] = range(len(fits))
+        for _ in range(_ROUNDS):
+            moved: set[int] = set()
+            for group in _apart(again, neighbours):
+                windows = {i: self._window(i, fits, neighbours[i]) for i in group}
+                chosen = [i for i in group if np.count_nonzero(windows[i].mask) >= _FEWEST_PIXELS]
+                found = fit_dots(
+                    [windows[i] for i in chosen],
+                    [_start(fits[i]) for i in chosen],
+                    noise,
+                    [priors[i] for i in chosen],
+                )
+                for i, fit in zip(chosen, found):
+                    if neighbours[i] and _has_moved(fits[i], fit):
+                        moved |= {i, *neighbours[i]}
+                    fits[i] = fit
+            again = sorted(moved)
+            if not again:
+                break
+        return fits
+
+    def _window(self, dot: int, fits: list[DotFit], near: list[int]) -> Window:
+        """A dot's pixels without its neighbours' light."""
+        blobs = self.blobs
+        known = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
+        window = dot_window(self.grey, self.labels, blobs[dot], _start(fits[dot]), known=known)
+        return without_neighbours(window, [fits[k] for k in near])
 
 
 def _apart(dots: Sequence[int], neighbours: list[list[int]]) -> Iterator[list[int]]:
@@ -270,65 +282,10 @@ def _apart(dots: Sequence[int], neighbours: list[list[int]]) -> Iterator[list[in
         left = sorted(set(left) - set(group))
 
 
-def _alone(
-    grey: NDArray[np.float32],
-    found: Candidates,
-    blobs: list[Candidate],
-    fits: list[DotFit],
-    dot: int,
-    near: list[int],
-) -> Window:
-    """A dot's pixels without its neighbours' light."""
-    sure = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
-    window = dot_window(grey, found.labels, blobs[dot], _start(fits[dot]), known=sure)
-    return without_neighbours(window, [fits[k] for k in near])
-
-
 def _start(fit: DotFit) -> Start:
     return Start(fit.centre_px, fit.shape_px, fit.sigma_px, previous=fit)
 
 
-def _refit(
-    fits: list[DotFit],
-    dots: list[int],
-    windows: list[Window],
-    noise: NoiseModel,
-    priors: list[Prior],
-    neighbours: list[list[int]],
-) -> list[int]:
-    """Replace those dots' fits; returns those with neighbours whose centres moved."""
-    seen = {
-        i: window
-        for i, window in zip(dots, windows)
-        if np.count_nonzero(window.mask) >= _FEWEST_PIXELS
-    }
-    starts = [_start(fits[i]) for i in seen]
-    found = fit_dots(list(seen.values()), starts, noise, [priors[i] for i in seen])
-    moved = []
-    for i, fit in zip(seen, found):
-        step = float(np.linalg.norm(fit.centre_px - fits[i].centre_px))
-        if neighbours[i] and step > _SETTLED_SD * np.sqrt(np.trace(fit.covariance_px2)):
-            moved.append(i)
-        fits[i] = fit
-    return moved
-
-
-def _dots_table(accepted: list[tuple[Candidate, DotFit]], noise: NoiseModel) -> pd.DataFrame:
-    import pandas as pd
-
-    rows = []
-    for blob, fit in accepted:
-        blur = float(np.sqrt(max(fit.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0)))
-        (suu, suv), (_, svv) = fit.inflated_covariance_px2
-        place = (*fit.centre_px, suu, suv, svv, *axes_from_shape(fit.shape_px), fit.chi2_dof)
-        levels = (fit.background + fit.contrast, fit.background)
-        rows.append((*place, *levels, blur, is_ring(blob), noise.sigma_at(fit.background)))
-    names = "u_px v_px suu_px2 suv_px2 svv_px2 a_px b_px angle_rad chi2_dof inner_level outer_level"
-    return pd.DataFrame(rows, columns=[*names.split(), "blur_px", "ring", "noise"])
-
-
-def _rejected_table(rejected: list[_Rejection]) -> pd.DataFrame:
-    import pandas as pd
-
-    rows = [(*r.centre_px, *axes_from_shape(r.shape_px), r.reason) for r in rejected]
-    return pd.DataFrame(rows, columns=["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"])
+def _has_moved(before: DotFit, after: DotFit) -> bool:
+    step = float(np.linalg.norm(after.centre_px - before.centre_px))
+    return bool(step > _SETTLED_SD * np.sqrt(np.trace(after.covariance_px2)))

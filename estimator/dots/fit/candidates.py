@@ -1,7 +1,7 @@
-"""Where dots may be: a threshold that follows the light, outlines, and a first look at each.
+"""Candidates for dots: a threshold that follows the illumination, and the outlines it gives.
 
-The threshold is half-way between the local extremes wherever an edge is near and is carried
-smoothly across the flats between edges, so it needs no dot size and no even light.
+The threshold is half-way between the local extremes wherever an edge is near, and is interpolated
+smoothly across the flat parts between edges. So it needs neither a dot size nor even light.
 """
 
 from __future__ import annotations
@@ -17,16 +17,11 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     axes_from_shape,
     shape_from_axes,
 )
+from telerig.estimator.dots.fit.types import Reason
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.float32]
 Polarity = Literal["white_on_black", "black_on_white"]
-
-TOUCHES_BORDER = "touches the image border"
-TOO_LARGE = "larger than the dots"
-MERGED = "merged with its neighbour"
-NOT_ELLIPSE = "outline is not an ellipse"
-TOO_SMALL = "smaller than the smallest dot asked for"
 
 _BLOCK = 4
 _COARSE_WINDOW = 5
@@ -44,18 +39,17 @@ _MIN_PIECE_PIXELS = 4
 
 @dataclass(frozen=True)
 class Candidate:
-    """A blob: ellipse of equal second moments, its box (u, v, width, height), and ``reason``.
+    """A blob: the centre and ellipse of its second moments, its area, and its holes.
 
-    ``reason`` is empty for a blob that may be a dot. ``holes`` lists the outlines (N, 2) of holes.
+    reason : why it is no dot; empty for a blob that may be one. holes : outline (N, 2) of each.
     """
 
     label: int
     centre_px: Array
     shape_px: Array
-    box: tuple[int, int, int, int]
     area_px2: float
     holes: tuple[NDArray[np.int32], ...]
-    reason: str
+    reason: Reason | None
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,9 @@ class Candidates:
         if np.isinf(diameter_px):
             return self
         most = np.pi / 4 * diameter_px**2
-        blobs = (replace(b, reason=TOO_LARGE) if b.area_px2 > most else b for b in self.blobs)
+        blobs = (
+            replace(b, reason=Reason.TOO_LARGE) if b.area_px2 > most else b for b in self.blobs
+        )
         return replace(self, blobs=tuple(blobs))
 
 
@@ -115,9 +111,9 @@ def edge_map(image: Grey, sigma: float) -> EdgeMap:
 
 
 def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels far from any crossing of the threshold, as far as leaves enough of them.
+    """Pixels far from any crossing of the threshold: the greatest distance that leaves enough.
 
-    Chosen by place alone: choosing quiet pixels would bias the noise that they are to tell.
+    They are chosen by place alone: choosing quiet pixels would bias the noise measured in them.
     """
     import cv2
 
@@ -135,7 +131,7 @@ def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _spread(values: Grey, weight: Grey) -> Grey:
-    """Weighted values carried over to where there is no weight, coarse scales filling in."""
+    """Values weighted and interpolated to where there is no weight, from coarser scales."""
     import cv2
 
     rows, columns = values.shape
@@ -174,7 +170,7 @@ def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) 
     for outline, look in shown:
         if look is not None:
             blobs.append(replace(look, label=len(blobs) + 1))
-            _fill(labels, len(blobs), outline, *look.holes)
+            fill(labels, len(blobs), outline, *look.holes)
     return Candidates(polarity, tuple(blobs), labels)
 
 
@@ -182,13 +178,17 @@ _Look = tuple[NDArray[np.int32], Candidate | None]
 
 
 def _with_pieces(shown: list[_Look], above: Grey, min_diameter_px: float) -> list[_Look]:
-    """The outlines with those replaced by their pieces that come apart (see :func:`_pieces`)."""
+    """The outlines, where those of merged small dots are replaced by their pieces (`_pieces`)."""
     good = [look.area_px2 for _, look in shown if look is not None and not look.reason]
     large = _LARGE_PIECE * float(np.median(good)) if good else 0.0
     result: list[_Look] = []
     for outline, look in shown:
         pieces: list[NDArray[np.int32]] = []
-        if look is not None and look.reason != TOO_SMALL and (look.reason or look.area_px2 > large):
+        if (
+            look is not None
+            and look.reason != Reason.TOO_SMALL
+            and (look.reason or look.area_px2 > large)
+        ):
             pieces = _pieces(above, outline)
         for piece in pieces:
             smallest = min_diameter_px - 2.0 * _PIECE_GROWTH_PX
@@ -201,8 +201,8 @@ def _with_pieces(shown: list[_Look], above: Grey, min_diameter_px: float) -> lis
     return result
 
 
-def _fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) -> None:
-    """The first outline's inside without that of the others, its holes: they may hold dots."""
+def fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) -> None:
+    """Fill the inside of the first outline, without that of the others, which are its holes."""
     import cv2
 
     cv2.drawContours(canvas, [o.reshape(-1, 1, 2) for o in outlines], -1, value, cv2.FILLED)
@@ -226,16 +226,16 @@ def _outlines(
 
 
 def _pieces(above: Grey, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
-    """Outlines of small dots whose blur runs together, told apart by a higher threshold.
+    """Outlines of small dots whose blurs overlap, separated by a higher threshold.
 
-    Only dots of the blur's own size are, in blobs that are nowhere thicker: larger ones that
-    touch do so in the world.
+    Only blobs that are nowhere thicker than the blur are separated: larger dots that touch in the
+    image touch in the world.
     """
     import cv2
 
     low, high = outline.min(axis=0), outline.max(axis=0) + 1
     filled = np.zeros((high - low)[::-1] + 2, np.uint8)
-    _fill(filled, 1, outline - low + 1)
+    fill(filled, 1, outline - low + 1)
     if cv2.distanceTransform(filled, cv2.DIST_L2, 3).max() > _PIECE_SEMI_AXIS_PX + 1.0:
         return []
     filled = filled[1:-1, 1:-1]
@@ -261,9 +261,8 @@ def _is_small_dot(outline: NDArray[np.int32], image_shape: tuple[int, ...]) -> b
         return True
     area, centre, shape = _filled_moments(outline)
     small = axes_from_shape(shape)[1] <= _PIECE_SEMI_AXIS_PX
-    return bool(
-        area >= _MIN_PIECE_PIXELS and small and not _outline_verdict(outline, centre, shape)
-    )
+    sound = _reason_against_outline(outline, centre, shape) is None
+    return bool(area >= _MIN_PIECE_PIXELS and small and sound)
 
 
 def _first_look(
@@ -272,19 +271,19 @@ def _first_look(
     image_shape: tuple[int, ...],
     min_diameter_px: float,
 ) -> Candidate | None:
-    """Moments and first verdict of one outline; None for specks below half the smallest dot."""
+    """The candidate of one outline; None for specks below half the smallest dot."""
     low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
     if size.max() < 0.5 * min_diameter_px:
         return None
     area, centre, shape = _filled_moments(outline)
+    reason: Reason | None
     if low.min() <= 0 or np.any(low + size >= image_shape[::-1]):
-        reason = TOUCHES_BORDER
+        reason = Reason.TOUCHES_BORDER
     elif 2.0 * axes_from_shape(shape)[0] < min_diameter_px:
-        reason = TOO_SMALL
+        reason = Reason.TOO_SMALL
     else:
-        reason = _outline_verdict(outline, centre, shape)
-    box = (int(low[0]), int(low[1]), int(size[0]), int(size[1]))
-    return Candidate(0, centre, shape, box, area, holes, reason)
+        reason = _reason_against_outline(outline, centre, shape)
+    return Candidate(0, centre, shape, area, holes, reason)
 
 
 def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
@@ -293,7 +292,7 @@ def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
 
     low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
     filled = np.zeros((int(size[1]), int(size[0])), np.uint8)
-    _fill(filled, 1, outline - low)
+    fill(filled, 1, outline - low)
     m = cv2.moments(filled, binaryImage=True)
     area = float(m["m00"])
     variance = (m["mu20"] / area + 1 / 12, m["mu11"] / area, m["mu02"] / area + 1 / 12)
@@ -307,7 +306,9 @@ def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
     return shape_from_axes(2.0 * np.sqrt(large), 2.0 * np.sqrt(max(small, 0.05)), angle)
 
 
-def _outline_verdict(outline: NDArray[np.int32], centre: Array, shape: Array) -> str:
+def _reason_against_outline(
+    outline: NDArray[np.int32], centre: Array, shape: Array
+) -> Reason | None:
     import cv2
 
     offset = outline - centre
@@ -315,12 +316,7 @@ def _outline_verdict(outline: NDArray[np.int32], centre: Array, shape: Array) ->
     _, b, _ = axes_from_shape(shape)
     roughness = float(np.sqrt(np.mean(distance**2)))
     if roughness <= 0.5 + 0.04 * b:
-        return ""
+        return None
     hull = cv2.contourArea(cv2.convexHull(outline.reshape(-1, 1, 2)))
     solidity = cv2.contourArea(outline.reshape(-1, 1, 2)) / max(hull, 1.0)
-    return MERGED if 0.6 < solidity < 0.95 else NOT_ELLIPSE
-
-
-def choose_polarity(options: tuple[Candidates, Candidates]) -> Candidates:
-    """The polarity whose dot-like blobs cover more of the image."""
-    return max(options, key=lambda c: sum(blob.area_px2 for blob in c.promising))
+    return Reason.MERGED if 0.6 < solidity < 0.95 else Reason.NOT_ELLIPSE

@@ -1,4 +1,4 @@
-"""Which pixels a dot's fit looks at, cleared of holes, neighbours and their blur."""
+"""The pixels of a dot's fit, without holes, neighbours and their blur."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     extent_px,
     semi_axes,
 )
-from telerig.estimator.dots.fit.candidates import Candidate
+from telerig.estimator.dots.fit.candidates import Candidate, fill
 from telerig.estimator.dots.fit.types import DotFit, Start, Window
 
 Array = NDArray[np.float64]
@@ -34,14 +34,14 @@ def dot_window(
     coarse: bool = False,
     known: Sequence[int] = (),
 ) -> Window:
-    """Crop and mask round one dot: its edge, what is inside, background as far as it is free.
+    """Crop and mask round one dot: its edge, its inside, and the background as far as it is free.
 
     Pixels nearer to another blob than to this dot, or near a hole in it, are left out. Of a large
-    dot, only the surroundings of its edge count, and one in four of those beyond its blur
-    (``coarse``: one in four everywhere, for a first look).
+    dot only the surroundings of the edge are used, and of those beyond the blur one pixel in four
+    (coarse : one in four everywhere, for a first fit).
 
-    known : labels of blobs whose light will be taken away: what they share with this dot's blur
-        stays. Left out, it costs a third of the precision where blurs overlap.
+    known : labels of blobs whose light is subtracted later, so that pixels which their blur shares
+        with this dot's stay. Without those pixels a third of the precision would be lost.
     """
     a, b = semi_axes(start.shape_px)
     reach = 4.0 * start.sigma_px + 2.0
@@ -60,12 +60,15 @@ def dot_window(
     if gap is not None:
         free = (gap > clear) | (distance < gap)
         if known:
-            strange = _distance_to_others(labels, (blob.label, *known), *around)
-            alone = True if strange is None else (strange > clear) | (distance < strange)
+            unknown = _distance_to_others(labels, (blob.label, *known), *around)
+            alone = True if unknown is None else (unknown > clear) | (distance < unknown)
             free |= (distance < clear) & alone
         mask &= free
     if blob.holes:
-        mask &= _distance_to(_holes(blob, low, mask.shape)) > clear + 0.5
+        holes = np.zeros(mask.shape, np.uint8)
+        for hole in blob.holes:
+            fill(holes, 1, hole - low.astype(np.int32))
+        mask &= _distance_to(holes > 0) > clear + 0.5
     if np.count_nonzero(mask) > (_COARSE_ABOVE_PIXELS if coarse else _THIN_ABOVE_PIXELS):
         thin = np.abs(distance) > (0.0 if coarse else _EDGE_SIGMA * start.sigma_px)
         thin[::2, ::2] = False
@@ -87,7 +90,10 @@ def _distance_to_others(
     high: NDArray[np.int_],
     reach: int,
 ) -> Array | None:
-    """Distance to all blobs but ``own``, also just outside the crop; None where there is none."""
+    """Distance to the blobs whose label is not in ``own``; None where none is within reach.
+
+    low, high : (2,) first pixel (u, v) of the crop and the one after its last.
+    """
     first = np.maximum(low - reach, 0)
     wide = labels[first[1] : high[1] + reach, first[0] : high[0] + reach]
     others = wide != 0
@@ -101,17 +107,8 @@ def _distance_to_others(
     return distance[inner[1] : inner[1] + size[1], inner[0] : inner[0] + size[0]]
 
 
-def _holes(blob: Candidate, low: NDArray[np.int_], shape: tuple[int, ...]) -> Mask:
-    import cv2
-
-    canvas = np.zeros(shape, np.uint8)
-    for hole in blob.holes:
-        cv2.drawContours(canvas, [(hole - low).reshape(-1, 1, 2)], -1, 1, cv2.FILLED)
-    return canvas > 0
-
-
 def close_neighbours(fits: list[DotFit]) -> list[list[int]]:
-    """For each dot, those whose blur reaches its window."""
+    """For each dot, the positions of the dots whose blur overlaps its own."""
     from scipy.spatial import cKDTree
 
     if not fits:
@@ -140,7 +137,7 @@ def _radius_of(shape: Array, du: float, dv: float) -> float:
 
 
 def without_neighbours(window: Window, neighbours: list[DotFit]) -> Window:
-    """The window with the neighbours' fitted light taken away."""
+    """The window with the neighbours' fitted light subtracted."""
     if not neighbours:
         return window
     rows, columns = window.grey.shape

@@ -1,4 +1,4 @@
-"""Why a blob is not taken for a dot, in words for the person who looks at the overlay."""
+"""Decides which blobs and which fits are no dots."""
 
 from __future__ import annotations
 
@@ -6,24 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.dots.fit.blurred_ellipse import axes_from_shape, extent_px
-from telerig.estimator.dots.fit.candidates import (
-    MERGED,
-    NOT_ELLIPSE,
-    TOUCHES_BORDER,
-    Candidate,
-    Candidates,
-    Polarity,
-)
-from telerig.estimator.dots.fit.types import PARAMETERS, DotFit
+from telerig.estimator.dots.fit.candidates import Candidate, Candidates, Polarity
+from telerig.estimator.dots.fit.types import PARAMETERS, DotFit, Reason
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.float32]
-
-GLARE = "saturated by glare"
-MUCH_SMALLER = "much smaller than the other dots"
-HIDDEN = "hardly a pixel is its own"
-FAINT = "much fainter than the other dots"
-DARK_SPECK = "does not look like a dot (contrast has the wrong sign)"
 
 _MAX_EDGE_RESIDUAL = 0.12
 _MISFIT_CHI2 = 2.0
@@ -34,7 +21,7 @@ _MAX_ONE_SIDED_SATURATION = 0.06
 
 
 def reference_radius_px(found: Candidates) -> float:
-    """Radius that half of the promising blobs' area exceeds (0 without any)."""
+    """Radius of the blob at the median of the promising blobs' area; 0 where there are none."""
     areas = np.sort([blob.area_px2 for blob in found.promising])
     if areas.size == 0:
         return 0.0
@@ -51,7 +38,8 @@ def is_ring(blob: Candidate) -> bool:
 
 
 def saturation_level(grey: Grey) -> float:
-    """Grey level at which the sensor clips: the top level if it is unusually populated."""
+    """Grey level at which the sensor saturates: the top level if unusually many pixels have it,
+    else infinity."""
     top = float(grey.max())
     at_top = int(np.count_nonzero(grey == top))
     span = top - float(grey.min())
@@ -62,7 +50,7 @@ def saturation_level(grey: Grey) -> float:
 def _one_sided_saturation(
     grey: Grey, centre: Array, shape: Array, margin: float, level: float
 ) -> float:
-    """Length of the mean direction towards clipped pixels round an edge: 0 when all round it."""
+    """Length of the mean direction towards saturated pixels; 0 where they are all round."""
     if not np.isfinite(level):
         return 0.0
     half = extent_px(shape) + margin
@@ -77,38 +65,40 @@ def _one_sided_saturation(
     return float(np.hypot(np.sum(du / away), np.sum(dv / away))) / crop.size
 
 
-def reason_against_blob(blob: Candidate, grey: Grey, reference_px: float, saturation: float) -> str:
-    """Reason to leave a blob out before any fit, or an empty string."""
-    if blob.reason == TOUCHES_BORDER:
-        return TOUCHES_BORDER
+def reason_against_blob(
+    blob: Candidate, grey: Grey, reference_px: float, saturation: float
+) -> Reason | None:
+    """Reason to leave a blob out before any fit; None for a blob that may be a dot."""
+    if blob.reason == Reason.TOUCHES_BORDER:
+        return Reason.TOUCHES_BORDER
     if np.sqrt(blob.area_px2 / np.pi) < _MIN_RELATIVE_RADIUS * reference_px:
-        return MUCH_SMALLER
-    if blob.reason in (MERGED, NOT_ELLIPSE):
+        return Reason.MUCH_SMALLER
+    if blob.reason in (Reason.MERGED, Reason.NOT_ELLIPSE):
         lopsided = _one_sided_saturation(grey, blob.centre_px, blob.shape_px, 2.0, saturation)
-        return GLARE if lopsided > _MAX_ONE_SIDED_SATURATION else blob.reason
+        return Reason.GLARE if lopsided > _MAX_ONE_SIDED_SATURATION else blob.reason
     return blob.reason
 
 
 def reason_against_fit(
     fit: DotFit, grey: Grey, polarity: Polarity, usual_contrast: float, saturation: float
-) -> str:
-    """Reason to leave a fitted dot out, or an empty string."""
+) -> Reason | None:
+    """Reason to leave a fitted dot out; None for a good one."""
     if fit.pixels <= PARAMETERS:
-        return HIDDEN
+        return Reason.HIDDEN
     if not np.all(np.isfinite(fit.covariance_px2)) or axes_from_shape(fit.shape_px)[1] <= 0.0:
-        return "does not look like a dot (fit failed)"
+        return Reason.FIT_FAILED
     half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(grey.shape[::-1])
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
-        return TOUCHES_BORDER
+        return Reason.TOUCHES_BORDER
     lopsided = _one_sided_saturation(
         grey, fit.centre_px, fit.shape_px, 2.0 * fit.sigma_px, saturation
     )
     if lopsided > _MAX_ONE_SIDED_SATURATION:
-        return GLARE
+        return Reason.GLARE
     if fit.edge_residual > _MAX_EDGE_RESIDUAL and fit.chi2_dof > _MISFIT_CHI2:
-        return f"does not look like a dot (residual {np.sqrt(fit.chi2_dof):.0f} x noise)"
+        return Reason.MISFIT
     if (fit.contrast > 0.0) != (polarity == "white_on_black"):
-        return DARK_SPECK
+        return Reason.WRONG_SIGN
     if abs(fit.contrast) < _MIN_RELATIVE_CONTRAST * usual_contrast:
-        return FAINT
-    return ""
+        return Reason.FAINT
+    return None

@@ -1,8 +1,9 @@
-"""What goes into the fit of a dot and what comes out of it."""
+"""Inputs and results of the fit of a dot, and the reasons why a blob is no dot."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +11,35 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PARAMETERS = 10  # free ones: the contrast gradient's two are held by their prior
+PARAMETERS = 10
+"""Free parameters of a fit; the two of the contrast gradient are held by their prior."""
+
+
+class Reason(StrEnum):
+    """Why a blob is no dot, in words for the person who looks at the overlay."""
+
+    TOUCHES_BORDER = "touches the image border"
+    TOO_LARGE = "larger than the dots"
+    TOO_SMALL = "smaller than the smallest dot asked for"
+    MUCH_SMALLER = "much smaller than the other dots"
+    MERGED = "merged with its neighbour"
+    NOT_ELLIPSE = "outline is not an ellipse"
+    GLARE = "saturated by glare"
+    HIDDEN = "shows too few pixels of its own"
+    FAINT = "much fainter than the other dots"
+    WRONG_SIGN = "does not look like a dot (contrast has the wrong sign)"
+    FIT_FAILED = "does not look like a dot (fit failed)"
+    MISFIT = "does not look like a dot (residuals far above the noise)"
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What the image's other dots tell about one dot.
+    """Prior knowledge about one dot, from the image's other dots.
 
-    Relative contrast gradient (dC/du)/C, (dC/dv)/C [1/px] and its sigma; with
-    ``tie_to_background`` instead the background's own relative gradient (light falls on both) up
-    to ``sigma_per_px``. The edge's sigma ``edge_px`` up to ``edge_spread_px`` (infinite: unknown).
+    u_per_px, v_per_px : relative contrast gradient (dC/du)/C, (dC/dv)/C, with standard deviation
+    ``sigma_per_px``. tie_to_background : take the background's own relative gradient instead, as
+    the same light falls on both. edge_px : sigma of the blurred edge, with standard deviation
+    ``edge_spread_px`` (infinite where it is unknown).
     """
 
     u_per_px: float = 0.0
@@ -32,7 +52,8 @@ class Prior:
 
 @dataclass(frozen=True)
 class Window:
-    """Pixels that a fit looks at: grey levels (V, U) of a crop, its first pixel, a mask (V, U)."""
+    """Pixels of a fit: grey levels (V, U) of a crop, its first pixel, and a mask (V, U) of those
+    that are used."""
 
     grey: Array
     first_u: int
@@ -42,9 +63,9 @@ class Window:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit begins: centre (2,) and shape (3,) in image px, edge sigma [px].
+    """Start values of a fit: centre (2,) and shape (3,) in image px, edge sigma [px].
 
-    ``previous`` is an earlier fit of the same dot: its levels are then the start too.
+    previous : an earlier fit of the same dot, whose grey levels are then start values too.
     """
 
     centre_px: Array
@@ -57,11 +78,13 @@ class Start:
 class DotFit:
     """One fitted dot.
 
-    ``centre_px`` (2,), ``shape_px`` (3,) (see ``blurred_ellipse``), ``sigma_px`` of the edge,
-    ``levels`` (6,): B0, B1, B2, C, C1, C2 about the window's middle ``origin_px`` (2,) in units of
-    ``radius_px``; ``covariance_px2`` (2, 2) of the centre, ``contrast_sigma`` of C; ``dropped``
-    pixels were outliers; ``edge_residual`` is the residual's RMS over C in the edge's band,
-    ``inner_chi2`` the mean whitened square of the ``inner_pixels`` that the dot covers.
+    centre_px (2,), shape_px (3,) (see ``blurred_ellipse``), sigma_px of the edge.
+    levels : (6,) B0, B1, B2, C, C1, C2 about the window's middle origin_px (2,) in units of
+        radius_px.
+    covariance_px2 : (2, 2) of the centre. contrast_sigma : of C.
+    dropped : number of pixels left out as outliers.
+    edge_residual : RMS residual in the band of the edge over C.
+    inner_chi2 : mean whitened square residual of the inner_pixels that the dot covers.
     """
 
     centre_px: Array
@@ -91,7 +114,7 @@ class DotFit:
         return self.covariance_px2 * (self.chi2_dof if significant else 1.0)
 
     def under_noise(self, factor: float) -> DotFit:
-        """The same fit judged by a noise variance ``factor`` times as large."""
+        """The same fit for a noise variance ``factor`` times as large."""
         return replace(
             self,
             covariance_px2=self.covariance_px2 * factor,
@@ -106,7 +129,7 @@ class DotFit:
 
     @property
     def background(self) -> float:
-        """Background [grey] carried on under the dot's centre."""
+        """Background [grey] extrapolated to the dot's centre."""
         return float(self.levels[:3] @ self._position)
 
     @property

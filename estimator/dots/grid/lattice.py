@@ -23,7 +23,6 @@ from telerig.estimator.dots.grid.local_fit import (
     fit_homography,
     fit_neighbours,
     leave_one_out,
-    nearest,
 )
 
 Array = NDArray[np.float64]
@@ -145,7 +144,7 @@ def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
     """(K, 2) steps between near dots, each up to sign, and how often each occurs (K,)."""
     middle = np.median(flat, axis=0)
     patch = np.argsort(np.sum((flat - middle) ** 2, axis=1))[:_PATCH]
-    _, near = nearest(cKDTree(flat), flat[patch], neighbours + 1)
+    _, near = cKDTree(flat).query(flat[patch], neighbours + 1)
     steps = (flat[near[:, 1:]] - flat[patch][:, None]).reshape(-1, 2)
     steps = np.concatenate([steps, -steps])
     reach = 0.15 * np.linalg.norm(steps, axis=1)
@@ -167,7 +166,7 @@ def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
 def _seeds(flat: Array, basis: Array) -> Iterator[int]:
     """Dots with good neighbours on all sides, best first and well apart."""
     steps = np.concatenate([basis, -basis])
-    miss, _ = nearest(cKDTree(flat), (flat[:, None] + steps).reshape(-1, 2))
+    miss, _ = cKDTree(flat).query((flat[:, None] + steps).reshape(-1, 2))
     pitch = np.linalg.norm(steps, axis=1)
     part = np.minimum(miss.reshape(-1, 4) / pitch, 1.0)
     order = np.argsort(np.sum(part, axis=1), kind="stable")
@@ -227,7 +226,7 @@ class _Growth:
             return np.asarray(wanted)
         expected, basis, _ = fit_neighbours(self.at, self.flat, wanted, self.basis)
         reach = _REACH * np.linalg.norm(basis, axis=2).min(axis=1)
-        miss, dot = nearest(self.tree, expected, 2)
+        miss, dot = self.tree.query(expected, 2)
         free = ~self.placed()[dot] & ~self.banned[dot]
         pick = np.where(free[:, 0], 0, 1)
         rows = np.arange(len(dot))
@@ -293,7 +292,7 @@ def _lattice(growth: _Growth, image_from_flat: Array, shapes_px2: Array) -> Latt
     shape = pitch_from_px @ shapes_px2[index] @ np.swapaxes(pitch_from_px, -1, -2)
     unplaced = np.flatnonzero(~growth.placed())
     reach = np.linalg.norm(basis, axis=2).min(axis=1)
-    miss, next_to = nearest(cKDTree(growth.flat[index]), growth.flat[unplaced])
+    miss, next_to = cKDTree(growth.flat[index]).query(growth.flat[unplaced])
     second = miss < _REACH * reach[next_to]
     reasons = np.where(second, SECOND_DOT, NOT_ON_GRID)
     reasons = np.where(growth.banned[unplaced] & ~second, OFF_PLACE, reasons)

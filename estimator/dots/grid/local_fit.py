@@ -1,10 +1,9 @@
-"""Affine fits to the neighbours of a lattice place, homographies, nearest points."""
+"""Affine fits to the neighbours of a lattice place, and homographies."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -15,7 +14,7 @@ NEIGHBOURS: Ints = np.array(
 """(24, 2) steps to the places of the 5 x 5 window."""
 
 _HOLD = 0.05
-"""Weight of the neighbours' own pitch vectors, which decide where the places are in one line."""
+"""Weight of the neighbours' own pitch vectors, which decide where all places lie in one line."""
 
 
 def fit_neighbours(
@@ -24,8 +23,9 @@ def fit_neighbours(
     """Weighted affine fit of the values at the occupied places round each of (C, 2) places.
 
     at : dot at each place or -1; values : (N, 2) per dot; basis : (N, 2, 2) pitch vectors per dot,
-    to which the fit is held weakly. Returns the value at the place (C, 2), the pitch vectors
-    (C, 2, 2) and the variance factor of the value for unit noise per dot (C,).
+    towards which the fit is pulled weakly. itself : use the place's own dot too. Returns the value
+    at the place (C, 2), the pitch vectors (C, 2, 2) and the variance of the value for dots of unit
+    variance (C,).
     """
     steps = np.concatenate([NEIGHBOURS, [[0, 0]]]) if itself else NEIGHBOURS
     dots = at[places[:, :1] + steps[:, 0], places[:, 1:] + steps[:, 1]]
@@ -46,32 +46,20 @@ def fit_neighbours(
 
 
 def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
-    """(C,) distance of each place's residual from what its neighbours' say, per unit noise."""
+    """(C,) distance of each place's residual from its prediction by the neighbours' residuals, in
+    units of a dot's standard deviation if that is 1."""
     flat = np.zeros((len(residuals), 2, 2))
     expected, _, spread = fit_neighbours(at, residuals, places, flat)
     own = residuals[at[tuple(places.T)]]
     return np.asarray(np.linalg.norm(own - expected, axis=1) / np.sqrt(1 + spread))
 
 
-def nearest(tree: cKDTree, points: Array, count: int = 1) -> tuple[Array, Ints]:
-    """Distances and positions of the ``count`` nearest; (...,) for one, (..., count) for more."""
-    distance, index = tree.query(points, count)
-    return np.asarray(distance, float), np.asarray(index, np.int64)
-
-
 def fit_homography(source: ArrayLike, target: ArrayLike) -> Array:
-    """(3, 3) homography, target ~ H source, of (N, 2) pairs; normalised DLT.
+    """(3, 3) homography, target ~ H source, of (N, 2) pairs; affine where that is all they tell."""
+    import cv2
 
-    Hartley & Zisserman, Multiple View Geometry, algorithm 4.2.
-    """
-    a, ta = _normalised(np.asarray(source, float))
-    b, tb = _normalised(np.asarray(target, float))
-    one, zero = np.column_stack([a, np.ones(len(a))]), np.zeros((len(a), 3))
-    rows_u = np.hstack([one, zero, -b[:, :1] * one])
-    rows_v = np.hstack([zero, one, -b[:, 1:] * one])
-    design = np.concatenate([rows_u, rows_v])
-    _, vectors = np.linalg.eigh(design.T @ design)
-    return np.asarray(np.linalg.inv(tb) @ vectors[:, 0].reshape(3, 3) @ ta)
+    homography, _ = cv2.findHomography(np.asarray(source, float), np.asarray(target, float))
+    return fit_affine(source, target) if homography is None else np.asarray(homography)
 
 
 def apply_homography(homography: Array, points: ArrayLike) -> Array:
@@ -87,12 +75,3 @@ def fit_affine(source: ArrayLike, target: ArrayLike) -> Array:
     a, b = np.asarray(source, float), np.asarray(target, float)
     solved, *_ = np.linalg.lstsq(np.column_stack([a, np.ones(len(a))]), b, rcond=None)
     return np.vstack([solved.T, [0.0, 0.0, 1.0]])
-
-
-def _normalised(points: Array) -> tuple[Array, Array]:
-    centre = points.mean(0)
-    scale = np.sqrt(2) / max(float(np.sqrt(np.mean(np.sum((points - centre) ** 2, 1)))), 1e-300)
-    transform = np.array(
-        [[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1.0]]
-    )
-    return (points - centre) * scale, transform

@@ -1,7 +1,7 @@
-"""Which places of a lattice carry a mark: evidence as log-likelihoods, not verdicts.
+"""Which places of a lattice carry a mark, as bounded log-likelihoods rather than decisions.
 
-One mark that is missed, or one dot that only looks like a mark, must cost a numbering something
-but not decide it, so every place gets a bounded gain for being a mark.
+One mark that is missed, or one dot that only looks like a mark, must make a numbering less likely
+but not impossible. So the log-likelihood ratio of each place is bounded on both sides.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ LOG_UNSURE_GAP = -0.7
 
 @dataclass(frozen=True)
 class MarkEvidence:
-    """Evidence for marks over the places of a lattice.
+    """Evidence for marks at the places of a lattice.
 
-    gain : (H, W) log-likelihood gained if the place is a mark; place (i, j) is gain[i + 1, j + 1].
+    gain : (H, W) log-likelihood ratio of mark to plain dot; place (i, j) is gain[i + 1, j + 1].
     seen : (K, 2) places that look like marks.
     """
 
@@ -42,15 +42,11 @@ class MarkEvidence:
     seen: Ints
 
     def at(self, places: Ints) -> Array:
-        """(...,) gain at (..., 2) places; a mark outside the lattice is unseen."""
+        """(...,) log-likelihood ratio at (..., 2) places; marks outside the lattice are unseen."""
         shifted = places + 1
         inside = np.all((shifted >= 0) & (shifted < self.gain.shape), axis=-1)
         clipped = np.clip(shifted, 0, np.array(self.gain.shape) - 1)
         return np.where(inside, self.gain[clipped[..., 0], clipped[..., 1]], LOG_UNSEEN_MARK)
-
-    def is_shown(self, places: Ints) -> Bools:
-        """(...,) whether the image can tell if each of the (..., 2) places is a mark."""
-        return np.asarray(self.at(places) != LOG_UNSEEN_MARK)
 
     def is_seen(self, places: Ints) -> Bools:
         """(...,) whether each of the (..., 2) places looks like a mark."""
@@ -83,7 +79,10 @@ def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
 
 
 def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidence:
-    """Evidence of all places of the lattice and one place round it."""
+    """Evidence at all places of the lattice and of a border one place wide.
+
+    rings : (n,) whether the image shows a ring.
+    """
     shape = lattice.places.max(0) + 3
     occupied = np.zeros(shape, bool)
     occupied[tuple((lattice.places + 1).T)] = True
@@ -101,7 +100,7 @@ def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidenc
 
 
 def mark_gain(likeness: Array) -> Array:
-    """(n,) log-likelihood gained when dots that look like marks so much are marks."""
+    """(n,) log-likelihood ratio of mark to plain dot, from the likeness of `mark_likeness` (n,)."""
     missed, false = np.exp(LOG_MISSED_MARK), np.exp(LOG_FALSE_MARK)
     as_mark = np.log(likeness * (1 - missed) + (1 - likeness) * missed)
     as_plain = np.log(likeness * false + (1 - likeness) * (1 - false))
@@ -120,8 +119,8 @@ def _gaps(occupied: Bools, bounded: bool) -> Bools:
 
 
 def _count_around(places: Bools) -> Ints:
-    """(H, W) how many of the eight neighbours are set; the outermost places are never set."""
-    count = np.zeros(places.shape, np.int64)
-    for i, j in ((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)):
-        count += np.roll(places, (i, j), (0, 1))
-    return count
+    """(H, W) how many of the eight neighbours are set."""
+    from scipy.ndimage import convolve
+
+    ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+    return np.asarray(convolve(places.astype(np.int64), ring, mode="constant"))

@@ -1,4 +1,4 @@
-"""Every way to lay a target's grid onto a lattice, scored by what the image shows."""
+"""The placements of a target's grid on a lattice, ranked by their log-likelihood in the image."""
 
 from __future__ import annotations
 
@@ -10,27 +10,26 @@ from numpy.typing import NDArray
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.grid.lattice import Lattice
 from telerig.estimator.dots.grid.marks import MarkEvidence
-from telerig.rig.target import Target
+from telerig.rig.target import QUARTER_TURNS, Target
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LOG_DOT_OUTSIDE = -6.0
-"""A dot on the lattice where the target has none."""
+"""Log-likelihood of a dot on the lattice where the target has none."""
 MARGIN = 4.0
-"""Candidates within this log-likelihood of the best are equally good."""
+"""Placements within this log-likelihood of the best are taken as equally good."""
 MAX_TIED = 64
 
 _MIN_ASPECT_SIGMA = 0.03
-_TURN = np.array([[0, -1], [1, 0]])
-_TURNS = [np.linalg.matrix_power(_TURN, k) for k in range(4)]
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """K ways to number a lattice, best first: (column, row) = turn @ place - shift.
+class Placements:
+    """K placements of the grid on a lattice, best first: (column, row) = turn @ place - shift.
 
-    turn : (K, 2, 2), det -1 where the image is mirrored; shift : (K, 2); score : (K,) nats.
+    turn : (K, 2, 2), det -1 where the image is mirrored; shift : (K, 2); score : (K,)
+    log-likelihoods.
     """
 
     turn: Ints
@@ -38,57 +37,48 @@ class Candidates:
     score: Array
 
     def columns_rows(self, places: Ints) -> Ints:
-        """(K, n, 2) column and row of (n, 2) places under each candidate."""
+        """(K, n, 2) column and row of (n, 2) places of the lattice."""
         turned = np.einsum("kab,nb->kna", self.turn, places)
         return np.asarray(turned - self.shift[:, None])
 
     def places(self, columns_rows: Ints) -> Ints:
-        """(K, m, 2) places of (m, 2) columns and rows: the inverse."""
+        """(K, m, 2) places of (m, 2) columns and rows: the inverse of `columns_rows`."""
         shifted = columns_rows + self.shift[:, None]
         return np.asarray(np.einsum("kba,knb->kna", self.turn, shifted))
 
-    def take(self, which: Ints) -> Candidates:
-        return Candidates(self.turn[which], self.shift[which], self.score[which])
+    def take(self, which: Ints) -> Placements:
+        return Placements(self.turn[which], self.shift[which], self.score[which])
 
 
-def mark_points(target: Target) -> Ints:
-    """(M, 2) column and row of each mark."""
-    return np.array(target.marks, np.int64).reshape(-1, 2)[:, ::-1]
+def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: Target) -> Placements:
+    """All placements within `MARGIN` of the best, best first (unmirrored before mirrored).
 
+    Mirrored images are considered where the target's marks tell them apart.
 
-def rank_candidates(
-    lattice: Lattice, evidence: MarkEvidence, target: Target, handedness: tuple[int, ...]
-) -> Candidates:
-    """All candidates within `MARGIN` of the best, best first (unmirrored before mirrored).
-
-    Raises DetectionError when nothing fits or too many fit, InputError when an unbounded grid has
-    no marks.
+    Raises DetectionError when the image shows none of the marks that an unbounded grid needs,
+    InputError when an unbounded grid has no marks.
     """
-    turns = [t * [[h], [1]] if h < 0 else t for h in sorted(handedness)[::-1] for t in _TURNS]
+    hands = (1, -1) if target.mirror_images_differ() else (1,)
+    turns = [turn * np.array([[hand], [1]]) for hand in hands for turn in QUARTER_TURNS]
     aspect = _aspect_score(lattice, target)
     parts = []
     for turn in turns:
         shifts, score = _shifts(lattice, evidence, target, turn)
         score = score + aspect[int(turn[0, 0] == 0)]
         parts.append((np.broadcast_to(turn, (len(shifts), 2, 2)), shifts, score))
-    every = Candidates(*(np.concatenate(p) for p in zip(*parts)))
-    _check_marks_seen(len(every.score), evidence, target)
+    every = Placements(*(np.concatenate(p) for p in zip(*parts)))
+    if not len(every.score):
+        raise DetectionError(
+            f"none of the target's {len(target.marks)} marks was found",
+            todo="an unbounded grid is numbered from its marks: keep them in view, and check "
+            "[target] marks, mark_style and mark_diameter_mm in rig.toml",
+        )
     order = np.argsort(-np.round(every.score, 6), kind="stable")
     return every.take(order[every.score[order] >= every.score[order[0]] - MARGIN])
 
 
-def _check_marks_seen(count: int, evidence: MarkEvidence, target: Target) -> None:
-    if count:
-        return
-    raise DetectionError(
-        f"none of the target's {len(target.marks)} marks was found",
-        todo="an unbounded grid is numbered from its marks: keep them in view, and check "
-        "[target] marks, mark_style and mark_diameter_mm",
-    )
-
-
 def _aspect_score(lattice: Lattice, target: Target) -> tuple[float, float]:
-    """Log-likelihood that the first lattice axis runs along x, and along y, by the dots' shapes."""
+    """Log-likelihoods, from the dots' shapes, that the lattice's first axis is x and is y."""
     logs = 0.5 * np.log(lattice.shape[:, 1, 1] / lattice.shape[:, 0, 0])
     middle = float(np.median(logs))
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
@@ -105,7 +95,7 @@ def _shifts(
         shifts, score = _bounded_shifts(lattice.places @ turn.T, target)
     elif target.marks:
         seen = evidence.seen @ turn.T
-        shifts = np.unique((seen[:, None] - mark_points(target)).reshape(-1, 2), axis=0)
+        shifts = np.unique((seen[:, None] - target.marks_column_row()).reshape(-1, 2), axis=0)
         score = np.zeros(len(shifts))
     else:
         raise InputError(
@@ -114,12 +104,12 @@ def _shifts(
             todo="state marks, or extent = 'bounded'",
         )
     if target.marks:
-        score = score + evidence.at((mark_points(target) + shifts[:, None]) @ turn).sum(1)
+        score = score + evidence.at((target.marks_column_row() + shifts[:, None]) @ turn).sum(1)
     return shifts, score
 
 
 def _bounded_shifts(turned: Ints, target: Target) -> tuple[Ints, Array]:
-    """Shifts that keep most dots within rows x columns, and the cost of those left outside."""
+    """(S, 2) shifts that keep most dots within rows x columns, and their log-likelihoods (S,)."""
     size = np.array([target.columns, target.rows])
     low = turned.min(0) - size + 1
     span = turned.max(0) - low + size
@@ -133,45 +123,16 @@ def _bounded_shifts(turned: Ints, target: Target) -> tuple[Ints, Array]:
     return near + low, LOG_DOT_OUTSIDE * outside[tuple(near.T)]
 
 
-def mirror_images_differ(target: Target) -> bool:
-    """Whether the target's marks tell it from its mirror image."""
-    return bool(target.marks) and not any(
-        _unchanged_by(target, turn * [[-1], [1]]) for turn in _TURNS
-    )
-
-
-def _unchanged_by(target: Target, turn: Ints) -> bool:
-    marks = mark_points(target)
-    if turn[0, 0] == 0 and not np.isclose(*target.pitch_mm):
+def related_by_symmetry(placements: Placements, target: Target) -> bool:
+    """Whether the placements differ only by rotations that leave the target unchanged."""
+    hands = np.linalg.det(placements.turn)
+    if np.any(hands != hands[0]):
         return False
-    if target.bounded:
-        if turn[0, 0] == 0 and target.rows != target.columns:
-            return False
-        centre2 = np.array([target.columns - 1, target.rows - 1])
-        moved2 = (2 * marks - centre2) @ turn.T + centre2
-    else:
-        moved2 = 2 * (marks @ turn.T)
-        moved2 = moved2 + 2 * (marks.min(0) - (marks @ turn.T).min(0))
-    return _as_set(moved2) == _as_set(2 * marks)
-
-
-def related_by_symmetry(candidates: Candidates, target: Target) -> bool:
-    """Whether the candidates differ only by rotations that leave the target unchanged."""
-    marks = mark_points(target)
+    marks = target.marks_column_row()
     corners = np.array([[0, 0], [target.columns - 1, target.rows - 1]])
-    fixed = _as_set(marks)
-    seen = candidates.take(np.array([0])).places(np.concatenate([marks, corners]))[0]
-    moved = candidates.columns_rows(seen)
-    if np.any(np.linalg.det(candidates.turn) != np.linalg.det(candidates.turn[0])):
+    seen = placements.places(np.concatenate([marks, corners]))[0]
+    moved = placements.columns_rows(seen)
+    if target.bounded and np.any(np.sort(moved[:, len(marks) :], axis=1) != corners):
         return False
-    for one in moved:
-        ends = np.sort(one[len(marks) :], axis=0)
-        if target.bounded and not np.array_equal(ends, corners):
-            return False
-        if _as_set(one[: len(marks)]) != fixed:
-            return False
-    return True
-
-
-def _as_set(points: Ints) -> set[tuple[int, ...]]:
-    return {tuple(p) for p in points.tolist()}
+    wanted = {*map(tuple, marks.tolist())}
+    return all({*map(tuple, one[: len(marks)].tolist())} == wanted for one in moved)

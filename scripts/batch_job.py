@@ -19,13 +19,14 @@ from telerig.estimator.batch.jobs import Job
 from telerig.estimator.batch.work import FAILED, do_job, failure
 from telerig.io.files.atomic import plain
 
-_PATIENCE_S = 10.0
+_END_WITHIN_S = 10.0
 
 
 def main() -> None:
     """Do the job that is asked for. What other code prints goes to standard error.
 
-    A batch begun in the background of a shell hands down that Ctrl-C is ignored: heard here again.
+    A batch that a shell runs in the background ignores Ctrl-C, and so would this process, which
+    inherits that; `stop_all` needs it to react, so the handler is set again.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     answer = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -41,10 +42,10 @@ def main() -> None:
 
 
 def _end_with_parent() -> None:
-    """Nobody waits for the result any more: tidy up as after Ctrl-C, and if that hangs, leave."""
+    """End when the asking process has ended: as after Ctrl-C, or at once if that takes too long."""
     os.read(0, 1)
     _thread.interrupt_main()
-    time.sleep(_PATIENCE_S)
+    time.sleep(_END_WITHIN_S)
     os._exit(130)
 
 

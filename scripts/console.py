@@ -1,4 +1,4 @@
-"""What all commands share: errors in words, progress, exit codes."""
+"""What all commands share: messages for errors, progress, exit codes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
-from typing import Any, Literal
+from typing import Any
 
 import typer
 
-from telerig.errors import InputError, TelerigError
+from telerig.errors import TelerigError
 
 EXIT_REJECTED = 1
 EXIT_BAD_INPUT = 2
@@ -29,20 +30,17 @@ def say(text: str) -> None:
     typer.echo(text)
 
 
-def checked_source(source: str | None) -> Literal["images", "dots"] | None:
-    """The value of ``--from``; raises InputError for another word."""
-    if source is None:
-        return None
-    if source == "images":
-        return "images"
-    if source == "dots":
-        return "dots"
-    raise InputError(f"--from {source}", todo="use --from images or --from dots")
+def say_written(folder: Path, report: bool) -> None:
+    """Where the results are, or their report if there is one."""
+    say(f"written: {folder}" + ("/report.html" if report else ""))
 
 
 @contextmanager
 def errors_in_words() -> Iterator[None]:
-    """Turn telerig's errors, Ctrl-C and our own faults into a message and an exit code."""
+    """Turn telerig's errors, Ctrl-C and faults of telerig into a message and an exit code.
+
+    Every command has it as a decorator.
+    """
     try:
         yield
     except TelerigError as error:
@@ -58,25 +56,25 @@ def errors_in_words() -> Iterator[None]:
             raise
         typer.echo(
             f"telerig: this is a fault of telerig, not of your data: {error!r:.500}\n"
-            "  -> run again with TELERIG_DEBUG=1 and report what it prints",
+            "  -> run the command again with TELERIG_DEBUG=1 and report what it prints",
             err=True,
         )
         raise typer.Exit(EXIT_FAULT) from error
     except KeyboardInterrupt:
-        typer.echo("telerig: interrupted; nothing was half-written", err=True)
+        typer.echo("telerig: interrupted; no file is half-written", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 def _leave_closed_pipe() -> None:
-    """Let the interpreter flush into nothing at its end, instead of complaining once more."""
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, sys.stdout.fileno())
-    os.close(nothing)
+    """Redirect standard output to nowhere: flushing it at the end must raise no second error."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)
 
 
 @contextmanager
 def stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set, so that what runs can be ended in order."""
+    """An event that Ctrl-C and SIGTERM set, so that the work can end in an orderly way."""
     stop = threading.Event()
 
     def asked(_: int, __: FrameType | None) -> None:
@@ -95,7 +93,7 @@ def stopped_by_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """A callback (what, done, of): a rich bar on a terminal, plain lines elsewhere."""
+    """A callback (what, done, of): a progress bar on a terminal, plain lines elsewhere."""
     if quiet:
         yield lambda *_: None
     elif sys.stderr.isatty():

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from telerig.scripts import options
 from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, say
 
 if TYPE_CHECKING:
@@ -17,52 +18,47 @@ if TYPE_CHECKING:
     from telerig.io.simulation.run.presets import RunConfig
 
 
+@errors_in_words()
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder to create; must be new or empty.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder to create; it must be new or empty.")] = Path(
         "telerig-demo"
     ),
     seed: Annotated[int, typer.Option(help="Seed of the simulated rig and its noise.")] = 0,
-    quiet: Annotated[bool, typer.Option(help="No progress.")] = False,
+    quiet: options.Quiet = False,
 ) -> None:
-    """Simulate a rig with images, calibrate, track a bubble, take out the shake, compare.
+    """Simulate a rig with images, calibrate it, track a bubble, remove the shake, compare.
 
-    Writes the dataset and its reports into the folder; exit code 1 when an estimate disagrees
-    with the truth by more than its own standard deviations allow.
+    Writes the dataset and its reports into the folder.
+
+    Exit code 0: all estimates agree with the truth. 1: an estimate differs from the truth by more
+    than its own standard deviations allow.
     """
-    with errors_in_words():
-        import numpy as np
+    import numpy as np
 
-        from telerig.estimator.calibration.calibrate import run_calibration
-        from telerig.estimator.calibration.quality.truth import compare_with_truth
-        from telerig.estimator.calibration.results_folder import write_results
-        from telerig.io.simulation.simulate import simulate
+    from telerig.estimator.calibration.calibrate import run_calibration
+    from telerig.estimator.calibration.quality.truth import compare_with_truth
+    from telerig.estimator.calibration.results_folder import write_results
+    from telerig.io.simulation.simulate import simulate
 
-        say("simulating two telecentric cameras of 512 x 512 px: 12 views of a hand-held target,")
-        say("and a bubble of 5 mm that zigzags upwards, followed by the vibrating rig")
-        begun = time.perf_counter()
-        data = simulate(_config(), rng=np.random.default_rng(seed), out=out)
-        simulated = time.perf_counter()
-        options = {"seed": seed}
-        with progress(quiet) as stage:
-            run = run_calibration(data, seed=seed, stage=stage, pictures=True)
-        seconds = {
-            "simulate": simulated - begun,
-            "calibrate": time.perf_counter() - simulated,
-        }
-        folder = data.results / "calibration"
-        page = write_results(data, run, folder, command="demo", options=options, seconds=seconds)
-        say(run.calibration.report())
-        comparison = compare_with_truth(run.calibration, data.truth or {})
-        say("")
-        say(comparison.table)
-        say(comparison.verdict)
-        say(f"report: {page}")
-        say("")
-        tracked = track_and_compare(data, run.calibration, options, quiet)
-        say("")
-        smoothed = smooth_and_compare(data, run.calibration, quiet)
-        if not (comparison.passed and tracked and smoothed):
-            raise typer.Exit(EXIT_REJECTED)
+    say("simulating two telecentric cameras of 512 x 512 px: 12 views of a hand-held target,")
+    say("and a bubble of 5 mm that zigzags upwards, followed by the vibrating rig")
+    begun = time.perf_counter()
+    data = simulate(_config(), rng=np.random.default_rng(seed), out=out)
+    simulated = time.perf_counter()
+    with progress(quiet) as stage:
+        run = run_calibration(data, seed=seed, stage=stage, pictures=True)
+    seconds = {"simulate": simulated - begun, "calibrate": time.perf_counter() - simulated}
+    folder = data.results / "calibration"
+    record = {"seed": seed}
+    page = write_results(data, run, folder, command="demo", options=record, seconds=seconds)
+    say(run.calibration.report())
+    comparison = compare_with_truth(run.calibration, data.truth or {})
+    say(f"\n{comparison.table}\n{comparison.verdict}\nreport: {page}\n")
+    tracked = track_and_compare(data, run.calibration, record, quiet)
+    say("")
+    smoothed = smooth_and_compare(data, run.calibration, quiet)
+    if not (comparison.passed and tracked and smoothed):
+        raise typer.Exit(EXIT_REJECTED)
 
 
 def _config() -> RunConfig:
@@ -74,7 +70,7 @@ def _config() -> RunConfig:
 
 
 def track_and_compare(
-    data: Dataset, calibration: Calibration, options: dict[str, int], quiet: bool
+    data: Dataset, calibration: Calibration, record: dict[str, int], quiet: bool
 ) -> bool:
     """Track the only run of a simulated dataset; whether the bubble was followed throughout."""
     import pandas as pd
@@ -88,11 +84,10 @@ def track_and_compare(
     begun = time.perf_counter()
     (name,) = data.runs
     folder = data.results / name
-    record = {"command": "demo", "options": options}
     with progress(quiet) as stage:
         summary = write_tracking(
-            data.runs[name].load(), calibration, folder, options=TrackOptions(), record=record,
-            stage=stage,
+            data.runs[name].load(), calibration, folder, options=TrackOptions(),
+            record={"command": "demo", "options": record}, stage=stage,
         )  # fmt: skip
     say(tracking_words(summary, time.perf_counter() - begun))
     truth = pd.read_csv(data.path / "truth" / "runs" / name / "bubbles.csv")
@@ -100,8 +95,8 @@ def track_and_compare(
     passed = score.recall == 1 and score.precision == 1 and score.tracks == 1
     say(
         f"{score.right} of {score.in_view} true positions found, {score.wrong} wrong ones, "
-        f"{score.tracks} track; its centre of volume is seen {score.corrected_px:.2f} px RMS from "
-        f"the truth ({score.centre_px:.2f} px for the outlines' centres)"
+        f"{score.tracks} track; the RMS error of its centre of volume in the images is "
+        f"{score.corrected_px:.2f} px ({score.centre_px:.2f} px for the centres of the outlines)"
     )
     say("PASSED: the bubble was followed throughout" if passed else "FAILED: see the report")
     say(f"report: {folder / 'report.html'}")
@@ -109,7 +104,7 @@ def track_and_compare(
 
 
 def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> bool:
-    """Smooth with and without the accelerometers; whether they bring the path near the truth."""
+    """Smooth without and with the accelerometers; whether the path with them is near the truth."""
     import pandas as pd
 
     from telerig.estimator.smoothing.results_folder import smooth_run
@@ -133,7 +128,7 @@ def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> 
         rows.append((words, motion_error(found.trajectories, truth), found.verdict.get("verdict")))
     naive = motion_error(found.trajectories, truth, "naive_")
     say("")
-    say("path and velocity against the truth     um RMS  (predicted)   mm/s RMS  (predicted)")
+    say("RMS error against the truth                 µm  (predicted)       mm/s  (predicted)")
     say(
         f"{'triangulate and add the encoder':38}{naive.position_um:8.1f}{naive.velocity_mm_s:24.2f}"
     )
@@ -144,7 +139,7 @@ def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> 
         )
     best = rows[-1][1]
     passed = best.position_um < 0.6 * naive.position_um and best.position_um < 2 * best.predicted_um
-    say("PASSED: the shake is taken out" if passed else "FAILED: see the report")
+    say("PASSED: the shake is removed" if passed else "FAILED: see the report")
     say(f"report: {folder / 'report.html'}")
     return passed
 

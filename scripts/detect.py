@@ -2,44 +2,40 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
+from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, say
 
 
+@errors_in_words()
 def detect(
-    dataset: Annotated[Path, typer.Argument(help="Dataset folder with rig.toml and calibration/.")],
-    out: Annotated[
-        Path | None, typer.Option(help="Results folder [DATASET/results/calibration].")
-    ] = None,
-    quiet: Annotated[bool, typer.Option(help="No progress.")] = False,
+    dataset: options.Dataset, out: options.CalibrationFolder = None, quiet: options.Quiet = False
 ) -> None:
-    """Find and number the target's dots in every calibration image.
+    """Find and number the dots of the target in every calibration image.
 
-    Writes dots.csv (every numbered dot with its covariance and chi-square), rejected.csv (every
-    dot-like thing that was left out, with the reason) and overlays/<camera>/<view>.jpg.
+    Writes dots.csv (every numbered dot with its covariance and chi-square), rejected.csv (what
+    looked like a dot and was rejected, with the reason) and overlays/CAMERA/VIEW.jpg.
+
+    Exit code 0: done. 2: the input cannot be used. 130: interrupted.
     """
-    with errors_in_words():
-        from telerig.estimator.calibration.results_folder import write_detections
-        from telerig.estimator.dots.dataset_dots import detect_dataset
-        from telerig.io.dataset.dataset import load_dataset
-        from telerig.io.dataset.tables import write_table
-        from telerig.io.files.atomic import atomic_folder
+    from telerig.estimator.calibration.results_folder import write_detections
+    from telerig.estimator.dots.dataset_dots import detect_dataset
+    from telerig.io.dataset.dataset import load_dataset
+    from telerig.io.files.atomic import atomic_folder
+    from telerig.io.files.csv_table import write_table
 
-        data = load_dataset(dataset, source="images")
-        with progress(quiet) as stage:
-            found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
-        folder = out or data.results / "calibration"
-        with atomic_folder(folder) as staged:
-            write_table(found.dots, staged / "dots.csv")
-            write_detections(found, staged)
-        for image in found.images:
-            words = image.failure or f"{len(image.dots)} dots, {len(image.rejected)} rejected"
-            say(f"view {image.view}, camera {image.camera}: {words}")
-        say(f"written: {folder}/dots.csv, rejected.csv, overlays/")
+    data = load_dataset(dataset, source="images")
+    with progress(quiet) as stage:
+        found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
+    folder = out or data.results / "calibration"
+    with atomic_folder(folder) as staged:
+        write_table(found.dots, staged / "dots.csv")
+        write_detections(found, staged)
+    for image in found.images:
+        result = image.failure or f"{len(image.dots)} dots, {len(image.rejected)} rejected"
+        say(f"view {image.view}, camera {image.camera}: {result}")
+    say(f"written: {folder}/dots.csv, rejected.csv, overlays/")
 
 
 if __name__ == "__main__":

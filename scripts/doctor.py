@@ -11,36 +11,35 @@ import typer
 
 from telerig.scripts.console import EXIT_REJECTED, errors_in_words, say
 
-_SIGNS = {"ok": "ok      ", "note": "note    ", "warning": "WARNING ", "failure": "FAILURE "}
+_SIGNS = {"ok": "ok", "note": "note", "warning": "WARNING", "failure": "FAILURE"}
+_WIDTH = 8
 
 
+@errors_in_words()
 def doctor(
-    dataset: Annotated[
-        Path | None, typer.Argument(help="Dataset folder to look at as well.")
-    ] = None,
+    dataset: Annotated[Path | None, typer.Argument(help="Dataset folder to check as well.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for other programs.")] = False,
 ) -> None:
     """Check the installation, the serial ports, and a dataset if one is given.
 
-    Exit code 0: nothing stands in the way, though there may be warnings. 1: something does.
+    Exit code 0: nothing prevents the work, though there may be warnings. 1: there is a failure.
     """
-    with errors_in_words():
-        from telerig.estimator.doctor.dataset import check_dataset
-        from telerig.estimator.doctor.installation import check_installation, check_ports
+    from telerig.estimator.doctor.dataset import check_dataset
+    from telerig.estimator.doctor.installation import check_installation, check_ports
 
-        checks = [*check_installation(), *check_ports()]
-        if dataset is not None:
-            checks += check_dataset(dataset)
-        if as_json:
-            say(json.dumps([asdict(check) for check in checks], indent=1, ensure_ascii=False))
-        else:
-            width = max(len(check.what) for check in checks)
-            for check in checks:
-                say(f"{_SIGNS[check.status]}{check.what:<{width}}  {check.words}")
-                if check.todo:
-                    say(f"{'':{width + 10}}-> {check.todo}")
-        if any(check.status == "failure" for check in checks):
-            raise typer.Exit(EXIT_REJECTED)
+    checks = [*check_installation(), *check_ports()]
+    if dataset is not None:
+        checks += check_dataset(dataset)
+    if as_json:
+        say(json.dumps([asdict(check) for check in checks], indent=1, ensure_ascii=False))
+    else:
+        width = max(len(check.what) for check in checks)
+        for check in checks:
+            say(f"{_SIGNS[check.status]:<{_WIDTH}}{check.what:<{width}}  {check.words}")
+            if check.todo:
+                say(f"{'':{_WIDTH + width + 2}}-> {check.todo}")
+    if any(check.status == "failure" for check in checks):
+        raise typer.Exit(EXIT_REJECTED)
 
 
 if __name__ == "__main__":

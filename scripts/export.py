@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from telerig.errors import InputError
+from telerig.io.exchange.formats import CAMERA_EXPORTS, RUN_EXPORTS, described
+from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from telerig.io.exchange.export.volume import Volume
     from telerig.rig.camera import Camera
 
+_TRAJECTORIES = ("trajectories.csv", "tracks.csv")
+_RESULTS = (*_TRAJECTORIES, "calibration.json")
 
+
+@errors_in_words()
 def export(
     source: Annotated[
         Path,
@@ -28,7 +33,8 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="Cameras: halcon, opencv, soloff. Trajectories: hdf5, netcdf, mat, trackpy."
+            help=f"Format of the cameras: {described(CAMERA_EXPORTS)}; or of the trajectories of a "
+            f"run: {described(RUN_EXPORTS)}."
         ),
     ],
     run: Annotated[
@@ -40,7 +46,7 @@ def export(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="File to write; a folder for halcon and soloff [DATASET/results/export]."
+            help="File to write, or the folder for halcon and soloff [DATASET/results/export]."
         ),
     ] = None,
     volume: Annotated[
@@ -50,10 +56,13 @@ def export(
         ),
     ] = None,
     full_cubic: Annotated[
-        bool, typer.Option("--full-cubic", help="soloff: add the term z^3 (20 terms).")
+        bool, typer.Option("--full-cubic", help="For soloff: add the term z^3, 20 terms in all.")
     ] = False,
     first_pixel: Annotated[
-        float, typer.Option(help="soloff: coordinate of the first pixel's centre; MATLAB: 1.")
+        float,
+        typer.Option(
+            help="For soloff: coordinate of the centre of the first pixel; MATLAB counts from 1."
+        ),
     ] = 0.0,
 ) -> None:
     """Write a calibration or a run for HALCON, OpenCV, PIV programs, MATLAB, Python, NetCDF tools.
@@ -61,55 +70,33 @@ def export(
     Prints how far the exported cameras are from the calibrated ones over the working volume.
     docs/exports.md says what each format holds.
 
-    Exit code 0: written. 2: the input cannot be used, with what, where and what to do.
+    Exit code 0: written. 2: the input cannot be used; the message says what, where and what to do.
     """
-    with errors_in_words():
-        polynomial = {"full_cubic": full_cubic, "first_pixel": first_pixel}
-        for line in _export(source, to, run, calibration, out, volume_from(volume), polynomial):
-            say(line)
-
-
-_TRAJECTORIES = ("trajectories.csv", "tracks.csv")
-_RESULTS = (*_TRAJECTORIES, "calibration.json")
-
-
-def _export(
-    source: Path,
-    to: str,
-    run: str | None,
-    calibration: Path | None,
-    out: Path | None,
-    volume: Volume | None,
-    polynomial: dict[str, Any],
-) -> list[str]:
     from telerig.io.exchange.export.run_results import read_results
-    from telerig.io.exchange.export.write import (
-        CAMERA_FORMATS,
-        RUN_FORMATS,
-        SUFFIXES,
-        export_cameras,
-        export_run,
-    )
+    from telerig.io.exchange.export.volume import volume_of
+    from telerig.io.exchange.formats import export_cameras, export_run
 
-    if to not in CAMERA_FORMATS + RUN_FORMATS:
-        known = ", ".join(CAMERA_FORMATS + RUN_FORMATS)
-        raise InputError(f"--to {to}", todo=f"use one of: {known}")
+    box = None
+    if volume is not None:
+        todo = "give six numbers: x,x,y,y,z,z in mm"
+        bounds = options.numbers_of("--volume", volume, 6, ",", todo)
+        box = volume_of([bounds[0:2], bounds[2:4], bounds[4:6]])
+    known = CAMERA_EXPORTS | RUN_EXPORTS
+    if to not in known:
+        raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
     folder = results_root(source) / "export"
-    cameras = cameras_of(source, calibration, required=to in CAMERA_FORMATS)
-    if to in CAMERA_FORMATS:
-        place = out or folder / f"{to}{SUFFIXES.get(to, '')}"
-        words = export_cameras(cameras, to, place, volume=volume, **polynomial)
-        behind = [c.name for c in cameras if c.wall is not None]
-        if behind and to != "halcon":
-            words.append(
-                f"for points in the water: what the walls of {', '.join(behind)} do is fitted with "
-                "the rest"
-            )
+    cameras = cameras_of(source, calibration, required=to in CAMERA_EXPORTS)
+    if to in CAMERA_EXPORTS:
+        place = out or folder / f"{to}{known[to].suffix}"
+        lines = export_cameras(
+            cameras, to, place, volume=box, full_cubic=full_cubic, first_pixel=first_pixel
+        )
     else:
         results = read_results(run_folder(source, run))
-        place = out or folder / f"{results.name}{SUFFIXES[to]}"
-        words = export_run(results, to, place, cameras)
-    return [*words, f"written: {place}"]
+        place = out or folder / f"{results.name}{known[to].suffix}"
+        lines = export_run(results, to, place, cameras)
+    for line in [*lines, f"written: {place}"]:
+        say(line)
 
 
 def results_root(source: Path) -> Path:
@@ -136,7 +123,10 @@ def results_root(source: Path) -> Path:
 
 
 def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Sequence[Camera]:
-    """Of --calibration, of a calibration.json, or of the dataset's own; () where there is none."""
+    """The cameras of --calibration, of ``source`` or of its dataset; () where there are none.
+
+    Raises InputError when there are none and they are required.
+    """
     from telerig.estimator.calibration.result.calibration import load_calibration
 
     trials = [results_root(source) / "calibration" / "calibration.json"]
@@ -180,21 +170,6 @@ def run_folder(source: Path, run: str | None) -> Path:
         where=str(root),
         todo=f"name one with --run: {names}" if found else "run `telerig track` first",
     )
-
-
-def volume_from(words: str | None) -> Volume | None:
-    """A `Volume` from six numbers; None for None. Raises InputError for anything else."""
-    from telerig.io.exchange.export.volume import volume_of
-
-    if words is None:
-        return None
-    try:
-        numbers = [float(word) for word in words.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 6:
-        raise InputError(f"--volume {words}", todo="give six numbers: x,x,y,y,z,z in mm")
-    return volume_of([numbers[0:2], numbers[2:4], numbers[4:6]])
 
 
 if __name__ == "__main__":

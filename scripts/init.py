@@ -8,45 +8,51 @@ from typing import Annotated
 import typer
 
 from telerig.errors import InputError
+from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, say
 
 
+@errors_in_words()
 def init(
     dataset: Annotated[Path, typer.Argument(help="Folder to make, or to complete.")],
-    cameras: Annotated[str, typer.Option(help="Names of the cameras, first first.")] = "left,right",
+    cameras: Annotated[
+        str,
+        typer.Option(help="Names of the two cameras. The first one's frame is the rig frame."),
+    ] = "left,right",
     size: Annotated[str, typer.Option(help="Width x height of the images in pixels.")] = "512x512",
-    scale: Annotated[float, typer.Option(help="Pixels per mm in the object, roughly.")] = 10.0,
+    scale: Annotated[
+        float, typer.Option(help="Approximate scale, in pixels per mm in the object.")
+    ] = 10.0,
     angle: Annotated[
-        float, typer.Option(help="From the first camera's axis to the second's, degrees.")
+        float,
+        typer.Option(
+            help="Angle from the first camera's optical axis to the second's, in degrees."
+        ),
     ] = 90.0,
 ) -> None:
     """Make the folders of a dataset and a commented rig.toml.
 
-    Nothing that is there is changed. Then: edit rig.toml, put the views of the target into
-    calibration/<camera>/, and run `telerig doctor DATASET`.
+    Files that exist are not changed. Then edit rig.toml, put the views of the target into
+    calibration/CAMERA/, and run `telerig doctor DATASET`.
 
-    Exit code 0: made. 2: there is a rig.toml already, or a value cannot be.
+    Exit code 0: made. 2: there is a rig.toml already, or a value is impossible.
     """
-    with errors_in_words():
-        from telerig.io.dataset.new_dataset import new_dataset
+    from telerig.io.dataset.new_dataset import new_dataset
 
-        first, *rest = [name.strip() for name in cameras.split(",")]
-        if len(rest) != 1:
-            raise InputError(f"--cameras {cameras}", todo="give two names, like left,right")
-        made = new_dataset(
-            dataset, cameras=(first, rest[0]), image_size_px=_size(size), scale_px_per_mm=scale,
-            angle_deg=angle,
-        )  # fmt: skip
-        for path in made:
-            say(f"made: {path}")
-        say(f"now edit {made[0]}: the target, its scale, the cameras")
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.strip().isdecimal() and height.strip().isdecimal()):
-        raise InputError(f"--size {text}", todo="give width x height, like 1280x800")
-    return int(width), int(height)
+    names = options.split_names(cameras) or []
+    if len(names) != 2:
+        raise InputError(f"--cameras {cameras}", todo="give two names, like left,right")
+    todo = "give width x height, like 1280x800"
+    width, height = options.numbers_of("--size", size, 2, "x", todo)
+    if not (width.is_integer() and height.is_integer()):
+        raise InputError(f"--size {size}", todo=todo)
+    made = new_dataset(
+        dataset, cameras=(names[0], names[1]), image_size_px=(int(width), int(height)),
+        scale_px_per_mm=scale, angle_deg=angle,
+    )  # fmt: skip
+    for path in made:
+        say(f"made: {path}")
+    say(f"next: edit {made[0]} (the target and its size, the cameras)")
 
 
 if __name__ == "__main__":

@@ -2,80 +2,88 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from telerig.errors import InputError
+from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, say, stopped_by_signals
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
+    from telerig.io.recording.session import DeviceStatus, Status
+    from telerig.io.recording.tables import Recording
     from telerig.io.rig_file.description import DeviceDescription, RigDescription
 
+_PLAIN_EVERY_S = 5.0
 
+
+@errors_in_words()
 def record(
     run: Annotated[
         Path | None, typer.Argument(help="Run to record: DATASET/runs/NAME, a new folder.")
     ] = None,
-    seconds: Annotated[float | None, typer.Option(help="How long [until Ctrl-C].", min=0.1)] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Duration in seconds [until Ctrl-C].", min=0.1)
+    ] = None,
     port: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=PORT instead of the port in rig.toml; may be given again."),
+        typer.Option(
+            help="NAME=PORT replaces the port of a device in rig.toml; can be given several times."
+        ),
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.toml [DATASET/rig.toml].")] = None,
     replay: Annotated[
         Path | None,
-        typer.Option(help="Make the tables again from this recording.raw, byte for byte."),
+        typer.Option(help="Write the tables of this recording.raw again, byte for byte the same."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the tables [the run].")] = None,
     ports: Annotated[bool, typer.Option("--ports", help="List the serial ports and end.")] = False,
-    quiet: Annotated[bool, typer.Option(help="Print only the summary.")] = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Record the devices of rig.toml ([devices.NAME]) until Ctrl-C: stage.csv and the others.
 
-    Every byte goes to recording.raw first, on the disk within a second; stage.csv,
-    accelerometer.csv, frames.csv and recording.json are made of it at the end, and can be made
-    again (--replay). A device that is unplugged is waited for. Practise without hardware:
-    telerig simulate --devices --out practice.
+    Every byte is written to recording.raw first, at most a second after it came. At the end
+    stage.csv, accelerometer.csv, frames.csv and recording.json are made from it; --replay makes
+    them again. If a device is unplugged, the recording waits for it and goes on. To practise
+    without hardware: telerig simulate --devices --out practice.
 
-    Exit code 0: recorded. 2: a device, port or file cannot be used, with what to do.
+    Exit code 0: recorded. 2: a device, port or file cannot be used; the message says what to do.
     """
-    with errors_in_words():
-        if ports:
-            _list_ports()
-            return
-        from telerig.io.recording.tables import refuse_existing, write_tables
-        from telerig.scripts.record_display import recording_words
+    if ports:
+        _list_ports()
+        return
+    from telerig.io.recording.tables import refuse_existing, write_tables
 
-        if replay is not None:
-            _alone(run, seconds, port)
-            log = replay / "recording.raw" if replay.is_dir() else replay
-            if not ((out or log.parent) / "recording.json").exists():
-                refuse_existing(out or log.parent)
-            done = write_tables(log, out)
-        else:
-            place = out or run
-            if place is not None:
-                refuse_existing(place)
-            done = write_tables(_recorded(run, seconds, port or [], rig, quiet), out)
-        say(recording_words(done))
-
-
-def _alone(run: Path | None, seconds: float | None, port: list[str] | None) -> None:
-    if run is not None or seconds is not None or port:
-        raise InputError(
-            "--replay reads a recording, it records nothing",
-            todo="leave out the run, --seconds and --port; --out says where the tables go",
-        )
+    if replay is not None:
+        if run is not None or seconds is not None or port:
+            raise InputError(
+                "--replay reads a recording, it records nothing",
+                todo="leave out the run, --seconds and --port; --out says where the tables go",
+            )
+        log = replay / "recording.raw" if replay.is_dir() else replay
+        if not ((out or log.parent) / "recording.json").exists():
+            refuse_existing(out or log.parent)
+        done = write_tables(log, out)
+    else:
+        place = out or run
+        if place is not None:
+            refuse_existing(place)
+        done = write_tables(_recorded(run, seconds, port or [], rig, quiet), out)
+    say(recording_words(done))
 
 
 def _recorded(
     run: Path | None, seconds: float | None, ports: list[str], rig: Path | None, quiet: bool
 ) -> Path:
     from telerig.io.recording.session import record as record_run
-    from telerig.scripts.record_display import display
 
     if run is None:
         raise InputError(
@@ -83,10 +91,9 @@ def _recorded(
         )
     description = _rig(run, rig)
     devices = _devices(description, ports)
-    with stopped_by_signals() as stop, display(quiet) as tell:
-        return record_run(
-            devices, run, cameras=list(description.cameras), seconds=seconds, stop=stop, tell=tell
-        )
+    cameras = list(description.cameras)
+    with stopped_by_signals() as stop, _display(quiet) as tell:
+        return record_run(devices, run, cameras=cameras, seconds=seconds, stop=stop, tell=tell)
 
 
 def _rig(run: Path, rig: Path | None) -> RigDescription:
@@ -144,7 +151,117 @@ def _list_ports() -> None:
     for text in found:
         say(text)
     if not found:
-        say("no serial port is there; practise with telerig simulate --devices --out practice")
+        say("there is no serial port; practise with telerig simulate --devices --out practice")
+
+
+@contextmanager
+def _display(quiet: bool) -> Iterator[Callable[[Status], None]]:
+    """A callback for the status: a table on a terminal, plain lines elsewhere."""
+    if quiet:
+        yield lambda _: None
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.live import Live
+
+        with Live(console=Console(stderr=True), auto_refresh=False) as live:
+            yield lambda status: live.update(_table(status), refresh=True)
+    else:
+        yield _plain_lines()
+
+
+def _table(status: Status) -> Table:
+    from rich.table import Table
+
+    title = f"recording {status.seconds:.0f} s, {status.log_bytes / 1e6:.1f} MB; Ctrl-C ends"
+    table = Table(title=title, title_justify="left")
+    table.add_column("device")
+    for heading in ("readings", "per s", "malformed", "lost", "gaps", "unplugged"):
+        table.add_column(heading, justify="right")
+    for d in status.devices:
+        counts = (d.readings, round(d.rate_hz), d.malformed, d.lost, d.gaps, d.unplugged)
+        style = None if d.connected and d.rate_hz else "red" if not d.connected else "yellow"
+        table.add_row(_state(d), *(f"{n:,}" for n in counts), style=style)
+    return table
+
+
+def _state(device: DeviceStatus) -> str:
+    if not device.connected:
+        return f"{device.name} (unplugged)"
+    return device.name if device.rate_hz else f"{device.name} (silent)"
+
+
+def _plain_lines() -> Callable[[Status], None]:
+    last_s = -_PLAIN_EVERY_S
+
+    def tell(status: Status) -> None:
+        nonlocal last_s
+        if status.seconds - last_s < _PLAIN_EVERY_S:
+            return
+        last_s = status.seconds
+        parts = [
+            f"{_state(d)} {d.readings} ({d.rate_hz:.0f}/s), malformed {d.malformed}, lost {d.lost}"
+            for d in status.devices
+        ]
+        typer.echo(f"{status.seconds:.0f} s: " + "; ".join(parts), err=True)
+
+    return tell
+
+
+def recording_words(done: Recording) -> str:
+    """The summary of a recording, a line or more for each device."""
+    s = done.summary
+    lines = [f"{s['seconds']:.1f} s recorded"]
+    if not s["closed"]:
+        lines.append("the recording was cut off: nothing that came after its last entry is in it")
+    if s["log_damaged_bytes"]:
+        lines.append(f"{s['log_damaged_bytes']} bytes of the log are damaged and are not used")
+    for name, device in s["devices"].items():
+        lines += [f"{name}: " + ", ".join(_device_words(device))]
+        lines += [f"  {line}" for line in _clock_words(device)]
+    if s["frames"]:
+        f = s["frames"]
+        lines.append(
+            f"{f['count']} frames, {f['missing']} missing, "
+            f"{len(f['interpolated'])} with interpolated times"
+        )
+    lines.append(
+        "written: " + ", ".join(str(done.folder / n) for n in (*s["rows"], "recording.json"))
+    )
+    return "\n".join(lines)
+
+
+def _device_words(device: dict[str, Any]) -> Iterator[str]:
+    yield f"{device['readings']} readings"
+    if not device["readings"]:
+        yield "nothing came: is it switched on, and must it be polled (poll in rig.toml)?"
+    if device["rate_hz"]:
+        yield f"{device['rate_hz']:.6g} Hz"
+    if device["lost"]:
+        yield f"{device['lost']} lost in {device['gap_count']} gaps"
+    if device["malformed"]:
+        yield f"{device['malformed']} malformed"
+    if device["unplugged"]:
+        times = len(device["unplugged"])
+        yield "unplugged once" if times == 1 else f"unplugged {times} times"
+        if device["unplugged"][-1]["found_s"] is None:
+            yield "not plugged in again"
+    for reason, count in device["left_out"].items():
+        yield f"{count} left out ({reason})"
+
+
+def _clock_words(device: dict[str, Any]) -> Iterator[str]:
+    for clock in device["clocks"]:
+        yield (
+            f"its clock: drift {clock['drift_ppm']:+.2f} ppm (standard deviation "
+            f"{clock['sd_drift_ppm']:.2g} ppm); offset with a standard deviation of "
+            f"{clock['sd_offset_us']:.2g} µs, apart from the least delay of the line; readings "
+            f"arrive {clock['delay_median_ms']:.2g} ms later than that (median)"
+        )
+    if device["time_from"] == "arrival" and device["readings"]:
+        yield "it sends no time stamps: its times are those of arrival, up to 16 ms late"
+    if device["half_question_to_answer_ms"]:
+        half = device["half_question_to_answer_ms"]
+        yield f"its times are known to {half:.2g} ms (half the time from question to answer)"
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from telerig.errors import InputError
+from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, progress, say
 
 if TYPE_CHECKING:
@@ -25,62 +26,63 @@ class FilmFormat(StrEnum):
     gif = "gif"
 
 
+@errors_in_words()
 def report(
     folder: Annotated[
-        Path, typer.Argument(help="Results of a calibration, run or batch; or a dataset: all of it")
+        Path,
+        typer.Argument(help="Results of a calibration, run or batch; or a dataset, for all of it."),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Where to write [the folder itself]; of a dataset, a folder each below."),
+        typer.Option(help="Where to write [the folder itself]; for a dataset, one folder each."),
     ] = None,
     film: Annotated[
-        bool, typer.Option(help="Film each run too: the path turned round, and both views.")
+        bool, typer.Option(help="Also make films of each run: its path in space, and both views.")
     ] = False,
     film_format: Annotated[
-        FilmFormat, typer.Option("--format", help="Of the films.")
+        FilmFormat, typer.Option("--format", help="Format of the films.")
     ] = FilmFormat.both,
     run: Annotated[
         Path | None,
         typer.Option(help="The recording, for the film of both views [DATASET/runs/NAME]."),
     ] = None,
-    quiet: Annotated[bool, typer.Option(help="Print only what was written.")] = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Make the reports of a folder again, from nothing but its files.
 
     A folder of results (calibration.json, tracking.json or batch.json) gives its report.html, a
     dataset gives those of its calibration and all its runs. With --film each run also gets
     film/path.mp4 and film/path.gif, its path in space turned once about the vertical, and
-    film/views.mp4 and film/views.gif, the images of both cameras with what was found in them.
+    film/views.mp4 and film/views.gif, the images of both cameras with the detected bubbles.
 
     Exit code 0: written. 2: the input cannot be used. 130: interrupted.
     """
-    with errors_in_words():
-        from telerig.io.report.film.files import need_av
-        from telerig.io.report.remake import remake_report, results_folders
+    from telerig.io.report.film.files import need_av
+    from telerig.io.report.remake import remake_report, results_folders
 
-        found = results_folders(folder)
-        runs = [results for results in found if results.kind == "run"]
-        if (film or run) and not runs:
-            raise InputError(
-                "holds no tracked run, and films are of runs", where=str(folder),
-                todo="leave out --film, or name a run's results folder",
-            )  # fmt: skip
-        if run and len(runs) > 1:
-            raise InputError(
-                "--run is given, but there are several runs", where=str(folder),
-                todo=f"name one run's results folder, e.g. {runs[0].folder}",
-            )  # fmt: skip
-        if film and film_format is not FilmFormat.gif:
-            need_av()
-        for results in found:
-            alone = found[0].folder == folder
-            place = None if out is None else out if alone else out / results.folder.name
-            with progress(quiet) as stage:
-                if not quiet and len(found) > 1:
-                    stage("reports", found.index(results), len(found))
-                say(f"written: {remake_report(results, place)}")
-                if film and results.kind == "run":
-                    _film(results, (place or results.folder) / "film", film_format, run, stage)
+    found = results_folders(folder)
+    runs = [results for results in found if results.kind == "run"]
+    if (film or run) and not runs:
+        raise InputError(
+            "holds no tracked run, and films are made of runs", where=str(folder),
+            todo="leave out --film, or name the results folder of a run",
+        )  # fmt: skip
+    if run and len(runs) > 1:
+        raise InputError(
+            "--run is given, but there are several runs", where=str(folder),
+            todo=f"name the results folder of one run, e.g. {runs[0].folder}",
+        )  # fmt: skip
+    if film and film_format is not FilmFormat.gif:
+        need_av()
+    for i, results in enumerate(found):
+        alone = found[0].folder == folder
+        place = None if out is None else out if alone else out / results.folder.name
+        with progress(quiet) as stage:
+            if not quiet and len(found) > 1:
+                stage("reports", i, len(found))
+            say(f"written: {remake_report(results, place)}")
+            if film and results.kind == "run":
+                _film(results, (place or results.folder) / "film", film_format, run, stage)
 
 
 def _film(
@@ -95,7 +97,7 @@ def _film(
     _say_written(files, notes)
     recording, why = _recording(results.folder, run)
     if recording is None:
-        say(f"both views: left out, {why}")
+        say(f"the film of both views is left out: {why}")
         return
     files = [place / f"views.{ending}" for ending in endings]
     _say_written(files, _film_views(results.folder, recording, files, stage))

@@ -1,7 +1,9 @@
-"""telerig simulate: a dataset with known truth."""
+"""telerig simulate: a dataset with known truth, or serial devices to practise recording with."""
 
 from __future__ import annotations
 
+import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,82 +11,93 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from telerig.errors import InputError
-from telerig.scripts.console import errors_in_words, say
+from telerig.scripts.console import errors_in_words, say, stopped_by_signals
 
 if TYPE_CHECKING:
+    from numpy.random import Generator
+
     from telerig.io.simulation.calibration.presets import SimulationConfig
     from telerig.io.simulation.run.presets import RunConfig
 
 
+@errors_in_words()
 def simulate(
     preset: Annotated[
         str | None,
         typer.Argument(
             help="A calibration (paper, dense, scheimpflug, near_telecentric, symmetric, "
-            "unbounded, two_sided) or bubbles with a calibration (rise, swarm, crossing, S0 to S6)."
+            "unbounded, two_sided), or a run of bubbles (rise, swarm, crossing, S0 to S6)."
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to create; must be new or empty.")
+        Path | None, typer.Option(help="Folder to create; it must be new or empty.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the random numbers; the same seed gives the same files.")
+    ] = 0,
     images: Annotated[
-        bool, typer.Option(help="Render images; without, write dots.csv and detections.csv.")
+        bool,
+        typer.Option(help="Render images. Without them, dots.csv and detections.csv are written."),
     ] = True,
-    frames: Annotated[int | None, typer.Option(help="Frames of the run.")] = None,
-    bubbles: Annotated[int | None, typer.Option(help="Bubbles in view at a time.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of frames of the run.")] = None,
+    bubbles: Annotated[
+        int | None, typer.Option(help="Number of bubbles in view at a time.")
+    ] = None,
     stage_axis: Annotated[
         int | None,
-        typer.Option(help="Views of the target at rest while the stage travels [0: none]."),
+        typer.Option(
+            help="Number of views of a target at rest, seen from different stage positions [0]."
+        ),
     ] = None,
     encoder_scale: Annotated[
-        float | None, typer.Option(help="The encoder reads so much too far, like 0.01.")
+        float | None,
+        typer.Option(help="Relative scale error of the encoder; with 0.01 it reads 1 % too much."),
     ] = None,
     references: Annotated[
-        int | None, typer.Option(help="Dots of a strip on the tank that each camera sees [0].")
+        int | None,
+        typer.Option(
+            help="Number of dots that each camera sees of a strip that is fixed to the tank [0]."
+        ),
     ] = None,
     devices: Annotated[
         bool,
         typer.Option(
-            "--devices", help="Serial devices to practise `telerig record` with, until Ctrl-C."
+            "--devices",
+            help="Simulate serial devices instead, to practise `telerig record` with.",
         ),
     ] = False,
-    seconds: Annotated[float | None, typer.Option(help="With --devices: how long.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="With --devices: duration in seconds [until Ctrl-C].")
+    ] = None,
 ) -> None:
     """Simulate a calibration, or a run of bubbles with one: images, rig.toml, and the truth.
 
-    With --stage-axis 7, `stage_axis/` holds views of the target from seven stops of the stage, from
-    which `telerig calibrate` finds the travel axis and the encoder's scale.
+    With --stage-axis 7, the folder stage_axis/ holds views of the target from seven positions of
+    the stage, from which `telerig calibrate` estimates the travel axis and the encoder's scale.
+
+    Exit code 0: simulated. 2: the request cannot be used. 130: interrupted.
     """
-    with errors_in_words():
-        import numpy as np
+    import numpy as np
 
-        if devices:
-            from telerig.scripts.simulate_devices import simulate_devices
-
-            simulate_devices(out, seconds, np.random.default_rng(seed))
-            return
-        preset, out = _both(preset, out)
-
-        from telerig.io.simulation.simulate import simulate as run
-
-        run_only = {"frames": frames, "bubbles": bubbles}
-        stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale}
-        settings = _with_strip(preset, _settings(preset, run_only, stage), references, images)
-        data = run(settings, rng=np.random.default_rng(seed), out=out, images=images)
-        say(f"{preset}: {len(data.views)} views of {len(data.rig.cameras)} cameras in {data.path}")
-        for name in data.runs:
-            say(f"run {name}: {data.runs[name].path}")
-        say(f"next: telerig calibrate {data.path}")
-
-
-def _both(preset: str | None, out: Path | None) -> tuple[str, Path]:
+    if devices:
+        _simulate_devices(out, seconds, np.random.default_rng(seed))
+        return
     if preset is None or out is None:
-        what = "the name of what to simulate" if preset is None else "--out"
+        missing = "the name of what to simulate" if preset is None else "--out"
         raise InputError(
-            f"{what} is missing", todo="for instance telerig simulate paper --out tank"
+            f"{missing} is missing", todo="for instance telerig simulate paper --out tank"
         )
-    return preset, out
+
+    from telerig.io.simulation.simulate import simulate as run
+
+    run_only = {"frames": frames, "bubbles": bubbles}
+    stage = {"axis_views": stage_axis, "encoder_scale": encoder_scale}
+    settings = _with_strip(preset, _settings(preset, run_only, stage), references, images)
+    data = run(settings, rng=np.random.default_rng(seed), out=out, images=images)
+    say(f"{preset}: {len(data.views)} views of {len(data.rig.cameras)} cameras in {data.path}")
+    for name in data.runs:
+        say(f"run {name}: {data.runs[name].path}")
+    say(f"next: telerig calibrate {data.path}")
 
 
 def _settings(
@@ -93,39 +106,74 @@ def _settings(
     from telerig.io.simulation.run.presets import RUN_PRESETS, any_preset, run_preset
 
     changes: dict[str, Any] = {key: value for key, value in run.items() if value is not None}
-    moved = {key: value for key, value in stage.items() if value is not None}
-    if not changes and not moved:
+    stage_changes = {key: value for key, value in stage.items() if value is not None}
+    if not changes and not stage_changes:
         return any_preset(name)
     if name in RUN_PRESETS:
-        if moved:
-            changes["stage"] = replace(run_preset(name).stage, **moved)
+        if stage_changes:
+            changes["stage"] = replace(run_preset(name).stage, **stage_changes)
         return run_preset(name, **changes)
     any_preset(name)
-    given = [*changes, *(key.replace("axis_views", "stage_axis") for key in moved)]
-    raise InputError(
-        f"{name} is a calibration without a run, so {' and '.join(given)} mean nothing",
-        todo=f"leave them out, or choose one of {', '.join(RUN_PRESETS)}",
-    )
+    given = [*changes, *(key.replace("axis_views", "stage_axis") for key in stage_changes)]
+    raise _needs_run(name, " and ".join(given))
 
 
 def _with_strip(
     name: str, settings: SimulationConfig | RunConfig, dots: int | None, images: bool
 ) -> SimulationConfig | RunConfig:
-    """In the images, or in `references.csv` where there are none."""
+    """With a strip of dots in the images, or in `references.csv` where there are no images."""
     from telerig.io.simulation.run.mark_strip_config import StripConfig
     from telerig.io.simulation.run.presets import RunConfig
 
     if dots is None:
         return settings
     if not isinstance(settings, RunConfig):
-        raise InputError(
-            f"{name} is a calibration without a run, so references mean nothing",
-            todo="leave them out, or choose a run of bubbles, like rise",
-        )
+        raise _needs_run(name, "references")
     if dots < 0:
         raise InputError(f"--references {dots}", todo="give the number of dots in view, like 6")
     strip = StripConfig(dots) if images and dots else None
     return replace(settings, table=replace(settings.table, references=dots), strip=strip)
+
+
+def _needs_run(name: str, given: str) -> InputError:
+    from telerig.io.simulation.run.presets import RUN_PRESETS
+
+    return InputError(
+        f"{name} is a calibration without a run, so {given} have no effect",
+        todo=f"leave them out, or choose one of {', '.join(RUN_PRESETS)}",
+    )
+
+
+def _simulate_devices(out: Path | None, seconds: float | None, rng: Generator) -> None:
+    """Print the ports of simulated devices; with ``out`` also write a dataset whose rig.toml has
+    them."""
+    if sys.platform == "win32":
+        raise InputError("Windows has no pseudo-terminals", todo="practise on Linux or macOS")
+    from telerig.io.recording.simulated.devices import SimulatedPorts
+    from telerig.io.recording.simulated.practice import practice_devices, practice_rig
+    from telerig.io.rig_file.rig_file import write_rig_toml
+    from telerig.io.rig_file.writer import rig_toml
+
+    if out is not None and (out / "rig.toml").exists():
+        raise InputError(
+            "exists already", where=str(out / "rig.toml"), todo="give a new folder with --out"
+        )
+    with (
+        tempfile.TemporaryDirectory(prefix="telerig-") as folder,
+        SimulatedPorts(practice_devices(), Path(folder), rng) as ports,
+    ):
+        rig = practice_rig(ports.devices)
+        for device in ports.devices:
+            say(f"{device.name}: {device.port}")
+        if out is not None:
+            write_rig_toml(rig, out / "rig.toml")
+            say(f"next, in another terminal: telerig record {out}/runs/practice --seconds 20")
+        else:
+            say("\nfor rig.toml:\n" + "[devices" + rig_toml(rig).split("[devices", 1)[1])
+        say("Ctrl-C ends the devices")
+        sys.stdout.flush()
+        with stopped_by_signals() as stop:
+            stop.wait(seconds)
 
 
 if __name__ == "__main__":

@@ -4,80 +4,71 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from telerig.errors import InputError
-from telerig.scripts.console import errors_in_words, progress, say
+from telerig.scripts import options
+from telerig.scripts.console import errors_in_words, progress, say, say_written
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
 
 
+@errors_in_words()
 def track(
-    run: Annotated[Path, typer.Argument(help="Recording: DATASET/runs/NAME.")],
-    calibration: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="calibration.json, or two OpenLPT camera files, first camera first "
-            "[DATASET/results/calibration/calibration.json]."
-        ),
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Results folder [DATASET/results/NAME].")] = None,
-    min_diameter: Annotated[float, typer.Option(help="Smaller dark spots are dirt (px).")] = 8.0,
+    run: options.Run,
+    calibration: options.CalibrationFiles = None,
+    out: options.RunFolder = None,
+    min_diameter: Annotated[
+        float,
+        typer.Option(help="Dark spots with a smaller diameter, in px, are not taken for bubbles."),
+    ] = 8.0,
     source: Annotated[
-        str | None, typer.Option("--from", help="images or detections, when the run has both.")
+        str | None,
+        typer.Option("--from", help="Needed when the run has both: images or detections."),
     ] = None,
-    report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
-    quiet: Annotated[bool, typer.Option(help="Print only the summary.")] = False,
+    report: options.Report = True,
+    quiet: options.Quiet = False,
 ) -> None:
-    """Find the bubbles of a run, match them across the views, and follow them in space.
+    """Find the bubbles of a run, match them across the two views, and follow them in space.
 
-    Writes detections.csv, tracks.csv, events.csv, tracking.json, run.json and report.html. An
-    interrupted run goes on where it was when the same command is given again.
+    Writes detections.csv, tracks.csv, events.csv, tracking.json, run.json and report.html. The
+    same command, given again, continues an interrupted run.
 
-    Exit code 0: tracked. 2: the input cannot be used, with what, where and what to do.
+    Exit code 0: tracked. 2: the input cannot be used; the message says what, where and what to do.
     130: interrupted.
     """
-    with errors_in_words():
-        from telerig.estimator.batch.jobs import check_run_name
-        from telerig.estimator.tracking.calibration_of_run import calibration_for
-        from telerig.estimator.tracking.results_folder import write_tracking
-        from telerig.estimator.tracking.track import TrackOptions
-        from telerig.estimator.tracking.wording import tracking_words
-        from telerig.io.dataset.run import load_run
+    from telerig.estimator.batch.jobs import check_run_name
+    from telerig.estimator.tracking.calibration_of_run import calibration_for
+    from telerig.estimator.tracking.results_folder import write_tracking
+    from telerig.estimator.tracking.track import TrackOptions
+    from telerig.estimator.tracking.wording import tracking_words
+    from telerig.io.dataset.run import load_run
 
-        if out is None:
-            check_run_name(run)
-        begun = time.perf_counter()
-        calibrated, files = calibration_for(run, calibration)
-        data = load_run(run, source=chosen_source(source), **cameras_without_rig(run, calibrated))
-        folder = out or default_folder(run)
-        options = TrackOptions(min_diameter_px=min_diameter)
-        asked = {"from": source, "min_diameter_px": min_diameter}
-        record = {"command": "track", "options": asked, "inputs": files}
-        with progress(quiet) as stage:
-            summary = write_tracking(
-                data, calibrated, folder, options=options, record=record, report=report, stage=stage
-            )
-        say(tracking_words(summary, time.perf_counter() - begun))
-        say(f"written: {folder}" + ("/report.html" if report else ""))
-
-
-def chosen_source(source: str | None) -> Literal["images", "detections"] | None:
-    """The value of ``--from``; raises InputError for another word."""
-    if source is None:
-        return None
-    if source == "images":
-        return "images"
-    if source == "detections":
-        return "detections"
-    raise InputError(f"--from {source}", todo="use --from images or --from detections")
+    if out is None:
+        check_run_name(run)
+    begun = time.perf_counter()
+    calibrated, files = calibration_for(run, calibration)
+    chosen = options.chosen("--from", source, ("images", "detections"))
+    data = load_run(run, source=chosen, **cameras_without_rig(run, calibrated))
+    folder = out or default_folder(run)
+    record = {
+        "command": "track",
+        "options": {"from": source, "min_diameter_px": min_diameter},
+        "inputs": files,
+    }
+    with progress(quiet) as stage:
+        summary = write_tracking(
+            data, calibrated, folder, options=TrackOptions(min_diameter_px=min_diameter),
+            record=record, report=report, stage=stage,
+        )  # fmt: skip
+    say(tracking_words(summary, time.perf_counter() - begun))
+    say_written(folder, report)
 
 
 def cameras_without_rig(run: Path, calibration: Calibration) -> dict[str, Any]:
-    """What `load_run` needs of a calibration for a folder that belongs to no dataset."""
+    """The cameras of the calibration, for `load_run` of a folder that belongs to no dataset."""
     if (run.resolve().parent.parent / "rig.toml").is_file():
         return {}
     return {
@@ -86,13 +77,8 @@ def cameras_without_rig(run: Path, calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def any_source(run: Path) -> Literal["images", "detections"] | None:
-    """For work on tracks it does not matter which of both a run holds."""
-    return "detections" if (run / "detections.csv").is_file() else None
-
-
 def default_folder(run: Path) -> Path:
-    """results/<run> of the dataset that holds the run, else results/ inside the run."""
+    """results/NAME of the dataset that holds the run, else results/ inside the run."""
     place = run.resolve()
     if place.parent.name == "runs":
         return place.parent.parent / "results" / place.name

@@ -1,15 +1,16 @@
-"""Jobs given out to executors: the cores of this machine or a Dask cluster."""
+"""Jobs run in order on an executor: the cores of this machine or a Dask cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from graphlib import TopologicalSorter
 from typing import Any
 
 from telerig.errors import InputError
 from telerig.estimator.batch.jobs import Job, fingerprint
-from telerig.estimator.batch.journal import Journal
+from telerig.estimator.batch.records import Journal
 from telerig.estimator.batch.work import (
     CRASHED,
     DONE,
@@ -21,50 +22,49 @@ from telerig.estimator.batch.work import (
 )
 from telerig.io.machine.parallel import cores
 
-Told = Callable[[Job, dict[str, Any], int, int], None]
-"""Progress: (job, its record, done, of)."""
+Tell = Callable[[Job, dict[str, Any], int, int], None]
+"""Progress: (job, its record, number of jobs done, number of jobs)."""
 
 _CONNECT_S = 20
 
 
 def run_batch(
-    jobs: Sequence[Job], executor: Executor, journal: Journal, *, told: Told | None = None
+    jobs: Sequence[Job], executor: Executor, journal: Journal, *, tell: Tell | None = None
 ) -> list[dict[str, Any]]:
     """Do all jobs, each after those that it needs; returns their records, in the order of jobs.
 
-    What ``journal`` knows as done with the same inputs is not done again. A job that fails stops
-    only those that need it: they are left out, and their record says because of which.
+    A job that ``journal`` records as done with the same inputs is not done again. A job that fails
+    stops only those that need it: they are left out, and their record says because of which.
     """
+    by_name = {job.name: job for job in jobs}
     records: dict[str, dict[str, Any]] = {}
-    waiting, running = list(jobs), dict[Future[dict[str, Any]], tuple[Job, str]]()
+    running: dict[Future[dict[str, Any]], tuple[Job, str]] = {}
+    order = TopologicalSorter({job.name: job.needs for job in jobs})
+    order.prepare()
 
     def keep(job: Job, record: dict[str, Any]) -> None:
         records[job.name] = record
-        if told is not None:
-            told(job, record, len(records), len(jobs))
+        order.done(job.name)
+        if tell is not None:
+            tell(job, record, len(records), len(jobs))
 
-    while waiting or running:
-        ready = [j for j in waiting if all(n in records for n in j.needs)]
-        waiting = [j for j in waiting if j not in ready]
+    while order.is_active():
+        ready = [by_name[name] for name in order.get_ready()]
         for job in ready:
-            settled = _settled(job, records, journal)
-            if settled is None:
+            known = _known_record(job, records, journal)
+            if known is None:
                 inputs = fingerprint(job)
                 running[executor.submit(perform, job)] = job, inputs
             else:
-                keep(job, settled)
-        if running and not (ready and any(_is_ready(j, records) for j in waiting)):
+                keep(job, known)
+        if not ready:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, inputs = running.pop(future)
                 keep(job, journal.write(job, _result(future), inputs))
     return [records[job.name] for job in jobs]
 
 
-def _is_ready(job: Job, records: dict[str, dict[str, Any]]) -> bool:
-    return all(n in records for n in job.needs)
-
-
-def _settled(
+def _known_record(
     job: Job, records: dict[str, dict[str, Any]], journal: Journal
 ) -> dict[str, Any] | None:
     """The record of a job that needs no work; None for one that does."""
@@ -77,7 +77,7 @@ def _settled(
 
 
 def _result(future: Future[dict[str, Any]]) -> dict[str, Any]:
-    """A cluster that gives up a job, as when its workers keep dying, raises its own error."""
+    """A cluster that gives up a job, for instance because its workers die, raises an error."""
     error = future.exception()
     if error is None:
         return future.result()
@@ -86,9 +86,9 @@ def _result(future: Future[dict[str, Any]]) -> dict[str, Any]:
 
 @contextmanager
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
-    """So many jobs at once on this machine, each in a process of its own.
+    """Runs ``workers`` jobs at once on this machine, each in a process of its own.
 
-    workers : None takes one per core.
+    workers : None means one per core.
     """
     count = cores() if workers is None else workers
     if count < 1:
@@ -106,12 +106,12 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster that is already there.
+    """The workers of a Dask cluster that is running already.
 
     address : tcp://host:port of its scheduler. The datasets must be at the same paths on every
-    worker; only the descriptions of jobs and their results travel. A job whose worker dies is
-    done again by another one, as often as the cluster is set to (allowed-failures, 3). Raises
-    InputError when nobody answers.
+    worker; only the descriptions of jobs and their results are sent. A job whose worker dies is
+    done again by another one, as often as the cluster's setting allowed-failures says (3). Raises
+    InputError when no scheduler answers.
     """
     try:
         from distributed import Client

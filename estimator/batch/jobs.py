@@ -1,10 +1,9 @@
-"""What is to be done for a list of datasets, in which order, and whether it has been done."""
+"""The jobs of a list of datasets, in an order in which they can be done, and their inputs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -54,12 +53,12 @@ class Job:
 
     @property
     def results(self) -> Path:
-        """The folder that it fills."""
+        """The folder that it writes."""
         return Path(self.dataset) / "results" / (self.run or "calibration")
 
     @property
     def result(self) -> Path:
-        """The file without which it has not been done."""
+        """The file that exists once the job is done."""
         return self.results / MAIN_RESULT[self.kind]
 
     def as_json(self) -> str:
@@ -83,12 +82,12 @@ def jobs_of(
     only: Sequence[str] = (),
     strict: bool = False,
 ) -> list[Job]:
-    """Calibration, tracking and smoothing of every dataset, in an order that can be followed.
+    """Calibration, tracking and smoothing of every dataset, each job after those that it needs.
 
-    calibration : one for all; nothing is calibrated then. only : names of runs; empty takes all.
-    A dataset without views of the target is calibrated already, or it cannot be used.
+    calibration : one for all datasets; then nothing is calibrated. only : names of runs; empty
+    takes all. A dataset without views of the target must have a calibration already.
     strict : raise InputError for a dataset that cannot be used; otherwise it becomes a calibration
-        that fails, so that it does not stop the others.
+        job that fails, so that it does not stop the others.
 
     Raises InputError for folders that do not exist or are named twice, and unknown runs.
     """
@@ -187,15 +186,15 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
 
 
 def fingerprint(job: Job) -> str:
-    """Of all that the result depends on: the program, the options, the input files.
+    """A hash of all that the result depends on: the program, the options, the input files.
 
-    Images go by size and time of change, calibrations and tracks by content.
+    Recorded files count with size and time of change, calibrations and tracks with their content.
     """
     hashed = hashlib.sha256(f"{VERSION} {job.as_json()}".encode())
     place = Path(job.dataset)
     listed = [place / "rig.toml"]
     for folder in _INPUTS.get(job.kind, (f"runs/{job.run}",)):
-        listed += sorted(_files(place / folder))
+        listed += sorted((place / folder).rglob("*"))
     for file in listed:
         if file.is_file():
             stat = file.stat()
@@ -212,8 +211,3 @@ def _used_results(job: Job) -> list[Path]:
     own = Path(job.dataset) / "results" / "calibration" / "calibration.json"
     used = [Path(job.calibration) if job.calibration else own]
     return used if job.kind == "track" else [*used, job.results / "tracks.csv"]
-
-
-def _files(folder: Path) -> Iterable[Path]:
-    for base, _, names in os.walk(folder):
-        yield from (Path(base) / name for name in names)

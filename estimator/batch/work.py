@@ -1,4 +1,4 @@
-"""One job, done: in this process, or in a process of its own that may die without harm."""
+"""Doing one job: in this process, or in a process of its own that may die without harm."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from telerig.estimator.batch.jobs import Job, check_run_name
 Stage = Callable[[str, int, int], None]
 
 DONE, REJECTED, FAILED, CRASHED, LEFT_OUT = "done", "rejected", "failed", "crashed", "left out"
-_LAST_WORDS = 2000
-_PATIENCE_S = 5.0
+_KEPT_OUTPUT = 2000
+_END_WITHIN_S = 5.0
 _CHILD = "telerig.scripts.batch_job"
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -37,9 +37,9 @@ def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """Do it in a process of its own; returns what came of it, never raises.
+    """Do it in a process of its own; returns its result and never raises.
 
-    The process ends when this one does: its standard input closes.
+    That process ends when this one does, because its standard input closes.
     """
     begun = time.perf_counter()
     result = _outcome(job)
@@ -56,17 +56,17 @@ def allow() -> None:
 
 
 def stop_all() -> None:
-    """End the processes of `perform` in all threads; those not yet begun fail at once.
+    """End the processes of `perform` in all threads; jobs that begin later fail at once.
 
-    Each is interrupted as by Ctrl-C, so that it takes its temporary files away, and killed if it
-    has not ended after `_PATIENCE_S`.
+    Each process is interrupted as by Ctrl-C, so that it removes its temporary files, and killed if
+    it has not ended after `_END_WITHIN_S`.
     """
     _stopped.set()
     ending = list(_children)
     try:
         for child in ending:
             child.send_signal(signal.SIGINT)
-        deadline = time.monotonic() + _PATIENCE_S
+        deadline = time.monotonic() + _END_WITHIN_S
         for child in ending:
             with suppress(subprocess.TimeoutExpired):
                 child.wait(max(0.0, deadline - time.monotonic()))
@@ -77,7 +77,9 @@ def stop_all() -> None:
 
 def _outcome(job: Job) -> dict[str, Any]:
     if not Path(job.dataset).is_dir():
-        return failure(FAILED, f"{job.dataset}: this machine has no such folder; share it")
+        return failure(
+            FAILED, f"{job.dataset}: this machine has no such folder; share it with this machine"
+        )
     environment = {**dict.fromkeys(_ONE_THREAD, "1"), **os.environ}
     child = subprocess.Popen(
         [sys.executable, "-m", _CHILD], env=environment, stdin=subprocess.PIPE,
@@ -87,23 +89,29 @@ def _outcome(job: Job) -> dict[str, Any]:
     if _stopped.is_set():
         child.kill()
     try:
-        answer, said = _asked(child, job)
+        answer, messages = _answer(child, job)
     finally:
         _children.discard(child)
     code = child.returncode
     if code == 0 and answer:
         return dict(json.loads(answer))
     how = f"ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    tail = said.strip()[-_LAST_WORDS:]
-    return failure(CRASHED, f"{how}: {tail}" if tail else f"{how} without a word (memory?)")
+    tail = messages.strip()[-_KEPT_OUTPUT:]
+    return failure(
+        CRASHED,
+        f"{how}: {tail}" if tail else f"{how} without a message; was there too little memory?",
+    )
 
 
-def _asked(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
-    """Its answer, and what it said besides. Its standard input stays open until it has answered."""
+def _answer(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
+    """The answer of the process, and its standard error.
+
+    Its standard input stays open until it has answered.
+    """
     assert child.stdin and child.stdout and child.stderr
-    said: list[str] = []
+    messages: list[str] = []
     errors = child.stderr
-    listener = threading.Thread(target=lambda: said.append(errors.read()))
+    listener = threading.Thread(target=lambda: messages.append(errors.read()))
     listener.start()
     with suppress(BrokenPipeError):
         child.stdin.write(job.as_json() + "\n")
@@ -115,11 +123,11 @@ def _asked(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
         child.stdin.close()
     child.stdout.close()
     errors.close()
-    return answer, "".join(said)
+    return answer, "".join(messages)
 
 
 def failure(status: str, words: str) -> dict[str, Any]:
-    """What came of a job that gave no result."""
+    """The result of a job that failed."""
     return {"status": status, "words": words, "figures": {}}
 
 
@@ -130,9 +138,7 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 
     begun = time.perf_counter()
     data = load_dataset(Path(job.dataset))
-    run = run_calibration(
-        data, model=job.model, medium=job.medium, stage=stage, pictures=True
-    )  # fmt: skip
+    run = run_calibration(data, model=job.model, medium=job.medium, stage=stage, pictures=True)
     found = run.calibration
     write_results(
         data, run, job.results, command="run",
@@ -159,12 +165,13 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
     begun = time.perf_counter()
     run = Path(job.dataset) / "runs" / job.run
     check_run_name(run)
-    calibration, files = calibration_for(run, _given(job))
+    calibration, files = calibration_for(run, [Path(job.calibration)] if job.calibration else None)
     options = TrackOptions()
-    asked = {"min_diameter_px": options.min_diameter_px}
+    record = {
+        "command": "run", "options": {"min_diameter_px": options.min_diameter_px}, "inputs": files,
+    }  # fmt: skip
     summary = write_tracking(
-        load_run(run), calibration, job.results, options=options,
-        record={"command": "run", "options": asked, "inputs": files},
+        load_run(run), calibration, job.results, options=options, record=record,
         report=job.report, stage=stage,
     )  # fmt: skip
     figures = {name: summary[name] for name in ("frames", "detections", "points", "tracks")}
@@ -179,7 +186,7 @@ def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
     from telerig.io.dataset.run import load_run
 
     run = Path(job.dataset) / "runs" / job.run
-    calibration, files = calibration_for(run, _given(job))
+    calibration, files = calibration_for(run, [Path(job.calibration)] if job.calibration else None)
     found = smooth_run(
         load_run(run), calibration, job.results, job.results, inputs=files, report=job.report,
         stage=stage,
@@ -196,12 +203,8 @@ def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
     return {"status": DONE, "words": smoothing_words(found), "figures": figures}
 
 
-def _given(job: Job) -> list[Path] | None:
-    return [Path(job.calibration)] if job.calibration else None
-
-
 def summary_line(job: Job, result: Mapping[str, Any], *, whole_path: bool = False) -> str:
-    """A job's end in one line. whole_path : where datasets have the same name."""
+    """The result of a job in one line. whole_path : for datasets that have the same name."""
     place = job.dataset if whole_path else Path(job.dataset).name
     what = f"{job.kind} {place}" + (f" {job.run}" if job.run else "")
     verdict = result["figures"].get("verdict")

@@ -31,7 +31,7 @@ def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibratio
         from telerig.estimator.calibration.result.imported import calibration_from_cameras
         from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 
-        cameras, _ = read_openlpt_cameras(list(files))
+        cameras, *_ = read_openlpt_cameras(list(files))
         return calibration_from_cameras(cameras, name="OpenLPT"), list(files)
     raise InputError(
         f"--calibration was given {len(files)} times: {', '.join(p.name for p in files)}",

@@ -1,51 +1,55 @@
-"""Cameras in HALCON's area-scan models: parameters, projection, and the error of the exchange.
+"""Cameras in HALCON's area-scan models: their parameters, their error, and HALCON's files.
 
 HALCON's documented model (reference manual, chapter Calibration): camera point = pose * world
 point in metres; undistorted image coordinates (u, v) = magnification * (x, y) when telecentric,
-focus * (x, y) / z when not; distortion given from distorted to undistorted, by the division model
+focus * (x, y) / z when not. Distortion is given from distorted coordinates (U, V) to undistorted
+ones, by the polynomial model, with r^2 = U^2 + V^2,
 
-    u = U / (1 + kappa (U^2 + V^2))
+    u = U (1 + K1 r^2 + K2 r^4 + K3 r^6) + P1 (r^2 + 2 U^2) + 2 P2 U V      (v likewise),
 
-or the polynomial one, r^2 = U^2 + V^2,
-
-    u = U (1 + K1 r^2 + K2 r^4 + K3 r^6) + P1 (r^2 + 2 U^2) + 2 P2 U V      (v likewise);
-
-the tilt of the sensor behind an image-side telecentric lens, the inverse of the upper left 2 x 2
+or by the division model, which is exported for lenses without distortion only (its kappa is 0).
+The tilt of the sensor behind an image-side telecentric lens is the inverse of the upper left 2 x 2
 block of a rotation by ``tilt`` about the axis at ``rot`` in the image (Steger, IJCV 123:121, 2017);
 column = U / Sx + Cx, row = V / Sy + Cy.
 
-Distortion runs the other way in this library, so it is fitted; everything else maps exactly, but
-for the residual perspective of a lens exported as telecentric and `image_convergence_per_mm`.
+telerig's distortion runs from undistorted to distorted coordinates, so HALCON's is fitted;
+everything else maps exactly, but for the residual perspective of a lens that is exported as
+telecentric and `image_convergence_per_mm`.
+
+The `.dat` layouts are those of the reference manual (read_cam_par, write_pose). Before HALCON 13 a
+telecentric camera is one with Focus 0 and Sx, Sy the pixel's size in the object; here the
+magnification is 1, so that the numbers are the same in both conventions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.errors import GeometryError, InputError
+from telerig.errors import GeometryError
 from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
+from telerig.io.files.atomic import atomic_folder
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.distortion import COEFFICIENTS
+from telerig.rig.distortion import COEFFICIENTS, coefficient_jacobian, distortion_jacobian, undistort
 from telerig.rig.pose import Pose
 
 Array = NDArray[np.float64]
-Distortion = Literal["auto", "division", "polynomial"]
-Lens = Literal["auto", "telecentric", "perspective"]
 
 PERSPECTIVE_PX = 0.5
 """A lens whose residual perspective moves a point of the volume by more is exported as such."""
 
 _POINTS_PER_EDGE = 25
 _PIXELS_PER_EDGE = 41
-_SQUARE = 1e-13
-_NO_INVERSE = "HALCON's distortion has no inverse at some of these points"
-_USE_OPENCV = "keep to a smaller volume, or export to OpenCV, which has telerig's distortion"
+_DIAGONAL = 1e-13
+_POLYNOMIAL = {"k1": 2, "k2": 4, "k3": 6, "p2": 1, "p1": 1}
+"""HALCON's distortion coefficients, in the order of OpenCV's that do the same, which are named
+k1 k2 k3 p1 p2, and the power of length in their units."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class HalconCamera:
 
     kind : HALCON's camera type. camera_from_rig : HALCON's external parameters, mm here.
     misfit : against the camera of this library over the working volume.
-    exact : whether nothing was fitted or left out.
+    notes : what was fitted or left out; empty where HALCON's camera is exactly telerig's.
     """
 
     camera: str
@@ -62,7 +66,6 @@ class HalconCamera:
     parameters: dict[str, float]
     camera_from_rig: Pose
     misfit: Misfit
-    exact: bool
     notes: tuple[str, ...]
 
     def project(self, points_mm: ArrayLike) -> Array:
@@ -71,196 +74,263 @@ class HalconCamera:
         return _pixel_from_camera(points, self.parameters).reshape(*np.shape(points_mm)[:-1], 2)
 
 
+def export_halcon(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[str]:
+    """Write the HALCON files of all cameras into the folder ``out``; returns a line per camera."""
+    exported = halcon_cameras(cameras, volume)
+    write_halcon(exported, out)
+    return [
+        f"{c.camera}: {c.kind}; {'; '.join(c.notes) or 'exact'}; {c.misfit.words()}"
+        for c in exported
+    ]
+
+
 def halcon_cameras(
-    cameras: Sequence[Camera],
-    *,
-    distortion: Distortion = "auto",
-    lens: Lens = "auto",
-    volume: Volume | None = None,
+    cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[HalconCamera, ...]:
     """Every camera in HALCON's model.
 
-    distortion : "auto" takes the division model with kappa 0 where there is none, else the
-    polynomial one. lens : "auto" is telecentric unless that moves points of the volume by more
-    than `PERSPECTIVE_PX`. volume : None takes `working_volume`.
-    Raises InputError when the cameras do not see the volume, and for lens="perspective" with a
-    kappa that is not positive.
+    A camera is exported as telecentric unless that moves points of the volume by more than
+    `PERSPECTIVE_PX`. volume : None takes `working_volume`.
+    Raises InputError when the cameras do not see the volume.
     """
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
-    return tuple(_halcon_camera(c, points, distortion, lens) for c in cameras)
+    return tuple(_halcon_camera(camera, points) for camera in cameras)
 
 
-def _halcon_camera(
-    camera: Camera, points: Array, distortion: Distortion, lens: Lens
-) -> HalconCamera:
-    perspective = _is_perspective(camera, points, lens)
+def _halcon_camera(camera: Camera, points: Array) -> HalconCamera:
+    from scipy.linalg import polar
+
+    perspective = _is_perspective(camera, points)
     kappa = camera["kappa_per_mm"]
-    stretch, turn = _stretch_and_turn(camera)
-    sensor, tilted = _sensor(camera, stretch)
-    bent = any(camera[name] != 0 for name in COEFFICIENTS)
-    model = ("polynomial" if bent else "division") if distortion == "auto" else distortion
-    values = {"focus": 1 / kappa} if perspective else {"magnification": 1.0}
-    values |= _fitted_distortion(camera, stretch, turn, model) if bent else _no_distortion(model)
-    values |= sensor
-    kind = "_".join(["area_scan", *_lens_words(perspective, tilted), model])
+    linear = _linear_map(camera)
+    if max(abs(linear[0, 1]), abs(linear[1, 0])) <= _DIAGONAL * camera["scale_px_per_mm"]:
+        rotation, stretch = np.eye(2), np.diag(np.diag(linear))
+    else:
+        rotation, stretch = polar(linear, side="left")
+    distorted = any(camera[name] != 0 for name in COEFFICIENTS)
+    values = {"focus": 1e-3 / kappa} if perspective else {"magnification": 1.0}
+    values |= _fitted_distortion(camera, stretch, rotation) if distorted else {"kappa": 0.0}
+    values |= _sensor(camera, stretch)
     spin = np.eye(3)
-    spin[:2, :2] = turn
+    spin[:2, :2] = rotation
     pose = Pose(spin, np.array([0, 0, 1 / kappa if perspective else 0.0])) @ camera.camera_from_rig
-    if perspective:
-        values["focus"] *= 1e-3
-    raw = HalconCamera(camera.name, kind, values, pose, Misfit(0, 0, 0), False, ())
-    misfit = Misfit.between(raw.project(points), camera.project(points))
-    notes = _notes(camera, bent, perspective)
-    return HalconCamera(camera.name, kind, values, pose, misfit, not notes, notes)
+    kind = _kind(perspective, "tilt" in values, distorted)
+    notes = _notes(camera, distorted, perspective)
+    made = HalconCamera(camera.name, kind, values, pose, Misfit(0, 0, 0), notes)
+    return replace(made, misfit=Misfit.between(made.project(points), camera.project(points)))
 
 
-def _is_perspective(camera: Camera, points: Array, lens: Lens) -> bool:
-    kappa = camera["kappa_per_mm"]
-    if lens == "perspective" and not kappa > 0:
-        raise InputError(
-            f"its kappa is {kappa:.3g} per mm: HALCON's perspective models need a positive one",
-            where=f"camera {camera.name}",
-            todo="export it as telecentric",
-        )
-    if lens != "auto":
-        return lens == "perspective"
+def _is_perspective(camera: Camera, points: Array) -> bool:
     moved = camera.project(points) - camera.with_parameters(kappa_per_mm=0.0).project(points)
-    return bool(kappa > 0 and np.linalg.norm(moved, axis=-1).max() > PERSPECTIVE_PX)
+    largest_px = np.linalg.norm(moved, axis=-1).max()
+    return bool(camera["kappa_per_mm"] > 0 and largest_px > PERSPECTIVE_PX)
 
 
-def _stretch_and_turn(camera: Camera) -> tuple[Array, Array]:
-    """(2, 2) symmetric or diagonal px per mm, and a (2, 2) rotation before it; their product is
-    the camera's linear map from distorted coordinates."""
-    scale = camera["scale_px_per_mm"]
-    affine = scale * np.array([[1, camera["skew"]], [0, camera["aspect"]]])
+def _linear_map(camera: Camera) -> Array:
+    """(2, 2) px per mm, from distorted telecentric coordinates to pixels."""
+    affine = camera["scale_px_per_mm"] * np.array([[1, camera["skew"]], [0, camera["aspect"]]])
     q = np.array([camera["tilt_x"], camera["tilt_y"]])
-    linear = affine @ (np.eye(2) + np.outer(q, q) / (1 + np.sqrt(1 + q @ q)))
-    if max(abs(linear[0, 1]), abs(linear[1, 0])) <= _SQUARE * scale:
-        return np.diag(np.diag(linear)), np.eye(2)
-    u, s, vt = np.linalg.svd(linear)
-    return np.asarray((u * s) @ u.T), np.asarray(u @ vt)
+    return np.asarray(affine @ (np.eye(2) + np.outer(q, q) / (1 + np.sqrt(1 + q @ q))))
 
 
-def _sensor(camera: Camera, stretch: Array) -> tuple[dict[str, float], bool]:
-    """tilt and rot where needed, sx, sy, cx, cy and the image's size; and whether it is tilted."""
+def _sensor(camera: Camera, stretch: Array) -> dict[str, float]:
+    """tilt and rot where the sensor is tilted; sx, sy, cx, cy and the image's size."""
     width, height = camera.image_size_px
     values: dict[str, float] = {}
-    pixels = np.diag(stretch)
-    tilted = stretch[0, 1] != 0
-    if tilted:
+    px_per_mm = np.diag(stretch)
+    if stretch[0, 1] != 0:
         lengths, axes = np.linalg.eigh(stretch)
-        values["tilt"] = float(np.degrees(np.arctan2(np.sqrt(
-            (lengths[1] - lengths[0]) * (lengths[1] + lengths[0])), lengths[0])))  # fmt: skip
+        sine = np.sqrt((lengths[1] - lengths[0]) * (lengths[1] + lengths[0]))
+        values["tilt"] = float(np.degrees(np.arctan2(sine, lengths[0])))
         values["rot"] = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])) % 180)
-        pixels = lengths[[0, 0]]
-    values |= {
-        "sx": 1e-3 / float(pixels[0]),
-        "sy": 1e-3 / float(pixels[1]),
+        px_per_mm = lengths[[0, 0]]
+    return values | {
+        "sx": 1e-3 / float(px_per_mm[0]),
+        "sy": 1e-3 / float(px_per_mm[1]),
         "cx": camera["centre_u_px"],
         "cy": camera["centre_v_px"],
         "image_width": width,
         "image_height": height,
     }
-    return values, bool(tilted)
 
 
-def _lens_words(perspective: bool, tilted: bool) -> list[str]:
+def _kind(perspective: bool, tilted: bool, distorted: bool) -> str:
+    words = ["area_scan"]
     if tilted:
-        return ["tilt", "image_side_telecentric" if perspective else "bilateral_telecentric"]
-    return [] if perspective else ["telecentric"]
+        words += ["tilt", "image_side_telecentric" if perspective else "bilateral_telecentric"]
+    elif not perspective:
+        words.append("telecentric")
+    return "_".join([*words, "polynomial" if distorted else "division"])
 
 
-def _no_distortion(model: str) -> dict[str, float]:
-    names = ("kappa",) if model == "division" else ("k1", "k2", "k3", "p1", "p2")
-    return dict.fromkeys(names, 0.0)
-
-
-def _fitted_distortion(camera: Camera, stretch: Array, turn: Array, model: str) -> dict[str, float]:
-    """Least squares over the image, in HALCON's direction, where the models are linear."""
+def _fitted_distortion(camera: Camera, stretch: Array, rotation: Array) -> dict[str, float]:
+    """Least squares over the image, in HALCON's direction, in which the model is linear."""
     width, height = camera.image_size_px
     edges = [np.linspace(0, size - 1, _PIXELS_PER_EDGE) for size in (width, height)]
     uv = np.stack(np.meshgrid(*edges), -1).reshape(-1, 2)
     rho = camera.rho_mm
     centre = np.array([camera["centre_u_px"], camera["centre_v_px"]])
-    bent = np.linalg.solve(stretch, (uv - centre).T).T / rho
-    straight = projection.ideal_from_pixel(uv, camera.intrinsics, rho) @ turn.T / rho
-    r2 = np.sum(bent**2, axis=-1, keepdims=True)
-    if model == "division":
-        design = (straight * r2).reshape(-1, 1)
-        (kappa,) = np.linalg.lstsq(design, (bent - straight).reshape(-1), rcond=None)[0]
-        return {"kappa": float(kappa) / (rho * 1e-3) ** 2}
-    x, y = bent[:, :1], bent[:, 1:]
-    design = np.stack(
-        [
-            bent * r2, bent * r2**2, bent * r2**3,
-            np.concatenate([r2 + 2 * x * x, 2 * x * y], -1),
-            np.concatenate([2 * x * y, r2 + 2 * y * y], -1),
-        ],
-        -1,
-    ).reshape(-1, 5)  # fmt: skip
-    found = np.linalg.lstsq(design, (straight - bent).reshape(-1), rcond=None)[0]
-    powers = np.array([2, 4, 6, 1, 1])
-    metric = found / (rho * 1e-3) ** powers
-    return dict(zip(("k1", "k2", "k3", "p1", "p2"), metric.tolist()))
+    distorted = np.linalg.solve(stretch, (uv - centre).T).T / rho
+    undistorted = projection.ideal_from_pixel(uv, camera.intrinsics, rho) @ rotation.T / rho
+    design = coefficient_jacobian(distorted)[..., : len(_POLYNOMIAL)].reshape(uv.size, -1)
+    found = np.linalg.lstsq(design, (undistorted - distorted).reshape(-1), rcond=None)[0]
+    in_metres = {
+        name: float(value) / (rho * 1e-3) ** power
+        for value, (name, power) in zip(found, _POLYNOMIAL.items())
+    }
+    return {name: in_metres[name] for name in ("k1", "k2", "k3", "p1", "p2")}
 
 
-def _notes(camera: Camera, bent: bool, perspective: bool) -> tuple[str, ...]:
+def _notes(camera: Camera, distorted: bool, perspective: bool) -> tuple[str, ...]:
     notes = []
     if camera.wall is not None:
-        notes.append("the glass wall left out: HALCON's models have none")
-    if bent:
-        notes.append("distortion fitted: HALCON's model runs from distorted to undistorted")
+        notes.append("the refractive window is left out, because HALCON's models have none")
+    if distorted:
+        notes.append("the distortion is fitted, because HALCON's maps distorted to undistorted")
     if camera["kappa_per_mm"] != 0 and not perspective:
         notes.append(
-            f"residual perspective kappa = {camera['kappa_per_mm']:.4g} per mm left out: a "
-            "telecentric model has none"
+            f"the residual perspective kappa = {camera['kappa_per_mm']:.4g} per mm is left out, "
+            "because a telecentric model has none"
         )
     if camera["image_convergence_per_mm"] != 0 and (camera["tilt_x"] or camera["tilt_y"]):
-        notes.append("image_convergence_per_mm of the tilted sensor left out")
+        notes.append("image_convergence_per_mm of the tilted sensor is left out")
     return tuple(notes)
 
 
 def _pixel_from_camera(points_m: Array, values: dict[str, float]) -> Array:
-    flat = points_m[..., :2]
-    flat = flat * values["focus"] / points_m[..., 2:] if "focus" in values else flat
-    flat = flat * values.get("magnification", 1.0)
-    bent = _distorted(flat, values)
+    lens = values["focus"] / points_m[..., 2:] if "focus" in values else values["magnification"]
+    distorted = _distorted(points_m[..., :2] * lens, values)
     if "tilt" in values:
         angle = np.radians(values["rot"])
         axis = np.array([np.cos(angle), np.sin(angle)])
         across = np.array([-axis[1], axis[0]])
         cosine = np.cos(np.radians(values["tilt"]))
-        bent = bent @ (np.outer(axis, axis) + np.outer(across, across) / cosine)
-    pixel = bent / [values["sx"], values["sy"]]
+        distorted = distorted @ (np.outer(axis, axis) + np.outer(across, across) / cosine)
+    pixel = distorted / [values["sx"], values["sy"]]
     return np.asarray(pixel + [values["cx"], values["cy"]])
 
 
-def _distorted(straight: Array, values: dict[str, float]) -> Array:
-    """The inverse of HALCON's distortion: closed for the division model, else by fixed point.
-
-    Raises GeometryError where there is none.
-    """
+def _distorted(undistorted_m: Array, values: dict[str, float]) -> Array:
+    """The inverse of HALCON's distortion. Raises GeometryError where there is none."""
     if "kappa" in values:
-        r2 = np.sum(straight**2, axis=-1, keepdims=True)
-        inside = 1 - 4 * values["kappa"] * r2
-        if np.any(inside < 0):
-            raise GeometryError(_NO_INVERSE, todo=_USE_OPENCV)
-        return np.asarray(2 * straight / (1 + np.sqrt(inside)))
-    k1, k2, k3, p1, p2 = (values[name] for name in ("k1", "k2", "k3", "p1", "p2"))
-    bent, size = straight, float(np.max(np.abs(straight), initial=1e-6))
-    step = np.inf
-    for _ in range(100):
-        x, y = bent[..., :1], bent[..., 1:]
-        r2 = x * x + y * y
-        shift = bent * (r2 * (k1 + r2 * (k2 + r2 * k3))) + np.concatenate(
-            [p1 * (r2 + 2 * x * x) + 2 * p2 * x * y, 2 * p1 * x * y + p2 * (r2 + 2 * y * y)], -1
+        return undistorted_m
+    coefficients = np.zeros(len(COEFFICIENTS))
+    coefficients[: len(_POLYNOMIAL)] = [values[name] for name in _POLYNOMIAL]
+    failure = GeometryError(
+        "HALCON's distortion has no inverse at some of these points",
+        todo="keep to a smaller volume, or export to OpenCV, which has telerig's distortion",
+    )
+    try:
+        distorted = undistort(undistorted_m, coefficients)
+    except GeometryError as error:
+        raise failure from error
+    from_centre = np.multiply.outer(np.linspace(0, 1, 17), distorted)
+    if np.any(np.linalg.det(distortion_jacobian(from_centre, coefficients)) <= 0):
+        raise failure  # a solution beyond a fold of the polynomial
+    return distorted
+
+
+_DAT = {
+    "focus": ("Focus:foc", "DOUBLE:0.0:", "Focal length of the lens [meter]"),
+    "kappa": ("Kappa:kappa", "DOUBLE::", "Radial distortion coefficient [1/(meter*meter)]"),
+    **{
+        name: (f"Poly{i}:poly{i}", "DOUBLE::", f"{nth} polynomial distortion coefficient")
+        for i, name, nth in zip(
+            range(1, 6), ("k1", "k2", "k3", "p1", "p2"), ("1st", "2nd", "3rd", "4th", "5th")
         )
-        last, bent = bent, straight - shift
-        step = np.max(np.abs(bent - last), initial=0.0)
-        if not step < 1e3 * size:
-            break
-        if step < 1e-16 * size:
-            return np.asarray(bent)
-    if step < 1e-12 * size:
-        return np.asarray(bent)
-    raise GeometryError(_NO_INVERSE, todo=_USE_OPENCV)
+    },
+    "sx": ("Sx:sx", "DOUBLE:0.0:", "Width of a cell on the sensor [meter]"),
+    "sy": ("Sy:sy", "DOUBLE:0.0:", "Height of a cell on the sensor [meter]"),
+    "cx": ("Cx:cx", "DOUBLE::", "X-coordinate of the image center [pixel]"),
+    "cy": ("Cy:cy", "DOUBLE::", "Y-coordinate of the image center [pixel]"),
+    "image_width": ("ImageWidth:imgw", "INT:1:32767", "Width of the images [pixel]"),
+    "image_height": ("ImageHeight:imgh", "INT:1:32767", "Height of the images [pixel]"),
+}
+
+
+def write_halcon(cameras: Sequence[HalconCamera], folder: str | PathLike[str]) -> list[str]:
+    """Into a folder: cameras.hdev.txt, and per camera <camera>.dat and <camera>_pose.dat.
+
+    Returns the names of the files. A camera with a tilted sensor has no `.dat`: its layout is not
+    documented. Raises InputError when the folder cannot be written.
+    """
+    names = []
+    with atomic_folder(folder) as place:
+        for camera in cameras:
+            if "tilt" not in camera.parameters:
+                names.append(_write(place / f"{camera.camera}.dat", _parameters_text(camera)))
+            names.append(_write(place / f"{camera.camera}_pose.dat", _pose_text(camera)))
+        names.append(_write(place / "cameras.hdev.txt", hdevelop_lines(cameras)))
+    return names
+
+
+def hdevelop_lines(cameras: Sequence[HalconCamera]) -> str:
+    """Assignments to paste into HDevelop: CamParam<i> (camera type first), Pose<i>."""
+    lines = [
+        "* World: telerig's rig frame, the first camera's.",
+        "* Pixels: the centre of the top-left pixel is (0, 0).",
+        "* CamParam: camera type, then its parameters in HALCON's order (m, px, degrees).",
+        "* Pose: the world relative to the camera (camera point = Pose * world point), m, degrees.",
+    ]
+    for i, camera in enumerate(cameras, 1):
+        error = "; ".join(camera.notes) or "exact"
+        values = ", ".join(_number(v) for v in camera.parameters.values())
+        pose = ", ".join(repr(float(v)) for v in pose_tuple(camera.camera_from_rig))
+        lines += [
+            "",
+            f"* {camera.camera}: {error}",
+            f"* error against telerig over the working volume: {camera.misfit.words()}",
+            f"CamParam{i} := ['{camera.kind}', {values}]",
+            f"Pose{i} := [{pose}, 0]",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def pose_tuple(pose: Pose) -> Array:
+    """(6,) translation in m, then angles in degrees, R = Rx Ry Rz (HALCON's type 0: Rp+T, gba)."""
+    r = pose.rotation
+    beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))
+    alpha = np.arctan2(-r[1, 2], r[2, 2]) if np.hypot(r[1, 2], r[2, 2]) > 1e-9 else 0.0
+    c, s = np.cos(alpha), np.sin(alpha)
+    second = c * r[1] + s * r[2]
+    gamma = np.arctan2(second[0], second[1])
+    return np.concatenate([pose.translation_mm * 1e-3, np.degrees([alpha, beta, gamma]) % 360])
+
+
+def _parameters_text(camera: HalconCamera) -> str:
+    values = dict(camera.parameters)
+    if "magnification" in values:
+        values = {"focus": 0.0} | {k: v for k, v in values.items() if k != "magnification"}
+    lines = [
+        f"# {camera.camera}: {camera.kind}, magnification 1, Sx and Sy in the object",
+        *(f"# {note}" for note in camera.notes),
+        f"# error against telerig over the working volume: {camera.misfit.words()}",
+        "# INTERNAL CAMERA PARAMETERS",
+        "",
+        "ParGroup: Camera: Parameter;",
+        '  "Internal camera parameters";',
+    ]
+    for name, value in values.items():
+        head, kind, words = _DAT[name]
+        lines += ["", f"{head}: {_number(value)};", f"  {kind};", f'  "{words}";']
+    return "\n".join(lines) + "\n"
+
+
+def _pose_text(camera: HalconCamera) -> str:
+    x, y, z, alpha, beta, gamma = (repr(float(v)) for v in pose_tuple(camera.camera_from_rig))
+    return (
+        f"# {camera.camera}: the rig frame relative to the camera\n"
+        "# 3D POSE PARAMETERS: rotation and translation\n\n"
+        "# Used representation type:\nf 0\n\n"
+        f"# Rotation angles [deg] or Rodriguez vector:\nr {alpha} {beta} {gamma}\n\n"
+        f"# Translation vector (x y z [m]):\nt {x} {y} {z}\n"
+    )
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else repr(float(value))
+
+
+def _write(path: Path, text: str) -> str:
+    path.write_text(text, encoding="utf-8")
+    return path.name

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +49,17 @@ class Matrices:
     distortion: Array | None
 
 
+def export_opencv(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[str]:
+    """Write the matrices of all cameras into the file ``out``; returns a line per camera."""
+    matrices = camera_matrices(cameras, volume)
+    write_opencv(matrices, out)
+    return [
+        f"{m.camera}: affine matrix, {m.affine_misfit.words()}; "
+        f"matrix without the distortion, {m.undistorted_misfit.words()}"
+        for m in matrices
+    ]
+
+
 def undistorted_matrix(camera: Camera) -> Array:
     """(3, 4) projection of the camera without its distortion, in closed form.
 
@@ -57,16 +70,22 @@ def undistorted_matrix(camera: Camera) -> Array:
     tilt[:2, :2] += np.outer(q, q) / (1 + np.sqrt(1 + q @ q))
     tilt[2, :2] = -camera["image_convergence_per_mm"] * q
     scale = camera["scale_px_per_mm"]
-    pixel = np.array(
+    pixel = _pixel_matrix(camera, scale)
+    pixel[0, 1] = scale * camera["skew"]
+    pose = camera.camera_from_rig
+    placed = np.vstack([np.c_[pose.rotation, pose.translation_mm], [0, 0, 0, 1]])
+    return np.asarray(pixel @ tilt @ _telecentric_matrix(camera) @ placed)
+
+
+def _pixel_matrix(camera: Camera, scale: float) -> Array:
+    """(3, 3) scale, aspect and image centre, without skew."""
+    return np.array(
         [
-            [scale, scale * camera["skew"], camera["centre_u_px"]],
+            [scale, 0, camera["centre_u_px"]],
             [0, scale * camera["aspect"], camera["centre_v_px"]],
             [0, 0, 1],
         ]
     )
-    pose = camera.camera_from_rig
-    placed = np.vstack([np.c_[pose.rotation, pose.translation_mm], [0, 0, 0, 1]])
-    return np.asarray(pixel @ tilt @ _telecentric_matrix(camera) @ placed)
 
 
 def _telecentric_matrix(camera: Camera) -> Array:
@@ -104,7 +123,8 @@ def camera_matrices(
 
 def _matrices(camera: Camera, points: Array) -> Matrices:
     seen, exact = camera.project(points), undistorted_matrix(camera)
-    if np.array_equal(exact[2], [0, 0, 0, 1]) and not _is_distorted(camera):
+    distorted = any(camera[name] != 0 for name in COEFFICIENTS)
+    if np.array_equal(exact[2], [0, 0, 0, 1]) and not distorted:
         affine = exact
     else:
         design = np.c_[points, np.ones(len(points))]
@@ -122,21 +142,10 @@ def _matrices(camera: Camera, points: Array) -> Matrices:
     )
 
 
-def _is_distorted(camera: Camera) -> bool:
-    return any(camera[name] != 0 for name in COEFFICIENTS)
-
-
 def _opencv_distortion(camera: Camera) -> tuple[Array | None, Array | None]:
     if any(camera[name] != 0 for name in ("skew", "tilt_x", "tilt_y")):
         return None, None
-    focal = camera["scale_px_per_mm"] * camera.rho_mm
-    matrix = np.array(
-        [
-            [focal, 0, camera["centre_u_px"]],
-            [0, focal * camera["aspect"], camera["centre_v_px"]],
-            [0, 0, 1],
-        ]
-    )
+    matrix = _pixel_matrix(camera, camera["scale_px_per_mm"] * camera.rho_mm)
     return matrix, np.array([camera[name] if name else 0.0 for name in _OPENCV_ORDER])
 
 
@@ -148,35 +157,35 @@ def write_opencv(matrices: Sequence[Matrices], path: str | PathLike[str]) -> Non
     import cv2
 
     with atomic_path(path) as temporary:
-        storage = cv2.FileStorage(
-            str(temporary), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML
-        )
+        mode = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML
+        storage: Any = cv2.FileStorage(str(temporary), mode)
         try:
             storage.write("frame", "rig: the first camera's frame, mm")
             storage.write("pixel_origin", "centre of the top-left pixel is (0, 0)")
             storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
             for one in matrices:
-                _write_camera(storage, one)
+                storage.startWriteStruct("", cv2.FILE_NODE_MAP)
+                for name, value in _content(one).items():
+                    storage.write(name, value)
+                storage.endWriteStruct()
             storage.endWriteStruct()
         finally:
             storage.release()
 
 
-def _write_camera(storage: object, one: Matrices) -> None:
-    import cv2
-
-    write = storage.write  # type: ignore[attr-defined]
-    storage.startWriteStruct("", cv2.FILE_NODE_MAP)  # type: ignore[attr-defined]
-    write("name", one.camera)
-    write("image_width", one.image_size_px[0])
-    write("image_height", one.image_size_px[1])
-    write("undistorted", one.undistorted)
-    write("undistorted_rms_px", one.undistorted_misfit.rms_px)
-    write("undistorted_max_px", one.undistorted_misfit.max_px)
-    write("affine", one.affine)
-    write("affine_rms_px", one.affine_misfit.rms_px)
-    write("affine_max_px", one.affine_misfit.max_px)
+def _content(one: Matrices) -> dict[str, Any]:
+    content: dict[str, Any] = {
+        "name": one.camera,
+        "image_width": one.image_size_px[0],
+        "image_height": one.image_size_px[1],
+        "undistorted": one.undistorted,
+        "undistorted_rms_px": one.undistorted_misfit.rms_px,
+        "undistorted_max_px": one.undistorted_misfit.max_px,
+        "affine": one.affine,
+        "affine_rms_px": one.affine_misfit.rms_px,
+        "affine_max_px": one.affine_misfit.max_px,
+    }
     if one.camera_matrix is not None and one.distortion is not None:
-        write("camera_matrix", one.camera_matrix)
-        write("distortion_coefficients", one.distortion.reshape(1, -1))
-    storage.endWriteStruct()  # type: ignore[attr-defined]
+        content["camera_matrix"] = one.camera_matrix
+        content["distortion_coefficients"] = one.distortion.reshape(1, -1)
+    return content

@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.errors import InputError
 from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
-from telerig.io.files.atomic import write_text_atomic
+from telerig.io.files.atomic import atomic_folder, write_text_atomic
 from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
@@ -55,6 +54,25 @@ class Soloff:
         return terms(np.asarray(points_mm, float), len(self.coefficients)) @ self.coefficients
 
 
+def export_soloff(
+    cameras: Sequence[Camera],
+    out: Path,
+    volume: Volume,
+    *,
+    full_cubic: bool = False,
+    first_pixel: float = 0.0,
+) -> list[str]:
+    """Write soloff_<camera>.csv for all cameras into the folder ``out``; returns a line per camera.
+
+    full_cubic : see `fit_soloff`. first_pixel : see `write_soloff`.
+    """
+    fits = fit_soloff(cameras, volume, full_cubic=full_cubic)
+    with atomic_folder(out) as folder:
+        for fit in fits:
+            write_soloff(fit, folder / f"soloff_{fit.camera}.csv", first_pixel)
+    return [f"{f.camera}: {len(f.coefficients)} terms, {f.misfit.words()}" for f in fits]
+
+
 def terms(points_mm: Array, count: int = len(POWERS)) -> Array:
     """(..., 3) -> (..., count) monomials in the order of `POWERS`, then `CUBIC_Z`."""
     powers = np.array([*POWERS, CUBIC_Z][:count])
@@ -90,8 +108,7 @@ def write_soloff(fit: Soloff, path: str | PathLike[str], first_pixel: float = 0.
     """A CSV of the terms below a header in words: volume, units, pixel origin, fit error.
 
     first_pixel : the coordinate that the other program gives the centre of the top-left pixel: 0
-    as here, 0.5 where it counts from the pixel's corner, 1 in MATLAB. Read it back with
-    `read_soloff`.
+    as here, 0.5 where it counts from the pixel's corner, 1 in MATLAB.
     """
     shifted = fit.coefficients.copy()
     shifted[0] += first_pixel
@@ -110,29 +127,3 @@ def write_soloff(fit: Soloff, path: str | PathLike[str], first_pixel: float = 0.
     ]
     text = "".join(f"# {line}\n" for line in head) + "i,j,k,u,v\n" + "\n".join(rows) + "\n"
     write_text_atomic(path, text)
-
-
-def read_soloff(path: str | PathLike[str]) -> Array:
-    """(19, 2) or (20, 2) coefficients in the order of `POWERS`, pixel origin as the file has it.
-
-    Raises InputError for a file that does not hold these terms.
-    """
-    file = Path(path)
-    try:
-        table = np.loadtxt(file, delimiter=",", comments=("#", "i"), ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"cannot be read ({error})", where=str(file), todo="export again"
-        ) from error
-    powers = np.array([*POWERS, CUBIC_Z])[: len(table)]
-    if (
-        len(table) < len(POWERS)
-        or table.shape[1:] != (5,)
-        or not np.array_equal(table[:, :3], powers)
-    ):
-        raise InputError(
-            "does not hold the 19 terms in the order of telerig",
-            where=str(file),
-            todo="export again",
-        )
-    return np.asarray(table[:, 3:])

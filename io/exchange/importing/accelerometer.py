@@ -1,13 +1,15 @@
-"""Readings of accelerometers from CSV, WAV, TDMS and MAT files as `accelerometer.csv` wants them.
+"""Readings of accelerometers from CSV, WAV, TDMS and MAT files, for `accelerometer.csv`.
 
-The unit is never guessed: it is in the file's own column names (``ax_m_s2``), in a TDMS channel's
-``unit_string``, or given. Axes stay the sensor's own; rig.toml says how they lie in the rig.
+The unit is never guessed: it is in the column names of the file (``ax_m_s2``), in the
+``unit_string`` of a TDMS channel, or given. The axes stay those of the sensor; rig.toml says how
+they lie in the rig.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
-from telerig.io.exchange.importing.accelerometer_files import Recording, open_recording
+from telerig.io.exchange.importing.text import read_text
 from telerig.io.files.csv_table import write_table
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ Array = NDArray[np.float64]
 STANDARD_GRAVITY_M_S2 = 9.80665
 UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "g": STANDARD_GRAVITY_M_S2,
          "mg": 1e-3 * STANDARD_GRAVITY_M_S2}  # fmt: skip
+_EXPORT_AGAIN = "export the recording again, or give another file"
 COLUMNS = ["t_s", "sensor", "ax_m_s2", "ay_m_s2", "az_m_s2"]
 
 
@@ -65,7 +68,7 @@ def read_accelerations(
     names = _channels(recording, asked.channels)
     raw = np.stack([_values(recording, name) for name in names], -1)
     t_s = _times(recording, asked, len(raw)) + asked.start_s
-    _check(recording, names, raw, t_s)
+    _check_readings(recording, names, raw, t_s)
     readings = raw * _scale(recording, names, asked)
     table = pd.DataFrame({"t_s": t_s, "sensor": sensor})
     table[COLUMNS[2:]] = readings
@@ -104,7 +107,7 @@ def _channels(recording: Recording, asked: Sequence[str | int] | None) -> list[s
         if len(there) == 3:
             return there
         raise InputError(
-            "does not tell which channels are x, y and z",
+            "does not say which channels are x, y and z",
             where=recording.where,
             todo=f"name three of them: {', '.join(there)}",
         )
@@ -123,7 +126,9 @@ def _values(recording: Recording, name: str) -> Array:
     values = recording.channels[name]
     if values.dtype.kind not in "iufb" or values.ndim != 1:
         raise InputError(
-            f"channel {name!r} is no column of numbers", where=recording.where, todo="name another"
+            f"channel {name!r} is no column of numbers",
+            where=recording.where,
+            todo="name another one",
         )
     return np.asarray(values, float)
 
@@ -145,7 +150,7 @@ def _times(recording: Recording, asked: Layout, rows: int) -> Array:
                 return _values(recording, name)
     if rate is None or not rate > 0:
         raise InputError(
-            "tells neither times nor a sampling rate" if rate is None else f"rate is {rate} Hz",
+            "contains neither times nor a sampling rate" if rate is None else f"rate is {rate} Hz",
             where=recording.where,
             todo="give the name of the channel with times in s, or rate_hz",
         )
@@ -155,7 +160,7 @@ def _times(recording: Recording, asked: Layout, rows: int) -> Array:
 def _scale(recording: Recording, names: Sequence[str], asked: Layout) -> Array:
     if asked.scale_m_s2 is not None:
         if asked.unit is not None:
-            raise InputError("both a unit and scale_m_s2 given", todo="give one of them")
+            raise InputError("both a unit and scale_m_s2 are given", todo="give one of them")
         return _finite(asked.scale_m_s2)
     units = [asked.unit or recording.units.get(name) or "" for name in names]
     if all(name.endswith("_m_s2") for name in names) and asked.unit is None:
@@ -164,9 +169,9 @@ def _scale(recording: Recording, names: Sequence[str], asked: Layout) -> Array:
     if unknown:
         raise InputError(
             f"the unit of its readings is {unknown[0]!r}" if unknown[0]
-            else "does not tell the unit of its readings",
+            else "does not say the unit of its readings",
             where=recording.where,
-            todo=f"give unit ({', '.join(UNITS)}) or scale_m_s2, the m/s^2 for a reading of 1",
+            todo=f"give unit ({', '.join(UNITS)}), or scale_m_s2, the m/s^2 of a reading of 1",
         )  # fmt: skip
     return np.array([UNITS[unit] for unit in units])
 
@@ -174,14 +179,18 @@ def _scale(recording: Recording, names: Sequence[str], asked: Layout) -> Array:
 def _finite(scale: ArrayLike) -> Array:
     values = np.asarray(scale, float)
     if values.shape not in ((), (3,)) or not np.isfinite(values).all() or not values.all():
-        raise InputError(f"scale_m_s2 is {scale!r}", todo="give one number or three, none zero")
+        raise InputError(
+            f"scale_m_s2 is {scale!r}", todo="give one number or three, none of them zero"
+        )
     return values
 
 
-def _check(recording: Recording, names: Sequence[str], raw: Array, t_s: Array) -> None:
+def _check_readings(recording: Recording, names: Sequence[str], raw: Array, t_s: Array) -> None:
     if len(raw) != len(t_s) or not len(raw):
         raise InputError(
-            f"has {len(raw)} readings and {len(t_s)} times", where=recording.where, todo="check it"
+            f"has {len(raw)} readings and {len(t_s)} times",
+            where=recording.where,
+            todo="give as many times as readings, at least one",
         )
     bad = np.argwhere(~np.isfinite(np.c_[raw, t_s]))
     if len(bad):
@@ -198,14 +207,15 @@ def _check(recording: Recording, names: Sequence[str], raw: Array, t_s: Array) -
         raise InputError(
             f"time {t_s[i + 1]:.9g} s follows {t_s[i]:.9g} s (reading {i + 1})",
             where=recording.where,
-            todo="times must increase; give rate_hz where they are rounded",
+            todo="times must increase; give rate_hz instead if they are rounded",
         )
 
 
 def layout_from(options: dict[str, Any]) -> Layout:
-    """A `Layout` from words of a command line: channels "2,3,4" or "x,y,z", scale "9.8" or three.
+    """A `Layout` from the options of a command line.
 
-    Raises InputError for what is no number where one is needed.
+    channels is "2,3,4" or "x,y,z"; scale_m_s2 is "9.8" or three numbers. Raises InputError for a
+    scale that is no number.
     """
     values = {key: value for key, value in options.items() if value is not None}
     if "channels" in values:
@@ -220,3 +230,168 @@ def layout_from(options: dict[str, Any]) -> Layout:
             ) from error
         values["scale_m_s2"] = numbers[0] if len(numbers) == 1 else numbers
     return Layout(**values)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """channels : name -> (N,) raw values. units : name -> unit, where the file has one.
+
+    rate_hz, offset_s : of the samples, where the file has them.
+    """
+
+    where: str
+    channels: dict[str, NDArray[Any]]
+    units: dict[str, str] = field(default_factory=dict)
+    rate_hz: float | None = None
+    offset_s: float = 0.0
+
+
+def open_recording(path: Path, group: str | None = None) -> Recording:
+    """Read a file by its ending: .csv .txt .tsv, .wav, .tdms, .mat.
+
+    group : of a TDMS file with several. Raises InputError for what cannot be read.
+    """
+    readers = {".csv": _csv, ".txt": _csv, ".tsv": _csv, ".wav": _wav, ".mat": _mat}
+    ending = path.suffix.lower()
+    if not path.is_file():
+        raise InputError("there is no such file", where=str(path), todo="check the path")
+    if ending == ".tdms":
+        return _tdms(path, group)
+    if ending not in readers:
+        raise InputError(
+            f"recordings that end in {ending or 'nothing'} cannot be read",
+            where=str(path),
+            todo="give a .csv, .wav, .tdms or .mat file",
+        )
+    return readers[ending](path)
+
+
+def _csv(path: Path) -> Recording:
+    """The header is the last line before the numbers; lines above it (from a logger) are skipped.
+
+    Cells are separated by commas, semicolons (also with decimal commas) or tabs.
+    """
+    lines = read_text(path).splitlines()
+    first = next((i for i, line in enumerate(lines) if _cells(line) is not None), None)
+    if not first:
+        raise InputError(
+            "has no rows of numbers below a header" if first is None else "has no header line",
+            where=str(path),
+            todo="write the names of the channels above the numbers",
+        )
+    mark, _ = _cells(lines[first]) or ("", [])
+    header = [name.strip().strip('"') for name in lines[first - 1].split(mark)]
+    rows = []
+    for i, line in enumerate(lines[first:], first + 1):
+        if not line.strip():
+            continue
+        cells = _cells(line)
+        if cells is None or len(cells[1]) != len(header):
+            raise InputError(
+                f"{line[:60]!r} is not {len(header)} numbers",
+                where=f"{path} row {i}",
+                todo="correct or remove the row",
+            )
+        rows.append(cells[1])
+    if len(set(header)) != len(header):
+        raise InputError("two columns have the same name", where=str(path), todo="rename one")
+    return Recording(str(path), dict(zip(header, np.array(rows).T)))
+
+
+def _cells(line: str) -> tuple[str, list[float]] | None:
+    """Separator and numbers of a line; None when it holds anything else."""
+    mark = next((m for m in (";", "\t", ",") if m in line), ",")
+    cells = [cell.strip() for cell in line.split(mark)]
+    if mark != ",":
+        cells = [cell.replace(",", ".") for cell in cells]
+    if not any(cells):
+        return None
+    try:
+        return mark, [float(cell) if cell else np.nan for cell in cells]
+    except ValueError:
+        return None
+
+
+def _wav(path: Path) -> Recording:
+    """Whole numbers are divided by their full scale, so 1 is full scale in every format."""
+    from scipy.io import wavfile
+
+    try:
+        rate, samples = wavfile.read(path)
+    except (ValueError, OSError) as error:
+        raise InputError(
+            f"is no WAV file that can be read ({error})", where=str(path), todo=_EXPORT_AGAIN
+        ) from error
+    values = samples.reshape(len(samples), -1).astype(float)
+    if samples.dtype == np.uint8:
+        values = (values - 128) / 128
+    elif samples.dtype.kind == "i":
+        values /= -float(np.iinfo(samples.dtype).min)
+    channels = {str(i): column for i, column in enumerate(values.T)}
+    return Recording(str(path), channels, rate_hz=float(rate))
+
+
+def _mat(path: Path) -> Recording:
+    """Vectors by their names; the columns of an (N, k) matrix as name_0, name_1, ..."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path, squeeze_me=True)
+    except NotImplementedError as error:
+        raise InputError(
+            "is a MATLAB 7.3 file", where=str(path), todo="save it with -v7"
+        ) from error
+    except (ValueError, OSError, TypeError, MatReadError) as error:
+        raise InputError(
+            f"is no MAT file that can be read ({error})", where=str(path), todo=_EXPORT_AGAIN
+        ) from error
+    channels: dict[str, NDArray[Any]] = {}
+    for name, value in content.items():
+        array = np.asarray(value)
+        if name.startswith("__") or array.dtype.kind not in "iuf":
+            continue
+        if array.ndim == 1:
+            channels[name] = array
+        elif array.ndim == 2:
+            columns = array if array.shape[0] >= array.shape[1] else array.T
+            channels |= {f"{name}_{i}": column for i, column in enumerate(columns.T)}
+    return Recording(str(path), channels)
+
+
+def _tdms(path: Path, group: str | None) -> Recording:
+    try:
+        nptdms = import_module("nptdms")
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "TDMS files need nptdms", where=str(path), todo="pip install 'telerig[tdms]'"
+        ) from error
+    try:
+        file = nptdms.TdmsFile.read(path)
+    except (ValueError, OSError, KeyError) as error:
+        raise InputError(
+            f"is no TDMS file that can be read ({error})", where=str(path), todo=_EXPORT_AGAIN
+        ) from error
+    groups = [g for g in file.groups() if g.channels()]
+    chosen = [g for g in groups if group in (None, g.name)]
+    if len(chosen) != 1:
+        names = ", ".join(g.name for g in groups)
+        raise InputError(
+            f"has no group {group!r}" if group else f"has {len(groups)} groups",
+            where=str(path),
+            todo=f"name one of: {names}",
+        )
+    found = chosen[0].channels()
+    units = {c.name: str(c.properties["unit_string"]) for c in found
+             if c.properties.get("unit_string")}  # fmt: skip
+    steps = {float(c.properties["wf_increment"]) for c in found if "wf_increment" in c.properties}
+    starts = {float(c.properties.get("wf_start_offset", 0.0)) for c in found}
+    if len(steps) > 1 or len(starts) > 1:
+        raise InputError(
+            "its channels were sampled at different times",
+            where=str(path),
+            todo="resample them to one clock before the import",
+        )
+    step = steps.pop() if steps else 0.0
+    channels = {c.name: np.asarray(c[:]) for c in found}
+    return Recording(str(path), channels, units, 1 / step if step > 0 else None, starts.pop())

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes
-from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
+from telerig.rig.pose import rotation_from_rotvec
 
 Array = NDArray[np.float64]
 
@@ -34,8 +33,8 @@ def read_opencv_cameras(
     image_size_px: tuple[int, int] | None = None,
     unit_mm: float = 1.0,
     names: Sequence[str] = ("left", "right"),
-) -> tuple[tuple[Camera, ...], Pose]:
-    """Two pinhole cameras, and `rig_from_world`, the world being OpenCV's first camera.
+) -> ImportedCameras:
+    """Two pinhole cameras; the world is OpenCV's first camera.
 
     paths : one file with everything, or several: intrinsics and extrinsics, or one file for each
     camera (in their order) and one with R and T. image_size_px : (width, height), needed where no
@@ -53,10 +52,10 @@ def read_opencv_cameras(
     single = [c for c in contents if "camera_matrix" in c]
     if len(single) == 2:
         matrices = [c["camera_matrix"] for c in single]
-        bent = [c.get("distortion_coefficients", np.zeros(5)) for c in single]
+        distortions = [c.get("distortion_coefficients", np.zeros(5)) for c in single]
     else:
         matrices = [_one(joint, _MATRIX, i, where) for i in (1, 2)]
-        bent = [_one(joint, _DISTORTION, i, where, np.zeros(5)) for i in (1, 2)]
+        distortions = [_one(joint, _DISTORTION, i, where, np.zeros(5)) for i in (1, 2)]
     rotation = _one(joint, _ROTATION, 0, where)
     if rotation.size == 3:
         rotation = rotation_from_rotvec(rotation.reshape(3))
@@ -64,14 +63,14 @@ def read_opencv_cameras(
     size = image_size_px or _size(joint, where)
     if rotation.shape != (3, 3) or shift.shape != (3,) or any(m.shape != (3, 3) for m in matrices):
         raise InputError(
-            "R, T or a camera matrix is not of its size",
+            "R, T or a camera matrix does not have its size",
             where=where,
             todo="give R as (3, 3) or a rotation vector, T with 3 numbers, matrices (3, 3)",
         )
     pinholes = [
         Pinhole(f"{where} camera {i + 1}", size, matrix, *pose, np.asarray(d, float).reshape(-1))
         for i, (matrix, pose, d) in enumerate(
-            zip(matrices, [(np.eye(3), np.zeros(3)), (rotation, shift)], bent)
+            zip(matrices, [(np.eye(3), np.zeros(3)), (rotation, shift)], distortions)
         )
     ]
     return cameras_from_pinholes(pinholes, list(names))

@@ -1,7 +1,7 @@
 """OpenLPT's camera text files (`cam1.txt`, ...) as cameras of this library, exactly.
 
-See `telerig.io.exchange.importing.pinhole`. OpenLPT's images are often
-left-handed against its world (fy < 0 with a proper R): then the world is mirrored.
+OpenLPT's images are often left-handed with respect to its world (fy < 0 with a proper R): then the
+world is mirrored, see `telerig.io.exchange.importing.pinhole`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes
-from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose
+from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
+from telerig.io.exchange.importing.text import read_text
 
 Array = NDArray[np.float64]
 
@@ -29,12 +28,11 @@ _WIDTHS = {"image size": 2, "camera matrix": 3, "rotation matrix": 3, "translati
 
 def read_openlpt_cameras(
     paths: Sequence[str | PathLike[str]], names: Sequence[str] | None = None
-) -> tuple[tuple[Camera, ...], Pose]:
-    """Cameras of OpenLPT text files, and `rig_from_world` for points in OpenLPT's world.
+) -> ImportedCameras:
+    """Cameras of OpenLPT text files.
 
     The rig frame is the first camera's, its origin where the first two optical axes come closest
     (for one camera: at the depth of the world's origin). names : default the files' stems.
-    `rig_from_world.rotation` has determinant -1 where the files' world is mirrored.
 
     Raises InputError for files that cannot be read or are of another camera model, for distortion
     that this library's model cannot express exactly, and for cameras of unequal handedness.
@@ -47,16 +45,12 @@ def read_openlpt_cameras(
 
 
 def _read(path: Path) -> Pinhole:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", where=str(path), todo="check it") from error
-    numbered = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1)]
+    numbered = [(i, line.strip()) for i, line in enumerate(read_text(path).splitlines(), 1)]
     lines = [(i, line) for i, line in numbered if line and not line.startswith("#")]
     if not lines or lines[0][1] != "PINHOLE":
         kind = lines[0][1] if lines else "nothing"
         raise InputError(
-            f"holds {kind[:40]!r} where 'PINHOLE' should stand",
+            f"holds {kind[:40]!r} where 'PINHOLE' is expected",
             where=str(path),
             todo="only OpenLPT's pinhole cameras can be imported; calibrate others with telerig",
         )
@@ -96,7 +90,8 @@ def _numbers(line: str, what: str, where: str) -> Array:
         values = np.array([np.nan])
     if not np.isfinite(values).all() or len(values) != _WIDTHS.get(what, len(values)):
         raise InputError(
-            f"{line[:60]!r} is not the {what}: {_WIDTHS.get(what, 'some')} numbers, commas between",
+            f"{line[:60]!r} is not the {what}: {_WIDTHS.get(what, 'some')} numbers with commas "
+            "between them",
             where=where,
             todo="export the camera again",
         )

@@ -1,10 +1,10 @@
 """OpenPTV's `.ori` and `.addpar` files as cameras of this library.
 
-OpenPTV (liboptv: imgcoord, trafo, calibration): photogrammetric axes, x right, y up, the camera
-looks along -z; sensor coordinates in mm; Brown's distortion about the *sensor's* centre, after the
-principal point (xh, yh) has been added; then scx and she; pixels counted from the corner of the
-top-left one. Exact without distortion, and with it where xh = yh = 0; otherwise the distortion is
-fitted about the principal point, and a note says how well.
+OpenPTV (liboptv: imgcoord, trafo, calibration) has photogrammetric axes (x right, y up, the camera
+looks along -z), sensor coordinates in mm, Brown's distortion about the *sensor's* centre after the
+principal point (xh, yh) has been added, then scx and she, and pixels counted from the corner of the
+top-left one. The import is exact without distortion, and with it where xh = yh = 0; otherwise the
+distortion is fitted about the principal point, and a note states the error.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.exchange.importing.pinhole import Pinhole, cameras_from_pinholes
+from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
+from telerig.io.exchange.importing.text import read_text
 from telerig.rig import projection
 from telerig.rig.camera import Camera
+from telerig.rig.distortion import distort
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
 Array = NDArray[np.float64]
@@ -56,8 +58,8 @@ def read_openptv_cameras(
     paths: Sequence[str | PathLike[str]],
     sensor: Sensor,
     names: Sequence[str] | None = None,
-) -> tuple[tuple[Camera, ...], Pose, tuple[str, ...]]:
-    """Cameras of `.ori` files (with the `.addpar` beside each), `rig_from_world`, and notes.
+) -> ImportedCameras:
+    """Cameras of `.ori` files (with the `.addpar` beside each).
 
     sensor : of all cameras; see `read_ptv_par`. names : default the files' names up to the first
     point. Raises InputError for files that cannot be read and for distortion that cannot be
@@ -67,22 +69,24 @@ def read_openptv_cameras(
     if not files:
         raise InputError("no .ori files", todo="name at least one")
     labels = [f.path.name.split(".")[0] for f in files] if names is None else list(names)
-    cameras, rig_from_world = cameras_from_pinholes([_pinhole(f, sensor) for f in files], labels)
-    notes = [f"{f.path.name}: no .addpar beside it, distortion taken as none" for f in files
-             if not _added_path(f.path).is_file()]  # fmt: skip
+    cameras, rig_from_world, _ = cameras_from_pinholes([_pinhole(f, sensor) for f in files], labels)
+    notes = [
+        f"{f.path.name}: there is no .addpar file beside it, so it has no distortion"
+        for f in files
+        if not f.path.with_suffix(".addpar").is_file()
+    ]
     out = []
     for file, camera in zip(files, cameras):
         if np.any(file.added[:5]) and np.any(file.principal):
-            camera, words = _fitted(file, camera, sensor)
-            notes.append(words)
+            camera, note = _fitted(file, camera, sensor)
+            notes.append(note)
         out.append(camera)
-    turn = out[0].camera_from_rig
-    back = turn.inverse()
+    first = out[0].camera_from_rig
     in_rig = [
-        replace(c, camera_from_rig=c.camera_from_rig @ back if i else Pose.identity())
+        replace(c, camera_from_rig=c.camera_from_rig @ first.inverse() if i else Pose.identity())
         for i, c in enumerate(out)
     ]
-    return tuple(in_rig), turn @ rig_from_world, tuple(notes)
+    return ImportedCameras(tuple(in_rig), first @ rig_from_world, tuple(notes))
 
 
 def read_ptv_par(path: str | PathLike[str]) -> Sensor:
@@ -92,10 +96,10 @@ def read_ptv_par(path: str | PathLike[str]) -> Sensor:
     camera does not have it.
     """
     file = Path(path)
-    words = _text(file).split("\n")
+    lines = read_text(file).split("\n")
     try:
-        count = int(words[0])
-        values = [float(w) for w in words[1 + 2 * count :] if w.strip()]
+        count = int(lines[0])
+        values = [float(line) for line in lines[1 + 2 * count :] if line.strip()]
         width, height, pixel_x, pixel_y = values[3:7]
         interlaced, *indices = values[7:11]
     except (ValueError, IndexError) as error:
@@ -122,27 +126,23 @@ def _read(path: Path) -> _Orientation:
     omega, phi, kappa = values[3:6]
     turns = [rotation_from_rotvec(angle * axis) for angle, axis in
              zip((omega, phi, kappa), np.eye(3))]  # fmt: skip
-    added = _added_path(path)
-    bent = _numbers(added, 7)[:7] if added.is_file() else np.array([0.0] * 5 + [1.0, 0.0])
+    beside = path.with_suffix(".addpar")
+    added = _numbers(beside, 7)[:7] if beside.is_file() else np.array([0.0] * 5 + [1.0, 0.0])
     if not values[17] > 0:
         raise InputError(
-            f"its principal distance is {values[17]:g} mm", where=str(path), todo="it must be > 0"
+            f"its principal distance is {values[17]:g} mm", where=str(path), todo="give one > 0"
         )
     return _Orientation(
-        path, values[:3], turns[0] @ turns[1] @ turns[2], values[15:17], float(values[17]), bent
+        path, values[:3], turns[0] @ turns[1] @ turns[2], values[15:17], float(values[17]), added
     )
-
-
-def _added_path(path: Path) -> Path:
-    return path.with_suffix(".addpar")
 
 
 def _numbers(path: Path, least: int) -> Array:
     try:
-        values = np.array([float(word) for word in _text(path).split()])
+        values = np.array([float(word) for word in read_text(path).split()])
     except ValueError as error:
         raise InputError(
-            f"holds what is no number ({error})", where=str(path), todo="export it again"
+            f"holds something that is no number ({error})", where=str(path), todo="export it again"
         ) from error
     if len(values) < least or not np.isfinite(values).all():
         raise InputError(
@@ -151,13 +151,6 @@ def _numbers(path: Path, least: int) -> Array:
             todo="give an .ori file (its .addpar is found beside it)",
         )
     return values
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", where=str(path), todo="check it") from error
 
 
 def _pixel_from_metric(file: _Orientation, sensor: Sensor) -> Array:
@@ -205,38 +198,34 @@ def _fitted(file: _Orientation, camera: Camera, sensor: Sensor) -> tuple[Camera,
     inside = np.all((wanted > -1) & (wanted < np.array(sensor.image_size_px)), axis=-1)
     points, wanted = points[inside], wanted[inside]
 
-    def moved(x: Array) -> tuple[Camera, Array]:
+    def fitted(x: Array) -> tuple[Camera, Pose]:
         free = {name: camera[name] + value for name, value in zip(_FREE, x)}
         turn = Pose(rotation_from_rotvec(np.array([0, 0, x[-1]])), np.zeros(3))
-        return camera.with_parameters(**free), turn.apply(points)
+        return camera.with_parameters(**free), turn
 
-    def miss(x: Array) -> Array:
-        changed, turned = moved(x)
-        uv = projection.pixel_from_camera(turned, changed.intrinsics, camera.rho_mm)
+    def residual_px(x: Array) -> Array:
+        changed, turn = fitted(x)
+        uv = projection.pixel_from_camera(turn.apply(points), changed.intrinsics, camera.rho_mm)
         return np.asarray((uv - wanted).reshape(-1))
 
-    found = least_squares(miss, np.zeros(len(_FREE) + 1), x_scale="jac", xtol=1e-15, ftol=1e-15)
-    worst = float(np.linalg.norm(miss(found.x).reshape(-1, 2), axis=-1).max())
+    start = np.zeros(len(_FREE) + 1)
+    found = least_squares(residual_px, start, x_scale="jac", xtol=1e-15, ftol=1e-15)
+    worst = float(np.linalg.norm(residual_px(found.x).reshape(-1, 2), axis=-1).max())
     if worst > WORST_FIT_PX:
         raise InputError(
-            f"its distortion is {worst:.2g} px from any that this library has",
+            f"its distortion differs by {worst:.2g} px from the nearest that telerig's model has",
             where=str(file.path),
             todo="calibrate with telerig",
         )
-    changed, _ = moved(found.x)
-    turn = Pose(rotation_from_rotvec(np.array([0, 0, found.x[-1]])), np.zeros(3))
-    words = f"{file.path.name}: distortion fitted about the principal point, to {worst:.2g} px"
-    return replace(changed, camera_from_rig=turn @ camera.camera_from_rig), words
+    changed, turn = fitted(found.x)
+    note = f"{file.path.name}: distortion fitted about the principal point, to {worst:.2g} px"
+    return replace(changed, camera_from_rig=turn @ camera.camera_from_rig), note
 
 
 def _distorted_px(file: _Orientation, straight_px: Array, sensor: Sensor) -> Array:
     """OpenPTV's distortion between pixels without and with it."""
     matrix = _pixel_from_metric(file, sensor)
     flat = np.linalg.solve(matrix[:2, :2], (straight_px - matrix[:2, 2]).T).T
-    x, y = flat[:, 0], -flat[:, 1]
     k1, k2, k3, p1, p2 = file.added[:5]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bent_x = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
-    bent_y = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
-    return np.stack([bent_x, -bent_y], -1) @ matrix[:2, :2].T + matrix[:2, 2]
+    distorted = distort(flat * [1, -1], np.array([k1, k2, k3, p2, p1, 0, 0, 0, 0]))
+    return distorted * [1, -1] @ matrix[:2, :2].T + matrix[:2, 2]

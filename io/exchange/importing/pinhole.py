@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,10 +50,17 @@ class Pinhole:
         return bool(np.linalg.det(self.camera_matrix @ self.rotation) < 0)
 
 
-def cameras_from_pinholes(
-    pinholes: Sequence[Pinhole], names: Sequence[str]
-) -> tuple[tuple[Camera, ...], Pose]:
-    """Cameras, and `rig_from_world` for points in the other program's world.
+class ImportedCameras(NamedTuple):
+    """rig_from_world : for points in the other program's world; its rotation has determinant -1
+    where that world is mirrored. notes : what is not exact, for the user."""
+
+    cameras: tuple[Camera, ...]
+    rig_from_world: Pose
+    notes: tuple[str, ...] = ()
+
+
+def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> ImportedCameras:
+    """The cameras of this library that give the same pixels.
 
     The rig frame is the first camera's, its origin where the first two optical axes come closest
     (for one camera: at the depth of the world's origin).
@@ -62,15 +70,15 @@ def cameras_from_pinholes(
     """
     if len(names) != len(pinholes) or len(set(names)) != len(names):
         raise InputError(
-            f"{len(pinholes)} camera files with the names {list(names)}",
-            todo="give one name for each file, no two alike",
+            f"{len(pinholes)} cameras with the names {list(names)}",
+            todo="give as many names as cameras, all different",
         )
     mirror = np.diag([1.0, 1.0, -1.0 if pinholes[0].mirrored else 1.0])
     for one in pinholes:
         _check(one)
         if one.mirrored != pinholes[0].mirrored:
             raise InputError(
-                f"its image is mirrored against that of {pinholes[0].where}",
+                f"its image is mirrored with respect to that of {pinholes[0].where}",
                 where=one.where,
                 todo="flip one camera's images and calibrate again",
             )
@@ -88,22 +96,24 @@ def cameras_from_pinholes(
             zip(names, pinholes, split, distances, poses)
         )
     ]
-    return tuple(cameras), rig_from_world
+    return ImportedCameras(tuple(cameras), rig_from_world)
 
 
 def _check(one: Pinhole) -> None:
     k, r = one.camera_matrix, one.rotation
     if min(one.image_size_px) < 1:
-        raise InputError(f"image size {one.image_size_px}", where=one.where, todo="it must be > 0")
+        raise InputError(f"image size {one.image_size_px}", where=one.where, todo="give a size > 0")
     if not np.array_equal(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]) or not k[0, 0] > 0:
         raise InputError(
-            "the camera matrix is not [f 0 c; 0 f c; 0 0 1], f > 0 first", where=one.where
+            "the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1] with fx > 0",
+            where=one.where,
+            todo="export the camera again",
         )
     deviation = float(np.abs(r @ r.T - np.eye(3)).max())
     if deviation > 0.05 or np.linalg.det(r) < 0 or k[1, 1] == 0:
         raise InputError(
-            f"the rotation matrix is none (R R' is {deviation:.2g} from the unit matrix, "
-            f"det {np.linalg.det(r):.3f})",
+            f"the rotation matrix R is not a rotation (R R' differs by {deviation:.2g} from the "
+            f"unit matrix, det R = {np.linalg.det(r):.3f}), or fy is 0",
             where=one.where,
             todo="export the camera again",
         )
@@ -115,8 +125,8 @@ def _check(one: Pinhole) -> None:
         )
     if np.any(one.distortion) and deviation > _SHEAR_BESIDE_DISTORTION:
         raise InputError(
-            f"distortion and a rotation matrix with shear ({deviation:.2g}) have no exact "
-            "counterpart together",
+            f"a camera with distortion whose rotation matrix has shear ({deviation:.2g}) has no "
+            "exact counterpart here",
             where=one.where,
             todo="export the camera again, with an orthonormal rotation matrix",
         )
@@ -124,11 +134,10 @@ def _check(one: Pinhole) -> None:
 
 def _split(one: Pinhole, mirror: Array) -> tuple[Array, Pose]:
     """(3, 3) upper triangular map with positive diagonal, and camera_from_world (unmirrored)."""
+    from scipy.linalg import rq
+
     rotation = nearest_rotation(one.rotation) if np.any(one.distortion) else one.rotation
-    total = one.camera_matrix @ rotation @ mirror
-    flip = np.eye(3)[::-1]
-    q, r = np.linalg.qr((flip @ total).T)
-    upper, proper = flip @ r.T @ flip, flip @ q.T
+    upper, proper = rq(one.camera_matrix @ rotation @ mirror)
     signs = np.sign(np.diag(upper))
     upper, proper = upper * signs, signs[:, None] * proper
     translation = np.linalg.solve(upper, one.camera_matrix @ one.translation_mm)
@@ -152,7 +161,7 @@ def _working_distances(camera_from_world: list[Pose]) -> list[float]:
 def _camera(name: str, one: Pinhole, upper: Array, distance_mm: float, pose: Pose) -> Camera:
     if not distance_mm > 0:
         raise InputError(
-            f"its subject lies {distance_mm:.1f} mm behind the camera",
+            f"the point that it looks at lies {-distance_mm:.1f} mm behind the camera",
             where=one.where,
             todo="check the translation vector's sign",
         )
@@ -184,3 +193,26 @@ def _camera(name: str, one: Pinhole, upper: Array, distance_mm: float, pose: Pos
         s3=turn * s3 * ratio,
         s4=turn * s4 * ratio**3,
     )
+
+
+def nominal_toml(cameras: Sequence[Camera]) -> str:
+    """The tables [cameras.*] and [stereo] of rig.toml, for a calibration to start from.
+
+    docs/files.md says what else rig.toml needs. Raises InputError for more than two cameras.
+    """
+    if not 1 <= len(cameras) <= 2:
+        raise InputError(f"{len(cameras)} cameras", todo="rig.toml describes one or two")
+    lines = []
+    for camera in cameras:
+        width, height = camera.image_size_px
+        lines += [
+            f"[cameras.{camera.name}]",
+            f"image_size_px = [{width}, {height}]",
+            f"scale_px_per_mm = {camera['scale_px_per_mm']:.9g}",
+            f"telecentricity_per_mm = {camera['kappa_per_mm']:.9g}",
+        ]
+    if len(cameras) == 2:
+        rotvec_deg = np.degrees(cameras[1].camera_from_rig.rotvec_rad)
+        numbers = ", ".join(f"{value:.6f}" for value in rotvec_deg)
+        lines += ["[stereo]", f"{cameras[1].name}_from_{cameras[0].name}_rotvec_deg = [{numbers}]"]
+    return "\n".join(lines) + "\n"

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 from telerig.errors import InputError
 from telerig.estimator.batch.batch import local_executor, run_batch
 from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
-from telerig.estimator.batch.journal import Journal
-from telerig.estimator.batch.summary import write_batch
+from telerig.estimator.batch.records import Journal, write_batch
 from telerig.estimator.batch.work import perform
 from telerig.scripts.main import app
 

@@ -14,7 +14,7 @@ from batch_dataset import make_dataset
 from telerig.estimator.batch import work
 from telerig.estimator.batch.batch import local_executor, run_batch
 from telerig.estimator.batch.jobs import Job, jobs_of
-from telerig.estimator.batch.journal import Journal
+from telerig.estimator.batch.records import Journal
 from telerig.estimator.batch.work import perform
 
 

@@ -204,7 +204,7 @@ def test_bad_tables_and_cameras() -> None:
 def test_the_real_pairs_listed_circles() -> None:
     from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 
-    read, _ = read_openlpt_cameras([PAIR / "cam1.txt", PAIR / "cam2.txt"])
+    read, *_ = read_openlpt_cameras([PAIR / "cam1.txt", PAIR / "cam2.txt"])
     cameras = (read[0], read[1])
     listed = pd.read_csv(PAIR / "bb3d_list.csv")
     rng = np.random.default_rng(0)

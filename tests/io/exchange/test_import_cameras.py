@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
-from telerig.io.exchange.importing.nominals import nominal_toml
 from telerig.io.exchange.importing.opencv import read_opencv_cameras
 from telerig.io.exchange.importing.openptv import Sensor, read_openptv_cameras, read_ptv_par
+from telerig.io.exchange.importing.pinhole import nominal_toml
 from telerig.io.rig_file.rig_file import read_rig_toml
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def test_opencv_stereo_pixels_are_those_of_project_points(
         tmp_path / f"intrinsics{ending}", M1=MATRICES[0], D1=bent, M2=MATRICES[1], D2=bent, **size
     )
     extrinsics = write(tmp_path / f"extrinsics{ending}", R=ROTATION, T=TRANSLATION)
-    cameras, rig_from_world = read_opencv_cameras([intrinsics, extrinsics])
+    cameras, rig_from_world, _ = read_opencv_cameras([intrinsics, extrinsics])
     points = points_between()
     poses = [(np.zeros(3), np.zeros(3)), (cv2.Rodrigues(ROTATION)[0], TRANSLATION)]
     for camera, matrix, (turn, shift) in zip(cameras, MATRICES, poses):
@@ -71,7 +71,7 @@ def test_opencv_one_file_for_each_camera_units_and_rotation_vector(tmp_path: Pat
         for i, m in enumerate(MATRICES)
     ]
     files.append(write(tmp_path / "pair.yml", R=cv2.Rodrigues(ROTATION)[0], T=TRANSLATION / 1000))
-    (_, right), rig_from_world = read_opencv_cameras(
+    (_, right), rig_from_world, _ = read_opencv_cameras(
         files, image_size_px=(1280, 800), unit_mm=1000, names=("a", "b")
     )
     points = points_between()

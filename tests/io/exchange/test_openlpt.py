@@ -76,7 +76,7 @@ def test_pixels_are_those_of_opencv(
     tmp_path: Path, sign: float, distortion: tuple[float, ...]
 ) -> None:
     paths, poses = write_pair(tmp_path, distortion, sign)
-    cameras, rig_from_world = read_openlpt_cameras(paths)
+    cameras, rig_from_world, _ = read_openlpt_cameras(paths)
     world = np.random.default_rng(0).uniform(-12, 12, (200, 3))
     for camera, (rotation, translation) in zip(cameras, poses):
         k = np.array([[20000.0, 0, 640], [0, sign * 20010.0, 400], [0, 0, 1]])
@@ -89,7 +89,7 @@ def test_pixels_are_those_of_opencv(
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_cameras_are_right_handed_and_meet_at_the_rigs_origin(tmp_path: Path, sign: float) -> None:
-    (first, second), rig_from_world = read_openlpt_cameras(write_pair(tmp_path, sign=sign)[0])
+    (first, second), rig_from_world, _ = read_openlpt_cameras(write_pair(tmp_path, sign=sign)[0])
     assert np.linalg.det(rig_from_world.rotation) == pytest.approx(sign)
     for camera in (first, second):
         assert np.linalg.det(camera.camera_from_rig.rotation) == pytest.approx(1)
@@ -106,7 +106,7 @@ def test_cameras_are_right_handed_and_meet_at_the_rigs_origin(tmp_path: Path, si
 
 def test_one_camera_alone(tmp_path: Path) -> None:
     paths, _ = write_pair(tmp_path)
-    (camera,), rig_from_world = read_openlpt_cameras(paths[:1], names=["top"])
+    (camera,), rig_from_world, _ = read_openlpt_cameras(paths[:1], names=["top"])
     assert camera.name == "top" and camera.image_size_px == (1280, 800)
     assert camera["kappa_per_mm"] == pytest.approx(1 / 500, rel=1e-3)
     assert rig_from_world.apply(np.zeros((1, 3)))[0, 2] == pytest.approx(0, abs=1e-9)
@@ -116,7 +116,7 @@ def test_a_rotation_with_shear_is_kept_to_the_last_digit(tmp_path: Path) -> None
     paths, poses = write_pair(tmp_path)
     rotation = poses[0][0] + np.random.default_rng(1).normal(0, 5e-4, (3, 3))
     paths[0].write_text(text(rotation, poses[0][1]))
-    cameras, rig_from_world = read_openlpt_cameras(paths)
+    cameras, rig_from_world, _ = read_openlpt_cameras(paths)
     world = np.random.default_rng(0).uniform(-12, 12, (50, 3))
     homogeneous = (world @ rotation.T + poses[0][1]) @ np.diag([20000.0, 20000.0, 1])
     expected = homogeneous[:, :2] / homogeneous[:, 2:] + [640, 400]
@@ -125,7 +125,7 @@ def test_a_rotation_with_shear_is_kept_to_the_last_digit(tmp_path: Path) -> None
 
 @pytest.mark.skipif(not PAIR.is_dir(), reason="the real pair is not here")
 def test_real_files_reproject_the_list_as_openlpt_does() -> None:
-    cameras, rig_from_world = read_openlpt_cameras([PAIR / "cam1.txt", PAIR / "cam2.txt"])
+    cameras, rig_from_world, _ = read_openlpt_cameras([PAIR / "cam1.txt", PAIR / "cam2.txt"])
     world = pd.read_csv(PAIR / "bb3d_list.csv")[["WorldX", "WorldY", "WorldZ"]].to_numpy()
     for camera, name in zip(cameras, ("cam1.txt", "cam2.txt")):
         lines = (PAIR / name).read_text().splitlines()
@@ -180,7 +180,7 @@ def test_what_cannot_be_expressed_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="behind"):
         read_openlpt_cameras(paths)
     paths[1].write_text(text(np.diag([1.0, 1, 0.5]), two[1]))
-    with pytest.raises(InputError, match="rotation matrix is none"):
+    with pytest.raises(InputError, match="is not a rotation"):
         read_openlpt_cameras(paths)
     with pytest.raises(InputError, match="cannot be read"):
         read_openlpt_cameras([tmp_path / "nowhere.txt"])
@@ -191,7 +191,7 @@ def test_what_cannot_be_expressed_is_refused(tmp_path: Path) -> None:
 
 
 def test_imported_cameras_triangulate_and_survive_a_file(tmp_path: Path) -> None:
-    cameras, _ = read_openlpt_cameras(write_pair(tmp_path)[0])
+    cameras, *_ = read_openlpt_cameras(write_pair(tmp_path)[0])
     calibration = calibration_from_cameras(cameras, name="pair", sigma_px=0.2, notes=["cam1.txt"])
     points = np.random.default_rng(0).uniform(-10, 10, (7, 3))
     calibration.save(tmp_path / "out")
@@ -206,7 +206,7 @@ def test_imported_cameras_triangulate_and_survive_a_file(tmp_path: Path) -> None
 
 
 def test_imported_cameras_must_form_a_rig(tmp_path: Path) -> None:
-    cameras, _ = read_openlpt_cameras(write_pair(tmp_path)[0])
+    cameras, *_ = read_openlpt_cameras(write_pair(tmp_path)[0])
     with pytest.raises(CalibrationError, match="rig frame"):
         calibration_from_cameras(cameras[::-1])
     with pytest.raises(CalibrationError, match="named"):

@@ -22,7 +22,7 @@ from telerig.io.recording.simulated.practice import practice_devices, practice_r
 from telerig.io.recording.simulated.signals import SimulatedDevice
 from telerig.io.rig_file.rig_file import description_from_toml, read_rig_toml, write_rig_toml
 from telerig.scripts.main import app
-from telerig.scripts.record_display import _device_words
+from telerig.scripts.record import _device_words
 
 runner = CliRunner()
 

@@ -1,0 +1,131 @@
+"""The registry of other programs' formats: one line for each export and for each importer.
+
+A new export or importer is one file in ``export`` or ``importing`` and one line here; `telerig
+export`, `telerig import` and their help read these tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from telerig.io.exchange.export.run_results import RunResults
+    from telerig.io.exchange.export.volume import Volume
+    from telerig.rig.camera import Camera
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format, whose module is imported at its first use.
+
+    program : whose format it is. function : "module:name" below ``telerig.io.exchange``.
+    description : for the help. suffix : of an exported file; empty where a folder is filled.
+    options : which of the options that a command offers are passed to the function.
+    extra : the optional dependency that it needs, as in ``pip install 'telerig[tdms]'``.
+    """
+
+    program: str
+    function: str
+    description: str
+    suffix: str = ""
+    options: tuple[str, ...] = ()
+    extra: str = ""
+
+    def __call__(self, *arguments: Any, **offered: Any) -> Any:
+        """What the function returns; of the offered options it gets those that it takes."""
+        module, name = self.function.split(":")
+        function: Callable[..., Any] = getattr(import_module(f"telerig.io.exchange.{module}"), name)
+        return function(*arguments, **{key: offered[key] for key in self.options})
+
+
+CAMERA_EXPORTS = {
+    "halcon": Format("HALCON", "export.halcon:export_halcon", "HDevelop lines and .dat files"),
+    "opencv": Format("OpenCV", "export.opencv:export_opencv", "3 x 4 matrices in YAML", ".yml"),
+    "soloff": Format(
+        "Soloff",
+        "export.soloff:export_soloff",
+        "polynomials for PIV programs",
+        options=("full_cubic", "first_pixel"),
+    ),
+}
+RUN_EXPORTS = {
+    "hdf5": Format("HDF5", "export.tables:write_hdf5", "h5py, MATLAB", ".h5", ("cameras",)),
+    "netcdf": Format("NetCDF", "export.netcdf:write_netcdf", "CF-1.8 trajectories", ".nc"),
+    "mat": Format("MATLAB", "export.tables:write_mat", "MATLAB", ".mat", ("cameras",)),
+    "trackpy": Format("trackpy", "export.tables:write_trackpy", "CSV for trackpy", ".csv"),
+}
+CAMERA_IMPORTERS = {
+    "openlpt": Format(
+        "OpenLPT",
+        "importing.openlpt:read_openlpt_cameras",
+        "Import the pinhole cameras of OpenLPT (cam1.txt ...).",
+        options=("names",),
+    ),
+    "opencv": Format(
+        "OpenCV",
+        "importing.opencv:read_opencv_cameras",
+        "Import a stereo calibration of OpenCV (YAML, XML or JSON with M1 D1 M2 D2 R T).",
+        options=("names", "image_size_px", "unit_mm"),
+    ),
+    "openptv": Format(
+        "OpenPTV",
+        "importing.openptv:read_openptv_cameras",
+        "Import the cameras of OpenPTV (.ori files, with the .addpar file beside each). "
+        "Give --ptv-par, or --image-size and --pixel-mm.",
+        options=("names", "sensor"),
+    ),
+}
+SENSOR_IMPORTERS = {
+    "accelerometer": Format(
+        "CSV, WAV, MAT or TDMS",
+        "importing.accelerometer:read_accelerations",
+        "Add the recording of an accelerometer to a run's accelerometer.csv.",
+        extra="tdms",
+    ),
+}
+
+
+def described(formats: dict[str, Format]) -> str:
+    """The names of formats, each with its description, for a help text."""
+    return ", ".join(f"{name} ({known.description})" for name, known in formats.items())
+
+
+def export_cameras(
+    cameras: Sequence[Camera], to: str, out: Path, *, volume: Volume | None = None, **options: Any
+) -> list[str]:
+    """Write the cameras in one of `CAMERA_EXPORTS`; returns the volume and each camera's error.
+
+    volume : where errors are measured and polynomials fitted; None takes `working_volume`.
+    Raises InputError for a volume that the cameras do not see and a place that cannot be written.
+    """
+    from telerig.io.exchange.export.volume import working_volume
+
+    box = volume or working_volume(cameras)
+    lines = [f"working volume: {box.words()}", *CAMERA_EXPORTS[to](cameras, out, box, **options)]
+    walled = ", ".join(camera.name for camera in cameras if camera.wall is not None)
+    if walled and to != "halcon":
+        lines.append(
+            "the export is for points in the water: the refraction at the windows of "
+            f"{walled} is part of the exported cameras"
+        )
+    return lines
+
+
+def export_run(
+    results: RunResults, to: str, out: Path, cameras: Sequence[Camera] = ()
+) -> list[str]:
+    """Write a run in one of `RUN_EXPORTS`; returns lines on what was written.
+
+    Raises InputError for what the format cannot hold and a place that cannot be written.
+    """
+    RUN_EXPORTS[to](results, out, cameras=cameras)
+    count = results.points["particle"].nunique()
+    return [
+        f"{results.name}: {len(results.points)} rows, {count} bubbles, from {results.source}",
+        f"frame: {results.frame}",
+        f"verdict: {results.verdict or 'none: the run was tracked, but not smoothed'}",
+    ]

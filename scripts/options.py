@@ -1,0 +1,70 @@
+"""Arguments and options that several commands share, each declared once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from telerig.errors import InputError
+
+Dataset = Annotated[
+    Path, typer.Argument(help="Dataset folder, with rig.toml and the views in calibration/.")
+]
+Run = Annotated[Path, typer.Argument(help="Folder of the recording, DATASET/runs/NAME.")]
+CalibrationFolder = Annotated[
+    Path | None, typer.Option(help="Results folder [DATASET/results/calibration].")
+]
+RunFolder = Annotated[Path | None, typer.Option(help="Results folder [DATASET/results/NAME].")]
+CalibrationFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="calibration.json, or the two OpenLPT camera files in the order of the cameras "
+        "[DATASET/results/calibration/calibration.json]."
+    ),
+]
+GivenCalibration = Annotated[
+    Path | None,
+    typer.Option(help="A calibration.json to use. Without it each dataset is calibrated."),
+]
+Model = Annotated[
+    str,
+    typer.Option(
+        help="Lens model: auto chooses one per camera. Others: none, radial, tangential, brown, "
+        "prism, kappa, affine, tilt, k1, k2, p, s, centre, or several joined by + (k1+k2). "
+        "left=brown,right=auto gives each camera its own."
+    ),
+]
+Medium = Annotated[
+    str,
+    typer.Option(
+        help="Where the target was: air or water. With [walls] in rig.toml, runs are in water."
+    ),
+]
+Report = Annotated[bool, typer.Option(help="Write report.html.")]
+Quiet = Annotated[bool, typer.Option(help="Print the summary only.")]
+
+
+def split_names(text: str | None) -> list[str] | None:
+    """Names that commas separate; None for None."""
+    return None if text is None else [name.strip() for name in text.split(",")]
+
+
+def numbers_of(option: str, text: str, count: int, separator: str, todo: str) -> list[float]:
+    """The numbers of an option's text. Raises InputError where there are not ``count`` of them."""
+    try:
+        numbers = [float(word) for word in text.lower().split(separator)]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise InputError(f"{option} {text}", todo=todo)
+    return numbers
+
+
+def chosen(option: str, text: str | None, choices: tuple[str, ...]) -> Any:
+    """The text of an option, or None. Raises InputError for another word than ``choices``."""
+    if text is not None and text not in choices:
+        todo = "use " + " or ".join(f"{option} {word}" for word in choices)
+        raise InputError(f"{option} {text}", todo=todo)
+    return text

@@ -1,46 +1,54 @@
-"""A device's clock on the host's: one-way stamps, wraps, restarts, stamps that cannot be.
+"""Host time of readings that a device stamps with its own clock, which drifts, wraps and restarts.
 
-The host sees reading i at h_i = a + b d_i + delay_i, with d_i the device's own stamp and
-delay_i >= 0 the wait in the device, the adapter (16 ms) and the host. The line that lies below
-every (d_i, h_i) and is nearest to them in the sum of distances is the estimate: the linear
-programme of Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
-measurements", INFOCOM 1999, eq. 7-8, solved on the lower convex hull (Zhang, Liu, Xia, "Clock
-synchronization algorithms for network measurements", INFOCOM 2002). The least delay itself stays
-in a: one-way stamps cannot tell it from an offset.
+The host receives reading i at h_i = a + b d_i + delay_i, with d_i the device's own stamp and
+delay_i >= 0 the wait in the device, the adapter (up to 16 ms) and the host. The estimate is the
+line that lies below every (d_i, h_i) with the least sum of distances: the linear programme of Moon,
+Skelly, Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM
+1999, eq. 7-8, solved on the lower convex hull (Zhang, Liu, Xia, "Clock synchronization algorithms
+for network measurements", INFOCOM 2002). The least delay is part of a: one-way stamps cannot
+distinguish it from an offset.
+
+Where the rate of a clock changes (with the temperature, over minutes, by a part in a million) the
+line becomes a piecewise linear curve, by the same linear programme with a value at each knot.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from telerig.io.recording.bend import bend
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 RESTART_S = 0.5
-"""A stamp further than this from where it is expected belongs to another count."""
+"""A stamp that differs by more from the expected one belongs to another count."""
 _FEWEST = 5
-"""Readings in a row that a restarted clock must give; fewer are wrong stamps."""
+"""A restarted clock must give so many readings in a row; fewer are wrong stamps."""
 _WINDOWS = 64
 _BLOCKS = 8
 _SHORT_S = 10.0
-_BEND_WINDOW_S = 3.0
+_LEAST_WANDER_S = 100e-6
+"""The line gets knots only where the least delays wander by more than this."""
+_CURVE_WINDOW_S = 3.0
+_KNOT_S = 30.0
+_WINDOWS_PER_KNOT = 8
+_TREND = 0.5
+"""Mean squared step between neighbours over the variance: 2 for noise, near 0 for a slow change."""
 
 
 @dataclass(frozen=True)
 class ClockFit:
     """host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6).
 
-    drift_ppm : how much faster than the host's the device's clock runs. sd_offset_us : scatter of
-    the least delays in parts of the record. sd_drift_ppm : jackknife, or from that scatter if it
-    is larger; NaN where the drift is that of a longer count. delay_*_ms : above the least.
-    wander_us : how far the least delays of the parts are apart after the fit. knots_s, bend_s :
-    where the rate changed, what a chain of straight pieces adds at these times from the mean.
+    drift_ppm : how much faster the device's clock runs than the host's. sd_offset_us : scatter of
+    the least delays in parts of the record. sd_drift_ppm : from a jackknife, or from that scatter
+    if it is larger; NaN where the drift is that of a longer count. delay_*_ms : above the least.
+    wander_us : range of the least delays of the parts after the fit. knots_s, bend_s : where the
+    rate changed, the correction in s at these times, which are counted from device_mean_s.
     """
 
     device_mean_s: float
@@ -66,9 +74,9 @@ class ClockFit:
 
 @dataclass(frozen=True)
 class ClockRecord:
-    """t_s : (N,) host time of each reading, NaN where its stamp cannot be; `wrong` of them.
+    """t_s : (N,) host time of each reading, NaN for each of the ``wrong`` stamps.
 
-    segment : (N,) which fit; -1 for wrong stamps. wraps : how often the counter began anew.
+    segment : (N,) index of the fit; -1 for wrong stamps. wraps : how often the counter wrapped.
     """
 
     t_s: Array
@@ -102,7 +110,7 @@ def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockReco
 
 
 def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
-    """The count continued past its wraps, as many as the host's time between readings says."""
+    """(N,) the count without wraps; the host time between readings gives their number."""
     if not wrap_s or not len(device_s):
         return np.array(device_s)
     ahead = device_s - host_s
@@ -110,10 +118,14 @@ def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
     return np.asarray(device_s + wrap_s * np.cumsum(turns))
 
 
-def lower_line(x: Array, y: Array) -> tuple[float, float]:
-    """(y at the mean of x, slope) of the line below all points and nearest to them in the sum."""
+def lower_line(x: Array, y: Array, at: float | None = None) -> tuple[float, float]:
+    """(y at ``at``, slope) of the line below all points that is highest there.
+
+    at : default the mean of x, where it is the line with the least sum of distances to the points.
+    x must increase.
+    """
     hull = _lower_hull(x, y)
-    middle = float(np.mean(x))
+    middle = float(np.mean(x)) if at is None else at
     if len(hull) < 2:
         return float(y[hull[0]]), 0.0
     right = int(np.clip(np.searchsorted(x[hull], middle), 1, len(hull) - 1))
@@ -123,7 +135,7 @@ def lower_line(x: Array, y: Array) -> tuple[float, float]:
 
 
 def _lower_hull(x: Array, y: Array) -> list[int]:
-    """Indices of the lower convex hull, x increasing (Andrew's chain)."""
+    """Indices of the lower convex hull, x increasing (Andrew's algorithm)."""
     hull: list[int] = []
     for k in range(len(x)):
         while len(hull) > 1:
@@ -136,7 +148,7 @@ def _lower_hull(x: Array, y: Array) -> list[int]:
 
 
 def _plausible(host_s: Array, device_s: Array, wrap_s: float) -> Ints:
-    """Indices of readings whose stamps go on from their neighbours'."""
+    """Indices of the readings whose stamps are consistent with those of their neighbours."""
     kept: Ints = np.arange(len(host_s))
     while kept.size:
         u = unwrap(host_s[kept], device_s[kept], wrap_s)
@@ -151,7 +163,7 @@ def _plausible(host_s: Array, device_s: Array, wrap_s: float) -> Ints:
 
 
 def _breaks(host_s: Array, u: Array) -> Bools:
-    """(N,) where a count begins: its stamp fits neither the one before nor the host's time."""
+    """(N,) where a count begins: its stamp follows neither the one before nor the host time."""
     step = np.diff(u)
     apart = np.abs(step - np.diff(host_s)) > RESTART_S
     follows = (step > 0) & (step < RESTART_S)
@@ -193,14 +205,14 @@ def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) ->
     edge, least = _least_delays(x, late)
     used = np.flatnonzero(~_too_early(x, late, edge, least))
     if drift_ppm is None and len(used) > 1:
-        at_mean, slope = _support(x[used], late[used])
+        at_mean, slope = _lower_line_of_many(x[used], late[used])
     else:
         slope = 1 / (1 + 1e-6 * (drift_ppm or 0.0)) - 1
         at_mean = float(np.min(late[used] - slope * x[used]))
     delay = late[used] - at_mean - slope * x[used]
-    bent = None if drift_ppm is not None else _bent(x[used], delay)
-    if bent is not None:
-        delay = delay - np.interp(x[used], *bent)
+    curve = None if drift_ppm is not None else _curve(x[used], delay)
+    if curve is not None:
+        delay = delay - np.interp(x[used], *curve)
     low = np.array([np.min(p) for p in np.array_split(delay, _parts(delay.size))])
     scatter = float(np.std(low)) if len(low) > 1 else float(np.median(delay))
     known = drift_ppm is not None or len(used) < _WINDOWS
@@ -217,35 +229,63 @@ def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) ->
         delay_max_ms=1e3 * float(np.max(delay)),
         wander_us=1e6 * float(np.ptp(low)),
         readings=len(host_s),
-        knots_s=tuple(bent[0].tolist()) if bent else (),
-        bend_s=tuple(bent[1].tolist()) if bent else (),
+        knots_s=tuple(curve[0].tolist()) if curve else (),
+        bend_s=tuple(curve[1].tolist()) if curve else (),
     )
 
 
-def _bent(x: Array, delay: Array) -> tuple[Array, Array] | None:
-    parts = int(np.clip(np.ptp(x) / _BEND_WINDOW_S, 1, len(x) // 20 + 1))
-    edge, least = _least_delays(x, delay, parts)
-    return bend(x[edge], least)
-
-
-def _support(x: Array, late: Array) -> tuple[float, float]:
-    """`lower_line` about x = 0, of the few points that can touch it."""
+def _lower_line_of_many(x: Array, late: Array) -> tuple[float, float]:
+    """`lower_line` at x = 0, computed from the few points that can touch it."""
     edge, least = _least_delays(x, late, parts=4 * _WINDOWS)
     _, slope = lower_line(x[edge], least)
     height = late - slope * x
     near = np.flatnonzero(height <= np.min(height) + np.ptp(least - slope * x[edge]) + 1e-9)
-    hull = np.array(_lower_hull(x[near], late[near]))
-    points = near[hull]
-    if len(points) < 2:
-        return float(late[points[0]] - slope * x[points[0]]), slope
-    right = int(np.clip(np.searchsorted(x[points], 0.0), 1, len(points) - 1))
-    i, j = points[right - 1], points[right]
-    slope = float((late[j] - late[i]) / (x[j] - x[i]))
-    return float(late[i] - slope * x[i]), slope
+    if len(near) < 2:
+        return float(height[near[0]]), slope
+    return lower_line(x[near], late[near], at=0.0)
+
+
+def _curve(x: Array, delay: Array) -> tuple[Array, Array] | None:
+    """(knots_s, correction_s at them) below the delays, or None where a straight line serves.
+
+    x : (N,) increasing. delay : (N,) above the straight line.
+    """
+    parts = int(np.clip(np.ptp(x) / _CURVE_WINDOW_S, 1, len(x) // 20 + 1))
+    edge, least = _least_delays(x, delay, parts)
+    if len(edge) < 4 * _WINDOWS_PER_KNOT or np.ptp(least) < _LEAST_WANDER_S:
+        return None
+    if float(np.mean(np.diff(least) ** 2)) > _TREND * float(np.var(least)):
+        return None
+    at = x[edge]
+    count = 1 + int(np.clip(float(np.ptp(at)) / _KNOT_S, 2, len(at) // _WINDOWS_PER_KNOT))
+    knots = np.linspace(at[0], at[-1], count)
+    return knots, _highest_curve_below(at, least, knots)
+
+
+def _highest_curve_below(x_s: Array, least_s: Array, knots: Array) -> Array:
+    """(K,) values at the knots of the piecewise linear curve below all points, the highest in the
+    sum."""
+    from scipy.optimize import linprog
+    from scipy.sparse import csr_array
+
+    left = np.clip(np.searchsorted(knots, x_s, "right") - 1, 0, len(knots) - 2)
+    share = (x_s - knots[left]) / np.diff(knots)[left]
+    row = np.arange(len(x_s))
+    places = np.concatenate([row, row]), np.concatenate([left, left + 1])
+    shape = (len(x_s), len(knots))
+    weights: Any = csr_array((np.concatenate([1 - share, share]), places), shape=shape)
+    unit = max(float(np.ptp(least_s)), 1e-12)
+    found = linprog(
+        -np.asarray(weights.sum(axis=0)).ravel(), A_ub=weights, b_ub=least_s / unit,
+        bounds=(-10.0, 10.0), method="highs",
+    )  # fmt: skip
+    if not found.success or found.x is None:
+        return np.zeros(len(knots))
+    return np.asarray(unit * np.asarray(found.x))
 
 
 def _sd_slope(x: Array, late: Array) -> float:
-    """Jackknife over `_BLOCKS` stretches of the record, of the line below their least delays."""
+    """Jackknife over `_BLOCKS` parts of the record, of the line below their least delays."""
     edge, least = _least_delays(x, late)
     block = np.arange(len(edge)) * _BLOCKS // len(edge)
     kept = [block != k for k in range(_BLOCKS)]
@@ -265,9 +305,9 @@ def _least_delays(x: Array, late: Array, parts: int | None = None) -> tuple[Ints
 
 
 def _too_early(x: Array, late: Array, edge: Ints, least: Array) -> Bools:
-    """Readings that came before they were made: wrong stamps that pass for right ones.
+    """(N,) readings that came before they were made: wrong stamps that look right.
 
-    A part's least delay may scatter by what most of them do; a single one far below is a fault.
+    The least delays of the parts scatter; a single one far below the others is a wrong stamp.
     """
     if len(edge) < 8:
         return np.zeros(len(x), bool)

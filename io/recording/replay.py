@@ -1,7 +1,8 @@
-"""From a raw log to each device's readings in the host's time."""
+"""From a raw log to the readings of each device in host time, without those that are damaged."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.io.recording.clock import ClockFit, host_times
-from telerig.io.recording.damage import beside_gaps
 from telerig.io.recording.log import (
     END,
     FOUND,
@@ -25,8 +25,14 @@ from telerig.io.recording.protocols import Readings, parser
 from telerig.io.rig_file.description import DeviceDescription
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
+GAP_INTERVALS = 1.5
+"""A step longer than so many usual ones is a gap."""
+_NEIGHBOURS = 8
+_FAR_RESIDUALS = 5.0
+"""Far from a parabola through the neighbours: more than so many times their largest residual."""
 _BLOCK_BYTES = 1 << 19
 TIME_DIGITS = 7
 """Decimals of t_s in the tables: a tenth of a microsecond."""
@@ -34,12 +40,12 @@ TIME_DIGITS = 7
 
 @dataclass(frozen=True)
 class DeviceRecord:
-    """What one device said, in the order of time.
+    """The readings of one device, in the order of time.
 
-    t_s : (N,) since the begin of the recording, strictly increasing. arrived_s :
-    when the host had it. values : (N,) each, as sent.
-    malformed_s : arrival of what could not be read. away_s : (lost, found) of each unplug; found
-    is NaN if it never came back. faults : readings left out, by the reason.
+    t_s : (N,) since the beginning of the recording, strictly increasing. arrived_s : (N,) when the
+    host received it. values : (N,) each, as sent. malformed_s : arrival of what could not be read.
+    away_s : (lost, found) of each unplug; found is NaN if it never came back. faults : number of
+    readings left out, by the reason. half_width_s : half the time from question to answer.
     """
 
     device: DeviceDescription
@@ -202,3 +208,37 @@ def _in_order(t_s: Array, faults: dict[str, int]) -> Ints:
     later[1:] = t_s[timed][1:] > np.maximum.accumulate(t_s[timed])[:-1]
     faults["not later than the one before"] = int(np.sum(~later))
     return timed[later]
+
+
+def beside_gaps(t_s: Array, values: Sequence[Array]) -> Bools:
+    """(N,) False for a reading beside a gap whose value is far from what its neighbours predict.
+
+    Where bytes are lost, two lines may become one that reads like a line: its stamp is right, its
+    value is wrong, and the next reading is missing. Only readings beside a gap are tested.
+    """
+    sound = np.ones(len(t_s), bool)
+    step = np.diff(t_s)
+    if step.size < 4 * _NEIGHBOURS:
+        return sound
+    wide = np.flatnonzero(step > GAP_INTERVALS * np.median(step))
+    suspects = np.unique(np.concatenate([wide, wide + 1]))
+    plain = np.ones(len(t_s), bool)
+    plain[suspects] = False
+    for i in suspects:
+        window = np.arange(max(i - 2 * _NEIGHBOURS, 0), min(i + 2 * _NEIGHBOURS + 1, len(t_s)))
+        near = window[plain[window]]
+        near = near[np.argsort(np.abs(t_s[near] - t_s[i]), kind="stable")[: 2 * _NEIGHBOURS]]
+        if len(near) > _NEIGHBOURS:
+            sound[i] = not any(_far(t_s[near] - t_s[i], v[near] - v[i]) for v in values)
+    return sound
+
+
+def _far(t_s: Array, value: Array) -> bool:
+    """Whether 0 at 0 s is far from a parabola through these neighbours."""
+    scale = float(np.max(np.abs(t_s)))
+    powers = np.vander(t_s / scale, 3)
+    found, *_ = np.linalg.lstsq(powers, value, rcond=None)
+    residual = float(np.max(np.abs(powers @ found - value)))
+    steps = np.diff(np.unique(value))
+    resolution = float(np.min(steps)) if steps.size else 0.0
+    return bool(abs(found[-1]) > _FAR_RESIDUALS * max(residual, resolution) + 1e-9)

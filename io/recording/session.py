@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.recording.damage import GAP_INTERVALS
 from telerig.io.recording.log import END, LOST, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.ports import open_port
 from telerig.io.recording.protocols import Readings, parser
 from telerig.io.recording.reader import Reader
+from telerig.io.recording.replay import GAP_INTERVALS
 from telerig.io.rig_file.description import DeviceDescription
 
 LOG_NAME = "recording.raw"

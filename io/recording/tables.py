@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
-from telerig.io.recording.damage import GAP_INTERVALS
 from telerig.io.recording.frames import FrameTimes, frame_times
 from telerig.io.recording.log import damaged_bytes
-from telerig.io.recording.replay import TIME_DIGITS, DeviceRecord, Replay, replay
+from telerig.io.recording.replay import GAP_INTERVALS, TIME_DIGITS, DeviceRecord, Replay, replay
 
 Array = NDArray[np.float64]
 

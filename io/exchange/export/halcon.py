@@ -36,7 +36,12 @@ from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, worki
 from telerig.io.files.atomic import atomic_folder
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.distortion import COEFFICIENTS, coefficient_jacobian, distortion_jacobian, undistort
+from telerig.rig.distortion import (
+    COEFFICIENTS,
+    coefficient_jacobian,
+    distortion_jacobian,
+    undistort,
+)
 from telerig.rig.pose import Pose
 
 Array = NDArray[np.float64]

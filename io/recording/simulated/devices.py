@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
-from telerig.io.recording.log import END, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.protocols import poll_command
 from telerig.io.recording.simulated.signals import (
     Ints,
@@ -124,7 +123,7 @@ class _Runner(threading.Thread):
     def _stream(self) -> None:
         pause = float(self._rng.uniform(0, self._sim.jitter_s))
         self._stop_asked.wait(max(pause, 0.5 / self._sim.rate_hz))
-        number, pieces, data = _made(self._sim, self.truth, self._elapsed_s(), self._rng)
+        number, pieces, data = made_since_last(self._sim, self.truth, self._elapsed_s(), self._rng)
         written = self._port.write(data)
         if written < len(data):
             ends = np.cumsum([len(piece) for piece in pieces])
@@ -175,7 +174,7 @@ class SimulatedPorts:
             runner.stop()
 
 
-def _made(
+def made_since_last(
     sim: SimulatedDevice, truth: Truth, host_s: float, rng: Generator
 ) -> tuple[Ints, list[bytes], bytes]:
     """Numbers of the readings since the last call, the bytes of each, and what the line makes."""
@@ -191,27 +190,3 @@ def _made(
 
 def _at(sim: SimulatedDevice, folder: Path) -> SimulatedDevice:
     return replace(sim, device=replace(sim.device, port=str(folder / sim.device.name)))
-
-
-def simulated_log(
-    path: Path, sims: Sequence[SimulatedDevice], seconds: float, rng: Generator
-) -> list[Truth]:
-    """The raw log that streaming devices would give, made at once; least delay is near 0."""
-    header = LogHeader(0, "simulated", (), tuple(sim.device for sim in sims))
-    truths, entries = [], []
-    for index, sim in enumerate(sims):
-        truth = Truth()
-        truths.append(truth)
-        count = int(2.5 * seconds / sim.jitter_s) + 1
-        for flush_s in np.cumsum(rng.uniform(0, sim.jitter_s, count)):
-            if flush_s > seconds:
-                break
-            _, _, data = _made(sim, truth, float(flush_s), rng)
-            if data:
-                entries.append(Entry(RECEIVED, index, int(flush_s * 1e9), data))
-    with RawLog(path, header) as log:
-        for entry in sorted(entries, key=lambda e: e.time_ns):
-            log.append(entry)
-        log.append(Entry(END, 0, int(seconds * 1e9), b""))
-        log.flush()
-    return truths

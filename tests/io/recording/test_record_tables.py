@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from simulated_log import simulated_log
 
 from telerig.errors import InputError
 from telerig.io.dataset.run_tables import read_accelerometer_csv, read_frames_csv, read_stage_csv
-from telerig.io.recording.damage import beside_gaps
 from telerig.io.recording.frames import frame_numbers
 from telerig.io.recording.log import (
     FOUND,
@@ -24,8 +24,8 @@ from telerig.io.recording.log import (
     RawLog,
     read_log,
 )
-from telerig.io.recording.replay import replay
-from telerig.io.recording.simulated.devices import Truth, simulated_log
+from telerig.io.recording.replay import beside_gaps, replay
+from telerig.io.recording.simulated.devices import Truth
 from telerig.io.recording.simulated.practice import practice_devices
 from telerig.io.recording.simulated.signals import (
     Faults,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.estimator.calibration.views.candidate_poses import (
+from telerig.estimator.calibration.views.poses import (
     TILT_LIMIT_DEG,
     Candidates,
     bases,

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.quality.truth import working_volume
+from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
 from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.problem import cameras_from_state, held_at_nominal
-from telerig.estimator.calibration.views.candidate_poses import Candidates, candidates, dots_seen
 from telerig.estimator.calibration.views.next_view import NextView, next_view
+from telerig.estimator.calibration.views.poses import Candidates, candidates, dots_seen
 from telerig.estimator.calibration.views.wording import first_views, hold_words
 from telerig.factors.projection import State, pixels
 from telerig.io.report.calibration.next_view import next_pictures
@@ -38,9 +38,9 @@ def fitted(scene: Any, model: str = "radial") -> tuple[Any, Any, Any]:
     turn = start.rig_from_camera[1, :3, :3].T
     nominal = rotation_from_rotvec(np.radians(scene.nominal_rotvec_deg))
     if np.trace(turn.T @ nominal) < 2.8:
-        from telerig.estimator.calibration.start.mirror_ambiguity import twin_state
+        from telerig.estimator.calibration.start.mirror_ambiguity import mirrored_state
 
-        start = twin_state(start)
+        start = mirrored_state(start)
     problem = with_plate(problem).with_model(model)
     solution = solve(problem, held_at_nominal(problem, start))
     return problem, solution.state, joint_covariance(problem, solution)
@@ -121,7 +121,7 @@ def test_the_advice_beats_views_at_random(scene: Any) -> None:
 def test_both_cameras_really_see_every_candidate(scene: Any, preset: str) -> None:
     problem, state, _ = fitted(scene(preset, 1, views=6))
     found = candidates(problem, state)
-    assert len(found) > 50
+    assert len(found) > 40
     cameras = cameras_from_state(problem, state)
     glass = problem.target.plate_thickness_mm if problem.target.two_sided else 0.0
     plate = Plate(
@@ -168,9 +168,8 @@ def test_an_empty_corner_is_filled(scene: Any) -> None:
     assert advice is not None
     assert any("the empty upper left" in r and "camera left" in r for r in advice.poses[0].reasons)
     every = np.arange(len(problem.dot_ids))
-    best = Candidates(
-        advice.poses[0].rig_from_target[None], np.zeros((1, 2)), np.ones((1, 2)), np.zeros((1, 3))
-    )
+    pose = advice.poses[0].rig_from_target[None]
+    best = Candidates(pose, np.ones((1, 2)), np.zeros(1, int))
     visible, uv = dots_seen(problem, state, best, every)
     left = uv[0, 0][visible[0, 0]]
     assert np.any((left < 200).all(-1))
@@ -263,7 +262,7 @@ def test_enough_is_said_with_its_reason() -> None:
         return NextView(views, before, (HeldPose(np.eye(4), after, "so", ("why",)),))
 
     assert advice(12, 0.36, 0.35).enough()
-    assert advice(12, 0.36, 0.35).words().endswith("from 0.36 to 0.35 um: enough")
+    assert advice(12, 0.36, 0.35).words().endswith("from 0.36 to 0.35 µm: these views are enough")
     assert not advice(5, 0.36, 0.35).enough()
     assert not advice(12, 0.36, 0.30).enough()
     assert advice(12, 0.36, 0.30).words().endswith("Next: so (why)")

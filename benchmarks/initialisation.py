@@ -7,8 +7,8 @@ two-sided plate), tilts of the plate 5-75 deg, scale 1-100 px/mm, 512-2048 px, 9
 views, dot noise 0.005-0.03 px, print errors of 20 um in and out of plane, k1 up to 2e-2 and kappa
 up to 1e-4 / mm in every camera (print errors and 1 / kappa in proportion to the field of view,
 which is 51 mm for the figures given), nominal rotation wrong by up to 8 deg. The start of
-`self_calibrate` (closed form, a short solve, the choice of the twin), refined with the true model,
-must reach the cost that the same solver reaches from the truth, on the true side.
+`self_calibrate` (closed form, a short solve, the choice of the mirror solution), refined with the
+true model, must reach the cost that the same solver reaches from the truth, on the true side.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def judge(scene: Scene) -> tuple[str, str]:
     truth = scene.true_state(problem)
     try:
         start = best_start(problem, problem.nominal_mm)
-        start, _, _ = mirror_ambiguity.choose_twin(start, problem, nominal)
+        start = mirror_ambiguity.choose_solution(start, problem, nominal).state
     except CalibrationError as error:
         return "refused", str(error.what)
     final = problem.with_model(MODEL)
@@ -126,13 +126,13 @@ def judge(scene: Scene) -> tuple[str, str]:
 
 
 def _cause(problem: Problem, truth: State, start: State, turn_deg: float) -> str:
-    mirrored = mirror_ambiguity.twin_state(truth)
+    mirrored = mirror_ambiguity.mirrored_state(truth)
     turns = [
         np.degrees(angle_between(s.rig_from_camera[1, :3, :3], start.rig_from_camera[1, :3, :3]))
         for s in (truth, mirrored)
     ]
     if turns[1] < turns[0] and turns[1] < 10:
-        return "wrong twin"
+        return "wrong mirror solution"
     if turns[0] > 10:
         return "wrong inter-camera rotation"
     off = np.degrees(

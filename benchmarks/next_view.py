@@ -22,7 +22,8 @@ from calibration_scene import Scene, make_scene
 from numpy.typing import NDArray
 from rig_truth import without_advice
 
-from telerig.estimator.calibration.quality.truth import space_error, working_volume
+from telerig.estimator.calibration.quality.truth import space_error
+from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.calibration.solver.covariance import aligned_covariance

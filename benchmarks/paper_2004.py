@@ -24,7 +24,7 @@ from calibration_scene import make_scene
 
 import telerig
 from telerig.estimator.calibration.calibrate import run_calibration
-from telerig.estimator.calibration.quality.truth import working_volume
+from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.smoothing.truth import motion_error

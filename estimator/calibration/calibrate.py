@@ -138,20 +138,20 @@ def run_calibration(
     notes = [*dataset.notes, *(() if detected is None else detected.notes)]
 
     from telerig.estimator.calibration.refractive_windows import (
-        put_behind_walls,
-        stated_walls,
-        wall_words,
+        behind_windows,
+        stated_windows,
+        window_notes,
     )
 
-    rig, walls = dataset.rig, stated_walls(dataset.rig)
+    rig, walls = dataset.rig, stated_windows(dataset.rig)
     calibration = solve_dots(
         dataset, table, model=model, solver=solver, medium=medium, dots_free=dots_free,
         outlier_sd=outlier_sd, stage=stage, notes=notes,
     )  # fmt: skip
     calibration = replace(calibration, stage=_stage(dataset, calibration, stage), medium=medium)
     if medium == "air":
-        calibration = put_behind_walls(calibration, walls)
-    words = wall_words(calibration, rig)
+        calibration = behind_windows(calibration, walls)
+    words = window_notes(calibration, rig)
     calibration = replace(calibration, notes=(*calibration.notes, *words))
     return CalibrationRun(_with_measured(calibration, table, seed), detected)
 
@@ -169,14 +169,14 @@ def solve_dots(
     notes: Sequence[str] = (),
 ) -> Calibration:
     """The self-calibration of a table of dots, without the stage and walls that runs go through."""
-    from telerig.estimator.calibration.refractive_windows import stated_walls, with_walls
+    from telerig.estimator.calibration.refractive_windows import stated_windows, with_windows
     from telerig.estimator.calibration.self_calibration import self_calibrate
 
     rig = dataset.rig
     cameras = nominal_cameras(rig)
     return self_calibrate(
         table,
-        with_walls(cameras, stated_walls(rig)) if medium == "water" else cameras,
+        with_windows(cameras, stated_windows(rig)) if medium == "water" else cameras,
         dataset.target,
         nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
         model=model,

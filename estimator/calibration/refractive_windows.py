@@ -1,4 +1,8 @@
-"""A rig that was calibrated in one medium and measures behind glass walls in water."""
+"""Refractive windows: plane glass walls between the cameras and the water of a run.
+
+In: a calibration, and the windows that `[walls]` of rig.toml states. Out: the calibration behind
+them, and notes on what they do and what is not known of them.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.quality.truth import working_volume
+from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import aligned_covariance
 from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freedom
@@ -27,23 +31,23 @@ _STEP_MM = 10.0
 _LEANING_DEG = 30.0
 
 
-def stated_walls(rig: RigDescription) -> dict[str, Wall]:
-    """The walls of `rig.toml`, by camera."""
+def stated_windows(rig: RigDescription) -> dict[str, Wall]:
+    """The windows that `[walls]` of rig.toml states, by camera."""
     return {name: wall.wall() for name, wall in rig.walls.items()}
 
 
-def with_walls(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
-    """The cameras, each behind its wall if it has one."""
+def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
+    """The cameras, each behind its window if it has one."""
     return tuple(replace(c, wall=walls.get(c.name, c.wall)) for c in cameras)
 
 
-def put_behind_walls(calibration: Calibration, walls: Mapping[str, Wall]) -> Calibration:
-    """A calibration made in air, for use in the water behind walls.
+def behind_windows(calibration: Calibration, walls: Mapping[str, Wall]) -> Calibration:
+    """A calibration made in air, for use in the water behind windows.
 
-    What is not known of a wall's orientation joins the covariance as its prior, so it reaches
-    every projected and triangulated point.
+    The prior covariance of each window's orientation joins the covariance, so it reaches every
+    projected and triangulated point.
     """
-    cameras = with_walls(calibration.cameras, walls)
+    cameras = with_windows(calibration.cameras, walls)
     names, covariance = _with_priors(
         calibration, cameras, calibration.covariance_names, calibration.covariance
     )
@@ -55,11 +59,11 @@ def put_behind_walls(calibration: Calibration, walls: Mapping[str, Wall]) -> Cal
         free=tuple((*f, *wall_freedom(c)) for f, c in zip(calibration.free, cameras)),
         joint_names=joint_names, joint_covariance=joint,
     )  # fmt: skip
-    return replace(behind, statistics=_with_walls_share(behind, calibration))
+    return replace(behind, statistics=_with_windows_share(behind, calibration))
 
 
-def _with_walls_share(behind: Calibration, in_air: Calibration) -> dict[str, Any]:
-    """The statistics with what the walls' unknown orientation adds to the errors in space."""
+def _with_windows_share(behind: Calibration, in_air: Calibration) -> dict[str, Any]:
+    """The statistics with what the windows' uncertain orientation adds to the errors in space."""
     statistics = dict(in_air.statistics)
     if "space_sd_um" not in statistics or behind.free == in_air.free:
         return statistics
@@ -81,7 +85,7 @@ def _space_variance_um2(calibration: Calibration, points_mm: Array) -> float:
 def _with_priors(
     calibration: Calibration, cameras: Sequence[Camera], names: tuple[str, ...], matrix: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Names and covariance with each camera's wall after its intrinsics."""
+    """Names and covariance with each camera's window after its intrinsics."""
     grown: list[str] = []
     added: dict[str, float] = {}
     at = 0
@@ -99,9 +103,9 @@ def _with_priors(
 
 
 def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
-    """How wrong points are, at most, over the working volume (um): the same but for their walls.
+    """Largest error of points over the working volume (um) when ``used`` stands for ``true``.
 
-    A shift of all points alike is set aside: the rig's origin is a matter of definition. With one
+    A common shift of all points is set aside: the rig's origin is a matter of definition. With one
     camera, its error across its own axis.
     """
     points = working_volume(tuple(used))
@@ -114,51 +118,53 @@ def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
     return float(1e3 * np.linalg.norm(wrong, axis=-1).max())
 
 
-def wall_words(calibration: Calibration, rig: RigDescription) -> list[str]:
-    """What a user should know of the walls: what they do, and what is not known of them."""
+def window_notes(calibration: Calibration, rig: RigDescription) -> list[str]:
+    """Notes for the user: what the windows do, and what is not known of them."""
     cameras = [c for c in calibration.cameras if c.wall is not None]
     if not cameras:
-        return _without_walls(calibration)
+        return _without_windows(calibration)
     words = [_in_words(calibration, [c.name for c in cameras])]
     for camera in cameras:
-        words += _odd(camera)
-        words += _uncertain(calibration, camera) + _sign_open(calibration, camera)
+        words += _implausible(camera)
+        words += _uncertain(calibration, camera) + _tilt_sign_ambiguous(calibration, camera)
         if rig.walls[camera.name].distance_mm is None:
             words += _without_distance(camera)
     return words
 
 
 def _in_words(calibration: Calibration, names: Sequence[str]) -> str:
-    where = f"behind the walls of {', '.join(names)}"
+    where = f"behind the refractive windows of {', '.join(names)}"
     error = _um(model_error_um(calibration.in_air().cameras, calibration.cameras))
     if calibration.medium == "air":
         return (
-            f"calibrated in air; points of runs lie in the water {where}: a model without them "
-            f"would be {error} wrong over the working volume"
+            f"calibrated in air; points of runs lie in the water {where}. A model without the "
+            f"windows would be wrong by {error} over the working volume"
         )
-    return f"calibrated in the water {where}; used in air without them, it would be {error} wrong"
+    return (
+        f"calibrated in the water {where}; used in air without them, it would be wrong by {error}"
+    )
 
 
 def _um(error_um: float) -> str:
-    return f"up to {_rounded(error_um)} um" if error_um >= _NOTABLE_UM else "less than 0.1 um"
+    return f"up to {_rounded(error_um)} µm" if error_um >= _NOTABLE_UM else "less than 0.1 µm"
 
 
 def _rounded(value: float) -> str:
     return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 
-def _without_walls(calibration: Calibration) -> list[str]:
-    """Of a target in the water when `rig.toml` states no walls."""
+def _without_windows(calibration: Calibration) -> list[str]:
+    """Of a target in the water when `rig.toml` states no windows."""
     if calibration.medium == "air":
         return []
-    words = "calibrated in the water without [walls]: scales and axes are those of the water"
+    words = "calibrated in the water without [walls]: scales and axes hold in the water only"
     if any(abs(c["kappa_per_mm"]) * c.rho_mm >= ENTOCENTRIC for c in calibration.cameras):
-        words += "; a perspective lens behind glass needs [walls.<camera>], or dots will scatter"
+        words += "; with a perspective lens, state its window in [walls.<camera>] of rig.toml"
     return [words]
 
 
-def _odd(camera: Camera) -> list[str]:
-    """What is rarely meant: media in the wrong order, a wall that hardly faces the camera."""
+def _implausible(camera: Camera) -> list[str]:
+    """Probable mistakes: media in the wrong order, a window that hardly faces the camera."""
     wall, words = camera.wall, []
     if wall is None:
         return []
@@ -170,14 +176,14 @@ def _odd(camera: Camera) -> list[str]:
     leaning = np.degrees(np.arccos(min(1.0, abs(wall.normal[2]))))
     if leaning > _LEANING_DEG:
         words.append(
-            f"the wall of {camera.name} leans {leaning:.0f} degrees to its line of sight: its "
-            "normal is in the camera's frame, where a wall that faces the camera is [0, 0, 1]"
+            f"the window of {camera.name} leans {leaning:.0f} degrees to its line of sight: its "
+            "normal is in the camera's frame, where that of a window facing the camera is [0, 0, 1]"
         )
     return words
 
 
 def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
-    """The share of a wall's unknown orientation, one standard deviation in the worse direction."""
+    """The effect of one standard deviation of a window's orientation."""
     sd = max((calibration.sd(f"{camera.name}.{n}") for n in wall_freedom(camera)), default=0.0)
     if sd == 0 or camera.wall is None:
         return []
@@ -186,17 +192,17 @@ def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
     moved = (turned.project(points) - camera.project(points)) / camera["scale_px_per_mm"]
     moved = moved - moved.mean(0)
     most = 1e3 * float(np.abs(moved).max())
-    words = f"the normal of the wall of {camera.name} is known to {np.degrees(sd):.2g} deg"
+    words = f"the normal of the window of {camera.name} is known to {np.degrees(sd):.2g} deg"
     if calibration.medium == "water":
         return [f"{words}, counted in the covariances"]
-    words += f": {_rounded(most)} um over the working volume, counted in the covariances"
+    words += f": {_rounded(most)} µm over the working volume, counted in the covariances"
     if most > calibration.statistics.get("space_sd_um", np.inf) / 2:
         words += "; measure it better, or calibrate with the target in the water"
     return [words]
 
 
-def _sign_open(calibration: Calibration, camera: Camera) -> list[str]:
-    """Whether a wall that leans as much to the other side fits as well, and was as likely before.
+def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[str]:
+    """Where a window that leans as much to the other side fits as well, and was as likely before.
 
     Without perspective a target in the water shows the square of the tilt only.
     """
@@ -211,9 +217,9 @@ def _sign_open(calibration: Calibration, camera: Camera) -> list[str]:
     if apart < 3 * sd or from_stated > 3 * wall.normal_sigma_rad:
         return []
     return [
-        f"the wall of {camera.name} may as well lean {np.degrees(apart / 2):.2g} deg to the other "
-        "side: a telecentric lens with the target in the water sees no sign; points are not "
-        "affected, but state the normal's side better if its value matters"
+        f"the window of {camera.name} may as well lean {np.degrees(apart / 2):.2g} deg to the "
+        "other side: a telecentric lens with the target in the water does not show the sign of "
+        "the tilt. Points are not affected; if the normal matters, state it better in rig.toml"
     ]
 
 
@@ -222,7 +228,7 @@ def _angle_rad(a: Array, b: Array) -> float:
 
 
 def _without_distance(camera: Camera) -> list[str]:
-    """What 10 mm of a wall's unknown distance would do."""
+    """What 10 mm of a window's unknown distance would do."""
     if camera.wall is None:
         return []
     farther = replace(camera.wall, distance_mm=camera.wall.distance_mm + _STEP_MM)
@@ -234,39 +240,39 @@ def _without_distance(camera: Camera) -> list[str]:
     if max(shift, rest) < _NOTABLE_UM:
         return []
     return [
-        f"[walls.{camera.name}] has no distance_mm, so the wall is taken at the camera's origin: "
-        f"every {_STEP_MM:.0f} mm that it stands elsewhere shift this camera's points by "
-        f"{_rounded(shift)} um, all alike, and change them by {_um(rest)}"
+        f"[walls.{camera.name}] has no distance_mm, so the window is taken at the camera's origin: "
+        f"every {_STEP_MM:.0f} mm that it stands elsewhere shift all of this camera's points by "
+        f"{_rounded(shift)} µm, and each of them by {_um(rest)} more"
     ]
 
 
-def forgotten_walls(rig: RigDescription | None, calibration: Calibration) -> list[str]:
-    """Warnings where `rig.toml` has walls that the calibration does not model, or the reverse.
+def window_warnings(rig: RigDescription | None, calibration: Calibration) -> list[str]:
+    """Warnings where rig.toml has windows that the calibration does not model, or the reverse.
 
-    A calibration made in water without walls holds them in its scales and axes, but for what
-    perspective does.
+    A calibration made in water without windows has their effect in its scales and axes, all but
+    that on perspective.
     """
     if rig is None:
         return []
-    stated = stated_walls(rig)
+    stated = stated_windows(rig)
     have = {c.name: c.wall for c in calibration.cameras}
     gone = [name for name, wall in have.items() if wall is not None and name not in stated]
     if gone:
         bare = [replace(c, wall=None) if c.name in gone else c for c in calibration.cameras]
         much = _um(model_error_um(calibration.cameras, bare))
         return [
-            f"the calibration has walls for {', '.join(gone)} that rig.toml does not state: if "
-            f"they are gone, points are {much} wrong over the working volume; calibrate again"
+            f"the calibration has windows for {', '.join(gone)} that rig.toml does not state: if "
+            f"they are gone, points are wrong by {much} over the working volume; calibrate again"
         ]
     missing = [name for name, wall in stated.items() if not _same(have.get(name), wall)]
     if not missing or calibration.medium == "water":
         return []
-    error = model_error_um(calibration.cameras, with_walls(calibration.cameras, stated))
+    error = model_error_um(calibration.cameras, with_windows(calibration.cameras, stated))
     if error < _NOTABLE_UM:
         return []
     return [
-        f"the walls that rig.toml states for {', '.join(missing)} are not in the calibration as "
-        f"stated: points are {_um(error)} wrong over the working volume; calibrate again"
+        f"the windows that rig.toml states for {', '.join(missing)} are not in the calibration as "
+        f"stated: points are wrong by {_um(error)} over the working volume; calibrate again"
     ]
 
 
@@ -274,8 +280,8 @@ def _same(one: Wall | None, other: Wall) -> bool:
     """Alike to what a file keeps of them."""
     if one is None:
         return False
-    return np.allclose(_numbers(one), _numbers(other), rtol=1e-9, atol=1e-12)
-
-
-def _numbers(wall: Wall) -> Array:
-    return np.concatenate([np.atleast_1d(value) for value in wall.as_dict().values()])
+    a, b = (
+        np.concatenate([np.atleast_1d(value) for value in wall.as_dict().values()])
+        for wall in (one, other)
+    )
+    return np.allclose(a, b, rtol=1e-9, atol=1e-12)

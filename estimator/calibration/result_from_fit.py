@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.fit import Fit
-from telerig.estimator.calibration.lens.choice_record import model_rows
+from telerig.estimator.calibration.lens.choice import Choice, Step
+from telerig.estimator.calibration.quality.checks import Note
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import JointCovariance, aligned_covariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.robust import (
+    RobustFit,
     lost_views,
     pixel_residuals,
     squared_distance,
 )
+from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice
 from telerig.factors.projection import State
+from telerig.rig.lens_models import joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
+from telerig.rig.projection import INDEX
 from telerig.rig.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -32,7 +37,34 @@ GAUGE = (
 BAD_SCATTER_PX = 0.5
 BAD_KEPT = 0.9
 BAD_FLOOR = 5.0
-"""Noise floor over image noise beyond which the model is doubted aloud."""
+"""Noise floor over image noise beyond which a warning says that the model is incomplete."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A finished self-calibration.
+
+    models : the chosen one of each camera.  choice : None when they were given.
+    centre_held : (C, 4, 4) the cameras' poses with the image centres held at the middle of the
+        image, when strong perspective frees them.
+    mirror : None until it is known which of the two mirror solutions is kept.
+    mirrored_cost : of the other one.  tilts_deg : (view, camera) -> tilt of the target.
+    """
+
+    robust: RobustFit
+    models: tuple[str, ...]
+    model_words: str
+    choice: Choice | None
+    centre_held: Array | None
+    mirror: MirrorChoice | None = None
+    mirrored_cost: float = np.nan
+    tilts_deg: dict[tuple[int, int], float] = field(default_factory=dict)
+    notes: tuple[Note, ...] = ()
+
+    @property
+    def model(self) -> str:
+        """In one name."""
+        return joint_name(self.models, [c.name for c in self.robust.problem.cameras])
 
 
 def calibration_from_fit(
@@ -67,17 +99,17 @@ def calibration_from_fit(
         name=name,
         verdict=_verdict(fit, statistics),
         statistics=statistics,
-        twin=_twin(fit, nominal_rotvec_deg),
-        model=model_rows(fit.robust.problem, fit.models, fit.model_words, fit.choice),
+        twin=_mirror(fit, nominal_rotvec_deg),
+        model=_model(fit),
         diagnostics={
             "gauge": GAUGE,
             "weak": weak,
             "tilts_deg": {
                 f"{problem.views[v]}/{problem.cameras[c].name}": t
-                for (v, c), t in fit.pre.tilts_deg.items()
+                for (v, c), t in fit.tilts_deg.items()
             },
         },
-        notes=fit.notes,
+        notes=tuple(note.words for note in fit.notes),
         joint_names=joint.names,
         joint_covariance=joint.matrix,
         dots=dot_table(problem),
@@ -189,7 +221,7 @@ def _geometry(fit: Fit, joint: JointCovariance) -> dict[str, Any]:
         "axes_angle_formal_sd_deg": float(np.degrees(sd)),
         "axes_angle_sd_deg": float(np.degrees(np.hypot(sd, _angle_systematic(fit, angle)))),
     }
-    kappas = [k[5] for k in state.intrinsics]
+    kappas = state.intrinsics[:, INDEX["kappa_per_mm"]]
     if all(abs(k) > 1e-9 for k in kappas):
         centres = [
             (m @ np.array([0, 0, -1 / k, 1]))[:3] for m, k in zip(state.rig_from_camera, kappas)
@@ -257,20 +289,15 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
 
 def _paired(problem: Problem, state: State) -> tuple[Array, Array]:
     """(K, 2, 2) pixels of dots kept in both cameras of a view, (K, 3) their fitted places."""
-    keyed: dict[tuple[int, int], dict[int, Array]] = {}
-    for v, c, d, uv, w in zip(
-        problem.view, problem.camera, problem.dot, problem.uv_px, problem.weight
-    ):
-        if w > 0.5:
-            keyed.setdefault((int(v), int(d)), {})[int(c)] = uv
-    both = [(k, p) for k, p in keyed.items() if len(p) == 2]
-    if not both:
-        return np.zeros((0, 2, 2)), np.zeros((0, 3))
-    pixels = np.array([[p[0], p[1]] for _, p in both])
-    views, dots = np.array([k for k, _ in both]).T
-    poses = state.rig_from_target[views]
-    points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[dots]) + poses[:, :3, 3]
-    return pixels, points
+    key = problem.view * len(problem.dot_ids) + problem.dot
+    kept = problem.weight > 0.5
+    first, second = (np.flatnonzero(kept & (problem.camera == c)) for c in (0, 1))
+    _, i, j = np.intersect1d(key[first], key[second], return_indices=True)
+    first, second = first[i], second[j]
+    poses = state.rig_from_target[problem.view[first]]
+    dots = state.dots_mm[problem.dot[first]]
+    points = np.einsum("kij,kj->ki", poses[:, :3, :3], dots) + poses[:, :3, 3]
+    return np.stack([problem.uv_px[first], problem.uv_px[second]], 1), points
 
 
 def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
@@ -298,8 +325,7 @@ def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
             f"their own image noise is {statistics['image_noise_px']:.2g} px: what is left is "
             "systematic, and errors in space may exceed their stated standard deviations"
         )
-    if len(fit.notes):
-        reasons += [n for n in fit.notes if "weak" in n or "only" in n]
+    reasons += [note.words for note in fit.notes if note.affects_verdict]
     reasons += odd_views(fit.robust.problem)
     status = "USABLE, with warnings" if reasons else "GOOD"
     return {"status": status, "reasons": reasons}
@@ -314,11 +340,51 @@ def _kappa_hint(fit: Fit) -> str:
     )
 
 
-def _twin(fit: Fit, nominal_rotvec_deg: Array | None) -> dict[str, Any]:
+def _mirror(fit: Fit, nominal_rotvec_deg: Array | None) -> dict[str, Any]:
+    assert fit.mirror is not None
     return {
         "cost": fit.robust.solution.cost,
-        "other_cost": fit.twin_cost,
-        "decided_by": fit.twin_by,
-        "words": fit.twin_words,
+        "other_cost": fit.mirrored_cost,
+        "decided_by": fit.mirror.decided_by,
+        "words": fit.mirror.words,
         "nominal_rotvec_deg": None if nominal_rotvec_deg is None else list(nominal_rotvec_deg),
     }
+
+
+def _model(fit: Fit) -> dict[str, Any]:
+    """The chosen model, why, and a row for each step of the choice, taken or not."""
+    cameras = [c.name for c in fit.robust.problem.cameras]
+    steps = fit.choice.steps if fit.choice is not None else ()
+    return {
+        "name": fit.model,
+        "by_camera": dict(zip(cameras, fit.models)),
+        "words": fit.model_words,
+        "ladder": [_step(step, steps[max(k - 1, 0)], cameras) for k, step in enumerate(steps)],
+    }
+
+
+def _step(step: Step, before: Step, cameras: list[str]) -> dict[str, Any]:
+    """What was not fitted, or did not have to predict, is None."""
+    row: dict[str, Any] = {
+        "model": joint_name([name_of(lens) for lens in step.lenses], cameras),
+        "camera": cameras[step.camera] if step.camera >= 0 else "",
+        "added": list(step.added),
+        "taken": step.taken,
+        "chi2_gain": _finite(step.gain),
+        "bic_gain": _finite(step.bic_gain),
+        "p_value": _finite(step.p_value),
+        "words": step.words,
+    }
+    fit, earlier = step.fit, before.fit
+    if fit is None:
+        return row
+    return row | {
+        "parameters": fit.parameters, "chi2_dof": 2 * fit.cost / fit.rows,
+        "bic": 2 * fit.cost + fit.parameters * float(np.log(fit.rows)), "rms_px": fit.rms_px,
+        "held_out": _finite(fit.held_out),
+        "held_out_before": None if earlier is None else _finite(earlier.held_out),
+    }  # fmt: skip
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

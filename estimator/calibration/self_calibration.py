@@ -1,4 +1,4 @@
-"""Self-calibration from a table of dots: start, model, robust fit, twin, covariance, verdict."""
+"""Self-calibration from a table of dots: start, lens models, robust fit, covariance, verdict."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.fit import Fit
 from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens import considered_parameters
 from telerig.estimator.calibration.lens.choice import Choice
 from telerig.estimator.calibration.lens.start_values import model_start
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.quality.residual_tests import residual_tests
-from telerig.estimator.calibration.quality.split_half import halves
+from telerig.estimator.calibration.quality.split_half import split_half_check
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.result_from_fit import calibration_from_fit
+from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
 from telerig.estimator.calibration.solver.graph import Progress, Solution, solve
@@ -57,8 +56,8 @@ from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
 
-PLATE = "refraction in the plate"
-"""What decides the mirror twin of a two-sided target when no nominal rotation is given."""
+SURE_SD = 5.0
+"""Standard deviations by which a perspective must differ from none to be one."""
 
 
 def self_calibrate(
@@ -79,7 +78,7 @@ def self_calibrate(
 
     dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
     cameras : nominal, the first defines the rig frame.
-    nominal_rotvec_deg : of second_from_first; decides the mirror twin.
+    nominal_rotvec_deg : of second_from_first; resolves the mirror ambiguity.
     model : a name of `telerig.rig.lens_models`, or "auto"; for all cameras, or by camera.
     dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
     solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
@@ -99,45 +98,45 @@ def self_calibrate(
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
-    said = [*notes, *pre.notes]
+    found_notes = [*(checks.Note("input", words) for words in notes), *pre.notes]
     if target.symmetry_order() > 1:
-        problem, words = symmetric_target.settle(problem, nominal)
-        said += words
+        problem, words = symmetric_target.number_consistently(problem, nominal)
+        found_notes += [checks.Note("symmetric target", w) for w in words]
         start_dots = problem.nominal_mm
     problem = with_plate(problem)
     start = best_start(problem, start_dots)
-    by, words_twin = "mono", "one camera: its mirror twin has the same pixels and is not decided"
-    if len(cameras) == 2:
-        start, by, words_twin = _side(problem, start, nominal)
-    start = tilt_signs.settle(problem, start)
+    mirror = mirror_ambiguity.choose_start(start, problem, nominal)
+    start = tilt_signs.with_tilt_signs(problem, mirror.state)
     fit = _fit(problem, start, models, solver, progress)
-    if len(cameras) == 2 and by != PLATE:
-        fit, by, words_twin = _settled_twin(fit, nominal)
-    opened = considered_parameters.considered(fit.choice, len(cameras))
-    doubt = considered_parameters.considered_words(opened, [c.name for c in cameras])
-    done = replace(
-        fit, twin_cost=_twin_cost(fit), twin_by=by, twin_words=words_twin, pre=pre,
-        notes=tuple(said), model_words=fit.model_words + doubt,
+    if len(cameras) == 2 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
+        fit, mirror = _on_the_right_side(fit, nominal)
+    final, solution = fit.robust.problem, fit.robust.solution
+    considered = considered_parameters.considered_groups(fit.choice, len(cameras))
+    added = considered_parameters.considered_words(considered, [c.name for c in cameras])
+    other_cost = mirror_ambiguity.mirrored_cost(final, solution.state, solution.cost)
+    fit = replace(
+        fit, mirror=mirror, mirrored_cost=other_cost, tilts_deg=pre.tilts_deg,
+        notes=tuple(found_notes), model_words=fit.model_words + added,
     )  # fmt: skip
-    final, solution = done.robust.problem, done.robust.solution
     own = joint_covariance(final, solution)
     free, joint = considered_parameters.considered_covariance(
-        final, solution, own, done.models, opened
+        final, solution, own, fit.models, considered
     )
-    weak = checks.weak_parameters(final, solution.state, own)
-    found = calibration_from_fit(done, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
-    return replace(found, diagnostics={**found.diagnostics, **_trust(done.robust, joint, free)})
+    weak = checks.weak_parameters(final, own)
+    found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
+    checked = _trust(fit.robust, joint, free)
+    return replace(found, diagnostics={**found.diagnostics, **checked})
 
 
 def _trust(
     fit: RobustFit, joint: JointCovariance, free: tuple[tuple[str, ...], ...]
 ) -> dict[str, Any]:
-    """What the data say of the covariance (repeatability, structure), and what would lower it."""
+    """Whether the covariance can be believed (split halves, residuals), and what would lower it."""
     problem, state = fit.problem, fit.solution.state
     whitened = whitened_error(state, problem.observations(), problem.rho_mm)
     advice = next_view(replace(problem, free=free), state, joint)
     return {
-        "halves": halves(problem, state),
+        "halves": split_half_check(problem, state),
         "structure": residual_tests(problem, whitened, joint.leverage),
         "next_view": {} if advice is None else advice.as_dict(),
     }
@@ -169,8 +168,8 @@ def with_plate(problem: Problem) -> Problem:
     if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
         return problem
     hands = np.zeros((len(problem.views), len(problem.cameras)))
-    for (v, c), sign in _handedness(problem).items():
-        hands[v, c] = sign
+    for image, found in known_target.image_maps(problem, problem.nominal_mm).items():
+        hands[image] = np.sign(np.linalg.det(found.jacobian))
     options = [replace(problem, plate_shift=np.where(hands == h, -hands, 0.0)) for h in (1, -1)]
     costs = []
     for option in options:
@@ -179,18 +178,13 @@ def with_plate(problem: Problem) -> Problem:
     return options[int(np.argmin(costs))]
 
 
-def _handedness(problem: Problem) -> dict[tuple[int, int], int]:
-    maps = known_target.image_maps(problem, problem.nominal_mm)
-    return {k: int(np.sign(np.linalg.det(m.jacobian))) for k, m in maps.items()}
-
-
 def best_start(problem: Problem, dots_mm: Array) -> State:
-    """The closed-form start that a short solve likes best."""
+    """Of the closed-form starts, the one of least cost after a short solve."""
     if len(problem.cameras) == 1:
         return known_target.mono_state(problem, dots_mm)
     starts = known_target.stereo_states(problem, dots_mm)
-    if np.any(problem.plate_shift):  # refraction tells the mirror twins apart
-        starts += [mirror_ambiguity.twin_state(start) for start in starts]
+    if np.any(problem.plate_shift):  # refraction distinguishes mirrored solutions
+        starts += [mirror_ambiguity.mirrored_state(start) for start in starts]
     fits: list[Solution] = []
     for start in starts:
         perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)
@@ -206,7 +200,7 @@ def _fit(
     solver: str,
     progress: Progress | None,
 ) -> Fit:
-    """Outliers and floor with a rich model, the ladder, then the chosen model to the end.
+    """Outliers and noise floor with a rich model, the choice, then the chosen model to the end.
 
     solver : of the last fit; the trials before it take ``problem.solver``.
     """
@@ -218,7 +212,10 @@ def _fit(
         weighed = first.problem
         models, start, words = choice.chosen.names, choice.chosen.state, choice.words
         if any("centre" in name for name in models):
-            words += _CENTRE_WORDS
+            words += (
+                "; the perspective is strong, so the image centre (where the axis meets the "
+                "image) is free too, and the inter-camera angle is as uncertain as it makes it"
+            )
             held = _centre_held(first.problem, start, models)
     final = problem.with_model(models)
     if choice is None:
@@ -230,8 +227,7 @@ def _fit(
     shift = eccentricity_px(final, begin)
     final = replace(final, uv_px=final.uv_px - shift)
     robust = robust_solve(replace(final, solver=solver), begin, progress=progress)
-    none = checks.PreCheck({}, ())
-    return Fit(robust, np.nan, "", "", models, words, choice, held, none, ())
+    return Fit(robust, models, words, choice, held)
 
 
 def choose_model(
@@ -245,13 +241,7 @@ def choose_model(
     models : per camera, "auto" or a model that stays.
     """
     first = _rich(problem, start, models, progress)
-    return first, model_choice.climb(first.problem, first.solution, models)
-
-
-_CENTRE_WORDS = (
-    "; the perspective is strong, so the image centre (where the axis meets the image) is "
-    "free too, and the inter-camera angle is as uncertain as it makes it"
-)
+    return first, model_choice.choose(first.problem, first.solution, models)
 
 
 def _rich(
@@ -272,10 +262,6 @@ def _rich(
     return robust_solve(whole, model_start(whole, first.solution.state), progress=progress)
 
 
-_SURE = 5.0
-"""Standard deviations by which a perspective must differ from none to be one."""
-
-
 def _strong(fit: RobustFit) -> NDArray[np.bool_]:
     """(C,) whether a camera's perspective is that of no telecentric lens."""
     problem, kappa = fit.problem, INDEX["kappa_per_mm"]
@@ -288,7 +274,7 @@ def _strong(fit: RobustFit) -> NDArray[np.bool_]:
         for parameter in problem.free_indices(c):
             sd = np.sqrt(next(variance)) * parameter_unit(camera)[parameter]
             if parameter == kappa:
-                out[c] &= strength[c] > _SURE * sd * camera.rho_mm
+                out[c] &= strength[c] > SURE_SD * sd * camera.rho_mm
     return out
 
 
@@ -298,40 +284,12 @@ def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Arr
     return solve(held, held_at_nominal(held, state), relative=1e-7).state.rig_from_camera
 
 
-def _side(problem: Problem, start: State, nominal: Array | None) -> tuple[State, str, str]:
-    """The twin to go on with: by the plate's refraction where nothing else can tell."""
-    if nominal is not None or not np.any(problem.plate_shift):
-        return mirror_ambiguity.choose_twin(start, problem, nominal)
-    both = (start, mirror_ambiguity.twin_state(start))
-    costs = [solve(problem, s, max_iterations=20).cost for s in both]
-    words = "the plate's refraction, which has another sign in the mirror twin"
-    return both[int(np.argmin(costs))], PLATE, words
-
-
-def _settled_twin(fit: Fit, nominal: Array | None) -> tuple[Fit, str, str]:
+def _on_the_right_side(
+    fit: Fit, nominal: Array | None
+) -> tuple[Fit, mirror_ambiguity.MirrorChoice]:
     """The final fit may know the sign of kappa that the start did not."""
-    robust = fit.robust
-    state, by, words = mirror_ambiguity.choose_twin(robust.solution.state, robust.problem, nominal)
-    if state is not robust.solution.state:
-        fit = replace(fit, robust=replace(robust, solution=solve(robust.problem, state)))
-    return fit, by, words
-
-
-def _twin_cost(fit: Fit) -> float:
-    """The cost of the twin that was not kept.
-
-    Raises CalibrationError when it is far lower: the plate's refraction decides against the side
-    that the nominal rotation names.
-    """
     problem, solution = fit.robust.problem, fit.robust.solution
-    if len(problem.cameras) == 1:
-        return solution.cost
-    other = solve(problem, mirror_ambiguity.twin_state(solution.state), max_iterations=20).cost
-    if np.any(problem.plate_shift) and other < 0.5 * solution.cost - 10:
-        raise CalibrationError(
-            "the nominal rotation puts the second camera on one side, the refraction in the "
-            f"two-sided plate on the other (cost {solution.cost:.4g} against {other:.4g})",
-            where="rig.toml [stereo]",
-            todo="check the sign of the nominal rotation, and the plate's thickness and index",
-        )
-    return other
+    mirror = mirror_ambiguity.choose_solution(solution.state, problem, nominal)
+    if mirror.state is not solution.state:
+        fit = replace(fit, robust=replace(fit.robust, solution=solve(problem, mirror.state)))
+    return fit, mirror

@@ -30,7 +30,7 @@ from telerig.estimator.dots.dataset_dots import (
     with_example,
 )
 from telerig.estimator.dots.locate import REJECTED
-from telerig.io.dataset.dataset import Dataset, View, load_dataset
+from telerig.io.dataset.dataset import Dataset, NoViewsError, View, load_dataset
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -65,10 +65,10 @@ class WatchedFolder:
     _found: dict[Path, tuple[Stamp, ImageDots]] = field(default_factory=dict)
     _said: str = ""
     _rig: bytes = b""
-    _alone: dict[tuple[str, str], float] = field(default_factory=dict)
+    _waiting_s: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def poll(self, stop: Stop | None = None) -> None:
-        """Look at the folder and detect what is new, until ``stop`` is set."""
+        """List the folder and detect what is new, until ``stop`` is set."""
         dataset = self._listed()
         if dataset is None:
             return
@@ -82,23 +82,25 @@ class WatchedFolder:
                 if stamp is None or (stop is not None and stop.is_set()):
                     continue
                 self._stamps[path] = stamp
-                settled = stamp[0] > 0 and before.get(path) == stamp
-                if settled and self._found.get(path, (None,))[0] != stamp:
+                complete = stamp[0] > 0 and before.get(path) == stamp
+                if complete and self._found.get(path, (None,))[0] != stamp:
                     self._found[path] = stamp, self._detected(dataset, view, camera)
         self.dataset = replace(dataset, views=self._views(dataset))
         self._remind(dataset, time.monotonic())
 
     def _remind(self, dataset: Dataset, now_s: float) -> None:
-        """Name the views that wait for a camera; infinite once named."""
+        """Name the views that wait for a camera's image, each once."""
         waiting = [
             (view.name, camera)
             for view in dataset.views
             for camera in dataset.rig.cameras
             if camera not in view.image_paths
         ]
-        self._alone = {key: self._alone.get(key, now_s) for key in waiting}
-        late = [key for key, since_s in self._alone.items() if now_s - since_s > self.patience_s]
-        self._alone |= dict.fromkeys(late, float("inf"))
+        self._waiting_s = {key: self._waiting_s.get(key, now_s) for key in waiting}
+        late = [
+            key for key, since_s in self._waiting_s.items() if now_s - since_s > self.patience_s
+        ]
+        self._waiting_s |= dict.fromkeys(late, float("inf"))
         for camera in dataset.rig.cameras:
             if names := [view for view, lacking in late if lacking == camera]:
                 self.tell(_missing(names, camera))
@@ -106,20 +108,18 @@ class WatchedFolder:
     def _listed(self) -> Dataset | None:
         try:
             dataset = load_dataset(self.path, "images")
+        except NoViewsError:
+            return None
         except InputError as error:
-            if "there are no views" not in error.what:
-                self._say_once(str(error))
+            if str(error) != self._said:
+                self.tell(str(error))
+                self._said = str(error)
             return None
         self._said = ""
         rig = (self.path / "rig.toml").read_bytes()
         if rig != self._rig:
             self._found, self._rig = {}, rig
         return dataset
-
-    def _say_once(self, words: str) -> None:
-        if words != self._said:
-            self.tell(words)
-            self._said = words
 
     def _detected(self, dataset: Dataset, view: View, camera: str) -> ImageDots:
         try:
@@ -199,7 +199,7 @@ def watch(
     until_um: float | None = None,
     **options: Any,
 ) -> tuple[Dataset, CalibrationRun]:
-    """Solve whenever a complete view is new, until another view is not worth it or ``stop`` is set.
+    """Solve whenever a view is complete, until one more would gain little or ``stop`` is set.
 
     options : model, solver, medium, dots_free, outlier_sd and seed as for `run_calibration`.
     Returns the dataset of the images that were used and its calibration, walls and stage included.
@@ -234,7 +234,7 @@ def _solved(
     until_um: float | None,
     options: dict[str, Any],
 ) -> bool:
-    """Solve and say how things stand; whether it is enough."""
+    """Solve and report the state of the calibration; whether the views are enough."""
     count = len(folder.complete())
     if count < _FEWEST:
         tell(_too_few(dataset, count))
@@ -262,7 +262,7 @@ def _generic(dataset: Dataset, count: int) -> str:
     """What to do first, before a calibration can say more."""
     names, rotvec = list(dataset.rig.cameras), dataset.rig.second_from_first_rotvec_deg
     if len(names) < 2:
-        return "tilt the target by 20 to 50 degrees, otherwise than before"
+        return "tilt the target by 20 to 50 degrees, about another axis than before"
     angle = 90.0 if rotvec is None else float(np.linalg.norm(rotvec))
     return first_views(names[0], names[1], angle)[min(count, RECOMMENDED_VIEWS - 1)]
 
@@ -278,18 +278,19 @@ def standing(
         residual = calibration.statistics["rms_px"]
         return f"{words}: residual {residual:.3g} px. Next: {_generic(dataset, count)}", False
     sd = advice["before_um"]
-    words += f": {rounded_um(sd)} um in space"
+    words += f": points are good to {rounded_um(sd)} µm"
     if count < RECOMMENDED_VIEWS:
         missing = RECOMMENDED_VIEWS - count
         return f"{words}, {missing} more to begin with. Next: {_generic(dataset, count)}", False
     if status == "REJECTED":
         return f"{words}: {calibration.verdict['reasons'][0]}", False
     if until_um is not None and sd <= until_um:
-        return f"{words}: enough, {until_um:g} um were asked for", True
+        return f"{words}: enough, {until_um:g} µm were asked for", True
     if advice["enough"]:
-        unmet = "" if until_um is None else f", though {until_um:g} um were asked for"
-        gain = f"one more view would bring less than {ENOUGH_SHARE:.0%}"
+        unmet = "" if until_um is None else f", though {until_um:g} µm were asked for"
+        gain = f"one more view would lower this by less than {ENOUGH_SHARE:.0%}"
         return f"{words}: enough, {gain}{unmet}", True
     if not advice["poses"]:
         return f"{words}. {advice['verdict']}", False
-    return f"{words}, {rounded_um(advice['after_um'])} with: {advice['poses'][0]['words']}", False
+    after = rounded_um(advice["after_um"])
+    return f"{words}, {after} µm with one more view: {advice['poses'][0]['words']}", False

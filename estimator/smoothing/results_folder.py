@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
-from telerig.estimator.calibration.refractive_windows import forgotten_walls
+from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.tracking.detection import read_batch
@@ -53,7 +53,7 @@ def smooth_run(
     _check_cameras(followed, calibration)
     run, marks = with_followed_references(run, source.parent)
     warnings = [
-        *forgotten_walls(run.rig, calibration),
+        *window_warnings(run.rig, calibration),
         *([] if refine_rig else _moved(followed)),
         *check_sensors(run, tracks=followed, calibration=calibration),
     ]

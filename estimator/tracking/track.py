@@ -19,7 +19,7 @@ from telerig.estimator.bubbles.pairing.matching import match_pairs
 from telerig.estimator.bubbles.pairing.model import estimate_pair_model
 from telerig.estimator.bubbles.pairing.types import PairModel
 from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
-from telerig.estimator.calibration.refractive_windows import forgotten_walls
+from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.from_pairs import PairCollector, with_change
 from telerig.estimator.tracking.detection import (
@@ -340,7 +340,7 @@ def summary_of(
         "shape_sigma": stream.shape_sigma,
         "covariance": "of the measurement; the calibration's share, common to all points, is not "
         "in tracks.csv",
-        "warnings": forgotten_walls(run.rig, calibration),
+        "warnings": window_warnings(run.rig, calibration),
         "notes": list(run.notes),
     }
     if change is not None:

@@ -216,7 +216,11 @@ def _choose_source(
     raise _no_views(folder, rig, wanted)
 
 
-def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> InputError:
+class NoViewsError(InputError):
+    """A dataset in which no calibration views are found, yet."""
+
+
+def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> NoViewsError:
     calibration = folder / "calibration"
     kind = {"images": "images in calibration/<camera>/", "dots": "calibration/dots.csv"}
     what = f"there are no views: no {' and no '.join(kind[s] for s in wanted)}"
@@ -227,7 +231,7 @@ def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> InputE
         todo = f"rename {near[0]} to calibration" if near else todo
     elif list_images(calibration):
         todo = f"move the images in calibration/ into calibration/{rig.first}/"
-    return InputError(what, where=str(folder), todo=todo)
+    return NoViewsError(what, where=str(folder), todo=todo)
 
 
 def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tuple[View, ...]:

@@ -1,8 +1,8 @@
 """Which lens model the data support, camera by camera.
 
-A rich model is fitted once; the criterion of `lens_search` names the best model that it contains.
-The way there from the simplest model is then fitted step by step, and each step has to predict
-views that were left out no worse than the one before.
+A rich model is fitted once; the criterion of `search` names the best model that it contains. The
+models between the simplest one and that one are then fitted, one more group of parameters at each
+step, and each step has to predict views that were left out no worse than the one before.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from telerig.estimator.calibration.lens.cross_validation import held_out_chi2
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
     Addition,
-    Landscape,
     Lens,
     Lenses,
+    QuadraticCost,
     additions,
     possible,
     search,
@@ -39,15 +39,15 @@ Array = NDArray[np.float64]
 
 DOTS_FOR_WORKERS = 500
 """With fewer measured dots, four fits take 0.1 s, and starting processes for them 0.05 s."""
-HOPELESS = 10.0
+TOO_COSTLY = 10.0
 """Times the rich model's cost beyond which a model is not asked to predict."""
 ROUNDS = 3
 AGREEMENT = 2.0
-"""How far (chi-square) a fit may be from what the landscape promised before it is drawn anew."""
+"""Chi-square by which a fit may differ from the quadratic's prediction before that is redone."""
 
 
 @dataclass(frozen=True)
-class Fit:
+class FittedModel:
     """A fitted model: groups of every camera, free intrinsics of all, what is left.
 
     per_view : (V,) mean squared whitened residual of each view, predicted by a fit without it;
@@ -75,23 +75,25 @@ class Fit:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the ladder, taken or not.
+    """One step from the simplest model on, taken or not.
 
     camera, added : index of the camera whose model has these parameters more than the step before;
         -1 and () for the first.
-    gain : chi-square that it takes away, in units of the noise.  worth : gain less price.
-    fit : None where the gain alone decides.  vague : these views do not determine it.
+    gain : chi-square that it takes away, in units of the noise.
+    bic_gain : the gain less the criterion's penalty.
+    fit : None where the gain alone decides.
+    undetermined : these views do not determine the parameters.
     """
 
     camera: int
     added: tuple[str, ...]
     lenses: Lenses
     gain: float
-    worth: float
+    bic_gain: float
     taken: bool
     words: str
-    fit: Fit | None
-    vague: bool = False
+    fit: FittedModel | None
+    undetermined: bool = False
 
     @property
     def p_value(self) -> float:
@@ -104,7 +106,7 @@ class Choice:
     """The steps up to the chosen model, then those that were not taken; the choice in words."""
 
     steps: tuple[Step, ...]
-    chosen: Fit
+    chosen: FittedModel
     words: str
 
 
@@ -120,7 +122,7 @@ def rich_lens(*, mono: bool, strong: bool) -> Lens:
     return Lens({"affine", "k1", "k2", "p", "s"} | (set() if mono else {"kappa"}))
 
 
-def climb(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
+def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
     """Choose among what the problem has free.
 
     problem, rich : with the richest model, at its minimum.
@@ -128,22 +130,22 @@ def climb(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
     """
     whole = tuple(_lens_of(free) for free in problem.free)
     allowed = [possible(lens) if m == AUTO else [lens] for lens, m in zip(whole, models)]
-    least = tuple(min(options, key=len) for options in allowed)
-    landscape = Landscape.of(problem, rich)
-    wanted = _determined(landscape, allowed)
+    simplest = tuple(min(options, key=len) for options in allowed)
+    quadratic = QuadraticCost.of(problem, rich)
+    wanted = _determined(quadratic, allowed)
     for _ in range(ROUNDS):
-        path = steps_to(landscape, wanted, least)
-        rivals = _rivals(landscape, wanted, allowed)
-        fits = _fits(problem, rich, [least, *(step[2] for step in path)], rivals)
+        path = steps_to(quadratic, wanted, simplest)
+        alternatives = _alternatives(quadratic, wanted, allowed)
+        fits = _fits(problem, rich, [simplest, *(step[2] for step in path)], alternatives)
         fitted, others = fits[: len(path) + 1], fits[len(path) + 1 :]
-        landscape, better = _thought_over(problem, landscape, fitted[-1], others, allowed)
+        quadratic, better = _revised(problem, quadratic, fitted[-1], others, allowed)
         if better == wanted:
             break
         wanted = better
-    steps = _with_held_out(_taken(landscape, path, fitted))
+    steps = _without_worse_predictions(_taken(quadratic, path, fitted))
     chosen = [step.fit for step in steps if step.taken and step.fit is not None][-1]
     refused = [step for step in steps if not step.taken]
-    steps += _not_taken(landscape, chosen.lenses, allowed, refused)
+    steps += _not_taken(quadratic, chosen.lenses, allowed, refused)
     return Choice(tuple(steps), chosen, _words(problem, steps, chosen, others))
 
 
@@ -151,28 +153,30 @@ def _lens_of(free: Sequence[str]) -> Lens:
     return Lens(g for g, parameters in GROUPS.items() if set(parameters) <= set(free))
 
 
-def _determined(landscape: Landscape, allowed: list[list[Lens]]) -> Lenses:
+def _determined(quadratic: QuadraticCost, allowed: list[list[Lens]]) -> Lenses:
     """The best model of which the views determine every parameter."""
     allowed = list(allowed)
     while True:
-        found = search(landscape, allowed)
-        vague = [
+        found = search(quadratic, allowed)
+        undetermined = [
             (c, group) for c, lens in enumerate(found) for group in ordered(lens)
             if len(allowed[c]) > 1 and group != "centre"
-            and landscape.sd_over_prior(found, c, group) > UNDETERMINED
+            and quadratic.sd_over_prior(found, c, group) > UNDETERMINED
         ]  # fmt: skip
-        if not vague:
+        if not undetermined:
             return found
-        for c, group in vague:
+        for c, group in undetermined:
             allowed[c] = [lens for lens in allowed[c] if group not in lens]
 
 
-def _rivals(landscape: Landscape, wanted: Lenses, allowed: list[list[Lens]]) -> list[Lenses]:
+def _alternatives(
+    quadratic: QuadraticCost, wanted: Lenses, allowed: list[list[Lens]]
+) -> list[Lenses]:
     """What else is fitted: the best model without a tilt, and the richest without kappa."""
     out = []
     if any("tilt" in lens for lens in wanted):
         flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
-        out.append(_determined(landscape, flat))
+        out.append(_determined(quadratic, flat))
     if any("kappa" in lens and len(options) > 1 for lens, options in zip(wanted, allowed)):
         richest = (max(options, key=len) for options in allowed)
         out.append(tuple(
@@ -182,15 +186,17 @@ def _rivals(landscape: Landscape, wanted: Lenses, allowed: list[list[Lens]]) -> 
     return out
 
 
-def _fits(problem: Problem, rich: Solution, path: list[Lenses], rivals: list[Lenses]) -> list[Fit]:
+def _fits(
+    problem: Problem, rich: Solution, path: list[Lenses], alternatives: list[Lenses]
+) -> list[FittedModel]:
     # a copy of a process in which GTSAM has worked may wait for threads that it does not have
-    tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in rivals]
+    tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in alternatives]
     here = problem.solver == "gtsam" or len(problem.uv_px) < DOTS_FOR_WORKERS
     workers = 1 if here else quick_workers(len(tasks))
     return list(ordered_map(partial(_fit, problem, rich), tasks, workers))
 
 
-def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> Fit:
+def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> FittedModel:
     lenses, predict = task
     problem = problem.with_model([name_of(lens) for lens in lenses])
     begin = model_start(problem, rich.state)
@@ -198,49 +204,49 @@ def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> Fit:
     obs = problem.observations()
     residual = pixels(solution.state, obs, problem.rho_mm) - obs.uv_px
     per_view = np.full(len(problem.views), np.inf)
-    if predict and solution.cost < HOPELESS * rich.cost:
+    if predict and solution.cost < TOO_COSTLY * rich.cost:
         per_view = held_out_chi2(problem, solution.state)
     count = sum(len(free) for free in problem.free)
     rms = float(np.sqrt((residual**2).mean()))
-    return Fit(lenses, count, solution.cost, residual.size, rms, per_view, solution.state)
+    return FittedModel(lenses, count, solution.cost, residual.size, rms, per_view, solution.state)
 
 
-def _thought_over(
+def _revised(
     problem: Problem,
-    landscape: Landscape,
-    fit: Fit,
-    others: list[Fit],
+    quadratic: QuadraticCost,
+    fit: FittedModel,
+    others: list[FittedModel],
     allowed: list[list[Lens]],
-) -> tuple[Landscape, Lenses]:
-    """The wanted model again, or a better one: a rival, or one of a landscape drawn anew.
+) -> tuple[QuadraticCost, Lenses]:
+    """The wanted model again, or a better one: an alternative, or one of a new quadratic.
 
-    A landscape is right near the fit that it was drawn at; one that promised the wanted model
-    another cost than it has is drawn again there.
+    A quadratic holds near the fit at which it was made; one that predicted another cost for the
+    wanted model than it has is made again there.
     """
-    rivals = [o for o in others if all(x in options for x, options in zip(o.lenses, allowed))]
-    best = min((fit, *rivals), key=landscape.cost_of_fit)
+    fitting = [o for o in others if all(x in options for x, options in zip(o.lenses, allowed))]
+    best = min((fit, *fitting), key=quadratic.cost_of_fit)
     if best is not fit:
-        return landscape, best.lenses
-    promised = landscape.least + landscape.rise(fit.lenses)
+        return quadratic, best.lenses
+    predicted = quadratic.least + quadratic.rise(fit.lenses)
     if any("tilt" in lens for lens in fit.lenses):
-        return landscape, fit.lenses
-    if abs(2 * fit.cost / landscape.variance - promised) < AGREEMENT:
-        return landscape, fit.lenses
+        return quadratic, fit.lenses
+    if abs(2 * fit.cost / quadratic.variance - predicted) < AGREEMENT:
+        return quadratic, fit.lenses
     there = solve(problem, fit.state, max_iterations=0)
-    landscape = Landscape.of(problem, there)
-    return landscape, _determined(landscape, allowed)
+    quadratic = QuadraticCost.of(problem, there)
+    return quadratic, _determined(quadratic, allowed)
 
 
-def _taken(landscape: Landscape, path: list[Addition], fits: list[Fit]) -> list[Step]:
+def _taken(quadratic: QuadraticCost, path: list[Addition], fits: list[FittedModel]) -> list[Step]:
     out = [Step(-1, (), fits[0].lenses, float("nan"), float("nan"), True, "", fits[0])]
     for (camera, group, lenses), before, after in zip(path, fits, fits[1:]):
-        gain = 2 * (before.cost - after.cost) / landscape.variance
-        worth = gain - landscape.price_of(Lens({group}))
-        out.append(Step(camera, GROUPS[group], lenses, gain, worth, True, "", after))
+        gain = 2 * (before.cost - after.cost) / quadratic.variance
+        bic_gain = gain - quadratic.penalty_of(Lens({group}))
+        out.append(Step(camera, GROUPS[group], lenses, gain, bic_gain, True, "", after))
     return out
 
 
-def _with_held_out(steps: list[Step]) -> list[Step]:
+def _without_worse_predictions(steps: list[Step]) -> list[Step]:
     """Steps back from the end while the last one predicts left-out views worse."""
     last = len(steps) - 1
     while last > 0:
@@ -255,9 +261,9 @@ def _with_held_out(steps: list[Step]) -> list[Step]:
 
 
 def _not_taken(
-    landscape: Landscape, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
+    quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
 ) -> list[Step]:
-    """What one more group would have brought, but for those that were tried and refused.
+    """What one more group would have brought, but for those that were tried and taken back.
 
     A tilt is not asked for by itself: where aspect and skew bring nothing, it does not either.
     """
@@ -266,20 +272,22 @@ def _not_taken(
     for camera, group, lenses in additions(chosen, allowed):
         if group == "tilt" or (camera, GROUPS[group]) in known:
             continue
-        gain = max(landscape.rise(chosen) - landscape.rise(lenses), 0.0)
-        worth = gain - landscape.price_of(Lens({group}))
-        share = landscape.sd_over_prior(lenses, camera, group)
-        words = f"held: price {gain - worth:.1f}"
+        gain = max(quadratic.rise(chosen) - quadratic.rise(lenses), 0.0)
+        bic_gain = gain - quadratic.penalty_of(Lens({group}))
+        share = quadratic.sd_over_prior(lenses, camera, group)
+        words = f"held: the gain in chi-square is below its penalty of {gain - bic_gain:.1f}"
         if share > UNDETERMINED:
-            words = f"held: not determined by these views (sd {share:.0%} of the prior's)"
+            words = f"held: not determined by these views (posterior sd {share:.0%} of the prior's)"
         out.append(
-            Step(camera, GROUPS[group], lenses, gain, worth, False, words, None,
+            Step(camera, GROUPS[group], lenses, gain, bic_gain, False, words, None,
                  share > UNDETERMINED)
         )  # fmt: skip
     return out
 
 
-def _words(problem: Problem, steps: list[Step], chosen: Fit, others: list[Fit]) -> str:
+def _words(
+    problem: Problem, steps: list[Step], chosen: FittedModel, others: list[FittedModel]
+) -> str:
     cameras = [c.name for c in problem.cameras]
     name = joint_name(chosen.names, cameras)
     words = f"{name}: {_prediction_words(steps, chosen, cameras)}"
@@ -293,20 +301,22 @@ def _words(problem: Problem, steps: list[Step], chosen: Fit, others: list[Fit]) 
     for camera, lens, intrinsics in zip(cameras, chosen.lenses, chosen.state.intrinsics):
         if "affine" in lens:
             words += f"; {_stretch_words(camera, intrinsics)}"
-    vague = [
+    undetermined = [
         f"{', '.join(step.added)} of camera {cameras[step.camera]!r}"
-        for step in steps if step.vague
+        for step in steps if step.undetermined
     ]  # fmt: skip
-    return words + (f"; these views do not determine {', '.join(vague)}: held" if vague else "")
+    return words + (
+        f"; these views do not determine {', '.join(undetermined)}: held" if undetermined else ""
+    )
 
 
-def _prediction_words(steps: list[Step], chosen: Fit, cameras: list[str]) -> str:
-    """What the ladder as a whole and its last step did for the prediction of left-out views."""
+def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]) -> str:
+    """What all steps together, and the last one, did for the prediction of left-out views."""
     taken = [step for step in steps if step.taken]
     fits = [step.fit for step in taken if step.fit is not None]
     simpler = [fit for fit in fits[:-1] if np.isfinite(fit.held_out)]
     if not np.isfinite(chosen.held_out):
-        return "lowest information criterion; too few views to leave out"
+        return "lowest information criterion; there are too few views to leave some out"
     if not simpler:
         return "no richer model predicts left-out views better"
     words = (

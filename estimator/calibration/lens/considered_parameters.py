@@ -1,10 +1,10 @@
-"""What the ladder leaves out is held at nominal; how far the covariance may believe that.
+"""Considered parameters: held at nominal by the chosen model, but open in the covariance.
 
-A group that is not worth its price is not therefore zero. Where it acts like what is free (a
-stretch of one camera's image beside that of the other's), leaving it out makes the covariance many
-times smaller than the error: a stretch of three standard deviations bends space by thirty.
-Such a group is *considered* (Schmidt and Kalman's word): the estimate stays that of the simpler
-model, and its mean squared error is counted with the group's value open.
+A group of parameters that is not worth freeing is not therefore zero. Where it acts like what is
+free (a stretch of one camera's image beside that of the other's), leaving it out makes the
+covariance many times smaller than the error: a stretch of three standard deviations bends space by
+thirty. Such a group is *considered* (Schmidt and Kalman's word): the estimate stays that of the
+simpler model, and its mean squared error is counted with the group's value open.
 
 With C the covariance of the model that has the group, v the Gauss-Newton step to its minimum, and
 nothing known of the value but what the data say, E[(estimate - truth)^2] = C + v v^T; the group's
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 Lens = frozenset[str]
 
-DOUBT = 0.01
-"""Chance of the gain below which a group that does not pay its price is considered all the same."""
+CONSIDERED_P_VALUE = 0.01
+"""Of the gain, below which a group is considered though freeing it is not worth its penalty."""
 UNDAMPED = 1e-12
 
 
-def considered(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:
+def considered_groups(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:
     """Per camera the groups that are left out and may matter.
 
     Those that another camera of the rig needs (its lens is of the same kind, so that here the group
@@ -44,11 +44,11 @@ def considered(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:
     steps = choice.steps if choice is not None else ()
     taken = {(step.camera, g) for step in steps if step.taken for g in _acts_like(step.added)}
     for step in steps:
-        if step.taken or step.vague:
+        if step.taken or step.undetermined:
             continue
         elsewhere = {group for camera, group in taken if camera != step.camera}
         groups = _groups(step.added)
-        if groups & elsewhere or step.p_value < DOUBT:
+        if groups & elsewhere or step.p_value < CONSIDERED_P_VALUE:
             out[step.camera] |= groups
     return tuple(Lens(groups) for groups in out)
 
@@ -96,6 +96,6 @@ def considered_words(groups: Sequence[Lens], cameras: Sequence[str]) -> str:
     if not parts:
         return ""
     return (
-        f"; {' and '.join(parts)}: held at nominal, not worth freeing, but the data "
-        "do not exclude it, and every stated uncertainty contains what it may be"
+        f"; {' and '.join(parts)}: held at nominal because freeing it is not worth its "
+        "penalty, but the data do not exclude it, so every stated uncertainty contains its effect"
     )

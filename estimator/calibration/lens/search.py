@@ -37,10 +37,10 @@ _HOMOGRAPHY = (("p1", "s3"), ("p2", "s1"))
 _PLAIN = ("kappa", "affine", "k1", "k2", "p", "s")
 UNDETERMINED = 0.5
 """Standard deviation over the prior's beyond which the data say little of a parameter."""
-CAUTION = 4.0
-"""Price of a group, over the logarithm of how many there are: 2 would be Chen and Chen's gamma = 1;
-twice that lets one group in about 20 000 in by chance (docs/decisions/014)."""
-BELIEF = 20.0
+GROUP_PENALTY = 4.0
+"""Penalty of a group, over the logarithm of how many there are: 2 would be Chen and Chen's gamma =
+1; twice that lets one group in about 20 000 in by chance (docs/decisions/014)."""
+NOISE_DOF = 20.0
 """Degrees of freedom that the stated noise is worth beside the residuals."""
 
 
@@ -53,7 +53,7 @@ class _Fitted(Protocol):
 
 
 @dataclass(frozen=True)
-class Landscape:
+class QuadraticCost:
     """The quadratic form at the minimum of a rich model.
 
     names : (camera, parameter) of each coordinate; the homography's two per camera come last.
@@ -61,7 +61,7 @@ class Landscape:
     prior : (K,) standard deviations before any data.
     least : chi-square at the minimum.
     variance : of the residuals, 1 where the stated noise is right; every chi-square is over it.
-    price : what one parameter must lower chi-square by; group_price : and what a group must.
+    penalty : of one free parameter, in chi-square; group_penalty : of a group besides.
     """
 
     names: tuple[tuple[int, str], ...]
@@ -70,11 +70,11 @@ class Landscape:
     prior: Array
     least: float
     variance: float
-    price: float
-    group_price: float
+    penalty: float
+    group_penalty: float
 
     @staticmethod
-    def of(problem: Problem, solution: Solution) -> Landscape:
+    def of(problem: Problem, solution: Solution) -> QuadraticCost:
         """From a fit of the rich model, or from any point near its minimum."""
         names = [(c, p) for c, free in enumerate(problem.free) for p in free]
         posterior = solution.equations.posterior(whole=False)
@@ -103,11 +103,11 @@ class Landscape:
                      if (c, GROUPS[g][0]) in names)  # fmt: skip
         variance = _variance(problem, solution, posterior.common, posterior.dots)
         rows = 2 * int(np.sum(problem.weight > 0))
-        return Landscape(
+        return QuadraticCost(
             (*names, *(m[0] for m in more)), extend @ offset, extend @ covariance @ extend.T,
             np.r_[prior / unit, np.ones(len(more))],
             2 * (solution.cost - still) / variance, variance,
-            float(np.log(rows)), float(CAUTION * np.log(max(groups, 1))),
+            float(np.log(rows)), float(GROUP_PENALTY * np.log(max(groups, 1))),
         )  # fmt: skip
 
     def rise(self, lenses: Lenses) -> float:
@@ -119,18 +119,18 @@ class Landscape:
         return float(d @ np.linalg.solve(inside, d)) / self.variance
 
     def cost(self, lenses: Lenses) -> float:
-        """Of a model, by the criterion: chi-square and the price of what is free."""
-        return self.rise(lenses) + sum(self.price_of(lens) for lens in lenses)
+        """Of a model, by the criterion: chi-square and the penalty of what is free."""
+        return self.rise(lenses) + sum(self.penalty_of(lens) for lens in lenses)
 
     def cost_of_fit(self, fit: _Fitted) -> float:
         """The same of a model that was fitted."""
-        prices = sum(self.price_of(lens) for lens in fit.lenses)
-        return 2 * fit.cost / self.variance - self.least + prices
+        penalties = sum(self.penalty_of(lens) for lens in fit.lenses)
+        return 2 * fit.cost / self.variance - self.least + penalties
 
-    def price_of(self, lens: Lens) -> float:
-        """A tilt pays for two groups: the stretch, and the homography that it adds."""
+    def penalty_of(self, lens: Lens) -> float:
+        """A tilt counts as two groups: the stretch, and the homography that it adds."""
         free = sum(len(GROUPS[g]) for g in lens - {"centre"})
-        return self.price * free + self.group_price * len((lens - {"centre"}) | _also(lens))
+        return self.penalty * free + self.group_penalty * len((lens - {"centre"}) | _also(lens))
 
     def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
         """The largest standard deviation of a group's parameters in a model, over the prior's."""
@@ -155,7 +155,7 @@ def _also(lens: Lens) -> Lens:
 
 @cache
 def _held_by(lens: Lens) -> frozenset[str]:
-    """Coordinates that a lens holds at nominal, of all that a landscape can have."""
+    """Coordinates that a lens holds at nominal, of all that a quadratic can have."""
     free = {p for g in lens for p in GROUPS[g]}
     held = {p for g in (*_PLAIN, "centre") for p in GROUPS[g]} - free
     if "tilt" in lens:
@@ -166,7 +166,8 @@ def _held_by(lens: Lens) -> frozenset[str]:
 
 
 def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) -> float:
-    """Chi-square of the images over its expectation, the stated noise believed to a degree.
+    """Chi-square of the images over its expectation, the stated noise counted as `NOISE_DOF`
+    degrees of freedom.
 
     E[r^T r] = rows - numbers + tr(C P), P the information of the priors (docs/theory.md).
     """
@@ -181,7 +182,7 @@ def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) 
     seen = len(np.unique(problem.view[problem.weight > 0]))
     numbers = shared + 4 * (len(problem.cameras) - 1) + 6 * seen + 3 * len(problem.dot_ids)
     dof = max(error.size - numbers + by_prior, 0.0)
-    return float(((error**2).sum() + BELIEF) / (dof + BELIEF))
+    return float(((error**2).sum() + NOISE_DOF) / (dof + NOISE_DOF))
 
 
 def possible(rich: Lens) -> list[Lens]:
@@ -205,7 +206,7 @@ def possible(rich: Lens) -> list[Lens]:
     return sorted((f for f in found if f - {"tilt"} <= rich), key=ordered)
 
 
-def search(landscape: Landscape, allowed: Sequence[Sequence[Lens]]) -> Lenses:
+def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lenses:
     """The model of least cost, one camera after the other until none changes.
 
     allowed : per camera.  From the richest and the simplest model; the better end is taken.
@@ -216,11 +217,11 @@ def search(landscape: Landscape, allowed: Sequence[Sequence[Lens]]) -> Lenses:
         for _ in range(10):
             before = now
             for c, options in enumerate(allowed):
-                now = min(((*now[:c], lens, *now[c + 1 :]) for lens in options), key=landscape.cost)
+                now = min(((*now[:c], lens, *now[c + 1 :]) for lens in options), key=quadratic.cost)
             if now == before:
                 break
         ends.append(now)
-    return min(ends, key=landscape.cost)
+    return min(ends, key=quadratic.cost)
 
 
 def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Addition]:
@@ -232,13 +233,13 @@ def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Add
                 yield c, min(more), (*lenses[:c], lens, *lenses[c + 1 :])
 
 
-def steps_to(landscape: Landscape, chosen: Lenses, least: Lenses) -> list[Addition]:
+def steps_to(quadratic: QuadraticCost, chosen: Lenses, least: Lenses) -> list[Addition]:
     """The way from the simplest model to the chosen one, the most useful group first."""
     within = [list(_between(low, high)) for low, high in zip(least, chosen)]
     now = least
     out: list[Addition] = []
     while now != chosen:
-        step = min(additions(now, within), key=lambda s: landscape.cost(s[2]))
+        step = min(additions(now, within), key=lambda s: quadratic.cost(s[2]))
         now = step[2]
         out.append(step)
     return out

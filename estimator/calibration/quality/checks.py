@@ -1,4 +1,4 @@
-"""Checks before and after a self-calibration: refuse, warn, and name what is weak in words."""
+"""Checks before and after a self-calibration: refuse, warn, and say what is poorly determined."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
 from telerig.estimator.calibration.start.known_target import ImageMap, image_maps
 from telerig.estimator.dots.grid.numbering import check_handedness
-from telerig.factors.projection import State
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
@@ -26,11 +25,23 @@ CLEAR_MISFIT = 0.1
 
 
 @dataclass(frozen=True)
+class Note:
+    """A sentence for the user.
+
+    code : what it is about.  affects_verdict : the calibration is then usable with warnings only.
+    """
+
+    code: str
+    words: str
+    affects_verdict: bool = False
+
+
+@dataclass(frozen=True)
 class PreCheck:
     """tilts_deg : (view, camera) -> tilt of the target to that camera; notes for the user."""
 
     tilts_deg: dict[tuple[int, int], float]
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreCheck:
@@ -50,26 +61,32 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     _refuse_parallel(problem, maps, usable)
     notes = mirrored
     if len(usable) < RECOMMENDED_VIEWS:
-        notes.append(
-            f"only {len(usable)} views that {'both cameras' if stereo else 'the camera'} can use: "
-            f"{RECOMMENDED_VIEWS} or more are recommended; lens distortion and the dots' own "
-            "positions are the first to become uncertain (see their standard deviations)"
+        words = (
+            f"only {len(usable)} views can be used in "
+            f"{'both cameras' if stereo else 'the camera'}: {RECOMMENDED_VIEWS} or more are "
+            "recommended. With fewer, lens distortion and the dots' own positions become "
+            "uncertain first (see their standard deviations)"
         )
+        notes.append(Note("few views", words, affects_verdict=True))
     for c, camera in enumerate(problem.cameras):
         mine = np.array([t for (_, k), t in tilts.items() if k == c])
         if len(mine) and mine.max() < SMALL_TILT_DEG:
-            notes.append(
-                f"camera {camera.name!r}: no tilt above {mine.max():.0f} degrees, so its depth "
-                "scale is weak; add views at 20-40 degrees"
+            words = (
+                f"camera {camera.name!r}: no view is tilted by more than {mine.max():.0f} degrees, "
+                "so its scale along the depth is poorly determined; add views tilted by 20-40 "
+                "degrees"
             )
+            notes.append(Note("small tilts", words, affects_verdict=True))
         notes += _coverage_note(problem, c)
     for v, name in enumerate(problem.views):
-        alone = [c for c in range(len(problem.cameras)) if (v, c) in maps]
-        if stereo and len(alone) == 1:
-            seen = problem.cameras[alone[0]].name
-            notes.append(f"view {name!r} is usable in camera {seen!r} only: it gives no stereo")
-        if not alone:
-            notes.append(f"view {name!r} has fewer than {MINIMUM_DOTS} dots in every camera")
+        seen = [c for c in range(len(problem.cameras)) if (v, c) in maps]
+        if stereo and len(seen) == 1:
+            camera_name = problem.cameras[seen[0]].name
+            words = f"view {name!r} is usable in camera {camera_name!r} only, so it gives no stereo"
+            notes.append(Note("one camera", words, affects_verdict=True))
+        if not seen:
+            words = f"view {name!r} has fewer than {MINIMUM_DOTS} dots in every camera"
+            notes.append(Note("no camera", words))
     return PreCheck(tilts, tuple(notes))
 
 
@@ -110,7 +127,7 @@ def _refuse_too_few(
     )
 
 
-def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[str]:
+def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[Note]:
     """Refuse images of which some are mirrored.
 
     Not judged: an image seen nearly edge on, and one in which the dots are not where any view of
@@ -125,10 +142,12 @@ def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> l
     check_handedness(hands, problem.target.two_sided)
     if problem.target.two_sided or not hands or max(hands.values()) > 0:
         return []
-    return [
-        "every image shows the target as a mirror image of rig.toml: right if its rows are "
-        "numbered upwards, but if the images are flipped, so is every helix"
-    ]
+    words = (
+        "every image shows the target as a mirror image of rig.toml: this is right if its rows "
+        "are numbered upwards; but if the cameras' images are flipped, the handedness of every "
+        "helix is wrong"
+    )
+    return [Note("mirrored images", words)]
 
 
 def _tilt_deg(jacobian: Array) -> float:
@@ -160,24 +179,24 @@ def _refuse_parallel(
         )
 
 
-def _coverage_note(problem: Problem, c: int) -> list[str]:
+def _coverage_note(problem: Problem, c: int) -> list[Note]:
     camera = problem.cameras[c]
     mine = problem.camera == c
     if not np.any(mine):
-        return [f"camera {camera.name!r} has no dots at all"]
+        return [Note("no dots", f"camera {camera.name!r} has no dots at all")]
     cells = np.floor(problem.uv_px[mine] / np.array(camera.image_size_px) * 4).astype(int)
     filled = len({tuple(x) for x in np.clip(cells, 0, 3)})
     if filled >= 8:
         return []
-    return [
-        f"camera {camera.name!r}: dots cover {filled} of 16 parts of the image; distortion outside "
-        "is extrapolated. Hold the target nearer to the edges in some views"
-    ]
+    words = (
+        f"camera {camera.name!r}: dots cover {filled} of 16 parts of the image; elsewhere the "
+        "distortion is extrapolated. Hold the target nearer to the edges in some views"
+    )
+    return [Note("coverage", words)]
 
 
-def weak_parameters(problem: Problem, state: State, joint: JointCovariance) -> list[str]:
-    """Sentences on the rig's parameters that the data leave to their priors or to each other."""
-    del state
+def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:
+    """Sentences on the rig's parameters that are left to their priors or correlate with others."""
     names, covariance = joint.rig_block()
     sd = np.sqrt(np.diag(covariance))
     out = []
@@ -188,28 +207,31 @@ def weak_parameters(problem: Problem, state: State, joint: JointCovariance) -> l
             share = sd[i] / prior[INDEX[name]]
             if share > 0.5:
                 out.append(
-                    f"{_spoken(name)} of camera {camera.name!r} is not determined by these views "
-                    f"(its standard deviation is {share:.0%} of the prior's)"
+                    f"{_parameter_words(name)} of camera {camera.name!r} is not determined by "
+                    f"these views (its standard deviation is {share:.0%} of the prior's)"
                 )
-    return out + _trades(names, covariance)
+    return out + _correlated(names, covariance)
 
 
-def _trades(names: tuple[str, ...], covariance: Array) -> list[str]:
+def _correlated(names: tuple[str, ...], covariance: Array) -> list[str]:
     sd = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sd, sd)
     out = []
     for i, j in zip(*np.triu_indices(len(names), 1)):
         if abs(correlation[i, j]) > 0.98:
-            a, b = (_spoken_full(names[k]) for k in (i, j))
+            a, b = (
+                f"{_parameter_words(parameter)} of camera {camera!r}"
+                for camera, _, parameter in (names[k].partition(".") for k in (i, j))
+            )
             together = "both" if correlation[i, j] > 0 else "one and a fall of the other"
             out.append(
-                f"{a} and {b} trade against each other (correlation {correlation[i, j]:+.3f}): "
+                f"{a} and {b} can hardly be told apart (correlation {correlation[i, j]:+.3f}): "
                 f"a rise of {together} hardly changes the images"
             )
     return out
 
 
-_SPOKEN = {
+_PARAMETER_WORDS = {
     "scale_px_per_mm": "the scale", "aspect": "the aspect ratio", "skew": "the skew",
     "centre_u_px": "the image centre (u)", "centre_v_px": "the image centre (v)",
     "kappa_per_mm": "the residual perspective kappa", "tilt_x": "the sensor tilt (x)",
@@ -221,10 +243,5 @@ _SPOKEN = {
 }  # fmt: skip
 
 
-def _spoken(parameter: str) -> str:
-    return _SPOKEN.get(parameter, f"the distortion coefficient {parameter}")
-
-
-def _spoken_full(name: str) -> str:
-    camera, parameter = name.split(".", 1)
-    return f"{_spoken(parameter)} of camera {camera!r}"
+def _parameter_words(parameter: str) -> str:
+    return _PARAMETER_WORDS.get(parameter, f"the distortion coefficient {parameter}")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from telerig.errors import InputError
-from telerig.estimator.calibration.quality.truth import working_volume
+from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import aligned_shift
 from telerig.io.report.page.number_format import number, with_sd
@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 UNLIKELY = 1e-3
 """A difference that chance gives less often than this is called a movement."""
 _RANK = 1e-3
-"""Directions with a smaller share of the largest standard deviation are not judged: there the
-second order of the others is larger than what is predicted."""
+"""Directions with a smaller share of the largest standard deviation are left out: there, the
+second order of the others is larger than the prediction."""
 _ROUNDING = 1e-6
 _FAR = 5.0
 _LEAST_CHANCE = 1e-12
@@ -113,12 +113,12 @@ class RigComparison:
         """The verdict for a reader."""
         if self.identical:
             return (
-                "both calibrations are the same to rounding, so they come from the same views: "
-                "compare with one from other views to learn whether the rig moved"
+                "both calibrations are the same to rounding, so they come from the same views. To "
+                "learn whether the rig moved, compare with a calibration from other views"
             )
         shift, turn = self.changes[3], _norm(self.changes[:3])
         size = (
-            f"{with_sd(abs(shift.change), shift.sd)} um and {with_sd(turn.change, turn.sd)} urad "
+            f"{with_sd(abs(shift.change), shift.sd)} µm and {with_sd(turn.change, turn.sd)} µrad "
             "between the cameras"
         )
         first = (
@@ -129,21 +129,20 @@ class RigComparison:
         field = self.field
         apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
         second = (
-            f"the same pixels lie {apart} um RMS per axis apart in space, where the two "
-            f"calibrations' uncertainty explains {expected} um"
+            f"the same pixels lie {apart} µm RMS per axis apart in space, where the two "
+            f"calibrations' uncertainty explains {expected} µm"
         )
         if self.differs:
             chance = chance_words(field.p_value)
-            second += (
-                f": more than chance where both know it well ({chance}); do not mix their runs"
-            )
+            second += f", which is more than chance explains ({chance}); do not mix their runs"
         return "; ".join([first, *self._scale_words(), second, *self._medium_words()])
 
     def _scale_words(self) -> list[str]:
         """Of scales that changed by more than chance."""
         if self.exchanged:
             return [
-                "each camera has the other's scale, as if their images or cables were exchanged"
+                "each camera has the scale that the other one had, as if their images or cables "
+                "were exchanged"
             ]
         changed = [c for c in self.changes[4:] if chdtrc(1, c.deviations**2) < UNLIKELY]
         if not changed:
@@ -284,13 +283,18 @@ def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
     return Change(label, "ppm", float(change), float(1e6 * np.sqrt(variance)))
 
 
+def after_rigid_motion(found_mm: Array, points_mm: Array) -> Array:
+    """(N, 3) ``found_mm`` less ``points_mm`` about their means, after the best rotation."""
+    a, b = found_mm - found_mm.mean(0), points_mm - points_mm.mean(0)
+    return np.asarray(a @ nearest_rotation(b.T @ a).T - b)
+
+
 def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference:
     """Over the working volume: pixels by the first rig, points by the second."""
     points = working_volume(first.cameras, steps)
     pixels = [camera.project(points) for camera in first.cameras]
     found = triangulate(second.cameras, (pixels[0], pixels[1]), 1.0, "ml").points_mm
-    a, b = found - found.mean(0), points - points.mean(0)
-    shift = a @ nearest_rotation(b.T @ a).T - b
+    shift = after_rigid_motion(found, points)
     root = np.concatenate(
         [
             aligned_shift(rig.cameras, rig.free, points) @ _root(rig.covariance)

@@ -1,8 +1,8 @@
-"""Cross-validation by halves: is the calibration as repeatable as its covariance says?
+"""Split-half check: is the calibration as repeatable as its covariance says?
 
 Every second view calibrates the rig anew, and so do the others; the two rigs are compared over the
 working volume like two calibrations of one rig. The covariance does not know of errors that the
-views share (a wrong lens model), but two halves with other tilts feel them otherwise.
+views share (a wrong lens model), but they act differently in two halves with other tilts.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ LEAST_VIEWS = 4
 _SCALE = 1e-7
 
 
-def halves(problem: Problem, state: State) -> dict[str, Any]:
+def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
     """For `Calibration.diagnostics`: words, figures and the field of differences.
 
     The target's size is common to both halves and tells nothing about repeatability: the known
     distance, or without one that of two dots far apart, is taken as exact in both.
     """
     if len(problem.cameras) != 2:
-        return {"words": "one camera: halves are compared in space, which takes two"}
+        return {"words": "one camera: the split-half check compares points in space and needs two"}
     used = np.unique(problem.view[problem.weight > 0])
     parts = [used[0::2], used[1::2]]
     if min(len(p) for p in parts) < LEAST_VIEWS:
         return {
-            "words": f"{len(used)} views are too few to be calibrated by halves: take "
+            "words": f"{len(used)} views are too few for the split-half check: it needs "
             f"{2 * LEAST_VIEWS} or more"
         }
     problem = replace(problem, scale=problem.scale or _size(problem, state, parts))
     try:
         first, second = (_rig(problem, state, views) for views in parts)
     except CalibrationError as error:
-        return {"words": f"a half of the views does not determine the rig: {error.what}"}
+        return {"words": f"one half of the views does not determine the rig: {error.what}"}
     field = field_difference(first, second)
     return {
         "views": [len(p) for p in parts],
@@ -104,13 +104,13 @@ def _words(field: FieldDifference, views: list[int]) -> str:
     ratio = field.rms_um / max(field.predicted_um, 1e-12)
     apart, expected = (number(um, 2) for um in (field.rms_um, field.predicted_um))
     words = (
-        f"two halves of {views[0]} and {views[1]} views put the same pixels {apart} um "
-        f"RMS per axis apart in space; their covariances predict {expected} um"
+        f"calibrated from {views[0]} and from the other {views[1]} views, the same pixels lie "
+        f"{apart} µm RMS per axis apart in space; the two covariances predict {expected} µm"
     )
     if field.p_value >= UNLIKELY:
-        return words + f" (ratio {ratio:.2f}): the covariance can be believed"
+        return words + f" (ratio {ratio:.2f}), so the stated covariance can be believed"
     return (
-        words + f" (ratio {ratio:.2f}; {chance_words(field.p_value)}): the halves "
-        "disagree, so something that the model does not know acts; every stated standard "
-        "deviation is too small by about this ratio"
+        words + f" (ratio {ratio:.2f}; {chance_words(field.p_value)}): the two halves "
+        "disagree, so an effect that the model does not contain acts on the images; every stated "
+        "standard deviation is too small by about this ratio"
     )

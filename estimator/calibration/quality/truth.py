@@ -1,4 +1,7 @@
-"""A calibration against a simulator's truth, what no image can tell (the gauge) set aside."""
+"""Score a calibration against a simulator's truth; only demo, benchmarks and tests need it.
+
+What no image can tell (the gauge) is set aside.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.calibration.quality.comparison import after_rigid_motion
+from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import aligned_covariance
 from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose, nearest_rotation
+from telerig.rig.pose import Pose
 from telerig.rig.projection import intrinsics_from
 
 Array = NDArray[np.float64]
 
 MANY_SD = 4.0
-VOLUME_SHARE = 0.6
-"""The working volume: a cube of this share of the smaller field of view, round the rig's origin."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +61,6 @@ def true_cameras(truth: Mapping[str, Any]) -> tuple[Camera, ...]:
     return tuple(out)
 
 
-def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
-    """(steps^3, 3) grid of rig points that all cameras see."""
-    field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
-    axis = np.linspace(-0.5, 0.5, steps) * VOLUME_SHARE * field
-    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-
-
 def space_error(
     calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array
 ) -> SpaceError:
@@ -75,9 +71,7 @@ def space_error(
     calibration = calibration.in_air()
     pixels = [camera.project(points_mm) for camera in truth]
     found = calibration.triangulate(*pixels, sigma_px=1.0, include_calibration=False).points_mm
-    a, b = found - found.mean(0), points_mm - points_mm.mean(0)
-    turn = nearest_rotation(b.T @ a)
-    errors = a @ turn.T - b
+    errors = after_rigid_motion(found, points_mm)
     pair = (calibration.cameras[0], calibration.cameras[1])
     covariance = aligned_covariance(pair, calibration.free, calibration.covariance, found)
     predicted = np.sqrt(np.trace(covariance) / errors.size)
@@ -90,15 +84,15 @@ def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Co
     """Estimate beside truth, in standard deviations, and a verdict."""
     cameras = true_cameras(truth)
     space = space_error(calibration, cameras, working_volume(cameras))
-    rows = [_row(*r) for r in _parameters(calibration, cameras)]
-    worst = max(abs(deviation) for *_, deviation in rows)
+    rows = _parameters(calibration, cameras)
+    worst = max(abs(e - t) / s for _, e, t, s in rows)
     ratio = space.rms_um / space.predicted_um
     passed = worst < MANY_SD and ratio < 2.0
     lines = [f"{'quantity':<28}{'estimate':>14}{'truth':>14}{'sd':>10}{'off by':>9}"]
-    lines += [f"{n:<28}{e:>14.6f}{t:>14.6f}{s:>10.2g}{d:>6.1f} sd" for n, e, t, s, d in rows]
+    lines += [f"{n:<28}{e:>14.6f}{t:>14.6f}{s:>10.2g}{(e - t) / s:>6.1f} sd" for n, e, t, s in rows]
     lines.append(
-        f"3-D error of the calibration over the working volume: {space.rms_um:.2f} um RMS per "
-        f"axis; its covariance predicts {space.predicted_um:.2f} um"
+        f"3-D error of the calibration over the working volume: {space.rms_um:.2f} µm RMS per "
+        f"axis; its covariance predicts {space.predicted_um:.2f} µm"
     )
     words = (
         f"PASSED: every quantity within {MANY_SD:.0f} standard deviations of the truth"
@@ -109,16 +103,10 @@ def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Co
     return Comparison("\n".join(lines), words, passed, space)
 
 
-def _row(
-    name: str, estimate: float, truth: float, sd: float
-) -> tuple[str, float, float, float, float]:
-    return name, estimate, truth, sd, (estimate - truth) / sd
-
-
 def _parameters(
     calibration: Calibration, cameras: tuple[Camera, ...]
 ) -> list[tuple[str, float, float, float]]:
-    """What is comparable whatever the gauge: scales, radial distortion, angle of the axes."""
+    """(name, estimate, truth, sd) of what does not depend on the gauge."""
     rows = []
     for estimate, truth in zip(calibration.cameras, cameras):
         for name in ("scale_px_per_mm", "k1"):

@@ -1,4 +1,4 @@
-"""How well points are known over the working volume: the calibration's share and the pixels'."""
+"""The working volume, and how well points in it are known: the calibration's share, the pixels'."""
 
 from __future__ import annotations
 
@@ -7,12 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.quality.truth import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
 
 STEPS = 7
+VOLUME_SHARE = 0.6
+"""The working volume: a cube of this share of the smaller field of view, round the rig's origin."""
+
+
+def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
+    """(steps^3, 3) grid of rig points that all cameras see."""
+    field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
+    axis = np.linspace(-0.5, 0.5, steps) * VOLUME_SHARE * field
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)

@@ -84,9 +84,9 @@ def fit(
 ) -> tuple[State, Weights, Linear]:
     """Robust Gauss-Newton from a start. sigma_mm : of the carriage along and across the axis.
 
-    Dots and readings beyond 3.5 sd keep the weight (3.5 / z)^4; the limit halves from turn to
-    turn, so that what lies farthest off goes first (graduated non-convexity).
-    Raises CalibrationError when it does not settle.
+    Dots and readings beyond 3.5 sd keep the weight (3.5 / z)^4; the limit halves from iteration
+    to iteration, so that the largest outliers are removed first (graduated non-convexity).
+    Raises CalibrationError when it does not converge.
     """
     weights = Weights(np.ones(len(dots.view)), np.ones(len(dots.views)))
     system = linearised(cameras, free, dots, state, sigma_mm, weights)
@@ -107,7 +107,7 @@ def fit(
         if limit == _SUSPECT and moved < 1e-3 and np.abs(step).max() < 1e-7:
             return state, weights, system
     raise CalibrationError(
-        "the target's views do not fit one straight travel",
+        "the fit of one straight travel to the views of the target does not converge",
         where="stage_axis",
         todo="check that the target stood still and that positions.csv belongs to the views",
     )
@@ -200,8 +200,8 @@ def start(cameras: tuple[Camera, Camera], dots: Dots) -> State:
     points = triangulate(cameras, (dots.uv_px[left], dots.uv_px[right]), 0.02).points_mm
     reading = dots.reading_mm[dots.view[left]]
     slope = _median_slope(reading, ids[left], points)
-    settled = points + slope * reading[:, None]
-    return State(_fitted_pose(ids[left], dots.place_mm[left], settled), slope)
+    at_zero = points + slope * reading[:, None]
+    return State(_fitted_pose(ids[left], dots.place_mm[left], at_zero), slope)
 
 
 def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:

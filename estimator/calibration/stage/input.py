@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 FOLDER = "stage_axis"
 _POSITIONS = "positions.csv"
-_ASTRAY_DEG = 10.0
+_CONTRADICTION_DEG = 10.0
 
 
 def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | None:
@@ -86,10 +86,10 @@ def _image_views(dataset: Dataset, folder: Path) -> tuple[View, ...]:
 
 def _against(axis: Array, stated: tuple[float, float, float]) -> list[str]:
     angle = float(np.degrees(np.arccos(np.clip(axis @ np.asarray(stated), -1, 1))))
-    if angle < _ASTRAY_DEG:
+    if angle < _CONTRADICTION_DEG:
         return []
     direction = ", ".join(f"{v:.3f}" for v in axis)
     return [
         f"rig.toml states a travel direction {angle:.0f} deg away from the measured one: "
-        + ("turn its sign" if angle > 180 - _ASTRAY_DEG else f"write ({direction})")
+        + ("turn its sign" if angle > 180 - _CONTRADICTION_DEG else f"write ({direction})")
     ]

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 _COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
 _UNLIKELY = 1e-3
-_DOUBTED = 0.5
+_LEAST_WEIGHT = 0.5
 _WHERE = "stage_axis"
 
 
@@ -43,7 +43,7 @@ class StageAxis:
     scale, scale_sd : reading = (1 + scale) travel.  joint_covariance : (3, 3) of both and scale.
     rig_from_target : pose of the target at reading 0.
     chi2_dof : of the dots.  position_sigma_mm, wander_sigma_mm : of the carriage along and across
-        the axis, as given, or as the views show where that is more.
+        the axis, as given, or as observed where that is significantly more.
     words : for the user.
     """
 
@@ -107,7 +107,7 @@ def stage_axis_of(
         words += _scatter_words(sigma, shown)
         sigma = shown
         state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
-    words += _doubts(dots, weights, system)
+    words += _suspect_notes(dots, weights, system)
     return _result(calibration, dots, state, weights, system, sigma, words)
 
 
@@ -120,8 +120,8 @@ def _dots(
     _check_names(table, "camera", names, "is not in the calibration")
     index = {int(d): i for i, d in enumerate(calibration.dot_ids)}
     known = table["dot"].isin(index).to_numpy()
-    strangers = int((~known).sum())
-    words = [f"{strangers} dots are not in the calibration: not used"] if strangers else []
+    unknown = int((~known).sum())
+    words = [f"{unknown} dots are not in the calibration and are not used"] if unknown else []
     rows = table[known]
     views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
     unseen = [v for v in readings if v not in views]
@@ -207,7 +207,7 @@ def _shown_sigma(
     """
     from scipy.stats import chi2
 
-    kept = weights.views > _DOUBTED
+    kept = weights.views > _LEAST_WEIGHT
     spare = int(kept.sum()) - 2
     if spare < 1:
         return sigma_mm
@@ -225,27 +225,27 @@ def _shown_sigma(
 
 
 def _scatter_words(given: tuple[float, float], shown: tuple[float, float]) -> list[str]:
-    names = ("the readings scatter", "the carriage wanders across its axis")
+    names = ("the encoder readings scatter", "the carriage moves across its axis")
     return [
-        f"{name} by {1000 * new:.2g} um, more than the {1000 * old:.2g} um that were stated: taken "
-        "into account"
+        f"{name} by {1000 * new:.2g} µm, more than the {1000 * old:.2g} µm that were stated; the "
+        "larger value is used"
         for name, old, new in zip(names, given, shown)
         if new > old
     ]
 
 
-def _doubts(dots: Dots, weights: Weights, system: Linear) -> list[str]:
+def _suspect_notes(dots: Dots, weights: Weights, system: Linear) -> list[str]:
     words = []
-    for v in np.flatnonzero(weights.views < _DOUBTED):
+    for v in np.flatnonzero(weights.views < _LEAST_WEIGHT):
         words.append(
             f"the reading {dots.reading_mm[v]:.6g} mm of view {dots.views[v]} is off by "
-            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm: hardly used"
+            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm and hardly weighs; check positions.csv"
         )
-    odd = int((weights.dots < _DOUBTED).sum())
+    odd = int((weights.dots < _LEAST_WEIGHT).sum())
     if odd:
-        words.append(f"{odd} of {len(weights.dots)} dots lie far off and are hardly used")
+        words.append(f"{odd} of {len(weights.dots)} dots lie far from the model and hardly weigh")
     if len(dots.views) == 2:
-        words.append("two positions: nothing checks the readings; take three or more")
+        words.append("with two positions nothing checks the encoder readings; take three or more")
     return words
 
 
@@ -258,7 +258,7 @@ def _result(
     sigma_mm: tuple[float, float],
     words: list[str],
 ) -> StageAxis:
-    kept = weights.dots > _DOUBTED
+    kept = weights.dots > _LEAST_WEIGHT
     spare = 2 * int(kept.sum()) - 3 * len(dots.views) - 3
     chi2_dof = float(system.dot_score[kept].sum() / spare) if spare > 0 else 1.0
     inverse = np.linalg.inv(system.normal)
@@ -290,5 +290,5 @@ def _summary(dots: Dots, axis: Array, pace: float, joint: Array) -> list[str]:
         f"travel along ({direction}) +- {angle:.2g} deg, from {len(dots.views)} positions over "
         f"{np.ptp(dots.reading_mm):.4g} mm",
         f"the encoder reads {1e6 * (1 / pace - 1):+.0f} +- {1e6 * np.sqrt(joint[2, 2]):.0f} ppm "
-        "of the travel too much",
+        "more than the travel",
     ]

@@ -1,4 +1,8 @@
-"""The mirror twin: two rigs with the same pixels, and what decides between them."""
+"""The mirror ambiguity: two rigs, mirror images of each other in depth, give the same pixels.
+
+What decides between them: the nominal rotation of the second camera, the sign of strong
+perspective (farther dots are smaller), or the refraction in a two-sided plate.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
+from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.factors.projection import State
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
@@ -20,41 +25,35 @@ _D = np.diag([1.0, 1.0, -1.0, 1.0])
 ENTOCENTRIC = 0.01
 """kappa * rho beyond which a lens is a perspective one: no telecentric lens errs by 0.6 degrees."""
 TIE_DEG = 10.0
+BY_PLATE = "refraction in the plate"
+"""``decided_by`` for a two-sided target when no nominal rotation is given."""
 
 
 @dataclass(frozen=True)
-class TwinDecision:
-    """Which twin was kept and why; angles are between each twin and the nominal rotation."""
+class MirrorChoice:
+    """The solution that is kept of the two; decided_by, words : for calibration.json."""
 
-    chosen_cost: float
-    other_cost: float
+    state: State
     decided_by: str
-    sentence: str
-    chosen_rotvec_deg: tuple[float, ...]
-    other_rotvec_deg: tuple[float, ...]
+    words: str
 
 
-def twin_state(state: State) -> State:
-    """The twin: D R D and D t for every pose, D X for every dot, -kappa for every camera."""
+def mirrored_state(state: State) -> State:
+    """D R D and D t for every pose, D X for every dot, -kappa for every camera."""
     intrinsics = state.intrinsics.copy()
     intrinsics[:, _KAPPA] *= -1
     cameras, views = (_D @ m @ _D for m in (state.rig_from_camera, state.rig_from_target))
     return State(intrinsics, cameras, views, state.dots_mm * [1.0, 1.0, -1.0])
 
 
-def second_from_first(state: State) -> Array:
-    """(3, 3) rotation."""
-    return np.asarray(state.rig_from_camera[1, :3, :3].T)
-
-
 def angle_to_nominal_deg(state: State, nominal_rotvec_deg: Array) -> float:
     """Angle between the inter-camera rotation of a state and the nominal one."""
     nominal = rotation_from_rotvec(np.radians(nominal_rotvec_deg))
-    turn = rotvec_from_rotation(second_from_first(state) @ nominal.T)
+    turn = rotvec_from_rotation(state.rig_from_camera[1, :3, :3].T @ nominal.T)
     return float(np.degrees(np.linalg.norm(turn)))
 
 
-def entocentric_sign(state: State, problem: Problem) -> int:
+def perspective_sign(state: State, problem: Problem) -> int:
     """+1 or -1 when perspective is so strong that only one sign of kappa is possible, else 0."""
     strength = state.intrinsics[:, _KAPPA] * np.array(problem.rho_mm)
     if np.all(strength > ENTOCENTRIC):
@@ -64,47 +63,84 @@ def entocentric_sign(state: State, problem: Problem) -> int:
     return 0
 
 
-def choose_twin(
-    state: State, problem: Problem, nominal_rotvec_deg: Array | None
-) -> tuple[State, str, str]:
-    """(state on the right side, what decided, in words).
+def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Array | None) -> MirrorChoice:
+    """The solution to go on with before the final fit.
 
-    Raises CalibrationError when the two twins are alike far from the nominal rotation, when
+    One camera: undecided. The plate's refraction decides where no nominal rotation is given.
+    Raises CalibrationError as `choose_solution` does.
+    """
+    if len(problem.cameras) == 1:
+        words = "one camera: the mirrored solution has the same pixels and nothing decides"
+        return MirrorChoice(state, "mono", words)
+    if nominal_rotvec_deg is not None or not np.any(problem.plate_shift):
+        return choose_solution(state, problem, nominal_rotvec_deg)
+    both = (state, mirrored_state(state))
+    costs = [solve(problem, s, max_iterations=20).cost for s in both]
+    words = "the plate's refraction, which has the opposite sign in the mirrored solution"
+    return MirrorChoice(both[int(np.argmin(costs))], BY_PLATE, words)
+
+
+def choose_solution(
+    state: State, problem: Problem, nominal_rotvec_deg: Array | None
+) -> MirrorChoice:
+    """The solution on the right side, by the nominal rotation or by strong perspective.
+
+    Raises CalibrationError when both solutions are alike far from the nominal rotation, when
     nothing decides, or when nominal rotation and perspective contradict each other.
     """
-    other = twin_state(state)
-    perspective = entocentric_sign(state, problem)
-    nearest = None
+    other = mirrored_state(state)
+    perspective = perspective_sign(state, problem)
     if nominal_rotvec_deg is not None:
         angles = [angle_to_nominal_deg(s, nominal_rotvec_deg) for s in (state, other)]
         margin = abs(angles[0] - angles[1])
         nearest = int(np.argmin(angles))
         if margin < TIE_DEG and perspective == 0:
             raise CalibrationError(
-                f"the two mirror twins are {angles[0]:.0f} and {angles[1]:.0f} degrees from the "
-                "nominal rotation: too alike to choose",
+                f"the two mirror solutions are {angles[0]:.0f} and {angles[1]:.0f} degrees from "
+                "the nominal rotation: too alike to choose",
                 where="rig.toml [stereo]",
                 todo="correct the nominal second_from_first_rotvec_deg to within 20 degrees",
             )
         words = (
-            f"the nominal rotation in rig.toml: {angles[nearest]:.1f} degrees from the kept twin, "
-            f"{angles[1 - nearest]:.1f} from the other"
+            f"the nominal rotation in rig.toml: {angles[nearest]:.1f} degrees from the solution "
+            f"that is kept, {angles[1 - nearest]:.1f} degrees from the mirrored one"
         )
         if perspective and margin >= TIE_DEG and (perspective > 0) != (nearest == 0):
             raise CalibrationError(
                 "the nominal rotation puts the second camera on one side, the perspective of the "
-                f"lenses on the other ({words}); farther dots are smaller only in the twin that "
-                "the nominal rotation rejects",
+                f"lenses on the other ({words}); farther dots are smaller only in the solution "
+                "that the nominal rotation rejects",
                 where="rig.toml [stereo]",
                 todo="check the sign of second_from_first_rotvec_deg",
             )
         if not perspective:
-            return (state, other)[nearest], "nominal rotation", words
+            return MirrorChoice((state, other)[nearest], "nominal rotation", words)
     if perspective:
         kept = state if perspective > 0 else other
-        return kept, "perspective", "the lenses' perspective: farther dots are smaller"
+        return MirrorChoice(
+            kept, "perspective", "the lenses' perspective: farther dots are smaller"
+        )
     raise CalibrationError(
-        "nothing says on which side the second camera stands: both mirror twins fit alike",
+        "nothing says on which side the second camera stands: both mirror solutions fit alike",
         where="rig.toml [stereo]",
         todo="add the nominal second_from_first_rotvec_deg, 20 degrees is near enough",
     )
+
+
+def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
+    """The cost of the solution that was not kept; state, cost : of the one that was.
+
+    Raises CalibrationError when it is far lower: the plate's refraction decides against the side
+    that the nominal rotation names.
+    """
+    if len(problem.cameras) == 1:
+        return cost
+    other = solve(problem, mirrored_state(state), max_iterations=20).cost
+    if np.any(problem.plate_shift) and other < 0.5 * cost - 10:
+        raise CalibrationError(
+            "the nominal rotation puts the second camera on one side, the refraction in the "
+            f"two-sided plate on the other (cost {cost:.4g} against {other:.4g})",
+            where="rig.toml [stereo]",
+            todo="check the sign of the nominal rotation, and the plate's thickness and index",
+        )
+    return other

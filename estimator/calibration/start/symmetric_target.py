@@ -32,7 +32,9 @@ def turns(target: Target) -> list[Ints]:
     return [np.rot90(grid, k * (4 // order)).ravel() for k in range(order)]
 
 
-def settle(problem: Problem, nominal_rotvec_deg: Array | None) -> tuple[Problem, list[str]]:
+def number_consistently(
+    problem: Problem, nominal_rotvec_deg: Array | None
+) -> tuple[Problem, list[str]]:
     """Renumber images so that both cameras and all views agree; says how it was decided.
 
     Raises CalibrationError when two numberings explain the two cameras alike.

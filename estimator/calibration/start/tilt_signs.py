@@ -1,7 +1,7 @@
 """The sign of the tilt in views that one telecentric camera sees alone.
 
-A flat target and its mirror twin look alike to such a camera, but the dots' relief (how far they
-are from a plane) does not: its sign must agree with what the other views show of it.
+A flat target and its mirror image in depth look alike to such a camera, but the dots' relief (how
+far they are from a plane) does not: its sign must agree with what the other views show of it.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
     return alone, counts[alone].argmax(1)
 
 
-def settle(problem: Problem, state: State) -> State:
-    """The state with the tilts of views seen alone turned the way the dots' relief asks for.
+def with_tilt_signs(problem: Problem, state: State) -> State:
+    """The state with the tilts of views seen alone that agree with the dots' relief.
 
-    With one camera every view is of this kind: the signs come out right up to the one mirror twin
-    of everything. First all at once, from the reliefs that the views show (`_from_relief`), then
-    one by one, by the cost of each view's two poses. Dots that are wrong under any sign are left
-    out before.
+    With one camera every view is of this kind: the signs come out right up to the mirror
+    ambiguity of the whole. First all at once, from the reliefs that the views show
+    (`_from_relief`), then one by one, by the cost of each view's two poses. Dots that are wrong
+    under any sign are left out before.
     """
     alone, cameras = views_seen_alone(problem)
     relief = float(problem.dot_sigma_mm[:, 2].max())
@@ -104,7 +104,7 @@ def _without_plane(relief: Array, seen: NDArray[np.bool_], nominal_mm: Array) ->
 
 
 def _flipped(state: State, views: Ints, camera: int) -> State:
-    """Some views in the pose of their mirror twin, as one camera sees it."""
+    """Some views in their mirrored pose, as one camera sees it."""
     rig_from_camera = state.rig_from_camera[camera]
     mirror = rig_from_camera @ _D @ np.linalg.inv(rig_from_camera)
     poses = state.rig_from_target.copy()

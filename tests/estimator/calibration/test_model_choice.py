@@ -15,8 +15,8 @@ from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens.cross_validation import FOLDS, held_out_chi2, pose_only
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
-    Landscape,
     Lens,
+    QuadraticCost,
     additions,
     possible,
     search,
@@ -76,15 +76,15 @@ def _matrix(pose: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def fitted(scene: Any) -> tuple[Problem, Any, Landscape]:
-    """A rig with k1 alone: the rich problem, its fit, its landscape."""
+def fitted(scene: Any) -> tuple[Problem, Any, QuadraticCost]:
+    """A rig with k1 alone: the rich problem, its fit, its quadratic."""
     made = made_of(scene, LENS["radial"], LENS["radial"])
     problem = problem_of(made).with_model(name_of(RICH))
     rich = solve(problem, start_of(made, problem))
-    return problem, rich, Landscape.of(problem, rich)
+    return problem, rich, QuadraticCost.of(problem, rich)
 
 
-# --- the landscape, and the search over it ------------------------------------------------------
+# --- the quadratic, and the search over it ------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -92,48 +92,48 @@ def fitted(scene: Any) -> tuple[Problem, Any, Landscape]:
     [("none", "none"), ("radial", "none"), ("radial", "kappa+radial"), ("brown", "affine+radial"),
      ("p+s", "radial"), ("affine+k1+k2", "k1+s")],
 )  # fmt: skip
-def test_the_landscape_is_what_fits_find(names: tuple[str, str], fitted: Any) -> None:
-    problem, rich, landscape = fitted
+def test_the_quadratic_is_what_fits_find(names: tuple[str, str], fitted: Any) -> None:
+    problem, rich, quadratic = fitted
     model = problem.with_model(names)
     cost = solve(model, model_start(model, rich.state)).cost
     lenses = tuple(Lens(model_choice._lens_of(free)) for free in model.free)
-    promised = landscape.rise(lenses)
-    found = 2 * (cost - rich.cost) / landscape.variance
+    promised = quadratic.rise(lenses)
+    found = 2 * (cost - rich.cost) / quadratic.variance
     assert promised == pytest.approx(found, rel=2e-3, abs=0.02)
-    assert landscape.least == pytest.approx(2 * rich.cost / landscape.variance, rel=1e-6)
+    assert quadratic.least == pytest.approx(2 * rich.cost / quadratic.variance, rel=1e-6)
 
 
-def test_a_tilts_homography_is_in_the_landscape(scene: Any) -> None:
+def test_a_tilts_homography_is_in_the_quadratic(scene: Any) -> None:
     """At first order: the real tilt costs what its two directions promise, within a few units."""
     made = made_of(scene, LENS["tilt+radial"], LENS["none"])
     problem = problem_of(made).with_model(name_of(RICH))
     rich = solve(problem, start_of(made, problem))
-    landscape = Landscape.of(problem, rich)
-    tilted, flat = (landscape.rise((lens, Lens())) for lens in (
+    quadratic = QuadraticCost.of(problem, rich)
+    tilted, flat = (quadratic.rise((lens, Lens())) for lens in (
         Lens({"tilt", "k1"}), Lens({"affine", "k1"})))  # fmt: skip
     model = problem.with_model(("tilt+radial", "none"))
     cost = solve(model, model_start(model, rich.state)).cost
-    assert tilted == pytest.approx(2 * (cost - rich.cost) / landscape.variance, abs=30)
+    assert tilted == pytest.approx(2 * (cost - rich.cost) / quadratic.variance, abs=30)
     assert flat > 100 * max(tilted, 1.0)
 
 
 def test_the_search_finds_what_brute_force_does(fitted: Any) -> None:
-    """On landscapes with a few groups really there, weak and strong."""
+    """On quadratics with a few groups really there, weak and strong."""
     _, _, real = fitted
     options = possible(Lens({"kappa", "affine", "k1", "k2", "p"}))
     rng = np.random.default_rng(3)
     factor = np.linalg.cholesky(real.covariance + 1e-12 * np.diag(np.diag(real.covariance)))
     for _ in range(4):
         z = rng.normal(0, 1, len(factor)) + rng.choice([0, 0, 5], len(factor))
-        landscape = replace(real, offset=factor @ z)
-        best = min(product(options, options), key=landscape.cost)
-        assert landscape.cost(search(landscape, [options, options])) == landscape.cost(best)
+        quadratic = replace(real, offset=factor @ z)
+        best = min(product(options, options), key=quadratic.cost)
+        assert quadratic.cost(search(quadratic, [options, options])) == quadratic.cost(best)
 
 
 def test_the_way_goes_up_one_group_at_a_time(fitted: Any) -> None:
-    _, _, landscape = fitted
+    _, _, quadratic = fitted
     chosen = (Lens({"k1", "k2", "p"}), Lens({"kappa", "k1"}))
-    steps = steps_to(landscape, chosen, (Lens(), Lens()))
+    steps = steps_to(quadratic, chosen, (Lens(), Lens()))
     assert steps[-1][2] == chosen and len(steps) == 5
     assert {steps[0][:2], steps[1][:2]} == {(0, "k1"), (1, "k1")}
     order = [(camera, group) for camera, group, _ in steps]
@@ -184,11 +184,11 @@ def test_a_last_step_that_predicts_worse_is_taken_back(fitted: Any) -> None:
     _, rich, _ = fitted
     held_out = [4.0, 2.0, 1.9, 2.1, 2.2]
     fits = [
-        model_choice.Fit((Lens(), Lens()), 2, 1.0, 10, 0.01, np.full(3, h), rich.state)
+        model_choice.FittedModel((Lens(), Lens()), 2, 1.0, 10, 0.01, np.full(3, h), rich.state)
         for h in held_out
     ]
     steps = [model_choice.Step(0, ("k1",), f.lenses, 50.0, 40.0, True, "", f) for f in fits]
-    after = model_choice._with_held_out(steps)
+    after = model_choice._without_worse_predictions(steps)
     assert [s.taken for s in after] == [True, True, True, False, False]
     assert after[3].words == "left-out views are predicted 10.5% worse"
 
@@ -207,7 +207,7 @@ def test_each_camera_gets_its_own(left: str, right: str, scene: Any) -> None:
     _, choice = choose_model(problem, start_of(made, problem), ("auto", "auto"))
     assert choice.chosen.names == (left, right), choice.words
     step = choice.steps[-1]
-    assert not step.taken and step.worth < 0 and step.words.startswith("held: ")
+    assert not step.taken and step.bic_gain < 0 and step.words.startswith("held: ")
 
 
 def test_a_bilateral_tilt_is_a_stretch_and_says_so(scene: Any) -> None:

@@ -1,4 +1,4 @@
-"""What no pixel can tell: ranks of the full Jacobian without priors, and the mirror twin."""
+"""What no pixel can tell: ranks of the full Jacobian without priors, and the mirror mirrored."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.start.mirror_ambiguity import twin_state
+from telerig.estimator.calibration.start.mirror_ambiguity import mirrored_state
 from telerig.factors.priors import depth_gauge_residual, distance_residual
 from telerig.factors.projection import Observations, State, whitened_error, whitened_residuals
 from telerig.rig.pose import rotation_from_rotvec
@@ -213,15 +213,15 @@ def test_the_mirror_twin_has_the_same_pixels(kappa: float) -> None:
     second = state.rig_from_camera.copy()
     second[1, :3, 3] = [0.3, -0.1, 0.7]
     state = replace(state, rig_from_camera=second)
-    twin = twin_state(state)
-    here, there = (whitened_error(s, every_dot(s), RHO_MM) for s in (state, twin))
+    mirrored = mirrored_state(state)
+    here, there = (whitened_error(s, every_dot(s), RHO_MM) for s in (state, mirrored))
     np.testing.assert_allclose(here, there, atol=1e-10)
-    assert np.abs(twin.intrinsics[:, INDEX["kappa_per_mm"]] + kappa).max() == 0
-    turn = state.rig_from_camera[1, :3, :3].T @ twin.rig_from_camera[1, :3, :3]
+    assert np.abs(mirrored.intrinsics[:, INDEX["kappa_per_mm"]] + kappa).max() == 0
+    turn = state.rig_from_camera[1, :3, :3].T @ mirrored.rig_from_camera[1, :3, :3]
     assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) > 160
-    for pose_matrix in (*twin.rig_from_target, *twin.rig_from_camera):
+    for pose_matrix in (*mirrored.rig_from_target, *mirrored.rig_from_camera):
         assert np.linalg.det(pose_matrix[:3, :3]) == pytest.approx(1)
-    np.testing.assert_allclose(twin_state(twin).rig_from_target, state.rig_from_target)
-    keeps_kappa = replace(twin, intrinsics=state.intrinsics)
+    np.testing.assert_allclose(mirrored_state(mirrored).rig_from_target, state.rig_from_target)
+    keeps_kappa = replace(mirrored, intrinsics=state.intrinsics)
     moved = np.abs(whitened_error(keeps_kappa, every_dot(state), RHO_MM) - here).max()
     assert (moved > 1e-3) == (kappa != 0)

@@ -230,7 +230,7 @@ def test_both_twins_cost_the_same_and_are_shown(paper: Any) -> None:
     calibration = paper.calibrate("radial")
     twin = calibration.twin
     assert twin["cost"] == pytest.approx(twin["other_cost"], rel=1e-6)
-    assert "0.9 degrees from the kept twin, 179" in twin["words"]
+    assert "0.9 degrees from the solution that is kept, 179" in twin["words"]
     assert "mirror twin" in calibration.report()
 
 
@@ -245,7 +245,9 @@ def test_the_nominal_side_decides(paper: Any) -> None:
 
 @pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.0, 180.0, 0.0), (90.0, 0.0, 0.0)])
 def test_a_tie_is_an_error(rotvec: Any, paper: Any) -> None:
-    with pytest.raises(CalibrationError, match=r"mirror twins are \d+ and \d+ degrees.*too alike"):
+    with pytest.raises(
+        CalibrationError, match=r"mirror solutions are \d+ and \d+ degrees.*too alike"
+    ):
         paper.calibrate("radial", nominal_rotvec_deg=rotvec)
 
 

@@ -124,7 +124,7 @@ def test_halves_and_residuals_object_to_a_wrong_lens_model(scene: Any) -> None:
     structure = found.diagnostics["structure"]
     assert not structure["sound"]
     assert any("the lens model lacks a term" in words for words in structure["words"])
-    assert "! two halves" in found.report()
+    assert "! calibrated from" in found.report()
 
 
 def test_halves_need_views(scene: Any) -> None:

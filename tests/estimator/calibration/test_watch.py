@@ -111,7 +111,7 @@ def test_views_are_solved_as_they_arrive_and_enough_ends_it(
                 break
         until(lambda: not it.thread.is_alive(), "the end")
     data, run = it.result
-    assert "enough, 0.42 um were asked for" in it.lines[-1]
+    assert "enough, 0.42 µm were asked for" in it.lines[-1]
     assert 6 <= len(data.views) < 12
     assert run.calibration.diagnostics["next_view"]["before_um"] <= 0.42
     assert len(run.detected.images) == 2 * len(data.views)
@@ -255,7 +255,7 @@ def test_standing_in_words(scene: Any, paper_images: Path) -> None:
     data = load_dataset(paper_images)
     calibration = scene("paper", 1, views=7).calibrate()
     words, enough = standing(calibration, data, 7, None)
-    assert words.startswith("7 complete views") and "um in space" in words
+    assert words.startswith("7 complete views") and "points are good to" in words
     assert enough == calibration.diagnostics["next_view"]["enough"]
     assert standing(calibration, data, 7, 10.0)[1]
     assert not standing(calibration, data, 5, 10.0)[1]

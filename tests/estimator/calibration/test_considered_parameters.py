@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.lens.choice import Choice, Step
-from telerig.estimator.calibration.lens.choice import Fit as Trial
+from telerig.estimator.calibration.lens.choice import Choice, FittedModel, Step
 from telerig.estimator.calibration.lens.considered_parameters import (
-    DOUBT,
-    considered,
+    CONSIDERED_P_VALUE,
     considered_covariance,
+    considered_groups,
     considered_words,
 )
 from telerig.estimator.calibration.result.calibration import Calibration
@@ -30,8 +29,8 @@ NONE: frozenset[str] = frozenset()
 STRETCH = frozenset({"affine"})
 
 
-def left_out(camera: int, added: tuple[str, ...], gain: float, vague: bool = False) -> Step:
-    return Step(camera, added, (NONE, NONE), gain, -1.0, False, "", None, vague)
+def left_out(camera: int, added: tuple[str, ...], gain: float, undetermined: bool = False) -> Step:
+    return Step(camera, added, (NONE, NONE), gain, -1.0, False, "", None, undetermined)
 
 
 def taken(camera: int, added: tuple[str, ...]) -> Step:
@@ -40,7 +39,7 @@ def taken(camera: int, added: tuple[str, ...]) -> Step:
 
 def choice(*steps: Step) -> Choice:
     state: Any = None
-    chosen = Trial((NONE, NONE), 0, 0.0, 0, 0.0, np.zeros(0), state)
+    chosen = FittedModel((NONE, NONE), 0, 0.0, 0, 0.0, np.zeros(0), state)
     first = Step(-1, (), chosen.lenses, np.nan, np.nan, True, "", chosen)
     return Choice((first, *steps), chosen, "")
 
@@ -50,23 +49,23 @@ def test_what_another_camera_needs_is_considered_whatever_it_gained() -> None:
         taken(0, ("k1",)), taken(1, ("k1",)), taken(0, ("aspect", "skew")),
         left_out(0, ("k2",), 0.5), left_out(1, ("aspect", "skew"), 0.1), left_out(1, ("k2",), 0.5),
     )  # fmt: skip
-    assert considered(made, 2) == (NONE, STRETCH)
+    assert considered_groups(made, 2) == (NONE, STRETCH)
 
 
 def test_a_tilt_is_a_stretch_too() -> None:
     made = choice(taken(0, GROUPS["tilt"]), left_out(1, ("aspect", "skew"), 0.1))
-    assert considered(made, 2) == (NONE, STRETCH)
+    assert considered_groups(made, 2) == (NONE, STRETCH)
 
 
 def test_what_is_hardly_chance_is_considered_and_what_no_view_determines_is_not() -> None:
     """Chi-square of two degrees of freedom is beyond -2 ln(chance)."""
-    limit = -2 * np.log(DOUBT)
+    limit = -2 * np.log(CONSIDERED_P_VALUE)
     for gain, found in ((limit - 0.1, NONE), (limit + 0.1, STRETCH)):
         made = choice(left_out(0, ("aspect", "skew"), gain))
-        assert considered(made, 2) == (found, NONE)
-        vague = choice(left_out(0, ("aspect", "skew"), gain, vague=True))
-        assert considered(vague, 2) == (NONE, NONE)
-    assert considered(None, 2) == (NONE, NONE)
+        assert considered_groups(made, 2) == (found, NONE)
+        vague = choice(left_out(0, ("aspect", "skew"), gain, undetermined=True))
+        assert considered_groups(vague, 2) == (NONE, NONE)
+    assert considered_groups(None, 2) == (NONE, NONE)
 
 
 def test_the_words_name_what_is_considered() -> None:
@@ -167,7 +166,7 @@ def test_the_points_errors_are_those_of_the_covariance(scene: Any) -> None:
         if "skew" in bare.free[1]:
             continue
         assert "skew" in calibration.free[1]
-        assert calibration.model["words"].endswith("contains what it may be")
+        assert "the data do not exclude it" in calibration.model["words"]
         np.testing.assert_allclose(
             calibration.cameras[1].intrinsics, bare.cameras[1].intrinsics, rtol=1e-6, atol=1e-9
         )

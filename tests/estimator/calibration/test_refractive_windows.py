@@ -25,12 +25,12 @@ from telerig.estimator.batch.jobs import Job, check_options, jobs_of
 from telerig.estimator.calibration.calibrate import run_calibration
 from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.refractive_windows import (
-    forgotten_walls,
+    behind_windows,
     model_error_um,
-    put_behind_walls,
-    stated_walls,
-    wall_words,
-    with_walls,
+    stated_windows,
+    window_notes,
+    window_warnings,
+    with_windows,
 )
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
@@ -136,37 +136,37 @@ def test_without_the_wall_depth_shears_as_predicted_and_with_it_does_not(
 def test_the_warnings_say_how_large_the_error_would_be(tank: Path, in_air: Calibration) -> None:
     words = next(n for n in in_air.notes if "calibrated in air" in n)
     half = 0.5 * 0.6 * 512 / 10.0  # of the working volume
-    stated = float(words.split("up to ")[1].split(" um")[0])
+    stated = float(words.split("up to ")[1].split(" µm")[0])
     assert stated == pytest.approx(SHEAR_UM / 30 * half, rel=0.05)
     assert "up to" in in_air.report()
 
     run = telerig.load_run(tank / "runs" / "rise")
     found = telerig.track(run, in_air.in_air())
     warning = next(n for n in found.summary["warnings"] if "rig.toml states for left" in n)
-    assert float(warning.split("up to ")[1].split(" um")[0]) == pytest.approx(stated, rel=0.05)
-    assert not forgotten_walls(run.rig, in_air)
-    assert not forgotten_walls(run.rig, replace(in_air.in_air(), medium="water"))
-    assert not forgotten_walls(None, in_air)
-    (gone,) = forgotten_walls(replace(run.rig, walls={}), in_air)
-    assert "walls for left, right that rig.toml does not state" in gone
-    assert float(gone.split("up to ")[1].split(" um")[0]) == pytest.approx(stated, rel=0.05)
+    assert float(warning.split("up to ")[1].split(" µm")[0]) == pytest.approx(stated, rel=0.05)
+    assert not window_warnings(run.rig, in_air)
+    assert not window_warnings(run.rig, replace(in_air.in_air(), medium="water"))
+    assert not window_warnings(None, in_air)
+    (gone,) = window_warnings(replace(run.rig, walls={}), in_air)
+    assert "windows for left, right that rig.toml does not state" in gone
+    assert float(gone.split("up to ")[1].split(" µm")[0]) == pytest.approx(stated, rel=0.05)
 
 
 def test_words_on_walls_are_right(in_air: Calibration) -> None:
     dry = replace(in_air.in_air(), free=in_air.free)
 
     def said(glass: Wall) -> str:
-        calibration = put_behind_walls(dry, {"left": glass})
+        calibration = behind_windows(dry, {"left": glass})
         described = WallDescription("left", (0.0, 0.0, 1.0), INDICES, 10.0, -60.0)
-        return " ".join(wall_words(calibration, SimpleNamespace(walls={"left": described})))
+        return " ".join(window_notes(calibration, SimpleNamespace(walls={"left": described})))
 
-    assert "less than 0.1 um wrong" in said(wall(0.0))
+    assert "wrong by less than 0.1 µm" in said(wall(0.0))
     assert "denser medium" not in said(wall(1.0)) and "leans" not in said(wall(1.0))
     assert "denser medium" in said(replace(wall(1.0), indices=INDICES[::-1]))
     assert "leans 79 degrees" in said(wall(79.0))
     assert "calibrate with the target in the water" in said(wall(0.0, sigma_deg=0.5))
-    assert not wall_words(dry, SimpleNamespace(walls={}))
-    wet = wall_words(replace(dry, medium="water"), SimpleNamespace(walls={}))
+    assert not window_notes(dry, SimpleNamespace(walls={}))
+    wet = window_notes(replace(dry, medium="water"), SimpleNamespace(walls={}))
     assert len(wet) == 1 and "without [walls]" in wet[0]
 
 
@@ -177,7 +177,7 @@ def test_the_errors_in_space_hold_the_walls_share(in_air: Calibration) -> None:
     mean: b^2 / 8.
     """
     dry = replace(in_air.in_air(), free=in_air.free)
-    sd = {s: put_behind_walls(dry, {"left": wall(0.0, sigma_deg=s)}).statistics for s in (0.0, 0.5)}
+    sd = {s: behind_windows(dry, {"left": wall(0.0, sigma_deg=s)}).statistics for s in (0.0, 0.5)}
     assert sd[0.0]["space_sd_um"] == dry.statistics["space_sd_um"]
     share = np.sqrt(sd[0.5]["space_sd_um"] ** 2 - sd[0.0]["space_sd_um"] ** 2)
     assert share == pytest.approx(sd[0.5]["space_sd_walls_um"])
@@ -195,7 +195,7 @@ def test_files_keep_walls_and_medium(tank: Path, in_air: Calibration, tmp_path: 
         name = camera.name
         expected = traced(in_air.in_air().camera(name), WALLS[name], points)
         np.testing.assert_allclose(again.project(name, points), expected, rtol=0, atol=1e-9)
-    assert not forgotten_walls(load_dataset(tank).rig, again)
+    assert not window_warnings(load_dataset(tank).rig, again)
     assert all(c.wall is not None for c in read_cameras(tmp_path / "calibration.json"))
     assert all(c.wall is None for c in read_results(tmp_path).cameras)
 
@@ -211,8 +211,8 @@ def test_files_keep_walls_and_medium(tank: Path, in_air: Calibration, tmp_path: 
 def test_what_is_not_known_of_a_wall_reaches_the_points(in_air: Calibration) -> None:
     sigma_deg = 0.1
     air = replace(in_air.in_air(), free=in_air.free)
-    wet = put_behind_walls(air, {"left": wall(1.0, sigma_deg=sigma_deg)})
-    known = put_behind_walls(air, {"left": wall(1.0)})
+    wet = behind_windows(air, {"left": wall(1.0, sigma_deg=sigma_deg)})
+    known = behind_windows(air, {"left": wall(1.0)})
     assert wet.free[0][-2:] == ("wall_x_rad", "wall_y_rad")
     assert wet.sd("left.wall_y_rad") == pytest.approx(np.radians(sigma_deg))
     rows = len(wet.covariance)
@@ -228,7 +228,7 @@ def test_what_is_not_known_of_a_wall_reaches_the_points(in_air: Calibration) -> 
     moved = []
     for _ in range(400):
         glass = wall(1.0).turned(np.radians(sigma_deg) * rng.standard_normal(2))
-        turned = put_behind_walls(air, {"left": glass})
+        turned = behind_windows(air, {"left": glass})
         moved.append(turned.triangulate(uv[0], uv[1], sigma_px=0.01).points_mm[0])
     expected = np.cov(np.array(moved).T)
     difference = grown[0] - grown[1]
@@ -256,14 +256,14 @@ def test_a_sign_that_nothing_decides_is_said(scene: Callable[..., Any]) -> None:
     for sigma_deg, open_ in ((6.0, True), (1.0, False)):
         stated = {"left": wall(4.0, sigma_deg=sigma_deg), "right": wall(0.0)}
         found = self_calibrate(
-            dots, with_walls(made.cameras, stated), made.target, model="none",
+            dots, with_windows(made.cameras, stated), made.target, model="none",
             nominal_rotvec_deg=made.nominal_rotvec_deg,
         )  # fmt: skip
         descriptions = {
             n: WallDescription(n, (0.0, 0.0, 1.0), INDICES, 10.0, -60.0) for n in stated
         }
         rig = SimpleNamespace(walls=descriptions)
-        words = wall_words(replace(found, medium="water"), rig)
+        words = window_notes(replace(found, medium="water"), rig)
         assert any("to the other side" in line for line in words) == open_
 
 
@@ -276,7 +276,7 @@ def in_water(
         "kappa_per_mm": kappa_per_mm, "k1": 0.0, "centre_u_px": 255.5, "centre_v_px": 255.5
     }  # fmt: skip
     true = tuple(c.with_parameters(**lens) for c in made.true_cameras.values())
-    behind = with_walls(true, walls)
+    behind = with_windows(true, walls)
     rng, dots = np.random.default_rng(1), made.exact.copy()
     for camera in behind:
         mine = (dots["camera"] == camera.name).to_numpy()
@@ -301,7 +301,7 @@ def test_a_perspective_lens_from_air_into_water(scene: Callable[..., Any]) -> No
     points = np.random.default_rng(0).uniform(-12, 12, (20, 3))
     uv = [traced(c, WALLS[c.name], points) for c in true]
     wrong = {}
-    for calibration in (air, put_behind_walls(air, WALLS)):
+    for calibration in (air, behind_windows(air, WALLS)):
         seen = calibration.triangulate(uv[0], uv[1], sigma_px=0.01).points_mm - points
         wrong[calibration is air] = np.abs(seen - seen.mean(0)).max()
     assert wrong[False] < 2e-3 < 0.3 < wrong[True]
@@ -329,7 +329,7 @@ def test_rig_toml_states_the_wall(tank: Path, tmp_path: Path) -> None:
     write_rig_toml(replace(rig, walls=walls), tmp_path / "rig.toml")
     again = read_rig_toml(tmp_path / "rig.toml")
     assert again.walls == walls
-    stated = stated_walls(again)["left"]
+    stated = stated_windows(again)["left"]
     assert stated.normal_sigma_rad == pytest.approx(np.radians(0.25))
     assert stated.distance_mm == -60.0
     text = (tmp_path / "rig.toml").read_text(encoding="utf-8").replace("= 0.25", "= -0.25")
@@ -357,7 +357,7 @@ def test_a_target_in_the_water_shows_how_the_walls_stand(
     stated = {"left": wall(4.0, 5.0, 1.0), "right": wall(3.5, 90.0, 1.0)}
     found = {
         how: self_calibrate(
-            dots, with_walls(nominal, given), made.target,
+            dots, with_windows(nominal, given), made.target,
             nominal_rotvec_deg=made.nominal_rotvec_deg, model=model,
         )
         for how, given in (("ignored", {}), ("estimated", stated), ("known", walls))
@@ -387,7 +387,7 @@ def test_the_command_records_the_medium(tank: Path, tmp_path: Path) -> None:
     command = ["calibrate", str(tank), "--medium", "water", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, [*command, "--model", "none", "--quiet"])
     assert result.exit_code == 0, result.output
-    assert "calibrated in the water behind the walls of left, right" in result.output
+    assert "calibrated in the water behind the refractive windows of left, right" in result.output
     content = json.loads((tmp_path / "out" / "calibration.json").read_text(encoding="utf-8"))
     assert content["medium"] == "water" and set(content["walls"]) == {"left", "right"}
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -407,7 +407,7 @@ def test_a_wall_without_distance_says_what_that_costs(tank: Path, tmp_path: Path
     found = telerig.calibrate(load_dataset(bare), model="radial")
     (words,) = (n for n in found.notes if "has no distance_mm" in n)
     assert "[walls.left]" in words
-    shift = float(words.split("points by ")[1].split(" um")[0])
+    shift = float(words.split("points by ")[1].split(" µm")[0])
     assert shift == pytest.approx(SHEAR_UM / 3, rel=0.02)
     wrong = error_mm(found, tank)
     assert np.abs(wrong).max() < 3e-3

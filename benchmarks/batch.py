@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from telerig.estimator.batch.jobs import jobs_of
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
 
 TABLES = ("calibration.json", "residuals.csv", "tracks.csv", "trajectories.csv", "shake.csv")

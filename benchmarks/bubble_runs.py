@@ -25,7 +25,7 @@ import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
 from telerig.estimator.tracking.truth import TrackScore, score_tracks
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 
 
 def run_one(

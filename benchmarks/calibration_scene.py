@@ -15,7 +15,6 @@ from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.factors.projection import State
-from telerig.io.simulation.calibration.presets import SimulationConfig
 from telerig.io.simulation.calibration.scene import (
     TrueTarget,
     View,
@@ -24,6 +23,7 @@ from telerig.io.simulation.calibration.scene import (
     true_target,
 )
 from telerig.io.simulation.calibration_files import exact_dots, rig_description
+from telerig.io.simulation.config import SimulationConfig
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.target import Target

@@ -38,7 +38,8 @@ from telerig.estimator.smoothing.problem.problem import (
     Zigzag,
 )
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import RunConfig, run_preset
+from telerig.io.simulation.config import RunConfig
+from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.run.scene import RunScene, run_scene
 from telerig.io.simulation.run.sensors import stage_table
 from telerig.rig.camera import Camera

@@ -38,7 +38,7 @@ from telerig.factors.priors import (
     distance_residual,
 )
 from telerig.factors.projection import Observations, State, whitened_residuals
-from telerig.io.simulation.calibration.presets import preset
+from telerig.io.simulation.presets import preset
 
 Array = NDArray[np.float64]
 

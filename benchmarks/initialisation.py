@@ -28,7 +28,8 @@ from telerig.estimator.calibration.solver.problem import Problem, held_at_nomina
 from telerig.estimator.calibration.start import mirror_ambiguity
 from telerig.estimator.calibration.start.known_target import angle_between
 from telerig.factors.projection import State
-from telerig.io.simulation.calibration.presets import CameraConfig, SimulationConfig, preset
+from telerig.io.simulation.config import CameraConfig, SimulationConfig
+from telerig.io.simulation.presets import preset
 from telerig.rig.target import Target
 
 MODEL = "kappa+radial"

@@ -40,7 +40,7 @@ from telerig.estimator.calibration.solver.problem import (
     parameter_unit,
 )
 from telerig.factors.projection import State
-from telerig.io.simulation.calibration.presets import CameraConfig, SimulationConfig
+from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.rig.lens_models import name_of
 from telerig.rig.target import Target
 from telerig.rig.triangulation import triangulate

@@ -29,8 +29,7 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.smoothing.truth import motion_error
 from telerig.estimator.tracking.truth import score_tracks
-from telerig.io.simulation.calibration.presets import preset
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import preset, run_preset
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rig_truth import aligned, volume
 
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.io.simulation.calibration.presets import preset
+from telerig.io.simulation.presets import preset
 from telerig.rig.triangulation import triangulate
 
 Array = NDArray[np.float64]

@@ -19,8 +19,8 @@ from telerig.estimator.calibration.solver.covariance import aligned_covariance, 
 from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
 from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.problem import held_at_nominal
-from telerig.io.simulation.calibration.presets import SimulationConfig
 from telerig.io.simulation.calibration_files import exact_dots
+from telerig.io.simulation.config import SimulationConfig
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.projection import PARAMETERS

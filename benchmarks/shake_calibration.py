@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from telerig.estimator.calibration.calibrate import nominal_cameras
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.io.simulation.calibration.presets import CameraConfig, preset
 from telerig.io.simulation.calibration.scene import hand_held_views, true_cameras, true_target
 from telerig.io.simulation.calibration_files import exact_dots, rig_description
+from telerig.io.simulation.config import CameraConfig
+from telerig.io.simulation.presets import preset
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import telerig
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 
 SCALE = 0.01
 

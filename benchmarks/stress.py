@@ -35,7 +35,8 @@ from telerig.estimator.calibration.quality.truth import space_error, true_camera
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.calibration.solver.covariance import aligned_shift
-from telerig.io.simulation.calibration.presets import SimulationConfig, preset
+from telerig.io.simulation.config import SimulationConfig
+from telerig.io.simulation.presets import preset
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 

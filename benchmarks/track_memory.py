@@ -23,7 +23,7 @@ import numpy as np
 import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 
 TRACK = """
 import resource, sys, runpy

@@ -15,7 +15,7 @@ from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, sa
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.io.dataset.dataset import Dataset
-    from telerig.io.simulation.run.presets import RunConfig
+    from telerig.io.simulation.config import RunConfig
 
 
 @errors_in_words()
@@ -63,7 +63,7 @@ def demo(
 
 def _config() -> RunConfig:
     """The run of 2004, with an accelerometer on each camera's arm."""
-    from telerig.io.simulation.run.presets import run_preset
+    from telerig.io.simulation.presets import run_preset
 
     config = run_preset("rise")
     return replace(config, stage=replace(config.stage, accelerometers=("left", "right")))

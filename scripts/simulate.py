@@ -16,8 +16,7 @@ from telerig.scripts.console import errors_in_words, say, stopped_by_signals
 if TYPE_CHECKING:
     from numpy.random import Generator
 
-    from telerig.io.simulation.calibration.presets import SimulationConfig
-    from telerig.io.simulation.run.presets import RunConfig
+    from telerig.io.simulation.config import RunConfig, SimulationConfig
 
 
 @errors_in_words()
@@ -103,7 +102,7 @@ def simulate(
 def _settings(
     name: str, run: dict[str, int | None], stage: dict[str, Any]
 ) -> SimulationConfig | RunConfig:
-    from telerig.io.simulation.run.presets import RUN_PRESETS, any_preset, run_preset
+    from telerig.io.simulation.presets import RUN_PRESETS, any_preset, run_preset
 
     changes: dict[str, Any] = {key: value for key, value in run.items() if value is not None}
     stage_changes = {key: value for key, value in stage.items() if value is not None}
@@ -122,8 +121,7 @@ def _with_strip(
     name: str, settings: SimulationConfig | RunConfig, dots: int | None, images: bool
 ) -> SimulationConfig | RunConfig:
     """With a strip of dots in the images, or in `references.csv` where there are no images."""
-    from telerig.io.simulation.run.mark_strip_config import StripConfig
-    from telerig.io.simulation.run.presets import RunConfig
+    from telerig.io.simulation.config import RunConfig, StripConfig
 
     if dots is None:
         return settings
@@ -136,7 +134,7 @@ def _with_strip(
 
 
 def _needs_run(name: str, given: str) -> InputError:
-    from telerig.io.simulation.run.presets import RUN_PRESETS
+    from telerig.io.simulation.presets import RUN_PRESETS
 
     return InputError(
         f"{name} is a calibration without a run, so {given} have no effect",

@@ -1,4 +1,4 @@
-"""Exact coverage of grid cells by a closed outline, and its blur and integration over pixels."""
+"""From a closed outline to pixels: exact coverage of grid cells, blur, integration, windows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+Window = tuple[slice, slice]
 Index = NDArray[np.int64]
 
 
@@ -64,19 +64,35 @@ def _crossings(start: Array, step: Array) -> tuple[Index, Array]:
 
 
 def pixel_weights(
-    cells: int, per_pixel: int, pad: int, sigma_px: float, shift_px: float
-) -> Float32:
-    """(pixels + 2 pad, cells): Gaussian blur and integration over pixels, of a row of fine cells.
+    pixels: int,
+    per_pixel: int,
+    pad: int,
+    sigma_px: float,
+    shift_px: float = 0.0,
+    kind: type[np.floating] = np.float64,
+) -> Array:
+    """(pixels + 2 pad, pixels * per_pixel): Gaussian blur and integration over pixels of a row of
+    fine cells, as numbers of ``kind``.
 
     The row starts at the left edge of its first pixel and is displaced by shift_px. Averaging
     inside a cell blurs by its width squared over 12, which is taken off.
     """
-    pixels = cells // per_pixel
-    centre = (np.arange(cells) + 0.5) / per_pixel + shift_px
+    centre = (np.arange(pixels * per_pixel) + 0.5) / per_pixel + shift_px
     border = np.arange(-pad, pixels + pad + 1)[:, None]
     sigma = np.sqrt(max(sigma_px**2 - 1 / (12 * per_pixel**2), (0.1 / per_pixel) ** 2))
-    share = ndtr(((border - centre) / sigma).astype(np.float32))
-    return np.asarray((share[1:] - share[:-1]) / np.float32(per_pixel))
+    share = ndtr(((border - centre) / sigma).astype(kind))
+    return np.asarray((share[1:] - share[:-1]) / kind(per_pixel))
+
+
+def overlap(
+    shape: tuple[int, ...], patch_shape: tuple[int, ...], row: int, column: int
+) -> tuple[Window, Window]:
+    """Where a patch at (row, column) lies in an image, and which part of it does; may be empty."""
+    first = np.maximum([row, column], 0)
+    end = np.maximum(np.minimum(np.add([row, column], patch_shape), shape), first)
+    inside = slice(first[0], end[0]), slice(first[1], end[1])
+    taken = slice(first[0] - row, end[0] - row), slice(first[1] - column, end[1] - column)
+    return inside, taken
 
 
 def refined(outline: Array, count: int) -> Array:

@@ -14,7 +14,6 @@ from telerig.io.dataset.tables import write_table
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.rig_file.description import CameraDescription, RigDescription
 from telerig.io.rig_file.rig_file import write_rig_toml
-from telerig.io.simulation.calibration.presets import SimulationConfig
 from telerig.io.simulation.calibration.scene import (
     TrueTarget,
     View,
@@ -23,8 +22,10 @@ from telerig.io.simulation.calibration.scene import (
     true_target,
     wholly_inside,
 )
+from telerig.io.simulation.config import SimulationConfig
 from telerig.io.simulation.images.plate_view import pixel_from_plate
-from telerig.io.simulation.images.plates import Light, digitise, render
+from telerig.io.simulation.images.plates import Light, render
+from telerig.io.simulation.images.sensor import digitise
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS

@@ -21,13 +21,14 @@ from telerig.io.rig_file.description import (
     StageDescription,
 )
 from telerig.io.simulation.calibration_files import seed_of, write_calibration
+from telerig.io.simulation.config import ImageConfig, RunConfig
 from telerig.io.simulation.images.backlight import Screen, Specks, random_screen, random_specks
 from telerig.io.simulation.images.bodies import MODES
-from telerig.io.simulation.images.bubbles import Silhouette, exposed, render_bubbles
-from telerig.io.simulation.run.mark_strip import Strip, random_strips, strip_truth
-from telerig.io.simulation.run.presets import ImageConfig, RunConfig
+from telerig.io.simulation.images.bubbles import Silhouette, render_bubbles
+from telerig.io.simulation.images.sensor import digitise
+from telerig.io.simulation.run.marks import Strip, random_strips, references_table, strip_truth
 from telerig.io.simulation.run.scene import AXIS_RIG, RunScene, run_scene
-from telerig.io.simulation.run.sensors import accelerometer_table, references_table, stage_table
+from telerig.io.simulation.run.sensors import accelerometer_table, stage_table
 from telerig.io.simulation.run.views import CameraView, camera_view, linear_projection, truth_rows
 from telerig.io.simulation.stage_axis import write_stage_axis
 
@@ -176,7 +177,7 @@ class _Pictures:
             lab_shift_px=lab_shift,
             gain=float(self.gain[frame]),
         )
-        return exposed(
+        return digitise(
             grey,
             self.noise[index],
             read_noise=image.read_noise,
@@ -326,7 +327,7 @@ def _write_truth(
 
 
 def _summary(scene: RunScene, seed: dict[str, Any]) -> Mapping[str, Any]:
-    fleet, config = scene.fleet, plain(scene.config)
+    population, config = scene.population, plain(scene.config)
     if config["strip"] is None:
         del config["strip"]
     return {
@@ -336,12 +337,12 @@ def _summary(scene: RunScene, seed: dict[str, Any]) -> Mapping[str, Any]:
         "axis_rig": AXIS_RIG,
         "modes": MODES,
         "particles": {
-            "d_eq_mm": fleet.d_eq_mm,
-            "semi_axes_proportions": fleet.semi_axes_mm,
-            "modes_static": fleet.modes_static,
-            "modes_swing": fleet.modes_swing,
-            "swing_hz": fleet.swing_hz,
-            "spin_hz": fleet.spin_hz,
+            "d_eq_mm": population.d_eq_mm,
+            "semi_axes_proportions": population.semi_axes_mm,
+            "modes_static": population.modes_static,
+            "modes_swing": population.modes_swing,
+            "swing_hz": population.swing_hz,
+            "spin_hz": population.spin_hz,
         },
         "pairs_closest_s": scene.closest_s,
         "config": config,

@@ -11,9 +11,9 @@ import numpy as np
 from telerig.errors import InputError
 from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.files.atomic import atomic_folder
-from telerig.io.simulation.calibration.presets import SimulationConfig
 from telerig.io.simulation.calibration_files import write_calibration
-from telerig.io.simulation.run.presets import RunConfig, any_preset
+from telerig.io.simulation.config import RunConfig, SimulationConfig
+from telerig.io.simulation.presets import any_preset
 from telerig.io.simulation.run_files import write_run_dataset
 
 
@@ -27,8 +27,8 @@ def simulate(
     """Write a dataset with known truth and load it: a calibration, or a run with its calibration.
 
     config : the name of a preset, or a configuration
-        (`telerig.io.simulation.calibration.presets.preset`,
-        `telerig.io.simulation.run.presets.run_preset`).
+        (`telerig.io.simulation.presets.preset`,
+        `telerig.io.simulation.presets.run_preset`).
     rng : the only source of chance; the same seed gives the same bytes, and the same rig, target,
         poses and bubbles with images or without.
     out : a new or empty folder; None makes a temporary one, which the caller may delete.

@@ -14,7 +14,7 @@ from telerig.io.dataset.tables import write_table
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.simulation.calibration.scene import TrueTarget, View, hand_held_views, wholly_inside
 from telerig.io.simulation.calibration_files import exact_dots, measured_dots, write_images
-from telerig.io.simulation.run.presets import RunConfig
+from telerig.io.simulation.config import RunConfig
 from telerig.io.simulation.run.scene import AXIS_RIG
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from telerig.io.dataset.dataset import Dataset as Dataset
     from telerig.io.dataset.dataset import load_dataset as load_dataset
     from telerig.io.dataset.run import load_run as load_run
-    from telerig.io.simulation.calibration.presets import SimulationConfig as SimulationConfig
+    from telerig.io.simulation.config import SimulationConfig as SimulationConfig
     from telerig.io.simulation.simulate import simulate as simulate
     from telerig.rig.triangulation import Triangulation as Triangulation
 
@@ -45,7 +45,7 @@ _WHERE = {
     "Calibration": "telerig.estimator.calibration.result.calibration",
     "Dataset": "telerig.io.dataset.dataset",
     "ShakeModel": "telerig.estimator.smoothing.problem.problem",
-    "SimulationConfig": "telerig.io.simulation.calibration.presets",
+    "SimulationConfig": "telerig.io.simulation.config",
     "Smoothing": "telerig.estimator.smoothing.result",
     "TelerigError": "telerig.errors",
     "Triangulation": "telerig.rig.triangulation",

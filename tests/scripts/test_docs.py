@@ -19,7 +19,7 @@ import pytest
 import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 
 ROOT = docs_pages.ROOT
 PAGES = [

@@ -16,7 +16,7 @@ from telerig.estimator.doctor.dataset import check_dataset
 from telerig.estimator.doctor.installation import check_installation, check_ports
 from telerig.io.dataset.new_dataset import new_dataset
 from telerig.io.rig_file.rig_file import read_rig_toml
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
 from telerig.scripts.main import app
 

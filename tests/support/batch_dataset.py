@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.simulation.calibration.presets import CameraConfig, SimulationConfig
+from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec

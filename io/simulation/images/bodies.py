@@ -15,7 +15,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.errors import InputError
 from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
@@ -26,15 +25,6 @@ MODES = tuple((degree, order) for degree in (2, 3, 4) for order in range(-degree
 _SAMPLES = 12
 _SEARCH = 49
 _NEWTON = 4
-
-
-def mode_index(degree: int, order: int) -> int:
-    """Place of a mode among the coefficients. Raises InputError for a mode outside `MODES`."""
-    if (degree, order) not in MODES:
-        raise InputError(
-            f"no surface mode of degree {degree}, order {order}", todo="degrees 2 to 4, |m| <= l"
-        )
-    return MODES.index((degree, order))
 
 
 @dataclass(frozen=True)
@@ -102,15 +92,6 @@ def volume_centre_mm(bodies: Bodies) -> Array:
     """(..., 3) exact centre of volume."""
     offset = bodies.semi_axes_mm * _sphere_moments(bodies.modes)[1]
     turned = np.einsum("...ij,...j->...i", bodies.rotation, offset)
-    return np.asarray(bodies.origin_mm + turned)
-
-
-def surface_mm(bodies: Bodies, directions: ArrayLike) -> Array:
-    """(..., 3) surface points for unit directions (..., 3) in the undeformed sphere."""
-    s = np.asarray(directions, float)
-    radius = 1 + np.einsum("...k,...k->...", surface_modes(s), bodies.modes)
-    local = bodies.semi_axes_mm * s * radius[..., None]
-    turned = np.einsum("...ij,...j->...i", bodies.rotation, local)
     return np.asarray(bodies.origin_mm + turned)
 
 

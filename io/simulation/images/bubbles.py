@@ -13,14 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.errors import InputError
-from telerig.io.images.outline_raster import cell_coverage, pixel_weights, refined
+from telerig.io.images.outline_raster import cell_coverage, overlap, pixel_weights, refined
 from telerig.io.simulation.images.backlight import Screen, Specks
 from telerig.io.simulation.images.bodies import outline_moments
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
-Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 CELLS = 4
 """Fine cells per pixel and direction."""
@@ -122,7 +120,7 @@ def absorption_patch(bubble: Silhouette) -> Patch:
     total = np.zeros(count[::-1] + 2 * pad, np.float32)
     for node, weight in zip(nodes, weights):
         by_u, by_v = (
-            pixel_weights(int(n) * CELLS, CELLS, pad, bubble.blur_px, float(node * shift))
+            pixel_weights(int(n), CELLS, pad, bubble.blur_px, float(node * shift), np.float32)
             for n, shift in zip(count, smear)
         )
         total += np.float32(weight) * (by_v @ fine @ by_u.T)
@@ -156,19 +154,10 @@ def transmission(size_px: tuple[int, int], bubbles: Sequence[Silhouette]) -> Flo
             bubble.outline_px.min(0) > np.array(size_px) - 1 + reach
         ):
             continue
-        _multiply(out, absorption_patch(bubble))
+        patch = absorption_patch(bubble)
+        inside, taken = overlap(out.shape, patch.absorption.shape, patch.row, patch.column)
+        out[inside] *= 1 - patch.absorption[taken]
     return out
-
-
-def _multiply(out: Float32, patch: Patch) -> None:
-    top, left = max(patch.row, 0), max(patch.column, 0)
-    bottom = min(patch.row + patch.absorption.shape[0], out.shape[0])
-    right = min(patch.column + patch.absorption.shape[1], out.shape[1])
-    if bottom > top and right > left:
-        taken = patch.absorption[
-            top - patch.row : bottom - patch.row, left - patch.column : right - patch.column
-        ]
-        out[top:bottom, left:right] *= 1 - taken
 
 
 def render_bubbles(
@@ -195,33 +184,3 @@ def render_bubbles(
         lens_dirt.darken(image, np.zeros(2))
     image *= np.float32(gain)
     return image
-
-
-def exposed(
-    grey: NDArray[np.floating],
-    rng: np.random.Generator,
-    *,
-    read_noise: float,
-    shot_noise: float,
-    bit_depth: int,
-    left_aligned: bool = False,
-) -> Image:
-    """Noisy integers as a camera delivers them, clipped at full scale; grey in fractions of it.
-
-    read_noise : standard deviation; shot_noise : standard deviation at full scale.
-    left_aligned : data of fewer than 16 bits stand in the high bits of 16, as many cameras write.
-    Raises InputError for a bit depth outside 8..16.
-    """
-    if not 8 <= bit_depth <= 16:
-        raise InputError(f"a bit depth of {bit_depth}", todo="choose 8 to 16 bits")
-    full = np.float32(2**bit_depth - 1)
-    levels = rng.standard_normal(grey.shape, dtype=np.float32)
-    bright = np.clip(grey, 0, 1).astype(np.float32, copy=False)
-    levels *= np.sqrt(np.float32(read_noise**2) + np.float32(shot_noise**2) * bright)
-    levels += grey
-    levels *= full
-    np.clip(np.rint(levels, out=levels), 0, full, out=levels)
-    if bit_depth == 8:
-        return levels.astype(np.uint8)
-    aligned = levels.astype(np.uint16) << (16 - bit_depth if left_aligned else 0)
-    return aligned.astype(np.uint16, copy=False)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from telerig.errors import InputError
+from telerig.io.images.outline_raster import overlap, pixel_weights
 from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate, plate_from_pixel
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -66,29 +66,6 @@ def render(
     return _lit(grey, light, width, height)
 
 
-def digitise(
-    grey: Array,
-    rng: np.random.Generator,
-    *,
-    read_noise: float,
-    shot_noise: float = 0.0,
-    bit_depth: int = 8,
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Grey levels in fractions of full scale -> integers with noise, clipped at full scale.
-
-    read_noise : standard deviation; shot_noise : standard deviation at full scale (it grows with
-    the root of the grey level). Raises InputError for a bit depth outside 8..16.
-    """
-    if not 8 <= bit_depth <= 16:
-        raise InputError(f"a bit depth of {bit_depth}", todo="choose 8 to 16 bits")
-    sigma = np.sqrt(read_noise**2 + shot_noise**2 * np.clip(grey, 0, 1))
-    noisy = grey + sigma * rng.standard_normal(grey.shape)
-    full = 2**bit_depth - 1
-    levels = np.clip(np.rint(noisy * full), 0, full)
-    kind = np.uint8 if bit_depth == 8 else np.uint16
-    return np.asarray(levels.astype(kind))
-
-
 def disc_coverage(
     camera: Camera,
     rig_from_target: Pose,
@@ -113,8 +90,10 @@ def disc_coverage(
         fine = _cell_coverage(local, size, outer / 2)
         if inner > 0:
             fine -= _cell_coverage(local, size, inner / 2)
-        rows, columns = (_pixel_weights(int(n), pad, blur_px) for n in size[::-1])
-        _add_clipped(out, rows @ fine @ columns.T, int(corner[1]), int(corner[0]))
+        rows, columns = (_pixel_weights(int(n), SUPERSAMPLING, pad, blur_px) for n in size[::-1])
+        patch = rows @ fine @ columns.T
+        inside, taken = overlap(out.shape, patch.shape, int(corner[1]), int(corner[0]))
+        out[inside] += patch[taken]
     return out[pad : pad + height, pad : pad + width]
 
 
@@ -199,30 +178,7 @@ def _half_plane_share(depth: Array, slope: Array) -> Array:
     return np.asarray(np.where(depth > 0, 1 - small, small))
 
 
-def _add_clipped(out: Array, patch: Array, row: int, column: int) -> None:
-    """Add a patch at (row, column), leaving out what falls beside the array."""
-    top, left = max(row, 0), max(column, 0)
-    bottom = min(row + patch.shape[0], out.shape[0])
-    right = min(column + patch.shape[1], out.shape[1])
-    if bottom > top and right > left:
-        out[top:bottom, left:right] += patch[
-            top - row : bottom - row, left - column : right - column
-        ]
-
-
-@lru_cache(maxsize=512)
-def _pixel_weights(count: int, pad: int, blur_px: float) -> Array:
-    """(count + 2 pad, cells): Gaussian blur and integration over the pixel, of a row of cells.
-
-    The averaging inside a cell already blurs by 1/12 of its width squared, which is taken off.
-    """
-    cells = (np.arange(count * SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
-    distance = np.arange(-pad, count + pad)[:, None] - cells
-    sigma = np.sqrt(max(blur_px**2 - 1 / (12 * SUPERSAMPLING**2), 0.0))
-    if sigma == 0:
-        return np.asarray((np.abs(distance) < 0.5) / SUPERSAMPLING)
-    share = ndtr((distance + 0.5) / sigma) - ndtr((distance - 0.5) / sigma)
-    return np.asarray(share / SUPERSAMPLING)
+_pixel_weights = lru_cache(maxsize=512)(pixel_weights)
 
 
 def _chebyshev(count: int) -> Array:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
+from telerig.io.simulation.config import MotionConfig, RunConfig
 from telerig.io.simulation.images.bodies import Bodies, bodies_about
-from telerig.io.simulation.run.fleet import Fleet, random_fleet
 from telerig.io.simulation.run.motion import (
     Path,
     Shake,
@@ -23,7 +23,7 @@ from telerig.io.simulation.run.motion import (
     stage_trajectory,
     stochastic_paths,
 )
-from telerig.io.simulation.run.presets import MotionConfig, RunConfig
+from telerig.io.simulation.run.population import Population, random_population
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class RunScene:
     config: RunConfig
     cameras: Mapping[str, Camera]
     carriage: Carriage
-    fleet: Fleet
+    population: Population
     lab_mm: Array
     lab_mm_s: Array
     closest_s: Array
@@ -101,17 +101,17 @@ class RunScene:
 
     def bodies_lab(self, frame: int, chosen: NDArray[np.int64]) -> Bodies:
         """Some of the bubbles, (M,), in the lab frame."""
-        fleet, t = self.fleet, self.t_s[frame]
-        swing = np.cos(2 * np.pi * fleet.swing_hz[chosen] * t + fleet.swing_rad[chosen])
-        modes = fleet.modes_static[chosen] + fleet.modes_swing[chosen] * swing
-        spin = 2 * np.pi * fleet.spin_hz[chosen] * t + fleet.spin_rad[chosen]
+        population, t = self.population, self.t_s[frame]
+        swing = np.cos(2 * np.pi * population.swing_hz[chosen] * t + population.swing_rad[chosen])
+        modes = population.modes_static[chosen] + population.modes_swing[chosen] * swing
+        spin = 2 * np.pi * population.spin_hz[chosen] * t + population.spin_rad[chosen]
         rotation = _facing(self.lab_mm_s[chosen, frame], spin)
         return bodies_about(
             self.lab_mm[chosen, frame],
             rotation,
-            fleet.semi_axes_mm[chosen],
+            population.semi_axes_mm[chosen],
             modes,
-            d_eq_mm=fleet.d_eq_mm[chosen],
+            d_eq_mm=population.d_eq_mm[chosen],
         )
 
 
@@ -123,11 +123,11 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     position = carriage.position_mm[carriage.frames]
     size_mm = _view_mm(config)
     count = _bubble_count(config, position, size_mm)
-    fleet = random_fleet(config.bubble, count, shape_rng)
+    population = random_population(config.bubble, count, shape_rng)
     paths = _paths(config, count, path_rng)
     lab, velocity, closest = _lab_paths(config, paths, path_rng)
-    start = _starts(config, lab, position, fleet.d_eq_mm, size_mm, place_rng)
-    return RunScene(config, cameras, carriage, fleet, lab + start[:, None], velocity, closest)
+    start = _starts(config, lab, position, population.d_eq_mm, size_mm, place_rng)
+    return RunScene(config, cameras, carriage, population, lab + start[:, None], velocity, closest)
 
 
 def _view_mm(config: RunConfig) -> Array:

@@ -1,4 +1,4 @@
-"""The tables that stand beside a simulated run's images: encoder, accelerometers, marks."""
+"""The tables of a simulated run's sensors: encoder and accelerometers."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.io.rig_file.description import CARRIAGE
-from telerig.io.simulation.run.mark_strip import strip_places
-from telerig.io.simulation.run.mark_strip_config import MARKS_AT, MARKS_JITTER
 from telerig.io.simulation.run.motion import accelerometer_readings
 from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
 
@@ -61,52 +59,6 @@ def accelerometer_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
         columns |= {f"a{axis}_m_s2": reading[:, i] for i, axis in enumerate("xyz")}
         parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
-
-
-def references_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
-    """`references.csv`: marks fixed to the tank, which pass through the image as the stage moves.
-
-    Each camera has a strip of its own, at unknown uneven heights, so many in view at a time as
-    the configuration says.
-    """
-    import pandas as pd
-
-    return pd.concat(
-        [_camera_marks(scene, j, rng) for j in range(len(scene.cameras))], ignore_index=True
-    )
-
-
-def _camera_marks(scene: RunScene, index: int, rng: Generator) -> pd.DataFrame:
-    import pandas as pd
-
-    name, camera = list(scene.cameras.items())[index]
-    table = scene.config.table
-    lab_mm = strip_places(
-        camera, scene.position_mm, table.references, rng, at=MARKS_AT, jitter=MARKS_JITTER
-    )
-    frames, marks, pixels = [], [], []
-    size = np.array(camera.image_size_px) - 1
-    half_mm = size[1] / 2 / camera["scale_px_per_mm"]
-    for frame in range(scene.config.frames):
-        rig = lab_mm + scene.rig_from_lab_mm(index, frame)
-        near = np.flatnonzero(np.abs(rig @ AXIS_RIG) < 1.2 * half_mm)
-        uv = camera.project(rig[near])
-        seen = np.all((uv > 0) & (uv < size), -1)
-        noise = table.reference_sigma_px * rng.standard_normal(uv[seen].shape)
-        pixels.append(np.clip(uv[seen] + noise, 0, size))
-        marks.append(near[seen])
-        frames.append(np.full(len(near[seen]), frame))
-    uv = np.concatenate(pixels)
-    return pd.DataFrame(
-        {
-            "frame": np.concatenate(frames),
-            "camera": name,
-            "mark": [f"{name}{k}" for k in np.concatenate(marks)],
-            "u_px": uv[:, 0],
-            "v_px": uv[:, 1],
-            "sigma_px": max(table.reference_sigma_px, 1e-4),
-        }
-    )
 
 
 def _thinning(scene: RunScene, rate_hz: float) -> int:

@@ -45,7 +45,7 @@ class CameraView:
         """What the renderer needs."""
         return [
             Silhouette(
-                outline, scene.fleet.looks[k], float(blur), (float(smear[0]), float(smear[1]))
+                outline, scene.population.looks[k], float(blur), (float(smear[0]), float(smear[1]))
             )
             for k, outline, blur, smear in zip(
                 self.particle, self.outline_px, self.blur_px, self.smear_px
@@ -64,7 +64,7 @@ def camera_view(scene: RunScene, frame: int, index: int) -> CameraView:
     """One frame in one camera."""
     camera = list(scene.cameras.values())[index]
     to_rig = scene.rig_from_lab_mm(index, frame)
-    near = _near(camera, scene.lab_mm[:, frame] + to_rig, scene.fleet.d_eq_mm)
+    near = _near(camera, scene.lab_mm[:, frame] + to_rig, scene.population.d_eq_mm)
     centre = scene.lab_mm[near, frame] + to_rig
     outline = outline_px(scene.bodies_lab(frame, near).moved(to_rig), camera)
     area, silhouette, second = outline_moments(outline)
@@ -146,7 +146,7 @@ def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dic
     silhouette's centroid (both with that camera's shake), area, blur, and the flags of
     `CameraView`; blank where the bubble is far from the image.
     """
-    seen = np.zeros(len(scene.fleet.d_eq_mm), bool)
+    seen = np.zeros(len(scene.population.d_eq_mm), bool)
     for view in views.values():
         seen[view.particle[view.visible]] = True
     particle = np.flatnonzero(seen)
@@ -162,7 +162,7 @@ def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dic
         columns[f"{name}_lab_mm"] = lab[:, axis]
         columns[f"v{name}_lab_mm_s"] = velocity[:, axis]
         columns[f"{name}_rig_mm"] = rig[:, axis]
-    columns["d_eq_mm"] = scene.fleet.d_eq_mm[particle]
+    columns["d_eq_mm"] = scene.population.d_eq_mm[particle]
     for name, view in views.items():
         columns |= _camera_columns(name, view, particle)
     return columns

@@ -21,7 +21,7 @@ from telerig.estimator.calibration.solver.covariance import aligned_shift, joint
 from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.start.known_target import stereo_states
-from telerig.io.simulation.calibration.presets import preset
+from telerig.io.simulation.presets import preset
 from telerig.rig.lens_models import GROUPS
 from telerig.rig.triangulation import triangulate
 

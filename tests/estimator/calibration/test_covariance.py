@@ -15,7 +15,7 @@ from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal, parameter_unit
 from telerig.estimator.calibration.start import known_target
-from telerig.io.simulation.calibration.presets import preset
+from telerig.io.simulation.presets import preset
 
 
 def by_marginals(problem: Problem, state: Any) -> Any:

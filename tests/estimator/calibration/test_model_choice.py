@@ -28,7 +28,7 @@ from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.factors.projection import whitened_error
-from telerig.io.simulation.calibration.presets import preset
+from telerig.io.simulation.presets import preset
 from telerig.rig.lens_models import GROUPS, name_of
 
 RICH = model_choice.rich_lens(mono=False, strong=False)

@@ -20,7 +20,7 @@ from telerig.io.rig_file.description import StageDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.io.simulation.calibration.scene import true_cameras, true_target
 from telerig.io.simulation.calibration_files import view_image
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
 AXIS = np.array([0.01, -1.0, 0.02]) / np.linalg.norm([0.01, -1.0, 0.02])

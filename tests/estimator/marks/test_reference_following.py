@@ -12,7 +12,7 @@ from telerig.estimator.marks.following import AMBIGUOUS, HIDDEN, MOVED, Follower
 from telerig.estimator.marks.strip_dots import DotSightings
 from telerig.estimator.marks.tank_view import TankView
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]

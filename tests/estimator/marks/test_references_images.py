@@ -21,8 +21,8 @@ from telerig.estimator.marks.strip_dots import find_dots, learn_look, travel_in_
 from telerig.estimator.marks.tank_view import TankView
 from telerig.estimator.smoothing.results_folder import smooth_run
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.mark_strip_config import StripConfig
-from telerig.io.simulation.run.presets import RunConfig, run_preset
+from telerig.io.simulation.config import RunConfig, StripConfig
+from telerig.io.simulation.presets import run_preset
 from telerig.scripts.main import app
 
 pytestmark = pytest.mark.slow

@@ -28,7 +28,7 @@ from telerig.estimator.rig_drift.from_pairs import PairCollector, rig_change, wi
 from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, learned_noise
 from telerig.estimator.smoothing.problem.problem import RigMode, ShakeModel
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 

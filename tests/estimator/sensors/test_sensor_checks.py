@@ -16,7 +16,7 @@ from telerig.estimator.sensors.accelerometer_checks import (
 )
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.sensors.encoder_checks import check_encoder, encoder_faults
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 
 
 def test_jumps_outside_the_frames_only_warn() -> None:

@@ -15,7 +15,7 @@ import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
 from telerig.estimator.smoothing.truth import motion_error
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.scripts.main import app
 
 

@@ -21,7 +21,7 @@ from telerig.estimator.smoothing.smooth import smooth
 from telerig.io.dataset.run import RunData
 from telerig.io.rig_file.description import StageDescription
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import triangulate
 

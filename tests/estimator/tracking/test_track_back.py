@@ -14,7 +14,7 @@ from telerig.estimator.bubbles.pairing.model import default_model
 from telerig.estimator.tracking.link import Linker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 
 Array = NDArray[np.float64]
 

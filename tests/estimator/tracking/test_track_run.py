@@ -22,7 +22,7 @@ from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions
 from telerig.estimator.tracking.tracks import Tracks
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.scripts.main import app
 
 FRAMES = 14

@@ -11,7 +11,7 @@ import tifffile
 
 from telerig.io.dataset.run import load_run
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.run.presets import run_preset
+from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.run.scene import AXIS_RIG, run_scene
 from telerig.io.simulation.run.views import linear_projection
 from telerig.io.simulation.simulate import simulate

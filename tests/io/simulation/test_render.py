@@ -10,10 +10,10 @@ from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate, pla
 from telerig.io.simulation.images.plates import (
     Light,
     _half_plane_share,
-    digitise,
     disc_coverage,
     render,
 )
+from telerig.io.simulation.images.sensor import digitise
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -10,7 +10,6 @@ import pytest
 import tifffile
 
 from telerig.errors import InputError
-from telerig.io.simulation.calibration.presets import PRESETS, CameraConfig, preset
 from telerig.io.simulation.calibration.scene import (
     hand_held_views,
     true_cameras,
@@ -18,7 +17,9 @@ from telerig.io.simulation.calibration.scene import (
     wholly_inside,
 )
 from telerig.io.simulation.calibration_files import exact_dots, view_image
+from telerig.io.simulation.config import CameraConfig
 from telerig.io.simulation.images.plate_view import pixel_from_plate
+from telerig.io.simulation.presets import PRESETS, preset
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

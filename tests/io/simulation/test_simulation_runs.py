@@ -13,18 +13,11 @@ from typer.testing import CliRunner
 
 from telerig.errors import InputError
 from telerig.io.dataset.run import load_run
-from telerig.io.simulation.calibration.presets import SimulationConfig
 from telerig.io.simulation.calibration.scene import true_cameras
+from telerig.io.simulation.config import BubbleConfig, ImageConfig, RunConfig, SimulationConfig
 from telerig.io.simulation.images.bodies import volume_centre_mm
-from telerig.io.simulation.run.fleet import lamb_frequency_hz
-from telerig.io.simulation.run.presets import (
-    RUN_PRESETS,
-    BubbleConfig,
-    ImageConfig,
-    RunConfig,
-    any_preset,
-    run_preset,
-)
+from telerig.io.simulation.presets import RUN_PRESETS, any_preset, run_preset
+from telerig.io.simulation.run.population import lamb_frequency_hz
 from telerig.io.simulation.run.scene import AXIS_RIG, run_scene
 from telerig.io.simulation.run.views import camera_view
 from telerig.io.simulation.simulate import simulate
@@ -112,7 +105,7 @@ def test_bodies_have_their_volume_where_the_truth_says():
 def test_rise_is_the_run_of_2004():
     run = scene("rise")
     assert run.lab_mm.shape == (1, 59, 3) and np.allclose(np.diff(run.t_s), 0.01)
-    assert 4.0 <= run.fleet.d_eq_mm[0] <= 5.0
+    assert 4.0 <= run.population.d_eq_mm[0] <= 5.0
     views = [camera_view(run, frame, j) for frame in range(59) for j in range(2)]
     assert all(view.whole.all() and len(view.whole) == 1 for view in views)
     shift = np.concatenate([view.silhouette_px - view.centre_px for view in views])
@@ -144,7 +137,7 @@ def test_swarm_has_its_bubbles_in_view_and_they_come_and_go(seed):
 def test_bubbles_never_touch():
     run = scene("swarm", bubbles=30)
     gap = np.linalg.norm(run.lab_mm[:, None] - run.lab_mm, axis=-1).min(-1)
-    room = (run.fleet.d_eq_mm[:, None] + run.fleet.d_eq_mm) / 2
+    room = (run.population.d_eq_mm[:, None] + run.population.d_eq_mm) / 2
     off = ~np.eye(len(gap), dtype=bool)
     assert np.all(gap[off] > room[off])
     config = run_preset("rise", bubbles=60)

@@ -1,25 +1,126 @@
-"""What a simulated run is like: every number that can be set, and named examples."""
+"""What a simulated calibration or run is like: every number that can be set."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from telerig.errors import InputError
-from telerig.io.simulation.calibration.presets import (
-    PRESETS,
-    CameraConfig,
-    SimulationConfig,
-    preset,
-)
-from telerig.io.simulation.run.mark_strip_config import StripConfig
 from telerig.rig.target import Target
 
 Range = tuple[float, float]
+Vector = tuple[float, float, float]
 Oscillation = tuple[float, float, float]
 """RMS (mm), frequency (Hz), damping of a stochastic oscillation."""
+
+MARKS_AT = 0.88
+"""Where a strip of marks stands, from the image's middle over half its width."""
+
+MARKS_JITTER = 0.25
+"""Unevenness of a strip of marks, over their spacing."""
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """A true camera, and what the rig file will say of it.
+
+    scale_px_per_mm : true; nominal_scale_px_per_mm : in `rig.toml`.
+    centre_offset_px : of the optical axis from the image's centre.
+    parameters : further true parameters by their names in `telerig.rig.projection.PARAMETERS`.
+    nominal_telecentricity_per_mm : in `rig.toml`; None leaves it out.
+    """
+
+    name: str
+    image_size_px: tuple[int, int] = (512, 512)
+    scale_px_per_mm: float = 10.0
+    nominal_scale_px_per_mm: float = 10.0
+    centre_offset_px: Range = (0.0, 0.0)
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    nominal_telecentricity_per_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """A rig, a target, hand-held poses and the quality of the images.
+
+    Rig: the second camera is turned by ``angle_deg`` about the rig's y axis, then by the mounting
+    error ``mount_rotvec_deg``, which the rig file does not know; the optical axes pass each other
+    at ``axis_gap_mm``. One or two cameras.
+
+    Target: true dots are off by ``target.print_sigma_mm`` in the plane and
+    ``target.flatness_sigma_mm`` out of it, times ``print_factor``. The known distance is measured
+    on the true dots, within ``target.scale_sigma_mm``. Of an unbounded grid, ``margin_dots``
+    beyond the block exist. ``ring_hole_ratio`` is a ring's hole over its diameter.
+
+    Poses: the angle between each optical axis and the plate's normal is within ``tilt_deg``, the
+    roll within +-``roll_deg``, the middle of the target within +-``shift_mm`` of the rig's origin
+    along the rig's axes. At least ``visible_fraction`` of the dots lie wholly inside the images,
+    ``border_px`` from their border, and the marks too if ``marks_visible``. The last
+    ``single_camera_views`` views are seen by one camera only, in turn.
+
+    Dot tables (no images): ``sigma_px`` per coordinate; a share ``outlier_fraction`` is off by
+    ``outlier_px`` (standard deviation) besides. With ``sigma_px`` 0 the table is exact.
+
+    Images: ``blur_px`` (Gaussian sigma); ``noise`` is that of reading over the contrast between
+    dot and plate; ``shot_noise`` at full scale, over full scale; ``white``, ``black`` and
+    ``background`` are fractions of full scale. ``light_gradient`` per half diagonal in a random
+    direction, ``vignetting`` in the corners, ``exposure_spread`` from image to image (relative),
+    ``glare`` (strength over full scale) at a random place, ``dirt`` specks per plate.
+    """
+
+    name: str
+    cameras: tuple[CameraConfig, ...]
+    target: Target
+    views: int = 12
+    angle_deg: float = 90.0
+    mount_rotvec_deg: Vector = (0.4, -0.7, 0.5)
+    axis_gap_mm: float = 0.3
+    print_factor: float = 1.0
+    margin_dots: int = 0
+    plate_margin_mm: float = 4.0
+    ring_hole_ratio: float = 0.4
+    tilt_deg: Range = (25.0, 65.0)
+    roll_deg: float = 180.0
+    shift_mm: Vector = (15.0, 15.0, 15.0)
+    visible_fraction: float = 1.0
+    marks_visible: bool = True
+    border_px: float = 6.0
+    single_camera_views: int = 0
+    sigma_px: float = 0.01
+    outlier_fraction: float = 0.0
+    outlier_px: float = 10.0
+    blur_px: float = 0.8
+    noise: float = 0.01
+    shot_noise: float = 0.0
+    bit_depth: int = 8
+    white: float = 0.7
+    black: float = 0.1
+    background: float = 0.22
+    light_gradient: float = 0.15
+    vignetting: float = 0.1
+    exposure_spread: float = 0.05
+    glare: float = 0.0
+    glare_radius_px: float = 20.0
+    dirt: int = 0
+    dirt_diameter_mm: Range = (0.1, 0.5)
+
+    def __post_init__(self) -> None:
+        """Raises InputError for values that no simulation can have."""
+        low, high = self.tilt_deg
+        faults = {
+            "views": (self.views < 1, "at least 1"),
+            "tilt_deg": (not 0 <= low < high <= 85, "0 <= low < high <= 85"),
+            "visible_fraction": (not 0 <= self.visible_fraction <= 1, "between 0 and 1"),
+            "outlier_fraction": (not 0 <= self.outlier_fraction <= 1, "between 0 and 1"),
+            "single_camera_views": (not 0 <= self.single_camera_views <= self.views, "0 to views"),
+        }
+        amounts = (
+            *("sigma_px", "outlier_px", "blur_px", "noise", "shot_noise", "print_factor"),
+            *("margin_dots", "dirt", "exposure_spread", "glare"),
+        )
+        faults |= {name: (not getattr(self, name) >= 0, "0 or more") for name in amounts}
+        _refuse(self.name, {name: getattr(self, name) for name in faults}, faults)
 
 
 @dataclass(frozen=True)
@@ -167,6 +268,22 @@ class TableConfig:
 
 
 @dataclass(frozen=True)
+class StripConfig:
+    """A strip of dots fixed to the tank for each camera, drawn into the images.
+
+    dots : in view at a time. diameter_mm. transmission : of the ink. at, jitter : as `MARKS_AT`,
+    `MARKS_JITTER`. depth_mm : its depth is drawn from -depth_mm to depth_mm.
+    """
+
+    dots: int = 6
+    diameter_mm: float = 1.0
+    transmission: float = 0.08
+    at: float = MARKS_AT
+    jitter: float = MARKS_JITTER
+    depth_mm: float = 0.0
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """A run and its calibration; ``bubbles`` in view at a time; ``strip`` drawn into images."""
 
@@ -184,173 +301,25 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Raises InputError for values that no run can have."""
-        faults = [
-            ("frames", self.frames, self.frames < 1, "at least 1"),
-            ("bubbles", self.bubbles, self.bubbles < 0, "0 or more"),
-            ("frame_rate_hz", self.frame_rate_hz, not self.frame_rate_hz > 0, "positive"),
-            ("d_eq_mm", self.bubble.d_eq_mm, not self.bubble.d_eq_mm[0] > 0, "positive"),
-            ("blur_px", self.image.blur_px, not self.image.blur_px >= 0.2, "at least 0.2"),
-            ("dropped", self.image.dropped, not 0 <= self.image.dropped < 1, "within 0 and 1"),
-            ("bubbles", self.bubbles, self.motion.pairs and self.bubbles % 2, "even: pairs"),
-        ]
-        for name, value, wrong, wanted in faults:
-            if wrong:
-                where = f"simulation {self.name!r}"
-                raise InputError(f"{name} is {value}", where=where, todo=f"must be {wanted}")
+        lone = self.motion.pairs and self.bubbles % 2
+        faults = {
+            "frames": (self.frames < 1, "at least 1"),
+            "bubbles": (self.bubbles < 0 or lone, "even: pairs" if lone else "0 or more"),
+            "frame_rate_hz": (not self.frame_rate_hz > 0, "positive"),
+            "d_eq_mm": (not self.bubble.d_eq_mm[0] > 0, "positive"),
+            "blur_px": (not self.image.blur_px >= 0.2, "at least 0.2"),
+            "dropped": (not 0 <= self.image.dropped < 1, "within 0 and 1"),
+        }
+        values = vars(self.bubble) | vars(self.image) | vars(self)
+        _refuse(self.name, values, faults)
 
 
-def run_preset(name: str, **changes: Any) -> RunConfig:
-    """A named run, with some fields replaced: ``run_preset("swarm", frames=20, bubbles=40)``.
-
-    Raises InputError for an unknown name or field.
-    """
-    if name not in RUN_PRESETS:
-        raise InputError(f"no preset {name!r}", todo=f"choose one of {', '.join(RUN_PRESETS)}")
-    unknown = set(changes) - set(RunConfig.__dataclass_fields__)
-    if unknown:
-        raise InputError(
-            f"a simulated run has no setting {sorted(unknown)}",
-            todo=f"choose among {', '.join(RunConfig.__dataclass_fields__)}",
-        )
-    return replace(RUN_PRESETS[name](), **changes)
-
-
-def any_preset(name: str) -> SimulationConfig | RunConfig:
-    """A named calibration or run. Raises InputError for an unknown name."""
-    if name in RUN_PRESETS:
-        return run_preset(name)
-    if name in PRESETS:
-        return preset(name)
-    raise InputError(
-        f"no preset {name!r}", todo=f"choose one of {', '.join([*PRESETS, *RUN_PRESETS])}"
-    )
-
-
-def _calibration(
-    name: str, size_px: tuple[int, int], scale_px_per_mm: float, target_scale: float
-) -> SimulationConfig:
-    """The calibration of `paper` for cameras of another size and scale."""
-    paper = preset("paper")
-    ratio = scale_px_per_mm / 10
-    cameras = tuple(
-        CameraConfig(
-            c.name,
-            size_px,
-            c.scale_px_per_mm * ratio,
-            scale_px_per_mm,
-            c.centre_offset_px,
-            c.parameters,
-        )
-        for c in paper.cameras
-    )
-    pitch = 7.0 * target_scale
-    target = Target(
-        rows=3,
-        columns=5,
-        pitch_mm=(pitch, pitch),
-        dot_diameter_mm=2.4 * target_scale,
-        marks=((1, 2), (1, 3), (0, 2)),
-        mark_diameter_mm=3.6 * target_scale,
-        scale_dots=(0, 14),
-    )
-    reach = 15.0 * target_scale
-    return replace(paper, name=name, cameras=cameras, target=target, shift_mm=(reach, reach, reach))
-
-
-def _rise() -> RunConfig:
-    bubble = BubbleConfig(
-        modes_static={3: 0.02}, modes_oscillating={2: 0.04, 3: 0.03}, d_eq_mm=(4.0, 5.0)
-    )
-    return RunConfig("rise", replace(preset("paper"), name="rise"), bubble=bubble)
-
-
-def _swarm() -> RunConfig:
-    bubble = BubbleConfig(
-        d_eq_mm=(0.8, 4.0),
-        aspect=(1.0, 1.35),
-        triaxial=0.04,
-        modes_static={3: 0.006, 4: 0.004},
-        modes_oscillating={2: 0.02, 3: 0.012},
-    )
-    motion = MotionConfig(
-        "stochastic",
-        rise_mm_s=(220.0, 280.0),
-        wander_mm_s=10.0,
-        lateral_oscillation=(0.8, 6.0, 0.05),
-        spread=(0.9, 0.9),
-    )
-    return RunConfig(
-        "swarm",
-        _calibration("swarm", (1280, 800), 20.0, 0.8),
-        frames=100,
-        frame_rate_hz=500.0,
-        bubbles=20,
-        bubble=bubble,
-        motion=motion,
-        stage=StageConfig(follow=0.6, ramp_s=0.0, shake_mm=0.05),
-        image=ImageConfig(window_dirt=30, lens_dirt=25, defocus_px_per_mm=0.05),
-    )
-
-
-def _crossing() -> RunConfig:
-    bubble = BubbleConfig(d_eq_mm=(0.22, 0.24), aspect=(1.0, 1.05), triaxial=0.0)
-    motion = MotionConfig(
-        "stochastic",
-        rise_mm_s=(280.0, 280.0),
-        wander_mm_s=10.0,
-        height_oscillation=(0.177, 12.0, 0.03),
-        lateral_oscillation=(0.5, 6.0, 0.03),
-        spread=(0.6, 0.6),
-        pairs=True,
-    )
-    return RunConfig(
-        "crossing",
-        _calibration("crossing", (1280, 800), 40.0, 0.45),
-        frames=30,
-        frame_rate_hz=100.0,
-        bubbles=10,
-        bubble=bubble,
-        motion=motion,
-        stage=StageConfig(ramp_s=0.0, shake_mm=0.2),
-        table=TableConfig(centre="volume"),
-    )
-
-
-def _scenario(
-    name: str, frame_rate_hz: float, shake_hz: float, shake_mm: float, sigma_px: float
-) -> RunConfig:
-    """A benchmark of the smoother: 0.1 mm/px, 1.5 s (S0: 59 frames), everything measured."""
-    size = (1024, 1024)
-    calibration = replace(_calibration(name, size, 10.0, 1.0), name=name)
-    motion = MotionConfig(
-        "stochastic", wander_mm_s=10.0, lateral_oscillation=(2.0, 6.0, 0.03), spread=(0.5, 0.5)
-    )
-    stage = StageConfig(
-        ramp_s=0.1, shake_hz=shake_hz, shake_mm=shake_mm, accelerometers=("left", "right")
-    )
-    table = TableConfig(sigma_px=sigma_px, centre="volume", particle_ids=True, references=4)
-    frames = 59 if name == "S0" else round(1.5 * frame_rate_hz)
-    return RunConfig(
-        name, calibration, frames, frame_rate_hz, 1, motion=motion, stage=stage, table=table
-    )
-
-
-_SCENARIOS = {
-    "S0": (100.0, 12.0, 0.2, 1.5),
-    "S1": (500.0, 8.0, 0.2, 0.5),
-    "S2": (500.0, 20.0, 0.2, 0.5),
-    "S3": (500.0, 12.0, 0.2, 0.5),
-    "S4": (1000.0, 40.0, 0.5, 0.1),
-    "S5": (100.0, 8.0, 0.05, 1.5),
-    "S6": (500.0, 8.0, 0.5, 0.5),
-}
-"""Frame rate, shake frequency, shake amplitude (mm), noise (px) of the smoother's benchmarks."""
-
-
-RUN_PRESETS: Mapping[str, Callable[[], RunConfig]] = {
-    "rise": _rise,
-    "swarm": _swarm,
-    "crossing": _crossing,
-    **{name: partial(_scenario, name, *numbers) for name, numbers in _SCENARIOS.items()},
-}
-"""Named runs; `run_preset` makes one."""
+def _refuse(name: str, values: Mapping[str, Any], faults: Mapping[str, tuple[Any, str]]) -> None:
+    """Raise InputError for the first setting that is wrong; says what it must be."""
+    for setting, (wrong, wanted) in faults.items():
+        if wrong:
+            raise InputError(
+                f"{setting} is {values[setting]}",
+                where=f"simulation {name!r}",
+                todo=f"must be {wanted}",
+            )

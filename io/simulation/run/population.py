@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.io.simulation.config import BubbleConfig, Range
 from telerig.io.simulation.images.bodies import MODES
 from telerig.io.simulation.images.bubbles import Look
-from telerig.io.simulation.run.presets import BubbleConfig, Range
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -22,7 +22,7 @@ _DENSITY_KG_M3 = 998.0
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Population:
     """What stays the same of each of B bubbles.
 
     d_eq_mm : (B,); semi_axes_mm : (B, 3), proportions, the third along the path.
@@ -49,7 +49,7 @@ def lamb_frequency_hz(degree: int, d_eq_mm: float) -> float:
     return float(np.sqrt(square) / (2 * np.pi))
 
 
-def random_fleet(config: BubbleConfig, count: int, rng: Generator) -> Fleet:
+def random_population(config: BubbleConfig, count: int, rng: Generator) -> Population:
     """Draw ``count`` bubbles."""
     d_eq = rng.uniform(*config.d_eq_mm, count)
     aspect = rng.uniform(*config.aspect, count)
@@ -69,7 +69,7 @@ def random_fleet(config: BubbleConfig, count: int, rng: Generator) -> Fleet:
     turn = rng.uniform(0, 2 * np.pi, count)
     looks = tuple(_look(config, rng) for _ in range(count))
     swing_hz = np.reshape(hertz, (count, len(MODES)))
-    return Fleet(d_eq, axes, static, swing, swing_hz, phase, spin, turn, looks)
+    return Population(d_eq, axes, static, swing, swing_hz, phase, spin, turn, looks)
 
 
 def _look(config: BubbleConfig, rng: Generator) -> Look:

@@ -1,4 +1,4 @@
-"""A strip of dots fixed to the tank in a simulated run: its places, its pictures and its truth."""
+"""Marks fixed to the tank in a simulated run: places, pictures, `references.csv` and truth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.io.simulation.config import MARKS_AT, MARKS_JITTER
 from telerig.io.simulation.images.bubbles import Look, Silhouette
 from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
 from telerig.rig.camera import Camera
@@ -101,6 +102,33 @@ def strip_places(
     origin, _ = camera.unproject(size / 2 * np.array([1 + side, 1.0]))
     foot = origin - AXIS_RIG * (origin @ AXIS_RIG)
     return np.asarray(foot + heights[:, None] * AXIS_RIG)
+
+
+def references_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
+    """`references.csv`: marks fixed to the tank, which pass through the image as the stage moves.
+
+    Each camera has a strip of its own, at unknown uneven heights, so many in view at a time as
+    the configuration says.
+    """
+    import pandas as pd
+
+    table = scene.config.table
+    parts = []
+    for j, (name, camera) in enumerate(scene.cameras.items()):
+        places = strip_places(
+            camera, scene.position_mm, table.references, rng, at=MARKS_AT, jitter=MARKS_JITTER
+        )
+        strip = Strip(camera, places, 0.0, Look())
+        size = np.array(camera.image_size_px) - 1
+        for frame in range(scene.config.frames):
+            marks, exact = strip.seen(scene.rig_from_lab_mm(j, frame))
+            noise = table.reference_sigma_px * rng.standard_normal(exact.shape)
+            uv = np.clip(exact + noise, 0, size)
+            columns = {"frame": frame, "camera": name, "mark": [f"{name}{k}" for k in marks]}
+            parts.append(pd.DataFrame(columns | {"u_px": uv[:, 0], "v_px": uv[:, 1]}))
+    out = pd.concat(parts, ignore_index=True)
+    out["sigma_px"] = max(table.reference_sigma_px, 1e-4)
+    return out
 
 
 def strip_truth(scene: RunScene, strips: Sequence[Strip]) -> pd.DataFrame:

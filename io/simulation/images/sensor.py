@@ -1,0 +1,41 @@
+"""The camera's sensor: from grey levels to the noisy integers that it delivers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+def digitise(
+    grey: NDArray[np.floating],
+    rng: np.random.Generator,
+    *,
+    read_noise: float,
+    shot_noise: float = 0.0,
+    bit_depth: int = 8,
+    left_aligned: bool = False,
+) -> Image:
+    """(height, width) grey levels in fractions of full scale -> integers, clipped at full scale.
+
+    read_noise : standard deviation; shot_noise : standard deviation at full scale (it grows with
+    the root of the grey level). Noise is computed in the precision of ``grey``.
+    left_aligned : data of fewer than 16 bits stand in the high bits of 16, as many cameras write.
+    Raises InputError for a bit depth outside 8..16.
+    """
+    if not 8 <= bit_depth <= 16:
+        raise InputError(f"a bit depth of {bit_depth}", todo="choose 8 to 16 bits")
+    kind = grey.dtype.type
+    full = kind(2**bit_depth - 1)
+    levels = rng.standard_normal(grey.shape, dtype=kind)
+    levels *= np.sqrt(kind(read_noise**2) + kind(shot_noise**2) * np.clip(grey, 0, 1))
+    levels += grey
+    levels *= full
+    np.clip(np.rint(levels, out=levels), 0, full, out=levels)
+    if bit_depth == 8:
+        return levels.astype(np.uint8)
+    aligned = levels.astype(np.uint16) << (16 - bit_depth if left_aligned else 0)
+    return aligned.astype(np.uint16, copy=False)

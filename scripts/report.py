@@ -89,7 +89,7 @@ def _film(
     results: ResultsFolder, place: Path, kind: FilmFormat, run: Path | None, stage: Progress
 ) -> None:
     """Both films; the second only where the recording's images are at hand."""
-    from telerig.io.report.film.film import write_path_film
+    from telerig.io.report.film.path import write_path_film
 
     endings = ("mp4", "gif") if kind is FilmFormat.both else (kind.value,)
     files = [place / f"path.{ending}" for ending in endings]

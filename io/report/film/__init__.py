@@ -1,1 +1,5 @@
-"""Films of a run: the path in space, and both camera views. Read ``film`` and ``views`` first."""
+"""Films of a run: the path in space turned round, and both cameras' images with what was found.
+
+In: a tracked run's results folder, the calibration beside it, and for ``views`` the recording's
+images. Out: MP4 and GIF files (``files``). Read ``path`` and ``views`` first.
+"""

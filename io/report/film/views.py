@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.report.film.files import Progress, write_film
+from telerig.io.report.film.files import Progress, font, write_film
 from telerig.io.report.page.results_tables import optional_columns
 
 if TYPE_CHECKING:
@@ -272,8 +272,6 @@ def _words(
     colour: Colour = (28, 31, 36),
 ) -> None:
     from PIL import Image, ImageDraw
-
-    from telerig.io.report.film.drawing import font
 
     canvas = Image.fromarray(page)
     ImageDraw.Draw(canvas).text(

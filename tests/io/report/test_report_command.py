@@ -160,7 +160,7 @@ def test_films_of_a_run_as_gif(filmed: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "av", None)
     said = command(filmed, "--film", code=2)
     assert "pip install 'telerig[video]'" in said and "--format gif" in said
-    monkeypatch.setattr("telerig.io.report.film.film.STEP_DEG", 30)
+    monkeypatch.setattr("telerig.io.report.film.path.STEP_DEG", 30)
     said = command(filmed, "--film", "--format", "gif")
     for name, count in (("path", 12), ("views", FRAMES)):
         assert f"written: {filmed / 'film' / name}.gif (" in said
@@ -172,7 +172,7 @@ def test_films_of_a_run_as_gif(filmed: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_without_the_recording_only_the_path_is_filmed(
     filmed: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("telerig.io.report.film.film.STEP_DEG", 60)
+    monkeypatch.setattr("telerig.io.report.film.path.STEP_DEG", 60)
     shutil.move(tmp_path / "runs" / "rise", tmp_path / "elsewhere")
     said = command(filmed, "--film", "--format", "gif")
     assert "both views: left out" in said and "--run" in said
@@ -206,7 +206,7 @@ def test_the_pages_commands_and_code_run(
     for name in ("results", "runs"):
         shutil.move(tmp_path / name, tmp_path / "tank2" / name)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("telerig.io.report.film.film.STEP_DEG", 60)
+    monkeypatch.setattr("telerig.io.report.film.path.STEP_DEG", 60)
     lines = re.findall(r"^telerig report (.*)$", text, re.M)
     assert len(lines) == 7
     for line in lines:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,17 @@ from PIL import Image
 
 from telerig.errors import GeometryError, InputError
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
-from telerig.io.report.film import drawing, geometry
-from telerig.io.report.film.drawing import draw_path, film_layout, project_px, view_matrix
-from telerig.io.report.film.film import write_path_film
-from telerig.io.report.film.geometry import (
+from telerig.io.report.film import path as film_path
+from telerig.io.report.film.path import (
     FilmPath,
+    draw_path,
     ellipsoids_from_outlines,
     film_axes,
+    film_layout,
+    project_px,
     read_film_path,
+    view_matrix,
+    write_path_film,
 )
 from telerig.io.report.run.tracking.cameras import run_cameras
 from telerig.io.report.run.tracking.results import read_track_results
@@ -45,14 +47,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def films(run: Path) -> Iterator[Path]:
-    """Both films, at half their size to be quick."""
+def films(run: Path) -> Path:
+    """Both films, somewhat smaller, to be quick."""
     place = run / "film"
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("HEIGHT_PX", "_NARROW_PX", "_WIDE_PX"):
-            patch.setattr(drawing, name, getattr(drawing, name) // 4 * 2)
+        patch.setattr(film_path, "DPI", 80)
         write_path_film(run, [place / "path.mp4", place / "path.gif"])
-        yield place
+    return place
 
 
 def _path(points: Any, **changes: Any) -> FilmPath:
@@ -77,11 +78,13 @@ def test_the_film_goes_round_once_and_its_other_half_is_mirrored(run: Path, film
     path = read_film_path(run, two_cameras())
     layout = film_layout(path)
     assert len(frames) == 180
-    assert {f.shape for f in frames} == {(layout.size_px[1], layout.size_px[0], 3)}
+    assert {f.shape for f in frames} == {
+        (layout.size_px[1] * 4 // 5, layout.size_px[0] * 4 // 5, 3)
+    }
     end, panel = path.points_mm[-1:], layout.panels[0]
-    places = [project_px(panel, end, 2.0 * k)[0] for k in range(180)]
+    places = [project_px(panel, end, 2.0 * k)[0] * 0.8 for k in range(180)]
     assert all(_is_blue(frames[k], places[k]) for k in (0, 20, 45, 90, 110, 179))
-    middle = project_px(panel, (panel.low_mm + panel.high_mm)[None] / 2, 0.0)[0]
+    middle = project_px(panel, (panel.low_mm + panel.high_mm)[None] / 2, 0.0)[0] * 0.8
     assert abs(places[0][0] - middle[0]) > 12
     assert places[90][0] - middle[0] == pytest.approx(middle[0] - places[0][0])
     mirrored = np.array([2 * middle[0] - places[0][0], places[90][1]])
@@ -184,7 +187,7 @@ def test_a_slender_path_has_a_second_panel_drawn_wider() -> None:
 
 
 def test_a_long_path_is_thinned_with_words(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(geometry, "MOST_POINTS", 8)
+    monkeypatch.setattr(film_path, "MOST_POINTS", 8)
     path = read_film_path(run, two_cameras())
     assert len(path.points_mm) <= 9
     assert path.notes[0] == f"{len(path.points_mm)} of {FRAMES} positions drawn"

@@ -1,0 +1,552 @@
+"""The film of a run's path in space, turned once about the vertical."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.files.csv_table import Column
+from telerig.io.machine.parallel import ordered_map, quick_workers
+from telerig.io.report.film.files import Picture, Progress, font, write_film
+from telerig.io.report.page.results_tables import optional_columns
+from telerig.io.report.run.smoothing.results import read_smoothing_results
+from telerig.io.report.run.tracking.cameras import run_cameras
+from telerig.io.report.run.tracking.results import TrackResults, read_track_results
+from telerig.io.report.run.tracking.scene import thinned, track_colour
+from telerig.rig.camera import Camera
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+STEP_DEG = 2
+MOST_POINTS = 3_000
+MOST_BODIES = 120
+_SPACING = 1.7
+_STEP_MM = 0.01
+_THINNEST = 0.05
+_PLACE, _SD = ["x_mm", "y_mm", "z_mm"], ["sx_mm", "sy_mm", "sz_mm"]
+_VARIANCE = ["sxx_mm2", "syy_mm2", "szz_mm2"]
+_ELLIPSE = ["a_px", "b_px", "angle_rad"]
+
+DPI = 100
+"""Of the pictures; all lengths below in px are at 100 dpi."""
+
+_HEIGHT_PX, _NARROW_PX, _WIDE_PX = 960, 560, 960
+_ABOVE_PX, _BELOW_PX, _SIDE_PX = 112, 92, 74
+_LEFT_PX, _RIGHT_PX = 300, 500
+_ELEVATION_DEG, _ELEVATION_STRETCHED_DEG = 14.0, 4.0
+_SLENDER, _STRETCHED = 3.5, 0.6
+_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_LEAST_BAND_PX, _TICK_PX = 2.5, 46
+_MOST_NAMES = 12
+_INK, _SOFT, _EDGE = "#1c1f24", "#5b626d", "#c4c9d1"
+_SHADES = ((1.0, 0.62), (0.72, 0.74), (0.42, 0.86))
+"""Size and share of white of the three discs that shade a bubble, lightest towards upper left."""
+
+
+def write_path_film(
+    results_folder: Path, files: Sequence[Path], *, stage: Progress | None = None
+) -> tuple[str, ...]:
+    """Film the path that a run's results folder holds, from 180 sides; what to know, in words.
+
+    The view goes round the vertical in steps of 2 degrees, 25 pictures a second. Bubbles are
+    ellipsoids from both outlines where the calibration is at hand (`results_cameras`), else
+    spheres; the band round a path is +-2 sd, widened by a factor that stands in the film where it
+    would be thinner than a line. A long run's path is thinned.
+
+    files : .mp4 (needs PyAV), .gif. Raises InputError for results that cannot be read or hold no
+    path, and files that cannot be written.
+    """
+    folder = Path(results_folder)
+    cameras, why = run_cameras(folder, read_track_results(folder))
+    path = read_film_path(folder, cameras)
+    angles = [float(angle) for angle in range(0, 360, STEP_DEG)]
+    draw = partial(draw_path, path, film_layout(path))
+    pictures = ordered_map(draw, angles, quick_workers(len(angles)))
+    write_film(pictures, len(angles), files, what="turning the path", stage=stage)
+    return (*path.notes, *([f"spheres, because {why}"] if why else []))
+
+
+@dataclass(frozen=True)
+class FilmPath:
+    """Paths in the film's axes: right and forward (away from the viewer) at angle 0, and up.
+
+    points_mm, sd_mm : (N, 3), by particle and frame. particle : (N,). new : (N,), rows before
+    which the line is interrupted. bodies : (B,) rows of the points whose bubble is drawn.
+    quadrics_mm2 : (B, 3, 3), Q of the ellipsoid x^T Q^-1 x = 1. names : of the three axes.
+    notes : what a viewer must know.
+    """
+
+    points_mm: Array
+    sd_mm: Array
+    particle: NDArray[np.int64]
+    new: NDArray[np.bool_]
+    bodies: NDArray[np.int64]
+    quadrics_mm2: Array
+    names: tuple[str, str, str]
+    title: str
+    notes: tuple[str, ...]
+
+
+def film_axes(up: Array) -> Array:
+    """(3, 3) rows right, forward, up in rig axes; (right, up, -forward) is right-handed.
+
+    right is the rig axis x, or z where x is upright.
+    """
+    first = np.eye(3)[0 if abs(up[0]) < 0.7 else 2]
+    right = first - (first @ up) * up
+    right /= np.linalg.norm(right)
+    return np.array([right, np.cross(up, right), up])
+
+
+def read_film_path(folder: Path, cameras: tuple[Camera, Camera] | None) -> FilmPath:
+    """The path that a run's results folder holds: smoothed in the lab frame, else the tracks.
+
+    cameras : for the bubbles' bodies from both outlines; without them they are spheres.
+    Raises InputError for a folder that cannot be read, or holds no point.
+    """
+    results = read_track_results(folder)
+    smoothing = read_smoothing_results(folder, results.up)
+    table, title = _table(results, None if smoothing is None else smoothing.trajectories)
+    found = int(np.isfinite(table[_PLACE].to_numpy(float)).all(1).sum())
+    if not found:
+        raise InputError(
+            "no bubble was followed, so there is no path to film", where=str(folder),
+            todo="look at the run's report.html for the reasons",
+        )  # fmt: skip
+    kept = thinned(table, MOST_POINTS).reset_index(drop=True)
+    notes = [f"{len(kept)} of {found} positions drawn"] if len(kept) < found else []
+    axes = film_axes(results.up)
+    rows, quadrics, how = _bodies(folder, results, kept, cameras)
+    names = tuple(_axis_name(direction) for direction in axes[:2])
+    return FilmPath(
+        kept[_PLACE].to_numpy(float) @ axes.T,
+        np.sqrt(kept[_SD].to_numpy(float) ** 2 @ (axes.T**2)),
+        kept["particle"].to_numpy(np.int64),
+        kept["new"].to_numpy(bool),
+        rows,
+        axes @ quadrics @ axes.T,
+        (names[0], names[1], "height"),
+        f"{results.content.get('run') or folder.name}: {title}",
+        (*notes, how),
+    )
+
+
+def _table(results: TrackResults, smoothed: pd.DataFrame | None) -> tuple[pd.DataFrame, str]:
+    """Rows with frame, particle, place and sd."""
+    if smoothed is not None and len(smoothed):
+        missing = {name: np.nan for name in _SD if name not in smoothed}
+        return smoothed.assign(**missing), "smoothed, lab frame"
+    variance = results.tracks[_VARIANCE].to_numpy(float)
+    sd = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    return results.tracks.assign(**dict(zip(_SD, sd.T))), "triangulated, rig frame"
+
+
+def _axis_name(direction: Array) -> str:
+    axis = int(np.argmax(np.abs(direction)))
+    return ("" if direction[axis] > 0 else "-") + "xyz"[axis]
+
+
+def _bodies(
+    folder: Path,
+    results: TrackResults,
+    kept: pd.DataFrame,
+    cameras: tuple[Camera, Camera] | None,
+) -> tuple[NDArray[np.int64], Array, str]:
+    """Rows of ``kept``, their quadrics in rig axes, and in words what is drawn."""
+    here = kept[["frame", "particle"]].assign(row=np.arange(len(kept)))
+    sizes = results.tracks[["frame", "particle", "d_eq_mm", *_PLACE]].merge(
+        here, on=["frame", "particle"]
+    )
+    sizes = sizes[np.isfinite(sizes["d_eq_mm"].to_numpy(float))].sort_values("row")
+    sizes = sizes.iloc[_apart(kept, sizes)].reset_index(drop=True)
+    radius = sizes["d_eq_mm"].to_numpy(float) / 2
+    quadrics = radius[:, None, None] ** 2 * np.eye(3)
+    rows = sizes["row"].to_numpy(np.int64)
+    ellipses = _ellipses(folder, sizes, cameras)
+    if cameras is None or ellipses is None:
+        return rows, quadrics, "bubbles: spheres of equal volume"
+    seen = np.isfinite(ellipses).all((1, 2))
+    if seen.any():
+        points = sizes.loc[seen, _PLACE].to_numpy(float)
+        quadrics[seen] = ellipsoids_from_outlines(cameras, points, ellipses[seen])
+    return rows, quadrics, "bubbles: ellipsoids from both outlines"
+
+
+def _apart(kept: pd.DataFrame, sizes: pd.DataFrame) -> list[int]:
+    """Rows of ``sizes`` so far apart along their tracks that bubbles do not hide each other."""
+    points = kept[_PLACE].to_numpy(float)[sizes["row"].to_numpy(np.int64)]
+    particle, diameter = sizes["particle"].to_numpy(), sizes["d_eq_mm"].to_numpy(float)
+    chosen: list[int] = []
+    for i in range(len(sizes)):
+        last = chosen[-1] if chosen else -1
+        far = np.linalg.norm(points[i] - points[last]) > _SPACING * diameter[i]
+        if last < 0 or particle[i] != particle[last] or far:
+            chosen.append(i)
+    return chosen[:: len(chosen) // MOST_BODIES + 1]
+
+
+def _ellipses(
+    folder: Path, sizes: pd.DataFrame, cameras: tuple[Camera, Camera] | None
+) -> Array | None:
+    """(B, cameras, 3) semi-axes and angle; NaN where a bubble was not seen."""
+    names = [Column(n, required=False, blank=True) for n in _ELLIPSE]
+    key = [
+        Column("frame", "whole"),
+        Column("camera", "text"),
+        Column("particle", "text", blank=True),
+    ]
+    table: pd.DataFrame = optional_columns(folder / "detections.csv", [*key, *names])
+    if cameras is None or not len(table) or any(name not in table for name in _ELLIPSE):
+        return None
+    table = table[table["particle"] != ""]
+    table = table.assign(particle=table["particle"].astype(float).astype("int64"))
+    views = []
+    for camera in cameras:
+        mine = table[table["camera"] == camera.name].drop_duplicates(["frame", "particle"])
+        joined = sizes[["frame", "particle"]].merge(mine, how="left", on=["frame", "particle"])
+        views.append(joined[_ELLIPSE].to_numpy(float))
+    return np.stack(views, axis=1)
+
+
+def ellipsoids_from_outlines(
+    cameras: tuple[Camera, Camera], points_mm: Array, ellipses: Array
+) -> Array:
+    """(N, 3, 3) in rig axes, Q of x^T Q^-1 x = 1, from the outlines in two views.
+
+    points_mm : (N, 3). ellipses : (N, 2, 3) semi-axes in px and angle in rad.
+    A parallel projection P maps an ellipsoid Q to the ellipse P Q P^T, so the two outlines are six
+    linear equations. They leave one number open, a shear that neither camera sees: of all that
+    fit, the body of largest volume is taken (the determinant is quadratic along that direction).
+    """
+    upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    basis = np.zeros((6, 3, 3))
+    for k, (i, j) in enumerate(upper):
+        basis[k, i, j] = basis[k, j, i] = 1.0
+    rows, targets = [], []
+    for index, camera in enumerate(cameras):
+        steps = _STEP_MM * np.eye(3)
+        plus, minus = (camera.project(points_mm[:, None] + s * steps) for s in (1, -1))
+        by_point = np.swapaxes(plus - minus, 1, 2) / (2 * _STEP_MM)
+        seen = by_point[:, None] @ basis @ np.swapaxes(by_point, 1, 2)[:, None]
+        rows.append(seen[..., [0, 0, 1], [0, 1, 1]].swapaxes(1, 2))
+        targets.append(_ellipse_matrix(ellipses[:, index])[..., [0, 0, 1], [0, 1, 1]])
+    system, target = np.concatenate(rows, 1), np.concatenate(targets, 1)
+    fitted = (np.linalg.pinv(system, rcond=1e-3) @ target[..., None])[..., 0]
+    open_direction = np.linalg.svd(system)[2][:, -1]
+    body = np.einsum("nk,kij->nij", fitted, basis)
+    return _proper(_largest(body, np.einsum("nk,kij->nij", open_direction, basis)))
+
+
+def _ellipse_matrix(ellipse: Array) -> Array:
+    cos, sin = np.cos(ellipse[:, 2]), np.sin(ellipse[:, 2])
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    return np.asarray(turn * ellipse[:, None, :2] ** 2 @ np.swapaxes(turn, 1, 2))
+
+
+def _largest(body: Array, direction: Array) -> Array:
+    """body + t direction where its determinant, a parabola in t, is largest."""
+    unit = np.trace(body, axis1=1, axis2=2)[:, None, None] / 3 * direction
+    down, here, up = (np.linalg.det(body + t * unit) for t in (-1.0, 0.0, 1.0))
+    bend = up + down - 2 * here
+    t = np.where(bend < 0, (down - up) / (2 * np.where(bend < 0, bend, -1.0)), 0.0)
+    return np.asarray(body + t[:, None, None] * unit)
+
+
+def _proper(body: Array) -> Array:
+    """Outlines that do not fit together may leave no body: the thinnest axis is limited."""
+    squares, axes = np.linalg.eigh(body)
+    squares = np.maximum(squares, _THINNEST**2 * np.abs(squares).max(1, keepdims=True))
+    return np.asarray(axes * squares[:, None] @ np.swapaxes(axes, 1, 2))
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Where a drawing stands and how it is scaled, in px at 100 dpi.
+
+    low_mm, high_mm : (3,) the box. stretch : how much wider than high a mm is drawn.
+    px_per_mm : of the vertical. centre_px : (2,), where the box's middle is. band : how much the
+    +-2 sd band is widened, 0 without one. bodies : whether bubbles are drawn. words : above it.
+    """
+
+    low_mm: Array
+    high_mm: Array
+    stretch: int
+    px_per_mm: float
+    centre_px: Array
+    band: int
+    bodies: bool
+    words: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """size_px : (width, height) at 100 dpi, multiples of 20, as videos need even numbers."""
+
+    size_px: tuple[int, int]
+    panels: tuple[Panel, ...]
+
+
+def film_layout(path: FilmPath) -> Layout:
+    """A panel in true proportions and, for a slender path, one that is stretched sideways."""
+    reach = np.zeros_like(path.points_mm)
+    reach[path.bodies] = np.sqrt(np.diagonal(path.quadrics_mm2, axis1=1, axis2=2))
+    low, high = (path.points_mm - reach).min(0), (path.points_mm + reach).max(0)
+    margin = 0.02 * float((high - low).max()) + 1e-3
+    low, high = low - margin, high + margin
+    wide, tall = float(np.hypot(*(high - low)[:2])), float((high - low)[2])
+    if tall < _SLENDER * wide:
+        width = int(np.clip(_HEIGHT_PX * wide / tall, _NARROW_PX, _WIDE_PX)) // 20 * 20
+        panel = _panel(path, low, high, 0.0, width, 1, "", bodies=True)
+        return Layout((width, _HEIGHT_PX), (panel,))
+    lowest, highest = path.points_mm.min(0), path.points_mm.max(0)
+    margins = np.maximum(0.06 * (highest - lowest), 1e-3)
+    lowest, highest = lowest - margins, highest + margins
+    thin = float(np.hypot(*(highest - lowest)[:2]))
+    factor = max(f for f in _FACTORS if f * thin < _STRETCHED * tall or f == 1)
+    words = f"horizontally {factor} times wider"
+    panels = (
+        _panel(path, low, high, 0.0, _LEFT_PX, 1, "true proportions", bodies=True),
+        _panel(path, lowest, highest, _LEFT_PX, _RIGHT_PX, factor, words, bodies=False),
+    )
+    return Layout((_LEFT_PX + _RIGHT_PX, _HEIGHT_PX), panels)
+
+
+def _panel(
+    path: FilmPath, low: Array, high: Array, left_px: float, width_px: float, stretch: int,
+    words: str, *, bodies: bool,
+) -> Panel:  # fmt: skip
+    height_px = _HEIGHT_PX - _ABOVE_PX - _BELOW_PX
+    size, tilt = high - low, np.deg2rad(_elevation_deg(stretch))
+    wide = stretch * float(np.hypot(*size[:2]))
+    tall = float(size[2] * np.cos(tilt) + wide * np.sin(tilt))
+    scale = min((width_px - 2 * _SIDE_PX) / wide, height_px / tall)
+    centre = np.array([left_px + width_px / 2 + 12, _ABOVE_PX + height_px / 2])
+    sd = path.sd_mm[np.isfinite(path.sd_mm).all(1)]
+    half = 2 * float(np.median(np.sqrt((sd**2).mean(1)))) * scale * stretch if len(sd) else 0.0
+    band = next((f for f in _FACTORS if f * half >= _LEAST_BAND_PX), _FACTORS[-1]) if half else 0
+    band = 0 if words and bodies else band
+    return Panel(low, high, stretch, scale, centre, band, bodies, words)
+
+
+def _elevation_deg(stretch: int) -> float:
+    """How far the view looks down: less where depth is widened."""
+    return _ELEVATION_DEG if stretch == 1 else _ELEVATION_STRETCHED_DEG
+
+
+def view_matrix(angle_deg: float, elevation_deg: float) -> Array:
+    """(3, 3) rows: right, up and away on the screen, in the film's axes right, forward, up.
+
+    The viewer walks round the vertical and looks down a little; 180 degrees further on every
+    point of the axis' height has its horizontal coordinate mirrored.
+    """
+    turn, tilt = np.deg2rad(angle_deg), np.deg2rad(elevation_deg)
+    cos, sin, down, level = np.cos(turn), np.sin(turn), np.sin(tilt), np.cos(tilt)
+    away = np.array([-sin, cos, 0.0])
+    return np.array([
+        [cos, sin, 0.0],
+        [*(down * away[:2]), level],
+        [*(level * away[:2]), -down],
+    ])  # fmt: skip
+
+
+def _screen(panel: Panel, angle_deg: float) -> tuple[Array, Array]:
+    """(3, 3) px per mm: u right, v down, away; and (2,) px of the axes' origin."""
+    view = view_matrix(angle_deg, _elevation_deg(panel.stretch))
+    view = view * [panel.stretch, panel.stretch, 1]
+    matrix = panel.px_per_mm * view * np.array([[1.0], [-1.0], [1.0]])
+    return matrix, panel.centre_px - matrix[:2] @ ((panel.low_mm + panel.high_mm) / 2)
+
+
+def project_px(panel: Panel, points_mm: Array, angle_deg: float) -> Array:
+    """(N, 2) pixels of the picture for points in the film's axes."""
+    matrix, offset = _screen(panel, angle_deg)
+    return np.asarray(points_mm @ matrix[:2].T + offset) * (DPI / 100)
+
+
+def draw_path(path: FilmPath, layout: Layout, angle_deg: float) -> Picture:
+    """(height, width, 3) RGB."""
+    width, height = layout.size_px
+    page = _Page(layout.size_px)
+    for panel in layout.panels:
+        matrix, offset = _screen(panel, angle_deg)
+        _draw_box(page, path.names, panel, matrix, offset)
+        _draw_tracks(page, path, panel, matrix, offset)
+        lines = [line for line in (panel.words, _band_words(panel)) if line]
+        for i, line in enumerate(lines):
+            page.write(line, (panel.centre_px[0], 44 + 18 * i), "ma")
+    page.write(path.title, (16, 12), "la", _INK, size=17)
+    page.write("; ".join(path.notes), (16, height - 14), "ls")
+    page.write(f"{angle_deg % 360:3.0f}°", (width - 16, height - 14), "rs")
+    return page.picture()
+
+
+class _Page:
+    """A figure without axes: what is drawn is in px at 100 dpi, v down.
+
+    Text is written by Pillow, which takes a tenth of the time that matplotlib takes for it.
+    """
+
+    def __init__(self, size_px: tuple[int, int]) -> None:
+        from matplotlib.figure import Figure
+        from matplotlib.transforms import Affine2D
+
+        width, height = size_px
+        self.figure = Figure(figsize=(width / 100, height / 100), dpi=DPI)
+        self.px = Affine2D().scale(DPI / 100, -DPI / 100).translate(0, height * DPI / 100)
+        self._texts: list[tuple[str, Any, str, str, int]] = []
+
+    def lines(self, lines: Sequence[Array], colours: Any) -> None:
+        from matplotlib.collections import LineCollection
+
+        made = LineCollection(lines, colors=colours, linewidths=0.8, transform=self.px)
+        self.figure.add_artist(made)
+
+    def polygons(self, polygons: Sequence[Array], **how: Any) -> None:
+        from matplotlib.collections import PolyCollection
+
+        self.figure.add_artist(PolyCollection(polygons, transform=self.px, **how))
+
+    def write(
+        self, words: str, place: Any, anchor: str, colour: str = _SOFT, size: int = 13
+    ) -> None:
+        """anchor : Pillow's, of the text at its place."""
+        self._texts.append((words, place, anchor, colour, size))
+
+    def picture(self) -> Picture:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from PIL import Image, ImageDraw
+
+        canvas = FigureCanvasAgg(self.figure)
+        canvas.draw()
+        image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+        pen = ImageDraw.Draw(image)
+        for words, (u, v), anchor, colour, size in self._texts:
+            place = u * DPI / 100, v * DPI / 100
+            pen.text(place, words, colour, font(size * DPI / 100), anchor)
+        return np.array(image)
+
+
+def _band_words(panel: Panel) -> str:
+    if not panel.band:
+        return ""
+    return "band: ±2 sd" + (f", drawn {panel.band} times wider" if panel.band > 1 else "")
+
+
+def _draw_box(
+    page: _Page, names: Sequence[str], panel: Panel, matrix: Array, offset: Array
+) -> None:
+    """The base and the upright edges but the nearest; ticks on two edges below and one upright."""
+    pick = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    ends = np.array([panel.low_mm, panel.high_mm])
+    corners = np.array([[[ends[a, 0], ends[b, 1], h] for a, b in pick] for h in ends[:, 2]])
+    uv = corners @ matrix[:2].T + offset
+    front = int(np.argmin(corners[0] @ matrix[2]))
+    after, before = (front + 1) % 4, (front - 1) % 4
+    behind = [after, (front + 2) % 4, before]
+    base = uv[0, [*range(4), 0]]
+    page.lines([base, uv[1, behind], *(uv[:, i] for i in behind)], _EDGE)
+    for other in (after, before):
+        axis = 0 if pick[front, 0] != pick[other, 0] else 1
+        outwards = np.array([0.25 * np.sign(uv[0, other, 0] - uv[0, front, 0]), 1.0])
+        _draw_ticks(page, corners[0, front], axis, panel, matrix, offset, outwards, names[axis])
+    side = corners[0, int(np.argmin(uv[0, :, 0]))]
+    _draw_ticks(page, side, 2, panel, matrix, offset, np.array([-1.0, 0.0]), names[2])
+
+
+def _draw_ticks(
+    page: _Page, corner: Array, axis: int, panel: Panel, matrix: Array, offset: Array,
+    outwards: Array, name: str,
+) -> None:  # fmt: skip
+    """Ticks along an edge of the box through ``corner``, and the axis' name with its unit."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = panel.low_mm[axis], panel.high_mm[axis]
+    length_px = float(np.hypot(*matrix[:2, axis])) * (high - low)
+    if length_px < _TICK_PX:
+        return
+    values = MaxNLocator(max(1, length_px // _TICK_PX), steps=[1, 2, 5, 10]).tick_values(low, high)
+    values = values[(values >= low) & (values <= high)]
+    points = np.repeat(corner[None], len(values) + 1, 0)
+    points[:, axis] = [*values, high if axis == 2 else (low + high) / 2]
+    uv = points @ matrix[:2].T + offset
+    page.lines([np.array([at, at + 5 * outwards]) for at in uv[:-1]], _SOFT)
+    for value, at in zip(values, uv + 9 * outwards):
+        page.write(f"{value + 0.0:.10g}", at, "rm" if axis == 2 else "ma")
+    where = uv[-1] + ((-16, -8) if axis == 2 else 32 * outwards)
+    page.write(f"{name} / mm", where, "ms" if axis == 2 else "ma", _INK, size=14)
+
+
+def _draw_tracks(page: _Page, path: FilmPath, panel: Panel, matrix: Array, offset: Array) -> None:
+    """Bubbles, bands, paths and their ends, from back to front."""
+    from matplotlib.collections import CircleCollection
+
+    uv, away = path.points_mm @ matrix[:2].T + offset, path.points_mm @ matrix[2]
+    if panel.bodies and len(path.bodies):
+        order = np.argsort(-away[path.bodies])
+        rows, shapes = path.bodies[order], matrix[:2] @ path.quadrics_mm2[order] @ matrix[:2].T
+        discs, faces, edges = _shaded(uv[rows], shapes, path.particle[rows])
+        page.polygons(list(discs), facecolors=faces, edgecolors=edges, linewidths=0.8)
+    pieces = np.split(np.arange(len(uv)), np.flatnonzero(path.new)[1:])
+    pieces.sort(key=lambda piece: -float(away[piece].mean()))
+    colours = [track_colour(int(path.particle[piece[0]])) for piece in pieces]
+    if panel.band:
+        bands = [_band(uv[p], path.sd_mm[p], panel.band, matrix[:2]) for p in pieces]
+        page.polygons(bands, facecolors=colours, alpha=0.35, linewidths=0)
+    page.lines([uv[piece] for piece in pieces], colours)
+    last = np.append(np.diff(path.particle) != 0, True)
+    ends = np.array([piece[-1] for piece in pieces if last[piece[-1]]])
+    colours = [track_colour(int(k)) for k in path.particle[ends]]
+    page.figure.add_artist(CircleCollection(
+        [19.0], offsets=uv[ends], offset_transform=page.px, facecolors=colours, linewidths=0
+    ))  # fmt: skip
+    if len(ends) <= _MOST_NAMES:
+        for end, colour in zip(ends, colours):
+            page.write(f"{path.particle[end]}", uv[end] + (8, 0), "lm", colour)
+
+
+def _shaded(
+    centres: Array, shapes: Array, particles: NDArray[np.int64]
+) -> tuple[Array, Array, Array]:
+    """Three discs to a bubble as polygons (3 B, 48, 2), their face and their edge colours (RGBA).
+
+    centres : (B, 2) px. shapes : (B, 2, 2), Q of the outlines x^T Q^-1 x = 1.
+    """
+    from matplotlib.colors import to_rgb
+
+    turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    squares, axes = np.linalg.eigh(shapes)
+    half = np.sqrt(np.maximum(squares, 0.0))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+    ring = half @ np.swapaxes(axes, 1, 2)
+    light = 0.35 * ring.min(1)[:, None]
+    discs = [centres[:, None] + size * ring + (1 - size) * light for size, _ in _SHADES]
+    colour = np.array([to_rgb(track_colour(int(k))) for k in particles])
+    faces = [
+        np.c_[white + (1 - white) * colour, np.full(len(colour), 0.75)] for _, white in _SHADES
+    ]
+    edges = [np.c_[colour, np.full(len(colour), float(k == 0))] for k in range(len(_SHADES))]
+    mixed = (np.stack(parts, 1) for parts in (discs, faces, edges))
+    polygons, face, edge = (part.reshape(-1, *part.shape[2:]) for part in mixed)
+    return polygons, face, edge
+
+
+def _band(uv: Array, sd_mm: Array, times: int, matrix: Array) -> Array:
+    """(2 N, 2) polygon round the line (N, 2) of +-2 sd across it, ``times`` as wide."""
+    good = np.isfinite(sd_mm).all(1)
+    uv, sd_mm = uv[good], sd_mm[good]
+    if len(uv) < 2:
+        return uv[:0]
+    along = np.gradient(uv, axis=0)
+    across = np.stack([-along[:, 1], along[:, 0]], -1)
+    across /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    half = 2 * times * np.sqrt((((across @ matrix) * sd_mm) ** 2).sum(1))[:, None]
+    return np.concatenate([uv + half * across, (uv - half * across)[::-1]])

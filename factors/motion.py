@@ -14,12 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.factors.state_space import (
-    Component,
-    block_diagonal,
-    discretise,
-    elimination_basis,
-)
+from telerig.factors.state_space import Component, block_diagonal, discretise, distinct_steps
 
 Array = NDArray[np.float64]
 
@@ -29,7 +24,7 @@ class Motion:
     """Steps of several components side by side, whitened: W (x' - Phi x - G c) has unit noise.
 
     by_next, by_last : (U, n, n) W and -W Phi.  by_input : (U, n, K) -W G.  log_det : (U,) of W.
-    basis : (U + 1, n, n), see `elimination_basis`.
+    basis : (U + 1, n, n), see `Steps.bases`.
     index : (M,) which of the U distinct steps each step is.
     """
 
@@ -59,23 +54,32 @@ class Motion:
         return last[place], (self.by_next[step] @ self.basis[after])[place]
 
 
-def motion(components: Sequence[Component], dt_s: ArrayLike) -> Motion:
-    """The steps (M,) of independent components, states and inputs one after the other."""
-    if not components:
-        steps = len(np.atleast_1d(np.asarray(dt_s, float)))
-        none = np.zeros((1, 0, 0))
-        zero = np.zeros((2, 0, 0)), np.zeros(steps, np.int64)
-        return Motion(none, none, none, np.zeros(1), *zero)
-    all_steps = [discretise(c, dt_s) for c in components]
-    index = all_steps[0].index
-    return Motion(
-        block_diagonal([-s.whitener @ s.transition for s in all_steps]),
-        block_diagonal([s.whitener for s in all_steps]),
-        block_diagonal([-s.whitener @ s.input for s in all_steps]),
-        np.sum([s.log_det for s in all_steps], 0),
-        block_diagonal([elimination_basis(c, s) for c, s in zip(components, all_steps)]),
-        index,
-    )
+def motion(components: Sequence[Component], dt_s: ArrayLike, *, batched: bool = False) -> Motion:
+    """The steps dt_s (M,) of independent components, states and inputs one after the other.
+
+    batched : components of one kind in one batch of arrays, which pays where few steps are worked
+    out a thousand times.
+    """
+    lengths, index = distinct_steps(dt_s)
+    sizes, inputs = (np.array([c.input.shape[i] for c in components], int) for i in (0, 1))
+    first, first_input = np.cumsum(sizes) - sizes, np.cumsum(inputs) - inputs
+    count, width = len(lengths), int(sizes.sum())
+    by_last, by_next = np.zeros((2, count, width, width))
+    by_input = np.zeros((count, width, int(inputs.sum())))
+    basis = np.zeros((count + 1, width, width))
+    log_det = np.zeros((0, count))
+    for steps in discretise(components, lengths, batched=batched):
+        states = first[steps.which, None] + np.arange(steps.input.shape[-2])
+        constants = first_input[steps.which, None] + np.arange(steps.input.shape[-1])
+        for out, columns, blocks in (
+            (by_last, states, -steps.whitener @ steps.transition),
+            (by_next, states, steps.whitener),
+            (by_input, constants, -steps.whitener @ steps.input),
+            (basis, states, steps.bases()),
+        ):
+            out[:, states[:, :, None], columns[:, None]] = np.swapaxes(blocks, 0, 1)
+        log_det = np.concatenate([log_det, steps.log_det.sum(0, keepdims=True)])
+    return Motion(by_last, by_next, by_input, log_det.sum(0), basis, index)
 
 
 def start(components: Sequence[Component]) -> tuple[Array, Array]:

@@ -9,15 +9,22 @@ neither a long gap nor the tiny variance of an often integrated noise loses digi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
-from telerig.factors.exact_steps import exact_steps, inverse_root
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_SERIES_TERMS = 26
+_SHORT_STEP = 0.5
+"""Largest eigenvalue times step over which the exponential's series is summed."""
+_STEPS_PER_S = 1e11
+"""Clocks printed to a nanosecond jitter in the last digit; that makes no new length of step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,24 +58,10 @@ class Component:
         """(n,) the acceleration's rate of change, its white part (if any) left out."""
         return np.asarray(self.acceleration @ self.drift)
 
-    def renamed(self, name: str) -> Component:
-        return replace(self, name=name)
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Transitions over M steps, of which few differ; row i of the steps is row index[i] here.
-
-    transition : (U, n, n).  input : (U, n, k).  covariance : (U, n, n).
-    whitener : (U, n, n) W with W covariance W^T = 1.  log_det : (U,) of W.
-    """
-
-    transition: Array
-    input: Array
-    covariance: Array
-    whitener: Array
-    log_det: Array
-    index: NDArray[np.int64] = field(repr=False)
+    def without_input(self) -> Component:
+        """The same process about a mean that is known."""
+        nothing = np.zeros((self.size, 0))
+        return replace(self, input=nothing, start_from_input=nothing)
 
 
 def _component(
@@ -258,11 +251,6 @@ def slow_ou(rms: float, tau_s: float) -> Component:
     return _component("slow_ou", [[-1 / tau_s]], [rms * np.sqrt(2 / tau_s)])
 
 
-def wander(rms_px: float, tau_s: float) -> Component:
-    """Correlated wander of a bubble's centroid, one image axis."""
-    return slow_ou(rms_px, tau_s).renamed("wander")
-
-
 def independent(sigma: float) -> Component:
     """One state, drawn anew at every node: a position that only its own reading tells."""
     _positive(sigma=sigma)
@@ -270,55 +258,169 @@ def independent(sigma: float) -> Component:
     return replace(plain, memoryless=True)
 
 
-def discretise(component: Component, dt_s: ArrayLike) -> Steps:
-    """Exact steps of lengths dt_s (M,), positive; each distinct length is worked out once.
+@dataclass(frozen=True)
+class Steps:
+    """Exact steps of N processes alike in kind, of n states and k inputs, over U lengths.
+
+    which : (N,) their places in the list of processes.
+    transition, covariance : (N, U, n, n).  input : (N, U, n, k).
+    whitener : (N, U, n, n) W with W covariance W^T = 1.  log_det : (N, U) of W.
+    start : (N, n, n) whitener of the state at the first node.  start_log_det : (N,).
+    """
+
+    which: Ints
+    transition: Array
+    input: Array
+    covariance: Array
+    whitener: Array
+    log_det: Array
+    start: Array
+    start_log_det: Array
+
+    def bases(self) -> Array:
+        """(N, U + 1, n, n) bases T, x = T y, of a state before each step, last one: before none.
+
+        Integrated noise has variances many powers of the step apart. In this basis the information
+        of the next state and of the prior on a state, Phi^T Q^-1 Phi + P^-1, is the identity: the
+        pivots of a forward elimination are of order one, as Cholesky in double precision needs.
+        """
+        count, lengths, size, _ = self.whitener.shape
+        ahead = np.zeros((count, lengths + 1, size, size))
+        ahead[:, :-1] = self.whitener @ self.transition
+        prior = np.broadcast_to(self.start[:, None], ahead.shape)
+        root = np.linalg.qr(np.concatenate([ahead, prior], -2), mode="r")
+        return np.asarray(np.linalg.inv(root))
+
+
+def distinct_steps(dt_s: ArrayLike) -> tuple[Array, Ints]:
+    """Distinct lengths (U,) of steps dt_s (M,), and (M,) which of them each is.
 
     Raises InputError for a length that is not positive.
     """
-    dt = np.atleast_1d(np.asarray(dt_s, float))
+    return _distinct(np.atleast_1d(np.asarray(dt_s, float)).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _distinct(dt_s: bytes) -> tuple[Array, Ints]:
+    dt = np.frombuffer(dt_s)
     if dt.size and not np.min(dt) > 0:
         raise InputError("a time step is not positive", todo="give strictly increasing times")
-    # clocks printed to a nanosecond jitter in the last digit: not a reason for a new step
-    digits = np.round(dt * 1e11)
+    digits = np.round(dt * _STEPS_PER_S)
     _, first, index = np.unique(digits, return_index=True, return_inverse=True)
-    if component.memoryless:
-        n = component.size
-        q = np.broadcast_to(component.start_covariance, (len(first), n, n))
-        zero = np.zeros((len(first), n, n))
-        return _steps(zero, np.zeros((len(first), n, component.input.shape[1])), q, index)
-    return _steps(*_exact(component, dt[first]), index)
+    return dt[first], index.ravel().astype(np.int64)
 
 
-def _steps(transition: Array, gain: Array, q: Array, index: NDArray[np.int64]) -> Steps:
-    whitener = inverse_root(q)
-    log_det = np.log(np.diagonal(whitener, axis1=-2, axis2=-1)).sum(-1)
-    return Steps(transition, gain, q, whitener, log_det, index.ravel())
+def discretise(
+    components: Sequence[Component], lengths_s: Array, *, batched: bool = True
+) -> list[Steps]:
+    """Exact steps of lengths_s (U,), of components of one kind in one batch or each by itself."""
+    kinds: dict[object, list[int]] = {}
+    for i, component in enumerate(components):
+        kinds.setdefault(_kind(component) if batched else i, []).append(i)
+    return [_steps([components[i] for i in mine], mine, lengths_s) for mine in kinds.values()]
 
 
-def elimination_basis(component: Component, steps: Steps) -> Array:
-    """(U + 1, n, n) bases T, x = T y, of a state that a step follows, last one: that none follows.
+def _kind(component: Component) -> object:
+    """Alike for processes that one batch can hold."""
+    drift, noise = (a.astype(bool).tobytes() for a in (component.drift, component.noise))
+    inputs = component.input.astype(bool).tobytes()
+    return component.memoryless, inputs, _cached_orders(drift, noise, component.size)
 
-    Integrated noise has variances many powers of the step apart. In this basis what the next
-    state and the prior together tell of a state, Phi^T Q^-1 Phi + P^-1, is the identity: the
-    pivots of a forward elimination are of order one, as Cholesky in double precision asks for.
+
+@lru_cache(maxsize=64)
+def _cached_orders(drift: bytes, noise: bytes, size: int) -> tuple[float, ...]:
+    pattern = [np.frombuffer(b, bool).reshape(size, -1).astype(float) for b in (drift, noise)]
+    return tuple(_integrations(*pattern).tolist())
+
+
+def _steps(components: Sequence[Component], which: Sequence[int], lengths_s: Array) -> Steps:
+    n, k = components[0].input.shape
+    shape = (len(components), len(lengths_s))
+    begin = np.array([c.start_covariance for c in components])
+    if components[0].memoryless:
+        transition, q = np.zeros((*shape, n + k, n + k)), np.zeros((*shape, n + k, n + k))
+        q[..., :n, :n] = begin[:, None]
+    else:
+        drift = np.zeros((len(components), n + k, n + k))
+        drift[:, :n, :n] = [c.drift for c in components]
+        drift[:, :n, n:] = [c.input for c in components]
+        noise = np.zeros((len(components), n + k, components[0].noise.shape[1]))
+        noise[:, :n] = [c.noise for c in components]
+        orders = _integrations(drift[0], noise[0])
+        drift, noise = (np.repeat(a, shape[1], 0) for a in (drift, noise))
+        whole = _exact_steps(drift, noise, np.tile(lengths_s, shape[0]), orders)
+        transition, q = (a.reshape(*shape, n + k, n + k) for a in whole)
+    covariance = q[..., :n, :n]
+    whitener, first = _inverse_root(covariance), _inverse_root(begin)
+    return Steps(
+        np.array(which), transition[..., :n, :n], transition[..., :n, n:], covariance,
+        whitener, log_det_of(whitener), first, log_det_of(first),
+    )  # fmt: skip
+
+
+def _exact_steps(drift: Array, noise: Array, dt_s: Array, orders: Array) -> tuple[Array, Array]:
+    """Transitions and covariances (M, n, n) of steps dt_s (M,); drift (M, n, n), noise (M, n, m).
+
+    orders : (n,) see `_integrations`, the same for all.
     """
-    prior = np.broadcast_to(
-        inverse_root(component.start_covariance), (len(steps.whitener) + 1, *component.drift.shape)
+    rate = np.abs(np.linalg.eigvals(drift)).max(-1, initial=0.0)
+    doublings = np.ceil(np.log2(np.maximum(rate * dt_s / _SHORT_STEP, 1.0))).astype(int)
+    transition, q = _short_step(drift, noise, dt_s / 2.0**doublings, orders)
+    for step in range(int(doublings.max(initial=0))):
+        more = doublings > step
+        phi = transition[more]
+        q[more] += phi @ q[more] @ np.swapaxes(phi, -1, -2)
+        transition[more] = phi @ phi
+    return transition, (q + np.swapaxes(q, -1, -2)) / 2
+
+
+def _short_step(drift: Array, noise: Array, h: Array, orders: Array) -> tuple[Array, Array]:
+    """Van Loan's exponential by its series, states scaled by the powers of h they grow with."""
+    n = drift.shape[-1]
+    scale = h[:, None] ** orders
+    ratio = scale[:, None, :] / scale[:, :, None]
+    f = drift * h[:, None, None] * ratio
+    q = (
+        noise
+        @ np.swapaxes(noise, -1, -2)
+        * h[:, None, None]
+        / scale[:, :, None]
+        / scale[:, None, :]
     )
-    ahead = np.zeros_like(prior)
-    ahead[:-1] = steps.whitener @ steps.transition
-    root = np.linalg.qr(np.concatenate([ahead, prior], -2), mode="r")
-    return np.asarray(np.linalg.inv(root))
+    block = np.zeros((len(h), 2 * n, 2 * n))
+    block[:, :n, :n], block[:, :n, n:], block[:, n:, n:] = -f, q, np.swapaxes(f, -1, -2)
+    total = np.broadcast_to(np.eye(2 * n), block.shape).copy()
+    term = total.copy()
+    for i in range(1, _SERIES_TERMS):
+        term = term @ block / i
+        total += term
+    phi = np.swapaxes(total[:, n:, n:], -1, -2)
+    covariance = phi @ total[:, :n, n:]
+    return phi / ratio, covariance * scale[:, :, None] * scale[:, None, :]
 
 
-def _exact(component: Component, dt: Array) -> tuple[Array, Array, Array]:
-    """Transitions (U, n, n), inputs (U, n, k), covariances (U, n, n)."""
-    n, k = component.size, component.input.shape[1]
-    drift = np.zeros((n + k, n + k))
-    drift[:n, :n], drift[:n, n:] = component.drift, component.input
-    noise = np.vstack([component.noise, np.zeros((k, component.noise.shape[1]))])
-    transition, q = exact_steps(drift, noise, dt)
-    return transition[:, :n, :n], transition[:, :n, n:], q[:, :n, :n]
+def _integrations(drift: Array, noise: Array) -> Array:
+    """(n,) how many integrations lie between the white noise and each state."""
+    orders = np.full(len(drift), np.nan)
+    reached = np.abs(noise).sum(1)
+    for order in range(len(orders)):
+        orders[np.isnan(orders) & (reached > 0)] = order
+        reached = np.abs(drift) @ reached
+    return np.asarray(np.nan_to_num(orders, nan=0.0))
+
+
+def _inverse_root(covariance: Array) -> Array:
+    """(..., n, n) lower W with W C W^T = 1, scaled so that small variances keep their digits."""
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    scaled = covariance / sigma[..., :, None] / sigma[..., None, :]
+    root = np.linalg.cholesky(scaled)
+    unit = np.broadcast_to(np.eye(root.shape[-1]), root.shape)
+    return np.asarray(np.tril(np.linalg.solve(root, unit)) / sigma[..., None, :])
+
+
+def log_det_of(whitener: Array) -> Array:
+    """(...) log of the determinant of triangular whiteners (..., n, n)."""
+    return np.asarray(np.log(np.abs(np.diagonal(whitener, axis1=-2, axis2=-1))).sum(-1))
 
 
 def block_diagonal(blocks: Sequence[Array]) -> Array:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.baselines import central_velocity, rts
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import carriage, carriage_sigma, left_open
+from telerig.estimator.smoothing.problem.problem import BubbleModel
+from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,9 +94,9 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
     for k in range(len(problem.bubbles)):
         mine = slice(frame.first_row[k], frame.first_row[k + 1])
         t = problem.t_s[frame.frame_of_row[mine]]
-        velocity[mine] = central_velocity(t, naive[mine])
+        velocity[mine] = _central_velocity(t, naive[mine])
         if 1 < len(t) <= LONGEST_RTS:
-            plain[:, mine] = rts(t, naive[mine], covariance[mine], frame.model.bubble)
+            plain[:, mine] = _rts(t, naive[mine], covariance[mine], frame.model.bubble)
     out = _named(naive, "naive_{}_mm") | _named(velocity, "naive_v{}_mm_s")
     out |= _named(plain[0], "rts_{}_mm") | _named(plain[1], "rts_v{}_mm_s")
     if "d_eq_mm" in tracks:
@@ -103,6 +104,48 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
         diameter[rows] = tracks["d_eq_mm"].to_numpy(float)
         out["d_eq_mm"] = diameter
     return out
+
+
+def _central_velocity(t_s: Array, position_mm: Array) -> Array:
+    """(n, 3) differences over two frames, one at the ends; NaN beside a missing position."""
+    if len(t_s) < 2:
+        return np.full_like(position_mm, np.nan)
+    before, after = (np.clip(np.arange(len(t_s)) + i, 0, len(t_s) - 1) for i in (-1, 1))
+    difference = position_mm[after] - position_mm[before]
+    return np.asarray(difference / (t_s[after] - t_s[before])[:, None])
+
+
+def _rts(
+    t_s: Array, position_mm: Array, covariance_mm2: Array, model: BubbleModel
+) -> tuple[Array, Array]:
+    """filterpy's Kalman filter and RTS smoother on lab positions, no shake in the model.
+
+    t_s (n,), position_mm (n, 3) with NaN where there is none, covariance_mm2 (n, 3, 3).
+    Returns positions and velocities (n, 3).
+    """
+    from filterpy.kalman import KalmanFilter
+
+    seen = np.asarray(np.isfinite(position_mm).all(1))
+    lengths, index = distinct_steps(np.diff(t_s))
+    bubble = ou_velocity(model.velocity_sigma_mm_s, model.velocity_tau_s)
+    steps = discretise([bubble], lengths)[0]
+    # of one axis: position, velocity, mean velocity
+    transition, noise = np.tile(np.eye(3), (len(t_s), 1, 1)), np.zeros((len(t_s), 3, 3))
+    transition[1:, :2, :2] = steps.transition[0, index]
+    transition[1:, :2, 2] = steps.input[0, index, :, 0]
+    noise[1:, :2, :2] = steps.covariance[0, index]
+    start = np.diag([model.start_sigma_mm**2, 0.0, 0.0])
+    start[1:, 1:] = model.mean_sigma_mm_s**2
+    start[1, 1] += model.velocity_sigma_mm_s**2
+    filter_: Any = KalmanFilter(dim_x=9, dim_z=3)
+    filter_.x = np.r_[position_mm[np.argmax(seen)], np.zeros(6)][:, None]
+    filter_.P = np.kron(start, np.eye(3))
+    filter_.H = np.eye(3, 9)
+    matrices = [np.kron(a, np.eye(3)) for a in (transition, noise)]
+    readings = [p if s else None for p, s in zip(position_mm, seen)]
+    means, covariances, _, _ = filter_.batch_filter(readings, *matrices, Rs=covariance_mm2)
+    smooth, *_ = filter_.rts_smoother(means, covariances, *matrices)
+    return smooth[:, :3, 0], smooth[:, 3:6, 0]
 
 
 def shake(solution: Solution) -> pd.DataFrame:

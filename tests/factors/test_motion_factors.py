@@ -86,35 +86,22 @@ def test_pitch_shifts_with_depth() -> None:
 
 def test_accelerometer_at_rest_shows_gravity_upwards() -> None:
     axes = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-    read = measurements.accelerometer_reading(np.zeros(3), np.zeros(3), UP, axes)
+    read = measurements.accelerometer_reading(np.zeros(3), UP, axes)
     np.testing.assert_allclose(read.reading_mm_s2, [-9810.0, 0, 0])
 
 
 def test_accelerometer_derivatives() -> None:
     rng = np.random.default_rng(5)
-    a, jerk = rng.normal(size=(4, 3)) * 1000, rng.normal(size=(4, 3)) * 1e5
+    a = rng.normal(size=(4, 3)) * 1000
     axes, bias = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
 
-    def reading(x: Any, scale: float = 0.02, delay: float = 0.0) -> Any:
-        moved = x - delay * jerk
-        return measurements.accelerometer_reading(
-            moved, jerk, UP, axes, bias, np.asarray(scale)
-        ).reading_mm_s2
+    def reading(x: Any, scale: float = 0.02) -> Any:
+        return measurements.accelerometer_reading(x, UP, axes, bias, scale).reading_mm_s2
 
-    found = measurements.accelerometer_reading(a, jerk, UP, axes, bias, np.asarray(0.02))
+    found = measurements.accelerometer_reading(a, UP, axes, bias, 0.02)
     np.testing.assert_allclose(found.by_acceleration, slope(reading, a, 1.0), atol=1e-9)
     by_scale = (reading(a, 0.03) - reading(a, 0.01)) / 0.02
     np.testing.assert_allclose(found.by_scale, by_scale, rtol=1e-9)
-    by_delay = (reading(a, delay=1e-5) - reading(a, delay=-1e-5)) / 2e-5
-    np.testing.assert_allclose(found.by_delay, by_delay, rtol=1e-9)
-
-
-def test_encoder_derivatives() -> None:
-    found = measurements.encoder_reading(np.array([10.0, 20.0]), np.array([280.0, 0.0]), 0.01)
-    np.testing.assert_allclose(found.reading_mm, [10.1, 20.2])
-    np.testing.assert_allclose(found.by_position, 1.01)
-    np.testing.assert_allclose(found.by_scale, [10.0, 20.0])
-    np.testing.assert_allclose(found.by_delay, [-282.8, 0.0])
 
 
 def test_speed_residual_is_second_order_zero_on_a_zigzag() -> None:

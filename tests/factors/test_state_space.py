@@ -11,17 +11,17 @@ from scipy.linalg import expm
 from telerig.errors import InputError
 from telerig.factors.state_space import (
     Component,
+    Steps,
     block_diagonal,
     broad_band,
     discretise,
+    distinct_steps,
     driven_mode,
-    elimination_basis,
     forced_mass,
     independent,
     oscillator,
     ou_velocity,
     slow_ou,
-    wander,
     white_jerk,
 )
 
@@ -36,6 +36,10 @@ ALL = [
 ]
 STEEP = broad_band(0.3, low_hz=40.0, high_hz=80.0, floor=0.12, tail=3)
 SETTLING = [c for c in ALL if c.name not in ("ou_velocity", "white_jerk", "forced_mass")]
+
+
+def steps_of(component: Component, *lengths_s: float) -> Steps:
+    return discretise([component], np.array(lengths_s))[0]
 
 
 def quadrature(component: Component, dt: float) -> tuple[Any, Any]:
@@ -56,32 +60,32 @@ def quadrature(component: Component, dt: float) -> tuple[Any, Any]:
     ids=lambda v: getattr(v, "name", v),
 )
 def test_steps_are_exact(component: Component, dt: float) -> None:
-    steps = discretise(component, [dt])
+    steps = steps_of(component, dt)
     transition, covariance = quadrature(component, dt)
     sigma = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(
-        steps.transition[0], transition, atol=1e-12 * np.abs(transition).max()
+        steps.transition[0, 0], transition, atol=1e-12 * np.abs(transition).max()
     )
-    error = (steps.covariance[0] - covariance) / sigma / sigma[:, None]
+    error = (steps.covariance[0, 0] - covariance) / sigma / sigma[:, None]
     assert np.abs(error).max() < 1e-11
-    white = steps.whitener[0] @ steps.covariance[0] @ steps.whitener[0].T
+    white = steps.whitener[0, 0] @ steps.covariance[0, 0] @ steps.whitener[0, 0].T
     np.testing.assert_allclose(white, np.eye(component.size), atol=1e-8)
-    assert steps.log_det[0] == pytest.approx(np.linalg.slogdet(steps.whitener[0])[1])
+    assert steps.log_det[0, 0] == pytest.approx(np.linalg.slogdet(steps.whitener[0, 0])[1])
 
 
 @pytest.mark.parametrize("component", ALL, ids=lambda c: c.name)
 def test_two_steps_are_one(component: Component) -> None:
-    half, whole = discretise(component, [0.05]), discretise(component, [0.1])
-    phi, q = half.transition[0], half.covariance[0]
-    np.testing.assert_allclose(phi @ phi, whole.transition[0], atol=1e-9)
-    np.testing.assert_allclose(phi @ q @ phi.T + q, whole.covariance[0], rtol=1e-9, atol=1e-12)
+    half, whole = steps_of(component, 0.05), steps_of(component, 0.1)
+    phi, q = half.transition[0, 0], half.covariance[0, 0]
+    np.testing.assert_allclose(phi @ phi, whole.transition[0, 0], atol=1e-9)
+    np.testing.assert_allclose(phi @ q @ phi.T + q, whole.covariance[0, 0], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("component", SETTLING, ids=lambda c: c.name)
 def test_stationary_stays_stationary(component: Component) -> None:
-    steps, p = discretise(component, [0.003]), component.start_covariance
+    steps, p = steps_of(component, 0.003), component.start_covariance
     sigma = np.sqrt(np.diag(p))
-    after = steps.transition[0] @ p @ steps.transition[0].T + steps.covariance[0]
+    after = steps.transition[0, 0] @ p @ steps.transition[0, 0].T + steps.covariance[0, 0]
     np.testing.assert_allclose(
         after / sigma / sigma[:, None], p / sigma / sigma[:, None], atol=1e-9
     )
@@ -126,39 +130,39 @@ def test_broad_band_has_nothing_at_zero_frequency() -> None:
 
 
 def test_mean_velocity_enters_as_the_input() -> None:
-    steps = discretise(ou_velocity(10.0, 0.3), [0.02])
-    state = steps.transition[0] @ [5.0, 280.0] + steps.input[0] @ [280.0]
+    steps = steps_of(ou_velocity(10.0, 0.3), 0.02)
+    state = steps.transition[0, 0] @ [5.0, 280.0] + steps.input[0, 0] @ [280.0]
     np.testing.assert_allclose(state, [5.0 + 280 * 0.02, 280.0], rtol=1e-12)
 
 
 def test_irregular_steps_each_get_their_own(rng: np.random.Generator) -> None:
     dt = rng.uniform(1e-3, 5e-3, 40)
     dt[7] = dt[3]
-    steps = discretise(driven_mode(0.1, 8.0, 0.03), dt)
-    assert len(steps.transition) == 39
-    assert steps.index[7] == steps.index[3]
+    lengths, index = distinct_steps(dt)
+    steps = steps_of(driven_mode(0.1, 8.0, 0.03), *lengths)
+    assert len(lengths) == 39
+    assert index[7] == index[3]
     for i in (0, 11, 39):
         expected = expm(driven_mode(0.1, 8.0, 0.03).drift * dt[i])
-        np.testing.assert_allclose(steps.transition[steps.index[i]], expected, atol=1e-8)
+        np.testing.assert_allclose(steps.transition[0, index[i]], expected, atol=1e-8)
 
 
 def test_memoryless_state_is_drawn_anew() -> None:
-    steps = discretise(independent(0.3), [0.1, 7.0])
+    steps = steps_of(independent(0.3), 0.1, 7.0)
     np.testing.assert_array_equal(steps.transition, 0)
     np.testing.assert_allclose(steps.covariance, 0.09)
 
 
 def test_elimination_basis_makes_pivots_the_identity() -> None:
     component = broad_band(0.14)
-    steps = discretise(component, [5e-4])
-    basis = elimination_basis(component, steps)[0]
-    ahead = steps.whitener[0] @ steps.transition[0] @ basis
+    steps = steps_of(component, 5e-4)
+    basis = steps.bases()[0, 0]
+    ahead = steps.whitener[0, 0] @ steps.transition[0, 0] @ basis
     prior = basis.T @ np.linalg.solve(component.start_covariance, basis)
     np.testing.assert_allclose(ahead.T @ ahead + prior, np.eye(5), atol=1e-5)
 
 
-def test_wander_and_block_diagonal() -> None:
-    assert wander(0.3, 0.1).name == "wander"
+def test_block_diagonal() -> None:
     blocks = [np.ones((3, 2, 2)), 2 * np.ones((3, 1, 1))]
     whole = block_diagonal(blocks)
     assert whole.shape == (3, 3, 3)
@@ -167,7 +171,7 @@ def test_wander_and_block_diagonal() -> None:
 
 def test_refusals() -> None:
     with pytest.raises(InputError, match="not positive"):
-        discretise(slow_ou(1.0, 1.0), [0.1, 0.0])
+        distinct_steps([0.1, 0.0])
     with pytest.raises(InputError, match="rms_mm is 0"):
         oscillator(0.0, 12.0, 0.1)
     with pytest.raises(InputError, match="tau_s is nan"):

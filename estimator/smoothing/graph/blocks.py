@@ -41,14 +41,6 @@ class Linear:
         return float((share * each).sum())
 
 
-def log_det_of(whitener: Array) -> Array:
-    return np.asarray(np.log(np.abs(np.diagonal(whitener, axis1=-2, axis2=-1))).sum(-1))
-
-
-def repeated(block: Array, count: int) -> Array:
-    return np.broadcast_to(block, (count, *block.shape))
-
-
 @dataclass(frozen=True)
 class Blocks:
     """Covariances of increments, in their bases.

@@ -17,9 +17,10 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dtrsm, dtrsv
-from scipy.linalg.lapack import dpotrf, dtrtri
+from scipy.linalg.blas import dtrsv
+from scipy.linalg.lapack import dpotrf
 
+from telerig.estimator.smoothing.graph.block_tridiagonal import eliminate_forward, inverses
 from telerig.estimator.smoothing.graph.blocks import Blocks, Linear
 from telerig.estimator.smoothing.graph.state import Frame
 
@@ -33,10 +34,6 @@ LEAST_PIVOT = 1e-9
 """Of a diagonal, what elimination leaves of it; covariances then are good to 1e-5."""
 
 _CHUNK = 1000
-
-
-class NotPositiveError(ArithmeticError):
-    """The normal equations are not positive definite, or barely so in double precision."""
 
 
 @dataclass(frozen=True)
@@ -259,30 +256,19 @@ class EliminatedChain:
 def eliminate(places: Places, equations: NormalEquations) -> EliminatedChain:
     """Forward over the frames, the constants, and back for the solution. The input is used up.
 
-    Raises NotPositiveError where Cholesky's pivots run out of digits.
+    Raises numpy's LinAlgError where Cholesky's pivots run out of digits.
     """
     own, joined, constants = equations.own, equations.joined, places.constants
     after = 1 + constants
     before = np.diagonal(own, axis1=-2, axis2=-1).copy()
-    product = np.empty((joined.shape[1], places.width))
-    last = len(own) - 1
-    for t in range(last + 1):
-        _, fault = dpotrf(own[t].T, lower=1, clean=1, overwrite_a=1)
-        if fault:
-            raise NotPositiveError(f"frame {t}")
-        rows = joined[t]
-        dtrsm(1.0, own[t].T, rows.T, lower=1, overwrite_b=1)
-        if t < last:
-            np.matmul(rows, rows[after:].T, out=product)
-            own[t + 1] -= product[after:]
-            joined[t + 1, :after] -= product[:after]
+    eliminate_forward(own, joined)
     if np.min(np.diagonal(own, axis1=-2, axis2=-1) ** 2 / before) < LEAST_PIVOT:
-        raise NotPositiveError("too few digits are left")
+        raise np.linalg.LinAlgError("too few digits are left")
     rows = joined[:, :after].transpose(1, 0, 2).reshape(after, -1)
     reduced = equations.constant - rows[1:] @ np.roll(rows, -1, 0).T
     root, fault = dpotrf(reduced[:, :-1], lower=1, clean=1) if constants else (np.eye(0), 0)
     if fault:
-        raise NotPositiveError("the constants")
+        raise np.linalg.LinAlgError("the constants")
     fixed = np.linalg.solve(root @ root.T, reduced[:, -1]) if constants else np.zeros(0)
     states = _back_substituted(own, joined, fixed)
     return EliminatedChain(places, own, joined, root, _in_key_order(places, states, fixed))
@@ -316,9 +302,7 @@ def _backward(chain: EliminatedChain, of_constants: Array) -> Iterator[tuple[int
     joint[:constants, :constants] = of_constants
     for stop in range(count, 0, -_CHUNK):
         first = max(stop - _CHUNK, 0)
-        inverse = chain.upper[first:stop].copy()
-        for block in inverse:
-            dtrtri(block.T, lower=1, overwrite_c=1)
+        inverse = inverses(chain.upper[first:stop])
         found = inverse @ inverse.swapaxes(-1, -2)
         gains = chain.whitened[first:stop, 1:] @ inverse.swapaxes(-1, -2)
         for own, gain in zip(found[::-1], gains[::-1]):

@@ -26,7 +26,6 @@ from telerig.factors.state_space import (
     ou_velocity,
     resonance,
     slow_ou,
-    wander,
     white_jerk,
 )
 from telerig.rig.camera import Camera
@@ -239,7 +238,7 @@ def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
     motion = sum(c.size for c, _ in parts)
     extra: list[Component] = []
     if model.wander_px > 0:
-        extra = [wander(model.wander_px, model.wander_tau_s)] * (2 * cameras)
+        extra = [slow_ou(model.wander_px, model.wander_tau_s)] * (2 * cameras)
     size = motion + len(extra)
     position, velocity = np.zeros((3, size)), np.zeros((3, size))
     at = 0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +15,6 @@ from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph import chain, elimination
 from telerig.estimator.smoothing.graph.blocks import Blocks, Linear
 from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
-from telerig.estimator.smoothing.graph.robust_weights import Truncation
-from telerig.estimator.smoothing.graph.sensor_delays import late, restamped
 from telerig.estimator.smoothing.graph.state import (
     Frame,
     State,
@@ -23,14 +23,18 @@ from telerig.estimator.smoothing.graph.state import (
     moved,
     times,
 )
-from telerig.estimator.smoothing.graph.threads import in_large_stack
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
+T = TypeVar("T")
 
 _CLOCK_PASSES = 6
+_OUTLIER_SIGMAS, _SUSPICIOUS_SIGMAS = 4.0, 5.0
+_LEAST_KEPT = 0.7
+_DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
+_STACK_BYTES = 512 << 20
 
 
 @dataclass(frozen=True)
@@ -223,7 +227,7 @@ def _eliminated(frame: Frame, factors: list[Linear]) -> Eliminated:
         places = chain.places_of(frame)
         try:
             return chain.eliminate(places, chain.normal_equations(places, factors))
-        except chain.NotPositiveError:
+        except np.linalg.LinAlgError:
             cholesky = False
     return elimination.eliminate(frame, factors, cholesky=cholesky)
 
@@ -300,3 +304,94 @@ def _covariances(frame: Frame, blocks: Blocks) -> Covariances:
         shake, bubbles, cross, own[2], own[3], own[4][0, :encoder, :encoder],
         own[4][0, encoder:, encoder:], *own[5:],
     )  # fmt: skip
+
+
+class Truncation:
+    """Truncated least squares by graduated non-convexity (Yang et al., RA-L 5:1127, 2020).
+
+    Nothing is touched as long as no residual is suspicious.
+    """
+
+    def __init__(self, wanted: bool) -> None:
+        self.wanted, self.control = wanted, 0.0
+
+    def update(
+        self, weights: tuple[Array, Array], residuals: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array], bool]:
+        """New weights, and whether they have changed."""
+        squares = [(r**2).sum(-1) for r in residuals]
+        largest = max((float(s.max(initial=0.0)) for s in squares), default=0.0)
+        bound = _OUTLIER_SIGMAS**2
+        if not self.wanted or (self.control == 0 and largest < _SUSPICIOUS_SIGMAS**2):
+            return weights, False
+        if self.control == 0:
+            self.control = bound / max(2 * largest - bound, bound)
+        else:
+            self.control *= 4
+        fresh = tuple(_truncated(s, bound, self.control) for s in squares)
+        if self.control > 1 and any(len(w) and w.mean() < _LEAST_KEPT for w in fresh):
+            # so many cannot be outliers: it is the motion that the priors do not allow
+            self.wanted = False
+            fresh = tuple(np.ones_like(w) for w in weights)
+        change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fresh, weights))
+        return (fresh[0], fresh[1]), change > 1e-3
+
+
+def _truncated(squares: Array, bound: float, control: float) -> Array:
+    """(M,) weights; control grows from near 0 (convex) to infinity (truncated)."""
+    low, high = control / (control + 1) * bound, (control + 1) / control * bound
+    if control > 1e3:
+        return (squares <= bound).astype(float)
+    between = np.sqrt(bound * control * (control + 1) / np.maximum(squares, 1e-12)) - control
+    return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, np.clip(between, 0, 1)))
+
+
+def late(frame: Frame, state: State) -> bool:
+    """Whether a sensor's delay has moved so far that its samples belong elsewhere."""
+    if not (frame.sensor_flags[1] and frame.problem.accelerometers):
+        return False
+    return bool(np.max(np.abs(state.clocks)) >= _DELAY_STEP_S)
+
+
+def restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
+    """Move the nodes of sensors whose estimated delay has moved."""
+    if not late(frame, state):
+        return frame, state, False
+    leap = np.clip(state.clocks[frame.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
+    fresh = frame_of(frame.problem, frame.model, frame.delays_s + leap)
+    shake = np.stack(
+        [np.interp(fresh.nodes.t_s, frame.nodes.t_s, column) for column in state.shake.T], -1
+    )
+    clocks = np.zeros_like(state.clocks)
+    return fresh, replace(state, shake=shake, clocks=clocks), True
+
+
+def in_large_stack(task: Callable[[], T]) -> T:
+    """Run in a thread with a large stack: GTSAM's recursion is as deep as the run is long.
+
+    Python's cycle collector rests meanwhile: it would walk through a million small arrays, none of
+    them in a cycle, again and again, more than linearly in the length of the run.
+    """
+    result: list[T] = []
+    fault: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            result.append(task())
+        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
+            fault.append(error)
+
+    collecting = gc.isenabled()
+    gc.disable()
+    before = threading.stack_size(_STACK_BYTES)
+    try:
+        thread = threading.Thread(target=run, name="telerig-smoother")
+        thread.start()
+    finally:
+        threading.stack_size(before)
+    thread.join()
+    if collecting:
+        gc.enable()
+    if fault:
+        raise fault[0]
+    return result[0]

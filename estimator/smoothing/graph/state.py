@@ -133,10 +133,9 @@ class Frame:
         model = self.model
         return read and model.encoder_scale_sigma > 0, read and model.encoder_delay_sigma_s > 0
 
-    def by_scale(self, column: Array) -> Array:
-        """(..., n, 0 to 2) derivatives by the encoder's scale and delay, from (..., n) by scale."""
-        both = np.stack([column, np.zeros_like(column)], -1)
-        return np.asarray(both[..., np.array(self.encoder_flags)])
+    def by_encoder(self, by_scale: Array, by_delay: Array) -> Array:
+        """(..., n, 0 to 2) derivatives by those of the encoder's constants that are variables."""
+        return np.asarray(np.stack([by_scale, by_delay], -1)[..., np.array(self.encoder_flags)])
 
     @property
     def encoder_size(self) -> int:

@@ -1,8 +1,8 @@
 """Marginal likelihood and posterior of one channel, from the Cholesky factor of its chain.
 
-The precision of a chain of states is block-tridiagonal, eliminated frame by frame (`shake_chain`).
-Constants (mean velocities, places of marks) are eliminated after the chain. The evidence equals the
-graph's, channel by channel (see tests/test_shake_learning.py).
+The precision of a chain of states is block-tridiagonal and eliminated frame by frame. Constants
+(mean velocities, places of marks) are eliminated after the chain. The evidence equals the graph's,
+channel by channel (see tests/test_shake_learning.py).
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.learning.chain import eliminated
+from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.lines_of_sight import Channel
 from telerig.estimator.smoothing.learning.processes import bubble_processes, shake_processes
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
 from telerig.factors.measurements import whitener_of
-from telerig.factors.motion import Motion, start
-from telerig.factors.motion_stack import stacked_motion
+from telerig.factors.motion import Motion, motion, start
 from telerig.factors.state_space import Component, slow_ou
 
 Array = NDArray[np.float64]
@@ -120,7 +119,7 @@ class Factor:
     def __init__(self, channel: Channel, model: ShakeModel) -> None:
         self.channel = channel
         self.system = system = _system(channel, model)
-        self.steps = steps = stacked_motion(system.components, np.diff(channel.t_s))
+        self.steps = steps = motion(system.components, np.diff(channel.t_s), batched=True)
         self.which = np.append(steps.index, len(steps.basis) - 1)
         self.bases = steps.basis
         self.weight = weight = channel.weight / model.pixel_inflation**2

@@ -4,7 +4,7 @@ Fisher's identity: the derivative of the log evidence is the posterior mean of t
 log density of states and measurements together (Cappe, Moulines, Ryden, Inference in Hidden Markov
 Models, 2005, sec. 10.1.3). That density is a sum over independent processes, each a function of its
 own few states: second moments of these, summed over the frames, are all that is needed of the
-posterior (see `shake_chain`); what a parameter does to a process of two or four states is cheap.
+posterior; what a parameter does to a process of two or four states is cheap.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from telerig.estimator.smoothing.learning.processes import (
     shake_processes,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel
-from telerig.factors.motion_stack import Stack, lengths_of, stacks
-from telerig.factors.state_space import Component
+from telerig.factors.state_space import Component, Steps, discretise, distinct_steps
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -118,7 +117,7 @@ def _expected(
     changes: list[_Change],
 ) -> Array:
     """(changes,) posterior mean of the states' log density, were a process like the change's."""
-    dt_s, index = lengths_of(np.diff(factor.channel.t_s).tobytes())
+    dt_s, index = distinct_steps(np.diff(factor.channel.t_s))
     counts = np.bincount(index, minlength=len(dt_s))
     own = [p.component for p in (*shake, *bubble)]
     begin = np.r_[0, np.cumsum([c.size for c in own])]
@@ -126,7 +125,7 @@ def _expected(
     places = _Places(begin, copies, int(begin[-1] - begin[len(shake)]))
     process = np.array([c.process for c in changes])
     out = np.zeros(len(changes))
-    for stack in stacks([*own, *(c.component for c in changes)], dt_s):
+    for stack in discretise([*own, *(c.component for c in changes)], dt_s):
         new = np.flatnonzero(stack.which >= len(own))
         if not len(new):
             continue
@@ -142,7 +141,7 @@ def _expected(
     return out
 
 
-def _noise_rows(stack: Stack, old: Ints, new: Ints) -> Array:
+def _noise_rows(stack: Steps, old: Ints, new: Ints) -> Array:
     """(m, U, n, 2 n) whitened noise under new processes, from that under old ones and the state."""
     one, two = (np.swapaxes(stack.whitener[at], -1, -2) for at in (old, new))
     same = np.swapaxes(np.linalg.solve(one, two), -1, -2)

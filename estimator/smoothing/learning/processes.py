@@ -25,7 +25,13 @@ Make = Callable[..., Component]
 
 _cached = lru_cache(maxsize=512)
 _resonance = _cached(resonance)
-_broad_band, _slow_ou, _ou_velocity = _cached(broad_band), _cached(slow_ou), _cached(ou_velocity)
+_broad_band, _slow_ou = _cached(broad_band), _cached(slow_ou)
+
+
+@_cached
+def _ou_velocity(**values: float) -> Component:
+    """The mean velocity is a constant of the signal, no input of the states."""
+    return ou_velocity(**values).without_input()
 
 
 @dataclass(frozen=True)

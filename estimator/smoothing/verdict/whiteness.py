@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.graph.linear_sensors import accelerometers, felt
+from telerig.estimator.smoothing.graph.linear import accelerometers, felt
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.verdict.residual_draws import drawn_residuals, stretch_of
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from shake_learning_data import run, true_model
 
-from telerig.estimator.smoothing.learning.chain import eliminated
+from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.evidence import channel_evidence
 from telerig.estimator.smoothing.learning.gradient import channel_slope
 from telerig.estimator.smoothing.learning.likelihood import evidence, evidence_slope, laplace_sigma

@@ -19,8 +19,8 @@ def _offsets(floor: float, seconds: float, seed: int) -> tuple[np.ndarray, np.nd
     rng = np.random.default_rng(seed)
     component = broad_band(RMS_MM, floor=floor, **BAND)
     t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
-    steps = discretise(component, np.diff(t)[:1])
-    transition, root = steps.transition[0], np.linalg.inv(steps.whitener[0])
+    steps = discretise([component], np.diff(t)[:1])[0]
+    transition, root = steps.transition[0, 0], np.linalg.inv(steps.whitener[0, 0])
     start = np.linalg.cholesky(component.start_covariance + 1e-15 * np.eye(component.size))
     x = np.einsum("ij,cj->ci", start, rng.normal(size=(4, component.size)))
     out = np.zeros((len(t), 2, 3))

@@ -23,7 +23,14 @@ from telerig.estimator.smoothing.problem.problem import (
     Zigzag,
 )
 from telerig.estimator.smoothing.smooth import smooth
-from telerig.factors.state_space import Component, discretise, driven_mode, oscillator, ou_velocity
+from telerig.factors.state_space import (
+    Component,
+    discretise,
+    distinct_steps,
+    driven_mode,
+    oscillator,
+    ou_velocity,
+)
 from telerig.io.rig_file.description import StageDescription
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -47,13 +54,14 @@ TRUE = ShakeModel(
 
 
 def path(component: Component, t: Any, rng: np.random.Generator) -> Any:
-    steps = discretise(component, np.diff(t))
-    roots = np.linalg.inv(steps.whitener)
+    lengths, index = distinct_steps(np.diff(t))
+    steps = discretise([component], lengths)[0]
+    roots = np.linalg.inv(steps.whitener[0])
     values, vectors = np.linalg.eigh(component.start_covariance)
     x = vectors @ (np.sqrt(values.clip(0)) * rng.normal(size=component.size))
     out = [x]
-    for i in steps.index:
-        x = steps.transition[i] @ x + roots[i] @ rng.normal(size=component.size)
+    for i in index:
+        x = steps.transition[0, i] @ x + roots[i] @ rng.normal(size=component.size)
         out.append(x)
     return np.array(out)
 

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 Array = NDArray[np.float64]
 
@@ -37,7 +39,7 @@ class Chain:
 
     def means(self, sides: Array) -> Array:
         """(F, K, D) solutions for right sides (F, K, D) as in ``sides``."""
-        inverse = self._inverse()
+        inverse = inverses(self.upper)
         turned = np.swapaxes(inverse, -1, -2)
         out, gain = sides @ turned, self.following @ turned[:-1]
         part = np.empty(out.shape[1:])
@@ -48,7 +50,7 @@ class Chain:
 
     def moments(self, sides: Array) -> tuple[Array, Array, Array]:
         """As `means`, and covariances (F, D, D), (F - 1, D, D) of states with the ones before."""
-        inverse = self._inverse()
+        inverse = inverses(self.upper)
         turned = np.swapaxes(inverse, -1, -2)
         size = self.upper.shape[-1]
         gain = self.following @ turned[:-1]
@@ -65,37 +67,43 @@ class Chain:
             mean[t] -= product[size:]
         return mean, own, -carried[:, :size]
 
-    def _inverse(self) -> Array:
-        """(F, D, D) L_t^-T."""
-        from scipy.linalg.lapack import dtrtri
-
-        out = self.upper.copy()
-        for block in out:
-            dtrtri(block.T, lower=1, overwrite_c=1)
-        return out
-
 
 def eliminated(own: Array, following: Array, sides: Array) -> Chain:
     """The factor of diagonal blocks (F, D, D) and those below (F - 1, D, D), with sides (F, S, D).
 
     Raises numpy's LinAlgError where the precision is not positive definite. The input is used up.
     """
-    from scipy.linalg.blas import dtrsm
-    from scipy.linalg.lapack import dpotrf
-
     count = sides.shape[1]
     joined = np.zeros((len(own), count + own.shape[-1], own.shape[-1]))
     joined[:, :count], joined[:-1, count:] = sides, following
-    product = np.empty(joined.shape[1:])
-    ahead = np.swapaxes(joined[:, count:], -1, -2)
-    last = len(own) - 1
-    for t in range(last + 1):
-        block, rows = own[t], joined[t]
-        if dpotrf(block.T, lower=1, clean=1, overwrite_a=1)[1]:
-            raise np.linalg.LinAlgError(f"frame {t}")
-        dtrsm(1.0, block.T, rows.T, lower=1, overwrite_b=1)
-        if t < last:
-            np.matmul(rows, ahead[t], out=product)
-            own[t + 1] -= product[count:]
-            joined[t + 1, :count] -= product[:count]
+    eliminate_forward(own, joined)
     return Chain(own, joined[:, :count], joined[:-1, count:])
+
+
+def eliminate_forward(own: Array, joined: Array) -> None:
+    """Eliminate frame by frame, in place.
+
+    own : (F, D, D), in: diagonal blocks, out: L_t^T.
+    joined : (F, S + D, D), in: rows of the sides and of the next frame, out: the same times L_t^-T.
+    Raises numpy's LinAlgError where the precision is not positive definite.
+    """
+    width, last = own.shape[-1], len(own) - 1
+    after = joined.shape[1] - width
+    product = np.empty(joined.shape[1:])
+    for t in range(last + 1):
+        if dpotrf(own[t].T, lower=1, clean=1, overwrite_a=1)[1]:
+            raise np.linalg.LinAlgError(f"frame {t}")
+        rows = joined[t]
+        dtrsm(1.0, own[t].T, rows.T, lower=1, overwrite_b=1)
+        if t < last:
+            np.matmul(rows, rows[after:].T, out=product)
+            own[t + 1] -= product[after:]
+            joined[t + 1, :after] -= product[:after]
+
+
+def inverses(upper: Array) -> Array:
+    """(F, D, D) inverses of upper triangular blocks (F, D, D)."""
+    out = upper.copy()
+    for block in out:
+        dtrtri(block.T, lower=1, overwrite_c=1)
+    return out

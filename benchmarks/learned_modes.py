@@ -26,9 +26,9 @@ from shake_learning_data import ARM_HZ, COMMON_HZ, run, true_model
 from shake_scene import cases, simulate
 
 from telerig.estimator.smoothing.graph.solve import Options, solve
-from telerig.estimator.smoothing.learning import mode_labels
+from telerig.estimator.smoothing.learning import attribution
 from telerig.estimator.smoothing.learning.likelihood import maximise
-from telerig.estimator.smoothing.learning.lines_of_sight import channels_of, pooled
+from telerig.estimator.smoothing.learning.lines_of_sight import pooled, signals_of
 from telerig.estimator.smoothing.learning.parameters import FORCE
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.smooth import smooth
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 RIG_HZ, RIG_MM = 30.0, 0.5
 HIDDEN_MM = (0.0, 0.08, 0.15)
 LINE = "bubble.zigzags.1."
-PRIORS = {"as it is": mode_labels.expected, "all sizes alike": lambda line, own: np.ones(6)}
+PRIORS = {"as it is": attribution.expected, "all sizes alike": lambda line, own: np.ones(6)}
 
 
 def hidden(hidden_mm: float, seed: int) -> Iterable[tuple[str, float, float, float]]:
@@ -51,12 +51,12 @@ def hidden(hidden_mm: float, seed: int) -> Iterable[tuple[str, float, float, flo
     common, *arms = (replace(m, force_hz=60.0) for m in told.modes)
     arms = [replace(m, frequency_hz=ARM_HZ / COMMON_HZ * RIG_HZ) for m in arms]
     told = replace(told, modes=(replace(common, frequency_hz=RIG_HZ), *arms))
-    heights = pooled(channels_of(problem)[0])
+    heights = pooled(signals_of(problem)[0])
     names = [LINE + last for last in ("frequency_hz", "damping", "rms_mm")]
     found = maximise(heights, told, names, steps=8).model
     for prior, expected in PRIORS.items():
-        with patch.object(mode_labels, "expected", expected):
-            model = mode_labels.doubted(heights, found, (0.0, 1.0, 0.0), problem.up)
+        with patch.object(attribution, "expected", expected):
+            model = attribution.with_hidden_modes(heights, found, (0.0, 1.0, 0.0), problem.up)
         yield prior, *_heights(problem, model, lab)
 
 

@@ -11,7 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.stage_travel import left_open, scale_sigma, total_scale
+from telerig.estimator.smoothing.graph.stage_travel import (
+    considered_variance,
+    scale_sigma,
+    total_scale,
+)
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
 
@@ -125,7 +129,7 @@ def _travel(solution: Solution) -> dict[str, Any]:
     travel = solution.frame.problem.travel
     if travel is None or solution.frame.problem.stage is None:
         return {}
-    place, _ = left_open(solution)
+    place, _ = considered_variance(solution)
     return {
         "axis": travel.axis.tolist(),
         "axis_from": "stage_axis" if travel.source == "stage_axis" else "rig.toml",

@@ -14,7 +14,9 @@ from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution,
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
 from telerig.estimator.smoothing.learning.adapted_priors import adapted
 from telerig.estimator.smoothing.learning.default_priors import default_model
-from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import inflated
+from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import (
+    with_hyperparameter_uncertainty,
+)
 from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
@@ -103,7 +105,7 @@ def smooth(
         solution = _adapted_solution(problem, chosen, options, progress)
         chosen = solution.frame.model
         if chosen.learned:
-            solution = inflated(solution)
+            solution = with_hyperparameter_uncertainty(solution)
     verdict = judge(problem, chosen, solution) if problem.bubbles else {}
     summary = summary_of(solution)
     change = refined_change(solution, calibration)

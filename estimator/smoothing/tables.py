@@ -8,7 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.stage_travel import carriage, carriage_sigma, left_open
+from telerig.estimator.smoothing.graph.stage_travel import (
+    carriage,
+    carriage_sigma,
+    considered_variance,
+)
 from telerig.estimator.smoothing.problem.problem import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
 
@@ -42,7 +46,7 @@ def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFram
     columns |= _named(states @ layout.position.T, "{}_mm")
     columns |= _named(states @ layout.velocity.T, "v{}_mm_s")
     if covariances is not None:
-        place, speed = left_open(solution)
+        place, speed = considered_variance(solution)
         sigma = _sigma(layout.position, covariances.bubbles)
         columns |= _named(np.sqrt(sigma**2 + place), "s{}_mm")
         sigma = _sigma(layout.velocity, covariances.bubbles)
@@ -142,7 +146,7 @@ def _rts(
     filter_.P = np.kron(start, np.eye(3))
     filter_.H = np.eye(3, 9)
     matrices = [np.kron(a, np.eye(3)) for a in (transition, noise)]
-    readings = [p if s else None for p, s in zip(position_mm, seen)]
+    readings = [p[:, None] if s else None for p, s in zip(position_mm, seen)]
     means, covariances, _, _ = filter_.batch_filter(readings, *matrices, Rs=covariance_mm2)
     smooth, *_ = filter_.rts_smoother(means, covariances, *matrices)
     return smooth[:, :3, 0], smooth[:, 3:6, 0]

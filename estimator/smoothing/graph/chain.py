@@ -66,7 +66,7 @@ class Places:
         return when, column
 
 
-def suits(frame: Frame) -> bool:
+def is_chain_of_frames(frame: Frame) -> bool:
     """Whether a graph of frames alone has states to chain, and few constants."""
     constants = sum(n * d for n, d in frame.counts()[2:])
     return frame.shake.size > 0 and constants <= MOST_CONSTANTS

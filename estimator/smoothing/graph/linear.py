@@ -293,7 +293,7 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
     acceleration = states @ rows.T + late[:, None] * (states @ jerk_rows.T)
     read = measurements.accelerometer_reading(acceleration, problem.up, sensor.axes, bias, scale)
     slope = _slope(sensor)
-    project, white = felt(frame, index)
+    project, white = sensed_directions(frame, index)
     by_shake = (project @ read.by_acceleration[0]) @ (
         (rows + late[:, None, None] * jerk_rows) @ frame.shake_basis(node)
     )
@@ -324,7 +324,7 @@ def _slope(sensor: Accelerometer) -> Array:
     return np.asarray(slope / step, np.float64)
 
 
-def felt(frame: Frame, index: int) -> tuple[Array, float]:
+def sensed_directions(frame: Frame, index: int) -> tuple[Array, float]:
     """(k, 3) whitened rows that take a reading to the directions of modelled motion; log det."""
     sensor = frame.problem.accelerometers[index]
     directions = np.eye(3) if sensor.camera == CARRIAGE else frame.shake.seen[sensor.camera]

@@ -133,18 +133,20 @@ def _solve(
     exact = _is_linear(problem, model)
     done = 0
     for done in range(1, options.passes + _CLOCK_PASSES + 1):
-        if done > options.passes and not late(frame, state):
+        if done > options.passes and not delays_have_moved(frame, state):
             break
         progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
         last = made = _linear_solve(frame, state, weights)
         state = moved(frame, state, made.done.vector)
         residuals = pixel_residuals(frame, state)
         fresh, changed = robust.update(weights, residuals)
-        settled = (made.largest_px < options.tolerance_px and not late(frame, state)) or exact
+        settled = (
+            made.largest_px < options.tolerance_px and not delays_have_moved(frame, state)
+        ) or exact
         if settled and not changed and (done > 1 or start is not None or exact):
             break
         weights = fresh
-        frame, state, again = restamped(frame, state)
+        frame, state, again = with_moved_nodes(frame, state)
         last = None if again or changed else last
     if last is None:
         weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
@@ -223,7 +225,7 @@ def _eliminated(frame: Frame, factors: list[Linear]) -> Eliminated:
     """
     only_frames = len(frame.nodes.t_s) == len(frame.problem.t_s)
     cholesky = only_frames and not frame.model.broad_bands
-    if cholesky and chain.suits(frame):
+    if cholesky and chain.is_chain_of_frames(frame):
         places = chain.places_of(frame)
         try:
             return chain.eliminate(places, chain.normal_equations(places, factors))
@@ -346,16 +348,16 @@ def _truncated(squares: Array, bound: float, control: float) -> Array:
     return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, np.clip(between, 0, 1)))
 
 
-def late(frame: Frame, state: State) -> bool:
+def delays_have_moved(frame: Frame, state: State) -> bool:
     """Whether a sensor's delay has moved so far that its samples belong elsewhere."""
     if not (frame.sensor_flags[1] and frame.problem.accelerometers):
         return False
     return bool(np.max(np.abs(state.clocks)) >= _DELAY_STEP_S)
 
 
-def restamped(frame: Frame, state: State) -> tuple[Frame, State, bool]:
+def with_moved_nodes(frame: Frame, state: State) -> tuple[Frame, State, bool]:
     """Move the nodes of sensors whose estimated delay has moved."""
-    if not late(frame, state):
+    if not delays_have_moved(frame, state):
         return frame, state, False
     leap = np.clip(state.clocks[frame.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
     fresh = frame_of(frame.problem, frame.model, frame.delays_s + leap)

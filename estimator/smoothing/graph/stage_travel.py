@@ -52,12 +52,12 @@ def default_scale_sigma(travel: Travel | None) -> float:
     """Prior of the encoder's scale where marks tell it.
 
     Not wider for that: a lens that is not quite telecentric and sees marks at unknown depths tells
-    the scale hardly at all. See `widened`.
+    the scale hardly at all. See `wider_scale_sigma`.
     """
     return SCALE_SIGMA if travel is None else float(np.sqrt(travel.covariance[2, 2]))
 
 
-def widened(solution: Solution) -> float | None:
+def wider_scale_sigma(solution: Solution) -> float | None:
     """The prior's sd for a scale that the run puts far outside an assumed one; None: it stays.
 
     Twice the estimate, which the narrow prior has drawn towards 0.
@@ -70,7 +70,7 @@ def widened(solution: Solution) -> float | None:
     return 2 * off if off > _FAR * prior else None
 
 
-def left_open(solution: Solution) -> tuple[Array, Array]:
+def considered_variance(solution: Solution) -> tuple[Array, Array]:
     """(rows, 3) variances of the bubbles' positions and velocities from scale and axis."""
     at = solution.frame.frame_of_row
     places, speeds = carriage(solution)

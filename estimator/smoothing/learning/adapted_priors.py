@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.graph.linear import images
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.stage_travel import widened
+from telerig.estimator.smoothing.graph.stage_travel import wider_scale_sigma
 from telerig.estimator.smoothing.learning.default_priors import DEFAULT_FLOOR, rescaled
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel
 from telerig.factors.state_space import broad_band_density
@@ -38,9 +38,9 @@ def adapted(solution: Solution) -> ShakeModel | None:
     None if that is it.
     """
     model = solution.frame.model
-    inflation = _inflation(solution)
+    inflation = _noise_factor(solution)
     better = model
-    wide = widened(solution)
+    wide = wider_scale_sigma(solution)
     if wide is not None:
         better = replace(better, encoder_scale_sigma=wide)
     if inflation > 1:
@@ -137,7 +137,7 @@ def _dominant_hz(solution: Solution) -> float:
     return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
 
 
-def _inflation(solution: Solution) -> float:
+def _noise_factor(solution: Solution) -> float:
     """By how much the pixels' stated noise is too small, 1 at least.
 
     From the median square of single coordinates, which outliers do not move; what the fit takes up

@@ -1,37 +1,56 @@
-"""Marginal likelihood and posterior of one channel, from the Cholesky factor of its chain.
+"""Marginal likelihood (evidence), posterior and gradient of one line-of-sight signal.
 
 The precision of a chain of states is block-tridiagonal and eliminated frame by frame. Constants
 (mean velocities, places of marks) are eliminated after the chain. The evidence equals the graph's,
-channel by channel (see tests/test_shake_learning.py).
+signal by signal (see tests/estimator/smoothing/test_shake_learning.py).
+
+The gradient by the hyper-parameters costs a few evaluations, whatever their number. Fisher's
+identity: the derivative of the log evidence is the posterior mean of the derivative of the log
+density of states and measurements together (Cappe, Moulines, Ryden, Inference in Hidden Markov
+Models, 2005, sec. 10.1.3). That density is a sum over independent processes, each a function of its
+own few states, so that second moments of these, summed over the frames, are all that is needed of
+the posterior.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel
-from telerig.estimator.smoothing.learning.processes import bubble_processes, shake_processes
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal
+from telerig.estimator.smoothing.learning.processes import (
+    Process,
+    bubble_processes,
+    shake_processes,
+)
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
 from telerig.factors.measurements import whitener_of
 from telerig.factors.motion import Motion, motion, start
-from telerig.factors.state_space import Component, slow_ou
+from telerig.factors.state_space import (
+    Component,
+    Steps,
+    discretise,
+    distinct_steps,
+    slow_ou,
+)
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _STILL_MM = 1e-6
+_DIFFERENCE = 1e-4
 
 
 @dataclass(frozen=True)
-class ChannelPosterior:
+class SignalPosterior:
     """log_evidence : of the measurements.  position_mm : (B, F) of the moving items, lab, along
     the direction, less their start.  offset_mm : (J, F) of each camera.
 
-    Of a channel of R replicates (B R, F) and (J R, F), those of an item one after the other.
+    Of a signal of R replicates (B R, F) and (J R, F), those of an item one after the other.
     """
 
     log_evidence: float
@@ -57,55 +76,55 @@ class _System:
     prior_sigma: Array
 
 
-def channel_evidence(channel: Channel, model: ShakeModel) -> float:
-    """Natural log of the density of the channel's measurements."""
-    return Factor(channel, model).log_evidence()
+def signal_evidence(signal: Signal, model: ShakeModel) -> float:
+    """Natural log of the density of the signal's measurements."""
+    return Factor(signal, model).log_evidence()
 
 
-def channel_posterior(channel: Channel, model: ShakeModel) -> ChannelPosterior:
+def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
     """Evidence and means."""
-    return Factor(channel, model).posterior()
+    return Factor(signal, model).posterior()
 
 
-def position_sigma(channel: Channel, model: ShakeModel, frames: NDArray[np.int64]) -> Array:
+def position_sigma(signal: Signal, model: ShakeModel, frames: NDArray[np.int64]) -> Array:
     """(B, n) standard deviation of the moving items' positions at some frames."""
-    return Factor(channel, model).position_sigma(frames)
+    return Factor(signal, model).position_sigma(frames)
 
 
-def _system(channel: Channel, model: ShakeModel) -> _System:
-    shake = [(p.component, p.camera) for p in shake_processes(channel, model)]
-    bubble = [p.component for p in bubble_processes(channel, model)]
-    if not shake and not channel.moving.any():
+def _system(signal: Signal, model: ShakeModel) -> _System:
+    shake = [(p.component, p.camera) for p in shake_processes(signal, model)]
+    bubble = [p.component for p in bubble_processes(signal, model)]
+    if not shake and not signal.moving.any():
         shake = [(slow_ou(_STILL_MM, 1.0), CARRIAGE)]
-    parts = [c for c, _ in shake] + bubble * int(channel.moving.sum())
+    parts = [c for c, _ in shake] + bubble * int(signal.moving.sum())
     size, shaken = sum(c.size for c in parts), sum(c.size for c, _ in shake)
-    offset = np.zeros((len(channel.cameras), size))
+    offset = np.zeros((len(signal.cameras), size))
     at = 0
     for part, camera in shake:
-        which = slice(None) if camera == CARRIAGE else channel.cameras.index(camera)
+        which = slice(None) if camera == CARRIAGE else signal.cameras.index(camera)
         offset[which, at : at + part.size] += part.position
         at += part.size
     width = sum(c.size for c in bubble)
-    movers = np.flatnonzero(channel.moving)
-    position, velocity = np.zeros((len(channel.moving), size)), np.zeros((len(movers), size))
+    movers = np.flatnonzero(signal.moving)
+    position, velocity = np.zeros((len(signal.moving), size)), np.zeros((len(movers), size))
     for k, item in enumerate(movers):
         columns = slice(shaken + k * width, shaken + (k + 1) * width)
         position[item, columns] = np.concatenate([c.position for c in bubble])
         velocity[k, columns] = np.concatenate([c.velocity for c in bubble])
-    columns_, sigma = _constants(channel, model)
-    rows = position[channel.item] - offset[channel.camera]
+    columns_, sigma = _constants(signal, model)
+    rows = position[signal.item] - offset[signal.camera]
     return _System(tuple(parts), rows, offset, position[movers], velocity, columns_, sigma)
 
 
-def _constants(channel: Channel, model: ShakeModel) -> tuple[Array, Array]:
+def _constants(signal: Signal, model: ShakeModel) -> tuple[Array, Array]:
     """(F, P, I): a moving item's travel at 1 mm/s, a fixed item's place; priors (I,)."""
-    t = channel.t_s
-    columns = np.zeros((len(t), len(channel.item), len(channel.moving)))
-    for p, item in enumerate(channel.item):
-        since = t - t[channel.first[item]]
-        columns[:, p, item] = since if channel.moving[item] else 1.0
-    speed = model.bubble.mean_sigma_mm_s / np.sqrt(channel.pooled)
-    sigma = np.where(channel.moving, speed, channel.start_sigma_mm)
+    t = signal.t_s
+    columns = np.zeros((len(t), len(signal.item), len(signal.moving)))
+    for p, item in enumerate(signal.item):
+        since = t - t[signal.first[item]]
+        columns[:, p, item] = since if signal.moving[item] else 1.0
+    speed = model.bubble.mean_sigma_mm_s / np.sqrt(signal.pooled)
+    sigma = np.where(signal.moving, speed, signal.start_sigma_mm)
     return columns, sigma
 
 
@@ -116,16 +135,16 @@ class Factor:
     rows : (U + 1, P, D).  rest : (F, P, R) measured less ``guess``.  constants : (c, R).
     """
 
-    def __init__(self, channel: Channel, model: ShakeModel) -> None:
-        self.channel = channel
-        self.system = system = _system(channel, model)
-        self.steps = steps = motion(system.components, np.diff(channel.t_s), batched=True)
+    def __init__(self, signal: Signal, model: ShakeModel) -> None:
+        self.signal = signal
+        self.system = system = _system(signal, model)
+        self.steps = steps = motion(system.components, np.diff(signal.t_s), batched=True)
         self.which = np.append(steps.index, len(steps.basis) - 1)
         self.bases = steps.basis
-        self.weight = weight = channel.weight / model.pixel_inflation**2
+        self.weight = weight = signal.weight / model.pixel_inflation**2
         self.rows = system.rows @ self.bases
-        self.guess = _fitted(channel, system, weight)
-        self.rest = _replicates(channel) - system.columns @ self.guess
+        self.guess = _fitted(signal, system, weight)
+        self.rest = _replicates(signal) - system.columns @ self.guess
         self.count = self.rest.shape[-1]
         data = np.concatenate([self.rest, system.columns], -1)
         weighted = weight[..., None] * data
@@ -177,27 +196,27 @@ class Factor:
         sides[:, :count] += self.chain.sides[:, :count]
         return sides, constants
 
-    def posterior(self) -> ChannelPosterior:
-        system, channel, count = self.system, self.channel, self.count
+    def posterior(self) -> SignalPosterior:
+        system, signal, count = self.system, self.signal, self.count
         states = self.chain.means(self.spread()[0][:, :count])
         states = states @ np.swapaxes(self.bases, -1, -2)[self.which]
-        movers = np.flatnonzero(channel.moving)
+        movers = np.flatnonzero(signal.moving)
         speed = (self.guess + self.constants)[movers, :, None]
-        since = (channel.t_s - channel.t_s[channel.first[movers], None])[:, None]
+        since = (signal.t_s - signal.t_s[signal.first[movers], None])[:, None]
         position, velocity, offset = (
             np.einsum("bd,frd->brf", row, states, optimize=True)
             for row in (system.position, system.velocity, system.offset)
         )
         found = position + speed * since, velocity + speed, offset
-        frames = len(channel.t_s)
-        return ChannelPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
+        frames = len(signal.t_s)
+        return SignalPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
 
     def position_sigma(self, frames: NDArray[np.int64]) -> Array:
-        system, channel = self.system, self.channel
-        movers = np.flatnonzero(channel.moving)
+        system, signal = self.system, self.signal
+        movers = np.flatnonzero(signal.moving)
         sides, constants = self.spread()
         mean, own, _ = self.chain.moments(sides[:, self.count :])
-        since = (channel.t_s - channel.t_s[channel.first[movers], None])[:, frames, None]
+        since = (signal.t_s - signal.t_s[signal.first[movers], None])[:, frames, None]
         rows = system.position @ self.bases[self.which[frames]]
         by_constant = np.einsum("fbd,fkd->bfk", rows, mean[frames])
         by_constant += since * constants[movers, None, self.count :]
@@ -214,22 +233,22 @@ def runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice | NDArray[np.int
         yield value, slice(int(mine[0]), int(mine[-1]) + 1) if whole else mine
 
 
-def _replicates(channel: Channel) -> Array:
+def _replicates(signal: Signal) -> Array:
     """(F, P, R) the measurements, R of them alike but for their values."""
-    values = channel.value_mm
+    values = signal.value_mm
     return values if values.ndim == 3 else values[..., None]
 
 
-def _fitted(channel: Channel, system: _System, weight: Array) -> Array:
+def _fitted(signal: Signal, system: _System, weight: Array) -> Array:
     """(c, R) constants near the answer: what is small without them keeps its digits.
 
     Moving items by straight lines, what is fixed where it was guessed.
     """
-    values = _replicates(channel)
-    out = np.zeros((len(channel.moving), values.shape[-1]))
-    for item in np.flatnonzero(channel.moving):
-        mine = channel.item == item
-        w, t = weight[:, mine].sum(1), channel.t_s - channel.t_s[channel.first[item]]
+    values = _replicates(signal)
+    out = np.zeros((len(signal.moving), values.shape[-1]))
+    for item in np.flatnonzero(signal.moving):
+        mine = signal.item == item
+        w, t = weight[:, mine].sum(1), signal.t_s - signal.t_s[signal.first[item]]
         if not w.any():
             continue
         mean = (weight[:, mine, None] * values[:, mine]).sum(1) / np.where(w > 0, w, 1.0)[:, None]
@@ -262,3 +281,162 @@ def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
     log_det = float(np.log(np.abs(np.diag(whitener))).sum() + steps.log_det[steps.index].sum())
     each = np.linalg.slogdet(steps.basis)[1]
     return diagonal, (forward @ last)[place], log_det + float(each[which].sum())
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """Second moments under the posterior, summed over replicates.
+
+    step : (U, 2 D, 2 D) of (w, x), the whitened noise of a step and the state before it, summed
+    over the steps of one length.  start : (D, D) of the first state.  residual : of the whitened
+    measurements less what is predicted, summed.
+    """
+
+    step: Array
+    start: Array
+    residual: float
+
+
+@dataclass(frozen=True)
+class _Change:
+    """A process with one hyper-parameter moved.
+
+    process : place among the signal's.  name : index into the names.  sign : up or down.
+    """
+
+    process: int
+    name: int
+    sign: int
+    component: Component
+
+
+def signal_gradient(signal: Signal, model: ShakeModel, names: Sequence[str]) -> tuple[float, Array]:
+    """The log evidence, as `signal_evidence`, and (n,) its derivatives by log-parameters."""
+    factor = Factor(signal, model)
+    moments = _moments(factor)
+    slope = np.zeros(len(names))
+    if "pixel_inflation" in names:
+        seen = factor.count * int((signal.weight > 0).sum())
+        slope[names.index("pixel_inflation")] = moments.residual - seen
+    shake, bubble = shake_processes(signal, model), bubble_processes(signal, model)
+    changes = _changes([*shake, *bubble], names)
+    if changes:
+        expected = _expected(factor, moments, shake, bubble, changes)
+        for change, value in zip(changes, expected):
+            slope[change.name] += change.sign * value / (2 * _DIFFERENCE)
+    return factor.log_evidence(), slope
+
+
+def _changes(found: list[Process], names: Sequence[str]) -> list[_Change]:
+    where = {name: i for i, name in enumerate(names)}
+    return [
+        _Change(i, where[name], sign, p.moved(last, np.exp(sign * _DIFFERENCE)))
+        for i, p in enumerate(found)
+        for name, last in p.names.items()
+        if name in where
+        for sign in (1, -1)
+    ]
+
+
+@dataclass(frozen=True)
+class _Places:
+    """begin : (N + 1,) first state of each process.  copies : (N,) of it, ``width`` apart."""
+
+    begin: Ints
+    copies: Ints
+    width: int
+
+    def moments(self, found: _Moments, which: Ints) -> tuple[Array, Array]:
+        """(m, U, 2 n, 2 n) and (m, n, n): those of processes of n states, their copies' summed."""
+        size, count = len(found.start), self.copies[which]
+        states = np.arange(self.begin[which[0] + 1] - self.begin[which[0]])
+        step, start = np.zeros(()), np.zeros(())
+        for k in range(max(count)):
+            used = (count > k)[:, None, None]
+            at = self.begin[which, None] + states + np.minimum(k, count - 1)[:, None] * self.width
+            both = np.concatenate([at, size + at], -1)
+            more = found.step[:, both[:, :, None], both[:, None]]
+            step = step + used[:, None] * np.swapaxes(more, 0, 1)
+            start = start + used * found.start[at[:, :, None], at[:, None]]
+        return step, start
+
+
+def _expected(
+    factor: Factor,
+    found: _Moments,
+    shake: list[Process],
+    bubble: list[Process],
+    changes: list[_Change],
+) -> Array:
+    """(changes,) posterior mean of the states' log density, were a process like the change's."""
+    dt_s, index = distinct_steps(np.diff(factor.signal.t_s))
+    counts = np.bincount(index, minlength=len(dt_s))
+    own = [p.component for p in (*shake, *bubble)]
+    begin = np.r_[0, np.cumsum([c.size for c in own])]
+    copies = np.repeat([1, int(factor.signal.moving.sum())], [len(shake), len(bubble)])
+    places = _Places(begin, copies, int(begin[-1] - begin[len(shake)]))
+    process = np.array([c.process for c in changes])
+    out = np.zeros(len(changes))
+    for stack in discretise([*own, *(c.component for c in changes)], dt_s):
+        new = np.flatnonzero(stack.which >= len(own))
+        if not len(new):
+            continue
+        mine = stack.which[new] - len(own)
+        which = process[mine]
+        old = np.searchsorted(stack.which, which)
+        step, start = places.moments(found, which)
+        rows = _noise_rows(stack, old, new)
+        square = ((rows @ step) * rows).sum((1, 2, 3))
+        square += ((stack.start[new] @ start) * stack.start[new]).sum((1, 2))
+        log_det = stack.log_det[new] @ counts + stack.start_log_det[new]
+        out[mine] = factor.count * copies[which] * log_det - square / 2
+    return out
+
+
+def _noise_rows(stack: Steps, old: Ints, new: Ints) -> Array:
+    """(m, U, n, 2 n) whitened noise under new processes, from that under old ones and the state."""
+    one, two = (np.swapaxes(stack.whitener[at], -1, -2) for at in (old, new))
+    same = np.swapaxes(np.linalg.solve(one, two), -1, -2)
+    moved = stack.whitener[new] @ (stack.transition[old] - stack.transition[new])
+    return np.concatenate([same, moved], -1)
+
+
+def _moments(factor: Factor) -> _Moments:
+    steps, count = factor.steps, factor.count
+    sides, constants = factor.spread()
+    states, own, below = factor.chain.moments(sides)
+    lengths, size = len(steps.by_next), own.shape[-1]
+    total = np.zeros((lengths, 2 * size, 2 * size))
+    for kind, some in runs(steps.index * (lengths + 1) + factor.which[1:]):
+        step, after = divmod(kind, lengths + 1)
+        basis = steps.basis[step]
+        last, ahead = steps.by_last[step] @ basis, steps.by_next[step] @ steps.basis[after]
+        here, there, across = own[:-1][some].sum(0), own[1:][some].sum(0), below[some].sum(0)
+        noise_state = ahead @ across + last @ here
+        noise = noise_state @ last.T + (ahead @ there + last @ across.T) @ ahead.T
+        now = states[:-1][some] @ basis.T
+        new = states[1:][some] @ ahead.T + states[:-1][some] @ last.T
+        both = np.concatenate([new, now], -1).reshape(-1, 2 * size)
+        total[step] += both.T @ both
+        total[step, :size, :size] += count * noise
+        total[step, :size, size:] += count * noise_state @ basis.T
+        total[step, size:, :size] += count * basis @ noise_state.T
+        total[step, size:, size:] += count * basis @ here @ basis.T
+    basis = factor.bases[factor.which[0]]
+    begin = states[0] @ basis.T
+    start = begin.T @ begin + count * basis @ own[0] @ basis.T
+    return _Moments(total, start, _residual(factor, states, constants, own))
+
+
+def _residual(factor: Factor, states: Array, constants: Array, own: Array) -> float:
+    """Posterior mean of the measurements' chi-square.  constants : (c, K)."""
+    weight, count, total = factor.weight, factor.count, 0.0
+    values = -factor.system.columns @ constants
+    values[..., :count] += factor.rest
+    for basis, mine in runs(factor.which):
+        rows = factor.rows[basis]
+        off = values[mine] - np.swapaxes(states[mine] @ rows.T, -1, -2)
+        total += float((weight[mine] * (off**2).sum(-1)).sum())
+        mean = (weight[mine].T @ own[mine].reshape(len(off), -1)).reshape(-1, *own.shape[1:])
+        total += count * float(((rows[:, None] @ mean)[:, 0] * rows).sum())
+    return total

@@ -1,4 +1,4 @@
-"""What is learned together: the channels of a group, and which hyper-parameters they determine."""
+"""What is learned together: the signals of a group, and which hyper-parameters they determine."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel, pooled
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled
 from telerig.estimator.smoothing.learning.parameters import FORCE, names_of
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel, Triple
 
 Array = NDArray[np.float64]
-Where = int | str
+Owner = int | str
 
 BUBBLE = "bubble"
 
@@ -43,33 +43,33 @@ class Learning:
 class Group:
     """Channels learned together.
 
-    pattern : (3,) share of a line's RMS along the rig's axes.  wheres : what a line could be.
-    fast : the channels as their likelihood is worked out, see `pooled`.
+    pattern : (3,) share of a line's RMS along the rig's axes.  owners : what a line could be.
+    fast : the signals as their likelihood is worked out, see `pooled`.
     """
 
-    channels: tuple[Channel, ...]
+    signals: tuple[Signal, ...]
     pattern: Triple
-    wheres: tuple[Where, ...]
+    owners: tuple[Owner, ...]
     up: Array
 
     @cached_property
-    def fast(self) -> tuple[Channel, ...]:
-        return tuple(part for channel in self.channels for part in pooled(channel))
+    def fast(self) -> tuple[Signal, ...]:
+        return tuple(part for signal in self.signals for part in pooled(signal))
 
 
-def groups_of(channels: Sequence[Channel], options: Learning, up: Array) -> list[Group]:
+def groups_of(signals: Sequence[Signal], options: Learning, up: Array) -> list[Group]:
     """The shared coordinate, and what lies across it, alike whichever way; up : (3,)."""
-    if not channels:
+    if not signals:
         return []
-    bubble: tuple[Where, ...] = () if options.target else (BUBBLE,)
-    shared = channels[0]
-    own: tuple[Where, ...] = shared.cameras if len(shared.cameras) > 1 else ()
+    bubble: tuple[Owner, ...] = () if options.target else (BUBBLE,)
+    shared = signals[0]
+    own: tuple[Owner, ...] = shared.cameras if len(shared.cameras) > 1 else ()
     square = shared.direction**2
     groups = [Group((shared,), _pattern(square), (CARRIAGE, *own, *bubble), up)]
-    if len(channels) > 1:
-        directions = np.array([c.direction for c in channels[1:]])
+    if len(signals) > 1:
+        directions = np.array([c.direction for c in signals[1:]])
         across = np.diagonal(np.linalg.pinv(directions) @ directions)
-        groups.append(Group(tuple(channels[1:]), _pattern(across), (CARRIAGE, *bubble), up))
+        groups.append(Group(tuple(signals[1:]), _pattern(across), (CARRIAGE, *bubble), up))
     return groups
 
 
@@ -85,7 +85,7 @@ def free_names(model: ShakeModel, group: Group, options: Learning, first: bool) 
         if is_held(name, model, options):
             continue
         if name == FORCE:
-            if any(_concerns(group, model, f"modes.{i}.rms_mm") for i in _with_corner(model)):
+            if any(_concerns(group, model, f"modes.{i}.rms_mm") for i in _low_pass_modes(model)):
                 names.append(name)
         elif name.startswith(("modes", "bubble.zigzags", "broad_bands")):
             if _concerns(group, model, name):
@@ -103,7 +103,7 @@ def is_held(name: str, model: ShakeModel, options: Learning) -> bool:
     return any(fnmatch(n, pattern) for n in names for pattern in options.hold)
 
 
-def _with_corner(model: ShakeModel) -> list[int]:
+def _low_pass_modes(model: ShakeModel) -> list[int]:
     return [i for i, mode in enumerate(model.modes) if mode.force_hz is not None]
 
 
@@ -113,6 +113,6 @@ def _concerns(group: Group, model: ShakeModel, name: str) -> bool:
     lines = model.bubble.zigzags if parts[0] == "bubble" else getattr(model, parts[0])
     rms = np.asarray(lines[int(parts[-2])].rms_mm)
     inside = np.asarray(group.pattern) > 0.7
-    if parts[0] == "bubble" and group.channels[0].moving.sum() == 0:
+    if parts[0] == "bubble" and group.signals[0].moving.sum() == 0:
         return False
     return bool(rms[inside].max(initial=0.0) > rms[~inside].max(initial=0.0))

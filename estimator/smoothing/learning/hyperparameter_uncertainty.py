@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.graph.solve import Covariances, Solution
-from telerig.estimator.smoothing.learning.evidence import channel_posterior
+from telerig.estimator.smoothing.learning.evidence import signal_posterior
 from telerig.estimator.smoothing.learning.lines_of_sight import (
-    Channel,
-    channels_of,
+    Signal,
     contrasts,
     pooled,
+    signals_of,
 )
 from telerig.estimator.smoothing.learning.parameters import value_of, with_values
 from telerig.estimator.smoothing.learning.processes import processes
@@ -31,7 +31,7 @@ _Triple = tuple[Array, Array, Array]
 """Of positions, velocities and offsets."""
 
 
-def inflated(solution: Solution) -> Solution:
+def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
     """The solution with the spread by its model's ``learned`` parameters in its covariances.
 
     Bubbles beyond those that learning looks at get the mean spread of those. Unchanged without
@@ -40,24 +40,24 @@ def inflated(solution: Solution) -> Solution:
     found, model, problem = solution.covariances, solution.frame.model, solution.frame.problem
     if found is None or not model.learned or not problem.bubbles:
         return solution
-    channels = [c for c in channels_of(problem, solution.weights) if c.samples]
-    directions = np.array([c.direction for c in channels])
-    spreads = [_spread(c, model) for c in channels]
-    # coordinates along the channels, which need not be at right angles, back into the lab
+    signals = [c for c in signals_of(problem, solution.weights) if c.samples]
+    directions = np.array([c.direction for c in signals])
+    spreads = [_spread(c, model) for c in signals]
+    # coordinates along the signals, which need not be at right angles, back into the lab
     lab = np.linalg.pinv(directions)
     bubbles = found.bubbles.copy()
     for kind, rows in ((0, solution.frame.bubble.position), (1, solution.frame.bubble.velocity)):
-        along = np.stack([_rows(solution, c, s[kind]) for c, s in zip(channels, spreads)], -1)
+        along = np.stack([_rows(solution, c, s[kind]) for c, s in zip(signals, spreads)], -1)
         into = np.linalg.pinv(rows) @ lab
         bubbles += np.einsum("ik,nk,jk->nij", into, along, into, optimize=True)
-    shake = _shaken(solution, channels, [s[2] for s in spreads], found)
+    shake = _shaken(solution, signals, [s[2] for s in spreads], found)
     return replace(solution, covariances=replace(found, bubbles=bubbles, shake=shake))
 
 
-def _spread(channel: Channel, model: ShakeModel) -> _Triple:
+def _spread(signal: Signal, model: ShakeModel) -> _Triple:
     """Variances (B, F) of positions and velocities, (J, F) of offsets, by the parameters."""
-    parts = pooled(channel)
-    total = [np.zeros((1, len(channel.t_s)))] * 3
+    parts = pooled(signal)
+    total = [np.zeros((1, len(signal.t_s)))] * 3
     for name, sigma in model.learned.items():
         at, step = value_of(model, name), min(sigma, _FARTHEST)
         up, down = (with_values(model, [name], [at * np.exp(s * step)]) for s in (1, -1))
@@ -65,19 +65,19 @@ def _spread(channel: Channel, model: ShakeModel) -> _Triple:
         if all(same):
             continue
         moved = [_still(p) if s else _moved(p, up, down) for p, s in zip(parts, same)]
-        for i, change in enumerate(_of_bubbles(moved, int(channel.moving.sum()))):
+        for i, change in enumerate(_of_bubbles(moved, int(signal.moving.sum()))):
             total[i] = total[i] + (change / 2 * (sigma / step)) ** 2
     return total[0], total[1], total[2]
 
 
-def _same(channel: Channel, one: ShakeModel, two: ShakeModel) -> bool:
-    """Whether the channel cannot tell two models from each other."""
-    return all(a is b for a, b in zip(processes(channel, one), processes(channel, two)))
+def _same(signal: Signal, one: ShakeModel, two: ShakeModel) -> bool:
+    """Whether the signal cannot tell two models from each other."""
+    return all(a is b for a, b in zip(processes(signal, one), processes(signal, two)))
 
 
-def _moved(channel: Channel, up: ShakeModel, down: ShakeModel) -> _Triple:
+def _moved(signal: Signal, up: ShakeModel, down: ShakeModel) -> _Triple:
     """Posterior means under one model less those under the other."""
-    one, two = channel_posterior(channel, up), channel_posterior(channel, down)
+    one, two = signal_posterior(signal, up), signal_posterior(signal, down)
     return (
         one.position_mm - two.position_mm,
         one.velocity_mm_s - two.velocity_mm_s,
@@ -85,13 +85,13 @@ def _moved(channel: Channel, up: ShakeModel, down: ShakeModel) -> _Triple:
     )
 
 
-def _still(channel: Channel) -> _Triple:
-    nothing = np.zeros((1, len(channel.t_s)))
+def _still(signal: Signal) -> _Triple:
+    nothing = np.zeros((1, len(signal.t_s)))
     return nothing, nothing, nothing
 
 
 def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
-    """Of each bubble, where the channel is split into their mean and their differences."""
+    """Of each bubble, where the signal is split into their mean and their differences."""
     if len(moved) == 1:
         return moved[0]
     (position, velocity, offset), apart = moved
@@ -101,11 +101,11 @@ def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
     return position + place, velocity + speed, offset
 
 
-def _rows(solution: Solution, channel: Channel, variance: Array) -> Array:
-    """(rows,) of the bubbles' states, from (B, F) of the channel's bubbles."""
+def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
+    """(rows,) of the bubbles' states, from (B, F) of the signal's bubbles."""
     frame = solution.frame
     number = np.full(len(frame.problem.bubbles), -1)
-    movers = channel.bubble[channel.moving]
+    movers = signal.bubble[signal.moving]
     number[movers] = np.arange(len(movers))
     mine = number[frame.bubble_of_row]
     variance = np.broadcast_to(variance, (len(movers), variance.shape[-1]))
@@ -114,12 +114,12 @@ def _rows(solution: Solution, channel: Channel, variance: Array) -> Array:
 
 
 def _shaken(
-    solution: Solution, channels: list[Channel], spreads: list[Array], found: Covariances
+    solution: Solution, signals: list[Signal], spreads: list[Array], found: Covariances
 ) -> Array:
-    """(F, D, D) covariance of the shake's states, offsets widened along what the cameras see."""
+    """(F, D, D) covariance of the shake's states, their offsets widened along what the cameras see."""
     layout, out = solution.frame.shake, found.shake.copy()
-    for channel, variance in zip(channels, spreads):
-        rows = np.einsum("i,cid->cd", channel.direction, layout.offset[list(channel.cameras)])
+    for signal, variance in zip(signals, spreads):
+        rows = np.einsum("i,cid->cd", signal.direction, layout.offset[list(signal.cameras)])
         if not np.any(rows):
             continue
         into = np.linalg.pinv(rows)

@@ -10,32 +10,55 @@ a target standing still is the best source: there every line is the rig's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.smoothing.learning.attribution import (
+    Attribution,
+    attributions,
+    is_zigzag,
+    shared,
+    with_hidden_modes,
+)
 from telerig.estimator.smoothing.learning.groups import (
+    BUBBLE,
     Group,
     Learning,
+    Owner,
     free_names,
     groups_of,
     is_held,
 )
-from telerig.estimator.smoothing.learning.likelihood import evidence, laplace_sigma, maximise
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel, channels_of
-from telerig.estimator.smoothing.learning.mode_labels import LineLabel, doubted, labels, shared
-from telerig.estimator.smoothing.learning.mode_search import (
-    LOW_HZ,
-    Step,
-    coloured,
-    one_more,
-    pruned,
-    whitened,
+from telerig.estimator.smoothing.learning.likelihood import (
+    Fit,
+    evidence,
+    laplace_covariance,
+    maximise,
 )
-from telerig.estimator.smoothing.learning.parameters import FORCE, names_of, value_of, with_values
-from telerig.estimator.smoothing.learning.spectrum import coarsening, coarser, faded, unexplained
-from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal, signals_of
+from telerig.estimator.smoothing.learning.parameters import (
+    FORCE,
+    names_of,
+    value_of,
+    with_low_pass_force,
+    with_values,
+)
+from telerig.estimator.smoothing.learning.spectrum import (
+    Line,
+    averaged,
+    averaging_factor,
+    averaging_loss,
+    unexplained,
+)
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    RigMode,
+    ShakeModel,
+    SmoothingProblem,
+    Zigzag,
+)
 
 Array = NDArray[np.float64]
 
@@ -43,6 +66,11 @@ _STRONG = 20.0
 _ACROSS, _ACROSS_LOG_SIGMA = 0.5, 1.0
 _VAGUE_LOG_SIGMA = 0.3
 _LOG_RATIOS = np.linspace(-3.0, 2.0, 11)
+_START_DAMPING = 0.04
+_START_FORCE_HZ = 60.0
+LOW_HZ = 15.0
+_HARMONIC = 0.12
+_TIE_LOG_RATIO = 2.0
 
 
 def learn(
@@ -59,11 +87,11 @@ def learn(
     if start.name == "default" and problem.accelerometers:
         return start
     model = replace(start, modes=()) if start.name == "default" else start
-    channels = channels_of(problem, fixed=options.target)
-    channels = tuple(c for c in channels if c.samples)
+    signals = signals_of(problem, fixed=options.target)
+    signals = tuple(c for c in signals if c.samples)
     if options.target:
         model = replace(model, bubble=replace(model.bubble, zigzags=()))
-    groups = groups_of(channels, options, problem.up)
+    groups = groups_of(signals, options, problem.up)
     learned: dict[str, float] = {}
     for index, group in enumerate(groups):
         if index and not options.target:
@@ -76,36 +104,36 @@ def learn(
 def _learn_group(
     group: Group, model: ShakeModel, options: Learning, *, first: bool
 ) -> tuple[ShakeModel, dict[str, float]]:
-    t_s = group.channels[0].t_s
-    factor = coarsening(t_s, _highest(group, model))
-    model = _faded(model, factor, t_s)
-    coarse = replace(group, channels=tuple(coarser(c, factor) for c in group.channels))
+    t_s = group.signals[0].t_s
+    factor = averaging_factor(t_s, _highest(group, model))
+    model = _averaged_rms(model, factor, t_s)
+    coarse = replace(group, signals=tuple(averaged(c, factor) for c in group.signals))
     seeds = {} if first else _seeds(model, options)
     given = len(model.modes)
     begun_white = model.force_hz is None and options.force_hz is None
     step = Step(maximise(coarse.fast, model, free_names(model, coarse, options, first), steps=15))
-    step = coloured(coarse, step, options, first)
+    step = try_low_pass_force(coarse, step, options, first)
     while True:
-        better = one_more(coarse, step, options, first)
+        better = with_one_more_mode(coarse, step, options, first)
         if better is None:
             break
-        step = coloured(coarse, better, options, first)
+        step = try_low_pass_force(coarse, better, options, first)
     fit = pruned(coarse, step.fit, options, first, given)
     if first and begun_white:
-        fit = whitened(coarse, fit, options)
+        fit = try_white_force(coarse, fit, options)
     names = free_names(fit.model, coarse, options, first)
     fit = maximise(coarse.fast, fit.model, names)
-    sigma = np.sqrt(np.diag(laplace_sigma(coarse.fast, fit.model, names)))
+    sigma = np.sqrt(np.diag(laplace_covariance(coarse.fast, fit.model, names)))
     model = fit.model
     if not options.target:
-        found = labels(coarse.fast, model, group.pattern, group.up)
+        found = attributions(coarse.fast, model, group.pattern, group.up)
         model = shared(model, [x for x in found if not _is_kept(x, model, options)])
         vague = [n for n, s in zip(names, sigma) if n in seeds and s > _VAGUE_LOG_SIGMA]
-        likely = [as_likely(coarse.fast, model, n, seeds[n]) for n in vague]
+        likely = [posterior_rms(coarse.fast, model, n, seeds[n]) for n in vague]
         model = with_values(model, vague, likely)
-        if max(int(c.moving.sum()) for c in group.channels) > 1:
-            model = doubted(coarse.fast, model, group.pattern, group.up)
-    return _faded(model, factor, t_s, back=True), dict(zip(names, sigma.tolist()))
+        if max(int(c.moving.sum()) for c in group.signals) > 1:
+            model = with_hidden_modes(coarse.fast, model, group.pattern, group.up)
+    return _averaged_rms(model, factor, t_s, back=True), dict(zip(names, sigma.tolist()))
 
 
 def _seeded(model: ShakeModel, group: Group, options: Learning) -> tuple[ShakeModel, Learning]:
@@ -134,20 +162,20 @@ def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
     }
 
 
-def as_likely(channels: Sequence[Channel], model: ShakeModel, name: str, median: float) -> float:
+def posterior_rms(signals: Sequence[Signal], model: ShakeModel, name: str, median: float) -> float:
     """An RMS that the data hardly determine as the root of its posterior's mean square.
 
     The most probable of a line that bubbles' wide swings hide is next to none, and would say that
     the rig stands still. median : of the log-normal prior.
     """
     values = median * np.exp(_LOG_RATIOS)
-    found = np.array([evidence(channels, with_values(model, [name], [v])) for v in values])
+    found = np.array([evidence(signals, with_values(model, [name], [v])) for v in values])
     found -= 0.5 * (_LOG_RATIOS / _ACROSS_LOG_SIGMA) ** 2
     weight = np.exp(found - found.max())
     return float(np.sqrt(weight @ values**2 / weight.sum()))
 
 
-def _is_kept(label: LineLabel, model: ShakeModel, options: Learning) -> bool:
+def _is_kept(label: Attribution, model: ShakeModel, options: Learning) -> bool:
     name = f"modes.{label.index}.frequency_hz"
     return label.owner == "rig" and is_held(name, model, options)
 
@@ -156,22 +184,214 @@ def _highest(group: Group, model: ShakeModel) -> float:
     """The highest frequency at which something stands out."""
     lines = [
         line
-        for channel in group.channels
-        for where in group.wheres
-        for line in unexplained(channel, model, where, 8)
+        for signal in group.signals
+        for where in group.owners
+        for line in unexplained(signal, model, where, 8)
         if line.excess > _STRONG
     ]
     known = [m.frequency_hz for m in model.modes]
     return max([LOW_HZ, *known, *(line.frequency_hz for line in lines)])
 
 
-def _faded(model: ShakeModel, factor: int, t_s: Array, *, back: bool = False) -> ShakeModel:
+def _averaged_rms(model: ShakeModel, factor: int, t_s: Array, *, back: bool = False) -> ShakeModel:
     """The RMS of lines as they are in means over ``factor`` frames, or back."""
     if factor < 2:
         return model
     lines = [n for n in names_of(model) if n.endswith("rms_mm") and not n.startswith("broad")]
     values = []
     for n in lines:
-        fade = faded(value_of(model, n.replace("rms_mm", "frequency_hz")), factor, t_s)
+        fade = averaging_loss(value_of(model, n.replace("rms_mm", "frequency_hz")), factor, t_s)
         values.append(value_of(model, n) * (1 / fade if back else fade))
     return with_values(model, lines, values)
+
+
+@dataclass(frozen=True)
+class Step:
+    """The state of the search: the model, its fit, and lines of each kind found in this group."""
+
+    fit: Fit
+    found: tuple[Owner, ...] = ()
+
+
+def with_one_more_mode(group: Group, step: Step, options: Learning, first: bool) -> Step | None:
+    """The model with the line added that helps most; None when none is worth its parameters."""
+    tried = []
+    for where in group.owners:
+        if step.found.count(where) < options.most_modes:
+            tried += _trials(group, step.fit.model, where, options)
+    still = [c for c in group.fast if not c.shaken]
+    shaken, rest = [c for c in group.fast if c.shaken], evidence(still, step.fit.model)
+    trials = [
+        (evidence(group.fast, m) if where == BUBBLE else evidence(shaken, m) + rest, where, m)
+        for where, m in tried
+    ]
+    trials.sort(key=lambda trial: -trial[0])
+    best: tuple[float, Owner, Fit] | None = None
+    for _, where, model in _distinct(trials):
+        fit = maximise(group.fast, model, _last_line(model, where), steps=8)
+        lead = 0.0 if best is None else _preference(model, where, best[1], group.up)
+        if best is None or fit.log_evidence > best[0] + lead:
+            best = (fit.log_evidence, where, fit)
+    if best is None or best[0] < step.fit.log_evidence + _bic_penalty(group, best[2].model):
+        return None
+    model, found = _with_other_arms(group, best[2].model, best[1]), (*step.found, best[1])
+    names = free_names(model, group, options, first)
+    return Step(maximise(group.fast, model, names, steps=8), found)
+
+
+def try_low_pass_force(group: Group, step: Step, options: Learning, first: bool) -> Step:
+    """The modes' white forces given a corner, where it brings more than one parameter must.
+
+    Both ways get as many steps more.
+    """
+    model = step.fit.model
+    white = bool(model.modes) and all(m.force_hz is None for m in model.modes)
+    if not first or not white or is_held(FORCE, model, options) or step.found[-1:] == (BUBBLE,):
+        return step
+    low_pass = with_low_pass_force(model, _START_FORCE_HZ)
+    fits = [
+        maximise(group.fast, m, free_names(m, group, options, first), steps=8)
+        for m in (model, low_pass)
+    ]
+    gain = fits[1].log_evidence - fits[0].log_evidence
+    return Step(fits[gain > _bic_penalty(group, model) / 3], step.found)
+
+
+def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
+    """The forces' corner taken away again where the criterion does not mind."""
+    names = free_names(fit.model, group, options, True)
+    if FORCE not in names:
+        return fit
+    white = with_low_pass_force(fit.model, None)
+    quick = maximise(group.fast, white, [n for n in names if n != FORCE], steps=8)
+    worth = _bic_penalty(group, fit.model) / 3
+    return quick if quick.log_evidence > fit.log_evidence - worth else fit
+
+
+def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeModel:
+    """After an arm's first mode, the other arms given one like it, to be found smaller if it is.
+
+    Arms are built alike: one that shakes unseen would be taken for a shake of the whole rig.
+    """
+    cameras = group.signals[0].cameras
+    have = {m.camera for m in model.modes[:-1] if m.camera != CARRIAGE}
+    if where not in cameras or have:
+        return model
+    last = model.modes[-1]
+    copies = tuple(replace(last, camera=c) for c in cameras if c != last.camera)
+    return replace(model, modes=(*model.modes, *copies))
+
+
+def _bic_penalty(group: Group, model: ShakeModel) -> float:
+    """Nats that a line's three numbers must bring: half of Schwarz's 3 log n.
+
+    n : two samples for each cycle of the fastest line. Frames beyond tell of noise, not of lines.
+    """
+    t = group.signals[0].t_s
+    lines = [mode.frequency_hz for mode in model.modes]
+    lines += [line.frequency_hz for line in model.bubble.zigzags]
+    fastest = max(lines, default=LOW_HZ)
+    return 1.5 * float(np.log(max(2 * fastest * (t[-1] - t[0]), 8.0)))
+
+
+def _distinct(
+    trials: Sequence[tuple[float, Owner, ShakeModel]],
+) -> list[tuple[float, Owner, ShakeModel]]:
+    """The best trial of each kind, of the three best kinds."""
+    out: dict[Owner, tuple[float, Owner, ShakeModel]] = {}
+    for trial in trials:
+        out.setdefault(trial[1], trial)
+    return list(out.values())[:3]
+
+
+def _preference(model: ShakeModel, where: Owner, rival: Owner, up: Array) -> float:
+    """Nats by which a label must win over another that explains the data as well.
+
+    A line that fits equally goes to the rig: a wrong excuse for the rig hides its shake. Only the
+    second harmonic of the zigzag is taken for the bubble's own.
+    """
+    if BUBBLE not in (where, rival) or where == rival:
+        return 0.0
+    harmonic = _is_harmonic(model, up)
+    wins = (where == BUBBLE) == harmonic
+    return -_TIE_LOG_RATIO if wins else _TIE_LOG_RATIO
+
+
+def _is_harmonic(model: ShakeModel, up: Array) -> bool:
+    lateral = [z for z in model.bubble.zigzags if is_zigzag(z, up)]
+    lines = [m.frequency_hz for m in model.modes[-1:]]
+    lines += [z.frequency_hz for z in model.bubble.zigzags[-1:]]
+    return any(abs(f / (2 * z.frequency_hz) - 1) < _HARMONIC for z in lateral for f in lines)
+
+
+def _trials(
+    group: Group, model: ShakeModel, where: Owner, options: Learning
+) -> list[tuple[Owner, ShakeModel]]:
+    out = []
+    lines: list[Line] = []
+    for signal in group.signals:
+        lines += unexplained(signal, model, where)
+    for line in sorted(lines, key=lambda item: -item.excess)[:3]:
+        for share in (0.6, 1.2):
+            out.append((where, _with_line(model, group, where, line, share, options)))
+    return out
+
+
+def _with_line(
+    model: ShakeModel, group: Group, where: Owner, line: Line, share: float, options: Learning
+) -> ShakeModel:
+    x, y, z = (float(np.clip(share * line.rms_mm, 0.003, 4.0)) * p for p in group.pattern)
+    if where == BUBBLE:
+        added = Zigzag(line.frequency_hz, _START_DAMPING, (x, y, z))
+        zigzags = (*model.bubble.zigzags, added)
+        return replace(model, bubble=replace(model.bubble, zigzags=zigzags))
+    force_hz = model.force_hz or options.force_hz
+    mode = RigMode(line.frequency_hz, _START_DAMPING, (x, y, z), int(where), force_hz)
+    return replace(model, modes=(*model.modes, mode))
+
+
+def _last_line(model: ShakeModel, where: Owner) -> list[str]:
+    stem = f"modes.{len(model.modes) - 1}"
+    if where == BUBBLE:
+        stem = f"bubble.zigzags.{len(model.bubble.zigzags) - 1}"
+    return [f"{stem}.{field_}" for field_ in ("frequency_hz", "damping", "rms_mm")]
+
+
+def pruned(group: Group, fit: Fit, options: Learning, first: bool, given: int = 0) -> Fit:
+    """Lines taken away again whose absence the criterion does not mind.
+
+    given : so many modes were there before the search, and stay, so that their names do.
+    """
+    at = 0
+    while True:
+        names = [
+            n
+            for n in free_names(fit.model, group, options, first)
+            if n.endswith(".frequency_hz")
+            and not (n.startswith("modes") and int(n.split(".")[1]) < given)
+        ]
+        if at >= len(names):
+            return fit
+        less = _without(fit.model, names[at])
+        free = free_names(less, group, options, first)
+        quick = maximise(group.fast, less, free, steps=6)
+        own = names[at].startswith("modes") and _owner(fit.model, names[at]) != CARRIAGE
+        worth = 0.0 if own else _bic_penalty(group, fit.model)
+        if quick.log_evidence > fit.log_evidence - worth:
+            fit = quick
+        else:
+            at += 1
+
+
+def _owner(model: ShakeModel, name: str) -> int:
+    return model.modes[int(name.split(".")[1])].camera
+
+
+def _without(model: ShakeModel, name: str) -> ShakeModel:
+    parts = name.split(".")
+    index = int(parts[-2])
+    if parts[0] == "bubble":
+        zigzags = tuple(z for i, z in enumerate(model.bubble.zigzags) if i != index)
+        return replace(model, bubble=replace(model.bubble, zigzags=zigzags))
+    modes = tuple(m for i, m in enumerate(model.modes) if i != index)
+    return replace(model, modes=modes)

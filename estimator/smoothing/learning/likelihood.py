@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.learning.evidence import channel_evidence
-from telerig.estimator.smoothing.learning.gradient import channel_slope
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel
+from telerig.estimator.smoothing.learning.evidence import signal_evidence, signal_gradient
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import (
     log_prior,
     prior_of,
     value_of,
     with_values,
 )
-from telerig.estimator.smoothing.learning.processes import tells_of
+from telerig.estimator.smoothing.learning.processes import depends_on
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 
 Array = NDArray[np.float64]
@@ -35,21 +34,21 @@ class Fit:
     log_posterior: float
 
 
-def evidence(channels: Sequence[Channel], model: ShakeModel) -> float:
-    """Sum over the channels; very low where a model is not numerically sound."""
+def evidence(signals: Sequence[Signal], model: ShakeModel) -> float:
+    """Sum over the signals; very low where a model is not numerically sound."""
     try:
-        total = sum(channel_evidence(c, model) for c in channels)
+        total = sum(signal_evidence(c, model) for c in signals)
     except np.linalg.LinAlgError:
         return _IMPOSSIBLE
     return float(total) if np.isfinite(total) else _IMPOSSIBLE
 
 
-def evidence_slope(
-    channels: Sequence[Channel], model: ShakeModel, names: Sequence[str]
+def evidence_gradient(
+    signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]
 ) -> tuple[float, Array]:
     """The evidence, and (n,) its derivatives by the logarithms of the named parameters."""
     try:
-        each = [channel_slope(c, model, names) for c in channels]
+        each = [signal_gradient(c, model, names) for c in signals]
     except np.linalg.LinAlgError:
         return _IMPOSSIBLE, np.zeros(len(names))
     total, slope = float(sum(e for e, _ in each)), sum((s for _, s in each), np.zeros(len(names)))
@@ -58,38 +57,38 @@ def evidence_slope(
     return total, slope
 
 
-def _posterior_slope(
-    channels: Sequence[Channel], model: ShakeModel, names: Sequence[str]
+def _posterior_gradient(
+    signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """As `evidence_slope`, the parameters' priors added."""
-    found, slope = evidence_slope(channels, model, names)
+    """As `evidence_gradient`, the parameters' priors added."""
+    found, slope = evidence_gradient(signals, model, names)
     priors = [prior_of(n) for n in names]
-    of_prior = [p.log_slope(value_of(model, n)) for n, p in zip(names, priors)]
+    of_prior = [p.log_gradient(value_of(model, n)) for n, p in zip(names, priors)]
     return found + log_prior(model, names), slope + np.array(of_prior)
 
 
 def maximise(
-    channels: Sequence[Channel], model: ShakeModel, names: Sequence[str], *, steps: int = 25
+    signals: Sequence[Signal], model: ShakeModel, names: Sequence[str], *, steps: int = 25
 ) -> Fit:
     """Quasi-Newton on the logarithms of the named parameters, within their bounds."""
     from scipy.optimize import minimize
 
     if not names:
-        found = evidence(channels, model)
+        found = evidence(signals, model)
         return Fit(model, found, found)
     priors = [prior_of(n) for n in names]
     scale = np.array([p.step for p in priors])
     bounds = [(float(np.log(p.low) / s), float(np.log(p.high) / s)) for p, s in zip(priors, scale)]
     start: Array = np.log([value_of(model, n) for n in names]) / scale
 
-    moving = [c for c in channels if tells_of(c, model, names)]
-    still = evidence([c for c in channels if all(c is not m for m in moving)], model)
+    moving = [c for c in signals if depends_on(c, model, names)]
+    still = evidence([c for c in signals if all(c is not m for m in moving)], model)
 
     def at(x: Array) -> ShakeModel:
         return with_values(model, names, np.exp(x * scale).tolist())
 
     def cost(x: Array) -> tuple[float, Array]:
-        value, slope = _posterior_slope(moving, at(x), names)
+        value, slope = _posterior_gradient(moving, at(x), names)
         return -value - still, -slope * scale
 
     options: Any = {"maxiter": steps, "ftol": 1e-6, "gtol": 3e-2}
@@ -102,7 +101,7 @@ def maximise(
     return Fit(best, top - log_prior(best, names), top)
 
 
-def laplace_sigma(channels: Sequence[Channel], model: ShakeModel, names: Sequence[str]) -> Array:
+def laplace_covariance(signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]) -> Array:
     """(n, n) covariance of the log-parameters: the inverse curvature of the log posterior.
 
     Curvature that is not positive (a flat or bounded direction) is filled up by the prior's.
@@ -111,12 +110,12 @@ def laplace_sigma(channels: Sequence[Channel], model: ShakeModel, names: Sequenc
     values = np.log([value_of(model, n) for n in names])
 
     def change(name: str, step: Array) -> Array:
-        own = [c for c in channels if tells_of(c, model, [name])]
+        own = [c for c in signals if depends_on(c, model, [name])]
         down, up = (
             with_values(model, names, np.exp(values + sign * step * scale).tolist())
             for sign in (-1, 1)
         )
-        both = [_posterior_slope(own, moved, names)[1] for moved in (down, up)]
+        both = [_posterior_gradient(own, moved, names)[1] for moved in (down, up)]
         return np.asarray((both[0] - both[1]) * scale)
 
     h = 0.25

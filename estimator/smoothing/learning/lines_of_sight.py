@@ -3,8 +3,8 @@
 For cameras without distortion of the second order in shake, a pixel is a linear function of the
 bubble's place across the line of sight. Along one direction d seen by camera j it says
 d . (bubble - offset_j), the encoder added. The coordinate that two cameras share (their common
-perpendicular) makes one channel, each camera's other coordinate another. Learning and the swaps of
-labels work on channels: a few states each, where the whole graph has dozens.
+perpendicular) makes one signal, each camera's other coordinate another. Learning and the swaps of
+attributions work on signals: a few states each, where the whole graph has dozens.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PRESENT = 0.75
 
 
 @dataclass(frozen=True)
-class Channel:
+class Signal:
     """Measurements of one coordinate.
 
     direction : (3,) unit vector in rig axes.  cameras : indices of those that see it.
@@ -62,7 +62,7 @@ class Channel:
         return int((self.weight > 0).sum())
 
 
-def seen_channels(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, ...]]]:
+def sight_directions(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, ...]]]:
     """Directions (3,) with the cameras that see them; the shared one first, if there is one."""
     depths = np.array([c.camera_from_rig.rotation[2] for c in problem.cameras])
     cross = np.cross(depths[0], depths[-1])
@@ -84,14 +84,14 @@ def _signed(direction: Array) -> Array:
     return np.asarray(direction * np.sign(direction[np.abs(direction).argmax()]))
 
 
-def channels_of(
+def signals_of(
     problem: SmoothingProblem,
     weights: tuple[Array, Array] | None = None,
     *,
     fixed: bool = False,
     most_bubbles: int = MOST_BUBBLES,
-) -> tuple[Channel, ...]:
-    """The problem's channels, of the bubbles that were seen longest and all marks.
+) -> tuple[Signal, ...]:
+    """The problem's signals, of the bubbles that were seen longest and all marks.
 
     weights : of the bubbles' and the marks' pixels, those below 0.5 are left out.
     fixed : the tracks are those of a target that stands still in the lab.
@@ -105,15 +105,15 @@ def channels_of(
     if problem.stage is not None:
         position = np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm)
     out = []
-    for direction, cameras in seen_channels(problem):
+    for direction, cameras in sight_directions(problem):
         parts = [_bubble_rows(problem, bubbles, chosen, position, direction, cameras)]
         parts.append(_mark_rows(problem, marks, len(chosen), position, direction, cameras))
-        out.append(_channel(problem, direction, cameras, parts, chosen, fixed))
+        out.append(_signal(problem, direction, cameras, parts, chosen, fixed))
     return tuple(out)
 
 
 _Rows = tuple[Ints, Ints, Ints, Array, Array]
-"""Item, frame, camera (as index into the channel's), value (mm), variance (mm^2)."""
+"""Item, frame, camera (as index into the signal's), value (mm), variance (mm^2)."""
 
 
 def _bubble_rows(
@@ -166,10 +166,10 @@ def _along(
     return item, frame, camera, value, variance
 
 
-def _channel(
+def _signal(
     problem: SmoothingProblem, direction: Array, cameras: tuple[int, ...], parts: list[_Rows],
     chosen: Ints, fixed: bool,
-) -> Channel:  # fmt: skip
+) -> Signal:  # fmt: skip
     item, frame, camera, value, variance = (np.concatenate(p) for p in zip(*parts))
     count = len(chosen) + len(problem.marks)
     pair = item * len(cameras) + camera
@@ -189,36 +189,36 @@ def _channel(
     sigma = np.r_[np.full(len(chosen), 100.0), [m.sigma_mm for m in problem.marks]]
     moving = np.arange(count) < (0 if fixed else len(chosen))
     bubble_of = np.r_[chosen, np.full(len(problem.marks), -1)].astype(np.int64)
-    return Channel(
+    return Signal(
         direction, cameras, problem.t_s, values, weight, pairs // len(cameras),
         pairs % len(cameras), moving, np.minimum(first, len(problem.t_s) - 1), start, sigma,
         bubble_of,
     )  # fmt: skip
 
 
-def pooled(channel: Channel) -> tuple[Channel, ...]:
+def pooled(signal: Signal) -> tuple[Signal, ...]:
     """The mean of the bubbles, and their differences, where all were seen nearly all of the time.
 
     For bubbles alike in noise and presence the two are independent, and the likelihood is that of
     a single bubble twice, whatever their number. Few missing pixels are bridged by straight lines:
-    good enough to learn from. Other channels come back as they are.
+    good enough to learn from. Other signals come back as they are.
     """
-    movers = np.flatnonzero(channel.moving)
-    cameras, count = len(channel.cameras), len(movers)
-    pairs = np.flatnonzero(channel.moving[channel.item])
-    seen = channel.weight[:, pairs] > 0
-    if count < 2 or len(movers) < len(channel.moving) or len(pairs) != count * cameras:
-        return (channel,)
+    movers = np.flatnonzero(signal.moving)
+    cameras, count = len(signal.cameras), len(movers)
+    pairs = np.flatnonzero(signal.moving[signal.item])
+    seen = signal.weight[:, pairs] > 0
+    if count < 2 or len(movers) < len(signal.moving) or len(pairs) != count * cameras:
+        return (signal,)
     if seen.mean(0).min() < _PRESENT:
-        return (channel,)
-    whole, weight = _bridged(channel.t_s, channel.value_mm[:, pairs], channel.weight[:, pairs])
+        return (signal,)
+    whole, weight = _bridged(signal.t_s, signal.value_mm[:, pairs], signal.weight[:, pairs])
     value = whole.reshape(-1, count, cameras)
     each = weight.reshape(-1, count, cameras).mean(1)
     one = np.zeros(cameras, np.int64)
     alike = replace(
-        channel, item=one, camera=np.arange(cameras), moving=np.array([True]),
-        first=channel.first[movers].min(keepdims=True), start_mm=np.zeros(1),
-        start_sigma_mm=channel.start_sigma_mm[movers[:1]], bubble=np.array([-1]),
+        signal, item=one, camera=np.arange(cameras), moving=np.array([True]),
+        first=signal.first[movers].min(keepdims=True), start_mm=np.zeros(1),
+        start_sigma_mm=signal.start_sigma_mm[movers[:1]], bubble=np.array([-1]),
     )  # fmt: skip
     mean = replace(alike, value_mm=value.mean(1), weight=each * count, pooled=count)
     turn = contrasts(count)

@@ -36,7 +36,7 @@ class Prior:
         """Probability per unit of the value's logarithm."""
         return float(np.exp(self.log_density(value)) / (self.log_sigma * np.sqrt(2 * np.pi)))
 
-    def log_slope(self, value: float) -> float:
+    def log_gradient(self, value: float) -> float:
         """Derivative of the log density by the number's logarithm."""
         return float(-np.log(value / self.median) / self.log_sigma**2)
 
@@ -88,14 +88,14 @@ def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]
     out: Any = model
     for name, value in zip(names, values):
         if name == FORCE:
-            out = with_force(out, float(value))
+            out = with_cutoff(out, float(value))
         else:
             out = _replaced(out, name.split("."), float(value))
     assert isinstance(out, ShakeModel)
     return out
 
 
-def with_force(model: ShakeModel, force_hz: float) -> ShakeModel:
+def with_cutoff(model: ShakeModel, force_hz: float) -> ShakeModel:
     """The model with that corner of all forces that have one."""
     modes = tuple(m if m.force_hz is None else replace(m, force_hz=force_hz) for m in model.modes)
     zigzags = tuple(
@@ -104,7 +104,7 @@ def with_force(model: ShakeModel, force_hz: float) -> ShakeModel:
     return replace(model, modes=modes, bubble=replace(model.bubble, zigzags=zigzags))
 
 
-def forced(model: ShakeModel, force_hz: float | None) -> ShakeModel:
+def with_low_pass_force(model: ShakeModel, force_hz: float | None) -> ShakeModel:
     """The model with that corner of all modes' forces, None: all white."""
     return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
 

@@ -1,4 +1,4 @@
-"""The stochastic processes that a channel's measurements are sums of, by hyper-parameter."""
+"""The stochastic processes that a signal's measurements are sums of, by hyper-parameter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import FORCE
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel, Zigzag
 from telerig.factors.state_space import (
@@ -36,7 +36,7 @@ def _ou_velocity(**values: float) -> Component:
 
 @dataclass(frozen=True)
 class Process:
-    """One process along a channel's direction, and what it is made from.
+    """One process along a signal's direction, and what it is made from.
 
     stem : of the hyper-parameters' names, "modes.0".  learned : their last parts with the arguments
     of ``make`` and values here.  camera : the arm that it moves, CARRIAGE: all, None: a bubble.
@@ -64,17 +64,17 @@ class Process:
         return self.make(**dict(values.values()), **self.fixed)
 
 
-def shake_processes(channel: Channel, model: ShakeModel) -> list[Process]:
-    """The shake's, along the channel's direction."""
+def shake_processes(signal: Signal, model: ShakeModel) -> list[Process]:
+    """The shake's, along the signal's direction."""
     out: list[Process] = []
-    if not channel.shaken:
+    if not signal.shaken:
         return out
     for i, mode in enumerate(model.modes):
-        rms = _along(channel, mode.rms_mm, mode.camera)
+        rms = _along(signal, mode.rms_mm, mode.camera)
         if rms > 0:
             out.append(Process(f"modes.{i}", _resonance, _line(mode, rms), camera=mode.camera))
     for i, band in enumerate(model.broad_bands):
-        rms = _along(channel, band.rms_mm, band.camera)
+        rms = _along(signal, band.rms_mm, band.camera)
         if rms > 0:
             learned = {"rms_mm": ("rms_mm", rms)}
             fixed = {"low_hz": band.low_hz, "high_hz": band.high_hz}
@@ -92,17 +92,17 @@ def _line(line: RigMode | Zigzag, rms_mm: float) -> dict[str, tuple[str, float]]
     return {name: (name, value) for name, value in values.items()}
 
 
-def _along(channel: Channel, rms_mm: tuple[float, float, float], camera: int) -> float:
-    if camera != CARRIAGE and camera not in channel.cameras:
+def _along(signal: Signal, rms_mm: tuple[float, float, float], camera: int) -> float:
+    if camera != CARRIAGE and camera not in signal.cameras:
         return 0.0
-    return float(np.sqrt(np.sum(np.square(channel.direction * rms_mm))))
+    return float(np.sqrt(np.sum(np.square(signal.direction * rms_mm))))
 
 
-def bubble_processes(channel: Channel, model: ShakeModel) -> list[Process]:
-    """Of one bubble, along the channel's direction; none where nothing moves."""
-    if not channel.moving.any():
+def bubble_processes(signal: Signal, model: ShakeModel) -> list[Process]:
+    """Of one bubble, along the signal's direction; none where nothing moves."""
+    if not signal.moving.any():
         return []
-    bubble, share = model.bubble, 1 / np.sqrt(channel.pooled)
+    bubble, share = model.bubble, 1 / np.sqrt(signal.pooled)
     learned = {
         "velocity_sigma_mm_s": ("sigma_mm_s", float(share * bubble.velocity_sigma_mm_s)),
         "velocity_tau_s": ("tau_s", bubble.velocity_tau_s),
@@ -110,20 +110,20 @@ def bubble_processes(channel: Channel, model: ShakeModel) -> list[Process]:
     begin = {"start_sigma_mm": float(share * bubble.start_sigma_mm)}
     parts = [Process("bubble", _ou_velocity, learned, begin)]
     for i, z in enumerate(bubble.zigzags):
-        rms = float(share * np.sqrt(np.sum(np.square(channel.direction * z.rms_mm))))
+        rms = float(share * np.sqrt(np.sum(np.square(signal.direction * z.rms_mm))))
         if rms > 0:
             parts.append(Process(f"bubble.zigzags.{i}", _resonance, _line(z, rms)))
     return parts
 
 
-def processes(channel: Channel, model: ShakeModel) -> list[Component]:
+def processes(signal: Signal, model: ShakeModel) -> list[Component]:
     """Of the shake, then of one bubble. What two models have alike is the same object."""
-    found = shake_processes(channel, model) + bubble_processes(channel, model)
+    found = shake_processes(signal, model) + bubble_processes(signal, model)
     return [p.component for p in found]
 
 
-def tells_of(channel: Channel, model: ShakeModel, names: Sequence[str]) -> bool:
-    """Whether the channel's evidence depends on any of these hyper-parameters."""
-    found = shake_processes(channel, model) + bubble_processes(channel, model)
+def depends_on(signal: Signal, model: ShakeModel, names: Sequence[str]) -> bool:
+    """Whether the signal's evidence depends on any of these hyper-parameters."""
+    found = shake_processes(signal, model) + bubble_processes(signal, model)
     known = {name for p in found for name in p.names}
     return "pixel_inflation" in names or not known.isdisjoint(names)

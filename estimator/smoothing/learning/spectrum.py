@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.processes import bubble_processes, shake_processes
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
 from telerig.factors.state_space import Component
@@ -41,23 +41,23 @@ def density(components: Iterable[Component], frequency_hz: Array) -> Array:
     return total
 
 
-def coarser(channel: Channel, factor: int) -> Channel:
+def averaged(signal: Signal, factor: int) -> Signal:
     """Means over ``factor`` frames, which keep all of the noise and blur fast lines a little."""
-    if factor < 2 or len(channel.t_s) < 8 * factor:
-        return channel
-    count = len(channel.t_s) // factor
-    weight = channel.weight[: count * factor].reshape(count, factor, -1)
-    value = channel.value_mm[: count * factor].reshape(count, factor, -1)
+    if factor < 2 or len(signal.t_s) < 8 * factor:
+        return signal
+    count = len(signal.t_s) // factor
+    weight = signal.weight[: count * factor].reshape(count, factor, -1)
+    value = signal.value_mm[: count * factor].reshape(count, factor, -1)
     total = weight.sum(1)
     mean = (weight * value).sum(1) / np.where(total > 0, total, 1.0)
-    t = channel.t_s[: count * factor].reshape(count, factor).mean(1)
+    t = signal.t_s[: count * factor].reshape(count, factor).mean(1)
     # only whole blocks stand for the time of their middle
     whole = (weight > 0).all(1)
-    first = np.minimum(channel.first // factor, count - 1)
-    return replace(channel, t_s=t, value_mm=mean, weight=np.where(whole, total, 0.0), first=first)
+    first = np.minimum(signal.first // factor, count - 1)
+    return replace(signal, t_s=t, value_mm=mean, weight=np.where(whole, total, 0.0), first=first)
 
 
-def coarsening(t_s: Array, highest_hz: float) -> int:
+def averaging_factor(t_s: Array, highest_hz: float) -> int:
     """How many frames may be averaged before a line of that frequency fades by 2 %.
 
     By 8 % while more than `_ENOUGH` frames are left.
@@ -67,22 +67,20 @@ def coarsening(t_s: Array, highest_hz: float) -> int:
     return max(1, little, min(more, len(t_s) // _ENOUGH))
 
 
-def faded(frequency_hz: float, factor: int, t_s: Array) -> float:
+def averaging_loss(frequency_hz: float, factor: int, t_s: Array) -> float:
     """By how much a mean over ``factor`` frames shrinks a line's amplitude."""
     step = float(np.median(np.diff(t_s)))
     fine = np.sinc(frequency_hz * step)
     return float(np.sinc(frequency_hz * step * factor) / fine)
 
 
-def unexplained(
-    channel: Channel, model: ShakeModel, where: int | str, count: int = 3
-) -> list[Line]:
+def unexplained(signal: Signal, model: ShakeModel, where: int | str, count: int = 3) -> list[Line]:
     """The highest peaks of a spectrum over the model's.
 
     where : CARRIAGE: the mean of all items and cameras; "bubble": bubbles less their mean (of one
     bubble: the same as CARRIAGE); a camera: its difference from the mean of the cameras.
     """
-    frequency, power, expected = _spectra(channel, model, where)
+    frequency, power, expected = _spectra(signal, model, where)
     if not len(frequency):
         return []
     ratio = power / expected
@@ -96,14 +94,14 @@ def unexplained(
     return sorted(lines, key=lambda line: -line.excess)[:count]
 
 
-def _spectra(channel: Channel, model: ShakeModel, where: int | str) -> tuple[Array, Array, Array]:
+def _spectra(signal: Signal, model: ShakeModel, where: int | str) -> tuple[Array, Array, Array]:
     """Frequencies, density found (Hann windows, mean over independent series), and expected."""
     from scipy.signal import periodogram
 
-    t = channel.t_s
+    t = signal.t_s
     step = float(np.median(np.diff(t)))
     grid = np.arange(t[0], t[-1] + step / 2, step)
-    series, weights = _series(channel, where)
+    series, weights = _series(signal, where)
     if not len(series) or len(grid) < 16:
         return np.zeros(0), np.zeros(0), np.ones(0)
     total, noise, used = 0.0, 0.0, 0
@@ -121,14 +119,14 @@ def _spectra(channel: Channel, model: ShakeModel, where: int | str) -> tuple[Arr
         return np.zeros(0), np.zeros(0), np.ones(0)
     keep = frequency >= max(LOWEST_HZ, _LEAST_PERIODS / (t[-1] - t[0]))
     frequency = frequency[keep]
-    expected = noise / used + _expected(channel, model, where, frequency)
+    expected = noise / used + _expected(signal, model, where, frequency)
     return frequency, np.asarray(total)[keep] / used, expected
 
 
-def _expected(channel: Channel, model: ShakeModel, where: int | str, frequency: Array) -> Array:
-    movers = max(int(channel.moving.sum()), 1)
-    shake, cameras = shake_processes(channel, model), len(channel.cameras)
-    bubble = [p.component for p in bubble_processes(channel, model)]
+def _expected(signal: Signal, model: ShakeModel, where: int | str, frequency: Array) -> Array:
+    movers = max(int(signal.moving.sum()), 1)
+    shake, cameras = shake_processes(signal, model), len(signal.cameras)
+    bubble = [p.component for p in bubble_processes(signal, model)]
     common = [p.component for p in shake if p.camera == CARRIAGE]
     own = [p.component for p in shake if p.camera != CARRIAGE]
     if where == "bubble" and movers > 1:
@@ -140,17 +138,17 @@ def _expected(channel: Channel, model: ShakeModel, where: int | str, frequency: 
     return density(mine, frequency) + (density(own, frequency) - density(mine, frequency))
 
 
-def _series(channel: Channel, where: int | str) -> tuple[list[Array], list[Array]]:
+def _series(signal: Signal, where: int | str) -> tuple[list[Array], list[Array]]:
     """Independent series of one kind, (F,) each, and their weights (1 / variance)."""
-    value, weight = channel.value_mm, channel.weight
-    items = np.unique(channel.item)
+    value, weight = signal.value_mm, signal.weight
+    items = np.unique(signal.item)
     if where == CARRIAGE or (where == "bubble" and len(items) < 2):
-        return [_mean(_level(channel), weight)[0]], [_mean(value, weight)[1]]
+        return [_mean(_level(signal), weight)[0]], [_mean(value, weight)[1]]
     if where == "bubble":
-        every, _ = _mean(_level(channel), weight)
-        parts = [_mean(value[:, channel.item == i], weight[:, channel.item == i]) for i in items]
+        every, _ = _mean(_level(signal), weight)
+        parts = [_mean(value[:, signal.item == i], weight[:, signal.item == i]) for i in items]
         return [p[0] - every for p in parts], [p[1] for p in parts]
-    mine = channel.camera == channel.cameras.index(int(where))
+    mine = signal.camera == signal.cameras.index(int(where))
     if mine.all():
         return [], []
     here, rest = _mean(value[:, mine], weight[:, mine]), _mean(value[:, ~mine], weight[:, ~mine])
@@ -159,11 +157,11 @@ def _series(channel: Channel, where: int | str) -> tuple[list[Array], list[Array
     return [here[0] - rest[0]], [both / spread]
 
 
-def _level(channel: Channel) -> Array:
+def _level(signal: Signal) -> Array:
     """Values less each item's mean, so that items may come and go."""
-    total = channel.weight.sum(0)
-    mean = (channel.weight * channel.value_mm).sum(0) / np.where(total > 0, total, 1.0)
-    return np.asarray(channel.value_mm - mean)
+    total = signal.weight.sum(0)
+    mean = (signal.weight * signal.value_mm).sum(0) / np.where(total > 0, total, 1.0)
+    return np.asarray(signal.value_mm - mean)
 
 
 def _mean(value: Array, weight: Array) -> tuple[Array, Array]:

@@ -141,8 +141,8 @@ class ShakeModel:
     @property
     def force_hz(self) -> float | None:
         """Corner of the modes' forces; None where they are white, or have unlike ones."""
-        corners = {m.force_hz for m in self.modes if m.force_hz is not None}
-        return corners.pop() if len(corners) == 1 else None
+        cutoffs = {m.force_hz for m in self.modes if m.force_hz is not None}
+        return cutoffs.pop() if len(cutoffs) == 1 else None
 
     def without_shake(self) -> ShakeModel:
         """The oracle's model: the cameras stand still on the carriage."""

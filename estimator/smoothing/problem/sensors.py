@@ -185,16 +185,16 @@ def references_of(
             todo=f"it has {', '.join(names)}",
         )
     table = table[(table["frame"] >= 0) & (table["frame"] < len(t_s))]
-    labels = sorted(set(table["mark"].astype(str)))
-    number = {m: i for i, m in enumerate(labels)}
+    attributions = sorted(set(table["mark"].astype(str)))
+    number = {m: i for i, m in enumerate(attributions)}
     item = table["mark"].astype(str).map(number).to_numpy(np.int64)
     frame = table["frame"].to_numpy(np.int64)
     camera = table["camera"].map({n: i for i, n in enumerate(names)}).to_numpy(np.int64)
     uv = table[["u_px", "v_px"]].to_numpy(float)
     sigma = table["sigma_px"].to_numpy(float) if "sigma_px" in table else np.full(len(uv), 0.1)
     observations = Observations(item, frame, camera, uv, sigma[:, None, None] ** 2 * np.eye(2))
-    guesses = _marks(observations, cameras, positions_mm, axis, len(labels))
-    marks = (Mark(name, g, _MARK_SIGMA_MM) for name, g in zip(labels, guesses))
+    guesses = _marks(observations, cameras, positions_mm, axis, len(attributions))
+    marks = (Mark(name, g, _MARK_SIGMA_MM) for name, g in zip(attributions, guesses))
     return tuple(marks), observations
 
 

@@ -2,7 +2,7 @@
 
 Per axis of the rig: q, by how much not knowing the shake widens the bubbles' positions; eta, how
 much of the shake's variance the data take away; and whether a spectral line could be the bubble's
-as well as the rig's (see `telerig.estimator.smoothing.learning.mode_labels`).
+as well as the rig's (see `telerig.estimator.smoothing.learning.attribution`).
 A smoother that always answers is wrong: where these say no, the remedy is a mark fixed to the tank
 or an accelerometer on each arm.
 """
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
+from telerig.estimator.smoothing.learning.attribution import Attribution, attributions
 from telerig.estimator.smoothing.learning.groups import Learning, groups_of
-from telerig.estimator.smoothing.learning.lines_of_sight import channels_of
-from telerig.estimator.smoothing.learning.mode_labels import LineLabel, labels
+from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     CarriageModel,
@@ -51,7 +51,7 @@ class AxisVerdict:
 
     q : sigma(position) over sigma(position | shake known).  eta : share of the shake's prior
     variance that the data take away, None without a shake in the model.
-    shake_rms_mm : of the camera that shakes most.  lines : labels that could be swapped.
+    shake_rms_mm : of the camera that shakes most.  lines : attributions that could be swapped.
     """
 
     verdict: str
@@ -61,7 +61,7 @@ class AxisVerdict:
     sigma_mm: float
     sigma_shake_known_mm: float
     shake_rms_mm: float
-    lines: tuple[LineLabel, ...] = ()
+    lines: tuple[Attribution, ...] = ()
 
 
 def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
         "flags": _flags(found),
         "axes": {name: _as_json(axis) for name, axis in found.items()},
         "words": words(problem, model, found),
-        "remedy": "" if worst == RESOLVED else what_would_tell(problem),
+        "remedy": "" if worst == RESOLVED else remedy_of_verdict(problem),
         "left_out": _left_out(problem),
         "modes": shake_modes(solution),
     }
@@ -103,7 +103,7 @@ def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
 
 
 def _axis(
-    sigma: Array, known: Array, eta: float | None, rms: float, lines: tuple[LineLabel, ...]
+    sigma: Array, known: Array, eta: float | None, rms: float, lines: tuple[Attribution, ...]
 ) -> AxisVerdict:
     q, base = float(np.median(sigma / known)), float(np.median(known))
     verdict = UNRESOLVED
@@ -121,7 +121,7 @@ def _axis(
     )
 
 
-def _matters(line: LineLabel) -> bool:
+def _matters(line: Attribution) -> bool:
     return line.owner == "rig" and line.ambiguous
 
 
@@ -227,17 +227,19 @@ def _inner_frames(solution: Solution) -> NDArray[np.int64]:
     return np.arange(edge, count - edge)
 
 
-def _lines(problem: SmoothingProblem, model: ShakeModel) -> list[tuple[Sequence[float], LineLabel]]:
+def _lines(
+    problem: SmoothingProblem, model: ShakeModel
+) -> list[tuple[Sequence[float], Attribution]]:
     """What swapping each line would cost, with the directions it moves along.
 
     Sensors on the cameras' arms settle the question by themselves.
     """
     if any(a.camera != CARRIAGE for a in problem.accelerometers):
         return []
-    channels = [c for c in channels_of(problem) if c.samples]
-    out: list[tuple[Sequence[float], LineLabel]] = []
-    for group in groups_of(channels, Learning(), problem.up):
-        found = labels(group.fast, model, group.pattern, problem.up)
+    signals = [c for c in signals_of(problem) if c.samples]
+    out: list[tuple[Sequence[float], Attribution]] = []
+    for group in groups_of(signals, Learning(), problem.up):
+        found = attributions(group.fast, model, group.pattern, problem.up)
         out += [(group.pattern, line) for line in found]
     return out
 
@@ -247,13 +249,13 @@ def words(problem: SmoothingProblem, model: ShakeModel, found: dict[str, AxisVer
     upright = AXES[int(np.abs(problem.up).argmax())]
     parts = [_sentence(name, axis, name == upright) for name, axis in found.items()]
     if any(axis.verdict != RESOLVED for axis in found.values()):
-        parts.append(f"To resolve it: {what_would_tell(problem)}.")
+        parts.append(f"To resolve it: {remedy_of_verdict(problem)}.")
     if model.name == "learned":
         parts.append("The shake's modes were learned from this run.")
     return " ".join(parts)
 
 
-def what_would_tell(problem: SmoothingProblem) -> str:
+def remedy_of_verdict(problem: SmoothingProblem) -> str:
     """What would tell more, of what this run does not have."""
     arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
     has_arms = len(arms) == len(problem.cameras)
@@ -297,7 +299,7 @@ def _as_json(axis: AxisVerdict) -> dict[str, Any]:
             "owner": line.owner,
             "frequency_hz": line.frequency_hz,
             "rms_mm": line.rms_mm,
-            "other_owner_costs_nats": line.cost_nats,
+            "other_owner_costs_nats": line.log_likelihood_ratio,
             "ambiguous": line.ambiguous,
         }
         for line in axis.lines

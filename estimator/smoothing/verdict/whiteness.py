@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.smoothing.graph.linear import accelerometers, felt
+from telerig.estimator.smoothing.graph.linear import accelerometers, sensed_directions
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.verdict.residual_draws import drawn_residuals, stretch_of
 
@@ -103,7 +103,7 @@ def accelerometer_spectra(solution: Solution) -> dict[str, Any]:
         sensor = frame.problem.accelerometers[index]
         if len(sensor.t_s) < LAGS:
             continue
-        project, _ = felt(frame, index)
+        project, _ = sensed_directions(frame, index)
         unit = sensor.sigma_mm_s2 / 1000
         rate = 1 / float(np.median(np.diff(sensor.t_s)))
         frequency, before = _density(unit * sensor.reading_mm_s2 @ project.T, rate)

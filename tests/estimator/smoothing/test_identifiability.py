@@ -13,9 +13,9 @@ from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.problem.problem import Accelerometer, BroadBand, ShakeModel, Stage
 from telerig.estimator.smoothing.verdict.identifiability import (
     judge,
+    remedy_of_verdict,
     shake_share,
     verdicts,
-    what_would_tell,
     without_sensors,
 )
 from telerig.estimator.smoothing.verdict.modes import remedy, shake_modes
@@ -52,7 +52,7 @@ def test_several_bubbles_settle_the_label_but_not_the_amplitude() -> None:
     problem, _, _ = run(np.random.default_rng(1), bubbles=5)
     y = verdicts(solve(problem, true_model(), QUIET))["y"]
     assert "LABEL_AMBIGUOUS" not in y.flags
-    assert all(line.cost_nats > 5 for line in y.lines)
+    assert all(line.log_likelihood_ratio > 5 for line in y.lines)
     alone, _, _ = run(np.random.default_rng(1))
     assert y.q < verdicts(solve(alone, true_model(), QUIET))["y"].q
 
@@ -81,7 +81,7 @@ def test_the_remedy_is_never_what_the_run_already_has() -> None:
         (replace(alone, accelerometers=sensors[:1]), (strip, arms), ()),
         (replace(marked, accelerometers=sensors), ("longer record",), (strip, arms)),
     ):
-        words = what_would_tell(problem)
+        words = remedy_of_verdict(problem)
         assert all(word in words for word in said)
         assert not any(word in words for word in unsaid)
 

@@ -10,9 +10,9 @@ from shake_learning_data import SWING_HZ, run, true_model
 
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.learning.groups import groups_of
-from telerig.estimator.smoothing.learning.learn import Learning, as_likely, learn
+from telerig.estimator.smoothing.learning.learn import Learning, learn, posterior_rms
 from telerig.estimator.smoothing.learning.likelihood import evidence
-from telerig.estimator.smoothing.learning.lines_of_sight import channels_of
+from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.learning.parameters import with_values
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
 
@@ -23,10 +23,10 @@ NAME = "modes.3.rms_mm"
 def test_an_rms_that_the_data_hardly_determine_is_the_root_of_its_mean_square(seed: int) -> None:
     """Against a fine integral over the same evidence and prior."""
     problem, _, _ = run(np.random.default_rng(seed), bubbles=3, seconds=1.0)
-    group = groups_of(channels_of(problem), Learning(), problem.up)[1]
+    group = groups_of(signals_of(problem), Learning(), problem.up)[1]
     hidden = RigMode(1.2 * SWING_HZ, 0.03, (0.1, 0.0, 0.1), CARRIAGE, None)
     model = replace(true_model(), modes=(*true_model().modes, hidden))
-    found = as_likely(group.fast, model, NAME, 0.1)
+    found = posterior_rms(group.fast, model, NAME, 0.1)
     fine = np.linspace(-3.25, 2.25, 221)
     values = 0.1 * np.exp(fine)
     log = np.array([evidence(group.fast, with_values(model, [NAME], [v])) for v in values])
@@ -36,7 +36,7 @@ def test_an_rms_that_the_data_hardly_determine_is_the_root_of_its_mean_square(se
 
 def test_where_nothing_tells_it_is_the_priors() -> None:
     model = replace(true_model(), modes=(*true_model().modes, RigMode(9.0, 0.03, (0.1, 0.0, 0.1))))
-    found = as_likely((), model, NAME, 0.1)
+    found = posterior_rms((), model, NAME, 0.1)
     ratio = np.random.default_rng(1).normal(size=200_000)
     ratio = ratio[(ratio > -3.25) & (ratio < 2.25)]
     assert found == pytest.approx(0.1 * np.sqrt(np.mean(np.exp(2 * ratio))), rel=0.02)

@@ -10,23 +10,28 @@ from scipy.stats import norm
 from shake_learning_data import BUBBLE_HZ, COMMON_HZ, run, true_model
 
 from telerig.errors import InputError
-from telerig.estimator.smoothing.learning.default_priors import default_model
-from telerig.estimator.smoothing.learning.groups import free_names, groups_of
-from telerig.estimator.smoothing.learning.learn import Learning, learn
-from telerig.estimator.smoothing.learning.likelihood import evidence, maximise
-from telerig.estimator.smoothing.learning.lines_of_sight import channels_of, pooled
-from telerig.estimator.smoothing.learning.mode_labels import (
-    LineLabel,
-    doubted,
+from telerig.estimator.smoothing.learning.attribution import (
+    Attribution,
     expected,
     shared,
+    with_hidden_modes,
 )
-from telerig.estimator.smoothing.learning.mode_search import Step, coloured, whitened
+from telerig.estimator.smoothing.learning.default_priors import default_model
+from telerig.estimator.smoothing.learning.groups import free_names, groups_of
+from telerig.estimator.smoothing.learning.learn import (
+    Learning,
+    Step,
+    learn,
+    try_low_pass_force,
+    try_white_force,
+)
+from telerig.estimator.smoothing.learning.likelihood import evidence, maximise
+from telerig.estimator.smoothing.learning.lines_of_sight import pooled, signals_of
 from telerig.estimator.smoothing.learning.parameters import (
     FORCE,
-    forced,
     names_of,
     value_of,
+    with_low_pass_force,
     with_values,
 )
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, Zigzag
@@ -51,18 +56,18 @@ def test_a_white_force_gets_no_corner(seed: int) -> None:
         np.random.default_rng(seed), bubbles=1, seconds=1.0, rate_hz=250.0, sigma_px=0.15,
         common_hz=9.0, force_hz=2000.0,
     )  # fmt: skip
-    group = groups_of(channels_of(problem), Learning(), problem.up)[0]
+    group = groups_of(signals_of(problem), Learning(), problem.up)[0]
     begun = replace(true_model(), modes=(replace(true_model().modes[0], damping=0.1),))
     step = Step(maximise(group.fast, begun, names_of(begun)[:3], steps=2), (CARRIAGE,))
-    after = coloured(group, step, Learning(), True)
+    after = try_low_pass_force(group, step, Learning(), True)
     assert after.fit.model.force_hz is None
     assert after.fit.log_evidence > step.fit.log_evidence
     # one that was given is taken away again
     corner = maximise(
-        group.fast, forced(after.fit.model, 200.0), names_of(after.fit.model), steps=4
+        group.fast, with_low_pass_force(after.fit.model, 200.0), names_of(after.fit.model), steps=4
     )
-    assert whitened(group, corner, Learning()).model.force_hz is None
-    held = whitened(group, corner, Learning(hold=(FORCE,)))
+    assert try_white_force(group, corner, Learning()).model.force_hz is None
+    held = try_white_force(group, corner, Learning(hold=(FORCE,)))
     assert held.model.force_hz == 200.0
 
 
@@ -80,11 +85,11 @@ def test_one_corner_is_every_modes_that_has_one() -> None:
     moved = with_values(one, [FORCE], [80.0])
     assert [m.force_hz for m in moved.modes] == [80.0, None, None]
     assert [z.force_hz for z in moved.bubble.zigzags] == [None, 80.0]
-    assert [m.force_hz for m in forced(white, 30.0).modes] == [30.0] * 3
+    assert [m.force_hz for m in with_low_pass_force(white, 30.0).modes] == [30.0] * 3
 
 
 @pytest.mark.parametrize(
-    ("corners", "hold", "is_free"),
+    ("cutoffs", "hold", "is_free"),
     [
         ((60.0, 60.0, None), (), True),
         ((60.0, 60.0, 60.0), ("modes.*.frequency_hz",), True),
@@ -95,11 +100,11 @@ def test_one_corner_is_every_modes_that_has_one() -> None:
     ],
 )
 def test_a_corner_is_learned_unless_it_is_held_or_unlike(
-    corners: tuple[float | None, ...], hold: tuple[str, ...], is_free: bool
+    cutoffs: tuple[float | None, ...], hold: tuple[str, ...], is_free: bool
 ) -> None:
     problem, _, _ = run(np.random.default_rng(18), bubbles=2, seconds=0.2)
-    upright, across = groups_of(channels_of(problem), Learning(), problem.up)
-    modes = tuple(replace(m, force_hz=f) for m, f in zip(true_model().modes, corners))
+    upright, across = groups_of(signals_of(problem), Learning(), problem.up)
+    modes = tuple(replace(m, force_hz=f) for m, f in zip(true_model().modes, cutoffs))
     model, options = replace(true_model(), modes=modes), Learning(hold=hold)
     assert (FORCE in free_names(model, upright, options, True)) == is_free
     assert FORCE not in free_names(model, across, options, False)
@@ -121,16 +126,16 @@ def test_white_forces_that_are_held_stay_white() -> None:
 def test_an_ambiguous_line_is_halved_without_changing_one_bubbles_likelihood() -> None:
     """Also where the rig's other lines have a corner: the halves add up to the line."""
     problem, _, _ = run(np.random.default_rng(9), sigma_px=0.1)
-    channels = channels_of(problem)[:1]
-    for model in (true_model(), forced(true_model(), 20.0)):
+    signals = signals_of(problem)[:1]
+    for model in (true_model(), with_low_pass_force(true_model(), 20.0)):
         doubtful = [
-            LineLabel("rig", 0, COMMON_HZ, 0.2, 0.0),
-            LineLabel("bubble", 1, 13.0, 0.2, 0.0),
+            Attribution("rig", 0, COMMON_HZ, 0.2, 0.0),
+            Attribution("bubble", 1, 13.0, 0.2, 0.0),
         ]
         halved = shared(model, doubtful)
         assert len(halved.modes) == len(model.modes) + 1
-        at = evidence(channels, model)
-        assert evidence(channels, halved) == pytest.approx(at, abs=1e-5)
+        at = evidence(signals, model)
+        assert evidence(signals, halved) == pytest.approx(at, abs=1e-5)
 
 
 def test_prior_weights_of_a_line_beside_the_bubbles() -> None:
@@ -160,11 +165,11 @@ def test_prior_weights_of_a_line_beside_the_bubbles() -> None:
 def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None:
     """Elsewhere, of its own: then a second one just here would be a coincidence."""
     problem, _, _ = run(np.random.default_rng(16), bubbles=3)
-    channels, true = pooled(channels_of(problem)[0]), true_model()
+    signals, true = pooled(signals_of(problem)[0]), true_model()
 
     def room(*common: RigMode) -> float:
         modes = (*common, *true.modes[1:])
-        found = doubted(channels, replace(true, modes=modes), (0, 1, 0), problem.up)
+        found = with_hidden_modes(signals, replace(true, modes=modes), (0, 1, 0), problem.up)
         added = found.modes[len(modes) :]
         return max((m.rms_mm[1] for m in added if round(m.frequency_hz) == BUBBLE_HZ), default=0.0)
 
@@ -178,13 +183,13 @@ def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None
 def test_beside_the_rigs_hidden_line_the_bubbles_own_gets_its_width_back() -> None:
     """Fitted without the rig's, it was wider: it had to be what the bubbles have in common, too."""
     problem, _, _ = run(np.random.default_rng(19), bubbles=4, common_hz=BUBBLE_HZ)
-    channels, true = pooled(channels_of(problem)[0]), true_model()
+    signals, true = pooled(signals_of(problem)[0]), true_model()
     missed = replace(true, modes=true.modes[1:])
     names = [f"bubble.zigzags.1.{n}" for n in ("frequency_hz", "damping", "rms_mm")]
-    alone = maximise(channels, missed, names).model
-    found = doubted(channels, alone, (0, 1, 0), problem.up)
+    alone = maximise(signals, missed, names).model
+    found = with_hidden_modes(signals, alone, (0, 1, 0), problem.up)
     assert [m.camera for m in found.modes] == [0, 1, CARRIAGE]
     wide, own = (m.bubble.zigzags[1].rms_mm[1] for m in (alone, found))
     assert abs(own - 0.18) < 0.7 * abs(wide - 0.18)
     assert own < 0.95 * wide
-    assert evidence(channels, found) > evidence(channels, alone)
+    assert evidence(signals, found) > evidence(signals, alone)

@@ -10,35 +10,37 @@ from shake_learning_data import ARM_HZ, BUBBLE_HZ, COMMON_HZ, SWING_HZ, run, tru
 
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Options, solve
-from telerig.estimator.smoothing.learning.default_priors import default_model
-from telerig.estimator.smoothing.learning.evidence import (
-    channel_evidence,
-    channel_posterior,
-    position_sigma,
-)
-from telerig.estimator.smoothing.learning.groups import groups_of
-from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import inflated
-from telerig.estimator.smoothing.learning.learn import Learning, learn
-from telerig.estimator.smoothing.learning.likelihood import evidence, laplace_sigma, maximise
-from telerig.estimator.smoothing.learning.lines_of_sight import channels_of, pooled, seen_channels
-from telerig.estimator.smoothing.learning.mode_labels import (
-    doubted,
-    labels,
+from telerig.estimator.smoothing.learning.attribution import (
+    attributions,
     moved_to_bubble,
     moved_to_rig,
+    with_hidden_modes,
 )
+from telerig.estimator.smoothing.learning.default_priors import default_model
+from telerig.estimator.smoothing.learning.evidence import (
+    position_sigma,
+    signal_evidence,
+    signal_posterior,
+)
+from telerig.estimator.smoothing.learning.groups import groups_of
+from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import (
+    with_hyperparameter_uncertainty,
+)
+from telerig.estimator.smoothing.learning.learn import Learning, learn
+from telerig.estimator.smoothing.learning.likelihood import evidence, laplace_covariance, maximise
+from telerig.estimator.smoothing.learning.lines_of_sight import pooled, sight_directions, signals_of
 from telerig.estimator.smoothing.learning.parameters import (
-    forced,
     log_prior,
     names_of,
     value_of,
+    with_low_pass_force,
     with_values,
 )
 from telerig.estimator.smoothing.learning.spectrum import (
-    coarsening,
-    coarser,
+    averaged,
+    averaging_factor,
+    averaging_loss,
     density,
-    faded,
     unexplained,
 )
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel, Zigzag
@@ -55,29 +57,29 @@ OTHER = replace(
 @pytest.mark.parametrize("marks", [0, 2])
 def test_evidence_means_and_deviations_equal_the_graphs(marks: int) -> None:
     problem, _, _ = run(np.random.default_rng(3), bubbles=2, seconds=0.3, marks=marks, kept=0.8)
-    channels = channels_of(problem)
+    signals = signals_of(problem)
     quiet = Options(robust=False)
     first, second = (solve(problem, m, quiet) for m in (true_model(), OTHER))
-    fast = evidence(channels, true_model()) - evidence(channels, OTHER)
+    fast = evidence(signals, true_model()) - evidence(signals, OTHER)
     assert fast == pytest.approx(first.log_evidence - second.log_evidence, abs=1e-4)
 
     frames = np.array([5, 30, 55])
     assert first.covariances is not None
     states = first.state.bubbles @ first.frame.bubble.position.T
     row = first.frame.bubble.position
-    for channel in channels[:1]:
-        found = channel_posterior(channel, true_model())
-        place = (found.position_mm + channel.start_mm[:2, None]).ravel()
-        np.testing.assert_allclose(place, states @ channel.direction, atol=1e-6)
-        sigma = position_sigma(channel, true_model(), frames)
-        along = channel.direction @ row
+    for signal in signals[:1]:
+        found = signal_posterior(signal, true_model())
+        place = (found.position_mm + signal.start_mm[:2, None]).ravel()
+        np.testing.assert_allclose(place, states @ signal.direction, atol=1e-6)
+        sigma = position_sigma(signal, true_model(), frames)
+        along = signal.direction @ row
         full = np.sqrt(np.einsum("d,nde,e->n", along, first.covariances.bubbles, along))
         np.testing.assert_allclose(sigma, full.reshape(2, -1)[:, frames], rtol=1e-5)
 
 
 def test_shared_coordinate_comes_first_and_depth_is_never_a_channel() -> None:
     problem, _, _ = run(np.random.default_rng(0), seconds=0.1)
-    found = seen_channels(problem)
+    found = sight_directions(problem)
     np.testing.assert_allclose(found[0][0], [0, 1, 0], atol=1e-12)
     assert [cameras for _, cameras in found] == [(0, 1), (0,), (1,)]
     for direction, cameras in found:
@@ -87,10 +89,10 @@ def test_shared_coordinate_comes_first_and_depth_is_never_a_channel() -> None:
 
 def test_mean_and_differences_of_alike_bubbles_have_the_whole_likelihood() -> None:
     problem, _, _ = run(np.random.default_rng(1), bubbles=4, seconds=0.5)
-    channel = channels_of(problem)[0]
-    parts = pooled(channel)
+    signal = signals_of(problem)[0]
+    parts = pooled(signal)
     assert [p.shaken for p in parts] == [True, False]
-    whole = channel_evidence(channel, true_model()) - channel_evidence(channel, true_model(0.4))
+    whole = signal_evidence(signal, true_model()) - signal_evidence(signal, true_model(0.4))
     assert evidence(parts, true_model()) - evidence(parts, true_model(0.4)) == pytest.approx(
         whole, abs=1e-4
     )
@@ -104,26 +106,26 @@ def test_density_integrates_to_the_variance() -> None:
 
 def test_coarser_means_fade_a_line_as_said() -> None:
     problem, _, _ = run(np.random.default_rng(2), still=True, shake_mm=0.0, sigma_px=1e-6)
-    channel = channels_of(problem, fixed=True)[0]
-    wave = np.sin(2 * np.pi * 12 * channel.t_s)
-    channel = replace(channel, value_mm=np.repeat(wave[:, None], 2, 1))
+    signal = signals_of(problem, fixed=True)[0]
+    wave = np.sin(2 * np.pi * 12 * signal.t_s)
+    signal = replace(signal, value_mm=np.repeat(wave[:, None], 2, 1))
     factor = 2
-    mean = coarser(channel, factor).value_mm[:, 0]
-    assert (coarsening(channel.t_s, 12.0), coarsening(channel.t_s, 2.0)) == (1, 11)
-    exact = faded(12.0, factor, channel.t_s)
+    mean = averaged(signal, factor).value_mm[:, 0]
+    assert (averaging_factor(signal.t_s, 12.0), averaging_factor(signal.t_s, 2.0)) == (1, 11)
+    exact = averaging_loss(12.0, factor, signal.t_s)
     np.testing.assert_allclose(
-        mean, exact * np.sin(2 * np.pi * 12 * coarser(channel, factor).t_s), atol=1e-6
+        mean, exact * np.sin(2 * np.pi * 12 * averaged(signal, factor).t_s), atol=1e-6
     )
     assert exact == pytest.approx(np.cos(np.pi * 12 / 200), rel=1e-6)
 
 
 def test_an_unexplained_line_is_seen_where_it_is() -> None:
     problem, _, _ = run(np.random.default_rng(4), seconds=3.0)
-    channel = channels_of(problem)[0]
+    signal = signals_of(problem)[0]
     bare = replace(true_model(), modes=true_model().modes[1:])
-    assert unexplained(channel, bare, CARRIAGE)[0].frequency_hz == pytest.approx(COMMON_HZ, abs=0.7)
+    assert unexplained(signal, bare, CARRIAGE)[0].frequency_hz == pytest.approx(COMMON_HZ, abs=0.7)
     bare = replace(true_model(), modes=())
-    assert unexplained(channel, bare, 0)[0].frequency_hz == pytest.approx(ARM_HZ, abs=1.0)
+    assert unexplained(signal, bare, 0)[0].frequency_hz == pytest.approx(ARM_HZ, abs=1.0)
 
 
 def test_parameters_by_name() -> None:
@@ -143,12 +145,12 @@ def test_parameters_by_name() -> None:
 
 def test_maximum_is_above_the_truth_and_laplace_covers_it() -> None:
     problem, _, _ = run(np.random.default_rng(5), bubbles=3)
-    parts = pooled(channels_of(problem)[0])
+    parts = pooled(signals_of(problem)[0])
     names = ["modes.0.frequency_hz", "modes.0.rms_mm"]
     truth = true_model()
     fit = maximise(parts, truth, names)
     assert fit.log_posterior >= evidence(parts, truth) + log_prior(truth, names) - 1e-6
-    covariance = laplace_sigma(parts, fit.model, names)
+    covariance = laplace_covariance(parts, fit.model, names)
     off = np.log([value_of(truth, n) / value_of(fit.model, n) for n in names])
     assert off @ np.linalg.solve(covariance, off) < 14
     # a line of 1.5 s cannot be known better than a fraction of its width, nor worse than it
@@ -183,7 +185,7 @@ def test_several_bubbles_tell_their_own_line_from_the_rigs() -> None:
     assert swing.frequency_hz == pytest.approx(SWING_HZ, rel=0.1)
 
     def error(model: ShakeModel) -> float:
-        place = channel_posterior(channels_of(problem)[0], model).position_mm
+        place = signal_posterior(signals_of(problem)[0], model).position_mm
         off = place + lab[:, 0, 1, None] - lab[:, :, 1]
         return float(np.sqrt(np.mean(off[:, 20:-20] ** 2)))
 
@@ -204,22 +206,22 @@ def test_what_is_held_keeps_its_value() -> None:
 
 def test_a_line_changes_hands_without_changing_one_bubbles_likelihood() -> None:
     problem, _, _ = run(np.random.default_rng(9))
-    channels = channels_of(problem)[:1]
-    at = evidence(channels, true_model())
-    assert evidence(channels, moved_to_bubble(true_model(), 0)) == pytest.approx(at, abs=1e-5)
-    assert evidence(channels, moved_to_rig(true_model(), 1)) == pytest.approx(at, abs=1e-5)
-    assert evidence(channels, moved_to_rig(true_model(), 1, 0.3)) == pytest.approx(at, abs=1e-5)
-    coloured = forced(true_model(), 40.0)
-    at = evidence(channels, coloured)
-    there = moved_to_bubble(coloured, 0)
-    assert evidence(channels, there) == pytest.approx(at, abs=1e-5)
+    signals = signals_of(problem)[:1]
+    at = evidence(signals, true_model())
+    assert evidence(signals, moved_to_bubble(true_model(), 0)) == pytest.approx(at, abs=1e-5)
+    assert evidence(signals, moved_to_rig(true_model(), 1)) == pytest.approx(at, abs=1e-5)
+    assert evidence(signals, moved_to_rig(true_model(), 1, 0.3)) == pytest.approx(at, abs=1e-5)
+    try_low_pass_force = with_low_pass_force(true_model(), 40.0)
+    at = evidence(signals, try_low_pass_force)
+    there = moved_to_bubble(try_low_pass_force, 0)
+    assert evidence(signals, there) == pytest.approx(at, abs=1e-5)
     back = moved_to_rig(there, len(there.bubble.zigzags) - 1)
-    assert evidence(channels, back) == pytest.approx(at, abs=1e-5)
+    assert evidence(signals, back) == pytest.approx(at, abs=1e-5)
     assert back.modes[-1].force_hz == 40.0
     several, _, _ = run(np.random.default_rng(9), bubbles=4)
-    costs = labels(pooled(channels_of(several)[0]), true_model(), (0, 1, 0), several.up)
+    costs = attributions(pooled(signals_of(several)[0]), true_model(), (0, 1, 0), several.up)
     assert {(c.owner, c.index) for c in costs} == {("rig", 0), ("bubble", 1)}
-    assert all(c.cost_nats > 5 and not c.ambiguous for c in costs)
+    assert all(c.log_likelihood_ratio > 5 and not c.ambiguous for c in costs)
 
 
 def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
@@ -227,7 +229,7 @@ def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
     names = {"modes.0.frequency_hz": 0.05}
     model = replace(true_model(), learned=names)
     solution = solve(problem, model, Options(robust=False))
-    wider = inflated(solution)
+    wider = with_hyperparameter_uncertainty(solution)
     assert solution.covariances is not None and wider.covariances is not None
     moved = [
         solve(
@@ -247,7 +249,7 @@ def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
     added = wider.covariances.shake - solution.covariances.shake
     np.testing.assert_allclose(np.einsum("d,nde,e->n", offset, added, offset), step**2, atol=1e-9)
     plain = solve(problem, true_model(), Options(robust=False))
-    assert inflated(plain) is plain
+    assert with_hyperparameter_uncertainty(plain) is plain
 
 
 def test_a_line_of_several_bubbles_leaves_room_for_the_rigs() -> None:
@@ -259,15 +261,15 @@ def test_a_line_of_several_bubbles_leaves_room_for_the_rigs() -> None:
         true.bubble, zigzags=(*true.bubble.zigzags, Zigzag(COMMON_HZ, 0.03, (0.0, 0.17, 0.0)))
     )
     missed = replace(true, modes=true.modes[1:], bubble=bubble)
-    channels = pooled(channels_of(problem)[0])
-    found = doubted(channels, missed, (0, 1, 0), problem.up)
+    signals = pooled(signals_of(problem)[0])
+    found = with_hidden_modes(signals, missed, (0, 1, 0), problem.up)
     at = {round(m.frequency_hz): max(m.rms_mm) for m in found.modes if m.camera == CARRIAGE}
     assert set(at) >= {round(COMMON_HZ)}
     assert 0.6 * 0.17 < at[round(COMMON_HZ)] <= 0.17
-    # the bubbles' own line at 13 Hz is doubted too, by less; their wide swing is not
+    # the bubbles' own line at 13 Hz is with_hidden_modes too, by less; their wide swing is not
     assert at.get(round(BUBBLE_HZ), 0.0) < 0.6 * 0.18
     assert round(SWING_HZ) not in at
-    assert doubted(channels, replace(missed, modes=(*missed.modes, common)), (0, 1, 0),
+    assert with_hidden_modes(signals, replace(missed, modes=(*missed.modes, common)), (0, 1, 0),
                    problem.up).modes[: len(true.modes)] == (*true.modes[1:], common)  # fmt: skip
 
 
@@ -277,10 +279,10 @@ def test_lines_across_are_as_wide_whichever_way_the_cameras_look(angle_deg: floa
     problem, _, _ = run(np.random.default_rng(17), bubbles=1, seconds=0.2)
     turned = Pose.from_rotvec([0.0, np.deg2rad(angle_deg), 0.0])
     right = Camera.create("right", (1024, 1024), 10.0, camera_from_rig=turned)
-    channels = channels_of(replace(problem, cameras=(problem.cameras[0], right)))
-    upright, across = groups_of(channels, Learning(), problem.up)
+    signals = signals_of(replace(problem, cameras=(problem.cameras[0], right)))
+    upright, across = groups_of(signals, Learning(), problem.up)
     np.testing.assert_allclose(upright.pattern, [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(across.pattern, [1, 0, 1], atol=1e-12)
     # one camera alone knows nothing of its own depth
-    single = groups_of(channels[:2], Learning(), problem.up)[1]
-    np.testing.assert_allclose(single.pattern, np.abs(channels[1].direction), atol=1e-12)
+    single = groups_of(signals[:2], Learning(), problem.up)[1]
+    np.testing.assert_allclose(single.pattern, np.abs(signals[1].direction), atol=1e-12)

@@ -10,17 +10,20 @@ from numpy.typing import NDArray
 from shake_learning_data import run, true_model
 
 from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
-from telerig.estimator.smoothing.learning.evidence import channel_evidence
-from telerig.estimator.smoothing.learning.gradient import channel_slope
-from telerig.estimator.smoothing.learning.likelihood import evidence, evidence_slope, laplace_sigma
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel, channels_of, pooled
-from telerig.estimator.smoothing.learning.mode_labels import moved_to_bubble
+from telerig.estimator.smoothing.learning.attribution import moved_to_bubble
+from telerig.estimator.smoothing.learning.evidence import signal_evidence, signal_gradient
+from telerig.estimator.smoothing.learning.likelihood import (
+    evidence,
+    evidence_gradient,
+    laplace_covariance,
+)
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled, signals_of
 from telerig.estimator.smoothing.learning.parameters import (
-    forced,
     log_prior,
     names_of,
     prior_of,
     value_of,
+    with_low_pass_force,
     with_values,
 )
 from telerig.estimator.smoothing.problem.problem import BroadBand, ShakeModel
@@ -32,23 +35,23 @@ BANDS = (BroadBand((0.1, 0.05, 0.1), 0, slow_rms_mm=0.02), BroadBand((0.0, 0.1, 
 
 def partly_forced() -> ShakeModel:
     white = true_model()
-    return replace(white, modes=(*forced(white, 45.0).modes[:2], white.modes[2]))
+    return replace(white, modes=(*with_low_pass_force(white, 45.0).modes[:2], white.modes[2]))
 
 
 MODELS = {
     "modes": true_model(),
     "bands": replace(true_model(0.4), broad_bands=BANDS),
-    "forced": forced(true_model(), 60.0),
-    "partly forced": moved_to_bubble(partly_forced(), 0, 0.5),
+    "with_low_pass_force": with_low_pass_force(true_model(), 60.0),
+    "partly with_low_pass_force": moved_to_bubble(partly_forced(), 0, 0.5),
 }
 
 
-def differences(channel: Channel, model: ShakeModel, names: list[str]) -> Array:
+def differences(signal: Signal, model: ShakeModel, names: list[str]) -> Array:
     h, out = 5e-4, []
     for name in names:
         at = value_of(model, name)
         up, down = (with_values(model, [name], [at * np.exp(s * h)]) for s in (1, -1))
-        out.append((channel_evidence(channel, up) - channel_evidence(channel, down)) / (2 * h))
+        out.append((signal_evidence(signal, up) - signal_evidence(signal, down)) / (2 * h))
     return np.array(out)
 
 
@@ -58,10 +61,10 @@ def test_slope_equals_differences_of_the_evidence(kind: str, kept: float, marks:
     problem, _, _ = run(np.random.default_rng(3), bubbles=3, seconds=0.3, marks=marks, kept=kept)
     model = replace(MODELS[kind], pixel_inflation=1.2)
     names = names_of(model)
-    for channel in channels_of(problem)[: 2 if kind == "modes" else 1]:
-        for part in (channel, *pooled(channel)):
-            value, slope = channel_slope(part, model, names)
-            assert value == pytest.approx(channel_evidence(part, model), abs=1e-9)
+    for signal in signals_of(problem)[: 2 if kind == "modes" else 1]:
+        for part in (signal, *pooled(signal)):
+            value, slope = signal_gradient(part, model, names)
+            assert value == pytest.approx(signal_evidence(part, model), abs=1e-9)
             # the evidence of broad bands, stiff in double precision, has noise of 1e-5 nats
             np.testing.assert_allclose(slope, differences(part, model, names), atol=0.03, rtol=1e-4)
 
@@ -71,10 +74,10 @@ def test_slope_with_frames_at_uneven_times_and_a_still_target() -> None:
     uneven = problem.t_s + np.random.default_rng(5).uniform(0, 4e-3, len(problem.t_s))
     names = names_of(true_model())
     for fixed in (False, True):
-        channel = channels_of(replace(problem, t_s=uneven), fixed=fixed)[0]
-        slope = channel_slope(channel, true_model(), names)[1]
+        signal = signals_of(replace(problem, t_s=uneven), fixed=fixed)[0]
+        slope = signal_gradient(signal, true_model(), names)[1]
         np.testing.assert_allclose(
-            slope, differences(channel, true_model(), names), atol=2e-3, rtol=1e-5
+            slope, differences(signal, true_model(), names), atol=2e-3, rtol=1e-5
         )
         # what does not move has no motion to learn
         moves = [n.startswith("bubble") and slope[i] != 0 for i, n in enumerate(names)]
@@ -109,7 +112,7 @@ def test_the_chains_solution_and_covariances_equal_dense_algebra() -> None:
 
 def test_laplace_equals_second_differences_of_the_posterior() -> None:
     problem, _, _ = run(np.random.default_rng(7), bubbles=3)
-    parts, names = pooled(channels_of(problem)[0]), ["modes.0.rms_mm", "bubble.velocity_tau_s"]
+    parts, names = pooled(signals_of(problem)[0]), ["modes.0.rms_mm", "bubble.velocity_tau_s"]
     at = np.log([value_of(true_model(), n) for n in names])
     scale = np.array([prior_of(n).step for n in names])
 
@@ -122,27 +125,27 @@ def test_laplace_equals_second_differences_of_the_posterior() -> None:
         [[cost(h * (a + b)) - cost(h * (a - b)) - cost(h * (b - a)) + cost(-h * (a + b))
           for b in unit] for a in unit]
     ) / (4 * h * h)  # fmt: skip
-    found = np.linalg.inv(laplace_sigma(parts, true_model(), names)) * scale[:, None] * scale
+    found = np.linalg.inv(laplace_covariance(parts, true_model(), names)) * scale[:, None] * scale
     np.testing.assert_allclose(found, second, rtol=0.02, atol=0.02 * np.abs(second).max())
 
 
 def test_a_model_that_is_not_sound_has_no_slope(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, _, _ = run(np.random.default_rng(8), seconds=0.1)
-    channels = channels_of(problem)[:1]
+    signals = signals_of(problem)[:1]
 
     def fails(*_: object) -> None:
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr("telerig.estimator.smoothing.learning.likelihood.channel_slope", fails)
-    value, slope = evidence_slope(channels, true_model(), names_of(true_model()))
+    monkeypatch.setattr("telerig.estimator.smoothing.learning.likelihood.signal_gradient", fails)
+    value, slope = evidence_gradient(signals, true_model(), names_of(true_model()))
     assert value < -1e11
     assert not slope.any()
 
 
 def test_what_a_parameter_does_not_touch_is_left_out() -> None:
     problem, _, _ = run(np.random.default_rng(9), bubbles=3, seconds=0.2)
-    apart = pooled(channels_of(problem)[0])[1]
+    apart = pooled(signals_of(problem)[0])[1]
     names = names_of(true_model())
-    slope = dict(zip(names, channel_slope(apart, true_model(), names)[1]))
+    slope = dict(zip(names, signal_gradient(apart, true_model(), names)[1]))
     assert all(slope[n] == 0 for n in names if n.startswith("modes"))
     assert slope["bubble.zigzags.1.rms_mm"] != 0

@@ -47,7 +47,7 @@ def scene(information: str) -> tuple[SmoothingProblem, Any]:
 def both(monkeypatch: pytest.MonkeyPatch, information: str) -> tuple[Solution, Solution]:
     given, model = scene(information)
     by_arrays = solve(given, model, Options(passes=3))
-    monkeypatch.setattr(chain, "suits", lambda frame: False)
+    monkeypatch.setattr(chain, "is_chain_of_frames", lambda frame: False)
     return by_arrays, solve(given, model, Options(passes=3))
 
 

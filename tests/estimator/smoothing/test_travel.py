@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 from shake_learning_data import ARM_HZ, CAMERAS, COMMON_HZ, UP, run
 
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
-from telerig.estimator.smoothing.graph.stage_travel import left_open, total_scale, travel_of
+from telerig.estimator.smoothing.graph.stage_travel import (
+    considered_variance,
+    total_scale,
+    travel_of,
+)
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     Accelerometer,
@@ -82,7 +86,7 @@ def test_what_is_left_open_is_how_far_the_answer_moves() -> None:
     assert known.stage is not None
     scaled = replace(known, stage=replace(known.stage, position_mm=known.stage.position_mm / 1.001))
     moved = place(solve(scaled, STILL)) - place(solution)
-    variance, speed = left_open(solution)
+    variance, speed = considered_variance(solution)
     np.testing.assert_allclose(np.sqrt(variance[:, 1]), np.abs(moved[:, 1]), atol=2e-4)
     assert np.sqrt(variance[-1, 1]) == pytest.approx(1e-3 * SPEED * known.t_s[-1], rel=0.01)
     np.testing.assert_allclose(np.sqrt(speed[5:-5, 1]), 1e-3 * SPEED, rtol=0.05)
@@ -90,7 +94,7 @@ def test_what_is_left_open_is_how_far_the_answer_moves() -> None:
 
     tilt = 2e-3
     tilted = solve(replace(known, axis=UP + tilt * BASIS[:, 0]), STILL)
-    variance, _ = left_open(solve(replace(known, travel=travel(0.0, tilt)), STILL))
+    variance, _ = considered_variance(solve(replace(known, travel=travel(0.0, tilt)), STILL))
     moved = np.abs(place(tilted) - place(solution))
     np.testing.assert_allclose(np.sqrt(variance[:, 0]), moved[:, 0], atol=2e-4)
 
@@ -115,7 +119,7 @@ def test_marks_tell_the_scale_and_the_carriage_is_where_it_was() -> None:
     assert total_scale(solution) == pytest.approx(0.01, abs=3e-4)
     truth = SPEED * off.t_s
     np.testing.assert_allclose(shake(solution)["position_mm"], truth, atol=0.03)
-    assert not left_open(solution)[0].any()
+    assert not considered_variance(solution)[0].any()
 
 
 def test_without_marks_the_prior_rules_a_free_scale() -> None:

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.learning.likelihood import Fit, evidence, maximise
-from telerig.estimator.smoothing.learning.lines_of_sight import Channel
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import prior_of
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel, Zigzag
 
 Array = NDArray[np.float64]
 
-AMBIGUOUS_NATS = 5.0
-HARMONIC_NATS = 7.0
+AMBIGUOUS_LOG_RATIO = 5.0
+HARMONIC_LOG_RATIO = 7.0
 _SAME_HZ = 0.02
 _HARMONIC = 0.12
-_REFIT_NATS = 40.0
+_REFIT_LOG_RATIO = 40.0
 _ZIGZAG_MM = 0.3
 _ZIGZAG_HZ = (3.0, 12.0)
 _SHARES = np.linspace(0.0, 1.0, 6)
@@ -35,56 +35,56 @@ _LEAST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class LineLabel:
+class Attribution:
     """A line and what its other reading costs.
 
     owner : "rig" or "bubble".  index : into the model's modes or zigzags.
-    cost_nats : by how much the data prefer this owner to the other, refitted; what is known
-    beforehand (the zigzag's second harmonic) is in ``prior_nats``.
+    log_likelihood_ratio : by how much the data prefer this owner to the other, refitted; what is known
+    beforehand (the zigzag's second harmonic) is in ``log_prior_ratio``.
     """
 
     owner: str
     index: int
     frequency_hz: float
     rms_mm: float
-    cost_nats: float
-    prior_nats: float = 0.0
+    log_likelihood_ratio: float
+    log_prior_ratio: float = 0.0
 
     @property
     def ambiguous(self) -> bool:
-        return self.cost_nats + self.prior_nats < AMBIGUOUS_NATS
+        return self.log_likelihood_ratio + self.log_prior_ratio < AMBIGUOUS_LOG_RATIO
 
 
-def labels(
-    channels: Sequence[Channel], model: ShakeModel, pattern: Sequence[float], up: Array
-) -> list[LineLabel]:
-    """The lines of these channels that could be the rig's as a whole or the bubbles'.
+def attributions(
+    signals: Sequence[Signal], model: ShakeModel, pattern: Sequence[float], up: Array
+) -> list[Attribution]:
+    """The lines of these signals that could be the rig's as a whole or the bubbles'.
 
     pattern : (3,) the directions along rig axes in which lines are moved.  up : (3,).
     """
-    if not any(c.moving.any() for c in channels):
+    if not any(c.moving.any() for c in signals):
         return []
-    at = evidence(channels, model)
+    at = evidence(signals, model)
     out = []
     for i, mode in enumerate(model.modes):
-        if _lies_in(mode.rms_mm, pattern) and _is_common(mode, channels):
-            cost = _cost(channels, model, moved_to_bubble(model, i), at)
-            label = LineLabel("rig", i, mode.frequency_hz, max(mode.rms_mm), cost)
+        if _lies_in(mode.rms_mm, pattern) and _is_common(mode, signals):
+            cost = _cost(signals, model, moved_to_bubble(model, i), at)
+            label = Attribution("rig", i, mode.frequency_hz, max(mode.rms_mm), cost)
             out.append(label)
     differential = any(m.camera != CARRIAGE for m in model.modes)
     for i, line in enumerate(model.bubble.zigzags):
         if _lies_in(line.rms_mm, pattern):
-            cost = _cost(channels, model, moved_to_rig(model, i), at)
-            prior = _own_motion_nats(model, i, differential, up)
-            out.append(LineLabel("bubble", i, line.frequency_hz, max(line.rms_mm), cost, prior))
+            cost = _cost(signals, model, moved_to_rig(model, i), at)
+            prior = _own_motion_log_ratio(model, i, differential, up)
+            out.append(Attribution("bubble", i, line.frequency_hz, max(line.rms_mm), cost, prior))
     return out
 
 
-def _is_common(mode: RigMode, channels: Sequence[Channel]) -> bool:
-    """Seen by all cameras of a channel alike: only then a bubble can look the same."""
+def _is_common(mode: RigMode, signals: Sequence[Signal]) -> bool:
+    """Seen by all cameras of a signal alike: only then a bubble can look the same."""
     if mode.camera == CARRIAGE:
         return True
-    return all(c.cameras == (mode.camera,) for c in channels if mode.camera in c.cameras)
+    return all(c.cameras == (mode.camera,) for c in signals if mode.camera in c.cameras)
 
 
 def _lies_in(rms_mm: Sequence[float], pattern: Sequence[float]) -> bool:
@@ -92,11 +92,11 @@ def _lies_in(rms_mm: Sequence[float], pattern: Sequence[float]) -> bool:
     return bool(rms[inside].max(initial=0.0) > rms[~inside].max(initial=0.0))
 
 
-def _cost(channels: Sequence[Channel], model: ShakeModel, other: ShakeModel, at: float) -> float:
+def _cost(signals: Sequence[Signal], model: ShakeModel, other: ShakeModel, at: float) -> float:
     """Loss of log likelihood, the lines refitted where that could matter."""
-    loss = at - evidence(channels, other)
-    if AMBIGUOUS_NATS / 2 < loss < _REFIT_NATS:
-        loss = min(loss, at - maximise(channels, other, _line_names(other), steps=8).log_evidence)
+    loss = at - evidence(signals, other)
+    if AMBIGUOUS_LOG_RATIO / 2 < loss < _REFIT_LOG_RATIO:
+        loss = min(loss, at - maximise(signals, other, _line_names(other), steps=8).log_evidence)
     return float(loss)
 
 
@@ -106,10 +106,10 @@ def _line_names(model: ShakeModel) -> list[str]:
     return [f"{s}.{f}" for s in stems for f in ("frequency_hz", "rms_mm")]
 
 
-def _own_motion_nats(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
+def _own_motion_log_ratio(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
     """What is known of bubbles before any image: wide swings are theirs, and twice their frequency.
 
-    The second harmonic is doubted where the cameras shake against each other, which shows a rig
+    The second harmonic is not taken for theirs where the cameras shake against each other, which shows a rig
     that may well shake as a whole.
     """
     line = model.bubble.zigzags[index]
@@ -117,7 +117,7 @@ def _own_motion_nats(model: ShakeModel, index: int, differential: bool, up: Arra
     if line in swings:
         return float("inf")
     second = any(abs(line.frequency_hz / (2 * z.frequency_hz) - 1) < _HARMONIC for z in swings)
-    return HARMONIC_NATS if second and not differential else 0.0
+    return HARMONIC_LOG_RATIO if second and not differential else 0.0
 
 
 def is_zigzag(line: Zigzag, up: Array) -> bool:
@@ -131,9 +131,9 @@ def is_zigzag(line: Zigzag, up: Array) -> bool:
 def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
     """A share of a mode's variance given to the bubbles; all of it: the mode goes."""
     mode = model.modes[index]
-    rms = _times(mode.rms_mm, np.sqrt(share))
+    rms = _scaled(mode.rms_mm, np.sqrt(share))
     added = Zigzag(mode.frequency_hz, mode.damping, rms, mode.force_hz)
-    kept = replace(mode, rms_mm=_times(mode.rms_mm, np.sqrt(1 - share)))
+    kept = replace(mode, rms_mm=_scaled(mode.rms_mm, np.sqrt(1 - share)))
     rest = (kept,) if share < 1 else ()
     modes = (*model.modes[:index], *rest, *model.modes[index + 1 :])
     zigzags = _joined(model.bubble.zigzags, added)
@@ -143,9 +143,9 @@ def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeM
 def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
     """A share of a bubble line's variance given to a mode of the whole rig."""
     line = model.bubble.zigzags[index]
-    rms = _times(line.rms_mm, np.sqrt(share))
+    rms = _scaled(line.rms_mm, np.sqrt(share))
     added = RigMode(line.frequency_hz, line.damping, rms, force_hz=line.force_hz)
-    kept = replace(line, rms_mm=_times(line.rms_mm, np.sqrt(1 - share)))
+    kept = replace(line, rms_mm=_scaled(line.rms_mm, np.sqrt(1 - share)))
     rest = (kept,) if share < 1 else ()
     zigzags = (*model.bubble.zigzags[:index], *rest, *model.bubble.zigzags[index + 1 :])
     bubble = replace(model.bubble, zigzags=zigzags)
@@ -163,12 +163,12 @@ def _joined(lines: tuple[Zigzag, ...], added: Zigzag) -> tuple[Zigzag, ...]:
     return (*lines, added)
 
 
-def _times(rms_mm: Sequence[float], factor: float) -> tuple[float, float, float]:
+def _scaled(rms_mm: Sequence[float], factor: float) -> tuple[float, float, float]:
     x, y, z = (float(factor * r) for r in rms_mm)
     return x, y, z
 
 
-def shared(model: ShakeModel, found: Sequence[LineLabel]) -> ShakeModel:
+def shared(model: ShakeModel, found: Sequence[Attribution]) -> ShakeModel:
     """Every ambiguous line given half to the rig, half to the bubbles."""
     for label in sorted(found, key=lambda one: -one.index):
         if label.ambiguous and label.owner == "bubble":
@@ -179,8 +179,8 @@ def shared(model: ShakeModel, found: Sequence[LineLabel]) -> ShakeModel:
     return model
 
 
-def doubted(
-    channels: Sequence[Channel], model: ShakeModel, pattern: Sequence[float], up: Array
+def with_hidden_modes(
+    signals: Sequence[Signal], model: ShakeModel, pattern: Sequence[float], up: Array
 ) -> ShakeModel:
     """Beside a line of several bubbles, the rig given what of it the data leave open.
 
@@ -197,16 +197,18 @@ def doubted(
         if seen or not _lies_in(line.rms_mm, pattern) or is_zigzag(line, up):
             continue
         rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=line.force_hz)
-        found = np.array([_beside(channels, model, index, rig, s).log_posterior for s in _SHARES])
+        found = np.array(
+            [_with_hidden_mode(signals, model, index, rig, s).log_posterior for s in _SHARES]
+        )
         weight = np.exp(found - found.max()) * expected(line, own)
         share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
         if share > _LEAST_SHARE:
-            model = _beside(channels, model, index, rig, share).model
+            model = _with_hidden_mode(signals, model, index, rig, share).model
     return model
 
 
-def _beside(
-    channels: Sequence[Channel], model: ShakeModel, index: int, rig: RigMode, share: float
+def _with_hidden_mode(
+    signals: Sequence[Signal], model: ShakeModel, index: int, rig: RigMode, share: float
 ) -> Fit:
     """A share of that line given to the rig, beside the bubbles' own, which is fitted again.
 
@@ -215,9 +217,9 @@ def _beside(
     stem = f"bubble.zigzags.{index}"
     names = [f"{stem}.{last}" for last in ("frequency_hz", "damping", "rms_mm")]
     if share > 0:
-        mode = replace(rig, rms_mm=_times(rig.rms_mm, share))
+        mode = replace(rig, rms_mm=_scaled(rig.rms_mm, share))
         model = replace(model, modes=(*model.modes, mode))
-    return maximise(channels, model, names, steps=6)
+    return maximise(signals, model, names, steps=6)
 
 
 def _is_half(mode: RigMode, model: ShakeModel) -> bool:

@@ -140,10 +140,8 @@ def _solve(
         state = moved(frame, state, made.done.vector)
         residuals = pixel_residuals(frame, state)
         fresh, changed = robust.update(weights, residuals)
-        settled = (
-            made.largest_px < options.tolerance_px and not delays_have_moved(frame, state)
-        ) or exact
-        if settled and not changed and (done > 1 or start is not None or exact):
+        still = made.largest_px < options.tolerance_px and not delays_have_moved(frame, state)
+        if (still or exact) and not changed and (done > 1 or start is not None or exact):
             break
         weights = fresh
         frame, state, again = with_moved_nodes(frame, state)

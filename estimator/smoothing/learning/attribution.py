@@ -39,8 +39,8 @@ class Attribution:
     """A line and what its other reading costs.
 
     owner : "rig" or "bubble".  index : into the model's modes or zigzags.
-    log_likelihood_ratio : by how much the data prefer this owner to the other, refitted; what is known
-    beforehand (the zigzag's second harmonic) is in ``log_prior_ratio``.
+    log_likelihood_ratio : of this owner to the other, lines refitted (natural logarithm).
+    log_prior_ratio : of what is known before any image, as of a zigzag's second harmonic.
     """
 
     owner: str
@@ -109,8 +109,8 @@ def _line_names(model: ShakeModel) -> list[str]:
 def _own_motion_log_ratio(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
     """What is known of bubbles before any image: wide swings are theirs, and twice their frequency.
 
-    The second harmonic is not taken for theirs where the cameras shake against each other, which shows a rig
-    that may well shake as a whole.
+    The second harmonic is not taken for theirs where the cameras shake against each other, which
+    shows a rig that may well shake as a whole.
     """
     line = model.bubble.zigzags[index]
     swings = [z for z in model.bubble.zigzags if is_zigzag(z, up)]
@@ -197,9 +197,8 @@ def with_hidden_modes(
         if seen or not _lies_in(line.rms_mm, pattern) or is_zigzag(line, up):
             continue
         rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=line.force_hz)
-        found = np.array(
-            [_with_hidden_mode(signals, model, index, rig, s).log_posterior for s in _SHARES]
-        )
+        fits = [_with_hidden_mode(signals, model, index, rig, s) for s in _SHARES]
+        found = np.array([fit.log_posterior for fit in fits])
         weight = np.exp(found - found.max()) * expected(line, own)
         share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
         if share > _LEAST_SHARE:

@@ -116,7 +116,7 @@ def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
 def _shaken(
     solution: Solution, signals: list[Signal], spreads: list[Array], found: Covariances
 ) -> Array:
-    """(F, D, D) covariance of the shake's states, their offsets widened along what the cameras see."""
+    """(F, D, D) covariance of the shake's states, offsets widened along what the cameras see."""
     layout, out = solution.frame.shake, found.shake.copy()
     for signal, variance in zip(signals, spreads):
         rows = np.einsum("i,cid->cd", signal.direction, layout.offset[list(signal.cameras)])

@@ -99,16 +99,10 @@ def refined_change(solution: Solution, calibration: Calibration) -> RigChange | 
     tangent, own = share_of_drift(rig, covariance, before, share.drift)
     pair = (problem.cameras[0], problem.cameras[1])
     place = np.concatenate([b.guess_mm for b in problem.bubbles]).mean(0)
-    positions = np.concatenate([_positions(problem)[b.first : b.last + 1] for b in problem.bubbles])
+    positions = np.concatenate([problem.encoder_mm[b.first : b.last + 1] for b in problem.bubbles])
     place = place - positions.mean() * problem.axis
     pose = moved_pose(calibration.cameras[1].camera_from_rig.inverse(), rig[-6:])
     return described(pair, tangent, own, share.drift, place, len(problem.observations) // 2, pose)
-
-
-def _positions(problem: SmoothingProblem) -> Array:
-    if problem.stage is None:
-        return np.zeros(len(problem.t_s))
-    return np.asarray(np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm))
 
 
 def change_words(change: RigChange, first: str) -> str:

@@ -19,7 +19,6 @@ from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import (
 )
 from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.problem.problem import (
-    CARRIAGE,
     Observations,
     ShakeModel,
     SmoothingProblem,
@@ -43,7 +42,7 @@ from telerig.estimator.smoothing.refined_pose import (
 from telerig.estimator.smoothing.result import Smoothing, summary_of
 from telerig.estimator.smoothing.tables import shake as shake_table
 from telerig.estimator.smoothing.tables import trajectories
-from telerig.estimator.smoothing.verdict.identifiability import judge
+from telerig.estimator.smoothing.verdict.judge import judge
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -214,9 +213,7 @@ def choose_model(
             f"model is {model!r}", where="smooth", todo='give "auto", "default" or a ShakeModel'
         )
     default = default_model(problem, encoder_sigma_mm)
-    arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
-    known = len(problem.references) > 0 or len(arms) == len(problem.cameras)
-    if model == "auto" and not known and _longest_s(problem) >= _LEAST_LEARNED_S:
+    if model == "auto" and not problem.measures_shake and _longest_s(problem) >= _LEAST_LEARNED_S:
         return learn(problem, default)
     return default
 

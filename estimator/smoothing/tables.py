@@ -82,12 +82,9 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
     item = tracks["particle"].map(number).to_numpy(np.int64)
     seen = tracks["frame"].to_numpy(np.int64)
     rows = frame.row(np.asarray(item), np.asarray(seen))
-    position = np.zeros(len(problem.t_s))
-    if problem.stage is not None:
-        position = np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm)
     naive = np.full((frame.rows, 3), np.nan)
     naive[rows] = tracks[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-    naive[rows] += position[seen, None] * problem.axis
+    naive[rows] += problem.encoder_mm[seen, None] * problem.axis
     covariance = np.tile(1e-4 * np.eye(3), (frame.rows, 1, 1))
     names = [["sxx", "sxy", "sxz"], ["sxy", "syy", "syz"], ["sxz", "syz", "szz"]]
     if f"{names[0][0]}_mm2" in tracks:

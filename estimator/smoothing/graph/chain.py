@@ -55,14 +55,14 @@ class Places:
         base, counts = self.frame.base(), self.frame.counts()
         when = np.full(len(keys), -1)
         column = np.zeros(len(keys), np.int64)
-        node = keys < base[1]
-        row = (keys >= base[1]) & (keys < base[2])
-        rest = keys >= base[2]
+        node = keys < base.bubbles
+        row = (keys >= base.bubbles) & (keys < base.means)
+        rest = keys >= base.means
         when[node] = keys[node]
-        at = keys[row] - base[1]
+        at = keys[row] - base.bubbles
         when[row] = self.frame.node_of_row[at]
-        column[row] = counts[0][1] + self.slot[at] * counts[1][1]
-        column[rest] = self.constant_start[keys[rest] - base[2]]
+        column[row] = counts.shake.size + self.slot[at] * counts.bubbles.size
+        column[rest] = self.constant_start[keys[rest] - base.means]
         return when, column
 
 
@@ -84,7 +84,7 @@ def places_of(frame: Frame) -> Places:
         free_from[slot_of[k]] = bubbles[k].last + 1
     sizes = np.repeat([d for _, d in counts[2:]], [n for n, _ in counts[2:]]).astype(np.int64)
     starts = np.r_[0, np.cumsum(sizes)].astype(np.int64)
-    width = counts[0][1] + len(free_from) * counts[1][1]
+    width = counts.shake.size + len(free_from) * counts.bubbles.size
     return Places(frame, slot_of[frame.bubble_of_row], width, starts[:-1], int(starts[-1]))
 
 
@@ -228,7 +228,7 @@ class EliminatedChain:
         """Marginal covariances of all increments, and of shake with bubbles at the same frame."""
         frame, places = self.places.frame, self.places
         counts, constants = frame.counts(), places.constants
-        shake, bubble = counts[0][1], counts[1][1]
+        shake, bubble = counts.shake.size, counts.bubbles.size
         rows = np.arange(frame.rows)
         at = shake + places.slot[:, None] * bubble + np.arange(bubble)
         own = [np.zeros((len(self.upper), shake, shake)), np.zeros((len(rows), bubble, bubble))]

@@ -46,9 +46,9 @@ class EliminatedGraph:
         frame = self.frame
         base, counts = frame.base(), frame.counts()
         families = [range(base[i], base[i] + n * (d > 0)) for i, (n, d) in enumerate(counts)]
-        at_frames = frame.nodes.of_frame.tolist() if counts[0][1] else []
-        rows = base[1] + np.arange(frame.rows)
-        pairs = list(zip(frame.node_of_row.tolist(), rows.tolist())) if counts[0][1] else []
+        at_frames = frame.nodes.of_frame.tolist() if counts.shake.size else []
+        rows = base.bubbles + np.arange(frame.rows)
+        pairs = list(zip(frame.node_of_row.tolist(), rows.tolist())) if counts.shake.size else []
         sizes = [d for n, d in counts for _ in range(n)]
         wanted = set(at_frames).union(*families[1:])
         found, found_cross = marginal_covariances(self.net, sizes, wanted, pairs)
@@ -57,7 +57,7 @@ class EliminatedGraph:
             number = number if keys is not at_frames else len(frame.nodes.of_frame)
             own.append(np.array([found[k] for k in keys]).reshape(number, size, size))
         cross = np.array([found_cross[pair] for pair in pairs])
-        return Blocks(own, cross.reshape(frame.rows, counts[0][1], counts[1][1]))
+        return Blocks(own, cross.reshape(frame.rows, counts.shake.size, counts.bubbles.size))
 
 
 def eliminate(frame: Frame, factors: list[Linear], *, cholesky: bool) -> EliminatedGraph:
@@ -81,12 +81,12 @@ def _add_bonds(graph: Any, frame: Frame) -> None:
     Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
     its first row on would share none.
     """
-    size = frame.counts()[0][1]
+    size = frame.counts().shake.size
     seen = frame.row(frame.problem.observations.item, frame.problem.observations.frame)
     alone = np.setdiff1d(np.arange(frame.rows), seen)
     if not size or not len(alone):
         return
-    keys = (frame.node_of_row[alone], frame.base()[1] + alone)
+    keys = (frame.node_of_row[alone], frame.base().bubbles + alone)
     blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, frame.bubble.size))
     add_linear_factors(graph, keys, blocks, np.zeros((len(alone), 1)))
 
@@ -122,9 +122,9 @@ def _ordering(frame: Frame) -> Any:
     last_mark = np.zeros(len(problem.marks), np.int64)
     seen = frame.nodes.of_frame[problem.references.frame]
     np.maximum.at(last_mark, problem.references.item, seen)
-    keys = [nodes, base[1] + rows, base[2] + np.arange(len(problem.bubbles))]
+    keys = [nodes, base.bubbles + rows, base.means + np.arange(len(problem.bubbles))]
     when = [nodes, frame.node_of_row, last_row]
-    keys.append(base[5] + np.arange(len(problem.marks)))
+    keys.append(base.marks + np.arange(len(problem.marks)))
     when.append(last_mark)
     rank = np.repeat(np.arange(4), [len(k) for k in keys])
     joined = np.concatenate(keys).astype(np.int64)

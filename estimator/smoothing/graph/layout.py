@@ -76,12 +76,15 @@ class BubbleLayout:
     """The vector of a bubble at a frame.
 
     position, velocity : (3, D) lab, rig axes.  wander : (C, 2, D) px.
+    path_position, path_velocity : (3,) columns of the Ornstein-Uhlenbeck path along each axis.
     """
 
     components: tuple[Component, ...]
     position: Array
     velocity: Array
     wander: Array
+    path_position: Ints
+    path_velocity: Ints
 
     @property
     def size(self) -> int:
@@ -250,7 +253,8 @@ def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
     for i in range(len(extra)):
         shifts[i // 2, i % 2, motion + i] = 1.0
     components = tuple(c for c, _ in parts) + tuple(extra)
-    return BubbleLayout(components, position, velocity, shifts)
+    path = np.arange(3) * parts[0][0].size
+    return BubbleLayout(components, position, velocity, shifts, path, path + 1)
 
 
 def nodes_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Sequence[float]) -> Nodes:

@@ -70,13 +70,13 @@ def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
     covariance, by_input = start(layout.components)
     whitener = whitener_of(covariance)
     places = np.array([b.start_mm for b in problem.bubbles])
-    means = state.means[:, :3]
+    means = state.mean_velocity
     off = state.bubbles[firsts] - means @ by_input.T
-    off[:, [0, 2, 4]] -= places
+    off[:, layout.path_position] -= places
     numbers = np.arange(len(firsts))
     wide = _with_columns(-whitener @ by_input, frame.mean_size)
     begin = Linear(
-        (base[1] + firsts, base[2] + numbers),
+        (base.bubbles + firsts, base.means + numbers),
         (whitener @ frame.bubble_basis(firsts), np.broadcast_to(wide, (len(firsts), *wide.shape))),
         -off @ whitener.T,
         np.full(len(firsts), log_det_of(whitener)),
@@ -90,38 +90,36 @@ def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
         *steps.in_basis(frame.row_basis[rows + 1]),
         _with_columns(steps.by_input, frame.mean_size)[i],
     )
-    keys = (base[1] + rows, base[1] + rows + 1, base[2] + owner)
+    keys = (base.bubbles + rows, base.bubbles + rows + 1, base.means + owner)
     return [begin, Linear(keys, blocks, -residual, steps.log_det[i])]
 
 
 def _constant_priors(frame: Frame, state: State) -> list[Linear]:
     model, problem, base = frame.model, frame.problem, frame.base()
     scale, delay = frame.sensor_flags
-    out = [_prior(base[2], state.means[:, :3], model.bubble.mean_sigma_mm_s, frame.mean_size)]
-    if frame.mean_size == 4:
-        value = np.concatenate([state.means[:, :3], state.means[:, 3:]], 1)
-        sigma = np.full(4, model.bubble.mean_sigma_mm_s)
-        out = [_prior(base[2], value, sigma)]
+    out = [_prior(base.means, state.means, model.bubble.mean_sigma_mm_s)]
     if problem.accelerometers:
         extra = [model.accelerometer_scale_sigma] * scale
         sigma = np.array([[a.bias_sigma_mm_s2] * 3 + extra for a in problem.accelerometers])
-        out.append(_prior(base[3], state.sensors, sigma))
+        out.append(_prior(base.sensors, state.sensors, sigma))
         if delay:
             given = np.array([a.delay_s for a in problem.accelerometers])
             _, first = np.unique(frame.clock_of, return_index=True)
             value = state.clocks + (frame.delays_s - given)[first, None]
-            out.append(_prior(base[6], value, model.accelerometer_delay_sigma_s))
+            out.append(_prior(base.clocks, value, model.accelerometer_delay_sigma_s))
     sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
     sigmas = np.concatenate([sigmas[np.array(frame.encoder_flags)], np.ones(frame.share_size)])
-    out.append(_prior(base[4], np.concatenate([state.encoder, state.calibration])[None], sigmas))
+    out.append(
+        _prior(base.constants, np.concatenate([state.encoder, state.calibration])[None], sigmas)
+    )
     if problem.marks:
         guess = np.array([m.guess_mm for m in problem.marks])
         sigma = np.array([[m.sigma_mm] for m in problem.marks])
-        out.append(_prior(base[5], state.marks - guess, sigma))
+        out.append(_prior(base.marks, state.marks - guess, sigma))
     return [p for p in out if p.rhs.size]
 
 
-def _prior(base: int, value: Array, sigma: ArrayLike, size: int | None = None) -> Linear:
+def _prior(base: int, value: Array, sigma: ArrayLike) -> Linear:
     count, width = value.shape
     scale = np.broadcast_to(1 / np.asarray(sigma, float), (count, width))
     block = scale[:, :, None] * np.eye(width)
@@ -148,7 +146,7 @@ def images(frame: Frame, state: State, weight: Array) -> Seen:
     by_point = layout.position @ basis
     shift = np.einsum("mid,md->mi", layout.wander[obs.camera], states)
     extra = layout.wander[obs.camera] @ basis
-    keys = frame.base()[1] + rows
+    keys = frame.base().bubbles + rows
     return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
 
 
@@ -156,7 +154,7 @@ def references(frame: Frame, state: State, weight: Array) -> Seen:
     """Pixels of the marks fixed to the tank; weight (R,)."""
     obs = frame.problem.references
     points = state.marks[obs.item]
-    keys = frame.base()[5] + obs.item
+    keys = frame.base().marks + obs.item
     extra, shift = np.zeros((len(obs), 2, 3)), np.zeros((len(obs), 2))
     by_point = np.broadcast_to(np.eye(3), (len(obs), 3, 3))
     return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
@@ -216,7 +214,7 @@ def _seen(
         )
         rhs = -residual[mine] * root[:, None]
         log_det = log_det_of(whitener[mine])
-        linear = Linear((keys[mine], node, base[4]), blocks, rhs, log_det, weight[mine])
+        linear = Linear((keys[mine], node, base.constants), blocks, rhs, log_det, weight[mine])
         out.append(linear)
     return Seen(out, residual)
 
@@ -266,7 +264,11 @@ def encoder(frame: Frame, state: State) -> list[Linear]:
     sigma = model.encoder_sigma_mm
     blocks = (by_shake / sigma, np.concatenate(constants, -1)[:, None] / sigma)
     log_det = np.full(len(node), -np.log(sigma))
-    return [Linear((node, frame.base()[4]), blocks, (reading - position)[:, None] / sigma, log_det)]
+    return [
+        Linear(
+            (node, frame.base().constants), blocks, (reading - position)[:, None] / sigma, log_det
+        )
+    ]
 
 
 def accelerometers(frame: Frame, state: State) -> list[Linear]:
@@ -305,7 +307,7 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
     blocks = (by_shake, project @ by_sensor, project @ by_clock[..., :has_delay])
     rhs = (sensor.reading_mm_s2 - read.reading_mm_s2 + delay * slope) @ project.T
     log_det = np.full(len(node), white)
-    keys = (node, frame.base()[3] + index, frame.base()[6] + clock)
+    keys = (node, frame.base().sensors + index, frame.base().clocks + clock)
     return Linear(keys, blocks, rhs, log_det)
 
 
@@ -348,7 +350,7 @@ def speeds(frame: Frame, state: State) -> list[Linear]:
     by_mean[:, 0, 3] = by_speed / sigma
     every = frame.bubble_basis(np.arange(frame.rows))
     by_state = (by_velocity @ layout.velocity)[:, None] @ every / sigma
-    keys = (base[1] + np.arange(frame.rows), base[2] + owner)
+    keys = (base.bubbles + np.arange(frame.rows), base.means + owner)
     log_det = np.full(len(owner), -np.log(sigma))
     return [Linear(keys, (by_state, by_mean), -value[:, None] / sigma, log_det)]
 

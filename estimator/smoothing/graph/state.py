@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +25,41 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+class Family(NamedTuple):
+    """Variables of one kind: their number and their dimension."""
+
+    number: int
+    size: int
+
+
+class Families(NamedTuple):
+    """The families of variables, in the order of their keys.
+
+    constants : one key for encoder and calibration, since a factor takes three keys at most.
+    """
+
+    shake: Family
+    bubbles: Family
+    means: Family
+    sensors: Family
+    constants: Family
+    marks: Family
+    clocks: Family
+
+
+class FirstKeys(NamedTuple):
+    """The first key of each family, and the number of all keys."""
+
+    shake: int
+    bubbles: int
+    means: int
+    sensors: int
+    constants: int
+    marks: int
+    clocks: int
+    end: int
+
+
 @dataclass(frozen=True)
 class State:
     """shake : (N, Ds), the carriage in units of the encoder's reading.
@@ -42,6 +78,11 @@ class State:
     calibration: Array
     marks: Array
     clocks: Array
+
+    @property
+    def mean_velocity(self) -> Array:
+        """(K, 3) of the bubbles, lab."""
+        return self.means[:, :3]
 
     def encoder_scale(self, frame: Frame) -> float:
         """0 where it is held."""
@@ -147,25 +188,20 @@ class Frame:
         share = self.problem.calibration
         return 0 if share is None else int(share.root.shape[1])
 
-    def counts(self) -> list[tuple[int, int]]:
-        """(number, dimension) of the keys of each family, in the order of `State`.
-
-        Encoder and calibration are one key: a factor takes three at most.
-        """
+    def counts(self) -> Families:
         problem = self.problem
-        return [
-            (len(self.nodes.t_s), self.shake.size),
-            (self.rows, self.bubble.size),
-            (len(problem.bubbles), self.mean_size),
-            (len(problem.accelerometers), 3 + self.sensor_flags[0]),
-            (1, self.encoder_size + self.share_size),
-            (len(problem.marks), 3),
-            (int(self.clock_of.max(initial=-1)) + 1, int(self.sensor_flags[1])),
-        ]
+        return Families(
+            Family(len(self.nodes.t_s), self.shake.size),
+            Family(self.rows, self.bubble.size),
+            Family(len(problem.bubbles), self.mean_size),
+            Family(len(problem.accelerometers), 3 + self.sensor_flags[0]),
+            Family(1, self.encoder_size + self.share_size),
+            Family(len(problem.marks), 3),
+            Family(int(self.clock_of.max(initial=-1)) + 1, int(self.sensor_flags[1])),
+        )
 
-    def base(self) -> list[int]:
-        """The first key of each family."""
-        return [0, *(int(n) for n in np.cumsum([n for n, _ in self.counts()]))]
+    def base(self) -> FirstKeys:
+        return FirstKeys(0, *np.cumsum([family.number for family in self.counts()]).tolist())
 
 
 def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> Frame:
@@ -210,9 +246,9 @@ def _basis_index(index: Ints, node: ArrayLike) -> Ints:
 def first_guess(frame: Frame) -> State:
     """Bubbles where the cameras first saw them, the carriage where the encoder was, no shake."""
     problem = frame.problem
-    shapes = frame.counts()
-    values = [np.zeros(shape) for shape in shapes]
-    shake, bubbles, means = values[0], values[1], values[2]
+    shake, bubbles, means, sensors, constants, marks, clocks = (
+        np.zeros(family) for family in frame.counts()
+    )
     if problem.stage is not None:
         _guess_carriage(frame, shake)
     for k, bubble in enumerate(problem.bubbles):
@@ -221,15 +257,14 @@ def first_guess(frame: Frame) -> State:
         slope = np.zeros(3)
         if len(bubble) > 1:
             slope = np.polyfit(t - t.mean(), bubble.guess_mm, 1)[0]
-        for axis in range(3):
-            bubbles[rows, 2 * axis] = bubble.guess_mm[:, axis]
-            bubbles[rows, 2 * axis + 1] = slope[axis]
+        bubbles[rows, frame.bubble.path_position] = bubble.guess_mm
+        bubbles[rows, frame.bubble.path_velocity] = slope
         means[k, :3] = slope
         means[k, 3:] = max(float(np.linalg.norm(slope)), 1.0)
     if len(problem.marks):
-        values[5][:] = [m.guess_mm for m in problem.marks]
-    encoder, calibration = np.split(values[4][0], [frame.encoder_size])
-    return State(shake, bubbles, means, values[3], encoder, calibration, *values[5:])
+        marks[:] = [m.guess_mm for m in problem.marks]
+    encoder, calibration = np.split(constants[0], [frame.encoder_size])
+    return State(shake, bubbles, means, sensors, encoder, calibration, marks, clocks)
 
 
 def _guess_carriage(frame: Frame, shake: Array) -> None:
@@ -241,18 +276,21 @@ def _guess_carriage(frame: Frame, shake: Array) -> None:
 
 def moved(frame: Frame, state: State, step: Array) -> State:
     """The state after an increment, keys in their order."""
-    counts = [n * d for n, d in frame.counts()]
-    parts = np.split(step, np.cumsum(counts)[:-1])
-    shaped = [p.reshape(n, d) for p, (n, d) in zip(parts, frame.counts())]
+    families = frame.counts()
+    parts = np.split(step, np.cumsum([n * d for n, d in families])[:-1])
+    shake, bubbles, means, sensors, constants, marks, clocks = (
+        p.reshape(family) for p, family in zip(parts, families)
+    )
+    encoder, calibration = np.split(constants[0], [frame.encoder_size])
     return State(
-        state.shake + times(frame.shake_basis(np.arange(len(shaped[0]))), shaped[0]),
-        state.bubbles + times(frame.bubble_basis(np.arange(len(shaped[1]))), shaped[1]),
-        state.means + shaped[2],
-        state.sensors + shaped[3],
-        state.encoder + shaped[4][0, : frame.encoder_size],
-        state.calibration + shaped[4][0, frame.encoder_size :],
-        state.marks + shaped[5],
-        state.clocks + shaped[6],
+        state.shake + times(frame.shake_basis(np.arange(len(shake))), shake),
+        state.bubbles + times(frame.bubble_basis(np.arange(len(bubbles))), bubbles),
+        state.means + means,
+        state.sensors + sensors,
+        state.encoder + encoder,
+        state.calibration + calibration,
+        state.marks + marks,
+        state.clocks + clocks,
     )
 
 

@@ -171,7 +171,7 @@ def leverages(solution: Solution) -> list[tuple[NDArray[np.int64], Array]]:
     out = []
     linear = images(frame, solution.state, np.ones(len(observed))).linear
     for camera, part in zip(np.unique(observed.camera), linear, strict=True):
-        row, node = np.asarray(part.keys[0]) - frame.base()[1], np.asarray(part.keys[1])
+        row, node = np.asarray(part.keys[0]) - frame.base().bubbles, np.asarray(part.keys[1])
         some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
         row, node = row[some], node[some]
         at = frame.frame_of_row[row]

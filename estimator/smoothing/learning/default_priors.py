@@ -41,11 +41,10 @@ DEFAULT_FLOOR = 0.12
 
 def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) -> ShakeModel:
     """With marks or arm sensors a broad prior of the shake; else a guess at its modes."""
-    arms = {a.camera for a in problem.accelerometers if a.camera != CARRIAGE}
     bands: tuple[BroadBand, ...] = ()
     modes: tuple[RigMode, ...] = ()
     cameras = range(len(problem.cameras))
-    if len(problem.references) or len(arms) == len(problem.cameras):
+    if problem.measures_shake:
         bands = tuple(_band(j) for j in cameras)
     elif problem.accelerometers:
         bands = (_band(CARRIAGE), *(replace(_band(j), rms_mm=(0.07,) * 3) for j in cameras))

@@ -101,9 +101,7 @@ def signals_of(
         bubbles, marks = bubbles.of(weights[0] > 0.5), marks.of(weights[1] > 0.5)
     seen = np.bincount(bubbles.item, minlength=len(problem.bubbles))
     chosen = np.sort(np.argsort(-seen, kind="stable")[:most_bubbles])
-    position = np.zeros(len(problem.t_s))
-    if problem.stage is not None:
-        position = np.interp(problem.t_s, problem.stage.t_s, problem.stage.position_mm)
+    position = problem.encoder_mm
     out = []
     for direction, cameras in sight_directions(problem):
         parts = [_bubble_rows(problem, bubbles, chosen, position, direction, cameras)]

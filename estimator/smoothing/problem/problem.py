@@ -282,6 +282,23 @@ class SmoothingProblem:
     calibration: CalibrationShare | None = None
     travel: Travel | None = None
 
+    @property
+    def encoder_mm(self) -> Array:
+        """(F,) the encoder's reading at the frames, interpolated; 0 without a stage."""
+        if self.stage is None:
+            return np.zeros(len(self.t_s))
+        return np.asarray(np.interp(self.t_s, self.stage.t_s, self.stage.position_mm))
+
+    @property
+    def arms_with_sensor(self) -> set[int]:
+        """Indices of the cameras whose arm carries an accelerometer."""
+        return {a.camera for a in self.accelerometers} - {CARRIAGE}
+
+    @property
+    def measures_shake(self) -> bool:
+        """Whether marks fixed to the tank, or an accelerometer on each arm, show the shake."""
+        return len(self.references) > 0 or len(self.arms_with_sensor) == len(self.cameras)
+
     def __post_init__(self) -> None:
         """Raises InputError for times that do not increase or a run of fewer than two frames."""
         if len(self.t_s) < 2:

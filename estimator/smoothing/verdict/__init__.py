@@ -1,5 +1,5 @@
 """Can this run tell the bubbles' motion from the rig's shake?
 
-In: a solved smoothing graph. Out: verdict, modes, tests of residuals. Read ``identifiability``
-first.
+In: a solved smoothing graph. Out: verdict, modes, tests of residuals. Read ``judge``, then
+``identifiability``.
 """

@@ -1,17 +1,15 @@
-"""Can this run tell the bubbles' motion from the rig's shake? The verdict, in numbers and words.
+"""Which axes of the bubbles' motion can this run separate from the rig's shake? In numbers.
 
-Per axis of the rig: q, by how much not knowing the shake widens the bubbles' positions; eta, how
-much of the shake's variance the data take away; and whether a spectral line could be the bubble's
-as well as the rig's (see `telerig.estimator.smoothing.learning.attribution`).
-A smoother that always answers is wrong: where these say no, the remedy is a mark fixed to the tank
-or an accelerometer on each arm.
+Per axis of the rig: q, by how much not knowing the shake widens the bubbles' positions; eta, by
+how much the data reduce the shake's variance; and whether a spectral line could be the bubble's as
+well as the rig's (see `telerig.estimator.smoothing.learning.attribution`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,41 +19,50 @@ from telerig.estimator.smoothing.learning.attribution import Attribution, attrib
 from telerig.estimator.smoothing.learning.groups import Learning, groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.problem.problem import (
-    CARRIAGE,
+    Bubble,
     CarriageModel,
     Observations,
     ShakeModel,
     SmoothingProblem,
 )
-from telerig.estimator.smoothing.verdict.modes import shake_modes
-from telerig.estimator.smoothing.verdict.window import Window, window_of
 from telerig.factors.motion import start
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
-RESOLVED, PARTIAL, UNRESOLVED = "RESOLVED", "PARTIAL", "UNRESOLVED"
-LABEL_AMBIGUOUS, SHAKE_BELOW_NOISE = "LABEL_AMBIGUOUS", "SHAKE_BELOW_NOISE"
 AXES = ("x", "y", "z")
-
 RESOLVED_Q, PARTIAL_Q, RESOLVED_ETA = 1.25, 2.0, 0.99
-_STRIP = "fix a strip of dots to the tank inside both views"
-_ARMS = "one accelerometer on each camera arm"
-_MORE = "a longer record, more bubbles in view"
+_MOST_FRAMES, _MOST_BUBBLES = 2000, 3
 _EDGE = 0.1
 _SEEN = 0.25
+
+
+class Verdict(StrEnum):
+    """From the best to the worst."""
+
+    RESOLVED = "RESOLVED"
+    PARTIAL = "PARTIAL"
+    UNRESOLVED = "UNRESOLVED"
+
+
+class Flag(StrEnum):
+    """What a reader of a verdict has to know besides."""
+
+    LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
+    SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
 
 
 @dataclass(frozen=True)
 class AxisVerdict:
     """One axis of the rig.
 
-    q : sigma(position) over sigma(position | shake known).  eta : share of the shake's prior
-    variance that the data take away, None without a shake in the model.
-    shake_rms_mm : of the camera that shakes most.  lines : attributions that could be swapped.
+    q : sigma(position) over sigma(position | shake known).  eta : 1 - posterior over prior variance
+    of the shake, None without a shake in the model.
+    shake_rms_mm : of the camera that shakes most.  lines : spectral lines and their owners.
     """
 
-    verdict: str
-    flags: tuple[str, ...]
+    verdict: Verdict
+    flags: tuple[Flag, ...]
     q: float
     eta: float | None
     sigma_mm: float
@@ -63,25 +70,10 @@ class AxisVerdict:
     shake_rms_mm: float
     lines: tuple[Attribution, ...] = ()
 
-
-def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> dict[str, Any]:
-    """The verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ``modes``.
-
-    solution : of the problem under the model, with covariances (else the answer is empty).
-    """
-    found = verdicts(solution)
-    if not found:
-        return {}
-    worst = max((a.verdict for a in found.values()), key=(RESOLVED, PARTIAL, UNRESOLVED).index)
-    return {
-        "verdict": worst,
-        "flags": _flags(found),
-        "axes": {name: _as_json(axis) for name, axis in found.items()},
-        "words": words(problem, model, found),
-        "remedy": "" if worst == RESOLVED else remedy_of_verdict(problem),
-        "left_out": _left_out(problem),
-        "modes": shake_modes(solution),
-    }
+    @property
+    def ambiguous_lines(self) -> tuple[Attribution, ...]:
+        """Modes of the rig that could be an oscillation of the bubbles."""
+        return tuple(line for line in self.lines if line.owner == "rig" and line.ambiguous)
 
 
 def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
@@ -106,39 +98,24 @@ def _axis(
     sigma: Array, known: Array, eta: float | None, rms: float, lines: tuple[Attribution, ...]
 ) -> AxisVerdict:
     q, base = float(np.median(sigma / known)), float(np.median(known))
-    verdict = UNRESOLVED
+    verdict = Verdict.UNRESOLVED
     if q <= RESOLVED_Q or (eta is not None and eta >= RESOLVED_ETA):
-        verdict = RESOLVED
+        verdict = Verdict.RESOLVED
     elif q <= PARTIAL_Q:
-        verdict = PARTIAL
+        verdict = Verdict.PARTIAL
+    found = AxisVerdict(verdict, (), q, eta, float(np.median(sigma)), base, float(rms), lines)
     flags = []
-    if any(_matters(line) and line.rms_mm > base for line in lines):
-        flags.append(LABEL_AMBIGUOUS)
+    if any(line.rms_mm > base for line in found.ambiguous_lines):
+        flags.append(Flag.LABEL_AMBIGUOUS)
     if rms < base and q <= RESOLVED_Q:
-        flags.append(SHAKE_BELOW_NOISE)
-    return AxisVerdict(
-        verdict, tuple(flags), q, eta, float(np.median(sigma)), base, float(rms), lines
-    )
-
-
-def _matters(line: Attribution) -> bool:
-    return line.owner == "rig" and line.ambiguous
-
-
-def _flags(found: dict[str, AxisVerdict]) -> list[str]:
-    """Ambiguous if any axis is; below noise only if all are."""
-    flags = []
-    if any(LABEL_AMBIGUOUS in axis.flags for axis in found.values()):
-        flags.append(LABEL_AMBIGUOUS)
-    if all(SHAKE_BELOW_NOISE in axis.flags for axis in found.values()):
-        flags.append(SHAKE_BELOW_NOISE)
-    return flags
+        flags.append(Flag.SHAKE_BELOW_NOISE)
+    return replace(found, flags=tuple(flags))
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
     """(n, 3) sd of positions, and what they would be were the shake known, away from the ends.
 
-    What the encoder's scale leaves open is in neither.
+    The uncertainty of the encoder's scale is in neither.
     """
     still = solve(
         without_sensors(window.problem),
@@ -230,11 +207,11 @@ def _inner_frames(solution: Solution) -> NDArray[np.int64]:
 def _lines(
     problem: SmoothingProblem, model: ShakeModel
 ) -> list[tuple[Sequence[float], Attribution]]:
-    """What swapping each line would cost, with the directions it moves along.
+    """Spectral lines with their owners, and the directions that each moves along.
 
-    Sensors on the cameras' arms settle the question by themselves.
+    Sensors on the cameras' arms answer the question by themselves: none then.
     """
-    if any(a.camera != CARRIAGE for a in problem.accelerometers):
+    if problem.arms_with_sensor:
         return []
     signals = [c for c in signals_of(problem) if c.samples]
     out: list[tuple[Sequence[float], Attribution]] = []
@@ -244,73 +221,49 @@ def _lines(
     return out
 
 
-def words(problem: SmoothingProblem, model: ShakeModel, found: dict[str, AxisVerdict]) -> str:
-    """The verdict for a reader."""
-    upright = AXES[int(np.abs(problem.up).argmax())]
-    parts = [_sentence(name, axis, name == upright) for name, axis in found.items()]
-    if any(axis.verdict != RESOLVED for axis in found.values()):
-        parts.append(f"To resolve it: {remedy_of_verdict(problem)}.")
-    if model.name == "learned":
-        parts.append("The shake's modes were learned from this run.")
-    return " ".join(parts)
+@dataclass(frozen=True)
+class Window:
+    """problem : of frames ``first`` on.  bubbles : which of the whole problem's it holds."""
+
+    problem: SmoothingProblem
+    first: int
+    bubbles: Ints
 
 
-def remedy_of_verdict(problem: SmoothingProblem) -> str:
-    """What would tell more, of what this run does not have."""
-    arms = {a.camera for a in problem.accelerometers} - {CARRIAGE}
-    has_arms = len(arms) == len(problem.cameras)
-    if len(problem.references) and has_arms:
-        return _MORE
-    if len(problem.references):
-        return _ARMS
-    return _STRIP if has_arms else f"{_STRIP}, or {_ARMS}"
+def window_of(solution: Solution) -> Window:
+    """The middle of a solved run, outliers left out, with the bubbles seen longest there."""
+    problem = solution.frame.problem
+    count = len(problem.t_s)
+    first = max(0, (count - _MOST_FRAMES) // 2)
+    end = min(count, first + _MOST_FRAMES)
+    seen = _between(problem.observations.of(solution.weights[0] > 0.5), first, end)
+    marks = _between(problem.references.of(solution.weights[1] > 0.5), first, end)
+    often = np.bincount(seen.item, minlength=len(problem.bubbles))
+    chosen = np.sort(np.argsort(-often, kind="stable")[:_MOST_BUBBLES])
+    chosen = chosen[often[chosen] > 1]
+    known = np.unique(marks.item)
+    cut = replace(
+        problem,
+        t_s=problem.t_s[first:end],
+        bubbles=tuple(_cut(problem.bubbles[b], first, end) for b in chosen),
+        observations=_renumbered(seen, chosen),
+        marks=tuple(problem.marks[m] for m in known),
+        references=_renumbered(marks, known),
+    )
+    return Window(cut, first, chosen)
 
 
-def _sentence(name: str, axis: AxisVerdict, upright: bool) -> str:
-    title = f"{name} (vertical)" if upright else name
-    sizes = f"{1e3 * axis.sigma_mm:.3g} um where {1e3 * axis.sigma_shake_known_mm:.3g} um "
-    text = {
-        RESOLVED: f"{title}: bubble motion and shake are told apart ({sizes}would be possible).",
-        PARTIAL: f"{title}: shake widens the positions {axis.q:.2g} times ({sizes}"
-        "would be possible).",
-        UNRESOLVED: f"{title}: bubble motion and shake cannot be told apart ({sizes}"
-        "would be possible with the shake known).",
-    }[axis.verdict]
-    if SHAKE_BELOW_NOISE in axis.flags:
-        text += f" The shake ({1e3 * axis.shake_rms_mm:.3g} um RMS) is below the noise."
-    if LABEL_AMBIGUOUS in axis.flags:
-        lines = [x for x in axis.lines if _matters(x)]
-        which = ", ".join(sorted({f"{x.frequency_hz:.3g} Hz" for x in lines}))
-        text += f" The oscillation at {which} could be the bubble's as well as the rig's."
-    return text
+def _between(obs: Observations, first: int, end: int) -> Observations:
+    inside = obs.of((obs.frame >= first) & (obs.frame < end))
+    return replace(inside, frame=inside.frame - first)
 
 
-def _left_out(problem: SmoothingProblem) -> list[str]:
-    out = []
-    for camera in problem.cameras:
-        depth = ", ".join(f"{v:.2f}" for v in camera.camera_from_rig.rotation[2])
-        out.append(f"shake of {camera.name} along its own depth ({depth}): it cannot be seen")
-    return out
+def _renumbered(obs: Observations, chosen: Ints) -> Observations:
+    kept = obs.of(np.isin(obs.item, chosen))
+    return replace(kept, item=np.searchsorted(chosen, kept.item))
 
 
-def _as_json(axis: AxisVerdict) -> dict[str, Any]:
-    lines = [
-        {
-            "owner": line.owner,
-            "frequency_hz": line.frequency_hz,
-            "rms_mm": line.rms_mm,
-            "other_owner_costs_nats": line.log_likelihood_ratio,
-            "ambiguous": line.ambiguous,
-        }
-        for line in axis.lines
-    ]
-    return {
-        "verdict": axis.verdict,
-        "flags": list(axis.flags),
-        "q": axis.q,
-        "eta": axis.eta,
-        "sigma_mm": axis.sigma_mm,
-        "sigma_shake_known_mm": axis.sigma_shake_known_mm,
-        "shake_rms_mm": axis.shake_rms_mm,
-        "lines": lines,
-    }
+def _cut(bubble: Bubble, first: int, end: int) -> Bubble:
+    low, high = max(bubble.first, first), min(bubble.last, end - 1)
+    guess = bubble.guess_mm[low - bubble.first : high - bubble.first + 1]
+    return Bubble(bubble.particle, low - first, high - first, guess[0], guess)

@@ -1,16 +1,16 @@
-"""The table of what shakes: frequency, damping, RMS, where, and what a mechanic could do."""
+"""The table of what shakes: place, frequency, damping and RMS of each mode."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -25,64 +25,59 @@ _BLUR = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
 _BLUR_HALF = 1.0
 _ALIKE = 0.7
 _STRONGER = 2.0
-SEEN_BY = "seen only by "
-"""Of a line on an axis that one camera sees: its arm's, or common to all."""
 
 
-def shake_modes(solution: Solution) -> list[dict[str, Any]]:
-    """Rows {where, frequency_hz, damping, rms_mm (x, y, z), source, remedy}, strongest first.
+class Place(StrEnum):
+    """What a mode moves."""
 
-    Modes of the model as they are (source "model"); without any, peaks in the spectrum of the
-    estimated offsets (source "estimate"); peaks of the carriage about its travel are the servo's.
+    COMMON = "common"
+    ARM = "arm"
+    ONE_VIEW = "seen only by"
+    """A line on an axis that one camera alone sees: its arm's, or common to all."""
+    SERVO = "servo"
+
+
+@dataclass(frozen=True)
+class ShakeMode:
+    """One row.  camera : its name, of an arm or a single view.  rms_mm : (x, y, z).
+
+    source : "model", or "estimate" of a peak in the spectrum of the estimated offsets.
+    """
+
+    place: Place
+    camera: str
+    frequency_hz: float
+    damping: float
+    rms_mm: list[float]
+    source: str
+
+    @property
+    def where(self) -> str:
+        return f"{self.place} {self.camera}".strip()
+
+
+def shake_modes(solution: Solution) -> list[ShakeMode]:
+    """The strongest first: those of the model, or peaks in the spectrum of the estimated offsets.
+
+    Peaks of the carriage about its travel are the servo's.
     """
     frame = solution.frame
     names = [c.name for c in frame.problem.cameras]
+    rows = _from_offsets(solution, names)
     if frame.model.modes:
         rows = [_from_model(mode, names) for mode in frame.model.modes]
-    else:
-        rows = _from_offsets(solution, names)
     rows += _from_carriage(solution)
-    return sorted(rows, key=lambda row: -max(row["rms_mm"]))
+    return sorted(rows, key=lambda row: -max(row.rms_mm))
 
 
-def _from_model(mode: RigMode, names: Sequence[str]) -> dict[str, Any]:
-    where = "common" if mode.camera == CARRIAGE else f"arm {names[mode.camera]}"
-    return _row(where, mode.frequency_hz, mode.damping, mode.rms_mm, "model")
+def _from_model(mode: RigMode, names: Sequence[str]) -> ShakeMode:
+    common = mode.camera == CARRIAGE
+    place, camera = (Place.COMMON, "") if common else (Place.ARM, names[mode.camera])
+    rms = [float(r) for r in mode.rms_mm]
+    return ShakeMode(place, camera, float(mode.frequency_hz), float(mode.damping), rms, "model")
 
 
-def _row(
-    where: str, frequency_hz: float, damping: float, rms_mm: Sequence[float], source: str
-) -> dict[str, Any]:
-    return {
-        "where": where,
-        "frequency_hz": float(frequency_hz),
-        "damping": float(damping),
-        "rms_mm": [float(r) for r in rms_mm],
-        "source": source,
-        "remedy": remedy(where, frequency_hz, damping),
-    }
-
-
-def remedy(where: str, frequency_hz: float, damping: float) -> str:
-    """What would make this mode smaller."""
-    if where == "servo":
-        return "tune the stage's controller: more damping, a softer ramp, less gain at this line"
-    if where.startswith(SEEN_BY):
-        text = "one camera alone sees this axis, so whether its arm or the whole rig swings is not "
-        text += "known: an accelerometer on the carriage would tell"
-    elif where == "common":
-        text = "all cameras move alike: stiffen the mount between carriage and camera bridge, "
-        text += "or lighten what hangs on it"
-    else:
-        text = f"the {where} swings by itself: shorten or brace it, or counterweight its camera"
-    if damping < 0.02:
-        text += "; it rings: a layer of damping helps as much as stiffness"
-    if frequency_hz < 5:
-        text += "; so slow a swing is also driven by the travel: ramp the stage up more softly"
-    return text
-
-
-def _from_offsets(solution: Solution, names: Sequence[str]) -> list[dict[str, Any]]:
+def _from_offsets(solution: Solution, names: Sequence[str]) -> list[ShakeMode]:
     """Lines of the cameras' offsets: who moves shows where two cameras see the same axis.
 
     There the cameras move alike (common), one alone or both independently (arms). An axis that one
@@ -102,7 +97,7 @@ def _from_offsets(solution: Solution, names: Sequence[str]) -> list[dict[str, An
         return []
     seen = np.abs(rows).sum(-1) > 0
     shared = seen.sum(0) > 1
-    out: list[dict[str, Any]] = []
+    out: list[ShakeMode] = []
     for line in _lines(spectra, spectra.own[:, shared].sum((0, 1)), noise):
         out += _owned(spectra, line, seen, shared, names)
     for camera, name in enumerate(names):
@@ -110,7 +105,7 @@ def _from_offsets(solution: Solution, names: Sequence[str]) -> list[dict[str, An
         for line in _lines(spectra, spectra.own[camera, alone].sum(0), noise):
             if not any(_same_line(line, row) for row in out):
                 rms = np.sqrt(line.power(spectra.own[camera])) * alone
-                out.append(line.row(f"{SEEN_BY}{name}", rms))
+                out.append(line.row(Place.ONE_VIEW, name, rms))
     return out
 
 
@@ -135,14 +130,15 @@ class _Line:
     def power(self, density: Array) -> Array:
         return np.asarray(density[..., self.near].sum(-1) * self.step_hz)
 
-    def row(self, where: str, rms_mm: Array) -> dict[str, Any]:
+    def row(self, place: Place, camera: str, rms_mm: Array) -> ShakeMode:
         damping = self.half_hz / self.frequency_hz
-        return _row(where, self.frequency_hz, damping, rms_mm.tolist(), "estimate")
+        rms = rms_mm.tolist()
+        return ShakeMode(place, camera, self.frequency_hz, damping, rms, "estimate")
 
 
 def _owned(
     spectra: _Spectra, line: _Line, seen: Bools, shared: Bools, names: Sequence[str]
-) -> list[dict[str, Any]]:
+) -> list[ShakeMode]:
     """The line as common, or as the arms'."""
     own, cross = line.power(spectra.own), line.power(spectra.cross)
     among = cross[:, :, shared].sum(-1)
@@ -151,14 +147,14 @@ def _owned(
     lone = sd[strongest] > _STRONGER * sd[weakest]
     if not lone and among[strongest, weakest] > _ALIKE * sd[strongest] * sd[weakest]:
         rms = np.sqrt((own * seen).sum(0) / np.maximum(seen.sum(0), 1))
-        return [line.row("common", rms)]
+        return [line.row(Place.COMMON, "", rms)]
     arms = [strongest] if lone else range(len(names))
-    return [line.row(f"arm {names[c]}", np.sqrt(own[c]) * seen[c]) for c in arms]
+    return [line.row(Place.ARM, names[c], np.sqrt(own[c]) * seen[c]) for c in arms]
 
 
-def _same_line(line: _Line, row: dict[str, Any]) -> bool:
-    reach = 2 * max(line.half_hz, row["damping"] * row["frequency_hz"]) + line.step_hz
-    return bool(abs(line.frequency_hz - row["frequency_hz"]) <= reach)
+def _same_line(line: _Line, row: ShakeMode) -> bool:
+    reach = 2 * max(line.half_hz, row.damping * row.frequency_hz) + line.step_hz
+    return bool(abs(line.frequency_hz - row.frequency_hz) <= reach)
 
 
 def _spectra(t_s: Array, series: Array) -> _Spectra | None:
@@ -209,9 +205,9 @@ def _half_width(total: Array, peak: int) -> int:
     return int(max(1, min(sides, default=1)))
 
 
-def _from_carriage(solution: Solution) -> list[dict[str, Any]]:
+def _from_carriage(solution: Solution) -> list[ShakeMode]:
     """Following errors: lines of the encoder's record after a smooth travel is taken off."""
-    problem, model = solution.frame.problem, solution.frame.model
+    problem, noise = solution.frame.problem, solution.frame.model.encoder_sigma_mm
     if problem.stage is None:
         return []
     t, position = problem.stage.t_s, problem.stage.position_mm
@@ -221,14 +217,9 @@ def _from_carriage(solution: Solution) -> list[dict[str, Any]]:
     t, position = t[late], position[late]
     x = 2 * (t - t[0]) / (t[-1] - t[0]) - 1
     rest = position - np.polynomial.Chebyshev.fit(x, position, 5)(x)
-    noise = _encoder_noise(model)
     spectra = _spectra(t, (rest[:, None] * np.abs(problem.axis))[None])
     if spectra is None:
         return []
     lines = _lines(spectra, spectra.own.sum((0, 1)), noise**2)
-    rows = [line.row("servo", np.sqrt(line.power(spectra.own[0]))) for line in lines]
-    return [row for row in rows if max(row["rms_mm"]) > _SIGNIFICANT * noise][:1]
-
-
-def _encoder_noise(model: ShakeModel) -> float:
-    return model.encoder_sigma_mm
+    rows = [line.row(Place.SERVO, "", np.sqrt(line.power(spectra.own[0]))) for line in lines]
+    return [row for row in rows if max(row.rms_mm) > _SIGNIFICANT * noise][:1]

@@ -121,7 +121,7 @@ class _Part:
     @classmethod
     def of(cls, stretch: Stretch, linear: Linear) -> _Part:
         base, key = stretch.frame.base(), int(np.min(linear.keys[0]))
-        of_bubbles = linear.weight is not None and base[1] <= key < base[2]
+        of_bubbles = linear.weight is not None and base.bubbles <= key < base.means
         first = stretch.columns(linear)
         reached = first[:, 0] >= 0 if of_bubbles else np.any(first >= 0, axis=1)
         which = np.flatnonzero(reached)

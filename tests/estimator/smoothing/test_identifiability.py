@@ -12,14 +12,13 @@ from shake_learning_data import ARM_HZ, COMMON_HZ, run, true_model
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.problem.problem import Accelerometer, BroadBand, ShakeModel, Stage
 from telerig.estimator.smoothing.verdict.identifiability import (
-    judge,
-    remedy_of_verdict,
     shake_share,
     verdicts,
+    window_of,
     without_sensors,
 )
-from telerig.estimator.smoothing.verdict.modes import remedy, shake_modes
-from telerig.estimator.smoothing.verdict.window import window_of
+from telerig.estimator.smoothing.verdict.judge import judge, remedy_of_mode, remedy_of_verdict
+from telerig.estimator.smoothing.verdict.modes import Place, ShakeMode, shake_modes
 
 QUIET = Options(robust=False)
 BANDS = replace(
@@ -43,7 +42,7 @@ def test_one_bubble_cannot_be_told_from_the_rig() -> None:
     assert [line["frequency_hz"] for line in rig] == [COMMON_HZ]
     assert abs(rig[0]["other_owner_costs_nats"]) < 1e-3
     words = str(found["words"])
-    assert "y (vertical): bubble motion and shake cannot be told apart" in words
+    assert "y (vertical): bubble motion and shake cannot be separated" in words
     assert "fix a strip of dots to the tank inside both views" in words
     json.dumps(found)
 
@@ -149,11 +148,13 @@ def test_without_bubbles_or_covariances_there_is_no_verdict() -> None:
 def test_table_of_modes_names_places_and_remedies() -> None:
     problem, _, _ = run(np.random.default_rng(9), seconds=0.3)
     rows = shake_modes(solve(problem, true_model(), QUIET))
-    assert [r["where"] for r in rows] == ["common", "arm left", "arm right"]
-    assert rows[0]["frequency_hz"] == COMMON_HZ
-    assert "shorten" in rows[1]["remedy"]
-    assert "ramp" in remedy("common", 3.0, 0.1)
-    assert "damping" in remedy("arm left", 20.0, 0.01)
+    assert [r.where for r in rows] == ["common", "arm left", "arm right"]
+    assert rows[0].frequency_hz == COMMON_HZ
+    assert "shorten" in remedy_of_mode(rows[1])
+    slow = ShakeMode(Place.COMMON, "", 3.0, 0.1, [0.0, 0.1, 0.0], "model")
+    assert "ramp" in remedy_of_mode(slow)
+    ringing = ShakeMode(Place.ARM, "left", 20.0, 0.01, [0.0, 0.1, 0.0], "model")
+    assert "damping" in remedy_of_mode(ringing)
 
 
 def test_modes_are_read_from_estimated_shake_and_encoder_when_the_model_has_none() -> None:
@@ -166,8 +167,8 @@ def test_modes_are_read_from_estimated_shake_and_encoder_when_the_model_has_none
         solution,
         frame=replace(solution.frame, problem=replace(problem, stage=Stage(t, 50 * t + servo))),
     )
-    rows = {r["where"]: r for r in reversed(shake_modes(moving))}
-    assert rows["common"]["frequency_hz"] == pytest.approx(COMMON_HZ, abs=0.8)
-    assert rows["arm left"]["frequency_hz"] == pytest.approx(ARM_HZ, abs=1.2)
-    assert rows["servo"]["frequency_hz"] == pytest.approx(15, abs=0.5)
-    assert rows["servo"]["rms_mm"][1] == pytest.approx(0.1, rel=0.15)
+    rows = {r.where: r for r in reversed(shake_modes(moving))}
+    assert rows["common"].frequency_hz == pytest.approx(COMMON_HZ, abs=0.8)
+    assert rows["arm left"].frequency_hz == pytest.approx(ARM_HZ, abs=1.2)
+    assert rows["servo"].frequency_hz == pytest.approx(15, abs=0.5)
+    assert rows["servo"].rms_mm[1] == pytest.approx(0.1, rel=0.15)

@@ -180,6 +180,6 @@ def test_arms_that_shake_alone_and_together() -> None:
         rows = shake_modes(solve(given, bands))
         for row in rows:
             lines = {"common": COMMON_HZ, "arm left": ARM_HZ, "arm right": ARM_HZ}
-            assert row["frequency_hz"] == pytest.approx(lines[row["where"]], abs=1.5)
+            assert row.frequency_hz == pytest.approx(lines[row.where], abs=1.5)
         expected = ["common"] if seed == 21 else ["arm left", "arm right", "common"]
-        assert sorted(r["where"] for r in rows) == expected  # 21: nine tenths of it are common
+        assert sorted(r.where for r in rows) == expected  # 21: nine tenths of it are common

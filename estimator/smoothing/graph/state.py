@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,7 @@ from telerig.factors.motion import Motion, motion
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+T = TypeVar("T")
 
 
 class Family(NamedTuple):
@@ -32,32 +33,19 @@ class Family(NamedTuple):
     size: int
 
 
-class Families(NamedTuple):
-    """The families of variables, in the order of their keys.
+class Families(NamedTuple, Generic[T]):
+    """Something of each family of variables, in the order of their keys.
 
     constants : one key for encoder and calibration, since a factor takes three keys at most.
     """
 
-    shake: Family
-    bubbles: Family
-    means: Family
-    sensors: Family
-    constants: Family
-    marks: Family
-    clocks: Family
-
-
-class FirstKeys(NamedTuple):
-    """The first key of each family, and the number of all keys."""
-
-    shake: int
-    bubbles: int
-    means: int
-    sensors: int
-    constants: int
-    marks: int
-    clocks: int
-    end: int
+    shake: T
+    bubbles: T
+    means: T
+    sensors: T
+    constants: T
+    marks: T
+    clocks: T
 
 
 @dataclass(frozen=True)
@@ -188,7 +176,7 @@ class Frame:
         share = self.problem.calibration
         return 0 if share is None else int(share.root.shape[1])
 
-    def counts(self) -> Families:
+    def counts(self) -> Families[Family]:
         problem = self.problem
         return Families(
             Family(len(self.nodes.t_s), self.shake.size),
@@ -200,8 +188,10 @@ class Frame:
             Family(int(self.clock_of.max(initial=-1)) + 1, int(self.sensor_flags[1])),
         )
 
-    def base(self) -> FirstKeys:
-        return FirstKeys(0, *np.cumsum([family.number for family in self.counts()]).tolist())
+    def base(self) -> Families[int]:
+        """The first key of each family."""
+        numbers = [family.number for family in self.counts()]
+        return Families(0, *np.cumsum(numbers)[:-1].tolist())
 
 
 def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> Frame:

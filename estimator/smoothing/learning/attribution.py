@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from telerig.estimator.smoothing.learning.parameters import prior_of
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel, Zigzag
 
 Array = NDArray[np.float64]
+L = TypeVar("L", RigMode, Zigzag)
 
 AMBIGUOUS_LOG_RATIO = 5.0
 HARMONIC_LOG_RATIO = 7.0
@@ -133,9 +135,7 @@ def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeM
     mode = model.modes[index]
     rms = _scaled(mode.rms_mm, np.sqrt(share))
     added = Zigzag(mode.frequency_hz, mode.damping, rms, mode.force_hz)
-    kept = replace(mode, rms_mm=_scaled(mode.rms_mm, np.sqrt(1 - share)))
-    rest = (kept,) if share < 1 else ()
-    modes = (*model.modes[:index], *rest, *model.modes[index + 1 :])
+    modes = _with_rest(model.modes, index, share)
     zigzags = _joined(model.bubble.zigzags, added)
     return replace(model, modes=modes, bubble=replace(model.bubble, zigzags=zigzags))
 
@@ -145,11 +145,17 @@ def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeMode
     line = model.bubble.zigzags[index]
     rms = _scaled(line.rms_mm, np.sqrt(share))
     added = RigMode(line.frequency_hz, line.damping, rms, force_hz=line.force_hz)
-    kept = replace(line, rms_mm=_scaled(line.rms_mm, np.sqrt(1 - share)))
-    rest = (kept,) if share < 1 else ()
-    zigzags = (*model.bubble.zigzags[:index], *rest, *model.bubble.zigzags[index + 1 :])
-    bubble = replace(model.bubble, zigzags=zigzags)
+    bubble = replace(model.bubble, zigzags=_with_rest(model.bubble.zigzags, index, share))
     return replace(model, modes=(*model.modes, added), bubble=bubble)
+
+
+def _with_rest(lines: tuple[L, ...], index: int, share: float) -> tuple[L, ...]:
+    """Lines of which one has given away a share of its variance; all of it: that one goes."""
+    line = lines[index]
+    rest: tuple[L, ...] = ()
+    if share < 1:
+        rest = (replace(line, rms_mm=_scaled(line.rms_mm, np.sqrt(1 - share))),)
+    return lines[:index] + rest + lines[index + 1 :]
 
 
 def _joined(lines: tuple[Zigzag, ...], added: Zigzag) -> tuple[Zigzag, ...]:

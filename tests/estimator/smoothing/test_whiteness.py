@@ -14,8 +14,11 @@ from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.graph.state import frame_of
 from telerig.estimator.smoothing.learning.adapted_priors import adapted, leverages
 from telerig.estimator.smoothing.problem.problem import Observations, ShakeModel, SmoothingProblem
-from telerig.estimator.smoothing.verdict.residual_draws import drawn_residuals, stretch_of
-from telerig.estimator.smoothing.verdict.whiteness import pixel_whiteness
+from telerig.estimator.smoothing.verdict.whiteness import (
+    drawn_residuals,
+    pixel_whiteness,
+    stretch_of,
+)
 
 Array = NDArray[np.float64]
 

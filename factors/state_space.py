@@ -84,7 +84,7 @@ def _component(
 
 
 def stationary_covariance(drift: Array, noise: Array) -> Array:
-    """(n, n) P with F P + P F^T + L L^T = 0. Raises InputError when the process does not settle."""
+    """(n, n) P with F P + P F^T + L L^T = 0. Raises InputError for an unstable process."""
     from scipy.linalg import solve_continuous_lyapunov
 
     if np.max(np.linalg.eigvals(drift).real) >= 0:
@@ -140,14 +140,14 @@ def forced_mass(
     """A carriage under a smooth force: its acceleration is white noise through three equal poles.
 
     States (position, velocity, acceleration and two more of the force). Smoother than white jerk
-    on purpose: what a prior holds possible above a sensor's rate folds into the sensor's band and
-    drowns an accelerometer.
+    on purpose: a prior's power above a sensor's sampling rate is aliased into the sensor's band and
+    makes an accelerometer worthless.
     """
     _positive(acceleration_rms_mm_s2=acceleration_rms_mm_s2, corner_hz=corner_hz)
-    corner = 2 * np.pi * corner_hz
-    force = np.diag([-corner] * 3) + np.diag([1.0, 1.0], 1)
+    cutoff = 2 * np.pi * corner_hz
+    force = np.diag([-cutoff] * 3) + np.diag([1.0, 1.0], 1)
     scaled = _scaled("force", force, np.array([1.0, 0.0, 0.0]), acceleration_rms_mm_s2)
-    drift = np.diag([0.0, 0.0, -corner, -corner, -corner]) + np.diag([1.0] * 4, 1)
+    drift = np.diag([0.0, 0.0, -cutoff, -cutoff, -cutoff]) + np.diag([1.0] * 4, 1)
     noise = np.vstack([np.zeros((2, 1)), scaled.noise])
     start = np.diag([start_sigma_mm**2, start_sigma_mm_s**2, 0.0, 0.0, 0.0])
     start[2:, 2:] = scaled.start_covariance
@@ -182,7 +182,7 @@ def driven_mode(
 def resonance(
     rms_mm: float, frequency_hz: float, damping: float, force_hz: float | None = None
 ) -> Component:
-    """An `oscillator`, or with a corner of the force a `driven_mode`."""
+    """An `oscillator`, or with a low-pass filtered force a `driven_mode`."""
     if force_hz is None:
         return oscillator(rms_mm, frequency_hz, damping)
     return driven_mode(rms_mm, frequency_hz, damping, force_hz=force_hz)
@@ -245,14 +245,14 @@ def _scaled(name: str, drift: Array, position: Array, rms: float) -> Component:
 def slow_ou(rms: float, tau_s: float) -> Component:
     """One state that forgets within tau: slow drift of an arm, wander of a centroid (in px).
 
-    Too rough to have a velocity; an accelerometer is not told of it.
+    Too rough to have a velocity: accelerometers do not measure it.
     """
     _positive(rms=rms, tau_s=tau_s)
     return _component("slow_ou", [[-1 / tau_s]], [rms * np.sqrt(2 / tau_s)])
 
 
 def independent(sigma: float) -> Component:
-    """One state, drawn anew at every node: a position that only its own reading tells."""
+    """One state, drawn anew at every node: a position known from its own reading alone."""
     _positive(sigma=sigma)
     plain = _component("independent", [[0.0]], [[0.0]], np.array([[sigma**2]]))
     return replace(plain, memoryless=True)

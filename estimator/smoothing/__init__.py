@@ -1,4 +1,4 @@
-"""The smoothing graph: bubble motion and rig shake told apart, with a verdict.
+"""The smoothing graph: bubble motion and rig shake separated, with a verdict.
 
 In: ``Tracks``, a ``Calibration``, sensors. Out: a ``Smoothing`` and its files. Read ``smooth``
 first.

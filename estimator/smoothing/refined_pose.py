@@ -1,9 +1,9 @@
 """The pose between the cameras as a variable of the smoothing graph, and what the run makes of it.
 
 The graph carries the calibration's uncertainty in unit directions. To refine the rig, the prior
-of a movement is added to it in the directions that gaps tell; images, shake and bubbles then
-settle it together, and its posterior is read back. The wander of the bubbles' centres belongs to
-the model, else it would count as a movement.
+of a movement is added to it in the directions that the ray gaps determine. Images, shake and
+bubbles are then solved together with it, and its posterior is read back. The wander of the bubbles'
+centres belongs to the model, else it would count as a movement.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def refined_change(solution: Solution, calibration: Calibration) -> RigChange | 
 
 
 def change_words(change: RigChange, first: str) -> str:
-    """What `telerig smooth --refine-rig` says of it."""
+    """The change as a sentence, for smoothing.json and the command."""
     if not change.moved:
         return (
             f"no movement of camera {change.camera!r} against {first!r} since the calibration "

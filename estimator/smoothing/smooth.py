@@ -1,4 +1,4 @@
-"""`telerig.smooth`: the motion of the bubbles and the shake of the rig, told apart."""
+"""`telerig.smooth`: the motion of the bubbles, separated from the shake of the rig."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def smooth(
     progress: Progress | None = None,
     refine_rig: bool | DriftPrior = False,
 ) -> Smoothing:
-    """Smooth a run: every bubble in the lab, every camera's shake, with what is known of them.
+    """Smooth a run: every bubble in the lab and every camera's shake, with their covariances.
 
     tracks : `Tracks`, a table like tracks.csv, or None to estimate offsets alone.
     stage : a table t_s, position_mm, or the `RunData` that holds all of the run's records, which
@@ -161,7 +161,7 @@ def problem_of(
     times = frame_times if tracked is None else tracked.t_s
     if times is None:
         raise InputError(
-            "without tracks nothing says when the frames are",
+            "without tracks nothing says when the frames are taken",
             where="smooth",
             todo="give t_s, the times at which offsets are wanted",
         )

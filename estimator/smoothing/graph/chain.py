@@ -168,7 +168,7 @@ def _add_block(
 ) -> None:
     """Add (M, a, b) blocks of J_a^T J_b: rows of the first key, columns of the second.
 
-    Of a frame's own block only what is on and above the diagonal, as Cholesky asks for.
+    Of a frame's own block only the upper triangle with its diagonal, which Cholesky reads.
     """
     (one, two), (i, j) = whens, columns
     a, b = slice(i, i + block.shape[1]), slice(j, j + block.shape[2])

@@ -47,7 +47,7 @@ class ShakeLayout:
     components : independent, one after the other.
     position, velocity, acceleration, jerk : (D,) of the carriage along the axis.
     offset, offset_velocity, offset_acceleration, offset_jerk : (C + 1, 3, D) of each camera in
-        rig axes; the last is what all share, which a sensor on the carriage feels.
+        rig axes; the last is what all share, measured by a sensor on the carriage.
     pitch : (C, D).  seen : per camera (k, 3), the directions in which its own arm is modelled.
     unseen_variance_mm2 : (C, 3, 3) of the arm's own shake along the camera's depth.
     """
@@ -292,7 +292,7 @@ def _nearest(nodes: Array, t_s: Array) -> tuple[Ints, Array]:
 
 
 def carry(components: Sequence[Component], late_s: Array) -> Array | None:
-    """(M, D, D) exp(F late) that takes states to slightly later or earlier times; None: all alike.
+    """(M, D, D) exp(F late), from states to those slightly later or earlier; None: all the same.
 
     The noise of so short a time is left out.
     """

@@ -234,8 +234,8 @@ def encoder(frame: Frame, state: State) -> list[Linear]:
     """Readings of the stage's position: at their own times, or interpolated at the frames.
 
     The carriage's states are in units of the reading, so that its scale is not a factor of what
-    the encoder pins: the mode of (states, scale) together would shrink the states' noise, by one
-    nat in the log of the scale for every reading, where no data speak of the scale.
+    the encoder determines: the joint mode of (states, scale) would shrink the states' noise, by one
+    unit of log-likelihood per reading and unit of log scale, where no data inform on the scale.
     """
     problem, model, layout = frame.problem, frame.model, frame.shake
     stage, nodes = problem.stage, frame.nodes
@@ -274,7 +274,7 @@ def encoder(frame: Frame, state: State) -> list[Linear]:
 def accelerometers(frame: Frame, state: State) -> list[Linear]:
     """Samples of all sensors, along the directions in which their mount's motion is modelled.
 
-    What they say of the encoder's scale, by the carriage's own acceleration, is not used.
+    Their information on the encoder's scale, by the carriage's own acceleration, is not used.
     """
     return [_accelerometer(frame, state, i) for i in range(len(frame.problem.accelerometers))]
 

@@ -1,9 +1,9 @@
-"""How well the stage's travel is known, and what that leaves open of places in the lab.
+"""How well the stage's travel is known, and the uncertainty that it adds to places in the lab.
 
 Images and sensors on the stage see what moves past them, so an error of the encoder's scale or of
 the travel axis moves bubbles and carriage together and leaves no trace in any residual. Such
 constants are not estimated: their covariance is added to that of the places (a consider, or
-Schmidt, parameter). Marks fixed to the tank do tell the scale; there it is a variable of the graph.
+Schmidt, parameter). Marks fixed to the tank show the scale; it is a variable of the graph then.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from telerig.rig.pose import across
 Array = NDArray[np.float64]
 
 SCALE_SIGMA = 1e-3
-"""Of an encoder of which nothing is said: lead screws, belts, thermal growth."""
+"""Of an encoder without a stated scale: lead screws, belts, thermal growth."""
 _FAR = 3.0
 
 
 def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
-    """What `stage_axis/` showed (calibration.json's ``stage``), else what rig.toml says.
+    """As calibrated from `stage_axis/` (calibration.json's ``stage``), else as in rig.toml.
 
     described : `StageDescription` or None, which means upwards in the images.
     """
@@ -49,10 +49,10 @@ def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
 
 
 def default_scale_sigma(travel: Travel | None) -> float:
-    """Prior of the encoder's scale where marks tell it.
+    """Prior of the encoder's scale where it is estimated from marks.
 
-    Not wider for that: a lens that is not quite telecentric and sees marks at unknown depths tells
-    the scale hardly at all. See `wider_scale_sigma`.
+    Not wider for that: marks at unknown depths, seen through a lens that is not quite telecentric,
+    hardly determine the scale. See `wider_scale_sigma`.
     """
     return SCALE_SIGMA if travel is None else float(np.sqrt(travel.covariance[2, 2]))
 

@@ -1,4 +1,4 @@
-"""Values of everything in the graph, and the keys under which GTSAM knows them."""
+"""Values of all variables of the graph, and their keys."""
 
 from __future__ import annotations
 

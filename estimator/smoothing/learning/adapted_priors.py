@@ -1,4 +1,4 @@
-"""What a first solution tells of its own priors: pixel noise, the shake's size and spectrum."""
+"""Priors from a first solution: pixel noise, the shake's RMS and spectrum."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
 _SAMPLED = 1000
 _LEAST_SPARE = 0.2
-_LEAST_TELLING = 60
+_LEAST_PIXELS = 60
 _MEDIAN_OF_CHI_SQUARE, _SD_OF_MEDIAN = 0.4549, 1.16
 _FLOORS = np.geomspace(0.03, 0.4, 40)
 _FLOOR_SPREAD = np.log(2.0)
@@ -29,7 +29,7 @@ _LOW_BAND = 0.4
 _FEWEST_BINS = 3
 _UNSEEN_MM = 1e-6
 _INDEPENDENT = 0.5
-"""Neighbouring bins of a tapered spectrum, and cameras that shake alike, tell the same thing."""
+"""Share of independent bins: a tapered spectrum's neighbours, and cameras, are correlated."""
 
 
 def adapted(solution: Solution) -> ShakeModel | None:
@@ -141,8 +141,8 @@ def _noise_factor(solution: Solution) -> float:
     """By how much the pixels' stated noise is too small, 1 at least.
 
     From the median square of single coordinates, which outliers do not move; what the fit takes up
-    is given back to each by its leverage. Those that it follows closely tell next to nothing, and
-    none tells that the noise is smaller than stated: the error of a bubble's outline changes slowly
+    is given back to each by its leverage. Those that it follows closely are left out. The noise is
+    never taken for smaller than stated: the error of a bubble's outline changes slowly
     with its shape, and the fit takes that for motion.
     """
     square, spare = [], []
@@ -153,12 +153,12 @@ def _noise_factor(solution: Solution) -> float:
     if not square:
         return 1.0
     squares, spares = np.concatenate(square), np.concatenate(spare)
-    telling = spares > _LEAST_SPARE
-    if np.count_nonzero(telling) < _LEAST_TELLING:
+    informative = spares > _LEAST_SPARE
+    if np.count_nonzero(informative) < _LEAST_PIXELS:
         return 1.0
-    median = float(np.median(squares[telling] / spares[telling]))
+    median = float(np.median(squares[informative] / spares[informative]))
     found = float(np.sqrt(median / _MEDIAN_OF_CHI_SQUARE))
-    sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(np.count_nonzero(telling)))
+    sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(np.count_nonzero(informative)))
     return found if found > sure else 1.0
 
 

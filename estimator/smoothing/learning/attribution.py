@@ -1,9 +1,8 @@
 """Whose is a spectral line, the bubble's or the rig's? Moving lines, and what that costs.
 
-A line seen in one bubble is seen alike whoever owns it: the likelihood does not change when it is
-moved. Several bubbles, marks or sensors tell. What the images cannot tell is shared between both
-owners: with half of the variance each, the posterior says that the share is unknown, and its
-covariance holds the spread between the two readings.
+With one bubble the likelihood is the same for both owners; several bubbles, marks or sensors make
+the owner identifiable. An ambiguous line is shared between both owners, half of the variance each:
+the share is unknown then, and the posterior covariance contains both explanations.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def attributions(
 
 
 def _is_common(mode: RigMode, signals: Sequence[Signal]) -> bool:
-    """Seen by all cameras of a signal alike: only then a bubble can look the same."""
+    """Common to all cameras of a signal: only then a bubble's oscillation looks the same."""
     if mode.camera == CARRIAGE:
         return True
     return all(c.cameras == (mode.camera,) for c in signals if mode.camera in c.cameras)

@@ -64,7 +64,7 @@ def default_model(problem: SmoothingProblem, encoder_sigma_mm: float = 0.005) ->
 
 
 def _scale_sigma(problem: SmoothingProblem) -> float:
-    """Marks tell the encoder's scale; without them nothing does, and it is held."""
+    """The encoder's scale is estimated where there are marks, and held without."""
     marked = len(problem.references) > 0 and problem.stage is not None
     return default_scale_sigma(problem.travel) if marked else 0.0
 
@@ -150,7 +150,7 @@ def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
 
 
 def default_carriage(problem: SmoothingProblem, encoder_sigma_mm: float) -> CarriageModel:
-    """Readings as they are, unless sensors or a slow encoder ask how the carriage moves between."""
+    """Readings as they are; with sensors or a slow encoder a model of the motion in between."""
     stage = problem.stage
     if stage is None:
         return CarriageModel()

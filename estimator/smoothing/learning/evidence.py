@@ -234,7 +234,7 @@ def runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice | NDArray[np.int
 
 
 def _replicates(signal: Signal) -> Array:
-    """(F, P, R) the measurements, R of them alike but for their values."""
+    """(F, P, R) the measurements, R replicates that differ in their values only."""
     values = signal.value_mm
     return values if values.ndim == 3 else values[..., None]
 

@@ -26,11 +26,11 @@ class Learning:
 
     most_modes : lines of one kind (common, each arm, bubble) at most, in the vertical and across.
     hold : patterns of names (see ``parameters``) that keep the start's values,
-        "modes.*" for instance for a rig that is known. The forces' corner, which all modes
+        "modes.*" for instance for a rig that is known. The forces' cut-off, which all modes
         share, is held with any mode of which all is held.
     target : the tracks are those of a target standing still in the lab, not of bubbles.
-    force_hz : corner of the modes' force to begin with, None for a white one, which gets a corner
-        where the data ask for it.
+    force_hz : low-pass cut-off of the modes' force to begin with; None: white, with a cut-off only
+        where the information criterion prefers one.
     """
 
     most_modes: int = 3
@@ -58,7 +58,7 @@ class Group:
 
 
 def groups_of(signals: Sequence[Signal], options: Learning, up: Array) -> list[Group]:
-    """The shared coordinate, and what lies across it, alike whichever way; up : (3,)."""
+    """The shared coordinate, and the coordinates across it, taken together; up : (3,)."""
     if not signals:
         return []
     bubble: tuple[Owner, ...] = () if options.target else (BUBBLE,)

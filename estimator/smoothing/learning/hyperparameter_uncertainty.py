@@ -1,4 +1,4 @@
-"""Covariances that know that the hyper-parameters were learned (Laplace's approximation).
+"""Covariances that contain the uncertainty of learned hyper-parameters (Laplace's approximation).
 
 Every learned parameter is moved by one standard deviation up and down; by how much the smoothed
 positions, velocities and offsets move with it is added to their covariances. The parameters count
@@ -71,7 +71,7 @@ def _spread(signal: Signal, model: ShakeModel) -> _Triple:
 
 
 def _same(signal: Signal, one: ShakeModel, two: ShakeModel) -> bool:
-    """Whether the signal cannot tell two models from each other."""
+    """Whether both models are the same for this signal."""
     return all(a is b for a, b in zip(processes(signal, one), processes(signal, two)))
 
 

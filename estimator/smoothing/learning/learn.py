@@ -165,8 +165,8 @@ def _seeds(model: ShakeModel, options: Learning) -> dict[str, float]:
 def posterior_rms(signals: Sequence[Signal], model: ShakeModel, name: str, median: float) -> float:
     """An RMS that the data hardly determine as the root of its posterior's mean square.
 
-    The most probable of a line that bubbles' wide swings hide is next to none, and would say that
-    the rig stands still. median : of the log-normal prior.
+    The most probable RMS of a line that bubbles' wide swings hide is next to 0, as if the rig stood
+    still. median : of the log-normal prior.
     """
     values = median * np.exp(_LOG_RATIOS)
     found = np.array([evidence(signals, with_values(model, [name], [v])) for v in values])
@@ -240,7 +240,7 @@ def with_one_more_mode(group: Group, step: Step, options: Learning, first: bool)
 
 
 def try_low_pass_force(group: Group, step: Step, options: Learning, first: bool) -> Step:
-    """The modes' white forces given a corner, where it brings more than one parameter must.
+    """The modes' white forces low-pass filtered, where the information criterion prefers that.
 
     Both ways get as many steps more.
     """
@@ -258,7 +258,7 @@ def try_low_pass_force(group: Group, step: Step, options: Learning, first: bool)
 
 
 def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
-    """The forces' corner taken away again where the criterion does not mind."""
+    """The forces white again, unless the information criterion prefers the low-pass filter."""
     names = free_names(fit.model, group, options, True)
     if FORCE not in names:
         return fit
@@ -269,9 +269,9 @@ def try_white_force(group: Group, fit: Fit, options: Learning) -> Fit:
 
 
 def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeModel:
-    """After an arm's first mode, the other arms given one like it, to be found smaller if it is.
+    """After an arm's first mode, the same for the other arms, to be fitted like any mode.
 
-    Arms are built alike: one that shakes unseen would be taken for a shake of the whole rig.
+    Arms are built alike, and an arm's mode left out would be taken for one of the whole rig.
     """
     cameras = group.signals[0].cameras
     have = {m.camera for m in model.modes[:-1] if m.camera != CARRIAGE}
@@ -283,9 +283,9 @@ def _with_other_arms(group: Group, model: ShakeModel, where: Owner) -> ShakeMode
 
 
 def _bic_penalty(group: Group, model: ShakeModel) -> float:
-    """Nats that a line's three numbers must bring: half of Schwarz's 3 log n.
+    """Log-likelihood ratio that a line's three parameters must bring: half of Schwarz's 3 log n.
 
-    n : two samples for each cycle of the fastest line. Frames beyond tell of noise, not of lines.
+    n : two samples for each cycle of the fastest line. More frames inform on the noise alone.
     """
     t = group.signals[0].t_s
     lines = [mode.frequency_hz for mode in model.modes]
@@ -305,9 +305,9 @@ def _distinct(
 
 
 def _preference(model: ShakeModel, where: Owner, rival: Owner, up: Array) -> float:
-    """Nats by which a label must win over another that explains the data as well.
+    """Log-likelihood ratio by which an owner must win over another.
 
-    A line that fits equally goes to the rig: a wrong excuse for the rig hides its shake. Only the
+    A line that fits both goes to the rig, since the other error hides the rig's shake. Only the
     second harmonic of the zigzag is taken for the bubble's own.
     """
     if BUBBLE not in (where, rival) or where == rival:
@@ -358,7 +358,7 @@ def _last_line(model: ShakeModel, where: Owner) -> list[str]:
 
 
 def pruned(group: Group, fit: Fit, options: Learning, first: bool, given: int = 0) -> Fit:
-    """Lines taken away again whose absence the criterion does not mind.
+    """Lines removed again that the information criterion does not need.
 
     given : so many modes were there before the search, and stay, so that their names do.
     """

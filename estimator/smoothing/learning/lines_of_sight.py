@@ -1,7 +1,7 @@
-"""One coordinate at a time: what the cameras say along each direction that they see.
+"""Line-of-sight signals: what the cameras measure, one coordinate at a time.
 
 For cameras without distortion of the second order in shake, a pixel is a linear function of the
-bubble's place across the line of sight. Along one direction d seen by camera j it says
+bubble's place across the line of sight. Along one direction d seen by camera j it measures
 d . (bubble - offset_j), the encoder added. The coordinate that two cameras share (their common
 perpendicular) makes one signal, each camera's other coordinate another. Learning and the swaps of
 attributions work on signals: a few states each, where the whole graph has dozens.

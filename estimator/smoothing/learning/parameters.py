@@ -2,7 +2,7 @@
 
 Names are paths: ``modes.0.frequency_hz``, ``bubble.zigzags.1.rms_mm``, ``pixel_inflation``. An RMS
 with three components is one number, its largest component; setting it keeps the proportions. The
-corner of the modes' force is one for all, ``modes.force_hz``.
+low-pass cut-off of the modes' force is one for all, ``modes.force_hz``.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Prior:
 
 
 FORCE = "modes.force_hz"
-"""Corner of the force that drives the modes, one for all."""
+"""Low-pass cut-off of the force that drives the modes, one for all."""
 
 PRIORS: dict[str, Prior] = {
     FORCE: Prior(10.0, 1000.0, 60.0, 1.5, 0.2),
@@ -96,7 +96,7 @@ def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]
 
 
 def with_cutoff(model: ShakeModel, force_hz: float) -> ShakeModel:
-    """The model with that corner of all forces that have one."""
+    """The model with that low-pass cut-off of all forces that have one."""
     modes = tuple(m if m.force_hz is None else replace(m, force_hz=force_hz) for m in model.modes)
     zigzags = tuple(
         z if z.force_hz is None else replace(z, force_hz=force_hz) for z in model.bubble.zigzags
@@ -105,7 +105,7 @@ def with_cutoff(model: ShakeModel, force_hz: float) -> ShakeModel:
 
 
 def with_low_pass_force(model: ShakeModel, force_hz: float | None) -> ShakeModel:
-    """The model with that corner of all modes' forces, None: all white."""
+    """The model with that low-pass cut-off of all modes' forces, None: all white."""
     return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
 
 

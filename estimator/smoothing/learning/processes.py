@@ -117,7 +117,7 @@ def bubble_processes(signal: Signal, model: ShakeModel) -> list[Process]:
 
 
 def processes(signal: Signal, model: ShakeModel) -> list[Component]:
-    """Of the shake, then of one bubble. What two models have alike is the same object."""
+    """Of the shake, then of one bubble. Processes that two models share are the same object."""
     found = shake_processes(signal, model) + bubble_processes(signal, model)
     return [p.component for p in found]
 

@@ -17,7 +17,7 @@ Ints = NDArray[np.int64]
 Triple = tuple[float, float, float]
 
 CARRIAGE = -1
-"""Where a sensor sits, or a mode shakes, that moves all cameras alike."""
+"""In place of a camera's index: a sensor on the carriage, or a mode common to all cameras."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ class BubbleModel:
 
 @dataclass(frozen=True)
 class RigMode:
-    """One vibration of the rig, alike on the axes where its RMS is not 0 but independent there.
+    """One vibration of the rig, independent along each axis where its RMS is not 0.
 
     camera : index of the camera whose arm shakes, or CARRIAGE for all cameras.
-    force_hz : corner of the force's two poles; None: white force, only for images without sensors.
+    force_hz : low-pass cut-off of the force (two poles); None: white, only without sensors.
     """
 
     frequency_hz: float
@@ -70,10 +70,10 @@ class RigMode:
 
 @dataclass(frozen=True)
 class BroadBand:
-    """Shake without modal knowledge, of each camera or (CARRIAGE) of all alike.
+    """Shake without modal knowledge, of one camera or (CARRIAGE) common to all.
 
     low_hz, high_hz, floor, tail : see `telerig.factors.state_space.broad_band`.  slow_rms_mm,
-    slow_tau_s : an Ornstein-Uhlenbeck offset besides, which accelerometers do not feel.
+    slow_tau_s : an Ornstein-Uhlenbeck offset besides, which accelerometers do not measure.
     """
 
     rms_mm: Triple
@@ -102,8 +102,8 @@ class CarriageModel:
     """How the carriage moves along the axis.
 
     kind : "readings", no dynamics: its position at a frame is what the encoder reads there;
-        "force", an acceleration of the given RMS through three poles at corner_hz, which
-        accelerometers and slow encoders need; "jerk", white jerk of the given density.
+        "force", an acceleration of the given RMS, low-pass filtered by three poles at corner_hz,
+        which accelerometers and slow encoders need; "jerk", white jerk of the given density.
     servo : (RMS mm, Hz, damping) of a following error besides.
     """
 
@@ -140,7 +140,7 @@ class ShakeModel:
 
     @property
     def force_hz(self) -> float | None:
-        """Corner of the modes' forces; None where they are white, or have unlike ones."""
+        """Low-pass cut-off of the modes' forces; None where they are white, or differ."""
         cutoffs = {m.force_hz for m in self.modes if m.force_hz is not None}
         return cutoffs.pop() if len(cutoffs) == 1 else None
 
@@ -248,9 +248,9 @@ class Accelerometer:
 class CalibrationShare:
     """What of the calibration's uncertainty reaches the pixels: unit-variance directions.
 
-    root : (P, r), covariance = root root^T up to what no pixel feels.
+    root : (P, r), covariance = root root^T up to directions that move no pixel.
     free : per camera, names of the free intrinsics (the order of P, see `Calibration`).
-    covariance : (P, P) before the run, of which ``root`` is what is felt.
+    covariance : (P, P) before the run, ``root`` its part that moves pixels.
     drift : (6, 6) of a movement of the second camera since, which is part of it; None: held.
     """
 

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 _LOOSE_PX = 0.5
 _SHARPEST_PX = 0.01
-"""No centre is believed to be known better, whatever its table says."""
+"""Standard deviation added to that of each centre, since tables may state next to none."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class Verdict(StrEnum):
 
 
 class Flag(StrEnum):
-    """What a reader of a verdict has to know besides."""
+    """Conditions that qualify a verdict."""
 
     LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
@@ -85,8 +85,8 @@ def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
         return {}
     sigma, known = _sigmas(solution, window)
     eta, rms = shake_share(solution), shake_rms(solution)
-    settled = all(e is not None and e >= RESOLVED_ETA for e in eta)
-    lines = [] if settled else _lines(window.problem, solution.frame.model)
+    resolved = all(e is not None and e >= RESOLVED_ETA for e in eta)
+    lines = [] if resolved else _lines(window.problem, solution.frame.model)
     out = {}
     for axis, name in enumerate(AXES):
         mine = tuple(line for part, line in lines if part[axis] > 0.7)

@@ -1,10 +1,11 @@
-"""What the outline of a nearly ellipsoidal body tells: traces of its shape on the rim.
+"""The shape of a nearly ellipsoidal body from its silhouettes in two cameras.
 
 The body is x(s) = centre + A s (1 + h(s)), s on the unit sphere, A symmetric (an ellipsoid), h a
 sum of spherical harmonics of degree 3 and more. An affine camera maps the body's silhouette as it
-maps the body, so all is done in the space of s: there the body is a perturbed unit sphere,
-and to first order the rim is the great circle across the viewing direction and the outline's radial
-displacement is h along it. A point of that circle is W (cos phi, sin phi).
+maps the body, so everything is computed in the space of s. There the body is a perturbed unit
+sphere. To first order its rim is the great circle perpendicular to the viewing direction, and the
+outline's radial displacement is h along that circle (the trace of h). A point of the circle is
+W (cos phi, sin phi).
 
 An isotropic Gaussian h of degree l with variance sigma^2 per (unit mean square) coefficient has the
 covariance sigma^2 (2 l + 1) P_l(cos) along the circle (addition theorem), so the variance of its
@@ -73,11 +74,12 @@ def zonal_traces(projection: Array) -> tuple[Array, Array]:
 class EllipsePair:
     """The silhouettes' ellipses of one ellipsoid in two affine cameras, in mm.
 
-    shared : (..., 3) unit vector across both viewing directions; sides : two (..., 3) unit vectors
-    across it and one viewing direction each.  moments_mm2 : two (..., 2, 2), the ellipse's A A^T in
-    (shared, side).  rims : two (..., 2, 2), in (cos phi, sin phi): column 0 is where the rim on the
-    unit sphere reaches farthest along the shared coordinate, column 1 the quarter after it,
-    on the positive side.
+    shared : (..., 3) unit vector perpendicular to both viewing directions.
+    sides : two (..., 3) unit vectors, each perpendicular to it and to one viewing direction.
+    moments_mm2 : two (..., 2, 2), the ellipse's A A^T in (shared, side).
+    rims : two (..., 2, 2), in (cos phi, sin phi): column 0 is where the rim on the unit sphere
+        reaches farthest along the shared coordinate, column 1 a quarter turn from it, on the
+        positive side.
     """
 
     shared: Array
@@ -88,9 +90,9 @@ class EllipsePair:
     def frames(self, coupling: Array) -> tuple[Array, Array]:
         """Two (..., 3, 2) W: a rim is W (cos phi, sin phi).
 
-        Both rims hold the direction of the shared coordinate, the first unit vector here. The
-        second's other direction is (0, r, sqrt(1 - r^2)) where the first's is (0, 1, 0); the
-        coupling r (...) is what silhouettes do not tell, see `coupling_of`.
+        Both rims contain the direction of the shared coordinate, the first unit vector here. The
+        other direction is (0, 1, 0) for the first rim and (0, r, sqrt(1 - r^2)) for the second.
+        Silhouettes do not determine the coupling r (...), see `coupling_of`.
         """
         zero, one = np.zeros_like(coupling), np.ones_like(coupling)
         second = np.stack([zero, coupling, np.sqrt(1 - coupling**2)], -1)
@@ -106,8 +108,11 @@ class EllipsePair:
 
 
 def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> EllipsePair:
-    """jacobians : two (..., 2, 3), px per mm.  axes_px : two (..., 2, 2), columns are the ellipse's
-    semi-axes, phi its eccentric anomaly."""
+    """The pair of silhouettes of one ellipsoid.
+
+    jacobians : two (..., 2, 3), px per mm.  axes_px : two (..., 2, 2) whose columns are the
+    ellipse's semi-axes.
+    """
     across = [np.cross(j[..., 0, :], j[..., 1, :]) for j in jacobians]
     view = [d / np.linalg.norm(d, axis=-1, keepdims=True) for d in across]
     shared = np.cross(view[0], view[1])
@@ -125,8 +130,9 @@ def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -
 def most_spherical(pair: EllipsePair) -> Array:
     """(..., 3, 3) A A^T in mm^2 of the most spherical ellipsoid with these silhouettes.
 
-    They give five of its six numbers (the extent along the shared coordinate twice: its geometric
-    mean is taken); the sixth makes det / trace^3 largest.
+    They determine five of its six parameters; both give the extent along the shared coordinate, of
+    which the geometric mean is taken. The sixth parameter is the one with the largest
+    det / trace^3.
     """
     inverse = np.linalg.inv(np.stack([pair.shared, *pair.sides], -2))
     moments = _joined(pair.moments_mm2)
@@ -138,8 +144,8 @@ def most_spherical(pair: EllipsePair) -> Array:
 def oblate_spheroid(pair: EllipsePair) -> tuple[Array, Array]:
     """The oblate spheroid nearest to these silhouettes: its pole (..., 3) from its centre, A A^T.
 
-    The long semi-axis of every silhouette is the equator's radius; the short one shows how the pole
-    leans in that view, up to a sign, which the shared coordinate settles. Units mm.
+    The long semi-axis of every silhouette is the equator's radius; the short one gives the pole's
+    inclination in that view up to a sign, which follows from the shared coordinate. Units mm.
     """
     equator2, leaning = [], []
     for moments in pair.moments_mm2:

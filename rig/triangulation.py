@@ -1,4 +1,4 @@
-"""Points in space from two pixels: mid-point of the rays, and maximum likelihood."""
+"""Points in space from their pixels in two cameras: mid-point of the rays, maximum likelihood."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _ROWS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 class Triangulation:
     """points_mm : (..., 3) in the rig frame.
 
-    covariance_mm2 : (..., 3, 3), of the measurement alone, or with the calibration's share added
-        where a calibration did the triangulation; measurement_covariance_mm2 is without it.
+    covariance_mm2 : (..., 3, 3) of the measurement; where a calibration triangulates, the
+        calibration's own uncertainty is added, which measurement_covariance_mm2 leaves out.
     ray_miss_mm : (...,) signed distance of the two rays, along their common perpendicular
         (first direction x second direction), from the first ray to the second.
     """
@@ -48,7 +48,8 @@ def midpoint(
     sine2 = (cross**2).sum(-1)
     if np.any(sine2 < 1e-8):
         raise GeometryError(
-            "the rays of the two cameras are parallel", todo="triangulation needs two directions"
+            "the rays of the two cameras are parallel",
+            todo="triangulate with two cameras that look in different directions",
         )
     between = origin_b - origin_a
     along_a = (np.cross(between, direction_b) * cross).sum(-1) / sine2
@@ -79,10 +80,10 @@ def triangulate(
 ) -> Triangulation:
     """Points from pixels in two cameras.
 
-    uv_px : two arrays (..., 2).  sigma_px : scalar, (...,) or covariances (..., 2, 2); a tuple of
-    two for the two cameras.  method : "ml" (minimum of the whitened reprojection error,
-    Gauss-Newton from the mid-point) or "midpoint" (the 2004 method; its covariance is propagated
-    through its own formula's weights, equal for both rays).
+    uv_px : two arrays (..., 2).
+    sigma_px : scalar, (...,) or covariances (..., 2, 2); a tuple of two for the two cameras.
+    method : "ml" (minimum of the whitened reprojection error, Gauss-Newton from the mid-point) or
+        "midpoint" (the method of 2004, which weights both rays equally).
 
     Raises InputError for unequal shapes, pixels that are not finite or an unknown method,
     GeometryError for parallel rays.
@@ -97,7 +98,7 @@ def triangulate(
     if np.any(bad):
         raise InputError(
             f"{int(bad.sum())} of {bad.size} points have pixels that are not finite",
-            todo="leave out points that one camera did not see",
+            todo="leave out the points that one camera did not see",
         )
     if method not in ("ml", "midpoint"):
         raise InputError(f"unknown method {method!r}", todo='use "ml" or "midpoint"')
@@ -177,7 +178,7 @@ def _gauss_newton(
 
 
 def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
-    """(3, N) rig points -> (2, N) pixels, (2, 3, N) by the rig point; quick for untilted lenses."""
+    """(3, N) rig points -> (2, N) pixels, (2, 3, N) by the rig point; fast for untilted lenses."""
     pose = camera.camera_from_rig
     x, y, z = pose.rotation @ points + pose.translation_mm[:, None]
     kappa = camera["kappa_per_mm"]

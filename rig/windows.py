@@ -1,16 +1,17 @@
-"""Plane glass between a camera and the water, and what it does to rays.
+"""Refraction at a plane window (a glass wall) between a camera and the water.
 
-The wall stands in the camera's frame: its near face meets the camera's axis at ``distance_mm``.
-With d the unit direction of a ray in air, c = n.d and T = d - c n its part along the wall, Snell
-keeps that part but for the ratio of the indices: per mm of travel along n the ray moves sideways
-by T m / sqrt(1 - m^2 T.T), m = n_air / n_medium (Born and Wolf, Principles of Optics, 1.5). A
-point X in water, h = n.X - far face, lies on the ray that enters the glass at H when
+The window is given in the camera's frame: its near face meets the camera's axis at
+``distance_mm``. Let d be the unit direction of a ray in air, n the normal, c = n.d, and T = d - c n
+the part of d along the window. By Snell's law this part keeps its direction and is multiplied by
+the ratio of the indices: per mm of travel along n the ray moves sideways by
+T m / sqrt(1 - m^2 T.T), m = n_air / n_medium (Born and Wolf, Principles of Optics, 1.5). A point X
+in water, h = n.X - far face, lies on the ray that enters the glass at H when
 
     X = H + (thickness + h) n + A T,   A = thickness m_g / sqrt(...) + h m_w / sqrt(...).
 
-For kappa = 0 all rays share T and this is an affine map in closed form; otherwise it is solved for
-the ray. Points before the wall are taken as if the water reached there, which is what the affine
-map means by them.
+For kappa = 0 all rays have the same T and this is an affine map in closed form; otherwise it is
+solved for the ray by Newton's method. Points in front of the window are treated as if the water
+extended to them.
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ Array = NDArray[np.float64]
 
 _STEPS = 60
 _WEAK = 1e-3
-"""kappa times distance below which the affine map is start enough."""
+"""kappa times distance below which the affine map is a sufficient start of Newton's method."""
 
 
 @dataclass(frozen=True)
 class Wall:
-    """normal : (3,) unit vector in the camera's frame, away from the camera (z > 0).
+    """A plane window in the camera's frame.
 
-    distance_mm : where the camera's axis meets the near face, negative before the camera's origin.
-    indices : of the medium on the camera's side, the glass, and the medium behind it.
-    normal_sigma_rad : how well the normal is known beforehand, 0 for exactly.
+    normal : (3,) unit vector, away from the camera (z > 0).
+    distance_mm : where the camera's axis meets the near face; negative behind the camera's origin.
+    indices : refractive indices on the camera's side, of the glass, and behind it.
+    normal_sigma_rad : prior standard deviation of the normal, 0 where it is exact.
     """
 
     normal: Array
@@ -57,19 +59,20 @@ class Wall:
         return float(self.normal[2] * self.distance_mm)
 
     def turned(self, tangent: Array) -> Wall:
-        """The normal moved by ``tangent_basis(normal) @ tangent`` (rad) and made unit again."""
+        """The window whose normal is moved by ``tangent_basis(normal) @ tangent`` (rad) and
+        normalised again."""
         if not np.any(tangent):
             return self
         normal = self.normal + tangent_basis(self.normal) @ np.asarray(tangent, float)
         return replace(self, normal=normal / np.linalg.norm(normal))
 
     def turn_jacobian(self, tangent: Array) -> Array:
-        """(2, 2): tangents at the turned normal by ``tangent`` of `turned`."""
+        """(2, 2) derivative of the turned normal, in its own tangents, by ``tangent``."""
         turned, length = self.turned(tangent), float(np.sqrt(1 + np.sum(np.square(tangent))))
         return np.asarray(tangent_basis(turned.normal).T @ tangent_basis(self.normal) / length)
 
     def as_dict(self) -> dict[str, Any]:
-        """What calibration.json says of it."""
+        """The window as it stands in calibration.json."""
         return {
             "normal": [float(v) for v in self.normal],
             "distance_mm": self.distance_mm,
@@ -123,7 +126,7 @@ class _Rays:
 
 
 def tangent_basis(normal: Array) -> Array:
-    """(3, 2) orthonormal vectors along the wall, near the camera's x and y for a facing wall."""
+    """(3, 2) orthonormal vectors along the window; the camera's x and y if the normal is z."""
     x, y, z = normal
     f = 1 / (1 + z)
     return np.array([[1 - f * x * x, -f * x * y], [-f * x * y, 1 - f * y * y], [-x, -y]])
@@ -202,7 +205,8 @@ def _sideways(ratio: float, tau: Array) -> Array:
     if not np.all(inside > 0):
         raise GeometryError(
             "a ray is totally reflected at the glass wall",
-            todo="check the normal and the order of the indices: camera's side, glass, behind",
+            todo="check the wall's normal and the order of its indices in rig.toml: camera's side, "
+            "glass, behind",
         )
     return np.asarray(ratio / np.sqrt(inside))
 
@@ -231,7 +235,7 @@ def _enter(ideal: Array, kappa: float, wall: Wall) -> tuple[Array, Array, Array]
 
 
 def _refract(ideal: Array, points: Array, kappa: float, wall: Wall) -> _Rays:
-    """The rays and where they reach the height of the points above the wall."""
+    """The rays, and the points that they reach at the given points' distance from the window."""
     entry, direction, along = _enter(ideal, kappa, wall)
     unit = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     tangential = unit - along[..., None] * wall.normal
@@ -319,6 +323,7 @@ def _start(points: Array, kappa: float, wall: Wall) -> Array:
 
 def _unreached() -> GeometryError:
     return GeometryError(
-        "a point behind a glass wall is out of the camera's reach",
-        todo="check the wall's distance_mm and normal, and keep to points in front of the camera",
+        "a point behind a glass wall is out of the camera's reach: no ray of the camera meets it",
+        todo="check the wall's distance_mm and normal in rig.toml, and use points in front of the "
+        "camera only",
     )

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Differences of second differences: blind to any plane, unit gain for white noise (Immerkaer 1996).
-_PLANE_KILLER = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
+# Second differences along both axes: zero on any plane, unit gain for white noise (Immerkaer 1996).
+_SECOND_DIFFERENCES = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
 _CLIP = 3.0
 _CLIPPED_VARIANCE = 0.973337  # variance of a unit normal cut at +-3 sigma
 _CORRELATED = 3.8  # sum of the filter's squared autocorrelation: neighbours share pixels
@@ -23,8 +23,8 @@ _UNSEEN_SHARE = 0.2
 class NoiseModel:
     """Variance of a pixel's grey level: ``alpha + beta * level``, at least that of rounding.
 
-    ``step`` between grey levels; ``relative_error`` of the variance; the range of grey levels
-    ``lowest .. highest`` at which it was seen.
+    step : between grey levels. relative_error : of the variance. lowest, highest : range of the
+    grey levels at which the noise was measured.
     """
 
     alpha: float
@@ -51,10 +51,10 @@ class NoiseModel:
 def with_inner_level(
     noise: NoiseModel, inner_level: float, outer_level: float, ratio: float, pixels: int
 ) -> NoiseModel:
-    """The noise with the dots' own level, at which the image may have no flat place.
+    """The noise corrected at the dots' own grey level, where the image may have no flat pixels.
 
-    ``ratio`` is the mean whitened square of ``pixels`` residuals at ``inner_level``: the slope
-    between both levels follows from it where it differs from 1 by more than 4 sigma.
+    ratio : mean whitened square of ``pixels`` residuals at ``inner_level``. The slope between both
+    levels follows from it where it differs from 1 by more than 4 standard deviations.
     """
     unseen = max(noise.lowest - inner_level, inner_level - noise.highest)
     if unseen < _UNSEEN_SHARE * abs(inner_level - outer_level):
@@ -67,11 +67,11 @@ def with_inner_level(
 
 
 def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
-    """What the dots' own residuals, chi2_dof (N,) with dof (N,), add to the noise variance.
+    """Factor on the noise variance from the fits' own chi2_dof (N,) with dof (N,).
 
-    Where edges crowd, few flat pixels tell the noise but the fits' residuals do. Their median
-    joins the estimate by inverse variance if it agrees with it to 3 sigma; if it does not,
-    the excess is misfit rather than noise and the factor is 1.
+    Where edges are dense, few flat pixels show the noise, but the fits' residuals do. Their median
+    is averaged with the estimate by inverse variance if both agree to 3 standard deviations; if
+    not, the excess is misfit rather than noise and the factor is 1.
     """
     if chi2_dof.size == 0:
         return 1.0
@@ -92,7 +92,7 @@ def grey_step(image: NDArray[np.generic]) -> float:
 
 
 def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
-    """Standard deviation without outliers; unlike a MAD it does not stick to rounded levels."""
+    """Standard deviation without outliers; unlike a MAD it is not quantised to the grey levels."""
     sigma = float(np.std(values))
     for _ in range(rounds):
         kept = values[np.abs(values) <= _CLIP * sigma]
@@ -106,14 +106,11 @@ def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
 
 
 def high_pass(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The image minus anything locally plane, scaled to keep white noise's variance."""
+    """The image without its locally plane part, scaled to keep the variance of white noise."""
     import cv2
 
-    kernel = _PLANE_KILLER.astype(np.float32)
-    filtered: NDArray[np.float32] = cv2.filter2D(
-        image, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT
-    )
-    return filtered
+    kernel = _SECOND_DIFFERENCES.astype(np.float32)
+    return np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT))
 
 
 def rough_sigma(response: NDArray[np.float32]) -> float:
@@ -137,8 +134,8 @@ def estimate_noise(
 
     ``response`` is the :func:`high_pass` of the image.
 
-    Pixels are grouped by the level of their surroundings (their own would pick the noise); the
-    clipped variances of the groups make a line if they differ with significance.
+    Pixels are grouped by the grey level of their surroundings, as their own level holds the noise.
+    A line is fitted through the clipped variances of the groups if they differ significantly.
     """
     import cv2
 
@@ -161,7 +158,7 @@ def estimate_noise(
 
 
 def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float) -> NoiseModel:
-    """Line through variances against level; flat unless the slope stands out of its own error."""
+    """Line through the variances against grey level; constant unless its slope is significant."""
     relative = np.sqrt(2.0 * _CORRELATED / counts)
     total = float(np.sqrt(2.0 * _CORRELATED / np.sum(counts)))
     mean = float(np.average(variances, weights=counts))

@@ -1,4 +1,4 @@
-"""A strip's dots taken out of bubble images, so that they are neither bubbles nor background."""
+"""A strip's dots erased from bubble images, so that they become neither bubbles nor background."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _PAD_PX = 2.0
 
 @dataclass(frozen=True)
 class StripInImages:
-    """Where one camera sees the dots, whole or not, measured or not.
+    """Where one camera sees the strip's dots, whether whole or not, measured or not.
 
     places_mm : (K, 2) lab; epochs : (K,). shift_mm : (F, 2) of each frame. position_mm : (F,).
-    epoch_starts : first frame of each epoch; a dot's place holds for its own.
+    epoch_starts : first frame of each epoch; a dot's place is valid in its own epoch.
     line_mm : least and greatest place across the travel. diameter_mm : of a dot.
     """
 
@@ -76,8 +76,8 @@ class StripInImages:
         return self.view.in_image(places, float(self.position_mm[frame]), margin)[1]
 
     def erased(self, image: NDArray[Any], frame: int) -> NDArray[Any]:
-        """A copy with the screen's level in place of the dots, but for dots that something
-        dark touches."""
+        """A copy with the screen's level in place of the dots. Dots that something dark touches
+        stay."""
         centres = self.centres_px(frame)
         if not len(centres):
             return image
@@ -88,8 +88,10 @@ class StripInImages:
         return out
 
     def are_dots(self, frame: int, bubbles: pd.DataFrame) -> NDArray[np.bool_]:
-        """(n,) which rows, columns as those of detections, are dots of the strip: by their place
-        and size, and those that the border cuts by the strip's line."""
+        """(n,) which rows of a table of detections are dots of the strip.
+
+        They are told by their place and size; those that the border cuts, by the strip's line.
+        """
         uv = bubbles[["u_px", "v_px"]].to_numpy(float)
         size, centres = bubbles["d_eq_px"].to_numpy(float), self.centres_px(frame)
         if not len(uv):
@@ -105,7 +107,7 @@ class StripInImages:
 
 
 def _erase(image: NDArray[Any], centre: Array, radius: float) -> None:
-    """In place: a plane through the ring about the dot; nothing where the ring is not free."""
+    """Replace the dot, in place, by a plane through the ring round it if the ring is free."""
     reach = radius + _RING_PX
     low = np.maximum(np.floor(centre - reach).astype(int), 0)
     high = np.minimum(np.ceil(centre + reach).astype(int) + 1, image.shape[::-1])

@@ -1,13 +1,14 @@
 """Dots fixed to the tank followed through a run: which dot of one frame is which of the next.
 
-All dots of a frame are shifted alike against the stage's reading: by the camera's shake. A frame's
-shift is the one that most dots agree on and that is near the last one; where another shift, such
-as one spacing of an even strip further, is nearly as likely, nothing says which dot is which, and
-following begins anew with new marks.
+The camera's shake shifts all dots of a frame alike against the stage's position. The shift of a
+frame is the most likely one: most dots agree on it, and it is near the last one. Where another
+shift is nearly as likely, such as one spacing further on an evenly spaced strip, the dots cannot be
+told apart, and following starts again with new marks.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,9 +39,11 @@ _TOO_MANY_LOST = 2
 
 @dataclass
 class Mark:
-    """A dot of the strip: lab place (2,) mm, and how often and over which travel it was seen.
+    """A dot of the strip: its place (2,) in the lab in mm, and how often and where it was seen.
 
-    left_out : frames in which it should have been seen, by the reason why it was not measured.
+    epoch : which start of following it belongs to. low_px, high_px : (2,) range of its pixels.
+    left_out : number of frames in which it should have been seen, by the reason why it was not
+    measured.
     """
 
     number: int
@@ -50,11 +53,16 @@ class Mark:
     low_px: Array
     high_px: Array
     sightings: int = 0
-    left_out: dict[str, int] = field(default_factory=dict)
+    left_out: Counter[str] = field(default_factory=Counter)
 
     @property
     def travelled_px(self) -> float:
         return float(np.linalg.norm(self.high_px - self.low_px))
+
+    @property
+    def always_seen(self) -> bool:
+        """Whether it was seen whenever it was whole in the image."""
+        return not self.left_out[HIDDEN]
 
 
 @dataclass(frozen=True)
@@ -91,9 +99,10 @@ class Follower:
     def add(
         self, frame: int, dots: DotSightings, position_mm: float | None
     ) -> list[tuple[int, int]]:
-        """(dot, mark's number) of the frame's dots. position_mm : None where it is not known.
+        """(dot, mark's number) of the frame's dots that are marks.
 
-        Frames come in order; those without an image may be left out.
+        position_mm : of the stage, None where it is not known. Frames come in order; those without
+        an image may be left out.
         """
         known = position_mm is not None and bool(np.isfinite(position_mm))
         if known and position_mm is not None:
@@ -105,36 +114,34 @@ class Follower:
             self._count_missing(frame, [], known)
             return []
         predicted, sd = self._prediction(frame, place, known)
-        if not self.marks:
-            self._accept(frame, predicted, known)
-            return self._born(frame, place - predicted, dots, range(len(place)))
-        shift = self._best(place, predicted, sd)
-        if shift is None or not shift.sure:
+        if self.marks:
+            shift = self._best(place, predicted, sd)
+            if shift is not None and shift.sure:
+                self._learn(shift.mm - predicted, sd)
+                self._accept(frame, shift.mm, known)
+                return self._sighted(frame, place - shift.mm, dots, shift)
             if shift is None and known and len(self._expected(predicted)) < _TOO_MANY_LOST:
-                return self._born(frame, place - predicted, dots, range(len(place)))
+                return self._new_marks(frame, place - predicted, dots, range(len(place)))
             self._restart(frame, LOST if shift is None else AMBIGUOUS)
             predicted = predicted if known else np.zeros(2)
-            self._accept(frame, predicted, known)
-            return self._born(frame, place - predicted, dots, range(len(place)))
-        self._learn(shift.mm - predicted, sd)
-        self._accept(frame, shift.mm, known)
-        return self._taken(frame, place - shift.mm, dots, shift)
+        self._accept(frame, predicted, known)
+        return self._new_marks(frame, place - predicted, dots, range(len(place)))
 
     def kept(self, *, moved: bool) -> list[Mark]:
-        """Marks that stayed at one place of the tank while it passed through the image.
+        """Marks that stayed at one place of the tank while the tank passed through the image.
 
-        moved : False where it never did, so that being seen often must do.
+        moved : whether the tank did pass; if not, being seen often has to suffice.
         """
         far = self.diameter_mm * self._scale if moved else 0.0
         return [
             m
             for m in [*self.finished, *self.marks]
-            if m.sightings >= _CONFIRM and (m.travelled_px >= far or _always_seen(m))
+            if m.sightings >= _CONFIRM and (m.travelled_px >= far or m.always_seen)
         ]
 
     def brief(self, kept: list[Mark]) -> list[Mark]:
-        """Dots in line with the kept marks, seen too rarely to be measured, but never missed: as
-        at a run's ends."""
+        """Dots in line with the kept marks that were seen too rarely to be kept, but never missed,
+        such as those at a run's ends."""
         if not kept:
             return []
         across = np.array([m.place_mm[1] for m in kept])
@@ -143,7 +150,7 @@ class Follower:
         return [
             m
             for m in [*self.finished, *self.marks]
-            if m.number not in taken and low < m.place_mm[1] < high and _always_seen(m)
+            if m.number not in taken and low < m.place_mm[1] < high and m.always_seen
         ]
 
     def _prediction(self, frame: int, place: Array, known: bool) -> tuple[Array, float]:
@@ -156,7 +163,7 @@ class Follower:
         return shift + (0 if known else gap) * self._speed, step * np.sqrt(gap)
 
     def _first_step_mm(self, place: Array) -> float:
-        """Without an encoder the first motion is taken as well below half the dots' spacing."""
+        """Standard deviation of the first motion without an encoder: well below half a spacing."""
         if len(place) < 2:
             return self.diameter_mm
         apart = np.linalg.norm(place[:, None] - place, axis=-1)
@@ -165,10 +172,11 @@ class Follower:
     def _expected(self, shift: Array) -> list[int]:
         """Marks that should be whole in the image."""
         inside, uv = self._in_image(shift)
+        return [k for k, whole in zip(inside, self._are_whole(uv, self.margin_px + 1)) if whole]
+
+    def _are_whole(self, uv: Array, margin: float) -> list[bool]:
         size = np.array(self.view.camera.image_size_px) - 1
-        margin = self.margin_px + 1
-        whole = np.all((uv > margin) & (uv < size - margin), axis=1)
-        return [k for k, good in zip(inside, whole) if good]
+        return list(np.all((uv > margin) & (uv < size - margin), axis=1).tolist())
 
     def _in_image(self, shift: Array) -> tuple[list[int], Array]:
         """Marks whose centre is in the image, and these centres (n, 2) px."""
@@ -192,13 +200,13 @@ class Follower:
         return _Shift(shift, pairs, sure)
 
     def _cost(self, apart: Array, shift: Array, predicted: Array, sd: float) -> float:
-        """Negative log likelihood of a shift: dots off their marks, marks not seen, a leap."""
+        """Negative log-likelihood of a shift: dots off their marks, missed marks, a large step."""
         distance = np.linalg.norm(apart - shift, axis=-1).min(1)
         square = (distance / (_TOLERANCE * self.diameter_mm)) ** 2
         seen = {k for _, k in self._pairs(apart, shift)}
         missed = sum(k not in seen for k in self._expected(shift))
-        leap = float(np.sum((shift - predicted) ** 2)) / (2 * sd**2)
-        return float(np.minimum(square / 2, _UNMATCHED).sum()) + _MISSED * missed + leap
+        step = float(np.sum((shift - predicted) ** 2)) / (2 * sd**2)
+        return float(np.minimum(square / 2, _UNMATCHED).sum()) + _MISSED * missed + step
 
     def _pairs(self, apart: Array, shift: Array) -> list[tuple[int, int]]:
         """Dots and marks that are each other's nearest and agree with a shift."""
@@ -209,10 +217,10 @@ class Follower:
             (i, int(k)) for i, k in enumerate(nearest) if back[k] == i and distance[i, k] < limit
         ]
 
-    def _learn(self, leap: Array, sd: float) -> None:
-        """How far the shift goes from frame to frame in this run."""
+    def _learn(self, step: Array, sd: float) -> None:
+        """Update the RMS step of the shift from frame to frame."""
         before = self._step_mm or sd
-        square = (1 - _LEARN) * before**2 + _LEARN * float(np.sum(leap**2))
+        square = (1 - _LEARN) * before**2 + _LEARN * float(np.sum(step**2))
         self._step_mm = max(_LEAST_STEP_MM, float(np.sqrt(square)))
 
     def _accept(self, frame: int, shift: Array, known: bool) -> None:
@@ -221,10 +229,10 @@ class Follower:
         self.shift_mm[frame] = shift
         self._last = (frame, shift, known)
 
-    def _taken(
+    def _sighted(
         self, frame: int, place: Array, dots: DotSightings, shift: _Shift
     ) -> list[tuple[int, int]]:
-        """Sightings of the marks at their places; dots elsewhere may be new marks."""
+        """Sightings of the marks at their places; dots at other places may be new marks."""
         out, used = [], set()
         off = np.array([place[i] - self.marks[k].place_mm for i, k in shift.pairs])
         middle = np.median(off, axis=0) if len(off) > 2 else np.zeros(2)
@@ -234,10 +242,12 @@ class Follower:
             used.add(i)
             seen.append(k)
             if np.linalg.norm(residual) * self._scale > _GATE * np.hypot(sigma, _PLACE_PX):
-                mark.left_out[MOVED] = mark.left_out.get(MOVED, 0) + 1
+                mark.left_out[MOVED] += 1
                 continue
             mark.place_mm = mark.place_mm + _PLACE_GAIN / max(1, mark.sightings) * residual
-            self._sighted(mark, frame, dots.uv_px[i], sigma)
+            mark.sightings, mark.last_frame = mark.sightings + 1, frame
+            mark.low_px = np.minimum(mark.low_px, dots.uv_px[i])
+            mark.high_px = np.maximum(mark.high_px, dots.uv_px[i])
             out.append((i, mark.number))
         self._count_missing(frame, seen, True)
         known = np.array([m.place_mm for m in self.marks])
@@ -247,14 +257,9 @@ class Follower:
             if i not in used
             and np.linalg.norm(known - place[i], axis=-1).min() > _SAME * self.diameter_mm
         ]
-        return out + self._born(frame, place, dots, free)
+        return out + self._new_marks(frame, place, dots, free)
 
-    def _sighted(self, mark: Mark, frame: int, uv: Array, sigma: float) -> None:
-        mark.sightings += 1
-        mark.last_frame = frame
-        mark.low_px, mark.high_px = np.minimum(mark.low_px, uv), np.maximum(mark.high_px, uv)
-
-    def _born(
+    def _new_marks(
         self, frame: int, place: Array, dots: DotSightings, chosen: list[int] | range
     ) -> list[tuple[int, int]]:
         out = []
@@ -264,38 +269,27 @@ class Follower:
             self.marks.append(mark)
             out.append((i, mark.number))
             self._number += 1
-        self._forget(frame)
-        return out
-
-    def _forget(self, frame: int) -> None:
-        """Dots that were not where they had been seen: bubbles, dirt on the lens."""
+        # Dots that are not seen again where they had been are bubbles or dirt on the lens.
         self.marks = [
             m
             for m in self.marks
-            if m.sightings >= _CONFIRM or _always_seen(m) or frame - m.last_frame < _FORGET
+            if m.sightings >= _CONFIRM or m.always_seen or frame - m.last_frame < _FORGET
         ]
+        return out
 
     def _count_missing(self, frame: int, seen: list[int], known: bool) -> None:
         if self._last is None or not self.marks:
             return
         gap = 0 if known else frame - self._last[0]
         inside, uv = self._in_image(self._last[1] + gap * self._speed)
-        size = np.array(self.view.camera.image_size_px) - 1
-        whole = np.all((uv > self.margin_px) & (uv < size - self.margin_px), axis=1)
-        for k, good in zip(inside, whole):
+        for k, whole in zip(inside, self._are_whole(uv, self.margin_px)):
             if k not in seen:
-                why = HIDDEN if good else BORDER
-                left = self.marks[k].left_out
-                left[why] = left.get(why, 0) + 1
+                self.marks[k].left_out[HIDDEN if whole else BORDER] += 1
 
     def _restart(self, frame: int, why: str) -> None:
-        """New marks from here on; those so far are not seen again."""
+        """Start again with new marks; the marks so far are not seen again."""
         self.breaks.append((frame, why))
         self.finished += self.marks
         self.marks = []
         self.epoch_starts.append(frame)
         self._speed, self._step_mm = np.zeros(2), None
-
-
-def _always_seen(mark: Mark) -> bool:
-    return not mark.left_out.get(HIDDEN)

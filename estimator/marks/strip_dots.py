@@ -1,7 +1,7 @@
-"""Dots of a strip fixed to the tank in bubble images: where they may be, and each frame's dots.
+"""Dots of a strip that is fixed to the tank: where in the image they may be, and each frame's dots.
 
-The luminance fit of `dots` measures them. What is not as large, as dark and as well fitted as the
-strip's dots is left out: bubbles, dirt, and dots that a bubble covers or the border cuts.
+The luminance fit of `dots` measures them. Blobs that are not as large, as dark and as well fitted
+as the strip's dots are left out: bubbles, dirt, and dots that a bubble covers or the border cuts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.dots.locate import measure_dots
-from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
     from telerig.estimator.dots.fit.candidates import Polarity
@@ -23,7 +22,7 @@ Array = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 BORDER_PX = 1.5
-"""Between a dot's blurred rim and the image's border."""
+"""Least distance between a dot's blurred edge and the image's border."""
 
 _FIRST_SIZE = (0.7, 1.35)
 _SIZE, _CONTRAST = 0.15, 0.25
@@ -36,10 +35,11 @@ _RING_TAIL, _RING_STEP = 0.1, 0.25
 
 @dataclass(frozen=True)
 class DotLook:
-    """What a strip's dots look like to one camera, and where in the image they may be.
+    """The appearance of a strip's dots in one camera, and where in the image they may be.
 
-    windows : image parts that the strip passes through. a_px >= b_px : usual semi-axes.
-    contrast : usual step over the brighter level. chi2_dof : usual misfit. blur_px : of the edge.
+    windows : image parts that the strip passes through. All others are medians over the dots:
+    a_px >= b_px : semi-axes. contrast : grey step over the brighter level. chi2_dof : misfit of the
+    luminance fit. blur_px : of the edge.
     """
 
     polarity: Polarity
@@ -65,17 +65,6 @@ class DotSightings:
     sigma_px: Array
 
 
-def travel_in_image(camera: Camera, axis_rig: Array) -> Array:
-    """(2,) px per mm of travel, of what is fixed to the tank, in the middle of the image."""
-    width, height = camera.image_size_px
-    origin, _ = camera.unproject(np.array([(width - 1) / 2, (height - 1) / 2]))
-    step = 1e-3
-    return np.asarray(
-        (camera.project(origin - step * axis_rig) - camera.project(origin + step * axis_rig))
-        / (2 * step)
-    )
-
-
 def learn_look(
     images: Iterable[NDArray[Any]],
     travel_px: Array,
@@ -83,10 +72,11 @@ def learn_look(
     polarity: Polarity,
     diameter_px: float,
 ) -> DotLook | None:
-    """From a sample of whole images; None where no strip is seen.
+    """The appearance of the strip's dots in a sample of whole images; None where no strip is seen.
 
-    travel_px : (2,) along which the strip passes through the image, any length.
-    A strip shows in several images at the same distance from the line of travel; bubbles do not.
+    travel_px : (2,) direction in which the strip passes through the image, of any length.
+    A strip's dots lie at the same distance from the line of travel in several images; bubbles do
+    not.
     """
     across = np.array([-travel_px[1], travel_px[0]]) / np.linalg.norm(travel_px)
     rows, shape, count = [], (0, 0), 0
@@ -139,7 +129,7 @@ _COLUMNS = (
 
 
 def _is_free(image: NDArray[Any], dot: Array, look: DotLook) -> bool:
-    """Whether the screen shows all round a dot: neither a bubble's rim nor its bright heart."""
+    """Whether the screen is seen all round a dot: neither a bubble's edge nor its bright middle."""
     u, v, inner, outer = dot[0], dot[1], dot[9], dot[10]
     first = look.a_px + 3 * look.blur_px
     last = first + max(3.0, 0.8 * look.a_px)
@@ -186,7 +176,10 @@ def _bands(seen: Array, across: Array, diameter_px: float) -> list[NDArray[np.in
 
 
 def _window(place: Array, across: Array, diameter_px: float, shape: Sequence[int]) -> Window:
-    """The part of the image within reach of the band between the least and greatest ``place``."""
+    """The part of the image that the band from the least to the greatest ``place`` crosses.
+
+    place : coordinates along ``across`` of the dots of one strip.
+    """
     reach = 1.5 * diameter_px + 6
     low, high = float(place.min()) - reach, float(place.max()) + reach
     height, width = shape
@@ -201,7 +194,7 @@ def _window(place: Array, across: Array, diameter_px: float, shape: Sequence[int
 
 
 def _single(dots: Array, diameter_px: float) -> Array:
-    """Each dot once, where windows overlap."""
+    """The dots without those that are found twice because windows overlap."""
     kept: list[Array] = []
     for dot in dots:
         if all(np.hypot(*(dot[:2] - other[:2])) > diameter_px / 2 for other in kept):

@@ -1,4 +1,4 @@
-"""Places in the tank as one camera sees them: across its rays, with the stage's travel put in."""
+"""Places in the tank as one camera sees them, perpendicular to its rays."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TankView:
-    """Lab places (2,) in mm: along the travel, and across it, as far as the camera sees them.
+    """Lab places (2,) in mm: the coordinates along the travel and across it that one camera sees.
 
-    basis : (2, 3) unit vectors in rig axes across the camera's middle ray. origin : (3,) rig mm.
+    basis : (2, 3) unit vectors in rig axes, perpendicular to the camera's middle ray. origin : (3,)
+    rig mm.
     """
 
     camera: Camera
@@ -42,10 +43,17 @@ class TankView:
 
     @property
     def px_per_mm(self) -> float:
-        """In the middle of the image."""
+        """Scale in the middle of the image."""
         steps = self.origin + 1e-2 * np.concatenate([self.basis, -self.basis])
         uv = self.camera.project(steps)
         return float(np.sqrt(abs(np.linalg.det((uv[:2] - uv[2:]) / 2e-2))))
+
+    @property
+    def travel_px_per_mm(self) -> Array:
+        """(2,) px that what is fixed to the tank moves per mm of travel, in the image's middle."""
+        step_mm = 1e-3
+        before, after = (self.origin + s * step_mm * self.axis_rig for s in (1, -1))
+        return (self.camera.project(after) - self.camera.project(before)) / (2 * step_mm)
 
     def lab_mm(self, uv_px: Array, position_mm: float) -> Array:
         """(n, 2) of pixels (n, 2)."""
@@ -64,7 +72,7 @@ class TankView:
     def in_image(
         self, lab_mm: Array, position_mm: float, margin_px: float = 0.0
     ) -> tuple[list[int], Array]:
-        """Which of (n, 2) lab places lie in the image or so much outside it, and their pixels."""
+        """Which of (n, 2) lab places lie in the image or a margin outside it, and their pixels."""
         width, height = self.camera.image_size_px
         offset = lab_mm - self.basis @ self.axis_rig * position_mm
         reach = 0.6 * np.hypot(width, height) / self.px_per_mm

@@ -19,7 +19,6 @@ from telerig.estimator.marks.strip_dots import (
     DotSightings,
     find_dots,
     learn_look,
-    travel_in_image,
 )
 from telerig.estimator.marks.tank_view import TankView
 from telerig.io.files.atomic import atomic_path
@@ -136,7 +135,7 @@ def _look(
     pictures = (run.image(name, int(frame)) for frame in frames)
     return learn_look(
         (p for p in pictures if p is not None),
-        travel_in_image(view.camera, view.axis_rig),
+        view.travel_px_per_mm,
         polarity=told.polarity,
         diameter_px=told.dot_diameter_mm * view.px_per_mm,
     )

@@ -31,10 +31,9 @@ def shape_from_axes(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> A
 
 def axes_from_shape(shape_px: ArrayLike) -> Array:
     """(..., 3) semi-axes a >= b and angle in (-pi/2, pi/2] from (..., 3) shape numbers."""
-    m11, m12, m22 = np.moveaxis(np.asarray(shape_px, dtype=np.float64), -1, 0)
-    mean, half = 0.5 * (m11 + m22), np.hypot(0.5 * (m11 - m22), m12)
-    angle = 0.5 * np.arctan2(m12, 0.5 * (m11 - m22))
-    return np.stack([mean + half, mean - half, angle], axis=-1)
+    shape = np.asarray(shape_px, dtype=np.float64)
+    angle = 0.5 * np.arctan2(shape[..., 1], 0.5 * (shape[..., 0] - shape[..., 2]))
+    return np.stack([*semi_axes(shape), angle], axis=-1)
 
 
 def extent_px(shape_px: Array) -> Array:
@@ -43,7 +42,7 @@ def extent_px(shape_px: Array) -> Array:
 
 
 def approximate_distance_px(shape_px: Array, du_px: Array, dv_px: Array) -> Array:
-    """Signed distance to the ellipse to first order (positive outside), for choosing pixels.
+    """Signed distance to the ellipse to first order, positive outside; for the choice of pixels.
 
     ``shape_px`` (..., 3); ``du_px, dv_px`` (..., P) offsets from the centre, or, for one ellipse,
     any that broadcast together.
@@ -237,7 +236,7 @@ def _bend(
 
 def semi_axes(shape_px: Array) -> tuple[Array, Array]:
     """Semi-axes a >= b [px], each (...), of (..., 3) shape numbers."""
-    m11, m12, m22 = shape_px[..., 0], shape_px[..., 1], shape_px[..., 2]
+    m11, m12, m22 = np.moveaxis(shape_px, -1, 0)
     mean, half = 0.5 * (m11 + m22), np.hypot(0.5 * (m11 - m22), m12)
     return mean + half, mean - half
 

@@ -1,4 +1,4 @@
-"""What the dots of an image tell about each other: how the light falls, and the common blur."""
+"""Priors for each dot from the other dots of the image: the illumination, and the common blur."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _BLUR_SPREAD = 0.1
 def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list[Prior]:
     """The relative contrast gradient expected at each fitted dot.
 
-    A quadratic in position is fitted to log |contrast|, robustly, with a prior on its coefficients
-    (light changes by about exp(0.4) over 1000 px) in place of thresholds on the number of dots.
-    Below 6 dots a bright background says more than the other dots: see :func:`background_tie`.
+    A quadratic in position is fitted robustly to log |contrast|. A prior on its coefficients (light
+    changes by about exp(0.4) over 1000 px) replaces thresholds on the number of dots. Below 6 dots
+    a bright background tells more than the other dots do: see `background_tie`.
     """
     if len(fits) < _ENOUGH_DOTS:
         return [background_tie(fit) for fit in fits]
@@ -39,9 +39,9 @@ def contrast_gradients(fits: list[DotFit], image_shape: tuple[int, ...]) -> list
 
 
 def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
-    """The priors with the usual edge sigma, to a tenth or to its actual spread over the image.
+    """The priors with the median edge sigma, to 10 % or to its spread over the image.
 
-    It matters for dots no larger than the blur, whose size, contrast and blur look alike.
+    It matters for dots no larger than the blur, whose size, contrast and blur have similar effects.
     """
     if len(fits) < _ENOUGH_DOTS:
         return priors
@@ -52,20 +52,16 @@ def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
 
 
 def background_tie(fit: DotFit) -> Prior:
-    """Prior for a dot alone: the background's relative gradient if it is bright, else none."""
+    """Prior for a single dot: the background's relative gradient if the background is bright."""
     if fit.levels[0] > 0.5 * abs(fit.levels[3]):
         return Prior(sigma_per_px=1e-4, tie_to_background=True)
     return Prior(sigma_per_px=PRIOR_GRADIENT_PER_PX)
 
 
-def _design(position: Array) -> Array:
-    x, y = position[:, 0], position[:, 1]
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-
-
 def _quadratic(position: Array, value: Array, own: Array, slope: float) -> tuple[Array, Array]:
     """Coefficients (6,) and covariance (6, 6) by reweighted least squares with a prior."""
-    design = _design(position)
+    x, y = position.T
+    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     prior = np.diag([1e-6, *[1.0 / slope**2] * 5])
     scatter, weight = 0.05, np.ones(len(value))
     for _ in range(8):

@@ -2,17 +2,20 @@
 
 A pixel's grey level is ``B0 + B1 x + B2 y`` plus the blurred image of an ellipse of grey level
 ``C + C1 x + C2 y``, with (x, y) the offset from the window's middle in units of the dot's radius
-(:mod:`telerig.estimator.dots.fit.blurred_ellipse`). A dot's contrast gradient (C1, C2) can hardly
-be told from a shift of its centre, so it never floats freely: it carries a Gaussian prior.
+(:mod:`telerig.estimator.dots.fit.blurred_ellipse`). A dot's contrast gradient (C1, C2) is nearly
+indistinguishable from a shift of its centre, so it is never free: it has a Gaussian prior.
 
-Many dots are computed at once, as arrays with a leading axis of D dots whose P pixels are padded
-to the most: one dot's arrays are so small that calls would cost more than sums.
+Many dots are computed at once, as arrays with a leading axis of D dots whose pixels are padded to
+the largest number P: one dot's arrays are so small that the calls would take most of the time.
+
+theta (D, 6) holds centre (2), shape (3) and sigma; levels (D, 6) holds B0, B1, B2, C, C1, C2; the
+parameters (D, 12) are both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,15 +34,19 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _FEW_PIXELS = 1e-9
-"""Of a pixel's weight on no grey at all, so that too few pixels tell something."""
-EDGE_EXPANSION_LIMIT = 0.25  # centres agree with the exact sum to 1e-5 px, levels to 5e-4
+"""Weight of grey level 0 against one pixel, so that too few pixels still have a solution."""
+EDGE_EXPANSION_LIMIT = 0.25
+"""Curvature times sigma up to which centres agree with the exact sum to 1e-5 px, levels to 5e-4."""
+_PRIOR = np.dtype([(f.name, type(f.default)) for f in fields(Prior)])
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels of D fits: offsets from their origin pixels, and data, (D, P); ``there`` of any.
+    """Pixels of D fits, padded to P: offsets x, y from the origin pixel, and grey levels, (D, P).
 
-    ``grids`` keep rows, columns and mask of each window. Priors are arrays (D,).
+    there : (D, P) False for padding. counts : (D,) pixels that are there.
+    grids : rows, columns and mask of each window. origin : (D, 2). radius : (D,) px.
+    prior : (D,) structured array with the fields of `Prior`.
     """
 
     x: Array
@@ -51,50 +58,21 @@ class Pixels:
     origin: Array
     radius: Array
     noise: NoiseModel
-    prior: _Priors
+    prior: NDArray[np.void]
 
     def of(self, dots: Ints) -> Pixels:
-        """Some of the dots."""
+        """The pixels of some of the dots."""
         if len(dots) == len(self.x):
             return self
-        return Pixels(
-            self.x[dots], self.y[dots], self.grey[dots], self.there[dots], self.counts[dots],
-            tuple(self.grids[i] for i in dots), self.origin[dots], self.radius[dots], self.noise,
-            self.prior.of(dots),
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Priors:
-    """The numbers of `Prior`, each (D,)."""
-
-    slope_per_px: Array
-    sigma_per_px: Array
-    tied: Mask
-    edge_px: Array
-    edge_spread_px: Array
-
-    def of(self, dots: Ints) -> _Priors:
-        return _Priors(
-            self.slope_per_px[dots], self.sigma_per_px[dots], self.tied[dots], self.edge_px[dots],
-            self.edge_spread_px[dots],
-        )  # fmt: skip
-
-
-def _priors(priors: Sequence[Prior]) -> _Priors:
-    return _Priors(
-        np.array([[p.u_per_px, p.v_per_px] for p in priors]),
-        np.array([p.sigma_per_px for p in priors]),
-        np.array([p.tie_to_background for p in priors]),
-        np.array([p.edge_px for p in priors]),
-        np.array([p.edge_spread_px for p in priors]),
-    )
+        names = ("x", "y", "grey", "there", "counts", "origin", "radius", "prior")
+        arrays = {name: getattr(self, name)[dots] for name in names}
+        return replace(self, grids=tuple(self.grids[i] for i in dots), **arrays)
 
 
 def gather(
     windows: Sequence[Window], starts: Sequence[Start], noise: NoiseModel, priors: Sequence[Prior]
 ) -> Pixels:
-    """The pixels that each window's mask shows, those of the shorter ones padded."""
+    """The pixels that each window's mask shows, padded to the largest number."""
     counts = np.array([np.count_nonzero(w.mask) for w in windows])
     x, y, grey = np.zeros((3, len(windows), max(int(counts.max()), 1)))
     origin, radius, grids = np.empty((len(windows), 2)), np.empty(len(windows)), []
@@ -109,9 +87,8 @@ def gather(
         grey[i, : counts[i]] = window.grey[window.mask]
         grids.append((rows, columns, window.mask))
     there = np.arange(x.shape[1]) < counts[:, None]
-    return Pixels(
-        x, y, grey, there, counts, tuple(grids), origin, radius, noise, _priors(priors)
-    )  # fmt: skip
+    prior = np.array([astuple(p) for p in priors], _PRIOR)
+    return Pixels(x, y, grey, there, counts, tuple(grids), origin, radius, noise, prior)
 
 
 def _coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
@@ -135,11 +112,11 @@ def _coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
 def grey_levels(pixels: Pixels, theta: Array, levels: Array) -> tuple[Array, Array, Array]:
     """Grey levels (D, P), their derivatives (D, 12, P) by theta and levels, and the levels (D, 6).
 
-    Instead of ``levels`` that are NaN, those that fit best.
+    Levels that are NaN are replaced by those that fit best.
 
-    The light's slope acts before the blur: the Gaussian of x F_sharp is x F + sigma^2 dF/dx.
-    Left out, this shifts a centre by sigma^2 times the relative slope. (How that small term
-    itself changes with theta is left out of the derivatives.)
+    The contrast gradient acts before the blur: the Gaussian of x F_sharp is x F + sigma^2 dF/dx.
+    Without that term a centre would shift by sigma^2 times the relative gradient. The derivatives
+    of this small term by theta are neglected.
     """
     coverage, gradient = _coverage(pixels, theta)
     radius = pixels.radius[:, None]
@@ -174,14 +151,16 @@ def transposed(x: Array) -> Array:
 def prior_rows(pixels: Pixels, parameters: Array) -> tuple[Array, Array]:
     """Three whitened prior rows: Jacobian (D, 3, 12) by the parameters, and residual (D, 3)."""
     prior, radius, levels = pixels.prior, pixels.radius, parameters[:, 6:]
-    weight = 1.0 / (prior.sigma_per_px * radius * np.maximum(np.abs(levels[:, 3]), 1e-12))
+    tied = prior["tie_to_background"]
+    weight = 1.0 / (prior["sigma_per_px"] * radius * np.maximum(np.abs(levels[:, 3]), 1e-12))
     rows = np.zeros((len(parameters), 3, 12))
     rows[:, 0, 10] = rows[:, 1, 11] = weight
-    tie = np.where(prior.tied, levels[:, 3] / np.where(prior.tied, levels[:, 0], 1.0), 0.0)
+    tie = np.where(tied, levels[:, 3] / np.where(tied, levels[:, 0], 1.0), 0.0)
     rows[:, 0, 7] = rows[:, 1, 8] = -tie * weight
-    told = np.where(prior.tied, 0.0, radius * weight)
-    rows[:, :2, 9] = -prior.slope_per_px * told[:, None]
-    rows[:, 2, 5] = 1.0 / prior.edge_spread_px
+    slope_weight = np.where(tied, 0.0, radius * weight)
+    rows[:, 0, 9] = -prior["u_per_px"] * slope_weight
+    rows[:, 1, 9] = -prior["v_per_px"] * slope_weight
+    rows[:, 2, 5] = 1.0 / prior["edge_spread_px"]
     gap = -(rows @ parameters[..., None])[..., 0]
-    gap[:, 2] += prior.edge_px / prior.edge_spread_px
+    gap[:, 2] += prior["edge_px"] / prior["edge_spread_px"]
     return rows, gap

@@ -1,9 +1,10 @@
-"""Least-squares fit of dots' grey levels by Levenberg-Marquardt, outliers left out."""
+"""Least-squares fit of dots' grey levels by Levenberg-Marquardt, without outliers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +30,11 @@ _INSIDE = 0.9
 _OUTLIER_SIGMA = 5.0
 _MAX_OUTLIER_SHARE = 0.15
 _PIXELS_AT_ONCE = 8_000
-"""Whose arrays stay in a core's cache."""
+"""Pixels of one chunk of dots, so that the arrays stay in a core's cache."""
 
 
 def _admissible(theta: Array, radius: Array) -> Mask:
-    """Near where the fit began, whose radius it was: a fit must not run away over the image."""
+    """(D,) whether theta is near the start of the fit: no fit may run away over the image."""
     a, b = semi_axes(theta[:, 2:5])
     sigma = theta[:, 5]
     near = np.max(np.abs(theta[:, :2]), axis=1) < radius + 2.0
@@ -44,7 +45,7 @@ def _admissible(theta: Array, radius: Array) -> Mask:
 
 @dataclass
 class _State:
-    """Where D iterations stand: parameters (D, 12), model, residual and weight (D, P), Jacobian
+    """State of D iterations: parameters (D, 12), model, residual and weight (D, P), Jacobian
     (D, 12, P), chi-square (D,). A weight of 0 leaves a pixel out."""
 
     parameters: Array
@@ -55,13 +56,13 @@ class _State:
     chi2: Array
 
     def take(self, dots: Ints, other: _State, rows: Mask) -> None:
-        """Those dots' state from rows of another."""
-        for name in ("parameters", "model", "jacobian", "residual", "weight", "chi2"):
-            getattr(self, name)[dots] = getattr(other, name)[rows]
+        """Replace the state of some dots by rows of another state."""
+        for name, array in vars(self).items():
+            array[dots] = getattr(other, name)[rows]
 
 
 def _state(pixels: Pixels, theta: Array, levels: Array, weight: Array | None = None) -> _State:
-    """weight : (D, P); None takes the noise's at the model."""
+    """weight : (D, P); None takes the inverse noise variance at the model's grey levels."""
     model, jacobian, levels = grey_levels(pixels, theta, levels)
     if weight is None:
         weight = pixels.there / pixels.noise.variance(model)
@@ -79,65 +80,65 @@ def _chi2(pixels: Pixels, parameters: Array, residual: Array, weight: Array) -> 
 
 
 def _normal_equations(pixels: Pixels, state: _State, dots: Ints) -> tuple[Array, Array]:
-    """Of some dots, (N, 12, 12) and (N, 12); ``pixels`` has those alone."""
+    """Information (N, 12, 12) and gradient (N, 12) of some dots; ``pixels`` holds only those."""
     rows, gap = prior_rows(pixels, state.parameters[dots])
     jacobian = state.jacobian if len(dots) == len(state.chi2) else state.jacobian[dots]
     weighted = jacobian * state.weight[dots, None]
     information = weighted @ transposed(jacobian) + transposed(rows) @ rows
-    pull = weighted @ state.residual[dots, :, None] + transposed(rows) @ gap[..., None]
-    return information, pull[..., 0]
+    gradient = weighted @ state.residual[dots, :, None] + transposed(rows) @ gap[..., None]
+    return information, gradient[..., 0]
 
 
-def _scales(information: Array) -> Array:
+def _equilibrated(information: Array) -> tuple[Array, Array]:
+    """Information with a unit diagonal, and the square roots (D, 12) of its own diagonal."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
-    scales: Array = np.sqrt(np.maximum(diagonal, 1e-300))
-    return scales
+    scale: Array = np.sqrt(np.maximum(diagonal, 1e-300))
+    return information / (scale[:, :, None] * scale[:, None]), scale
 
 
-def _damped_steps(information: Array, pull: Array, damping: Array) -> Array:
-    scale = _scales(information)
-    equilibrated = information / (scale[:, :, None] * scale[:, None])
+def _damped_steps(information: Array, gradient: Array, damping: Array) -> Array:
+    equilibrated, scale = _equilibrated(information)
     equilibrated += damping[:, None, None] * np.eye(information.shape[-1])
-    step: Array = np.linalg.solve(equilibrated, (pull / scale)[..., None])[..., 0] / scale
+    step: Array = np.linalg.solve(equilibrated, (gradient / scale)[..., None])[..., 0] / scale
     return step
 
 
 def _descend(
     pixels: Pixels, state: _State, dots: Ints, *, iterations: int, tolerance: float
 ) -> Ints:
-    """Levenberg-Marquardt of some dots at fixed weights, in place; returns those that settled.
+    """Levenberg-Marquardt of some dots at fixed weights, in place; returns those that converged.
 
-    Until a step would gain less than ``tolerance`` in chi-square, relative to the chi-square per
-    degree of freedom where that is above 1. The last step is taken without looking again: it is
-    small against the noise.
+    A dot has converged when a step would reduce chi-square by less than ``tolerance``, relative to
+    the chi-square per degree of freedom where that is above 1. The last step is taken without
+    evaluating the model again, since it is small against the noise.
     """
     damping = np.full(len(state.chi2), 1e-4)
-    settled: list[Ints] = []
+    done_parts: list[Ints] = []
     for _ in range(iterations):
         if not len(dots):
             break
         some = pixels.of(dots)
-        information, pull = _normal_equations(some, state, dots)
-        step = _damped_steps(information, pull, damping[dots])
+        information, gradient = _normal_equations(some, state, dots)
+        step = _damped_steps(information, gradient, damping[dots])
         moved = state.parameters[dots] + step
         sound = _admissible(moved[:, :6], some.radius)
-        gain = np.sum(step * pull, axis=1)
+        gain = np.sum(step * gradient, axis=1)
         small = gain < tolerance * np.maximum(1.0, state.chi2[dots] / np.maximum(some.counts, 1))
         last = small & (damping[dots] <= 1e-3) & sound
         done = dots[last]
         state.parameters[done] = moved[last]
         state.residual[done] -= (step[last, None] @ state.jacobian[done])[:, 0]
-        settled.append(done)
+        done_parts.append(done)
         _try(pixels, state, dots, moved, sound & ~last, damping)
         dots = dots[~last]
         dots = dots[damping[dots] <= 1e8]
-    return np.concatenate(settled) if settled else dots
+    return np.concatenate(done_parts) if done_parts else dots
 
 
 def _try(
     pixels: Pixels, state: _State, dots: Ints, moved: Array, sound: Mask, damping: Array
 ) -> None:
-    """Go where chi-square is less; damp the others more."""
+    """Take the steps that reduce chi-square; increase the damping of the others."""
     tried = dots[sound]
     better = np.zeros(len(dots), dtype=np.bool_)
     if len(tried):
@@ -178,7 +179,7 @@ def fit_dots(
 
 
 def _chunks(windows: Sequence[Window]) -> Iterator[list[int]]:
-    """Windows of like size, as many as stay in the cache together."""
+    """Positions of windows of similar size, as many as stay in the cache together."""
     counts = [int(np.count_nonzero(w.mask)) for w in windows]
     chunk: list[int] = []
     for i in sorted(range(len(windows)), key=counts.__getitem__):
@@ -203,11 +204,11 @@ def _first(pixels: Pixels, starts: Sequence[Start]) -> tuple[Array, Array]:
 def _fit(
     pixels: Pixels, state: _State, iterations: int, tolerance: float, outlier_rounds: int
 ) -> Mask:
-    """Bring the state to its minimum; returns which dots settled there."""
+    """Bring the state to its minimum; returns (D,) which dots converged."""
     converged = np.zeros(len(pixels.x), dtype=np.bool_)
     dots: Ints = np.arange(len(pixels.x))
-    settled = _descend(pixels, state, dots, iterations=iterations, tolerance=tolerance)
-    converged[settled] = True
+    descend = partial(_descend, pixels, state, iterations=iterations, tolerance=tolerance)
+    converged[descend(dots)] = True
     for _ in range(outlier_rounds):
         variance = pixels.noise.variance(state.model)
         bad = _outliers(pixels, state.residual, variance, dots)
@@ -223,13 +224,12 @@ def _fit(
             pixels.of(dots), state.parameters[dots], state.residual[dots], state.weight[dots]
         )
         converged[dots] = False
-        settled = _descend(pixels, state, dots, iterations=iterations, tolerance=tolerance)
-        converged[settled] = True
+        converged[descend(dots)] = True
     return converged & (pixels.counts > PARAMETERS)
 
 
 def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> Mask:
-    """(N, P), of some dots."""
+    """(N, P) which pixels of some dots are outliers."""
     whitened = np.abs(residual[dots]) / np.sqrt(variance[dots])
     limit = np.empty((len(dots), 1))
     for k, count in enumerate(np.maximum(pixels.counts[dots], 1)):
@@ -241,14 +241,12 @@ def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> M
 
 
 def _inverses(information: Array) -> Array:
-    scale = _scales(information)
-    outer = scale[:, :, None] * scale[:, None]
-    equilibrated = information / outer
+    equilibrated, scale = _equilibrated(information)
     try:
         inverse = np.linalg.inv(equilibrated)
     except np.linalg.LinAlgError:
         inverse = np.linalg.pinv(equilibrated, hermitian=True)
-    covariance: Array = inverse / outer
+    covariance: Array = inverse / (scale[:, :, None] * scale[:, None])
     return covariance
 
 
@@ -290,7 +288,7 @@ def _results(pixels: Pixels, state: _State, converged: Mask) -> list[DotFit]:
 
 
 def _mean_where(values: Array, where: Mask, otherwise: float) -> Array:
-    """(D,) means of the chosen pixels of (D, P), and what to take where there are none."""
+    """(D,) means over the chosen pixels of (D, P); ``otherwise`` where none is chosen."""
     count = np.count_nonzero(where, axis=1)
     total = np.sum(np.where(where, values, 0.0), axis=1)
     return np.where(count > 0, total / np.maximum(count, 1), otherwise)

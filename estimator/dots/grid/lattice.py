@@ -1,9 +1,9 @@
 """Grow a lattice from unordered dots: which of them lie on one grid, and at which places.
 
-The dots are circles, so their median ellipse tells how the image is foreshortened; mapping it to
-a circle makes the grid rectangular to first order, however strong the tilt. From there the grid
-grows place by place, each predicted from the dots around it, so perspective and distortion only
-have to be smooth.
+The dots are circles, so their median ellipse tells the foreshortening. Mapping that ellipse to a
+circle makes the grid rectangular to first order, however strong the tilt. From there the grid
+grows place by place, each predicted from the dots around it, so that perspective and distortion
+only have to be smooth.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ OFF_PLACE = "off its place on the grid"
 SECOND_DOT = "a second dot at an occupied place"
 
 _REACH = 0.25
-"""A dot is at a predicted place when it is within this part of the local pitch."""
+"""A dot is at a predicted place when it is within this fraction of the local pitch."""
 _ROUGH = 0.05
-"""Of a true grid the median dot is within this part of the pitch of where its neighbours say."""
+"""On a true grid the median distance from the neighbours' prediction is below this fraction of the
+pitch."""
 _PATCH = 60
 _SEEDS = 4
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Dots at the places of one grid. The axes of the places turn as u and v do (det > 0).
+    """Dots at the places of one grid. The axes of the places are right-handed in (u, v).
 
     index : (n,) positions in the given arrays of the dots that have a place.
     places : (n, 2) integer place of each.
@@ -113,7 +114,7 @@ def grow_lattice(
 
 
 def _best_growth(flat: Array, pitch_ratio: float) -> _Growth | None:
-    """The best of a few starts; the first that takes in nearly all dots is good enough."""
+    """The best of a few starts; the first that covers nearly all dots is good enough."""
     best: _Growth | None = None
     for basis in _bases(flat, pitch_ratio):
         for seed in _seeds(flat, basis):
@@ -127,7 +128,7 @@ def _best_growth(flat: Array, pitch_ratio: float) -> _Growth | None:
 
 
 def _bases(flat: Array, pitch_ratio: float) -> list[Array]:
-    """Pairs of frequent steps that are upright on each other in the pitch ratio, likely first."""
+    """Pairs of frequent perpendicular steps whose lengths have the pitch ratio, likeliest first."""
     ratio = max(pitch_ratio, 1 / pitch_ratio)
     steps, votes = _frequent_steps(flat, min(len(flat) - 1, round(4 + 6 * ratio)))
     length = np.linalg.norm(steps, axis=1)
@@ -193,19 +194,19 @@ class _Growth:
         return np.asarray(self.place[:, 0] >= 0)
 
     def score(self, pitch_ratio: float) -> float:
-        """Dots on the grid, less when they leave many places empty or it is not upright."""
+        """Number of dots on the grid, reduced where it has many gaps or is not rectangular."""
         dots = np.flatnonzero(self.placed())
         i, j = self.place[dots].T
         runs = (self.at[i + 1, j] >= 0).sum() + (self.at[i, j + 1] >= 0).sum()
         full = min(1.0, 0.5 + float(runs) / (2 * len(dots)))
         one, two = np.median(self.basis[dots], axis=0)
         length = np.hypot(*one), np.hypot(*two)
-        lean = abs(one @ two) / (length[0] * length[1])
+        skew = abs(one @ two) / (length[0] * length[1])
         stretch = abs(abs(np.log(length[0] / length[1])) - abs(np.log(pitch_ratio)))
-        return len(dots) * full * float(np.exp(-((lean / 0.3) ** 2) - (stretch / 0.3) ** 2))
+        return len(dots) * full * float(np.exp(-((skew / 0.3) ** 2) - (stretch / 0.3) ** 2))
 
     def grow(self) -> None:
-        """Add dots round by round until no place next to the grid, or two away, has one."""
+        """Add dots round by round until no place within two steps of the grid has one."""
         front = self.place[self.placed()]
         while len(front):
             front = self._round(front, NEIGHBOURS[np.abs(NEIGHBOURS).sum(1) == 1])
@@ -245,9 +246,9 @@ class _Growth:
 
 
 def _drop_false_dots(growth: _Growth, image_from_flat: Array, floor_px: float) -> None:
-    """Take out dots that are off the smooth surface of their neighbours, then grow again.
+    """Remove dots that are off their place as predicted by their neighbours, then grow again.
 
-    Global consistency: the residuals to one homography must be smooth over the grid.
+    The residuals from one homography have to be smooth over the grid.
     """
     for _ in range(8):
         dots = np.flatnonzero(growth.placed())
@@ -270,7 +271,7 @@ def _drop_false_dots(growth: _Growth, image_from_flat: Array, floor_px: float) -
 
 
 def _is_grid(growth: _Growth) -> bool:
-    """Whether enough dots lie on it, closely enough: scattered dots can look like a few places."""
+    """Whether enough dots lie closely enough on it: by chance a few scattered dots always do."""
     dots = np.flatnonzero(growth.placed())
     if len(dots) < max(MIN_DOTS, 0.3 * len(growth.flat)):
         return False

@@ -17,7 +17,7 @@ import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
 from telerig.estimator.marks.erasing import StripInImages
 from telerig.estimator.marks.following import HIDDEN
-from telerig.estimator.marks.strip_dots import find_dots, learn_look, travel_in_image
+from telerig.estimator.marks.strip_dots import find_dots, learn_look
 from telerig.estimator.marks.tank_view import TankView
 from telerig.estimator.smoothing.results_folder import smooth_run
 from telerig.io.simulation.calibration.scene import true_cameras
@@ -264,7 +264,7 @@ def test_cut_dots_and_erased_ones(data: Path) -> None:
     images = [run.image("left", f) for f in range(0, FRAMES, 14)]
     look = learn_look(
         [i for i in images if i is not None],
-        travel_in_image(mine, UP),
+        TankView.of(mine, UP).travel_px_per_mm,
         polarity="black_on_white",
         diameter_px=10.0,
     )

@@ -1,8 +1,8 @@
-"""What the tables of a smoothed run add up to: spreads, spectra, lines of the shake."""
+"""What the tables of a smoothed run add up to: standard deviations and spectra."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,14 +21,6 @@ LEAST_FRAMES = 32
 _LONGEST_SEGMENT = 1024
 _MOST_TRACKS = 20
 _FINITE_SHARE = 0.7
-_HANN_WIDTH = 1.44
-"""Full width at half power of Hann's window, in steps of frequency."""
-
-_LINE_SHARE = 0.05
-_ABOVE_FLOOR = 8.0
-_PROMINENT = 0.6
-_ALIKE = 0.7
-_STRONGER = 2.0
 
 
 @dataclass(frozen=True)
@@ -38,26 +30,6 @@ class Spectrum:
     frequency_hz: Array
     density: Array
     step_hz: float
-
-
-@dataclass(frozen=True)
-class Line:
-    """A peak of the shake's spectrum.
-
-    width_hz : over which another peak is not another line.
-    damping : of a single mode as wide as the peak; ``upper`` where the spectrum resolves no less.
-    where : "common", "apart" (both cameras, not alike), or a camera's name.  alone : no other
-    camera sees the axis.
-    """
-
-    axis: str
-    frequency_hz: float
-    damping: float
-    upper: bool
-    rms_um: float
-    where: str
-    alone: bool
-    width_hz: float
 
 
 def column(table: pd.DataFrame, name: str) -> Array:
@@ -161,65 +133,3 @@ def evenly(t_s: Array, values: Array) -> tuple[Array, float]:
         there = np.isfinite(one)
         columns.append(np.interp(wanted, t_s[there], one[there]) if there.any() else 0 * wanted)
     return np.stack(columns, 1), (count - 1) / (t_s[-1] - t_s[0])
-
-
-def shake_lines(results: SmoothingResults) -> list[Line]:
-    """The peaks that hold a noticeable share of the shake, strongest first."""
-    if len(results.shake) < LEAST_FRAMES:
-        return []
-    out: list[Line] = []
-    for axis in AXES:
-        cameras = [c for c in results.cameras if axis in results.seen(c)]
-        if cameras:
-            out += _lines_of(results, axis, cameras)
-    return sorted(out, key=lambda line: -line.rms_um)
-
-
-def _lines_of(results: SmoothingResults, axis: str, cameras: Sequence[str]) -> list[Line]:
-    from scipy.signal import csd, detrend, find_peaks, peak_widths
-
-    time, place = results.shake["t_s"].to_numpy(float), AXES.index(axis)
-    values = np.stack([_shake_um(results, camera)[:, place] for camera in cameras], 1)
-    even, rate = evenly(time, values)
-    level, length = np.asarray(detrend(even, axis=0)), min(segment(len(time)), len(even))
-    pairs = [
-        csd(level[:, i], level[:, j], rate, nperseg=length)[1]
-        for i in range(len(cameras))
-        for j in range(len(cameras))
-    ]
-    cross = np.real(np.array(pairs)).reshape(len(cameras), len(cameras), -1)
-    step = rate / length
-    each = np.einsum("iif->if", cross)
-    density = each.mean(0)
-    peaks, shape = find_peaks(density, prominence=0)
-    stands_out = shape["prominences"] > _PROMINENT * density[peaks]
-    peaks = peaks[stands_out & (density[peaks] > _ABOVE_FLOOR * np.median(density))]
-    widths = peak_widths(density, peaks, rel_height=0.5)[0]
-    variance = density.sum() * step
-    out = []
-    for peak, width in zip(peaks, widths):
-        near = slice(max(1, int(peak - 1.5 * width)), int(peak + 1.5 * width) + 2)
-        inside = cross[:, :, near].sum(-1) * step
-        if np.trace(inside) / len(cameras) < _LINE_SHARE * variance:
-            continue
-        own = np.sqrt(max(width**2 - _HANN_WIDTH**2, 0.0)) * step
-        narrow = width < 1.3 * _HANN_WIDTH
-        width_hz = _HANN_WIDTH * step if narrow else own
-        out.append(Line(
-            axis, float(peak * step), float(width_hz / (2 * peak * step)), bool(narrow),
-            float(np.sqrt(np.diagonal(inside).max())), _where(inside, cameras), len(cameras) == 1,
-            float(max(width, _HANN_WIDTH) * step),
-        ))  # fmt: skip
-    return out
-
-
-def _where(covariance: Array, cameras: Sequence[str]) -> str:
-    """Who moves, from the covariance of the cameras' shake about a line."""
-    if len(cameras) == 1:
-        return cameras[0]
-    sd = np.sqrt(np.diagonal(covariance))
-    strongest, weakest = int(np.argmax(sd)), int(np.argmin(sd))
-    if sd[strongest] > _STRONGER * sd[weakest]:
-        return cameras[strongest]
-    alike = covariance[strongest, weakest] / (sd[strongest] * sd[weakest])
-    return "common" if alike > _ALIKE else "apart"

@@ -21,10 +21,8 @@ from telerig.io.report.page.number_format import (
 )
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.smoothing.numbers import (
-    Line,
     axis_sd,
     known_parts,
-    shake_lines,
     shake_rms_um,
     taken_away,
 )
@@ -102,7 +100,7 @@ _REMEDY_KEYS = ("remedy", "remedies")
 _NAMES = {
     "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
 }  # fmt: skip
-_OPEN_NATS = 5.0
+_SURE_LOG_LIKELIHOOD_RATIO = 5.0
 _NEXT_AXIS = re.compile(r"(?<=\.) (?=[xyz](?: \([a-z]+\))?: |To resolve it)")
 _ELSEWHERE = {"words", "lines", "shake_rms_mm", *_REMEDY_KEYS}
 
@@ -244,7 +242,7 @@ def _head(key: str) -> str:
     if key in _NAMES:
         return _NAMES[key]
     for unit, shown in (("_mm_s", ", mm/s"), ("_mm", ", µm"), ("_um", ", µm"), ("_hz", ", Hz"),
-                        ("_nats", ", nats")):  # fmt: skip
+                        ("_nats", ", log-likelihood ratio (nats)")):  # fmt: skip
         if key.endswith(unit):
             return key.removesuffix(unit).replace("_", " ") + shown
     return key.replace("_", " ")
@@ -274,17 +272,16 @@ def swap_rows(results: SmoothingResults) -> list[Row]:
         for line in lines if isinstance(lines, list) else ():
             if isinstance(line, Mapping):
                 hz, owner = number(line.get("frequency_hz")), str(line.get("owner") or ABSENT)
-                alike.setdefault((hz, owner, _told(line)), []).append((axis, line))
+                alike.setdefault((hz, owner, _identified_by(line)), []).append((axis, line))
     return [_swap_row(*key, lines) for key, lines in alike.items()]
 
 
-def _told(line: Mapping[str, Any]) -> str:
+def _identified_by(line: Mapping[str, Any]) -> str:
     cost: Any = line.get("other_owner_costs_nats")
     if line.get("ambiguous"):
-        return "open"
-    return (
-        "told by the data" if is_number(cost) and cost >= _OPEN_NATS else "told by what bubbles do"
-    )
+        return "not identifiable"
+    sure = is_number(cost) and cost >= _SURE_LOG_LIKELIHOOD_RATIO
+    return "identified from the data" if sure else "identified from the priors of the bubbles"
 
 
 def _swap_row(hz: str, owner: str, told: str, lines: list[tuple[str, Mapping[str, Any]]]) -> Row:
@@ -294,7 +291,7 @@ def _swap_row(hz: str, owner: str, told: str, lines: list[tuple[str, Mapping[str
     costs = [line.get("other_owner_costs_nats") for _, line in lines]
     least = min((float(c) for c in costs if c is not None and is_number(c)), default=None)
     cost = ABSENT if least is None else f"{round(least, 1) + 0.0:.1f}"
-    return Row((hz, axes, sizes, cost, owner, told), strong=told == "open")
+    return Row((hz, axes, sizes, cost, owner, told), strong=told == "not identifiable")
 
 
 def residual_rows(results: SmoothingResults) -> list[Row]:
@@ -339,52 +336,34 @@ def residual_words(results: SmoothingResults) -> str:
     return text
 
 
-MODE_HEADS = ["what shakes", "Hz", "damping", "RMS, µm", "what helps"]
+MODE_HEADS = ["what shakes", "Hz", "damping", "RMS, µm", "what would help"]
 
 MOST_ROWS = 30
-_LIGHTLY_DAMPED = 0.02
-_COMMON = (
-    "stiffer carriage guide or mount of the arms; heavy parts closer to the guide; gentler ramps"
-)
-_ARM = (
-    "shorter or stiffer arm (a third shorter raises the frequency 1.8 times), less weight at its "
-    "end, a counterweight"
-)
-_DAMPING = "a damping layer or a tuned absorber"
-_SERVO = "the controller: a notch at {} Hz, less gain, smoother set points"
 _FOLLOWING = "servo (following error)"
 _PITCH = "stiffen the arm against twisting; camera's weight on the arm's axis"
-_UNKNOWN_ARM = (
-    "no other camera sees this axis: an accelerometer on the carriage tells whether it is the "
-    "carriage or the arm"
-)
 
 
 def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
-    """The shake's modes and where they come from: learned or given, else peaks of the estimate."""
-    judged = [m for m in results.content.get("modes") or [] if isinstance(m, Mapping)]
+    """The shake's modes with the remedies of smoothing.json, and where the modes come from."""
     model = results.part("model")
-    known = [m for m in judged if m.get("source") != "estimate"]
-    modes = known or [m for m in model.get("modes") or [] if isinstance(m, Mapping)]
+    judged = [m for m in results.content.get("modes") or [] if isinstance(m, Mapping)]
+    modes = judged or [m for m in model.get("modes") or [] if isinstance(m, Mapping)]
     rows = [_mode(mode, results.cameras) for mode in _merged(modes)]
     rows += [_pitch(m, results.cameras) for m in model.get("pitches") or []
              if isinstance(m, Mapping)]  # fmt: skip
     servo = dict(model.get("carriage") or {}).get("servo")
-    followed = [_mode(m, results.cameras) for m in judged if m.get("where") == "servo"]
-    if isinstance(servo, list) and len(servo) == 3:
-        followed = [_servo(*servo)]
-    if rows:
-        return rows + followed, "The modes of the model that the smoother used."
-    groups = _grouped(shake_lines(results))[:MOST_ROWS]
-    lines = [_line(group, results.cameras) for group in groups]
-    if not lines:
-        return followed, (
-            "The model has no modes, and no peak stands out of the spectrum of the estimated shake."
-        )
-    return lines + followed, (
-        "The model has no modes: these are the peaks in the spectrum of the estimated shake, and "
-        "how alike the cameras move there. Damping is that of a single mode as wide as the peak, "
-        "roughly; “below” where the run is too short to tell."
+    if isinstance(servo, list) and not any(m.get("where") == "servo" for m in modes):
+        rms_mm, frequency_hz, damping = servo
+        mode = {"where": "servo", "frequency_hz": frequency_hz, "damping": damping}
+        rows.append(_mode(mode | {"rms_mm": rms_mm}, results.cameras))
+    if not rows:
+        return rows, "The model has no modes, and no peak in the spectrum of the shake was found."
+    if any(mode.get("source") != "estimate" for mode in modes):
+        return rows, "These are the modes of the model that the smoother used."
+    return rows, (
+        "The model has no modes: these are peaks in the spectrum of the estimated shake. The "
+        "damping is that of a single mode that is as wide as the peak, so it is an upper limit "
+        "where the run is too short to resolve the peak."
     )
 
 
@@ -403,35 +382,21 @@ def _merged(modes: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def _mode(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
-    where, remedy = _place(mode.get("where", mode.get("camera")), cameras)
-    damping: Any = mode.get("damping")
-    helps = [text for key in ("remedy", "remedies") for text in _texts(mode.get(key))]
-    if not helps:
-        helps = [remedy] if remedy else []
-        if is_number(damping) and damping < _LIGHTLY_DAMPED:
-            helps.append(_DAMPING)
-    cells = (number(mode.get("frequency_hz")), number(damping), _rms_um(mode.get("rms_mm")))
-    return Row((where, *cells, "; ".join(helps)))
+    remedies = [text for key in _REMEDY_KEYS for text in strings(mode.get(key))]
+    cells = (number(mode.get(key)) for key in ("frequency_hz", "damping"))
+    where = _place(mode.get("where", mode.get("camera")), cameras)
+    return Row((where, *cells, _rms_um(mode.get("rms_mm")), "; ".join(remedies)))
 
 
-def _texts(value: Any) -> list[str]:
-    if isinstance(value, str):
-        return [value]
-    return [str(v) for v in value] if isinstance(value, list) else []
-
-
-def _place(camera: Any, cameras: Sequence[str]) -> tuple[str, str]:
-    """In words, and the remedy."""
+def _place(camera: Any, cameras: Sequence[str]) -> str:
     if isinstance(camera, int) and 0 <= camera < len(cameras):
         camera = cameras[camera]
     name = str(camera).removeprefix("arm ")
     if name in cameras:
-        return f"arm of {name}", _ARM
+        return f"arm of {name}"
     if camera == -1 or str(camera).lower() in ("common", "carriage", "none"):
-        return "all cameras alike (carriage, mount)", _COMMON
-    if camera == "servo":
-        return _FOLLOWING, _SERVO.format("its")
-    return str(camera), ""
+        return "all cameras alike (carriage, mount)"
+    return _FOLLOWING if camera == "servo" else str(camera)
 
 
 def _rms_um(rms_mm: Any) -> str:
@@ -445,43 +410,11 @@ def _rms_um(rms_mm: Any) -> str:
 
 
 def _pitch(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
-    where, _ = _place(mode.get("camera"), cameras)
+    where = _place(mode.get("camera"), cameras)
     rms: Any = mode.get("rms_rad")
     angle = f"{number(math.degrees(rms), 2)}°" if is_number(rms) else ABSENT
     return Row((f"{where}, turning", number(mode.get("frequency_hz")),
                 number(mode.get("damping")), angle, _PITCH))  # fmt: skip
-
-
-def _servo(rms_mm: Any, frequency_hz: Any, damping: Any) -> Row:
-    return Row((_FOLLOWING, number(frequency_hz), number(damping),
-                _rms_um(rms_mm), _SERVO.format(number(frequency_hz))))  # fmt: skip
-
-
-def _grouped(lines: Sequence[Line]) -> list[list[Line]]:
-    """Lines of about one frequency together, the strongest first."""
-    groups: list[list[Line]] = []
-    for line in lines:
-        near = [g for g in groups if abs(g[0].frequency_hz - line.frequency_hz) <= line.width_hz]
-        if near:
-            near[0].append(line)
-        else:
-            groups.append([line])
-    return groups
-
-
-def _line(lines: Sequence[Line], cameras: Sequence[str]) -> Row:
-    shared = [line for line in lines if not line.alone or len(cameras) == 1]
-    where, remedy = {
-        "common": ("all cameras alike (carriage, mount)", _COMMON),
-        "apart": ("cameras not alike (arms)", _ARM),
-        "": (f"camera {' and '.join(sorted({line.where for line in lines}))}", _UNKNOWN_ARM),
-    }.get(name := shared[0].where if shared else "", (f"camera {name} (arm)", _ARM))
-    first = lines[0]
-    if first.damping < _LIGHTLY_DAMPED and not first.upper:
-        remedy += f"; {_DAMPING}"
-    damping = ("below " if first.upper else "") + number(first.damping, 2)
-    sizes = ", ".join(f"{line.axis}: {number(line.rms_um, 3)}" for line in lines)
-    return Row((where, number(first.frequency_hz), damping, sizes, remedy))
 
 
 _CONSTANTS = (

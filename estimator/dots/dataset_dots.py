@@ -104,7 +104,7 @@ def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str
         import cv2  # noqa: F401
 
         import telerig.estimator.dots.example_dot
-        import telerig.io.report.overlays.dots  # noqa: F401
+        import telerig.io.report.overlays  # noqa: F401
 
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:
@@ -113,7 +113,7 @@ def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = F
     found = _numbered_image(dataset, image, view, camera)
     if not overlay:
         return found
-    from telerig.io.report.overlays.dots import overlay_jpeg
+    from telerig.io.report.overlays import overlay_jpeg
 
     drawn = overlay_jpeg(image, found.dots, found.rejected, max_width_px=OVERLAY_WIDTH_PX)
     return replace(found, overlay=drawn)

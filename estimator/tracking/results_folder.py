@@ -190,7 +190,7 @@ def _labels(staged: Path, camera: str, frame: int) -> pd.DataFrame:
 
 
 def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> None:
-    from telerig.io.report.overlays.bubbles import draw_binary, draw_bubble_overlay
+    from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
 
     camera, frame, labels = task
     image, plain = scene.run.image(camera, frame), scene.image(camera, frame)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from telerig.io.report.overlays.bubbles import draw_binary, draw_bubble_overlay
+from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.triangulation import triangulate

@@ -7,7 +7,7 @@ import pytest
 from tracked_folder import outline
 
 from telerig.errors import InputError
-from telerig.io.report.overlays.bubbles import draw_binary, draw_bubble_overlay
+from telerig.io.report.overlays import draw_binary, draw_bubble_overlay
 
 
 def test_binary_picture_has_the_outlines_area_and_place() -> None:

@@ -15,7 +15,7 @@ from telerig.io.report.calibration.figures import tilt_angles_rad
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_json
 from telerig.io.report.calibration.target import target_shape
-from telerig.io.report.overlays.dots import GREEN, RED, draw_overlay
+from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page.number_format import nice_below, number, short_names, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -1,9 +1,9 @@
-"""What was found in an image, drawn over it: accepted dots in green, rejected ones in red."""
+"""What was found in an image, drawn over it: dots of a calibration, outlines of bubbles."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +14,10 @@ from telerig.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
+
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
 
 GREEN, RED, PAPER, INK = (40, 200, 70), (235, 45, 45), (255, 255, 255), (30, 30, 30)
 _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
@@ -42,8 +44,9 @@ def draw_overlay(
 
     Raises InputError for what is no grey image or a table without these columns.
     """
-    _check(image, accepted, ["dot", "row", "column"], "accepted")
-    _check(image, rejected, ["reason"], "rejected")
+    _check_grey(image)
+    _check_columns(accepted, ["dot", "row", "column"], "accepted")
+    _check_columns(rejected, ["reason"], "rejected")
     factor = min(1.0, max_width_px / image.shape[1])
     picture = grey_picture(image, factor)
     counts = Counter(rejected["reason"]).most_common()
@@ -51,19 +54,24 @@ def draw_overlay(
     taken = np.zeros(picture.shape[:2], bool)
     _ellipses(picture, rejected, factor, RED)
     _ellipses(picture, accepted, factor, GREEN)
-    _write(picture, accepted, _labels(accepted), factor, GREEN, taken)
-    _write(picture, rejected, [str(numbers[r]) for r in rejected["reason"]], factor, RED, taken)
+    _write_indices(picture, accepted, _labels(accepted), factor, GREEN, taken)
+    _write_indices(
+        picture, rejected, [str(numbers[r]) for r in rejected["reason"]], factor, RED, taken
+    )
     lines = [f"{len(accepted)} dots accepted, {len(rejected)} rejected"]
     lines += [f"{numbers[reason]}: {reason} ({count})" for reason, count in counts]
     return np.concatenate([picture, legend(lines, picture.shape[1])])
 
 
-def _check(image: NDArray[Any], table: pd.DataFrame, extra: list[str], name: str) -> None:
+def _check_grey(image: NDArray[Any]) -> None:
     if image.ndim != 2 or min(image.shape) < 1:
         raise InputError(
             f"an overlay is drawn on a grey image, this one has shape {image.shape}",
             todo="pass one channel, (height, width)",
         )
+
+
+def _check_columns(table: pd.DataFrame, extra: list[str], name: str) -> None:
     missing = [column for column in _ELLIPSE + extra if column not in table]
     if missing:
         raise InputError(
@@ -110,9 +118,7 @@ def _labels(accepted: pd.DataFrame) -> list[str]:
     return [str(dot) for dot in accepted["dot"]]
 
 
-def _ellipses(
-    picture: Picture, table: pd.DataFrame, factor: float, colour: tuple[int, int, int]
-) -> None:
+def _ellipses(picture: Picture, table: pd.DataFrame, factor: float, colour: Colour) -> None:
     import cv2
 
     ellipses = table[_ELLIPSE].to_numpy(float)
@@ -125,12 +131,12 @@ def _ellipses(
         )  # fmt: skip
 
 
-def _write(
+def _write_indices(
     picture: Picture,
     table: pd.DataFrame,
     labels: Iterable[str],
     factor: float,
-    colour: tuple[int, int, int],
+    colour: Colour,
     taken: NDArray[np.bool_],
 ) -> None:
     """Each label in the middle of its ellipse, else at an end of the long axis, if there is room.
@@ -154,7 +160,7 @@ def write_label(
     picture: Picture,
     label: str,
     centre: Array,
-    colour: tuple[int, int, int],
+    colour: Colour,
     taken: NDArray[np.bool_],
 ) -> bool:
     """Write text round a point, with a dark rim, unless other text is there; whether it was."""
@@ -192,3 +198,135 @@ def legend(lines: list[str], width_px: int) -> Picture:
 def _ascii(text: str) -> str:
     """OpenCV's letters are ASCII only."""
     return text.replace("µ", "u").encode("ascii", "replace").decode("ascii")
+
+
+Rejected = tuple[float, float, float, str]
+
+_LEAST_CONTRAST = 0.6
+_LABEL_PX = 9
+"""An outline wider than twice this has its label inside."""
+
+_FINEST_PX = 2.0
+"""A circle round what was rejected is at least so large, to be seen."""
+
+
+def draw_bubble_overlay(
+    image: NDArray[Any],
+    outlines: Sequence[Array],
+    labels: Sequence[str],
+    colours: Sequence[Colour] | Colour = GREEN,
+    *,
+    rejected: Sequence[Rejected] = (),
+    max_width_px: int = 900,
+) -> Picture:
+    """The image, not wider than max_width_px, with its bubbles: an RGB picture (h, w, 3).
+
+    image : grey (H, W), 8 or 16 bit or float. outlines : each (N, 2) px of the image, closed;
+    points that are not finite are passed over. labels : one each, "" for none; a label stands in
+    the outline's middle, or beside it where other text is, or nowhere. colours : RGB, one each or
+    one for all. rejected : (u, v, radius, reason) is circled in red with the number of its reason,
+    which the legend underneath spells out with its count.
+
+    Raises InputError for what is no grey image, and for labels or colours that do not fit.
+    """
+    shades = _checked(image, outlines, labels, colours)
+    factor = min(1.0, max_width_px / image.shape[1])
+    picture = grey_picture(image, factor, _LEAST_CONTRAST)
+    reasons = Counter(reason for *_, reason in rejected)
+    numbers = {reason: i + 1 for i, (reason, _) in enumerate(reasons.most_common())}
+    circles = [_circle(u, v, radius, factor) for u, v, radius, _ in rejected]
+    for circle in circles:
+        _draw(picture, circle, factor, RED)
+    for outline, shade in zip(outlines, shades):
+        _draw(picture, outline, factor, shade)
+    taken = np.zeros(picture.shape[:2], bool)
+    for outline, label, shade in zip(outlines, labels, shades):
+        _write_beside(picture, outline, label, factor, shade, taken)
+    for circle, (*_, reason) in zip(circles, rejected):
+        _write_beside(picture, circle, str(numbers[reason]), factor, RED, taken)
+    lines = [f"{len(outlines)} bubbles, {len(rejected)} rejected"]
+    lines += [f"{n}: {reason} ({reasons[reason]})" for reason, n in numbers.items()]
+    return np.concatenate([picture, legend(lines, picture.shape[1])])
+
+
+def draw_binary(
+    shape: tuple[int, int], outlines: Sequence[Array], max_width_px: int = 900
+) -> NDArray[np.uint8]:
+    """(h, w), 255 where at least half of the pixel lies inside an outline, else 0.
+
+    shape : (H, W) of the image, whose pixels the outlines (N, 2) are in.
+    """
+    from telerig.io.images.outline_raster import cell_coverage
+
+    factor = min(1.0, max_width_px / shape[1])
+    picture = np.zeros([max(1, round(n * factor)) for n in shape[:2]], np.uint8)
+    for outline in outlines:
+        corners = (_finite(outline) + 0.5) * factor
+        if len(corners) < 3:
+            continue
+        low = np.floor(corners.min(axis=0)).astype(int)
+        columns, rows = np.ceil(corners.max(axis=0)).astype(int) - low + 1
+        inside = cell_coverage(corners - low, (int(rows), int(columns))) >= 0.5
+        row, column = np.nonzero(inside)
+        row, column = row + low[1], column + low[0]
+        seen = (row >= 0) & (row < picture.shape[0]) & (column >= 0) & (column < picture.shape[1])
+        picture[row[seen], column[seen]] = 255
+    return picture
+
+
+def _checked(
+    image: NDArray[Any],
+    outlines: Sequence[Array],
+    labels: Sequence[str],
+    colours: Sequence[Colour] | Colour,
+) -> list[Colour]:
+    """One colour per outline."""
+    _check_grey(image)
+    alike = len(colours) == 3 and all(np.ndim(part) == 0 for part in colours)
+    shades: list[Any] = [colours] * len(outlines) if alike else list(colours)
+    if not len(outlines) == len(labels) == len(shades):
+        raise InputError(
+            f"{len(outlines)} outlines, {len(labels)} labels and {len(shades)} colours",
+            todo="pass one label and one colour for each outline",
+        )
+    return [tuple(int(part) for part in shade) for shade in shades]  # type: ignore[misc]
+
+
+def _finite(outline: Array) -> Array:
+    points = np.asarray(outline, float).reshape(-1, 2)
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+
+def _circle(u: float, v: float, radius: float, factor: float) -> Array:
+    size = max(radius, _FINEST_PX / factor) if np.isfinite(radius) else 4 * _FINEST_PX / factor
+    turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    return np.stack([u + size * np.cos(turn), v + size * np.sin(turn)], -1)
+
+
+def _draw(picture: Picture, outline: Array, factor: float, colour: Colour) -> None:
+    import cv2
+
+    points = (_finite(outline) + 0.5) * factor - 0.5
+    if len(points) > 1:
+        corners = np.array([fixed(p) for p in points], np.int32).reshape(-1, 1, 2)
+        cv2.polylines(picture, [corners], True, colour, 1, cv2.LINE_AA, _FRACTION_BITS)
+
+
+def _write_beside(
+    picture: Picture,
+    outline: Array,
+    label: str,
+    factor: float,
+    colour: Colour,
+    taken: NDArray[np.bool_],
+) -> None:
+    points = (_finite(outline) + 0.5) * factor
+    if not label or not len(points):
+        return
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, (high - low) / 2
+    steps = [(1, 0), (-1, 0), (0, -1), (0, 1)]
+    if reach.min() > _LABEL_PX:
+        steps = [(0, 0), *steps]
+    places = [middle + (reach + _LABEL_PX) * step for step in steps]
+    any(write_label(picture, label, place, colour, taken) for place in places)

@@ -6,7 +6,7 @@ import gc
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,11 +108,8 @@ def solve(
     Raises CalibrationError when the measurements leave something undetermined.
     """
     chosen = options or Options()
-    return in_large_stack(lambda: _solve(problem, model, chosen, progress or _silent, start))
-
-
-def _silent(_what: str, _share: float) -> None:
-    return None
+    report = progress or (lambda _what, _share: None)
+    return in_large_stack(lambda: _solve(problem, model, chosen, report, start))
 
 
 def _solve(
@@ -182,18 +179,8 @@ def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
     return flat and not any(held) and model.bubble.speed_sigma_mm_s is None and not model.pitches
 
 
-class Eliminated(Protocol):
-    """The factors of one pass, solved, by GTSAM or by arrays."""
-
-    @property
-    def vector(self) -> Array:
-        """Increments of all keys in their order."""
-
-    def log_det(self) -> float:
-        """log |R| of the square root of the information."""
-
-    def blocks(self) -> Blocks:
-        """Marginal covariances of the increments."""
+Eliminated = elimination.EliminatedGraph | chain.EliminatedChain
+"""The factors of one pass, solved, by GTSAM or by arrays."""
 
 
 @dataclass(frozen=True)

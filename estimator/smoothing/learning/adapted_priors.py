@@ -115,10 +115,8 @@ def _offsets(solution: Solution) -> Array:
 
 def _offset_rms(solution: Solution) -> Array:
     """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
-    layout, found = solution.frame.shake, solution.covariances
-    rows = layout.offset[:-1]
-    states = solution.frame.shake_at_frames(solution.state.shake)
-    square = np.einsum("cid,fd->fci", rows, states) ** 2
+    rows, found = solution.frame.shake.offset[:-1], solution.covariances
+    square = _offsets(solution) ** 2
     if found is not None:
         square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
     mean = square.mean(0)
@@ -129,11 +127,9 @@ def _offset_rms(solution: Solution) -> Array:
 
 def _dominant_hz(solution: Solution) -> float:
     """RMS of the offsets' velocity over that of the offsets."""
-    layout = solution.frame.shake
-    states = solution.frame.shake_at_frames(solution.state.shake)
-    place, speed = (
-        np.einsum("cid,fd->fci", r[:-1], states) for r in (layout.offset, layout.offset_velocity)
-    )
+    frame, place = solution.frame, _offsets(solution)
+    states = frame.shake_at_frames(solution.state.shake)
+    speed = np.einsum("cid,fd->fci", frame.shake.offset_velocity[:-1], states)
     return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
 
 

@@ -88,20 +88,17 @@ def rescaled(model: ShakeModel, rms_mm: Array, frequency_hz: float) -> ShakeMode
         before[band.camera] += np.square(band.rms_mm)
     factor = rms_mm / np.sqrt(np.where(before > 0, before, 1.0))
     factor = np.clip(factor, 0.05, 20.0)
+    by_camera = {CARRIAGE: factor.mean(0), **dict(enumerate(factor))}
     frequency = float(np.clip(frequency_hz, *_SHAKE_HZ))
     strong = float(rms_mm.max()) * (2 * np.pi * frequency) ** 2 > STRONG_MM_S2
     shape: dict[str, Any] = {"low_hz": frequency, "high_hz": max(60.0, 1.25 * frequency)}
     if strong:
         shape = {"low_hz": frequency, "high_hz": max(60.0, 2.0 * frequency), "tail": 3}
     bands = [
-        replace(b, rms_mm=_triple(np.asarray(b.rms_mm) * _factor(factor, b.camera)), **shape)
+        replace(b, rms_mm=_triple(b.rms_mm * by_camera[b.camera]), **shape)
         for b in model.broad_bands
     ]
     return replace(model, broad_bands=tuple(bands))
-
-
-def _factor(factor: Array, camera: int) -> Array:
-    return np.asarray(factor.mean(0) if camera == CARRIAGE else factor[camera])
 
 
 def default_bubble(problem: SmoothingProblem) -> BubbleModel:
@@ -124,8 +121,10 @@ def _triple(values: Array) -> tuple[float, float, float]:
 def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
     """Frequency (Hz) and RMS (mm) of the bubbles' swing across the vertical; None without tracks.
 
-    A least-squares sine through each track over a range of frequencies, drift removed.
+    Lomb-Scargle periodogram of each track, drift removed.
     """
+    from scipy.signal import lombscargle
+
     trials = np.arange(_ZIGZAG_HZ[0], _ZIGZAG_HZ[1], 0.25)
     power, total, samples = np.zeros(len(trials)), 0.0, 0
     for bubble in problem.bubbles[:20]:
@@ -136,10 +135,7 @@ def zigzag(problem: SmoothingProblem) -> tuple[float, float] | None:
         x = (t - t.mean()) / (t[-1] - t[0])
         drift = np.stack([np.ones_like(x), x, x**2], -1)
         rest = across - drift @ np.linalg.lstsq(drift, across, rcond=None)[0]
-        for i, f in enumerate(trials):
-            wave = np.stack([np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)], -1)
-            fit = wave @ np.linalg.lstsq(wave, rest, rcond=None)[0]
-            power[i] += (fit**2).sum()
+        power += sum(2 * lombscargle(t, column, 2 * np.pi * trials) for column in rest.T)
         total, samples = total + (rest**2).sum(), samples + 2 * len(t)
     if not samples:
         return None

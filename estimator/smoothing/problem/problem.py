@@ -260,6 +260,17 @@ class CalibrationShare:
     drift: Array | None = None
 
 
+def check_increasing(t_s: Array, where: str, first_row: int) -> None:
+    """Raises InputError that names the row at which times (N,) do not increase."""
+    bad = np.flatnonzero(~(np.diff(t_s) > 0))
+    if len(bad):
+        raise InputError(
+            f"times do not increase at row {int(bad[0]) + 1 + first_row}",
+            where=where,
+            todo="sort the rows and remove duplicates",
+        )
+
+
 @dataclass(frozen=True)
 class SmoothingProblem:
     """Everything that was measured in one run, and the geometry it is seen through.
@@ -309,10 +320,4 @@ class SmoothingProblem:
         stage = [] if self.stage is None else [("stage", self.stage.t_s)]
         sensors = [(f"accelerometer {a.name}", a.t_s) for a in self.accelerometers]
         for name, times in [("frames", self.t_s), *stage, *sensors]:
-            if np.any(~(np.diff(times) > 0)):
-                row = int(np.flatnonzero(~(np.diff(times) > 0))[0]) + 1
-                raise InputError(
-                    f"times do not increase at row {row}",
-                    where=name,
-                    todo="sort the rows and remove duplicates",
-                )
+            check_increasing(times, name, 0)

@@ -17,6 +17,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Mark,
     Observations,
     Stage,
+    check_increasing,
 )
 from telerig.rig.camera import Camera
 
@@ -39,13 +40,7 @@ def stage_of(table: Any, t_s: Array) -> Stage | None:
         return None
     t = _column(table, "t_s", "stage")
     position = _column(table, "position_mm", "stage")
-    if np.any(~(np.diff(t) > 0)):
-        row = int(np.flatnonzero(~(np.diff(t) > 0))[0]) + 3
-        raise InputError(
-            f"times do not increase at row {row}",
-            where="stage",
-            todo="sort the rows and remove duplicates",
-        )
+    check_increasing(t, "stage", 2)
     if t[-1] < t_s[0] or t[0] > t_s[-1]:
         raise InputError(
             f"the record ({t[0]:.6g} to {t[-1]:.6g} s) does not overlap the frames "

@@ -38,7 +38,10 @@ Array = NDArray[np.float64]
 RIG_HZ, RIG_MM = 30.0, 0.5
 HIDDEN_MM = (0.0, 0.08, 0.15)
 LINE = "bubble.zigzags.1."
-PRIORS = {"as it is": attribution.expected, "all sizes alike": lambda line, own: np.ones(6)}
+PRIORS = {
+    "as it is": attribution.hidden_mode_weights,
+    "all sizes alike": lambda line, own: np.ones(6),
+}
 
 
 def hidden(hidden_mm: float, seed: int) -> Iterable[tuple[str, float, float, float]]:
@@ -54,8 +57,8 @@ def hidden(hidden_mm: float, seed: int) -> Iterable[tuple[str, float, float, flo
     heights = pooled(signals_of(problem)[0])
     names = [LINE + last for last in ("frequency_hz", "damping", "rms_mm")]
     found = maximise(heights, told, names, steps=8).model
-    for prior, expected in PRIORS.items():
-        with patch.object(attribution, "expected", expected):
+    for prior, weights in PRIORS.items():
+        with patch.object(attribution, "hidden_mode_weights", weights):
             model = attribution.with_hidden_modes(heights, found, (0.0, 1.0, 0.0), problem.up)
         yield prior, *_heights(problem, model, lab)
 

@@ -173,7 +173,7 @@ def _scaled(rms_mm: Sequence[float], factor: float) -> tuple[float, float, float
     return x, y, z
 
 
-def shared(model: ShakeModel, found: Sequence[Attribution]) -> ShakeModel:
+def with_split_lines(model: ShakeModel, found: Sequence[Attribution]) -> ShakeModel:
     """Every ambiguous line given half to the rig, half to the bubbles."""
     for label in sorted(found, key=lambda one: -one.index):
         if label.ambiguous and label.owner == "bubble":
@@ -204,7 +204,7 @@ def with_hidden_modes(
         rig = RigMode(line.frequency_hz, line.damping, line.rms_mm, force_hz=line.force_hz)
         fits = [_with_hidden_mode(signals, model, index, rig, s) for s in _SHARES]
         found = np.array([fit.log_posterior for fit in fits])
-        weight = np.exp(found - found.max()) * expected(line, own)
+        weight = np.exp(found - found.max()) * hidden_mode_weights(line, own)
         share = float(np.sqrt(np.sum(weight * _SHARES**2) / weight.sum()))
         if share > _LEAST_SHARE:
             model = _with_hidden_mode(signals, model, index, rig, share).model
@@ -231,7 +231,7 @@ def _is_half(mode: RigMode, model: ShakeModel) -> bool:
     return any(z.frequency_hz == mode.frequency_hz for z in model.bubble.zigzags)
 
 
-def expected(line: Zigzag, own: Sequence[RigMode]) -> Array:
+def hidden_mode_weights(line: Zigzag, own: Sequence[RigMode]) -> Array:
     """Prior weights of lines of the rig beside one of the bubbles', by their `_SHARES` of its RMS.
 
     All alike where the rig shows no line of its own elsewhere (a quarter of the frequency away):

@@ -19,8 +19,8 @@ from telerig.estimator.smoothing.learning.attribution import (
     Attribution,
     attributions,
     is_zigzag,
-    shared,
     with_hidden_modes,
+    with_split_lines,
 )
 from telerig.estimator.smoothing.learning.groups import (
     BUBBLE,
@@ -127,7 +127,7 @@ def _learn_group(
     model = fit.model
     if not options.target:
         found = attributions(coarse.fast, model, group.pattern, group.up)
-        model = shared(model, [x for x in found if not _is_kept(x, model, options)])
+        model = with_split_lines(model, [x for x in found if not _is_kept(x, model, options)])
         vague = [n for n, s in zip(names, sigma) if n in seeds and s > _VAGUE_LOG_SIGMA]
         likely = [posterior_rms(coarse.fast, model, n, seeds[n]) for n in vague]
         model = with_values(model, vague, likely)

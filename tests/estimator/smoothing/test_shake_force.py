@@ -12,9 +12,9 @@ from shake_learning_data import BUBBLE_HZ, COMMON_HZ, run, true_model
 from telerig.errors import InputError
 from telerig.estimator.smoothing.learning.attribution import (
     Attribution,
-    expected,
-    shared,
+    hidden_mode_weights,
     with_hidden_modes,
+    with_split_lines,
 )
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.learning.groups import free_names, groups_of
@@ -132,7 +132,7 @@ def test_an_ambiguous_line_is_halved_without_changing_one_bubbles_likelihood() -
             Attribution("rig", 0, COMMON_HZ, 0.2, 0.0),
             Attribution("bubble", 1, 13.0, 0.2, 0.0),
         ]
-        halved = shared(model, doubtful)
+        halved = with_split_lines(model, doubtful)
         assert len(halved.modes) == len(model.modes) + 1
         at = evidence(signals, model)
         assert evidence(signals, halved) == pytest.approx(at, abs=1e-5)
@@ -141,10 +141,10 @@ def test_an_ambiguous_line_is_halved_without_changing_one_bubbles_likelihood() -
 def test_prior_weights_of_a_line_beside_the_bubbles() -> None:
     line, shares = Zigzag(12.0, 0.03, (0.0, 0.2, 0.0)), np.linspace(0, 1, 6)
     mode = RigMode(30.0, 0.03, (0.0, 0.4, 0.0))
-    np.testing.assert_array_equal(expected(line, []), np.ones(6))
+    np.testing.assert_array_equal(hidden_mode_weights(line, []), np.ones(6))
     near = replace(mode, frequency_hz=13.5)
-    np.testing.assert_array_equal(expected(line, [near]), np.ones(6))
-    weight = expected(line, [replace(mode, frequency_hz=4.0), near, mode])
+    np.testing.assert_array_equal(hidden_mode_weights(line, [near]), np.ones(6))
+    weight = hidden_mode_weights(line, [replace(mode, frequency_hz=4.0), near, mode])
     # a fifth of a decade about 12 Hz under a log-normal prior, three modes
     each = norm.cdf(np.log(13.2 / 15), 0, 1.5) - norm.cdf(np.log(10.8 / 15), 0, 1.5)
     chance = 1 - (1 - each) ** 3
@@ -152,14 +152,14 @@ def test_prior_weights_of_a_line_beside_the_bubbles() -> None:
     np.testing.assert_allclose(weight[1:], (chance + (1 - chance) * size**2)[1:], rtol=0.01)
     assert weight.sum() == pytest.approx(6.0)
     weak = replace(mode, rms_mm=(0.0, 0.02, 0.0))
-    np.testing.assert_allclose(expected(line, [weak])[1:], 1.0)
+    np.testing.assert_allclose(hidden_mode_weights(line, [weak])[1:], 1.0)
     # as strong as the arms': the main line is seen, and whatever lies here does so by chance
     arm = RigMode(60.0, 0.03, (0.0, 0.3, 0.0), 0)
-    np.testing.assert_allclose(expected(line, [mode, arm])[1:], chance, rtol=0.01)
+    np.testing.assert_allclose(hidden_mode_weights(line, [mode, arm])[1:], chance, rtol=0.01)
     half = replace(mode, rms_mm=(0.0, 0.15, 0.0))
     size = np.minimum(shares * 0.2 / 0.15, 1)
     wanted = chance + (1 - chance) * (1 - 0.5**4) * size**2
-    np.testing.assert_allclose(expected(line, [half, arm])[1:], wanted[1:], rtol=0.01)
+    np.testing.assert_allclose(hidden_mode_weights(line, [half, arm])[1:], wanted[1:], rtol=0.01)
 
 
 def test_beside_a_line_is_less_room_where_the_rig_shows_a_stronger_one() -> None:

@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.solver.problem import (
     DOTS_FREE,
@@ -58,9 +56,10 @@ def check_options(
     cameras: Sequence[str] = (),
     **_: object,
 ) -> None:
-    """Before any image is looked at. cameras : the rig's, where they are known already.
+    """Check the options of `run_calibration` before any image is read.
 
-    Raises InputError or CalibrationError for a word that is none of those known.
+    cameras : names of the rig's, where they are known already.
+    Raises InputError or CalibrationError for an unknown word.
     """
     checked_medium(medium)
     checked_outlier_sd(outlier_sd)
@@ -215,7 +214,7 @@ def _load_libraries() -> None:
 
 def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:
     """Travel axis and encoder scale from `stage_axis/`; empty without it, or a usable rig."""
-    from telerig.estimator.calibration.stage.input import stage_axis_from
+    from telerig.estimator.calibration.stage.stage_axis import stage_axis_from
 
     if calibration.verdict["status"] == "REJECTED":
         return {}
@@ -231,5 +230,5 @@ def _with_measured(calibration: Calibration, table: pd.DataFrame, seed: int) -> 
     measured = table.reindex(columns=["view", "camera", "dot", *columns]).copy()
     measured["view"] = measured["view"].astype(str)
     dots = calibration.dots.merge(measured, on=["view", "camera", "dot"], how="left")
-    dots["chi2_dof"] = dots["chi2_dof"].astype(float).fillna(np.nan)
+    dots["chi2_dof"] = dots["chi2_dof"].astype(float)
     return replace(calibration, dots=dots, statistics={**calibration.statistics, "seed": seed})

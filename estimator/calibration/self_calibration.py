@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens import considered_parameters
-from telerig.estimator.calibration.lens.choice import Choice
-from telerig.estimator.calibration.lens.start_values import model_start
+from telerig.estimator.calibration.lens.choice import Choice, model_start
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.quality.residual_tests import residual_tests
 from telerig.estimator.calibration.quality.split_half import split_half_check

@@ -1,5 +1,5 @@
 """The choice of each camera's lens model.
 
-In: a ``Problem``. Out: the lens model that the data support, and what the covariance keeps open
-of the rest. Read ``choice`` first.
+In: a ``Problem`` and a start. Out: the lens model that the data support, and which parameters the
+covariance considers besides. Read ``choice`` first.
 """

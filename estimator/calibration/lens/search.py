@@ -191,19 +191,9 @@ def possible(rich: Lens) -> list[Lens]:
     A tilt leaves out s, with which its homography would be spanned twice. Where the centre is free,
     it and kappa always are.
     """
-    shapes = [Lens()]
-    if "affine" in rich:
-        shapes.append(Lens({"affine"}))
-        shapes += [Lens({"tilt"})] if {"p", "s"} <= rich else []
-    radial = [Lens(), Lens({"k1"}), Lens({"k1", "k2"})]
-    choices = [[Lens(), Lens({g})] for g in ("kappa", "p", "s")]
-    always = rich & ({"centre", "kappa"} if "centre" in rich else set())
-    found = {
-        frozenset.union(always, shape, *parts)
-        for shape, *parts in product(shapes, radial, *choices)
-        if not ("tilt" in shape and {"s"} <= frozenset.union(*parts))
-    }
-    return sorted((f for f in found if f - {"tilt"} <= rich), key=ordered)
+    always = rich & {"centre", "kappa"} if "centre" in rich else Lens()
+    richest = rich | {"tilt"} if {"affine", "p", "s"} <= rich else rich
+    return sorted(_between(always, richest), key=ordered)
 
 
 def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lenses:
@@ -246,8 +236,10 @@ def steps_to(quadratic: QuadraticCost, chosen: Lenses, least: Lenses) -> list[Ad
 
 
 def _between(low: Lens, high: Lens) -> Iterator[Lens]:
+    """Every lens that contains ``low`` and is contained in ``high``."""
     more = ordered(high - low)
     for picks in product((False, True), repeat=len(more)):
         lens = low | {g for g, pick in zip(more, picks) if pick}
-        if "k2" not in lens or "k1" in lens:
+        tilted_twice = "tilt" in lens and lens & {"affine", "s"}
+        if not tilted_twice and ("k2" not in lens or "k1" in lens):
             yield Lens(lens)

@@ -1,5 +1,5 @@
-"""How good is a calibration? Checks, tests of residuals, split halves, comparisons, maps.
+"""How good is a calibration? Checks, residual tests, split halves, comparison, uncertainty map.
 
-In: a problem, a fit or a ``Calibration``. Out: numbers and warnings for the report. Read
-``checks`` first.
+In: a problem, a fit or a ``Calibration``. Out: numbers and notes for the report. Read ``checks``
+first.
 """

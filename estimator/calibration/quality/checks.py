@@ -90,23 +90,15 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     return PreCheck(tilts, tuple(notes))
 
 
-def minimum_views(*, stereo: bool, unknown_dots: bool) -> tuple[int, str]:
-    """Fewest views that determine a calibration, and what is undetermined below it."""
-    if stereo and unknown_dots:
-        return 4, "the shape of the target (3 affine numbers), with it both scales and all tilts"
-    if stereo:
-        return 2, (
-            "the sign of the target's tilt in each camera: two inter-camera rotations fit alike"
-        )
-    if unknown_dots:
-        return 4, "the shape of the target (3 affine numbers) and with it the scale"
-    return 1, "everything"
-
-
 def _refuse_too_few(
     problem: Problem, usable: list[int], *, stereo: bool, unknown_dots: bool
 ) -> None:
-    needed, undetermined = minimum_views(stereo=stereo, unknown_dots=unknown_dots)
+    if unknown_dots:
+        needed, undetermined = 4, "the shape of the target (3 affine numbers) and with it the scale"
+    elif stereo:
+        needed, undetermined = 2, "the sign of the tilts: two inter-camera rotations fit alike"
+    else:
+        needed, undetermined = 1, "everything"
     if len(usable) >= needed:
         return
     kind = "unknown" if unknown_dots else "known"

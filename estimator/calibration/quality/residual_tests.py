@@ -1,8 +1,8 @@
 """Is anything left in the residuals? Tests of their places, directions, neighbours and views.
 
-Residuals of a right model are independent, alike in all directions and everywhere. Each is first
-brought to unit variance with the share of noise that the fit absorbs (the hat matrix). What the
-fit absorbs besides makes the tests say "nothing" slightly too often, never too seldom.
+Residuals of a right model are independent, with the same variance in all directions and everywhere.
+Each is first brought to unit variance with the share of noise that the fit absorbs (the hat
+matrix). The correlations that the fit causes make the tests slightly conservative.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int])
     size = float(np.sqrt((mean**2).mean()))
     words = (
         f"camera {camera}: residuals point the same way in parts of the image (most in row "
-        f"{row + 1}, column {column + 1} of {CELLS} x {CELLS}, {lengths.max():.1f} sd): the lens "
-        "model lacks a term; try a richer --model"
+        f"{row + 1}, column {column + 1} of {CELLS} x {CELLS}, {lengths.max():.1f} sd), so the "
+        "lens model lacks a term; try a richer --model"
     )
     return ResidualTest("region", camera, size, p, words)
 
@@ -108,13 +108,13 @@ def _direction(camera: str, values: Array, share: float) -> ResidualTest:
     ratio = np.sqrt((1 + length) / max(1 - length, 1e-3))
     words = (
         f"camera {camera}: residuals are {ratio:.2f} times longer along {angle:.0f} degrees (from "
-        "u towards v): motion during the exposure, or a sensor read line by line"
+        "u towards v). Possible causes: motion during the exposure, a sensor read line by line"
     )
     return ResidualTest("direction", camera, float(length), p, words)
 
 
 def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> ResidualTest:
-    """Do neighbours in one image err together, more than any two dots of that image do?"""
+    """Do residuals of neighbours correlate more than those of any two dots of that image?"""
     from scipy.spatial import cKDTree
 
     near, expected, spread = [], [], []
@@ -137,8 +137,9 @@ def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> Residua
     sd = float(np.sqrt(np.sum(spread)) / len(spread))
     p = float(ndtr(-excess / sd))
     words = (
-        f"camera {camera}: neighbouring dots err together (correlation {excess / 2:.2f}): the "
-        "plate bends from view to view, refraction, or a lens error finer than the model"
+        f"camera {camera}: residuals of neighbouring dots correlate ({excess / 2:.2f}). Possible "
+        "causes: a plate that bends from view to view, refraction, a lens error finer than the "
+        "model"
     )
     return ResidualTest("neighbours", camera, excess / 2, p, words)
 
@@ -155,8 +156,8 @@ def _views(camera: str, values: Array, view: Ints, names: tuple[str, ...]) -> li
         p = float(chdtrc(2 * len(mine), mine.sum()))
         size = float(np.sqrt(mine.mean() / 2))
         words = (
-            f"view {names[v]!r}, camera {camera}: residuals {size:.1f} times the others': blurred, "
-            "moved, or badly lit"
+            f"view {names[v]!r}, camera {camera}: residuals are {size:.1f} times those of the "
+            "other views. Is the image blurred or badly lit, or did the target move?"
         )
         out.append(ResidualTest("view", camera, size, p, words))
     return out

@@ -1,9 +1,13 @@
-"""Travel axis and encoder scale from views of one static target at several stage positions."""
+"""Travel axis and encoder scale from views of one static target at several stage positions.
+
+Read from the folder `stage_axis/` of a dataset: positions.csv beside dots.csv or images.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +23,10 @@ from telerig.estimator.calibration.stage.fit import (
     fit,
     start,
 )
+from telerig.io.dataset.dataset import Dataset, View
+from telerig.io.dataset.tables import read_dots_csv
+from telerig.io.files.csv_table import Column, read_table
+from telerig.io.images.read import list_images, natural
 from telerig.rig.pose import Pose, across
 
 if TYPE_CHECKING:
@@ -31,7 +39,9 @@ Array = NDArray[np.float64]
 _COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
 _UNLIKELY = 1e-3
 _LEAST_WEIGHT = 0.5
-_WHERE = "stage_axis"
+FOLDER = "stage_axis"
+_POSITIONS = "positions.csv"
+_CONTRADICTION_DEG = 10.0
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,73 @@ class StageAxis:
             "wander_sigma_mm": self.wander_sigma_mm,
             "notes": list(self.words),
         }
+
+
+def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | None:
+    """The stage as `stage_axis/` shows it; None when the dataset has no such folder.
+
+    Raises InputError for a folder without positions.csv, with neither or both of images and
+    dots.csv, and what `stage_axis_of` raises. Words tell when rig.toml states another direction.
+    """
+    folder = dataset.path / FOLDER
+    if not folder.is_dir():
+        return None
+    positions = _positions(folder)
+    described = dataset.rig.stage
+    found = stage_axis_of(
+        calibration,
+        _measured(dataset, folder),
+        positions,
+        position_sigma_mm=0.001 if described is None else described.position_sigma_mm,
+    )
+    if described is None:
+        return found
+    return replace(found, words=(*found.words, *_against(found.axis_rig, described.axis)))
+
+
+def _positions(folder: Path) -> pd.DataFrame:
+    file = folder / _POSITIONS
+    if not file.is_file():
+        raise InputError(
+            f"there is no {_POSITIONS}", where=str(folder), todo="write view,position_mm"
+        )
+    return read_table(file, [Column("view", "text"), Column("position_mm")])
+
+
+def _measured(dataset: Dataset, folder: Path) -> pd.DataFrame:
+    table = folder / "dots.csv"
+    views = _image_views(dataset, folder)
+    if table.is_file() == bool(views):
+        what = "both images and dots.csv" if views else "neither images nor dots.csv"
+        raise InputError(
+            f"holds {what}",
+            where=str(folder),
+            todo=f"keep one of them: {FOLDER}/<camera>/<view>.tif or {FOLDER}/dots.csv",
+        )
+    if not views:
+        return read_dots_csv(table, dataset.rig)
+    from telerig.estimator.dots.dataset_dots import detect_dataset
+
+    return detect_dataset(replace(dataset, views=views, source="images", table=None)).dots
+
+
+def _image_views(dataset: Dataset, folder: Path) -> tuple[View, ...]:
+    paths: dict[str, dict[str, Path]] = {}
+    for camera in dataset.rig.cameras:
+        for file in list_images(folder / camera) if (folder / camera).is_dir() else ():
+            paths.setdefault(file.stem, {})[camera] = file
+    return tuple(View(name, paths[name]) for name in sorted(paths, key=natural))
+
+
+def _against(axis: Array, stated: tuple[float, float, float]) -> list[str]:
+    angle = float(np.degrees(np.arccos(np.clip(axis @ np.asarray(stated), -1, 1))))
+    if angle < _CONTRADICTION_DEG:
+        return []
+    direction = ", ".join(f"{v:.3f}" for v in axis)
+    return [
+        f"rig.toml states a travel direction {angle:.0f} deg away from the measured one: "
+        + ("turn its sign" if angle > 180 - _CONTRADICTION_DEG else f"write ({direction})")
+    ]
 
 
 def stage_axis_of(
@@ -150,14 +227,14 @@ def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, flo
         if views.duplicated().any():
             raise InputError(
                 f"view {views[views.duplicated()].iloc[0]!r} has two positions",
-                where=f"{_WHERE}/positions.csv",
+                where=f"{FOLDER}/{_POSITIONS}",
                 todo="keep one of the rows",
             )
         out = dict(zip(views, positions_mm["position_mm"].astype(float)))
     bad = [view for view, position in out.items() if not np.isfinite(position)]
     if bad:
         raise InputError(
-            f"the position of view {bad[0]!r} is not finite", where=_WHERE, todo="leave it out"
+            f"the position of view {bad[0]!r} is not finite", where=FOLDER, todo="leave it out"
         )
     return out
 
@@ -166,7 +243,7 @@ def _check_names(table: pd.DataFrame, column: str, known: list[str], fault: str)
     strange = sorted(set(table[column].astype(str)) - set(known))
     if strange:
         raise InputError(
-            f"{column} {strange[0]!r} {fault}", where=_WHERE, todo=suggestion(strange[0], known)
+            f"{column} {strange[0]!r} {fault}", where=FOLDER, todo=suggestion(strange[0], known)
         )
 
 
@@ -174,14 +251,14 @@ def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
     if len(seen_by) < 2:
         raise CalibrationError(
             "one camera never sees travel along its own axis",
-            where=_WHERE,
+            where=FOLDER,
             todo="show the target to both cameras",
         )
     span = float(np.ptp(reading_mm))
     if span < LEAST_TRAVEL_MM:
         raise CalibrationError(
             f"{len(reading_mm)} view(s) over {span:.3g} mm of readings show no travel",
-            where=_WHERE,
+            where=FOLDER,
             todo="take views at three or more positions, as far apart as the image allows",
         )
 

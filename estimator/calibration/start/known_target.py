@@ -2,7 +2,7 @@
 
 Each image gives an affine (or local) map of the target plane, whose singular values are the scale
 and the cosine of the tilt, up to the sign of the tilt. The signs come from the one inter-camera
-rotation that fits all views; the global mirror twin is left for the caller to decide.
+rotation that fits all views; `mirror_ambiguity` decides between the two mirror solutions.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
+from telerig.estimator.dots.grid.local_fit import apply_homography, fit_homography
 from telerig.factors.projection import State
 from telerig.rig.pose import nearest_rotation
 from telerig.rig.projection import INDEX
@@ -60,12 +61,11 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
     misfit = ((uv_px - design @ affine) ** 2).sum()
     bend = np.zeros(2)
     if len(xy_mm) >= 8:
-        homography, bend_h = _homography(design, uv_px, affine)
-        better = (
-            (uv_px - (design @ homography) / (1 + design[:, :2] @ bend_h)[:, None]) ** 2
-        ).sum()
+        homography = fit_homography(design[:, :2], uv_px)
+        better = ((uv_px - apply_homography(homography, design[:, :2])) ** 2).sum()
         if better < 0.5 * misfit:
-            affine, bend, misfit = homography, bend_h, better
+            homography = homography / homography[2, 2]
+            affine, bend, misfit = homography[:2].T, homography[2, :2], better
     spread = max(((uv_px - uv_px.mean(0)) ** 2).sum(), 1e-12)
     # the target point imaged to the image centre: there the off-axis terms vanish
     at = np.linalg.solve(affine[:2].T, -affine[2]) if np.any(bend) else np.zeros(2)
@@ -76,24 +76,8 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
     return ImageMap(jacobian, offset, bend / depth / size, float(np.sqrt(misfit / spread)))
 
 
-def _homography(design: Array, uv_px: Array, affine: Array) -> tuple[Array, Array]:
-    """uv = (design @ m) / (1 + xy @ bend) by reweighted linear least squares; (3, 2), (2,)."""
-    xy, bend = design[:, :2], np.zeros(2)
-    scale = np.abs(uv_px).max()
-    m = affine
-    for _ in range(5):
-        weight = 1 / (1 + xy @ bend)
-        zero = np.zeros_like(design)
-        rows_u = np.c_[design, zero, -uv_px[:, :1] * xy] * weight[:, None]
-        rows_v = np.c_[zero, design, -uv_px[:, 1:] * xy] * weight[:, None]
-        right = np.r_[uv_px[:, 0] * weight, uv_px[:, 1] * weight]
-        solution, *_ = np.linalg.lstsq(np.r_[rows_u, rows_v] / scale, right / scale, rcond=None)
-        m, bend = np.c_[solution[:3], solution[3:6]], solution[6:]
-    return m, bend
-
-
 def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
-    """(2, 2) map -> (3, 3) camera_from_target up to its mirror twin, and the scale in px/mm."""
+    """(2, 2) map -> (3, 3) camera_from_target up to its mirror image, and the scale in px/mm."""
     _, singular, vt = np.linalg.svd(jacobian)
     top = jacobian / singular[0]
     sine = np.sqrt(max(0.0, 1 - (singular[1] / singular[0]) ** 2))
@@ -105,7 +89,7 @@ def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
 
 
 def mirrored(rotation: Array) -> Array:
-    """(..., 3, 3) D R D: the rotation of the mirror twin."""
+    """(..., 3, 3) D R D: the rotation in the mirrored solution."""
     return rotation * _MIRROR
 
 
@@ -118,9 +102,9 @@ def angle_between(a: Array, b: Array) -> Array:
 def rotation_hypotheses(first: Array, second: Array, count: int = 3) -> list[Array]:
     """Inter-camera rotations second_from_first that one choice of signs per view can explain.
 
-    first, second : (V, 3, 3) camera_from_target, each up to its own mirror twin. The best
-    ``count`` hypotheses, best first, none the twin of another (a rotation and its twin explain
-    the same). Each candidate pair of every view votes; the best are refined by averaging.
+    first, second : (V, 3, 3) camera_from_target, each up to its own mirror image. The best
+    ``count`` hypotheses, best first, none the mirror image of another (both explain the same). Each
+    pair of candidates of every view is tried and refined by averaging.
     """
     plain = second @ np.swapaxes(first, -1, -2)
     crossed = mirrored(second) @ np.swapaxes(first, -1, -2)
@@ -150,7 +134,7 @@ def _refined(rotation: Array, plain: Array, crossed: Array) -> tuple[Array, floa
 
 
 def stereo_states(problem: Problem, dots_mm: Array, count: int = 2) -> list[State]:
-    """Starting states of a stereo problem, best first, each on an arbitrary side of its twin."""
+    """Starting states of a stereo problem, best first; which mirror solution each is, is open."""
     maps = image_maps(problem, dots_mm)
     both = [v for v in range(len(problem.views)) if (v, 0) in maps and (v, 1) in maps]
     rotations = {k: rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}

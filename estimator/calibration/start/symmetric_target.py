@@ -1,7 +1,7 @@
 """A target without marks looks the same after a turn: one numbering for all images.
 
-Within a view, the two cameras must agree on one inter-camera rotation; between views, on the
-print errors of the dots, which are the only thing that a turn changes.
+Within a view, both cameras' numberings must agree with one inter-camera rotation. Between views,
+only the print errors of the dots differ after a turn, and they must be alike in all views.
 """
 
 from __future__ import annotations
@@ -35,26 +35,27 @@ def turns(target: Target) -> list[Ints]:
 def number_consistently(
     problem: Problem, nominal_rotvec_deg: Array | None
 ) -> tuple[Problem, list[str]]:
-    """Renumber images so that both cameras and all views agree; says how it was decided.
+    """Images renumbered so that both cameras and all views agree, and notes on how it was decided.
 
     Raises CalibrationError when two numberings explain the two cameras alike.
     """
     labels = turns(problem.target)
     if len(problem.cameras) == 2:
-        problem = _agree_between_cameras(problem, labels, nominal_rotvec_deg)
-    problem, contrast = _agree_between_views(problem, labels)
+        problem = _numbered_alike_in_cameras(problem, labels, nominal_rotvec_deg)
+    problem, contrast = _numbered_alike_in_views(problem, labels)
     problem, about_scale = _scale_of_any_turn(problem, labels)
     many = f"{len(labels)}-fold symmetric target without marks"
     if contrast > 3:
         return problem, [
             f"{many}: numbered so that both cameras and all views agree; the dots' print errors "
-            f"tell the turns apart ({contrast:.0f} standard deviations in the least certain view)",
+            f"decide the turn ({contrast:.0f} standard deviations in the least certain view)",
             *about_scale,
         ]
     return problem, [
-        f"{many}: both cameras agree within each view; between views the print errors are too "
-        f"small to tell the turns apart ({contrast:.1f} standard deviations in the least certain "
-        "view), so the dots' estimated positions may be averages over turns",
+        f"{many}: both cameras agree within each view. Between views the dots' print errors are "
+        f"too small to decide the turn ({contrast:.1f} standard deviations in the least certain "
+        "view), so the dots' estimated positions may be averages over turns; marks on the target "
+        "would decide it",
         *about_scale,
     ]
 
@@ -69,9 +70,10 @@ def _scale_of_any_turn(problem: Problem, labels: list[Ints]) -> tuple[Problem, l
         return problem, []
     either = float(np.hypot(sigma, np.sqrt(2) * problem.target.print_sigma_mm))
     words = (
-        f"the distance of dots {tuple(int(e) for e in ends)} may be that of another pair, which a "
-        f"turn puts in their place, so it is taken as good to {1e3 * either:.0f} um; choose two "
-        "dots that are opposite each other, or put marks on the target"
+        f"the stated distance of dots {tuple(int(e) for e in ends)} may be that of another pair, "
+        "because a turn of the target puts other dots in their place. Its standard deviation is "
+        f"therefore taken as {1e3 * either:.0f} µm; choose two dots that are opposite each other, "
+        "or put marks on the target"
     )
     return replace(problem, scale=(pair, distance, either)), [words]
 
@@ -87,7 +89,7 @@ def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:
     return replace(problem, dot=known)
 
 
-def _agree_between_cameras(
+def _numbered_alike_in_cameras(
     problem: Problem, labels: list[Ints], nominal_rotvec_deg: Array | None
 ) -> Problem:
     """The turn of the second camera's numbering in each view that one rotation explains."""
@@ -145,7 +147,7 @@ def _to_nominal_deg(rotation: Array, nominal_rotvec_deg: Array | None) -> float:
     return float(np.degrees(known_target.angle_between(both, nominal).min()))
 
 
-def _agree_between_views(problem: Problem, labels: list[Ints]) -> tuple[Problem, float]:
+def _numbered_alike_in_views(problem: Problem, labels: list[Ints]) -> tuple[Problem, float]:
     """Turn whole views until their print errors look like those of the others."""
     held = replace(problem, dot_sigma_mm=np.full_like(problem.dot_sigma_mm, 1e-6))
     if len(problem.cameras) == 2:
@@ -155,7 +157,7 @@ def _agree_between_views(problem: Problem, labels: list[Ints]) -> tuple[Problem,
     rough = robust_solve(held.with_model("tangential"), start)
     marks = _print_errors(rough.problem, rough.solution.state)
     turned = np.array([_turned(marks, label, k, len(labels)) for k, label in enumerate(labels)])
-    choice = _alike(turned)
+    choice = _most_alike_turns(turned)
     contrast = _contrast(turned, choice)
     picks = {
         (v, c): labels[k] for v, k in enumerate(choice) for c in range(len(problem.cameras)) if k
@@ -163,7 +165,7 @@ def _agree_between_views(problem: Problem, labels: list[Ints]) -> tuple[Problem,
     return _relabel(problem, picks), contrast
 
 
-def _alike(turned: Array) -> Ints:
+def _most_alike_turns(turned: Array) -> Ints:
     """(V,) turns that make the views' print errors most alike: to one view, then to the mean."""
     views = np.arange(turned.shape[1])
     starts = [_misfits(turned, turned[0, v][None]).argmin(0) for v in views]

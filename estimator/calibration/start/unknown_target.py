@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import orthogonal_procrustes
 
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
@@ -120,5 +121,5 @@ def _scale_factor(problem: Problem, shape: Array) -> float:
 def _onto_nominal(shape: Array, nominal_mm: Array) -> Array:
     target = nominal_mm[:, :2]
     a, b = shape - shape.mean(0), target - target.mean(0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    return np.asarray(np.c_[a @ (u @ vt) + target.mean(0), np.zeros(len(shape))])
+    turn, _ = orthogonal_procrustes(a, b)
+    return np.asarray(np.c_[a @ turn + target.mean(0), np.zeros(len(shape))])

@@ -118,12 +118,13 @@ def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, 
 
 def _where(cells: Array) -> str:
     """Empty parts that are filled, (columns, rows)."""
-    last = cells.shape[0] - _CORNER_CELLS
-    names = []
-    for v, upper in ((slice(0, _CORNER_CELLS), "upper"), (slice(last, None), "lower")):
-        for u, left in ((slice(0, _CORNER_CELLS), "left"), (slice(last, None), "right")):
-            if cells[u, v].any():
-                names.append(f"{upper} {left}")
+    near, far = slice(0, _CORNER_CELLS), slice(-_CORNER_CELLS, None)
+    names = [
+        f"{upper} {left}"
+        for v, upper in ((near, "upper"), (far, "lower"))
+        for u, left in ((near, "left"), (far, "right"))
+        if cells[u, v].any()
+    ]
     if not names:
         return "empty parts"
     return "the empty " + " and ".join(names)

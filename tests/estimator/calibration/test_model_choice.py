@@ -12,6 +12,7 @@ import pytest
 
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.lens import choice as model_choice
+from telerig.estimator.calibration.lens.choice import model_start
 from telerig.estimator.calibration.lens.cross_validation import FOLDS, held_out_chi2, pose_only
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
@@ -22,7 +23,6 @@ from telerig.estimator.calibration.lens.search import (
     search,
     steps_to,
 )
-from telerig.estimator.calibration.lens.start_values import model_start
 from telerig.estimator.calibration.self_calibration import choose_model
 from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.measurements import problem_from_dots

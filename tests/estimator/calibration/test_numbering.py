@@ -95,7 +95,7 @@ def test_a_perfect_print_leaves_the_turns_undecided_but_harmless(scene: Any) -> 
     made, _ = turned(scene("symmetric", 1, print_factor=0.0), 1)
     calibration = made.calibrate("radial")
     assert made.space_rms_um(calibration) < 1.0
-    assert any("too small to tell the turns apart" in n for n in calibration.notes)
+    assert any("too small to decide the turn" in n for n in calibration.notes)
 
 
 def test_a_known_distance_that_a_turn_moves_is_trusted_less(scene: Any) -> None:

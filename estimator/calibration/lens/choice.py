@@ -262,7 +262,7 @@ def _revised(
     wanted model than it has is made again there.
     """
     fitting = [o for o in others if all(x in options for x, options in zip(o.lenses, allowed))]
-    best = min((fit, *fitting), key=quadratic.cost_of_fit)
+    best = min((fit, *fitting), key=lambda f: quadratic.cost_of_fit(f.lenses, f.cost))
     if best is not fit:
         return quadratic, best.lenses
     predicted = quadratic.least + quadratic.rise(fit.lenses)

@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,14 +41,6 @@ GROUP_PENALTY = 4.0
 1; twice that lets one group in about 20 000 in by chance (docs/decisions/014)."""
 NOISE_DOF = 20.0
 """Degrees of freedom that the stated noise is worth beside the residuals."""
-
-
-class _Fitted(Protocol):
-    @property
-    def lenses(self) -> Lenses: ...
-
-    @property
-    def cost(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -122,10 +113,10 @@ class QuadraticCost:
         """Of a model, by the criterion: chi-square and the penalty of what is free."""
         return self.rise(lenses) + sum(self.penalty_of(lens) for lens in lenses)
 
-    def cost_of_fit(self, fit: _Fitted) -> float:
-        """The same of a model that was fitted."""
-        penalties = sum(self.penalty_of(lens) for lens in fit.lenses)
-        return 2 * fit.cost / self.variance - self.least + penalties
+    def cost_of_fit(self, lenses: Lenses, fitted_cost: float) -> float:
+        """The same of a model that was fitted; fitted_cost : half its chi-square."""
+        penalties = sum(self.penalty_of(lens) for lens in lenses)
+        return 2 * fitted_cost / self.variance - self.least + penalties
 
     def penalty_of(self, lens: Lens) -> float:
         """A tilt counts as two groups: the stretch, and the homography that it adds."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import read_dots_csv
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from telerig.io.dataset.run import RunData
 
 Source = Literal["images", "dots"]
+AnySource = TypeVar("AnySource", bound=str)
 
 _FOLDERS = ["calibration", "stage_axis", "runs", "truth", "results"]
 _LAYOUT = "put images at calibration/<camera>/<view>.tif, or dots in calibration/dots.csv"
@@ -72,7 +73,7 @@ class Dataset:
 
     @property
     def results(self) -> Path:
-        """Where commands write unless told otherwise."""
+        """Where commands write unless --out names another folder."""
         return self.path / "results"
 
     def dots(self) -> pd.DataFrame:
@@ -129,7 +130,7 @@ def load_dataset(
     source : "images" or "dots" when `calibration/` holds both.
     need_views : False for work on runs with a calibration from elsewhere; then a dataset without
     views, or with views of two kinds, is no error.
-    Raises InputError for a folder that is not a dataset or views that cannot be told apart.
+    Raises InputError for a folder that is not a dataset or views that are not distinct.
     """
     folder = _dataset_folder(Path(path))
     rig = read_rig_toml(folder / "rig.toml")
@@ -194,26 +195,38 @@ def _choose_source(
     folder: Path, rig: RigDescription, source: str | None, need_views: bool
 ) -> Source | None:
     calibration = folder / "calibration"
-    has_dots = (calibration / "dots.csv").is_file()
-    has_images = any(list_images(p) for p in _entries(calibration) if p.is_dir())
-    has: dict[Source, bool] = {"images": has_images, "dots": has_dots}
-    if source is not None and source not in has:
-        raise InputError(
-            f"source is {source!r}", where=str(folder), todo='give "images" or "dots" (--from)'
-        )
-    wanted: list[Source] = [s for s in has if source in (None, s)]
-    found = [s for s in wanted if has[s]]
-    if len(found) == 1:
-        return found[0]
-    if not need_views and source is None:
+    has: dict[Source, bool] = {
+        "images": any(list_images(p) for p in _entries(calibration) if p.is_dir()),
+        "dots": (calibration / "dots.csv").is_file(),
+    }
+    if not need_views and source is None and all(has.values()):
         return None
-    if found:
+    chosen = choose_source(has, source, calibration)
+    if chosen is None and (need_views or source is not None):
+        raise _no_views(folder, rig, [s for s in has if source in (None, s)])
+    return chosen
+
+
+def choose_source(
+    has: Mapping[AnySource, bool], source: str | None, folder: Path
+) -> AnySource | None:
+    """The source of measurements to use: the one asked for, else the only one; None: not there.
+
+    has : whether the folder has images or a table, by the words that ``source`` may be.
+    Raises InputError for another word, and for two sources of which none was asked for.
+    """
+    first, second = has
+    if source is not None and source not in has:
+        todo = f'give "{first}" or "{second}" (--from)'
+        raise InputError(f"source is {source!r}", where=str(folder), todo=todo)
+    found = [s for s in has if has[s] and source in (None, s)]
+    if len(found) > 1:
         raise InputError(
-            "holds both images and dots.csv, and which to use is not said",
-            where=str(calibration),
-            todo="choose with --from images or --from dots",
+            f"holds both {first} and {second}.csv, and nothing says which to use",
+            where=str(folder),
+            todo=f"choose with --from {first} or --from {second}",
         )
-    raise _no_views(folder, rig, wanted)
+    return found[0] if found else None
 
 
 class NoViewsError(InputError):
@@ -260,11 +273,11 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
 def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
     """The images of one camera by view name; what is no image is noted."""
     images = list_images(folder)
-    strange = [p.name for p in _entries(folder) if p not in images]
-    if strange:
+    unused = [p.name for p in _entries(folder) if p not in images]
+    if unused:
         notes.append(
             f"calibration/{folder.name}: not used, as they are no images "
-            f"({' '.join(EXTENSIONS)}): {', '.join(strange)}"
+            f"({' '.join(EXTENSIONS)}): {', '.join(unused)}"
         )
     stems: dict[str, Path] = {}
     for file in images:
@@ -294,7 +307,7 @@ def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
 
 
 def _note_single(cameras_of: Mapping[Any, set[str]], rig: RigDescription, notes: list[str]) -> None:
-    """Views of one camera alone say nothing about the other: tell it."""
+    """Add a note for the views that only one camera has, which say nothing about the other."""
     for camera in rig.cameras if len(rig.cameras) > 1 else ():
         alone = sorted((str(v) for v, seen in cameras_of.items() if seen == {camera}), key=natural)
         if alone:

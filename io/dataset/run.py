@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError, suggestion
+from telerig.io.dataset.dataset import choose_source
 from telerig.io.dataset.frame_pairing import Pairing, pair_frames
 from telerig.io.dataset.run_tables import (
     read_accelerometer_csv,
@@ -171,7 +172,7 @@ def load_run(
         sources=sources,
         positions=positions,
     )
-    return _looked_at(run)
+    return _with_ends_checked(run)
 
 
 def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
@@ -205,28 +206,19 @@ def _rig_above(folder: Path) -> RigDescription | None:
 
 
 def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSource:
-    if source not in (None, "images", "detections"):
-        todo = 'give "images" or "detections" (--from)'
-        raise InputError(f"source is {source!r}", where=str(folder), todo=todo)
-    table = (folder / "detections.csv").is_file()
-    images = bool(_recordings(folder))
-    if source is None and table and images:
+    has: dict[RunSource, bool] = {
+        "images": bool(_recordings(folder)),
+        "detections": (folder / "detections.csv").is_file(),
+    }
+    chosen = choose_source(has, source, folder)
+    if chosen is None:
         raise InputError(
-            "holds both images and detections.csv, and which to use is not said",
+            "there is no detections.csv" if source == "detections" else "there are no images",
             where=str(folder),
-            todo="choose with --from images or --from detections",
+            todo=f"put frames at {names[0]}/*.tif, {names[0]}.tif or {names[0]}.avi, "
+            "or detections into detections.csv",
         )
-    if table and source != "images":
-        return "detections"
-    if images and source != "detections":
-        return "images"
-    wanted = "no detections.csv" if source == "detections" else "no images"
-    raise InputError(
-        f"there are {wanted}" if source == "images" or not source else f"there is {wanted}",
-        where=str(folder),
-        todo=f"put frames at {names[0]}/*.tif, {names[0]}.tif or {names[0]}.avi, "
-        "or detections into detections.csv",
-    )
+    return chosen
 
 
 def _recordings(folder: Path) -> dict[str, Path]:
@@ -286,8 +278,8 @@ def _detections(
     table = read_detections_csv(folder / "detections.csv", names, sizes, count)
     if not all(name in sizes for name in names):
         notes.append("the images' sizes are not known: detections outside them are not noticed")
-    silent = [name for name in names if name not in set(table["camera"])]
-    notes += [f"detections.csv has nothing of camera {name}" for name in silent]
+    absent = [name for name in names if name not in set(table["camera"])]
+    notes += [f"detections.csv has nothing of camera {name}" for name in absent]
     return table
 
 
@@ -330,8 +322,8 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
     hit = [i for i in wide if np.any((t_s > t[i]) & (t_s < t[i + 1]))]
     if hit:
         notes.append(
-            f"stage.csv is silent for {step[hit[0]]:.3g} s from {t[hit[0]]:.6g} s on"
-            + (f", and {len(hit) - 1} times more" if len(hit) > 1 else "")
+            f"stage.csv has no reading for {step[hit[0]]:.3g} s from {t[hit[0]]:.6g} s on"
+            + (f", and {len(hit) - 1} further gaps" if len(hit) > 1 else "")
             + ": positions there are interpolated"
         )
     return np.asarray(at, float)
@@ -349,7 +341,7 @@ def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | N
     return read(file) if file.is_file() else None
 
 
-def _looked_at(run: RunData) -> RunData:
+def _with_ends_checked(run: RunData) -> RunData:
     """Each camera's first and last image are decoded, so that wrong sizes and cuts show at once."""
     for name, positions in run.positions.items():
         present = np.flatnonzero(positions >= 0)

@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.images.read import Image, image_from_pixels, list_images, read_image
+from telerig.io.images.read import (
+    Image,
+    damaged,
+    image_from_pixels,
+    list_images,
+    page_pixels,
+    read_image,
+)
 from telerig.io.images.video import VIDEO_EXTENSIONS, VideoFrames
 
 PAGE_EXTENSIONS = (".tif", ".tiff")
@@ -112,31 +119,32 @@ class PageFrames:
         try:
             return tifffile.TiffFile(self.path)
         except Exception as error:
-            raise _damaged(self.path, str(error)) from error
+            raise damaged(self.path, str(error)) from error
 
     def _page(self, position: int) -> NDArray[Any]:
         import tifffile
 
         if position >= len(self._offsets):
-            raise _damaged(self.path, f"it ends after {len(self._offsets)} pages")
+            raise damaged(self.path, f"it ends after {len(self._offsets)} pages")
         with self._opened() as tiff:
             tiff.filehandle.seek(int(self._offsets[position]))
             try:
                 page = tifffile.TiffPage(tiff, index=position)
-                end = max(o + n for o, n in zip(page.dataoffsets, page.databytecounts))
-                if end <= self._size and 0 not in page.databytecounts:
-                    return _black_is_zero(page, self.path)
+                return page_pixels(page, self._size, self.path)
             except InputError:
                 raise
             except Exception as error:
-                raise _damaged(self.path, str(error)) from error
-        raise _damaged(self.path, f"it has {self._size} bytes, the page asks for {end}")
+                if "imagecodecs" in str(error):
+                    todo = "save it without compression, or `pip install imagecodecs`"
+                    what = f"cannot be read: {error}"
+                    raise InputError(what, where=str(self.path), todo=todo) from error
+                raise damaged(self.path, str(error)) from error
 
     def _from_stack(self, position: int) -> NDArray[Any]:
         assert self._stack is not None
         start, end = self._stack.span(position)
         if end > self._size:
-            raise _damaged(self.path, f"it has {self._size} bytes, the page asks for {end}")
+            raise damaged(self.path, f"it has {self._size} bytes, the page asks for {end}")
         height, width = self._stack.shape
         flat = np.fromfile(self.path, self._stack.dtype, height * width, offset=start)
         return flat.reshape(height, width)
@@ -158,7 +166,7 @@ class _Stack:
 
 
 def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
-    """When the description speaks of more frames than there are page headers."""
+    """When the file's description counts more frames than there are page headers."""
     page = tiff.pages[0]
     if page.samplesperpixel != 1 or page.photometric == 0:
         return None
@@ -170,23 +178,6 @@ def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
     return _Stack(int(page.dataoffsets[0]), count, (page.imagelength, page.imagewidth), dtype)
 
 
-def _black_is_zero(page: Any, path: Path) -> NDArray[Any]:
-    if page.photometric == 0:
-        raise InputError(
-            "stores white as 0 (photometric MINISWHITE)",
-            where=str(path),
-            todo="save it again with black as 0",
-        )
-    try:
-        pixels = np.asarray(page.asarray())
-    except ValueError as error:
-        todo = "save it without compression, or `pip install imagecodecs`"
-        if "imagecodecs" in str(error):
-            raise InputError(f"cannot be read: {error}", where=str(path), todo=todo) from error
-        raise
-    return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
-
-
 def _page_offsets(path: Path) -> tuple[NDArray[np.int64], bool]:
     """Where each page's header begins, and whether the chain of headers leads out of the file."""
     with path.open("rb") as file:
@@ -195,7 +186,7 @@ def _page_offsets(path: Path) -> tuple[NDArray[np.int64], bool]:
         head = file.read(16)
         order = {b"II": "little", b"MM": "big"}.get(head[:2])
         if order is None or len(head) < 16 or size < 16:
-            raise _damaged(path, "it has no TIFF header")
+            raise damaged(path, "it has no TIFF header")
         big = int.from_bytes(head[2:4], order) == 43  # type: ignore[arg-type]
         counter, entry, pointer = (8, 20, 8) if big else (2, 12, 4)
 
@@ -218,7 +209,7 @@ def _page_offsets(path: Path) -> tuple[NDArray[np.int64], bool]:
 
 def _found(offsets: list[int], path: Path) -> NDArray[np.int64]:
     if not offsets:
-        raise _damaged(path, "it has no complete page")
+        raise damaged(path, "it has no complete page")
     return np.array(offsets, np.int64)
 
 
@@ -282,11 +273,3 @@ def _refuse_pages(file: Path, folder: Path) -> None:
             todo=f"a multi-page file stands beside the folder: move it to {folder.name}.tif, "
             f"and remove the folder {folder.name}",
         )
-
-
-def _damaged(path: Path, detail: str) -> InputError:
-    return InputError(
-        f"is truncated or damaged: {detail}",
-        where=str(path),
-        todo="copy or record it again, or leave the frame out (skip_unreadable)",
-    )

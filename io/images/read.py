@@ -24,7 +24,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 EXTENSIONS = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 _FORMATS = "telerig reads TIFF, PNG, BMP and JPEG"
-_COPY = "copy or record it again, or leave it out"
+_COPY = "copy or record it again, or leave it out (in a run with skip_unreadable)"
 _MONO = "save it with one grey channel; set a colour camera to a mono mode"
 
 
@@ -96,8 +96,9 @@ def _decoder(data: bytes, file: Path) -> Callable[[bytes, Path], NDArray[Any]]:
     raise InputError("is not an image of a known format", where=str(file), todo=_FORMATS)
 
 
-def _truncated(file: Path, detail: str) -> InputError:
-    return InputError(f"is truncated or damaged: {detail}", where=str(file), todo=_COPY)
+def damaged(path: Path, detail: str) -> InputError:
+    """The error for a file that ends too early or cannot be decoded."""
+    return InputError(f"is truncated or damaged: {detail}", where=str(path), todo=_COPY)
 
 
 def _opencv(data: bytes, file: Path) -> NDArray[Any]:
@@ -106,9 +107,9 @@ def _opencv(data: bytes, file: Path) -> NDArray[Any]:
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise _truncated(file, "it cannot be decoded") from error
+        raise damaged(file, "it cannot be decoded") from error
     if pixels is None:
-        raise _truncated(file, "it cannot be decoded")
+        raise damaged(file, "it cannot be decoded")
     return np.asarray(pixels)
 
 
@@ -119,17 +120,17 @@ def _png(data: bytes, file: Path) -> NDArray[Any]:
     try:
         Pillow.open(io.BytesIO(data), formats=["PNG"]).verify()
     except Exception as error:
-        raise _truncated(file, str(error)) from error
+        raise damaged(file, str(error)) from error
     return _opencv(data, file)
 
 
 def _bmp(data: bytes, file: Path) -> NDArray[Any]:
     if len(data) < 54:
-        raise _truncated(file, "the BMP header is incomplete")
+        raise damaged(file, "the BMP header is incomplete")
     offset, _, width, height, _, depth, packed = struct.unpack_from("<IIiiHHI", data, 10)
     needed = offset + (width * depth + 31) // 32 * 4 * abs(height)
     if packed in (0, 3) and len(data) < needed:
-        raise _truncated(file, f"it has {len(data)} bytes, its header asks for {needed}")
+        raise damaged(file, f"it has {len(data)} bytes, its header asks for {needed}")
     return _opencv(data, file)
 
 
@@ -137,11 +138,11 @@ def _jpeg(data: bytes, file: Path) -> NDArray[Any]:
     import imageio.v3 as iio
 
     if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-        raise _truncated(file, "the JPEG has no end marker")
+        raise damaged(file, "the JPEG has no end marker")
     try:
         return np.asarray(iio.imread(data, plugin="pillow", extension=".jpg"))
     except Exception as error:
-        raise _truncated(file, str(error)) from error
+        raise damaged(file, str(error)) from error
 
 
 def _tiff(data: bytes, file: Path) -> NDArray[Any]:
@@ -150,38 +151,43 @@ def _tiff(data: bytes, file: Path) -> NDArray[Any]:
 
     try:
         with tifffile.TiffFile(file) as tiff:
-            _check_tiff(tiff, len(data), file)
+            if len(tiff.pages) == 0:
+                raise damaged(file, "the TIFF has no page")
             page = tiff.pages[0]
-            pixels = np.asarray(page.asarray())
-            return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
+            of_series = int(np.prod(tiff.series[0].shape)) // max(page.size, 1)
+            frames = max(len(tiff.pages), of_series)
+            if frames > 1:
+                raise InputError(
+                    f"holds {frames} images",
+                    where=str(file),
+                    todo="save one image per file here; multi-page files belong in runs/",
+                )
+            return page_pixels(page, len(data), file)
     except InputError:
         raise
     except Exception as error:
         if "imagecodecs" in str(error):
             return _opencv(data, file)
-        raise _truncated(file, str(error)) from error
+        raise damaged(file, str(error)) from error
 
 
-def _check_tiff(tiff: Any, size: int, file: Path) -> None:
-    if len(tiff.pages) == 0:
-        raise _truncated(file, "the TIFF has no page")
-    page = tiff.pages[0]
-    frames = max(len(tiff.pages), int(np.prod(tiff.series[0].shape)) // max(page.size, 1))
-    if frames > 1:
-        raise InputError(
-            f"holds {frames} images",
-            where=str(file),
-            todo="save one image per file here; multi-page files belong in runs/",
-        )
+def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
+    """(height, width) or (height, width, channels) of tifffile's ``page``.
+
+    file_size : bytes. Raises InputError when the file ends before the page does, or white is 0;
+    and what tifffile raises.
+    """
     end = max((o + n for o, n in zip(page.dataoffsets, page.databytecounts)), default=0)
-    if end > size or 0 in page.databytecounts:
-        raise _truncated(file, f"it has {size} bytes, its tags ask for {end}")
+    if end > file_size or 0 in page.databytecounts:
+        raise damaged(file, f"it has {file_size} bytes, its tags ask for {end}")
     if page.photometric == 0:
         raise InputError(
             "stores white as 0 (photometric MINISWHITE)",
             where=str(file),
             todo="save it again with black as 0",
         )
+    pixels = np.asarray(page.asarray())
+    return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
 
 
 def _grey(pixels: NDArray[Any], file: Path) -> NDArray[Any]:
@@ -208,7 +214,7 @@ def _grey(pixels: NDArray[Any], file: Path) -> NDArray[Any]:
 def _native(pixels: NDArray[Any], file: Path) -> Image:
     """uint8, uint16 or float32, contiguous; wider integers are narrowed when nothing is lost."""
     if pixels.size == 0:
-        raise _truncated(file, "it has no pixels")
+        raise damaged(file, "it has no pixels")
     if pixels.dtype in (np.uint8, np.uint16):
         return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
     if pixels.dtype.kind == "f":

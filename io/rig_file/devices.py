@@ -49,7 +49,7 @@ def devices_from_tables(raw: Any, cameras: list[str], problems: Problems) -> Dev
 def _own_problems(place: str, device: DeviceDescription) -> Iterator[Problem]:
     allowed = _PROTOCOLS[device.kind]
     if device.protocol not in allowed:
-        what = f"is {device.protocol!r}, a protocol that no {device.kind} speaks"
+        what = f"is {device.protocol!r}, which is no protocol for the kind {device.kind}"
         yield Problem(place, "protocol", what, "known: " + ", ".join(allowed))
     if device.protocol == "regex":
         yield from pattern_problems(place, device.kind, device.pattern)

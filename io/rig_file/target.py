@@ -86,27 +86,17 @@ def _problem(key: str, what: str, todo: str, *involved: str) -> Problem:
 
 def _grid_problems(t: TargetTable) -> Iterator[Problem]:
     if t.points_mm is not None:
-        yield _problem(
-            "points_mm", "has no meaning on a grid", 'remove it, or set layout = "points"', "layout"
-        )
+        todo = 'remove it, or set layout = "points"'
+        yield _problem("points_mm", "has no meaning on a grid", todo, "layout")
     if t.pitch_mm is None:
         yield _problem("pitch_mm", *_missing_pitch(t), "layout", "scale_distance_mm")
     elif t.dot_diameter_mm >= np.min(t.pitch_mm):
-        yield _problem(
-            "dot_diameter_mm",
-            f"is {t.dot_diameter_mm}, not less than the pitch: the dots would touch",
-            "correct dot_diameter_mm or pitch_mm",
-            "pitch_mm",
-        )
+        what = f"is {t.dot_diameter_mm}, not less than the pitch: the dots would touch"
+        yield _problem("dot_diameter_mm", what, "correct dot_diameter_mm or pitch_mm", "pitch_mm")
     for key in ("rows", "columns"):
         if getattr(t, key) is None and t.extent == "bounded":
-            yield _problem(
-                key,
-                "is missing",
-                f'add how many {key} of dots the grid has, or extent = "unbounded"',
-                "layout",
-                "extent",
-            )
+            todo = f'add how many {key} of dots the grid has, or extent = "unbounded"'
+            yield _problem(key, "is missing", todo, "layout", "extent")
 
 
 def _missing_pitch(t: TargetTable) -> tuple[str, str]:
@@ -120,27 +110,16 @@ def _missing_pitch(t: TargetTable) -> tuple[str, str]:
 
 
 def _points_problems(t: TargetTable) -> Iterator[Problem]:
+    given = 'with layout = "points"'
     for key in (k for k in ("rows", "columns", "pitch_mm") if getattr(t, k) is not None):
-        yield _problem(
-            key,
-            'has no meaning with layout = "points"',
-            "remove it; the dots' places are points_mm",
-            "layout",
-        )
+        todo = "remove it; the dots' places are points_mm"
+        yield _problem(key, f"has no meaning {given}", todo, "layout")
     if t.extent == "unbounded":
-        yield _problem(
-            "extent",
-            'cannot be "unbounded" with layout = "points"',
-            "remove it; only a grid goes on beyond the image",
-            "layout",
-        )
+        todo = "remove it; only a grid goes on beyond the image"
+        yield _problem("extent", f'cannot be "unbounded" {given}', todo, "layout")
     if t.points_mm is None:
-        yield _problem(
-            "points_mm",
-            "is missing",
-            "add points_mm = [[x, y], ...], the nominal places of the dots",
-            "layout",
-        )
+        todo = "add points_mm = [[x, y], ...], the nominal places of the dots"
+        yield _problem("points_mm", "is missing", todo, "layout")
         return
     for twice in (point for point, count in Counter(t.points_mm).items() if count > 1):
         yield _problem("points_mm", f"has the point {list(twice)} more than once", "remove one")
@@ -154,31 +133,21 @@ def _mark_problems(t: TargetTable) -> Iterator[Problem]:
         "unbounded": f"rows and columns within +-{FARTHEST} of the origin mark",
     }["points" if t.layout == "points" else t.extent]
     for row, column in (cell for cell in t.marks if not _inside(t, *cell)):
-        yield _problem(
-            "marks",
-            f"has [{row}, {column}], which is not on the target",
-            f"marks are [row, column] from 0: {wanted}",
-            *involved,
-        )
+        what = f"has [{row}, {column}], which is not on the target"
+        yield _problem("marks", what, f"marks are [row, column] from 0: {wanted}", *involved)
     for twice in (cell for cell, count in Counter(t.marks).items() if count > 1):
         yield _problem("marks", f"has {list(twice)} more than once", "remove one")
     if t.mark_style != "large" or not t.marks:
         return
     related = ("marks", "mark_style", "dot_diameter_mm")
     if t.mark_diameter_mm is None:
-        yield _problem(
-            "mark_diameter_mm",
-            'is missing, and mark_style = "large" needs it',
-            "add the diameter of the large dots, or set mark_style",
-            *related,
-        )
+        what = 'is missing, and mark_style = "large" needs it'
+        todo = "add the diameter of the large dots, or set mark_style"
+        yield _problem("mark_diameter_mm", what, todo, *related)
     elif t.mark_diameter_mm <= t.dot_diameter_mm:
-        yield _problem(
-            "mark_diameter_mm",
-            f"is {t.mark_diameter_mm}, not larger than dot_diameter_mm = {t.dot_diameter_mm}",
-            "correct one of them, or set mark_style",
-            *related,
-        )
+        what = f"is {t.mark_diameter_mm}, not larger than dot_diameter_mm = {t.dot_diameter_mm}"
+        todo = "correct one of them, or set mark_style"
+        yield _problem("mark_diameter_mm", what, todo, *related)
 
 
 def _inside(t: TargetTable, row: int, column: int) -> bool:
@@ -192,14 +161,10 @@ def _inside(t: TargetTable, row: int, column: int) -> bool:
 
 def _scale_problems(t: TargetTable) -> Iterator[Problem]:
     if (t.scale_dots is None) != (t.scale_distance_mm is None):
-        missing = "scale_dots" if t.scale_dots is None else "scale_distance_mm"
-        other = "scale_distance_mm" if t.scale_dots is None else "scale_dots"
-        yield _problem(
-            missing,
-            f"is missing, and {other} is given",
-            f"give both, or remove {other}: the nominal pitch then sets the scale",
-            other,
-        )
+        pair = ("scale_dots", "scale_distance_mm")
+        missing, given = pair if t.scale_dots is None else pair[::-1]
+        todo = f"give both, or remove {given}: the nominal pitch then sets the scale"
+        yield _problem(missing, f"is missing, and {given} is given", todo, given)
     if t.scale_dots is None:
         return
     keys = ("rows", "columns", "layout", "extent", "points_mm")
@@ -260,11 +225,7 @@ def _scale_ids(t: TargetTable) -> tuple[int, int] | None:
 
 
 def _plate_problems(t: TargetTable) -> Iterator[Problem]:
+    what = "is missing, and two_sided = true needs it: the far side is seen through the plate"
     for key in ("plate_thickness_mm", "plate_index"):
         if t.two_sided and getattr(t, key) is None:
-            yield _problem(
-                key,
-                "is missing, and two_sided = true needs it: the far side is seen through the plate",
-                f"add {key} or remove two_sided",
-                "two_sided",
-            )
+            yield _problem(key, what, f"add {key} or remove two_sided", "two_sided")

@@ -225,7 +225,7 @@ class ImageConfig:
     relative. blur_px : Gaussian sigma in focus; defocus_px_per_mm : further sigma, added in
     quadrature, per mm of depth. window_dirt : specks per image area, fixed to the lab;
     lens_dirt : specks fixed in the image. flicker : relative, from frame to frame.
-    dropped : share of frames that a camera loses, told in `frames.csv`, column missing.
+    dropped : share of frames that a camera loses, named in the column missing of `frames.csv`.
     pages : one multi-page file per camera.
     """
 

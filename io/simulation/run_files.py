@@ -22,7 +22,7 @@ from telerig.io.rig_file.description import (
 )
 from telerig.io.simulation.calibration_files import seed_of, write_calibration
 from telerig.io.simulation.config import ImageConfig, RunConfig
-from telerig.io.simulation.images.backlight import Screen, Specks, random_screen, random_specks
+from telerig.io.simulation.images.backlight import Specks, random_screen, random_specks
 from telerig.io.simulation.images.bodies import MODES
 from telerig.io.simulation.images.bubbles import Silhouette, render_bubbles
 from telerig.io.simulation.images.sensor import digitise
@@ -76,7 +76,7 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     with ExitStack() as stack:
         if images:
             write = stack.enter_context(_image_files(run, config.image, list(cameras)))
-            picture = _Pictures(scene, image_rng, strips)
+            renderer = _Renderer(scene, image_rng, strips)
         for frame in range(config.frames):
             views = {name: camera_view(scene, frame, j) for j, name in enumerate(cameras)}
             truth.append(truth_rows(scene, frame, views))
@@ -84,7 +84,7 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
                 if lost[j, frame]:
                     continue
                 if images:
-                    write(name, frame, picture.image(frame, j, view))
+                    write(name, frame, renderer.image(frame, j, view))
                 else:
                     size = cameras[name].image_size_px
                     rows = _detected(config, frame, name, view, scene, size, table_rng)
@@ -145,7 +145,7 @@ def _lost_frames(scene: RunScene, rng: Generator) -> NDArray[np.bool_]:
     return np.asarray(lost)
 
 
-class _Pictures:
+class _Renderer:
     """The surroundings of the bubbles in each camera, drawn once, and each frame's light."""
 
     def __init__(self, scene: RunScene, rng: Generator, strips: Sequence[Strip]) -> None:
@@ -157,7 +157,8 @@ class _Pictures:
         self.lab_shift = np.stack([_lab_shift_px(scene, j) for j in range(len(names))])
         sizes = [camera.image_size_px for camera in scene.cameras.values()]
         self.sizes = sizes
-        self.screens = [_screen(image, look_rng) for _ in names]
+        light = {key: getattr(image, key) for key in ("gradient", "vignetting", "texture")}
+        self.screens = [random_screen(look_rng, level=image.screen, **light) for _ in names]
         self.lens = [_lens_dirt(image, size, look_rng) for size in sizes]
         self.window = [
             _window_dirt(image, size, shift, look_rng) for size, shift in zip(sizes, self.lab_shift)
@@ -203,16 +204,6 @@ def _lab_shift_px(scene: RunScene, index: int) -> Array:
     return np.stack([scene.rig_from_lab_mm(index, frame) for frame in frames]) @ slope.T
 
 
-def _screen(image: ImageConfig, rng: Generator) -> Screen:
-    return random_screen(
-        rng,
-        level=image.screen,
-        gradient=image.gradient,
-        vignetting=image.vignetting,
-        texture=image.texture,
-    )
-
-
 def _lens_dirt(image: ImageConfig, size: tuple[int, int], rng: Generator) -> Specks:
     low, high = np.zeros(2), np.array(size) - 1.0
     return random_specks(rng, image.lens_dirt, low, high, sigma_px=(1.5, 9.0), depth=(0.01, 0.06))
@@ -234,27 +225,23 @@ def _image_files(run: Path, image: ImageConfig, cameras: list[str]) -> Iterator[
     """A function (camera, frame, pixels) that writes single files, or pages of one per camera."""
     import tifffile
 
-    run.mkdir(parents=True, exist_ok=True)
-    if image.pages:
-        with ExitStack() as stack:
-            files = {
-                name: stack.enter_context(tifffile.TiffWriter(run / f"{name}.tif"))
-                for name in cameras
-            }
-
-            def add_page(name: str, frame: int, pixels: NDArray[Any]) -> None:
-                files[name].write(pixels, contiguous=False, metadata=None, software="telerig")
-
-            yield add_page
-        return
     for name in cameras:
-        (run / name).mkdir()
+        (run if image.pages else run / name).mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        files = {
+            name: stack.enter_context(tifffile.TiffWriter(run / f"{name}.tif"))
+            for name in cameras
+            if image.pages
+        }
 
-    def write_file(name: str, frame: int, pixels: NDArray[Any]) -> None:
-        file = run / name / f"{frame:06d}.tif"
-        tifffile.imwrite(file, pixels, metadata=None, software="telerig")
+        def write(name: str, frame: int, pixels: NDArray[Any]) -> None:
+            if image.pages:
+                files[name].write(pixels, contiguous=False, metadata=None, software="telerig")
+            else:
+                file = run / name / f"{frame:06d}.tif"
+                tifffile.imwrite(file, pixels, metadata=None, software="telerig")
 
-    yield write_file
+        yield write
 
 
 def _detected(

@@ -224,5 +224,5 @@ def wholly_inside(camera: Camera, pose: Pose, target: TrueTarget, border_px: flo
     """(N,) whether each dot, its rim included, lies inside the image and off its border."""
     uv = pixel_from_plate(camera, pose, target.points_mm, target.plate)
     radius = 1.03 * target.diameter_mm / 2 * camera["scale_px_per_mm"] * max(1, camera["aspect"])
-    room = np.minimum(uv, np.array(camera.image_size_px) - 1 - uv).min(-1)
-    return np.asarray(room >= radius + border_px)
+    to_border_px = np.minimum(uv, np.array(camera.image_size_px) - 1 - uv).min(-1)
+    return np.asarray(to_border_px >= radius + border_px)

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+POSITION, VELOCITY = 0, 1
+"""Places of these states in every process below."""
+
 GRAVITY_M_S2 = 9.81
 MICRO_G_M_S2 = 9.81e-6
 
@@ -35,7 +38,7 @@ class LinearProcess:
     noise_input: Array
 
     def stationary_covariance(self) -> Array:
-        """(n, n). Raises InputError for a process that does not settle."""
+        """(n, n). Raises InputError for a process without a stationary state."""
         from scipy.linalg import solve_continuous_lyapunov
 
         if np.max(np.linalg.eigvals(self.drift).real) >= 0:
@@ -132,7 +135,7 @@ def square_root(covariance: Array) -> Array:
 def ornstein_uhlenbeck(sigma: float, tau_s: float) -> LinearProcess:
     """States (integral, value): a velocity of RMS sigma that forgets within tau_s.
 
-    The integral, a displacement, does not settle: start it at 0.
+    The integral, a displacement, has no stationary state: start it at 0.
     """
     return LinearProcess(
         np.array([[0.0, 1.0], [0.0, -1 / tau_s]]), np.array([0.0, sigma * np.sqrt(2 / tau_s)])
@@ -162,13 +165,13 @@ def rig_mode(rms: float, frequency_hz: float, damping: float, force_hz: float) -
         ]
     )
     unit = LinearProcess(drift, np.array([0.0, 0.0, 0.0, f**2]))
-    gain = rms / np.sqrt(unit.stationary_covariance()[0, 0])
+    gain = rms / np.sqrt(unit.stationary_covariance()[POSITION, POSITION])
     return LinearProcess(drift, unit.noise_input * gain)
 
 
 def mode_acceleration(states: Array, process: LinearProcess) -> Array:
     """(..., 4) states of a `rig_mode` -> (...) its acceleration."""
-    return np.asarray(states @ process.drift[1])
+    return np.asarray(states @ process.drift[VELOCITY])
 
 
 @dataclass(frozen=True)
@@ -253,7 +256,10 @@ def stochastic_paths(
     across = across.reshape(2, count, steps, 2).transpose(1, 2, 3, 0)
     t = step_s * np.arange(steps)
     return Path(
-        rise[:, None] * t + up[..., 0], across[:, :, 0], rise[:, None] + up[..., 1], across[:, :, 1]
+        rise[:, None] * t + up[..., POSITION],
+        across[:, :, POSITION],
+        rise[:, None] + up[..., VELOCITY],
+        across[:, :, VELOCITY],
     )
 
 
@@ -311,8 +317,8 @@ def rig_shake(
                 continue
             mode = rig_mode(total * np.sqrt(share), ratio * frequency_hz, damping, force_hz)
             states = mode.paths(step_s, steps, rng, paths=copies)
-            offset[..., axis] += states[..., 0]
-            velocity[..., axis] += states[..., 1]
+            offset[..., axis] += states[..., POSITION]
+            velocity[..., axis] += states[..., VELOCITY]
             acceleration[..., axis] += mode_acceleration(states, mode)
     return Shake(offset, velocity, acceleration)
 

@@ -13,6 +13,8 @@ from telerig.errors import InputError
 from telerig.io.simulation.config import MotionConfig, RunConfig
 from telerig.io.simulation.images.bodies import Bodies, bodies_about
 from telerig.io.simulation.run.motion import (
+    POSITION,
+    VELOCITY,
     Path,
     Shake,
     constant_speed_path,
@@ -157,7 +159,7 @@ def _carriage(config: RunConfig, cameras: int, speed_mm_s: float, rng: Generator
     if stage.servo_rms_mm > 0:
         servo = rig_mode(stage.servo_rms_mm, stage.servo_hz, stage.servo_damping, stage.force_hz)
         states = servo.paths(step, steps, servo_rng)[0]
-        position, velocity = position + states[:, 0], velocity + states[:, 1]
+        position, velocity = position + states[:, POSITION], velocity + states[:, VELOCITY]
         acceleration = acceleration + mode_acceleration(states, servo)
     along = np.abs(AXIS_RIG)
     rms = stage.shake_mm / np.sqrt(2) * (along + stage.shake_lateral * (1 - along))
@@ -288,14 +290,14 @@ def _starts(
         member = slice(first, first + group)
         mean_rise = float(rise[member].mean())
         others = lab[:first, some] + starts[:first, None]
-        room = _CLEARANCE * (d_eq[:first] + d_eq[member].max()) / 2
+        least_gap = _CLEARANCE * (d_eq[:first] + d_eq[member].max()) / 2
         for _ in range(_TRIES):
             start = _start(config, size_mm, position[0], mean_rise, rng)
             gaps = [
                 np.linalg.norm(others - lab[i, some] - start, axis=-1).min(-1)
                 for i in range(first, first + group)
             ]
-            if all(np.all(gap > room) for gap in gaps):
+            if all(np.all(gap > least_gap) for gap in gaps):
                 break
         else:
             raise InputError(

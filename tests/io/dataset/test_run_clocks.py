@@ -87,7 +87,7 @@ def test_silent_stage_is_noted(full_run: Path) -> None:
     rows = [f"{t:.3f},0" for t in [*np.arange(1.99, 2.012, 0.001), 2.06]]
     (full_run / "stage.csv").write_text("t_s,position_mm\n" + "\n".join(rows))
     (note,) = load_run(full_run).notes
-    assert "silent for 0.048 s from 2.012 s" in note
+    assert "no reading for 0.048 s from 2.012 s" in note
 
 
 @pytest.mark.parametrize(

@@ -212,7 +212,7 @@ def with_ports(sims: list[SimulatedDevice]) -> list[SimulatedDevice]:
         ),
         (
             '[devices.arm_left]\nkind = "accelerometer"\nport = "x"\nprotocol = "zaber"',
-            r"no accelerometer speaks(.|\n)*known: stream, packets, regex",
+            r"no protocol for the kind accelerometer(.|\n)*known: stream, packets, regex",
         ),
         (
             '[devices.e]\nkind = "encoder"\nport = "x"\nprotocol = "regex"',

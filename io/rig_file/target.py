@@ -162,9 +162,9 @@ def _inside(t: TargetTable, row: int, column: int) -> bool:
 def _scale_problems(t: TargetTable) -> Iterator[Problem]:
     if (t.scale_dots is None) != (t.scale_distance_mm is None):
         pair = ("scale_dots", "scale_distance_mm")
-        missing, given = pair if t.scale_dots is None else pair[::-1]
-        todo = f"give both, or remove {given}: the nominal pitch then sets the scale"
-        yield _problem(missing, f"is missing, and {given} is given", todo, given)
+        missing, other = pair if t.scale_dots is None else pair[::-1]
+        todo = f"give both, or remove {other}: the nominal pitch then sets the scale"
+        yield _problem(missing, f"is missing, and {other} is given", todo, other)
     if t.scale_dots is None:
         return
     keys = ("rows", "columns", "layout", "extent", "points_mm")

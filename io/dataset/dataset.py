@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from telerig.errors import InputError, nearest, suggestion
-from telerig.io.dataset.tables import read_dots_csv
+from telerig.io.dataset.tables import choose_source, read_dots_csv
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.rig_file import read_rig_toml
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from telerig.io.dataset.run import RunData
 
 Source = Literal["images", "dots"]
-AnySource = TypeVar("AnySource", bound=str)
 
 _FOLDERS = ["calibration", "stage_axis", "runs", "truth", "results"]
 _LAYOUT = "put images at calibration/<camera>/<view>.tif, or dots in calibration/dots.csv"
@@ -205,28 +204,6 @@ def _choose_source(
     if chosen is None and (need_views or source is not None):
         raise _no_views(folder, rig, [s for s in has if source in (None, s)])
     return chosen
-
-
-def choose_source(
-    has: Mapping[AnySource, bool], source: str | None, folder: Path
-) -> AnySource | None:
-    """The source of measurements to use: the one asked for, else the only one; None: not there.
-
-    has : whether the folder has images or a table, by the words that ``source`` may be.
-    Raises InputError for another word, and for two sources of which none was asked for.
-    """
-    first, second = has
-    if source is not None and source not in has:
-        todo = f'give "{first}" or "{second}" (--from)'
-        raise InputError(f"source is {source!r}", where=str(folder), todo=todo)
-    found = [s for s in has if has[s] and source in (None, s)]
-    if len(found) > 1:
-        raise InputError(
-            f"holds both {first} and {second}.csv, and nothing says which to use",
-            where=str(folder),
-            todo=f"choose with --from {first} or --from {second}",
-        )
-    return found[0] if found else None
 
 
 class NoViewsError(InputError):

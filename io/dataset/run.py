@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError, suggestion
-from telerig.io.dataset.dataset import choose_source
 from telerig.io.dataset.frame_pairing import Pairing, pair_frames
 from telerig.io.dataset.run_tables import (
     read_accelerometer_csv,
@@ -22,6 +21,7 @@ from telerig.io.dataset.run_tables import (
     read_run_toml,
     read_stage_csv,
 )
+from telerig.io.dataset.tables import choose_source
 from telerig.io.images.frames import PAGE_EXTENSIONS, FrameSource, open_frames
 from telerig.io.images.read import Image, check_size, list_images
 from telerig.io.images.video import VIDEO_EXTENSIONS

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 __all__ = ["DOTS_COLUMNS", "Column", "read_dots_csv", "read_table", "write_table"]
 
+AnySource = TypeVar("AnySource", bound=str)
+
 DEFAULT_SIGMA_PX = 0.02
 """Standard deviation of a dot's centre where the table does not state it."""
 
@@ -28,6 +30,28 @@ OUTSIDE_PX = 3.0
 
 COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
 DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *COVARIANCE]
+
+
+def choose_source(
+    has: Mapping[AnySource, bool], source: str | None, folder: Path
+) -> AnySource | None:
+    """The source of measurements to use: the one asked for, else the only one; None: not there.
+
+    has : whether the folder has images or a table, by the words that ``source`` may be.
+    Raises InputError for another word, and for two sources of which none was asked for.
+    """
+    first, second = has
+    if source is not None and source not in has:
+        todo = f'give "{first}" or "{second}" (--from)'
+        raise InputError(f"source is {source!r}", where=str(folder), todo=todo)
+    found = [s for s in has if has[s] and source in (None, s)]
+    if len(found) > 1:
+        raise InputError(
+            f"holds both {first} and {second}.csv, and nothing says which to use",
+            where=str(folder),
+            todo=f"choose with --from {first} or --from {second}",
+        )
+    return found[0] if found else None
 
 
 def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFrame:

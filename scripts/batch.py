@@ -9,7 +9,7 @@ import typer
 
 from telerig.errors import InputError
 from telerig.scripts import options
-from telerig.scripts.console import EXIT_REJECTED, errors_in_words, say, say_written
+from telerig.scripts.console import EXIT_REJECTED, errors_in_words, run_file, say, say_written
 
 if TYPE_CHECKING:
     from telerig.estimator.batch.jobs import Job
@@ -86,4 +86,4 @@ def _share(text: str) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
-    typer.run(batch)
+    run_file(batch)

@@ -15,6 +15,7 @@ from telerig.scripts.console import (
     EXIT_REJECTED,
     errors_in_words,
     progress,
+    run_file,
     say,
     say_written,
     stopped_by_signals,
@@ -185,4 +186,4 @@ def _watched(
 
 
 if __name__ == "__main__":
-    typer.run(calibrate)
+    run_file(calibrate)

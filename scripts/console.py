@@ -25,6 +25,13 @@ EXIT_CLOSED_PIPE = 141
 """What a shell gives a program whose reader (`| head`) is gone: 128 + SIGPIPE."""
 
 
+def run_file(command: Callable[..., None]) -> None:
+    """Run a command's file as a program, with its help formatted as in `telerig`."""
+    app = typer.Typer(rich_markup_mode="markdown", add_completion=False)
+    app.command()(command)
+    app()
+
+
 def say(text: str) -> None:
     """A line for the user, on standard output."""
     typer.echo(text)

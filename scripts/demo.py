@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from telerig.scripts import options
-from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, say
+from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, run_file, say
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -145,4 +145,4 @@ def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> 
 
 
 if __name__ == "__main__":
-    typer.run(demo)
+    run_file(demo)

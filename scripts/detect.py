@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import typer
-
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, progress, say
+from telerig.scripts.console import errors_in_words, progress, run_file, say
 
 
 @errors_in_words()
@@ -39,4 +37,4 @@ def detect(
 
 
 if __name__ == "__main__":
-    typer.run(detect)
+    run_file(detect)

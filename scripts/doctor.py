@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from telerig.scripts.console import EXIT_REJECTED, errors_in_words, say
+from telerig.scripts.console import EXIT_REJECTED, errors_in_words, run_file, say
 
 _SIGNS = {"ok": "ok", "note": "note", "warning": "WARNING", "failure": "FAILURE"}
 _WIDTH = 8
@@ -43,4 +43,4 @@ def doctor(
 
 
 if __name__ == "__main__":
-    typer.run(doctor)
+    run_file(doctor)

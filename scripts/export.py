@@ -10,7 +10,7 @@ import typer
 from telerig.errors import InputError
 from telerig.io.exchange.formats import CAMERA_EXPORTS, RUN_EXPORTS, described
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, say
+from telerig.scripts.console import errors_in_words, run_file, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -173,4 +173,4 @@ def run_folder(source: Path, run: str | None) -> Path:
 
 
 if __name__ == "__main__":
-    typer.run(export)
+    run_file(export)

@@ -9,7 +9,7 @@ import typer
 
 from telerig.errors import InputError
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, say
+from telerig.scripts.console import errors_in_words, run_file, say
 
 
 @errors_in_words()
@@ -56,4 +56,4 @@ def init(
 
 
 if __name__ == "__main__":
-    typer.run(init)
+    run_file(init)

@@ -13,7 +13,7 @@ import typer
 
 from telerig.errors import InputError
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, say, stopped_by_signals
+from telerig.scripts.console import errors_in_words, run_file, say, stopped_by_signals
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -265,4 +265,4 @@ def _clock_words(device: dict[str, Any]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    typer.run(record)
+    run_file(record)

@@ -11,7 +11,7 @@ import typer
 
 from telerig.errors import InputError
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, progress, say
+from telerig.scripts.console import errors_in_words, progress, run_file, say
 
 if TYPE_CHECKING:
     from telerig.io.report.film.files import Progress
@@ -151,4 +151,4 @@ def _say_written(files: list[Path], notes: tuple[str, ...]) -> None:
 
 
 if __name__ == "__main__":
-    typer.run(report)
+    run_file(report)

@@ -8,7 +8,14 @@ import typer
 
 from telerig.errors import TelerigError
 from telerig.scripts import options
-from telerig.scripts.console import EXIT_REJECTED, errors_in_words, progress, say, say_written
+from telerig.scripts.console import (
+    EXIT_REJECTED,
+    errors_in_words,
+    progress,
+    run_file,
+    say,
+    say_written,
+)
 
 if TYPE_CHECKING:
     from telerig.estimator.batch.jobs import Job
@@ -68,4 +75,4 @@ def _done(job: Job, quiet: bool) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    typer.run(run)
+    run_file(run)

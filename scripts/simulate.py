@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from telerig.errors import InputError
-from telerig.scripts.console import errors_in_words, say, stopped_by_signals
+from telerig.scripts.console import errors_in_words, run_file, say, stopped_by_signals
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -175,4 +175,4 @@ def _simulate_devices(out: Path | None, seconds: float | None, rng: Generator) -
 
 
 if __name__ == "__main__":
-    typer.run(simulate)
+    run_file(simulate)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, progress, say, say_written
+from telerig.scripts.console import errors_in_words, progress, run_file, say, say_written
 
 
 @errors_in_words()
@@ -67,4 +67,4 @@ def smooth(
 
 
 if __name__ == "__main__":
-    typer.run(smooth)
+    run_file(smooth)

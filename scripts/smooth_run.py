@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import typer
-
+from telerig.scripts.console import run_file
 from telerig.scripts.smooth import smooth
 
 if __name__ == "__main__":
-    typer.run(smooth)
+    run_file(smooth)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, progress, say, say_written
+from telerig.scripts.console import errors_in_words, progress, run_file, say, say_written
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -86,4 +86,4 @@ def default_folder(run: Path) -> Path:
 
 
 if __name__ == "__main__":
-    typer.run(track)
+    run_file(track)

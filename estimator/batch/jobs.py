@@ -17,7 +17,7 @@ Kind = Literal["calibrate", "track", "smooth"]
 
 MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
 RESERVED = "calibration"
-"""results/calibration is the calibration's: no run can have this name."""
+"""No run can have this name, because results/calibration belongs to the calibration."""
 _INPUTS = {"calibrate": ("calibration", "stage_axis")}
 
 
@@ -130,7 +130,9 @@ def _checked(datasets: Iterable[Path]) -> list[Path]:
     for place in places:
         if not place.is_dir():
             raise InputError(
-                "there is no such folder", where=str(place), todo="give folders with a rig.toml"
+                "there is no such folder",
+                where=str(place),
+                todo="give folders with a rig.toml",
             )
         if places.count(place) > 1:
             raise InputError("the dataset is named twice", where=str(place), todo="name it once")
@@ -162,7 +164,7 @@ def check_run_name(run: Path) -> None:
     place = Path(run).resolve()
     if place.name == RESERVED and place.parent.name == "runs":
         raise InputError(
-            "a run of this name would write into the calibration's results",
+            "a run with this name would write into the results of the calibration",
             where=str(run), todo="rename the folder",
         )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Is a dataset fit to be calibrated, tracked and smoothed? One `Check` per question."""
+"""Checks whether a dataset can be calibrated, tracked and smoothed: one `Check` per question."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FEWEST_VIEWS = 6
 _GOOD_VIEWS = 10
 _LEAST_FREE_GB = 2.0
 _RESULT_BYTES_PER_FRAME = 20_000
-_DECODED = 3
-_UNEVEN = 0.2
-_FEW_READINGS = 2
+_DECODED_IMAGES = 3
+_UNEVEN_STEP = 0.2
+_FEWEST_READINGS = 2
 
 
 def check_dataset(place: Path) -> Iterator[Check]:
-    """rig.toml, the views, every run with its clocks and sensors, room on the disk."""
+    """Check rig.toml, the views, every run with its clocks and sensors, and the space on the disk."""
     try:
         data = load_dataset(place, need_views=False)
     except TelerigError as error:
@@ -47,7 +47,7 @@ def check_dataset(place: Path) -> Iterator[Check]:
 
 
 def _left_over(data: Dataset) -> Iterator[Check]:
-    """What commands that were killed have left, or commands that still work are writing."""
+    """Temporary files of commands that were killed, or that are still running."""
     found = sorted(p for p in data.results.rglob(".*.part*") if not p.parent.name.startswith("."))
     if found:
         words = ", ".join(str(p.relative_to(data.path)) for p in found[:4])
@@ -70,9 +70,10 @@ def _views(data: Dataset) -> Iterator[Check]:
     if single:
         words += f", {len(single)} of them from one camera only ({', '.join(single[:4])})"
     if count < FEWEST_VIEWS:
-        yield Check("views", "warning", words, f"take {FEWEST_VIEWS} or more, better a dozen")
+        yield Check("views", "warning", words, f"take at least {FEWEST_VIEWS}, better 12")
     elif count < _GOOD_VIEWS:
-        yield Check("views", "note", words, "a dozen, tilted all ways, know more")
+        todo = "12 views with tilts in all directions give a better calibration"
+        yield Check("views", "note", words, todo)
     else:
         yield Check("views", "ok", words)
     yield from _decoded(data)
@@ -87,7 +88,7 @@ def _decoded(data: Dataset) -> Iterator[Check]:
     for camera in data.rig.cameras:
         mine = [v for v in data.views if camera in v.image_paths]
         try:
-            kinds = {data.image(v, camera).dtype.name for v in mine[:_DECODED]}
+            kinds = {data.image(v, camera).dtype.name for v in mine[:_DECODED_IMAGES]}
         except TelerigError as error:
             yield _failure(f"images of {camera}", error)
         else:
@@ -98,7 +99,9 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
     what = f"run {name}"
     try:
         check_run_name(data.runs[name].path)
-        run = data.runs[name].load(source=_source(data.runs[name].path))
+        path = data.runs[name].path
+        source = "detections" if (path / "detections.csv").is_file() else None
+        run = data.runs[name].load(source=source)
     except TelerigError as error:
         yield _failure(what, error)
         return
@@ -112,22 +115,18 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
     yield from _sensors(run, what)
 
 
-def _source(path: Path) -> str | None:
-    return "detections" if (path / "detections.csv").is_file() else None
-
-
 def _clocks(run: RunData, what: str) -> Iterator[Check]:
     steps = np.diff(run.t_s)
     if not len(steps):
         return
-    usual = float(np.median(steps))
-    gaps = int((steps > (1 + _UNEVEN) * usual).sum())
+    median_s = float(np.median(steps))
+    gaps = int((steps > (1 + _UNEVEN_STEP) * median_s).sum())
     if gaps:
         yield Check(
             f"{what} frames.csv", "note",
-            f"{gaps} steps are longer than the usual {1000 * usual:.3g} ms, "
-            f"the longest {1000 * float(steps.max()):.3g} ms",
-            "frames were lost, or the camera was not triggered evenly; both are allowed for",
+            f"{gaps} steps are longer than the median step of {1000 * median_s:.3g} ms, "
+            f"the longest is {1000 * float(steps.max()):.3g} ms",
+            "frames were lost, or the camera was not triggered evenly; tracking allows for both",
         )  # fmt: skip
 
 
@@ -139,21 +138,21 @@ def _sensors(run: RunData, what: str) -> Iterator[Check]:
     except TelerigError as error:
         yield _failure(f"{what} sensors", error)
         return
-    told = [f"encoder {_rate(run.stage['t_s'].to_numpy(float))}"] if run.stage is not None else []
+    found = [f"encoder {_rate(run.stage['t_s'].to_numpy(float))}"] if run.stage is not None else []
     if run.accelerometers is not None:
         for sensor, rows in run.accelerometers.groupby("sensor"):
-            told.append(f"{sensor} {_rate(rows['t_s'].to_numpy(float))}")
+            found.append(f"{sensor} {_rate(rows['t_s'].to_numpy(float))}")
     if run.references is not None:
-        told.append(f"{run.references['mark'].nunique()} marks")
-    words = ", ".join(told) or "none: the rig's shake cannot be told from the bubbles' motion"
-    todo = "" if told else "record the encoder, and an accelerometer on each arm"
-    yield Check(f"{what} sensors", "ok" if told else "note", words, todo)
+        found.append(f"{run.references['mark'].nunique()} marks")
+    words = ", ".join(found) or "none, so the shake of the rig cannot be separated from the bubbles"
+    todo = "" if found else "record the encoder, and an accelerometer on each arm"
+    yield Check(f"{what} sensors", "ok" if found else "note", words, todo)
     for warning in warnings:
         yield Check(f"{what} sensors", "warning", warning)
 
 
 def _rate(t_s: np.ndarray) -> str:
-    if len(t_s) < _FEW_READINGS:
+    if len(t_s) < _FEWEST_READINGS:
         return f"{len(t_s)} readings"
     return f"{(len(t_s) - 1) / (t_s[-1] - t_s[0]):.4g} Hz"
 
@@ -164,12 +163,10 @@ def _disk(data: Dataset) -> Check:
     wanted = max(_LEAST_FREE_GB * 1e9, frames * _RESULT_BYTES_PER_FRAME)
     words = f"{free / 1e9:.3g} GB free"
     if free < wanted:
-        return Check("disk", "warning", words, f"results may need {wanted / 1e9:.2g} GB: make room")
+        return Check("disk", "warning", words, f"results may need {wanted / 1e9:.2g} GB; make room")
     return Check("disk", "ok", words)
 
 
 def _failure(what: str, error: TelerigError) -> Check:
-    where = getattr(error, "where", "")
-    said = getattr(error, "what", str(error))
-    words = f"{where}: {said}" if where else said
-    return Check(what, "failure", words, getattr(error, "todo", ""))
+    words = f"{error.where}: {error.what}" if error.where else error.what
+    return Check(what, "failure", words, error.todo)

@@ -1,4 +1,4 @@
-"""Is this installation whole, and do the serial ports work? One `Check` per question."""
+"""Checks of the installation and the serial ports: one `Check` per question."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LATENCY = Path("/sys/bus/usb-serial/devices")
 
 @dataclass(frozen=True)
 class Check:
-    """what : the question. words : the answer. todo : what to do about it, if anything."""
+    """what : the question. words : the answer. todo : the remedy, if one is needed."""
 
     what: str
     status: Status
@@ -35,7 +35,7 @@ class Check:
 
 
 def check_installation() -> Iterator[Check]:
-    """Python, the packages that telerig needs, one OpenCV only, the extras."""
+    """Check Python, the packages that telerig needs, that there is only one OpenCV, and the extras."""
     python = platform.python_version()
     known = _OLDEST <= sys.version_info[:2] <= _NEWEST
     yield Check(
@@ -72,7 +72,7 @@ def _package(name: str) -> Check:
         importlib.import_module(_IMPORTS.get(name, name))
     except ImportError as error:
         todo = f"pip install --force-reinstall {name}"
-        return Check(name, "failure", f"{have}, cannot be imported: {error}", todo)
+        return Check(name, "failure", f"{have}, but it cannot be imported: {error}", todo)
     return Check(name, "ok", have)
 
 
@@ -84,7 +84,7 @@ def _opencv() -> Check:
     if rivals:
         both = " ".join([*rivals, "opencv-python-headless"])
         return Check(
-            "one OpenCV", "warning", f"also installed: {', '.join(rivals)}; they share one folder",
+            "one OpenCV", "warning", f"also installed: {', '.join(rivals)}; they overwrite each other's files",
             f"pip uninstall -y {both} && pip install opencv-python-headless",
         )  # fmt: skip
     major = have.split(".")[0]
@@ -101,22 +101,24 @@ def _version(name: str) -> str | None:
 
 
 def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
-    """Every serial port: may it be opened, and how long does its adapter hold bytes back?"""
+    """Check for every serial port whether it may be opened, and the latency timer of its adapter."""
     ports = found_ports()
     if not ports:
         words = "none found"
         yield Check("serial ports", "note", words, "plug the sensors in if you want to record")
     for device, name in ports:
-        said = f"{device}: {name}" if name else device
+        label = f"{device}: {name}" if name else device
         if not os.access(device, os.R_OK | os.W_OK):
-            yield Check(device, "warning", f"{said}; you may not open it", NO_PERMISSION)
+            yield Check(
+                device, "warning", f"{label}; you have no permission to open it", NO_PERMISSION
+            )
         else:
-            yield Check(device, "ok", said)
+            yield Check(device, "ok", label)
         yield from _latency(device, latency / Path(device).name / "latency_timer")
 
 
 def _latency(device: str, timer: Path) -> Iterator[Check]:
-    """USB adapters gather bytes for so long before they send them: 16 ms unless told otherwise."""
+    """The latency timer is how long a USB adapter collects bytes before it sends them; often 16 ms."""
     try:
         held_ms = int(timer.read_text())
     except (OSError, ValueError):

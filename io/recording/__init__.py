@@ -1,1 +1,5 @@
-"""Sensors on serial lines: read, kept as raw bytes, turned into the tables of a run."""
+"""Sensors on serial lines: recorded as raw bytes, then turned into the tables of a run.
+
+In: the devices of rig.toml. Out: recording.raw, stage.csv, accelerometer.csv, frames.csv and
+recording.json. Read ``session`` (recording) first, then ``tables`` and ``replay``.
+"""

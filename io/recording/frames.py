@@ -1,4 +1,4 @@
-"""Camera frames from trigger or frame-counter lines: which frame when, and which are missing."""
+"""Camera frames from trigger or frame-counter lines: their times, and which are missing."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """(F,) t_s of the frames from 0; missing : names of cameras without it, joined by `|`.
+    """t_s : (F,) of the frames from 0. missing : names of the cameras without it, joined by `|`.
 
-    interpolated : (F,) no line told the frame, its time lies between its neighbours'.
+    interpolated : (F,) no line reported the frame; its time is interpolated.
     """
 
     t_s: Array
@@ -27,34 +27,34 @@ class FrameTimes:
 
 
 def frame_times(records: list[DeviceRecord]) -> FrameTimes:
-    """All frames that the lines tell of, the first being 0.
+    """All frames that the lines report, the first being 0.
 
-    A frame that a counter skips is missing of its cameras, if its line was whole meanwhile; where
-    bytes were damaged or the line away, only its time is interpolated.
+    A frame that a counter skips is missing from its cameras, if its line was undamaged meanwhile;
+    where bytes were damaged or the line was unplugged, only its time is interpolated.
     """
-    heard = [r for r in records if len(r.t_s)]
-    if not heard:
+    records = [r for r in records if len(r.t_s)]
+    if not records:
         return FrameTimes(np.zeros(0), (), np.zeros(0, bool))
-    numbers = _aligned(heard)
+    numbers = _aligned(records)
     count = 1 + max(int(n[-1]) for n in numbers)
     t_s = np.full(count, np.nan)
-    gone: list[list[str]] = [[] for _ in range(count)]
-    for record, number in zip(reversed(heard), reversed(numbers)):
+    missing: list[list[str]] = [[] for _ in range(count)]
+    for record, number in zip(reversed(records), reversed(numbers)):
         t_s[number] = record.t_s
-    for record, number in zip(heard, numbers):
+    for record, number in zip(records, numbers):
         for frame in _skipped(record, number, count):
-            gone[frame] += record.device.cameras
-    silent = np.isnan(t_s)
-    known = np.flatnonzero(~silent)
-    t_s[silent] = np.interp(np.flatnonzero(silent), known, t_s[known])
-    return FrameTimes(t_s, tuple("|".join(dict.fromkeys(names)) for names in gone), silent)
+            missing[frame] += record.device.cameras
+    unreported = np.isnan(t_s)
+    known = np.flatnonzero(~unreported)
+    t_s[unreported] = np.interp(np.flatnonzero(unreported), known, t_s[known])
+    return FrameTimes(t_s, tuple("|".join(dict.fromkeys(names)) for names in missing), unreported)
 
 
 def frame_numbers(t_s: Array, counter: Array | None) -> Ints:
-    """(N,) frames from 0 of a line's readings; by time where the counter cannot be right.
+    """(N,) frame of each reading of a line, from 0; from the times where the counter is wrong.
 
-    A counter may stand (a pause) but not run ahead of the time by more than a tenth, nor fall
-    back: then it began anew, wrapped, or was damaged.
+    A counter may fall behind the time (a pause of the camera), but not run ahead of it by more
+    than a tenth, nor go back: then it restarted, wrapped, or was damaged.
     """
     if len(t_s) < 2:
         return np.zeros(len(t_s), np.int64)
@@ -63,9 +63,9 @@ def frame_numbers(t_s: Array, counter: Array | None) -> Ints:
     if counter is None:
         steps = by_time
     else:
-        told = np.diff(counter)
-        sound = (told >= 1) & (told <= by_time + np.maximum(1, 0.1 * by_time))
-        steps = np.where(sound, told, by_time)
+        counted = np.diff(counter)
+        valid = (counted >= 1) & (counted <= by_time + np.maximum(1, 0.1 * by_time))
+        steps = np.where(valid, counted, by_time)
     return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
 
 
@@ -86,11 +86,11 @@ def _aligned(records: list[DeviceRecord]) -> list[Ints]:
 
 
 def _skipped(record: DeviceRecord, number: Ints, count: int) -> list[int]:
-    """Frames that the line skipped while it was whole."""
+    """Frames that the line skipped while its bytes were undamaged."""
     skipped = [*range(int(number[0])), *range(int(number[-1]) + 1, count)]
-    doubt = np.array([*record.malformed_s, *(t for away in record.away_s for t in away)])
+    damaged_s = np.array([*record.malformed_s, *(t for away in record.away_s for t in away)])
     for i in np.flatnonzero(np.diff(number) > 1):
         begin, end = record.t_s[i] - 1e-3, record.t_s[i + 1] + 0.1
-        if not np.any((doubt >= begin) & (doubt <= end)):
+        if not np.any((damaged_s >= begin) & (damaged_s <= end)):
             skipped += range(int(number[i]) + 1, int(number[i + 1]))
     return skipped

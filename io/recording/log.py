@@ -1,8 +1,8 @@
-"""The raw log of a recording: every byte that a port gave, with the host's time, append-only.
+"""The raw log of a recording: every byte that a port received, with the host's time, append-only.
 
 A file is `MAGIC`, one header of JSON, then entries: marker, kind, device, monotonic time (ns),
-length, payload, CRC-32 of all of it but the marker. A torn tail, or a damaged stretch, costs its
-own entries and no others.
+length, payload, CRC-32 of all of it but the marker. Damage, or a file cut off at its end, affects
+only the entries that it touches.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LEAST = len(MARKER) + _HEAD.size + _CRC.size
 _BLOCK = 1 << 22
 
 RECEIVED, SENT, LOST, FOUND, END = 1, 2, 3, 4, 5
-"""Kinds of entry: bytes in, bytes out, line lost, line found again, recording ended."""
+"""Kinds of entry: bytes in, bytes out, port lost, port found again, recording ended."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class LogHeader:
-    """start_ns : host's monotonic time that is 0 s of the run; started : the wall clock then."""
+    """start_ns : the host's monotonic time at 0 s of the run; started : the wall clock then."""
 
     start_ns: int
     started: str
@@ -50,7 +50,7 @@ class LogHeader:
 
 
 class RawLog:
-    """Writes a log; `append` costs nothing much, `flush` brings it all to the disk."""
+    """Writes a log; `append` keeps entries in memory, `flush` brings them to the disk."""
 
     def __init__(self, path: Path, header: LogHeader) -> None:
         self.path = path
@@ -75,7 +75,7 @@ class RawLog:
         self._waiting.append(packed(entry))
 
     def flush(self) -> None:
-        """Write what is waiting and have the disk confirm it. Raises InputError."""
+        """Write the entries in memory and wait until they are on the disk. Raises InputError."""
         if not self._waiting:
             return
         data, self._waiting = b"".join(self._waiting), []
@@ -108,7 +108,7 @@ def _make(folder: Path) -> None:
 
 
 def _keep_name(folder: Path) -> None:
-    """Have the disk confirm the folder's list of files, which a power cut could take back."""
+    """Bring the folder's list of files to the disk: a power cut could lose the new one."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -129,8 +129,7 @@ def log_error(path: Path, error: OSError) -> InputError:
         return InputError(
             "the disk is full: the recording ends here",
             where=str(path),
-            todo="make room; what was recorded until now is read with "
-            f"`telerig record --replay {path}`",
+            todo=f"make room; `telerig record --replay {path}` reads what was recorded until now",
         )
     return InputError(
         f"cannot be written: {error.strerror or error}",
@@ -145,7 +144,7 @@ def read_header(path: Path) -> LogHeader:
 
 
 def read_log(path: Path) -> Iterator[Entry]:
-    """Every sound entry, in the order of writing; damage is left out (see `damaged_bytes`)."""
+    """Every undamaged entry, in the order of writing (see `damaged_bytes`)."""
     header, start = _open(path)
     for piece in _pieces(path, start):
         if isinstance(piece, Entry) and piece.device < max(len(header.devices), 1):
@@ -153,7 +152,7 @@ def read_log(path: Path) -> Iterator[Entry]:
 
 
 def damaged_bytes(path: Path) -> int:
-    """How many bytes of the log belong to no sound entry: a torn tail, a damaged disk."""
+    """Number of bytes of the log that belong to no undamaged entry."""
     _, start = _open(path)
     return sum(p for p in _pieces(path, start) if isinstance(p, int))
 
@@ -177,9 +176,9 @@ def _open(path: Path) -> tuple[LogHeader, int]:
         header = _header(json.loads(text))
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"has a header that this telerig does not know ({error})",
+            f"has a header that this version of telerig does not know ({error})",
             where=str(path),
-            todo="replay it with the telerig that recorded it, or a newer one",
+            todo="replay it with the version of telerig that recorded it, or a newer one",
         ) from error
     return header, len(head) + length + _CRC.size
 
@@ -210,7 +209,7 @@ def _pieces(path: Path, start: int) -> Iterator[Entry | int]:
 
 
 def _entry(data: bytes, at: int, *, final: bool) -> tuple[Entry | int, int] | None:
-    """The piece at ``at`` and where the next begins; None: more data are needed, or the end."""
+    """The piece at ``at`` and where the next one begins; None for more data, or at the end."""
     left = len(data) - at
     if left == 0 or (left < _LEAST and not final):
         return None

@@ -1,4 +1,4 @@
-"""Serial ports: which there are, opening one, and what to do when it cannot be opened."""
+"""Serial ports: listing them, opening one, and what to do when one cannot be opened."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from telerig.errors import InputError
 from telerig.io.rig_file.description import DeviceDescription
 
 WAIT_S = 0.1
-"""How long a read waits for a byte before it looks whether to stop."""
+"""Longest wait for a byte before a reader checks whether it has to stop."""
 WRITE_S = 1.0
-"""A port that takes no question for so long is lost."""
+"""A port that does not accept a written byte for so long is lost."""
 NO_PERMISSION = "sudo usermod -a -G dialout $USER (uucp on some systems), then log in again"
-"""What to do about it."""
+"""The remedy for a port that may not be opened."""
 
 
 def found_ports() -> list[tuple[str, str]]:
-    """(device file, what it calls itself or "") of the serial ports that the machine has now."""
+    """(device file, description or "") of the serial ports that the machine has now."""
     from serial.tools import list_ports
 
     return sorted(
@@ -29,12 +29,12 @@ def found_ports() -> list[tuple[str, str]]:
 
 
 def known_ports() -> list[str]:
-    """The same as one text each."""
+    """`found_ports`, as one text for each port."""
     return [device + (f" ({name})" if name else "") for device, name in found_ports()]
 
 
 def open_port(device: DeviceDescription) -> Any:
-    """The open port, emptied of what it held. Raises InputError."""
+    """The open port, its input buffer emptied. Raises InputError when it cannot be opened."""
     import serial
 
     try:
@@ -48,9 +48,9 @@ def open_port(device: DeviceDescription) -> Any:
 
 
 def read_chunk(port: Any) -> tuple[int, bytes]:
-    """(host's monotonic time in ns, bytes): what has come, after waiting for the first byte.
+    """(host's monotonic time in ns, bytes received), after waiting for the first byte.
 
-    The time is taken when all of these bytes had arrived, before they are copied.
+    The time is taken after all of these bytes have arrived, before they are copied.
     """
     first = port.read(1)
     if not first:

@@ -1,4 +1,4 @@
-"""What the bytes of a serial line say: one adapter per protocol, all of them fed in any pieces."""
+"""The protocols of serial devices: one parser each, which takes its bytes in any pieces."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LONGEST_LINE = 4096
-"""Bytes without a line's end after which they are taken for garbage."""
+"""More bytes than this without an end of line are malformed."""
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _STREAMS: dict[Kind, str] = {
@@ -28,8 +28,8 @@ _ZABER = r"@\d\d \d(?: \d\d)? OK (?:IDLE|BUSY) \S\S (?P<counts>-?\d+)(?::[0-9A-F
 _GRBL_AXES = {axis: rf"(?:{_NUMBER},){{{i}}}" for i, axis in enumerate("xyz")}
 
 SYNC = b"\xa5\x5a"
-"""Begin of a binary packet; then u32 stamp, the values, and the sum of all bytes before modulo 256,
-little-endian."""
+"""Start of a binary packet; then, little-endian, u32 stamp, the values, and the sum of all bytes
+before modulo 256."""
 PACKETS: dict[Kind, list[tuple[str, str]]] = {
     "encoder": [("t", "<u4"), ("counts", "<i4")],
     "accelerometer": [("t", "<u4"), ("ax", "<i2"), ("ay", "<i2"), ("az", "<i2")],
@@ -38,10 +38,10 @@ PACKETS: dict[Kind, list[tuple[str, str]]] = {
 
 @dataclass(frozen=True)
 class Readings:
-    """values : by the group's name, each (N,). arrived_ns : (N,) of a reading's last byte.
+    """values : (N,) each, by the name of the group. arrived_ns : (N,) of each reading's last byte.
 
-    malformed : arrival (ns) of each line or stretch of bytes that is no reading.
-    malformed_bytes : how many bytes these have. samples : the first of them, to show.
+    malformed : arrival (ns) of each line or run of bytes that is no reading.
+    malformed_bytes : number of bytes in these. samples : the first of them, for messages.
     """
 
     arrived_ns: Ints
@@ -52,24 +52,24 @@ class Readings:
 
 
 class Parser(Interface):
-    """Keeps what is incomplete until the rest of it arrives."""
+    """Keeps an incomplete reading until the rest of it arrives."""
 
     def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
-        """Readings that end in these (arrival_ns, bytes)."""
+        """The readings whose last byte is in these (arrival_ns, bytes)."""
 
     def cut(self) -> int:
-        """Forget what is incomplete, and that the line begins in the middle; bytes forgotten."""
+        """Drop the incomplete reading, as at the start of a connection; number of bytes dropped."""
 
 
 def parser(device: DeviceDescription) -> Parser:
-    """The adapter of a device, at the begin of a connection."""
+    """The parser of a device, at the start of a connection."""
     if device.protocol == "packets":
         return PacketParser(PACKETS[device.kind])
     return LineParser(line_pattern(device), xor=device.checksum == "xor")
 
 
 def poll_command(device: DeviceDescription) -> bytes | None:
-    """What asks the device for one reading; None for a stream."""
+    """The bytes that poll the device for one reading; None for a stream."""
     known = {"zaber": b"/1 get pos\n", "grbl": b"?"}
     own = device.poll.encode() if device.poll else None
     return known.get(device.protocol, own)
@@ -88,7 +88,7 @@ def line_pattern(device: DeviceDescription) -> str:
 
 
 def xor_checksum(line: bytes) -> bytes:
-    """`*hh` of a line: all its bytes exclusive-or'ed, in hexadecimal (NMEA 0183)."""
+    """`*hh`, the exclusive or of all bytes of a line in hexadecimal (NMEA 0183)."""
     total = 0
     for byte in line:
         total ^= byte
@@ -96,25 +96,25 @@ def xor_checksum(line: bytes) -> bytes:
 
 
 class _Joined:
-    """Pieces put together; what is incomplete waits for the rest."""
+    """Joins received pieces; incomplete readings stay in `_tail`."""
 
     def __init__(self) -> None:
         self._tail = b""
         self._begun = False
 
     def _join(self, chunks: Sequence[tuple[int, bytes]]) -> tuple[bytes, Ints, Ints]:
-        """What waited and has come now; where each piece ends in it, and when it arrived (ns)."""
+        """The bytes to parse; where each piece ends in them, and when it arrived (ns)."""
         data = self._tail + b"".join(piece for _, piece in chunks)
         ends = np.cumsum([len(self._tail), *(len(piece) for _, piece in chunks)])[1:]
         return data, ends, np.array([stamp for stamp, _ in chunks], np.int64)
 
     def cut(self) -> int:
-        forgotten, self._tail, self._begun = len(self._tail), b"", False
-        return forgotten
+        dropped, self._tail, self._begun = len(self._tail), b"", False
+        return dropped
 
 
 class LineParser(_Joined):
-    """Lines that end in LF (CR before it is dropped), each matched whole against an expression."""
+    """Lines that end in LF or CR LF, each of which must match an expression as a whole."""
 
     def __init__(self, pattern: str, *, xor: bool = False) -> None:
         super().__init__()
@@ -138,7 +138,7 @@ class LineParser(_Joined):
         return self._readings(lines, arrived, [self._found(line) for line in lines])
 
     def _first(self, lines: list[bytes], arrived: Ints) -> tuple[list[bytes], Ints]:
-        """Without the first line if the connection began in its middle."""
+        """Without the first line, if the connection began in the middle of it."""
         return (lines, arrived) if self._found(lines[0]) else (lines[1:], arrived[1:])
 
     def _found(self, line: bytes) -> re.Match[bytes] | None:
@@ -167,7 +167,7 @@ class LineParser(_Joined):
 
 
 def _numbers(cells: Sequence[bytes | None]) -> Array:
-    """(N,) numbers; NaN for an empty group and for what the user's own group lets through."""
+    """(N,) numbers; NaN for an empty group, and for text that a user's own expression matches."""
     try:
         return np.array(list(map(float, cells)))  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -182,7 +182,7 @@ def _number(cell: bytes | None) -> float:
 
 
 class PacketParser(_Joined):
-    """Binary packets: `SYNC`, fields, sum of bytes; found again after any garbage."""
+    """Binary packets: `SYNC`, fields, sum of bytes; found again after any malformed bytes."""
 
     def __init__(self, fields: list[tuple[str, str]]) -> None:
         super().__init__()
@@ -211,7 +211,7 @@ class PacketParser(_Joined):
         )
 
     def _packets(self, data: bytes) -> Ints:
-        """Where sound packets start; of overlapping ones the first."""
+        """Where valid packets start; of overlapping ones the first."""
         size, raw = self._type.itemsize, np.frombuffer(data, np.uint8)
         if len(raw) < size:
             return np.zeros(0, np.int64)
@@ -229,7 +229,7 @@ class PacketParser(_Joined):
 
 
 def _between(starts: Ints, size: int, done: int) -> list[tuple[int, int]]:
-    """The stretches before ``done`` that belong to no packet."""
+    """The (begin, end) of the bytes before ``done`` that belong to no packet."""
     begin, end = [0, *(starts + size).tolist()], [*starts.tolist(), done]
     return [(a, b) for a, b in zip(begin, end) if b > a]
 

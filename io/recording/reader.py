@@ -1,4 +1,4 @@
-"""One thread for each serial line: bytes and their times, nothing else."""
+"""One thread for each serial line, which passes on the bytes and their times of arrival."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ ANSWER_S = 0.5
 
 
 class Reader(threading.Thread):
-    """Reads a port until told to stop; opens it again after an unplug.
+    """Reads a port until `stop` is called; opens it again after it was unplugged.
 
-    emit : called in this thread with every entry. `fault` : what ended the thread, if not `stop`.
+    emit : called in this thread with every entry. `fault` : the exception that ended the thread.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Reader(threading.Thread):
             self._close()
 
     def _listen(self) -> None:
-        """Until told to stop; pyserial raises OSError (or TypeError when torn) on an unplug."""
+        """Read until `stop`; on an unplug pyserial raises OSError, or TypeError within a read."""
         if self._command is None:
             while not self._stop_asked.is_set():
                 self._receive()
@@ -81,7 +81,7 @@ class Reader(threading.Thread):
         self._emit(Entry(kind, self._index, time_ns, data))
 
     def _lost(self, error: Exception) -> None:
-        """Wait for the port to come back; the gap is in the log."""
+        """Wait for the port to come back; both moments are in the log."""
         self.connected = False
         self._put(LOST, time.monotonic_ns(), str(error).encode())
         self._close()

@@ -66,7 +66,7 @@ class DeviceRecord:
 
 @dataclass(frozen=True)
 class Replay:
-    """end_s : of the last entry. ended : the recording was closed, not cut off."""
+    """end_s : time of the last entry. ended : whether the recording was closed, not cut off."""
 
     header: LogHeader
     records: tuple[DeviceRecord, ...]
@@ -76,7 +76,7 @@ class Replay:
 
 @dataclass
 class _Line:
-    """One device while the log is read."""
+    """The entries of one device while the log is read."""
 
     device: DeviceDescription
     chunks: list[tuple[int, bytes]] = field(default_factory=list)
@@ -114,7 +114,7 @@ class _Line:
 
 
 def replay(path: Path) -> Replay:
-    """Read a raw log. The same log gives the same numbers, to the last bit.
+    """The readings of a raw log. The same log gives the same numbers, to the last bit.
 
     Raises InputError for a file that is no log.
     """
@@ -144,12 +144,8 @@ def _record(line: _Line, start_ns: int) -> DeviceRecord:
     if "t" in values:
         wrap_s = 2.0**device.time_bits * device.time_unit_s if device.time_bits else 0.0
         clock = host_times(arrived, values["t"] * device.time_unit_s, wrap_s)
-        t_s, clocks, wraps, time_from = (
-            clock.t_s - device.latency_s,
-            clock.fits,
-            clock.wraps,
-            "device",
-        )
+        t_s, time_from = clock.t_s - device.latency_s, "device"
+        clocks, wraps = clock.fits, clock.wraps
         faults["wrong or repeated stamp"] = clock.wrong
     elif line.sent_ns:
         t_s, half = _between(arrived, _seconds(np.array(line.sent_ns), start_ns))
@@ -164,10 +160,8 @@ def _record(line: _Line, start_ns: int) -> DeviceRecord:
         sound = beside_gaps(t_s[kept], [v[kept] for k, v in values.items() if k != "t"])
         faults["far from its neighbours, beside lost bytes"] = int(np.sum(~sound))
         kept = kept[sound]
-    lost, back = (
-        _seconds(np.array(line.lost_ns), start_ns),
-        _seconds(np.array(line.found_ns), start_ns),
-    )
+    lost = _seconds(np.array(line.lost_ns), start_ns)
+    back = _seconds(np.array(line.found_ns), start_ns)
     back = np.append(back, np.full(len(lost) - len(back), np.nan))
     return DeviceRecord(
         device=device,
@@ -192,7 +186,7 @@ def _seconds(time_ns: NDArray[np.generic], start_ns: int) -> Array:
 
 
 def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
-    """(N,) middle of question and answer, NaN where they cannot be paired; median half width."""
+    """(N,) mid-time of question and answer, NaN where they cannot be paired; median half width."""
     asked = np.searchsorted(sent, arrived, "right") - 1
     answers = np.bincount(np.maximum(asked, 0), minlength=len(sent))
     clear = (asked >= 0) & (answers[asked] == 1) & ((asked < 1) | (answers[asked - 1] > 0))
@@ -202,7 +196,7 @@ def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
 
 
 def _in_order(t_s: Array, faults: dict[str, int]) -> Ints:
-    """Indices of the readings that have a time, and one later than all before."""
+    """Indices of the readings that have a time later than all before them."""
     timed = np.flatnonzero(np.isfinite(t_s))
     later = np.ones(len(timed), bool)
     later[1:] = t_s[timed][1:] > np.maximum.accumulate(t_s[timed])[:-1]

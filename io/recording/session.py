@@ -1,4 +1,4 @@
-"""A recording while it runs: readers, the raw log, and what the screen shows of them."""
+"""A running recording: reader threads, the raw log, and the status that the screen shows."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from telerig.io.rig_file.description import DeviceDescription
 LOG_NAME = "recording.raw"
 FAILED_NAME = "recording.failed.raw"
 TICK_S = 0.5
-"""How often the log is brought to the disk and the status told; a power cut costs this much."""
+"""Interval at which the log goes to the disk and the status is reported; a power cut costs this."""
 GARBAGE_S = 2.0
-"""A line that says nothing readable for so long has the wrong speed, or another protocol."""
+"""A line on which no reading comes for so long has the wrong baud rate, or another protocol."""
 
 
 class GarbageError(InputError):
-    """Nothing that comes over a line can be read."""
+    """Bytes come over a line, but no reading."""
 
 
 @dataclass
 class DeviceStatus:
-    """What the screen shows of a device. rate_hz : readings of the last tick.
+    """The status of a device for the screen. rate_hz : of readings since the last report.
 
-    lost : readings that the device's own stamps show to be missing. gaps : steps they lie in.
+    lost : readings that are missing by the device's own stamps. gaps : steps that they lie in.
     """
 
     name: str
@@ -56,7 +56,7 @@ class DeviceStatus:
     _step: float = field(default=np.nan, repr=False)
 
     def add(self, device: DeviceDescription, found: Readings) -> None:
-        """Count readings, and those that are missing between them."""
+        """Count the readings, and those that are missing between them."""
         self.readings += len(found.arrived_ns)
         self.malformed += len(found.malformed)
         self.sample = found.samples[0] if found.samples else self.sample
@@ -77,7 +77,7 @@ class DeviceStatus:
 
 @dataclass(frozen=True)
 class Status:
-    """Of the whole recording, told every `TICK_S`."""
+    """The status of the whole recording, reported every `TICK_S`."""
 
     seconds: float
     log_bytes: int
@@ -95,9 +95,9 @@ def record(
 ) -> Path:
     """Record all devices into ``folder``/recording.raw until ``stop`` is set or time is up.
 
-    Returns the log's path; `telerig.io.recording.tables.write_tables` makes the run's tables of it.
-    Raises InputError for a port that cannot be opened, a log that cannot be written, and a device
-    of which nothing readable comes in the first `GARBAGE_S`.
+    Returns the path of the log, from which `telerig.io.recording.tables.write_tables` makes the
+    tables of the run. Raises InputError for a port that cannot be opened, a log that cannot be
+    written, and a device that sends bytes but no reading in the first `GARBAGE_S`.
     """
     if not devices:
         raise InputError("no device to record", todo="add a table [devices.<name>] to rig.toml")
@@ -147,7 +147,7 @@ class _Session:
         ]
         self._parsers = [parser(device) for device in self._devices]
         self._status = [DeviceStatus(device.name) for device in self._devices]
-        self._suspects = set(range(len(self._devices)))
+        self._unread = set(range(len(self._devices)))
         self._drained = time.monotonic()
 
     def run(
@@ -165,7 +165,7 @@ class _Session:
         self._drain()
         self._log.append(Entry(END, 0, time.monotonic_ns(), b""))
         self._log.flush()
-        tell(self._told())
+        tell(self._report())
 
     def _ticks(
         self, seconds: float | None, stop: threading.Event, tell: Callable[[Status], None]
@@ -177,10 +177,10 @@ class _Session:
             stop.wait(max(0.0, due - time.monotonic()))
             self._drain()
             self._check(time.monotonic() - begin)
-            tell(self._told())
+            tell(self._report())
 
     def _drain(self) -> None:
-        """Bring what has come to the disk, then count it."""
+        """Bring what has come to the disk, then count the readings in it."""
         chunks: list[list[tuple[int, bytes]]] = [[] for _ in self._devices]
         before = [status.readings for status in self._status]
         now = time.monotonic()
@@ -206,28 +206,28 @@ class _Session:
         self._status[i].add(self._devices[i], self._parsers[i].feed(chunks))
 
     def _check(self, elapsed_s: float) -> None:
-        """Raises what ended a reader, and InputError for a line of garbage from the start."""
+        """Raises what ended a reader, and InputError for a line on which no reading has come."""
         for reader in self._readers:
             if reader.fault is not None:
                 raise reader.fault
-        self._suspects = {i for i in self._suspects if not self._status[i].readings}
+        self._unread = {i for i in self._unread if not self._status[i].readings}
         if elapsed_s < GARBAGE_S:
             return
-        for i in sorted(self._suspects):
+        for i in sorted(self._unread):
             if self._status[i].byte_count:
-                raise _garbage(self._devices[i], self._status[i])
-        self._suspects = set()
+                raise _no_reading(self._devices[i], self._status[i])
+        self._unread = set()
 
-    def _told(self) -> Status:
+    def _report(self) -> Status:
         seconds = (time.monotonic_ns() - self._start_ns) * 1e-9
         return Status(seconds, self._log.bytes, tuple(map(copy.copy, self._status)))
 
 
-def _garbage(device: DeviceDescription, status: DeviceStatus) -> GarbageError:
+def _no_reading(device: DeviceDescription, status: DeviceStatus) -> GarbageError:
     shown = f", like {status.sample[:40]!r}" if status.sample else ""
     return GarbageError(
-        f"{status.byte_count} bytes came in {GARBAGE_S:g} s, and not one reading{shown}",
+        f"{status.byte_count} bytes came in {GARBAGE_S:g} s, but not one reading{shown}",
         where=f"devices.{device.name} port {device.port}",
-        todo=f"set baud in rig.toml as the device has it (now {device.baud}); "
+        todo=f"set baud in rig.toml to the device's baud rate (now {device.baud}); "
         f"if the bytes look right, correct its protocol (now {device.protocol})",
     )

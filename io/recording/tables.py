@@ -21,12 +21,12 @@ from telerig.io.recording.replay import GAP_INTERVALS, TIME_DIGITS, DeviceRecord
 Array = NDArray[np.float64]
 
 _ROWS = 20_000
-_GAPS_TOLD = 200
+_LISTED_GAPS = 200
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What was made of a log: the summary is that of recording.json, rows by table's name."""
+    """The tables of a log: the content of recording.json, and the rows of each table by name."""
 
     folder: Path
     summary: dict[str, Any]
@@ -34,11 +34,11 @@ class Recording:
 
 
 def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = None) -> Recording:
-    """Write the tables that the log's devices give into ``folder`` (the log's own by default).
+    """Write the tables of the log's devices into ``folder`` (by default the folder of the log).
 
-    All are written beside and renamed at the end. Sensors that `accelerometer.csv` has from
-    elsewhere (`telerig import`) stay in it. Raises InputError for a file that is no log, or a
-    folder that cannot be written.
+    All are written to temporary files and renamed at the end. Imported sensors in
+    `accelerometer.csv` (`telerig import`) stay in it. Raises InputError for a file that is no log,
+    or a folder that cannot be written.
     """
     path = Path(log)
     out = Path(folder) if folder is not None else path.parent
@@ -88,7 +88,7 @@ def _accelerometers(records: Sequence[DeviceRecord], _: FrameTimes) -> Iterator[
 
 
 def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
-    """Rows of a table of before whose sensors are not recorded now."""
+    """Rows of an existing table whose sensors are not in this recording."""
     if not file.is_file():
         return
     with file.open(encoding="utf-8") as stream:
@@ -102,10 +102,10 @@ def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
 
 
 def _frames(_: Sequence[DeviceRecord], frames: FrameTimes) -> Iterator[str]:
-    told = any(frames.missing)
-    yield "frame,t_s,missing\n" if told else "frame,t_s\n"
+    any_missing = any(frames.missing)
+    yield "frame,t_s,missing\n" if any_missing else "frame,t_s\n"
     for frame, (t_s, missing) in enumerate(zip(frames.t_s, frames.missing)):
-        yield f"{frame},{t_s:.{TIME_DIGITS}f}" + (f",{missing}\n" if told else "\n")
+        yield f"{frame},{t_s:.{TIME_DIGITS}f}" + (f",{missing}\n" if any_missing else "\n")
 
 
 _WRITERS = {
@@ -139,7 +139,7 @@ def _write(path: Path, text: Iterable[str], final: Path) -> int:
         raise InputError(
             f"cannot be written: {error.strerror or error}",
             where=str(final),
-            todo="make room on the disk, then `telerig record --replay` the recording.raw",
+            todo="make room on the disk, then run `telerig record --replay` on the recording.raw",
         ) from error
     return lines
 
@@ -179,20 +179,20 @@ def _device_summary(record: DeviceRecord) -> dict[str, Any]:
         "unplugged": [{"lost_s": a, "found_s": b} for a, b in record.away_s],
         "lost": sum(gap["lost"] for gap in gaps),
         "gap_count": len(gaps),
-        "gaps": gaps[:_GAPS_TOLD],
+        "gaps": gaps[:_LISTED_GAPS],
     }
 
 
 def gaps_of(record: DeviceRecord) -> Iterator[dict[str, Any]]:
-    """Where readings are missing: from_s, to_s, how many are lost, and why."""
+    """Where readings are missing: from_s, to_s, the number lost, and the reason."""
     step = np.diff(record.t_s)
     if record.device.kind == "frames" or step.size < 8:
         return
-    usual = float(np.median(step))
+    median_s = float(np.median(step))
     limit = GAP_INTERVALS if record.time_from == "device" else 10.0
-    for i in np.flatnonzero(step > limit * usual):
+    for i in np.flatnonzero(step > limit * median_s):
         begin, end = float(record.t_s[i]), float(record.t_s[i + 1])
-        lost = round(float(step[i]) / usual) - 1
+        lost = round(float(step[i]) / median_s) - 1
         yield {"from_s": begin, "to_s": end, "lost": lost, "why": _why(record, begin, end)}
 
 

@@ -1,8 +1,8 @@
 """Cameras as OpenCV's 3 x 4 projection matrices in a YAML file that cv2.FileStorage reads.
 
-An undistorted camera of this library is a 3 x 4 matrix exactly: affine (last row 0 0 0 1) when it
-is telecentric. Distortion stays apart, in OpenCV's own coefficients, so that cv2.undistortPoints
-followed by cv2.triangulatePoints gives what telerig does.
+An undistorted camera of this library is exactly a 3 x 4 matrix, which is affine (last row 0 0 0 1)
+if the lens is telecentric. The distortion is written separately, in OpenCV's own coefficients, so
+that cv2.undistortPoints followed by cv2.triangulatePoints gives the same points as telerig.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _POINTS_PER_EDGE = 25
 class Matrices:
     """One camera. Pixels = (matrix @ (x, y, z, 1)) divided by its last row; mm in the rig frame.
 
-    undistorted : (3, 4) exact but for the lens distortion; misfit of leaving that out.
+    undistorted : (3, 4) exact but for the lens distortion; its misfit is that of leaving it out.
     affine : (3, 4) the best matrix with last row 0 0 0 1, and its misfit.
     camera_matrix (3, 3), distortion (12,) : for cv2.undistortPoints with P = camera_matrix, or
         None where OpenCV's model has no place for this camera's skew or sensor tilt.
@@ -63,7 +63,7 @@ def export_opencv(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[
 def undistorted_matrix(camera: Camera) -> Array:
     """(3, 4) projection of the camera without its distortion, in closed form.
 
-    Behind a glass wall it is exact for kappa = 0 only.
+    Behind a refractive window it is exact for kappa = 0 only.
     """
     q = np.array([camera["tilt_x"], camera["tilt_y"]])
     tilt = np.eye(3)
@@ -91,7 +91,8 @@ def _pixel_matrix(camera: Camera, scale: float) -> Array:
 def _telecentric_matrix(camera: Camera) -> Array:
     """(3, 4) telecentric coordinates of a camera point.
 
-    Behind a wall that of all rays near the origin's, which spread n_air / n_water as fast.
+    Behind a refractive window it is linearised about the ray through the origin; the rays then
+    diverge n_air / n_water times as fast.
     """
     kappa, out = camera["kappa_per_mm"], np.eye(3, 4)
     out[2] = [0, 0, kappa, 1]

@@ -30,7 +30,7 @@ POWERS = (
 """Exponents of x, y, z in the order of the paper's a0 ... a18."""
 
 CUBIC_Z = (0, 0, 3)
-"""The 20th term, which the paper leaves out: a camera that looks along x has its image along z."""
+"""The 20th term, which the paper leaves out; a camera that looks along x has its image along z."""
 
 FIT_POINTS_PER_EDGE = 21
 CHECK_POINTS_PER_EDGE = 34
@@ -117,7 +117,7 @@ def write_soloff(fit: Soloff, path: str | PathLike[str], first_pixel: float = 0.
         "u_px = sum of u * x^i y^j z^k, v_px likewise; x, y, z in mm in the rig frame",
         f"pixel: u right, v down; the centre of the top-left pixel is ({first_pixel:g}, "
         f"{first_pixel:g})",
-        f"fitted over {fit.volume.words()}, as far as every camera sees it; void outside",
+        f"fitted over {fit.volume.words()}, as far as every camera sees it; not valid outside",
         f"error against the calibrated camera: rms_px = {fit.misfit.rms_px!r}, "
         f"max_px = {fit.misfit.max_px!r} at {fit.misfit.points} points that were not fitted",
     ]

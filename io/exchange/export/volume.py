@@ -1,4 +1,4 @@
-"""The space that the cameras see together, as points where one camera model is held to another."""
+"""The volume that all cameras see, as points at which two camera models are compared."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Volume:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How far one projection is from another over some points, in pixels.
+    """The distance between two projections over some points, in pixels.
 
-    rms_px : root mean square of the distance; max_px : the largest; points : how many.
+    rms_px : root mean square; max_px : the largest; points : number of points.
     """
 
     rms_px: float
@@ -58,7 +58,7 @@ class Misfit:
 
 
 def volume_of(bounds_mm: ArrayLike) -> Volume:
-    """The box of ((x, x), (y, y), (z, z)). Raises InputError when it holds nothing."""
+    """The box of ((x, x), (y, y), (z, z)). Raises InputError when it is empty."""
     bounds = np.asarray(bounds_mm, float)
     if bounds.shape != (3, 2) or not np.all(bounds[:, 0] < bounds[:, 1]):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Sensors to practise with: each speaks over a pseudo-terminal, as a real one over its port."""
+"""Simulated sensors, each on a pseudo-terminal as a real one is on its port."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from telerig.io.rig_file.description import DeviceDescription
 
 _POLLED_WAIT_S = 0.05
 _BUFFER_S = 0.25
-"""What a device keeps while the host is busy and its port takes no more; then readings are lost."""
+"""How long a device keeps readings while its port is full; after that they are lost."""
 
 
 @dataclass
 class Truth:
-    """What a simulated device did. start_ns : host's time of its reading 0.
+    """What a simulated device did. start_ns : the host's time of its reading 0.
 
-    sent : how many readings were made. spoilt : numbers of readings that a fault damaged.
-    overrun : numbers of those that found the port's buffer full (nobody reads fast enough).
-    away_s : (from, to) of each unplug, in host's seconds from the start.
+    sent : number of readings made. spoilt : indices of the readings that a fault damaged.
+    overrun : indices of those for which the port's buffer was full (the host reads too slowly).
+    away_s : (from, to) of each unplug, in seconds of the host's time from the start.
     """
 
     start_ns: int = 0
@@ -47,7 +47,7 @@ class Truth:
 
 
 class PseudoTerminal:
-    """A port under a name of its own, which stays the same when it is plugged in again."""
+    """A port with a name that stays the same when the device is unplugged and plugged in again."""
 
     def __init__(self, name: Path) -> None:
         self.name = name
@@ -71,7 +71,7 @@ class PseudoTerminal:
             self.master = self._slave = -1
 
     def write(self, data: bytes) -> int:
-        """How many of the bytes went into the port's buffer."""
+        """Returns how many of the bytes the port's buffer took."""
         written = 0
         deadline = time.monotonic() + _BUFFER_S
         while written < len(data):
@@ -145,7 +145,7 @@ class _Runner(threading.Thread):
 
 
 class SimulatedPorts:
-    """Context manager: devices speak while it is open. `devices` have their ports filled in."""
+    """Context manager: the devices send while it is open. `devices` have their ports filled in."""
 
     def __init__(self, sims: Sequence[SimulatedDevice], folder: Path, rng: Generator) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -177,7 +177,7 @@ class SimulatedPorts:
 def made_since_last(
     sim: SimulatedDevice, truth: Truth, host_s: float, rng: Generator
 ) -> tuple[Ints, list[bytes], bytes]:
-    """Numbers of the readings since the last call, the bytes of each, and what the line makes."""
+    """Indices of the readings since the last call, the bytes of each, and those that arrive."""
     until = sim.first_after(host_s)
     number = np.arange(truth.sent, until)
     number = number[~np.isin(number, sim.faults.skip)]

@@ -1,4 +1,4 @@
-"""What simulated sensors send: every reading follows from its number, so that none can hide."""
+"""What simulated sensors send. Every reading follows from its index, so that a lost one shows."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _GARBAGE_BYTES = 40
 
 @dataclass(frozen=True)
 class Faults:
-    """Per second of record, at random: bursts of garbage, stretches of bytes lost.
+    """garbage_hz, cut_hz : mean number per second of random bytes inserted, and of bytes lost.
 
-    unplug_s : when the device goes away, seconds from its start, for `away_s` each time.
-    skip : frames of which a frame counter sends no line.
+    unplug_s : when the device is unplugged, in s from its start, for ``away_s`` each time.
+    skip : frames for which a frame counter sends no line.
     """
 
     garbage_hz: float = 0.0
@@ -37,9 +37,9 @@ class Faults:
 
 @dataclass(frozen=True)
 class SimulatedDevice:
-    """drift_ppm : how much faster than the host's its clock runs. start_ticks : of its counter.
+    """drift_ppm : how much faster its clock runs than the host's. start_ticks : of its counter.
 
-    jitter_s : readings wait in the adapter for a random time up to this, then all come at once.
+    jitter_s : readings wait in the adapter for a random time up to this, then arrive together.
     """
 
     device: DeviceDescription
@@ -74,7 +74,7 @@ class SimulatedDevice:
 
 
 def true_values(sim: SimulatedDevice, number: Ints) -> dict[str, Array]:
-    """What readings say, exactly as their numbers are sent."""
+    """The values of readings, exactly as they are sent."""
     phase = 2 * np.pi * sim.elapsed_s(number) / PERIOD_S
     kind = sim.device.kind
     if kind == "frames":
@@ -89,7 +89,7 @@ def true_values(sim: SimulatedDevice, number: Ints) -> dict[str, Array]:
 
 
 def messages(sim: SimulatedDevice, number: Ints) -> list[bytes]:
-    """The bytes of these readings, one piece each."""
+    """The bytes of each of these readings."""
     stamps, values = sim.stamps(number).tolist(), true_values(sim, number)
     rows = list(zip(*(v.tolist() for v in values.values())))
     if sim.device.protocol == "packets":
@@ -103,7 +103,7 @@ def messages(sim: SimulatedDevice, number: Ints) -> list[bytes]:
 
 
 def answer(device: DeviceDescription, position_mm: float) -> bytes:
-    """What a polled stage answers."""
+    """The answer of a polled stage."""
     if device.protocol == "grbl":
         place = {axis: position_mm if axis == device.axis else 0.0 for axis in "xyz"}
         told = ",".join(f"{place[axis]:.3f}" for axis in "xyz")
@@ -112,14 +112,14 @@ def answer(device: DeviceDescription, position_mm: float) -> bytes:
 
 
 def stage_position_mm(elapsed_s: Array) -> Array:
-    """Where the simulated stage is."""
+    """Position of the simulated stage."""
     return TRAVEL_MM * (1 - np.cos(2 * np.pi * elapsed_s / PERIOD_S))
 
 
 def damage(
     pieces: list[bytes], faults: Faults, per_reading_s: float, rng: Generator
 ) -> tuple[bytes, list[int]]:
-    """The bytes as they come over a bad line, and which of the pieces it spoilt."""
+    """The bytes that arrive over a line with faults, and the indices of the damaged pieces."""
     if not faults.garbage_hz and not faults.cut_hz:
         return b"".join(pieces), []
     out, spoilt = list(pieces), set()

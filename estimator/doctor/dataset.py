@@ -27,7 +27,7 @@ _FEWEST_READINGS = 2
 
 
 def check_dataset(place: Path) -> Iterator[Check]:
-    """Check rig.toml, the views, every run with its clocks and sensors, and the space on the disk."""
+    """Check rig.toml, the views, every run with its clocks and sensors, and the disk space."""
     try:
         data = load_dataset(place, need_views=False)
     except TelerigError as error:

@@ -35,7 +35,7 @@ class Check:
 
 
 def check_installation() -> Iterator[Check]:
-    """Check Python, the packages that telerig needs, that there is only one OpenCV, and the extras."""
+    """Check Python, the packages that telerig needs, that there is one OpenCV only, the extras."""
     python = platform.python_version()
     known = _OLDEST <= sys.version_info[:2] <= _NEWEST
     yield Check(
@@ -84,7 +84,7 @@ def _opencv() -> Check:
     if rivals:
         both = " ".join([*rivals, "opencv-python-headless"])
         return Check(
-            "one OpenCV", "warning", f"also installed: {', '.join(rivals)}; they overwrite each other's files",
+            "one OpenCV", "warning", f"also installed: {', '.join(rivals)}; they share files",
             f"pip uninstall -y {both} && pip install opencv-python-headless",
         )  # fmt: skip
     major = have.split(".")[0]
@@ -101,7 +101,7 @@ def _version(name: str) -> str | None:
 
 
 def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
-    """Check for every serial port whether it may be opened, and the latency timer of its adapter."""
+    """Check of every serial port whether it may be opened, and its adapter's latency timer."""
     ports = found_ports()
     if not ports:
         words = "none found"

@@ -22,7 +22,7 @@ EXIT_BAD_INPUT = 2
 EXIT_FAULT = 3
 EXIT_INTERRUPTED = 130
 EXIT_CLOSED_PIPE = 141
-"""What a shell gives a program whose reader (`| head`) is gone: 128 + SIGPIPE."""
+"""The exit code of a program whose reader (`| head`) has ended: 128 + SIGPIPE."""
 
 
 def run_file(command: Callable[..., None]) -> None:
@@ -84,13 +84,13 @@ def stopped_by_signals() -> Iterator[threading.Event]:
     """An event that Ctrl-C and SIGTERM set, so that the work can end in an orderly way."""
     stop = threading.Event()
 
-    def asked(_: int, __: FrameType | None) -> None:
+    def set_stop(_: int, __: FrameType | None) -> None:
         stop.set()
 
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    before = {s: signal.signal(s, asked) for s in (signal.SIGINT, signal.SIGTERM)}
+    before = {s: signal.signal(s, set_stop) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
     finally:

@@ -118,7 +118,7 @@ def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
 
 
 def _latency(device: str, timer: Path) -> Iterator[Check]:
-    """The latency timer is how long a USB adapter collects bytes before it sends them; often 16 ms."""
+    """How long a USB adapter collects bytes before it sends them, often 16 ms."""
     try:
         held_ms = int(timer.read_text())
     except (OSError, ValueError):

@@ -35,11 +35,15 @@ class Format:
     options: tuple[str, ...] = ()
     extra: str = ""
 
-    def __call__(self, *arguments: Any, **offered: Any) -> Any:
-        """What the function returns; of the offered options it gets those that it takes."""
+    def load(self) -> Callable[..., Any]:
+        """The function that reads or writes the format."""
         module, name = self.function.split(":")
         function: Callable[..., Any] = getattr(import_module(f"telerig.io.exchange.{module}"), name)
-        return function(*arguments, **{key: offered[key] for key in self.options})
+        return function
+
+    def __call__(self, *arguments: Any, **offered: Any) -> Any:
+        """What the function returns; of the offered options it gets those that it takes."""
+        return self.load()(*arguments, **{key: offered[key] for key in self.options})
 
 
 CAMERA_EXPORTS = {

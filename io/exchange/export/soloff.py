@@ -13,7 +13,7 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
 from telerig.io.files.atomic import atomic_folder, write_text_atomic
@@ -48,10 +48,6 @@ class Soloff:
     coefficients: Array
     misfit: Misfit
     volume: Volume
-
-    def project(self, points_mm: ArrayLike) -> Array:
-        """(..., 3) rig points -> (..., 2) pixels."""
-        return terms(np.asarray(points_mm, float), len(self.coefficients)) @ self.coefficients
 
 
 def export_soloff(

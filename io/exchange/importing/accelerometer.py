@@ -63,13 +63,13 @@ def read_accelerations(
     """
     import pandas as pd
 
-    asked = layout or Layout()
-    recording = open_recording(Path(path), asked.group)
-    names = _channels(recording, asked.channels)
+    layout = layout or Layout()
+    recording = open_recording(Path(path), layout.group)
+    names = _channels(recording, layout.channels)
     raw = np.stack([_values(recording, name) for name in names], -1)
-    t_s = _times(recording, asked, len(raw)) + asked.start_s
+    t_s = _times(recording, layout, len(raw)) + layout.start_s
     _check_readings(recording, names, raw, t_s)
-    readings = raw * _scale(recording, names, asked)
+    readings = raw * _scale(recording, names, layout)
     table = pd.DataFrame({"t_s": t_s, "sensor": sensor})
     table[COLUMNS[2:]] = readings
     return table
@@ -96,9 +96,9 @@ def merge_accelerations(table: pd.DataFrame, path: str | PathLike[str]) -> list[
     return replaced
 
 
-def _channels(recording: Recording, asked: Sequence[str | int] | None) -> list[str]:
+def _channels(recording: Recording, chosen: Sequence[str | int] | None) -> list[str]:
     there = list(recording.channels)
-    if asked is None:
+    if chosen is None:
         for trial in ("a{}_m_s2", "a{}", "acc_{}", "accel_{}", "acc{}", "{}"):
             wanted = [trial.format(axis) for axis in "xyz"]
             found = {name.lower(): name for name in there}
@@ -106,18 +106,15 @@ def _channels(recording: Recording, asked: Sequence[str | int] | None) -> list[s
                 return [found[name] for name in wanted]
         if len(there) == 3:
             return there
-        raise InputError(
-            "does not say which channels are x, y and z",
-            where=recording.where,
-            todo=f"name three of them: {', '.join(there)}",
+        raise recording.error(
+            "does not say which channels are x, y and z", f"name three of them: {', '.join(there)}"
         )
-    names = [there[c] if isinstance(c, int) and 0 <= c < len(there) else str(c) for c in asked]
+    names = [there[c] if isinstance(c, int) and 0 <= c < len(there) else str(c) for c in chosen]
     missing = [name for name in names if name not in there]
     if missing or len(names) != 3:
-        raise InputError(
+        raise recording.error(
             f"has no channel {', '.join(missing)}" if missing else f"{len(names)} channels named",
-            where=recording.where,
-            todo=f"name three of: {', '.join(there)}",
+            f"name three of: {', '.join(there)}",
         )
     return names
 
@@ -125,54 +122,48 @@ def _channels(recording: Recording, asked: Sequence[str | int] | None) -> list[s
 def _values(recording: Recording, name: str) -> Array:
     values = recording.channels[name]
     if values.dtype.kind not in "iufb" or values.ndim != 1:
-        raise InputError(
-            f"channel {name!r} is no column of numbers",
-            where=recording.where,
-            todo="name another one",
-        )
+        raise recording.error(f"channel {name!r} is no column of numbers", "name another one")
     return np.asarray(values, float)
 
 
-def _times(recording: Recording, asked: Layout, rows: int) -> Array:
-    if asked.time is not None:
-        if asked.time not in recording.channels:
-            raise InputError(
-                f"has no channel {asked.time!r} for the times",
-                where=recording.where,
-                todo=f"there are: {', '.join(recording.channels)}",
+def _times(recording: Recording, layout: Layout, rows: int) -> Array:
+    if layout.time is not None:
+        if layout.time not in recording.channels:
+            raise recording.error(
+                f"has no channel {layout.time!r} for the times",
+                f"there are: {', '.join(recording.channels)}",
             )
-        return _values(recording, asked.time)
-    rate = asked.rate_hz if asked.rate_hz is not None else recording.rate_hz
-    if asked.rate_hz is None:
+        return _values(recording, layout.time)
+    rate = layout.rate_hz if layout.rate_hz is not None else recording.rate_hz
+    if layout.rate_hz is None:
         common = {"t_s", "time", "time_s", "time (s)", "time [s]", "t", "timestamp_s"}
         for name in recording.channels:
             if name.strip().lower() in common:
                 return _values(recording, name)
     if rate is None or not rate > 0:
-        raise InputError(
+        raise recording.error(
             "contains neither times nor a sampling rate" if rate is None else f"rate is {rate} Hz",
-            where=recording.where,
-            todo="give the name of the channel with times in s, or rate_hz",
+            "give the name of the channel with times in s, or rate_hz",
         )
     return recording.offset_s + np.arange(rows) / rate
 
 
-def _scale(recording: Recording, names: Sequence[str], asked: Layout) -> Array:
-    if asked.scale_m_s2 is not None:
-        if asked.unit is not None:
+def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
+    if layout.scale_m_s2 is not None:
+        if layout.unit is not None:
             raise InputError("both a unit and scale_m_s2 are given", todo="give one of them")
-        return _finite(asked.scale_m_s2)
-    units = [asked.unit or recording.units.get(name) or "" for name in names]
-    if all(name.endswith("_m_s2") for name in names) and asked.unit is None:
+        return _finite(layout.scale_m_s2)
+    units = [layout.unit or recording.units.get(name) or "" for name in names]
+    if all(name.endswith("_m_s2") for name in names) and layout.unit is None:
         units = ["m/s2"] * 3
     unknown = [unit for unit in units if unit not in UNITS]
     if unknown:
-        raise InputError(
-            f"the unit of its readings is {unknown[0]!r}" if unknown[0]
+        raise recording.error(
+            f"the unit of its readings is {unknown[0]!r}"
+            if unknown[0]
             else "does not say the unit of its readings",
-            where=recording.where,
-            todo=f"give unit ({', '.join(UNITS)}), or scale_m_s2, the m/s^2 of a reading of 1",
-        )  # fmt: skip
+            f"give unit ({', '.join(UNITS)}), or scale_m_s2, the m/s^2 of a reading of 1",
+        )
     return np.array([UNITS[unit] for unit in units])
 
 
@@ -187,27 +178,24 @@ def _finite(scale: ArrayLike) -> Array:
 
 def _check_readings(recording: Recording, names: Sequence[str], raw: Array, t_s: Array) -> None:
     if len(raw) != len(t_s) or not len(raw):
-        raise InputError(
+        raise recording.error(
             f"has {len(raw)} readings and {len(t_s)} times",
-            where=recording.where,
-            todo="give as many times as readings, at least one",
+            "give as many times as readings, at least one",
         )
     bad = np.argwhere(~np.isfinite(np.c_[raw, t_s]))
     if len(bad):
         row, column = bad[0]
         name = [*names, "time"][column]
-        raise InputError(
+        raise recording.error(
             f"reading {row} of {name!r} is no finite number ({len(bad)} such)",
-            where=recording.where,
-            todo="cut it out, or export the recording again",
+            "cut it out, or export the recording again",
         )
     late = np.flatnonzero(np.diff(t_s) <= 0)
     if len(late):
         i = int(late[0])
-        raise InputError(
+        raise recording.error(
             f"time {t_s[i + 1]:.9g} s follows {t_s[i]:.9g} s (reading {i + 1})",
-            where=recording.where,
-            todo="times must increase; give rate_hz instead if they are rounded",
+            "times must increase; give rate_hz instead if they are rounded",
         )
 
 
@@ -244,6 +232,10 @@ class Recording:
     units: dict[str, str] = field(default_factory=dict)
     rate_hz: float | None = None
     offset_s: float = 0.0
+
+    def error(self, what: str, todo: str) -> InputError:
+        """The error of this recording."""
+        return InputError(what, where=self.where, todo=todo)
 
 
 def open_recording(path: Path, group: str | None = None) -> Recording:

@@ -49,6 +49,10 @@ class Pinhole:
         """Whether the image is left-handed against the world."""
         return bool(np.linalg.det(self.camera_matrix @ self.rotation) < 0)
 
+    def error(self, what: str, todo: str) -> InputError:
+        """The error of this camera's file."""
+        return InputError(what, where=self.where, todo=todo)
+
 
 class ImportedCameras(NamedTuple):
     """rig_from_world : for points in the other program's world; its rotation has determinant -1
@@ -77,10 +81,9 @@ def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> 
     for one in pinholes:
         _check(one)
         if one.mirrored != pinholes[0].mirrored:
-            raise InputError(
+            raise one.error(
                 f"its image is mirrored with respect to that of {pinholes[0].where}",
-                where=one.where,
-                todo="flip one camera's images and calibrate again",
+                "flip one camera's images and calibrate again",
             )
     split = [_split(one, mirror) for one in pinholes]
     distances = _working_distances([pose for _, pose in split])
@@ -102,33 +105,29 @@ def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> 
 def _check(one: Pinhole) -> None:
     k, r = one.camera_matrix, one.rotation
     if min(one.image_size_px) < 1:
-        raise InputError(f"image size {one.image_size_px}", where=one.where, todo="give a size > 0")
+        raise one.error(f"image size {one.image_size_px}", "give a size > 0")
     if not np.array_equal(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]) or not k[0, 0] > 0:
-        raise InputError(
+        raise one.error(
             "the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1] with fx > 0",
-            where=one.where,
-            todo="export the camera again",
+            "export the camera again",
         )
     deviation = float(np.abs(r @ r.T - np.eye(3)).max())
     if deviation > 0.05 or np.linalg.det(r) < 0 or k[1, 1] == 0:
-        raise InputError(
+        raise one.error(
             f"the rotation matrix R is not a rotation (R R' differs by {deviation:.2g} from the "
             f"unit matrix, det R = {np.linalg.det(r):.3f}), or fy is 0",
-            where=one.where,
-            todo="export the camera again",
+            "export the camera again",
         )
     if np.any(one.distortion[_RATIONAL]) or np.any(one.distortion[_TILT]):
-        raise InputError(
+        raise one.error(
             "distortion coefficients k4 k5 k6 and tau have no exact counterpart here",
-            where=one.where,
-            todo="calibrate with k1 k2 p1 p2 k3 (and s1 to s4), or with telerig",
+            "calibrate with k1 k2 p1 p2 k3 (and s1 to s4), or with telerig",
         )
     if np.any(one.distortion) and deviation > _SHEAR_BESIDE_DISTORTION:
-        raise InputError(
+        raise one.error(
             f"a camera with distortion whose rotation matrix has shear ({deviation:.2g}) has no "
             "exact counterpart here",
-            where=one.where,
-            todo="export the camera again, with an orthonormal rotation matrix",
+            "export the camera again, with an orthonormal rotation matrix",
         )
 
 
@@ -160,10 +159,9 @@ def _working_distances(camera_from_world: list[Pose]) -> list[float]:
 
 def _camera(name: str, one: Pinhole, upper: Array, distance_mm: float, pose: Pose) -> Camera:
     if not distance_mm > 0:
-        raise InputError(
+        raise one.error(
             f"the point that it looks at lies {-distance_mm:.1f} mm behind the camera",
-            where=one.where,
-            todo="check the translation vector's sign",
+            "check the translation vector's sign",
         )
     upper = upper / upper[2, 2]
     scale = upper[0, 0] / distance_mm

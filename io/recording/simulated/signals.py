@@ -106,8 +106,8 @@ def answer(device: DeviceDescription, position_mm: float) -> bytes:
     """The answer of a polled stage."""
     if device.protocol == "grbl":
         place = {axis: position_mm if axis == device.axis else 0.0 for axis in "xyz"}
-        told = ",".join(f"{place[axis]:.3f}" for axis in "xyz")
-        return f"<Run|MPos:{told}|FS:0,0>\r\n".encode()
+        positions = ",".join(f"{place[axis]:.3f}" for axis in "xyz")
+        return f"<Run|MPos:{positions}|FS:0,0>\r\n".encode()
     return f"@01 0 OK BUSY -- {round(position_mm * (device.counts_per_mm or 1.0))}\r\n".encode()
 
 

@@ -32,7 +32,7 @@ _stopped = threading.Event()
 
 
 def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
-    """Do it here; returns status, words and figures. Raises telerig's errors."""
+    """Do it in this process; returns status, words and figures. Raises telerig's errors."""
     return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
 
 

@@ -1,8 +1,8 @@
 """Trajectories as NetCDF after the CF conventions: a contiguous ragged array of trajectories.
 
-CF-1.8, section 9.3.3 and appendix H.4.3. NetCDF-3 (64-bit offsets) by SciPy: no further dependency,
-and every NetCDF program reads it, those of NetCDF-4 too. Its price: no compression, and whole
-numbers of 32 bits.
+CF-1.8, section 9.3.3 and appendix H.4.3. The file is NetCDF-3 with 64-bit offsets, which SciPy
+writes without a further dependency and every NetCDF program reads. It has no compression, and whole
+numbers of 32 bits only.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _put(
     elif values.dtype.kind in "iub":
         if values.size and np.abs(values.astype(np.int64)).max() > _LARGEST:
             raise InputError(
-                f"{name} holds numbers beyond 32 bits, which NetCDF-3 does not have",
+                f"{name} holds whole numbers beyond 32 bits, which NetCDF-3 cannot store",
                 todo="export to HDF5",
             )
         variable = file.createVariable(name, "i4", dimensions)

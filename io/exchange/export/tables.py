@@ -53,7 +53,7 @@ def write_mat(
 ) -> None:
     """MATLAB 5 file: structs ``trajectories`` and ``shake`` of columns, ``cameras``, ``info``.
 
-    Names that MATLAB does not take are changed (`identifier`), text columns are cells.
+    Names that MATLAB does not accept are changed (`identifier`); text columns are cells.
     Raises InputError when two names become one, or the file cannot be written.
     """
     from scipy.io import savemat
@@ -78,7 +78,7 @@ def _unique(content: dict[str, Any]) -> dict[str, Any]:
     out = {identifier(name): value for name, value in content.items()}
     if len(out) != len(content):
         raise InputError(
-            f"MATLAB cannot tell some of these names apart: {', '.join(content)}",
+            f"some of these names would be the same in MATLAB: {', '.join(content)}",
             todo="export to HDF5, which MATLAB reads with h5read",
         )
     return out

@@ -1,12 +1,12 @@
 """Pinhole cameras of other programs as cameras of this library, exactly.
 
-A pinhole camera is the model of `telerig.rig.projection` with kappa = 1 / working distance. The
-matrix K [R | t] is split anew into an upper triangular map and a rotation (RQ), because R is often
-not orthonormal (printed digits, or a fit of nine numbers): what R has of shear becomes the camera's
-skew and aspect, and every pixel stays what the other program computes.
+A pinhole camera is the model of `telerig.rig.projection` with kappa = 1 / working distance. R of
+other programs is often not orthonormal (rounded digits, or a fit of nine numbers). So K R is
+decomposed anew into an upper triangular map and a rotation (RQ decomposition): shear of R becomes
+skew and aspect of the camera, and every pixel stays the one that the other program computes.
 
-Where images are left-handed against the world (fy < 0 with a proper R) the *world* is mirrored,
-since the images are what was recorded: `rig_from_world` is then a rotation with a reflection
+Where images are left-handed with respect to the world (fy < 0 with a proper R), the *world* is
+mirrored, because the images were recorded: `rig_from_world` is then a rotation with a reflection
 (determinant -1), and the cameras are ordinary ones, x right, y down, z away.
 """
 
@@ -46,7 +46,7 @@ class Pinhole:
 
     @property
     def mirrored(self) -> bool:
-        """Whether the image is left-handed against the world."""
+        """Whether the image is left-handed with respect to the world."""
         return bool(np.linalg.det(self.camera_matrix @ self.rotation) < 0)
 
     def error(self, what: str, todo: str) -> InputError:
@@ -144,7 +144,7 @@ def _split(one: Pinhole, mirror: Array) -> tuple[Array, Pose]:
 
 
 def _working_distances(camera_from_world: list[Pose]) -> list[float]:
-    """Depth of each camera's plane Z = 0: where its axis is closest to the first's (second's)."""
+    """Distance of each camera's plane Z = 0, where its axis is closest to the first (second) one's."""
     back = [p.inverse() for p in camera_from_world]
     out = [float(p.translation_mm[2]) for p in camera_from_world]
     for i in range(len(back) if len(back) > 1 else 0):

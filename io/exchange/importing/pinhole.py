@@ -144,7 +144,7 @@ def _split(one: Pinhole, mirror: Array) -> tuple[Array, Pose]:
 
 
 def _working_distances(camera_from_world: list[Pose]) -> list[float]:
-    """Distance of each camera's plane Z = 0, where its axis is closest to the first (second) one's."""
+    """Distance to each camera's plane Z = 0, where its axis is closest to another camera's."""
     back = [p.inverse() for p in camera_from_world]
     out = [float(p.translation_mm[2]) for p in camera_from_world]
     for i in range(len(back) if len(back) > 1 else 0):

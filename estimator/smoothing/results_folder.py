@@ -99,7 +99,7 @@ def _moved(tracks: Tracks | Any) -> list[str]:
         return []
     return [
         f"camera {change['camera']!r} had moved since the calibration by which the run was tracked "
-        f"(by {1e3 * change['offset_mm']:+.0f} um along the shared coordinate): positions are off "
+        f"(by {1e3 * change['offset_mm']:+.0f} µm along the shared coordinate): positions are off "
         "by it; calibrate again and track again, or smooth with --refine-rig"
     ]
 

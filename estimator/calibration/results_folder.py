@@ -131,7 +131,7 @@ def write_uncertainty(calibration: Calibration, path: Path) -> None:
 
 def write_detections(detected: DatasetDots, folder: Path) -> None:
     """rejected.csv, and where they were made overlays/<camera>/<view>.jpg and dot_example.npz."""
-    from telerig.io.dataset.tables import write_table
+    from telerig.io.files.csv_table import write_table
 
     write_table(detected.rejected, folder / "rejected.csv")
     for image in (i for i in detected.images if i.overlay):

@@ -45,8 +45,8 @@ class Smoothing:
 
     def save(self, folder: str | Path) -> None:
         """Write trajectories.csv, shake.csv, smoothing.json and results.h5."""
-        from telerig.io.dataset.tables import write_table
         from telerig.io.files.atomic import write_json_atomic
+        from telerig.io.files.csv_table import write_table
 
         out = Path(folder)
         write_table(self.trajectories, out / "trajectories.csv")

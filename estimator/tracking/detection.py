@@ -22,8 +22,8 @@ from telerig.estimator.bubbles.detect import detect_bubbles
 from telerig.estimator.bubbles.outline.types import DETECTION_COLUMNS
 from telerig.estimator.marks.erasing import StripInImages
 from telerig.io.dataset.run import RunData
-from telerig.io.dataset.tables import write_table
 from telerig.io.files.atomic import write_json_atomic
+from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
 from telerig.rig.camera import Camera
 

@@ -29,8 +29,8 @@ from telerig.estimator.tracking.track import (
     tracking_stream,
 )
 from telerig.estimator.tracking.tracks import events_table
-from telerig.io.dataset.tables import write_table
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
+from telerig.io.files.csv_table import write_table
 from telerig.io.files.provenance import run_record
 from telerig.io.machine.parallel import ordered_map, quick_workers
 

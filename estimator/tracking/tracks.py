@@ -41,8 +41,8 @@ class Tracks:
 
     def save(self, folder: str | Path) -> None:
         """Write detections.csv, tracks.csv, events.csv, tracking.json; references.csv if any."""
-        from telerig.io.dataset.tables import write_table
         from telerig.io.files.atomic import write_json_atomic
+        from telerig.io.files.csv_table import write_table
 
         out = Path(folder)
         for name in ("detections", "tracks", "events"):

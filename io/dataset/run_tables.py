@@ -151,7 +151,7 @@ def read_stage_csv(path: Path) -> pd.DataFrame:
 def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFrame:
     """`accelerometer.csv`: t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2; each sensor in time's order.
 
-    sensors : the names that rig.toml knows; None where there is no rig file.
+    sensors : the names in rig.toml; None where there is no rig file.
     """
     axes = [Column(f"a{axis}_m_s2") for axis in "xyz"]
     table = read_table(path, [Column("t_s"), Column("sensor", "text"), *axes], extra=True)
@@ -188,7 +188,7 @@ def read_detections_csv(
     """`detections.csv`: frame, camera, u_px, v_px, covariance, particle (text), extras kept.
 
     Covariance from suu_px2, suv_px2, svv_px2, else sigma_px, else `DETECTION_SIGMA_PX`, and
-    ``attrs["sigma_known"]`` tells whether the file stated it. particle is "" where blank: not
+    ``attrs["sigma_known"]`` says whether the file stated it. particle is "" where blank: not
     matched. a_px, b_px, angle_rad may be blank (NaN). sizes_px : (width, height) by camera.
     frame_count : None where the table itself says it. Rows keep the file's order.
     """

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from telerig.errors import InputError, suggestion
-from telerig.io.files.csv_table import Column, read_table, rows_of, write_table
+from telerig.io.files.csv_table import Column, read_table, rows_of
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.rig.target import Target
 
 if TYPE_CHECKING:
     import pandas as pd
-
-__all__ = ["DOTS_COLUMNS", "Column", "read_dots_csv", "read_table", "write_table"]
 
 AnySource = TypeVar("AnySource", bound=str)
 
@@ -60,7 +58,7 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
     Columns `DOTS_COLUMNS` (and chi2_dof if the file has it): view and camera text; dot the id of
     `rig.target`, also on an unbounded grid, where the file's own dot is opaque and row, column
     count; covariance from suu_px2, suv_px2, svv_px2, else sigma_px, else `DEFAULT_SIGMA_PX`;
-    ``attrs["sigma_known"]`` tells whether the file stated it. Rows keep the file's order.
+    ``attrs["sigma_known"]`` says whether the file stated it. Rows keep the file's order.
     Raises InputError, with the row (header = 1) and the column, for anything that cannot be.
     """
     file = Path(path)

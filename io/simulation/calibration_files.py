@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.dataset.tables import write_table
 from telerig.io.files.atomic import write_json_atomic
+from telerig.io.files.csv_table import write_table
 from telerig.io.rig_file.description import CameraDescription, RigDescription
 from telerig.io.rig_file.rig_file import write_rig_toml
 from telerig.io.simulation.calibration.scene import (

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.dataset.tables import write_table
 from telerig.io.files.atomic import write_json_atomic
+from telerig.io.files.csv_table import write_table
 from telerig.io.simulation.calibration.scene import TrueTarget, View, hand_held_views, wholly_inside
 from telerig.io.simulation.calibration_files import exact_dots, measured_dots, write_images
 from telerig.io.simulation.config import RunConfig

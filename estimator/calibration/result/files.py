@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.io.dataset.tables import write_table
 from telerig.io.files.atomic import atomic_path, write_json_atomic
+from telerig.io.files.csv_table import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS, intrinsics_from

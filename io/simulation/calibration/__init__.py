@@ -1,4 +1,4 @@
 """The true rig and target of a simulated calibration.
 
-In: a preset. Out: true cameras, dots, poses. Read ``presets`` first.
+In: a ``SimulationConfig``. Out: true cameras, dots, poses. Read ``scene``.
 """

@@ -1,4 +1,4 @@
 """A simulated run before it is written: bubbles, stage, shake, sensors.
 
-In: a preset. Out: the scene in time and what each camera sees. Read ``presets``, then ``scene``.
+In: a ``RunConfig``. Out: the scene in time and what each camera sees. Read ``scene``.
 """

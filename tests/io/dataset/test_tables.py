@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.dataset.tables import Column, read_dots_csv, read_table, write_table
+from telerig.io.dataset.tables import read_dots_csv
+from telerig.io.files.csv_table import Column, read_table, write_table
 from telerig.io.rig_file.description import CameraDescription, RigDescription
 from telerig.rig.target import Target
 

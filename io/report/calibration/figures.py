@@ -257,14 +257,14 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
 
 _CALIBRATION = (
     "Uncertainty: the calibration's share",
-    "One standard deviation in um (all three axes together) of where a point lies in the rig's "
-    "frame, in the plane of the optical axes. It is the same for all points of a run that lie near "
-    "each other: differences of near points do not have it.",
+    "One standard deviation in µm (all three axes together) of a point's position in the rig "
+    "frame, in the plane of the optical axes. Points of a run that lie near each other share this "
+    "error: it cancels in their differences.",
 )
 _MEASUREMENT = (
     "Uncertainty: the pixels' share",
-    "One standard deviation in um of a point whose pixels scatter like this calibration's dots "
-    "({sigma} px), drawn anew for every point; in proportion for other pixels.",
+    "One standard deviation in µm of a point whose pixel noise is that of this calibration's "
+    "dots ({sigma} px). It is independent from point to point and proportional to the noise.",
 )
 
 
@@ -278,20 +278,20 @@ def _map(arrays: Mapping[str, Array], name: str, words: tuple[str, str]) -> Pict
     with drawing(3.6) as (figure, axes):
         if np.ptp(grid) > 1e-3 * grid.max():
             filled = axes.contourf(x, z, grid.T, levels=_LEVELS, cmap="viridis")
-            figure.colorbar(filled, ax=axes, label="um")
+            figure.colorbar(filled, ax=axes, label="µm")
         else:
-            axes.text(0.5, 0.5, f"{number(grid.mean(), 3)} um everywhere", ha="center",
+            axes.text(0.5, 0.5, f"{number(grid.mean(), 3)} µm everywhere", ha="center",
                       va="center", transform=axes.transAxes)  # fmt: skip
         axes.set(xlabel="x / mm", ylabel="z / mm", xlim=(x[0], x[-1]), ylim=(z[0], z[-1]))
         axes.set_aspect("equal")
         source = svg(figure)
     caption = words[1].format(sigma=number(float(arrays["sigma_px"]), 3))
-    caption += f" {number(grid.min(), 3)} to {number(grid.max(), 3)} um."
+    caption += f" {number(grid.min(), 3)} to {number(grid.max(), 3)} µm."
     return Picture(words[0], source, caption)
 
 
 def _halves(halves: Mapping[str, Any]) -> Picture:
-    """Arrows where the halves differ, circles of what the covariances allow."""
+    """Arrows: how the two halves of the views differ. Circles: what the covariances predict."""
     from matplotlib.patches import Circle
 
     points, shift, sd = (
@@ -313,9 +313,11 @@ def _halves(halves: Mapping[str, Any]) -> Picture:
         axes.set_aspect("equal", adjustable="datalim")
         source = svg(figure)
     caption = (
-        f"Arrows: how far {halves['views'][0]} views and the other {halves['views'][1]} put the "
-        f"same pixels apart (longest {number(longest, 2)} um); grey: one standard deviation of "
-        "that difference. They form a pattern by nature (a turn, a scale); arrows much longer than "
-        "the circles' radius in most places mean that the covariance cannot be believed."
+        f"Split-half check. Arrows show by how much a calibration from {halves['views'][0]} views "
+        f"and one from the other {halves['views'][1]} place the same pixels differently (longest "
+        f"{number(longest, 2)} µm). Grey circles have the radius of one predicted standard "
+        "deviation of that difference. Neighbouring arrows are alike, because the difference is "
+        "mostly a rotation and a scale. If most arrows are much longer than the radius, the "
+        "covariance is too small."
     )
-    return Picture("Two halves of the views", source, caption)
+    return Picture("Split-half check", source, caption)

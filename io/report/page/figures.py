@@ -117,41 +117,16 @@ Array = NDArray[np.float64]
 
 SMOOTHED, NAIVE, RTS = "#1f5fa8", "#9aa0a8", "#c2570c"
 BAND_SDS = 2
-_STRETCHES = 450
 _MANY = 1_500
 _SHADES = 64
 _DPI = 190
 _ROOM = 0.035
 
 
-def thin_line(t_s: Array, values: Array) -> tuple[Array, Array]:
-    """Least and greatest value of each of `_STRETCHES` stretches, where there are more points.
-
-    A stretch without a finite value breaks the line.
-    """
-    if len(t_s) <= 2 * _STRETCHES:
-        return t_s, values
-    starts = _starts(len(t_s))
-    low, high = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
-    return np.repeat(t_s[starts], 2), np.stack([low, high], 1).ravel()
-
-
-def thin_band(t_s: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """The widest band of each stretch."""
-    if len(t_s) <= 2 * _STRETCHES:
-        return t_s, low, high
-    starts = _starts(len(t_s))
-    return t_s[starts], np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
-
-
-def _starts(count: int) -> NDArray[np.int64]:
-    return np.unique(np.linspace(0, count, _STRETCHES, endpoint=False).astype(np.int64))
-
-
 def line(axes: Any, t_s: Array, values: Array, colour: str, label: str = "", **how: Any) -> None:
     """``values`` against time; nothing where none is finite."""
     if np.isfinite(values).any():
-        axes.plot(*thin_line(t_s, values), color=colour, label=label, **({"linewidth": 0.9} | how))
+        axes.plot(t_s, values, color=colour, label=label, **({"linewidth": 0.9} | how))
 
 
 def band(axes: Any, t_s: Array, centre: Array, sd: Array, colour: str, label: str = "") -> None:
@@ -159,7 +134,7 @@ def band(axes: Any, t_s: Array, centre: Array, sd: Array, colour: str, label: st
     if not np.isfinite(sd).any():
         return
     far = BAND_SDS * sd
-    axes.fill_between(*thin_band(t_s, centre - far, centre + far), color=colour, alpha=0.25,
+    axes.fill_between(t_s, centre - far, centre + far, color=colour, alpha=0.25,
                       linewidth=0, label=label)  # fmt: skip
 
 

@@ -69,7 +69,7 @@ def test_page_begins_with_the_smoothing_and_loads_nothing(whole: Path) -> None:
 def test_page_says_what_the_files_say(whole: Path) -> None:
     text = Page(whole / "report.html").spaced
     for words in (
-        "RESOLVED: the bubbles' motion and the rig's shake are told apart",
+        "RESOLVED: the data separate the motion of the bubbles from the shake of the rig",
         "y (vertical): told apart (13 µm).", "sd, µm 23.1 23.1 23.1",
         "q 1.01 1.07 1.02", "η 0.9961 0.9961 0.9961",
         "shake of left, µm 30.0", "verdict RESOLVED RESOLVED RESOLVED", "y (down)",
@@ -99,9 +99,9 @@ def test_without_smoothing_the_page_is_of_the_tracking_alone(folder: Path) -> No
 @pytest.mark.parametrize(
     ("word", "colour", "headline"),
     [
-        ("RESOLVED", "good", "are told apart"),
-        ("PARTIAL", "usable", "told apart in part"),
-        ("UNRESOLVED", "rejected", "do not tell the bubbles' motion from the rig's shake"),
+        ("RESOLVED", "good", "the data separate the motion of the bubbles"),
+        ("PARTIAL", "usable", "only in part"),
+        ("UNRESOLVED", "rejected", "cannot separate the bubbles' motion from the rig's shake"),
         (None, "usable", "Not judged"),
         ("NEW_WORD", "usable", "NEW WORD"),
     ],

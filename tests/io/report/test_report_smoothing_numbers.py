@@ -20,7 +20,6 @@ from smoothed_folder import (
     write_folder,
 )
 
-from telerig.io.report.page.figures import thin_band, thin_line
 from telerig.io.report.run.smoothing.numbers import (
     axis_sd,
     evenly,
@@ -112,18 +111,6 @@ def test_given_remedies_of_the_modes_are_shown(folder: Path) -> None:
     rows, _ = mode_rows(read(changed(folder, modes=[row, servo])))
     assert [r.cells[0] for r in rows] == ["arm of left", "servo (following error)"]
     assert [r.cells[4] for r in rows] == ["brace it <here>", "less gain"]
-
-
-def test_thinning_loses_no_excursion() -> None:
-    t = np.arange(50_000.0)
-    values = np.sin(t)
-    values[31_234] = 40.0
-    values[10_000:12_000] = np.nan
-    thin_t, thin = thin_line(t, values)
-    assert len(thin) < 1_000 and np.nanmax(thin) == 40.0 and np.isnan(thin).any()
-    assert np.all(np.diff(thin_t) >= 0)
-    _, low, high = thin_band(t, values - 1, values + 1)
-    assert np.nanmax(high) == 41.0 and np.nanmin(low) == pytest.approx(-2.0, abs=1e-6)
 
 
 def test_evenly_fills_gaps_with_straight_lines() -> None:

@@ -61,28 +61,28 @@ REMEDY = (
     "camera arm, and record again."
 )
 _NOT_JUDGED = (
-    "Not judged: nothing says how far bubble motion and shake were told apart",
+    "Not judged: smoothing.json does not say whether bubble motion and shake are separable",
     "usable",
-    "The bands below hold if the model of bubbles and shake is right; whether the data could have "
-    "shown otherwise was not tested.",
+    "The bands below are right if the model of bubbles and shake is right. Whether the data can "
+    "separate the two was not tested.",
 )
 _MEANING = {
     "RESOLVED": (
-        "RESOLVED: the bubbles' motion and the rig's shake are told apart",
+        "RESOLVED: the data separate the motion of the bubbles from the shake of the rig",
         "good",
-        "The shake is known so well that it hardly widens the bands below.",
+        "The uncertainty of the shake hardly widens the bands below.",
     ),
     "PARTIAL": (
-        "PARTIAL: the bubbles' motion and the rig's shake are told apart in part",
+        "PARTIAL: the data separate the bubbles' motion from the rig's shake only in part",
         "usable",
         "Part of the shake may still stand in the trajectories, or part of the bubbles' motion in "
         "the shake; the bands below say how much.",
     ),
     "UNRESOLVED": (
-        "UNRESOLVED: these data do not tell the bubbles' motion from the rig's shake",
+        "UNRESOLVED: the data cannot separate the bubbles' motion from the rig's shake",
         "rejected",
-        "What is drawn below as the bubbles' motion may be shake, and the other way round: do not "
-        "read anything from it that is as fast as the shake.",
+        "What is drawn below as motion of bubbles may be shake, and the other way round: do not "
+        "interpret any motion as fast as the shake.",
     ),
 }
 _FLAGS = {

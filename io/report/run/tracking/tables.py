@@ -83,8 +83,8 @@ def _matched_words(results: TrackResults) -> str:
 def _precision_words(results: TrackResults) -> str:
     x, y, z = (number(median(column), 2) for column in results.sd_um.T)
     return (
-        f"A position is known to {x}, {y} and {z} µm in x, y and z (1 sd, median), "
-        "without what the calibration itself is off."
+        f"A position is known to {x}, {y} and {z} µm in x, y and z (1 sd, median); the uncertainty "
+        "of the calibration is not included."
     )
 
 
@@ -113,12 +113,14 @@ def _with_learnt(results: TrackResults) -> Array | None:
 
 
 def _warnings(results: TrackResults) -> tuple[str, ...]:
-    pairs, words = results.pairs, []
-    if pairs.get("calibration_problem"):
-        told = [str(w) for w in pairs.get("words") or []]
-        words += [w for w in told if "calibration" in w.lower()] or [
-            "The cameras disagree along their shared axis: this is a calibration problem."
-        ]
+    words = []
+    if results.pairs.get("calibration_problem"):
+        offsets = ", ".join(number(b) for b in _as_list(results.pairs.get("bias_px")))
+        words.append(
+            "The two cameras disagree along their shared axis"
+            + (f" (offset {offsets} px)" if offsets else "")
+            + ": this is a calibration problem. Calibrate again before you use these tracks."
+        )
     ratio = ray_miss_ratio(results, _with_learnt(results), centred=bool(words))
     if ratio is not None and ratio > _MISS_TOO_LARGE:
         scatter = "Even without their common offset, rays" if words else "Rays"

@@ -34,12 +34,11 @@ _LEAST_MISS_MM = 1e-7
 class RayPair:
     """Two rays and where they come closest, in the rig frame.
 
-    origins_mm, directions : (2, 3), directions of unit length. closest_mm : (2, 3), the point of
+    directions : (2, 3), of unit length. closest_mm : (2, 3), the point of
     each ray that is nearest to the other. middle_mm : (3,), half way. miss_mm : signed, from the
     first ray to the second along first direction x second direction.
     """
 
-    origins_mm: Array
     directions: Array
     closest_mm: Array
     middle_mm: Array
@@ -56,7 +55,7 @@ def ray_pair(
     middle, miss = midpoint(origins[0], directions[0], origins[1], directions[1])
     across = np.cross(*directions)
     half = 0.5 * float(miss) * across / np.linalg.norm(across)
-    return RayPair(origins, directions, np.array([middle - half, middle + half]), middle,
+    return RayPair(directions, np.array([middle - half, middle + half]), middle,
                    float(miss))  # fmt: skip
 
 

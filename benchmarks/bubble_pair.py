@@ -26,9 +26,8 @@ from scipy.optimize import linear_sum_assignment
 
 from telerig.estimator.bubbles.detect import detect_bubbles
 from telerig.estimator.bubbles.pairing.geometry import pair_geometry, shared_axis, view_of
-from telerig.estimator.bubbles.pairing.matching import match_pairs
-from telerig.estimator.bubbles.pairing.model import estimate_pair_model
-from telerig.estimator.bubbles.pairing.types import Matches
+from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
+from telerig.estimator.bubbles.pairing.matching import Matches, match_pairs
 from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 from telerig.io.images.read import read_image
 from telerig.rig.camera import Camera
@@ -116,7 +115,7 @@ def real_pair(folder: Path, overlay: Path | None) -> list[str]:
         lines.append(f"| {name} | telerig | {counts} | {result} |")
         print("\n".join(lines[-2:]))
     lines += ["", "What the model says of the detections of `detect_bubbles`:", ""]
-    lines += [f"- {sentence}" for sentence in model.words]
+    lines += [f"- {sentence}" for sentence in model.sentences()]
     lines += ["", *agreement(found, known), "", *details(found, known, pairs)]
     if overlay is not None:
         draw(images, found, pairs, overlay)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.bubbles.pairing.pair_model import Finding
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
     RigChange,
@@ -26,7 +27,7 @@ from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, informatio
 if TYPE_CHECKING:
     import pandas as pd
 
-    from telerig.estimator.bubbles.pairing.types import PairModel
+    from telerig.estimator.bubbles.pairing.pair_model import PairModel
     from telerig.estimator.calibration.result.calibration import Calibration
 
 Array = NDArray[np.float64]
@@ -170,9 +171,9 @@ def with_change(
 
     A movement of the cameras replaces the sentence on an offset of the calibration.
     """
-    words, moved = list(model.words), change is not None and change.moved
+    words, moved = model.sentences(), change is not None and change.moved
     if change is not None and moved:
-        words = [w for w in words if w != model.offset_words]
+        words = model.sentences(without=[Finding.CALIBRATION_OFFSET])
         first = calibration.cameras[0].name
         unsure = "" if np.any(calibration.covariance) else " (or the calibration was never right)"
         words.append(

@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.outline.types import Prediction
-from telerig.estimator.bubbles.pairing.matching import match_pairs
-from telerig.estimator.bubbles.pairing.types import PairModel
+from telerig.estimator.bubbles.pairing.matching import Prediction, match_pairs
+from telerig.estimator.bubbles.pairing.pair_model import PairModel
 from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
 from telerig.estimator.tracking.backtracking import follow_back
 from telerig.estimator.tracking.filter.types import (

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.outline.types import DETECTION_COLUMNS
+from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import match_pairs
-from telerig.estimator.bubbles.pairing.model import estimate_pair_model
-from telerig.estimator.bubbles.pairing.types import PairModel
+from telerig.estimator.bubbles.pairing.pair_model import PairModel
 from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import Calibration

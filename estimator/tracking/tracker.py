@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
-from telerig.estimator.bubbles.outline.types import Prediction
+from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.association.advance import Scan, advance
 from telerig.estimator.tracking.association.hypotheses import Broken, Cluster, Decision, decide
 from telerig.estimator.tracking.association.labelled_tracks import follow_given

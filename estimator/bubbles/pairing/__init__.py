@@ -1,6 +1,6 @@
 """Which bubble of the second camera is which of the first.
 
 In: the detections of one frame in both cameras, and predicted tracks. Out: pairs with
-probabilities. Read ``matching`` first; ``model`` learns from the run what both views of a bubble
-have in common.
+probabilities. Read ``matching`` first; ``learning`` estimates from a run what both views of a
+bubble have in common.
 """

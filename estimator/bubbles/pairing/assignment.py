@@ -5,12 +5,14 @@ An assignment's probability is proportional to the product of exp(log odds) of i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 NEGLIGIBLE = -9.0
 """Log odds below which a pair is never considered: its probability stays under exp(-9)."""
@@ -52,27 +54,17 @@ def marginals(log_odds: Array) -> Array:
     return out
 
 
-def _components(possible: NDArray[np.bool_]) -> list[tuple[list[int], list[int]]]:
-    """Rows and columns that hang together."""
-    rows = {int(i): np.flatnonzero(possible[i]).tolist() for i in np.flatnonzero(possible.any(1))}
-    columns = {
-        int(j): np.flatnonzero(possible[:, j]).tolist() for row in rows.values() for j in row
-    }
-    out = []
-    while rows:
-        mine: tuple[list[int], list[int]] = ([], [])
-        todo = [next(iter(rows))]
-        while todo:
-            i = todo.pop()
-            if i not in rows:
-                continue
-            mine[0].append(i)
-            for j in rows.pop(i):
-                if j in columns:
-                    mine[1].append(j)
-                    todo += columns.pop(j)
-        out.append((sorted(mine[0]), sorted(mine[1])))
-    return out
+def _components(possible: NDArray[np.bool_]) -> Iterator[tuple[Index, Index]]:
+    """Rows and columns that are connected by possible pairs."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(possible)
+    i, j = np.nonzero(possible)
+    graph = coo_array((np.ones(len(i)), (i, n + j)), shape=(sum(possible.shape),) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    for label in np.unique(labels[i]):
+        yield np.flatnonzero(labels[:n] == label), np.flatnonzero(labels[n:] == label)
 
 
 @lru_cache(maxsize=16)

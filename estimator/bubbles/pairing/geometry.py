@@ -23,7 +23,7 @@ from telerig.rig.triangulation import midpoint
 Array = NDArray[np.float64]
 
 NO_SIZE_FLAGS = ("border", "merged")
-_DOUBTFUL = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
+_SCATTER_FACTOR = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
 _UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
 """What hidden outline may add to a centre's sd, as a share of the larger semi-axis."""
 _OUTLINE_SAMPLES = 96
@@ -39,7 +39,7 @@ class View:
     middle_mm : (N,) middle of top and bottom less the centre, along the shared axis.
     log_size : (N, 2) logarithms of half the height and half the width (mm), along and across the
         shared axis; NaN where unknown.  log_contrast : (N, 1), likewise.
-    doubt : (N,) factor for the scatter of flagged detections.
+    scatter_factor : (N,) factor for the scatter of flagged detections.
     """
 
     camera: Camera
@@ -51,10 +51,10 @@ class View:
     middle_mm: Array
     log_size: Array
     log_contrast: Array
-    doubt: Array
+    scatter_factor: Array
 
     def __len__(self) -> int:
-        return len(self.doubt)
+        return len(self.scatter_factor)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class PairGeometry:
     included; positive along that image's +u or +v, whichever is nearer the axis.
     variance_px2 : its variance by the detections' covariances.  points_mm : (N1, N2, 3) mid-points.
     size, contrast : (N1, N2, 2), (N1, N2, 1) logarithms of the ratios first / second.
-    mm_per_px : (N1, N2) length of a pixel of the gap.  doubt : (N1, N2).
+    mm_per_px : (N1, N2) length of a pixel of the gap.  scatter_factor : (N1, N2).
     """
 
     views: tuple[View, View]
@@ -75,7 +75,7 @@ class PairGeometry:
     size: Array
     contrast: Array
     mm_per_px: Array
-    doubt: Array
+    scatter_factor: Array
 
 
 def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
@@ -118,7 +118,7 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     mm_by_px = _mm_by_px(camera, uv)
     across = np.einsum("i,nij->nj", (camera.camera_from_rig.rotation @ axis)[:2], mm_by_px)
     middle, height = outline_extent(table, across)
-    known, doubt, unsure = _trust(table)
+    known, scatter_factor, unsure = _trust(table)
     extra = np.square(unsure * np.nan_to_num(_column(table, "a_px")))
     area = np.pi * _column(table, "a_px") * _column(table, "b_px")
     measured = _column(table, "area_px2")
@@ -132,7 +132,7 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
         camera, uv, origin, direction, mm_by_px,
         covariance.reshape(-1, 2, 2) + extra[:, None, None] * np.eye(2), middle,
         _finite(np.stack([log_height, log_width], -1)), _finite(contrast[:, None]),
-        doubt,
+        scatter_factor,
     )  # fmt: skip
 
 
@@ -163,7 +163,7 @@ def pair_geometry(first: View, second: View) -> PairGeometry:
         views, gap / lengths[0], variance / lengths[0] ** 2, points,
         first.log_size[:, None] - second.log_size + (stretch[0] - stretch[1])[..., None],
         first.log_contrast[:, None] - second.log_contrast,
-        lengths[0], np.maximum(first.doubt[:, None], second.doubt),
+        lengths[0], np.maximum(first.scatter_factor[:, None], second.scatter_factor),
     )  # fmt: skip
 
 
@@ -213,14 +213,18 @@ def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
 
 def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array, Array]:
     """By the flags: is the size known, the factor for the scatter, the unsure share of the size."""
-    known, doubt, unsure = np.ones(len(table), bool), np.ones(len(table)), np.zeros(len(table))
+    known, scatter_factor, unsure = (
+        np.ones(len(table), bool),
+        np.ones(len(table)),
+        np.zeros(len(table)),
+    )
     if "flags" in table:
         for i, text in enumerate(table["flags"].tolist()):
             for word in text.split("|") if isinstance(text, str) and text else ():
                 known[i] &= word not in NO_SIZE_FLAGS
-                doubt[i] = max(doubt[i], _DOUBTFUL.get(word, 1.0))
+                scatter_factor[i] = max(scatter_factor[i], _SCATTER_FACTOR.get(word, 1.0))
                 unsure[i] = max(unsure[i], _UNSURE_SHARE.get(word, 0.0))
-    return known, doubt, unsure
+    return known, scatter_factor, unsure
 
 
 def _column(table: pd.DataFrame, name: str) -> Array:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 import telerig
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.bubbles.pairing.model import default_model
+from telerig.estimator.bubbles.pairing.learning import default_model
+from telerig.estimator.bubbles.pairing.pair_model import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
@@ -292,14 +293,14 @@ def test_words_say_it_once() -> None:
     still = PairCollector(known)
     pairs.add(Run().tracks(cameras, moved(cameras, along_perpendicular(cameras, 0.08, 0, 0)), rng))
     still.add(Run().tracks(cameras, cameras, rng))
-    model = replace(default_model(cameras), words=("Off by 0.8 px.", "More."))
-    model = replace(model, offset_words=model.words[0])
+    findings = (Finding.CALIBRATION_OFFSET, Finding.FEW_PAIRS)
+    model = replace(default_model(cameras), findings=findings)
     said = with_change(model, pairs.found(), known)
     assert said["calibration_problem"]
-    assert said["words"][0] == "More." and len(said["words"]) == 2
-    assert "'right' has moved against 'left'" in said["words"][1]
-    assert "--refine-rig" in said["words"][1] and "positions are off" in said["words"][1]
-    assert with_change(model, still.found(), known)["words"] == list(model.words)
+    assert said["words"][:-1] == model.sentences(without=findings[:1]) and len(said["words"]) == 3
+    assert "'right' has moved against 'left'" in said["words"][-1]
+    assert "--refine-rig" in said["words"][-1] and "positions are off" in said["words"][-1]
+    assert with_change(model, still.found(), known)["words"] == model.sentences()
     assert PairCollector(known).found() is None
 
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.outline.types import DETECTION_COLUMNS
-from telerig.estimator.bubbles.pairing.model import default_model
+from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.tracking.link import Linker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.io.simulation.calibration.scene import true_cameras

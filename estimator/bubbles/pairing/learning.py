@@ -1,15 +1,16 @@
 """What the two views of a bubble have in common, learnt from the detections of a run.
 
 The calibration may be off along the shared axis by more than bubbles are apart there, so the gap
-alone would pair wrongly and prove itself right. Sizes know nothing of it: every combination of
-detections votes for its gap by how well the heights agree, the fullest place is the start, and
-expectation-maximisation over the pairs' probabilities does the rest.
+alone would give wrong pairs that seem to confirm it. Sizes are independent of the calibration:
+every combination of detections votes for its gap by how well the heights agree, the fullest place
+is the start, and expectation-maximisation over the pairs' probabilities does the rest. The
+systematic part of the gaps is a constant, or smooth in space where pairs left out of it agree.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.assignment import marginals
-from telerig.estimator.bubbles.pairing.bias import PAIRS_PER_TERM, TERMS, better, fit_bias
 from telerig.estimator.bubbles.pairing.geometry import (
     PairGeometry,
     View,
@@ -26,8 +26,7 @@ from telerig.estimator.bubbles.pairing.geometry import (
     view_of,
 )
 from telerig.estimator.bubbles.pairing.matching import appearance_log_odds, common_shift
-from telerig.estimator.bubbles.pairing.types import Cue, PairModel
-from telerig.estimator.bubbles.pairing.wording import describe
+from telerig.estimator.bubbles.pairing.pair_model import Finding, LogRatioModel, PairModel
 from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
@@ -36,7 +35,7 @@ MOST_FRAMES = 60
 MOST_BIAS_PX = 20.0
 _START_SCATTER_PX = 1.5
 _PASSES = 6
-_LEAST_LONELY, _MOST_LONELY = 0.05, 0.9
+_LEAST_UNMATCHED, _MOST_UNMATCHED = 0.05, 0.9
 _PRIOR_PAIRS = 3.0
 _PRIOR_SCATTER_PX = 0.3
 _SMALLEST = {"size": np.diag([0.005, 0.005]) ** 2, "contrast": np.diag([0.02]) ** 2}
@@ -44,12 +43,21 @@ _PRIOR = {"size": np.diag([0.03, 0.06]) ** 2, "contrast": np.diag([0.2]) ** 2}
 _USUAL = {"size": np.array([[0.17, 0.15], [0.15, 0.17]]), "contrast": np.array([[0.1]])}
 _USUAL_WEIGHT = 4.0
 
+_BIAS_TERMS = (1, 4, 10)
+_PAIRS_PER_TERM = 3.0
+_BETTER, _AS_MANY = 0.95, 0.95
+_PRIOR_BIAS_SD_PX = np.array([10.0] + [2.0] * 3 + [1.0] * 6)
+_PRIOR_SCATTER_PAIRS, _SMALLEST_SCATTER_PX = 2.0, 0.02
+
+_LEAST_PROBLEM_PX, _SIGNIFICANT = 0.5, 4.0
+_FEW_PAIRS, _CLEAR_VOTE = 5.0, 3.0
+
 
 def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
     """A model for a calibration that is believed, before any detection was seen."""
     axis = shared_axis(cameras)
     size, contrast = (
-        Cue(np.zeros(len(usual)), _PRIOR[name], np.zeros((2, len(usual))), 9.0 * usual)
+        LogRatioModel(np.zeros(len(usual)), _PRIOR[name], np.zeros((2, len(usual))), 9.0 * usual)
         for name, usual in _USUAL.items()
     )
     reach = np.full(3, max(c.image_size_px[0] / c["scale_px_per_mm"] / 2 for c in cameras))
@@ -62,12 +70,13 @@ def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
 def estimate_pair_model(
     frames: Sequence[tuple[pd.DataFrame, pd.DataFrame]], cameras: tuple[Camera, Camera]
 ) -> PairModel:
-    """Bias and scatter of the shared coordinate, scatter of the ratios, share of lonely detections.
+    """Bias and scatter of the shared coordinate, scatter of the ratios, share without a partner.
 
     frames : detection tables of the first and second camera, one pair per frame; at most
     ``MOST_FRAMES`` are used, spread evenly. With nothing to learn from, the default model with
-    words that say so. A bias up to ``MOST_BIAS_PX`` is found. The bias is a constant, or linear or
-    quadratic in space when that predicts pairs left out better (at least three pairs per term).
+    a finding that says so. A bias up to ``MOST_BIAS_PX`` is found. The bias is a constant, or
+    linear or quadratic in space when that predicts pairs left out better (at least three pairs
+    per term).
 
     Raises InputError for tables without centres or covariances and for parallel cameras.
     """
@@ -80,7 +89,7 @@ def estimate_pair_model(
     used = [pair for pair in views if len(pair[0]) and len(pair[1])]
     model = default_model(cameras)
     if not used:
-        return replace(model, words=("No frame has detections in both cameras: nothing learnt.",))
+        return replace(model, findings=(Finding.NO_DETECTIONS,))
     model = _populations(model, used)
     geometries = [pair_geometry(*pair) for pair in used]
     points = np.concatenate([g.points_mm.reshape(-1, 3) for g in geometries])
@@ -95,59 +104,135 @@ def estimate_pair_model(
     for _ in range(_PASSES):
         model = _improved(model, geometries, 1)
     best = model
-    for terms in TERMS[1:]:
-        if model.pairs >= PAIRS_PER_TERM * terms:
+    for terms in _BIAS_TERMS[1:]:
+        if model.pairs >= _PAIRS_PER_TERM * terms:
             trial = model
             for _ in range(_PASSES):
                 trial = _improved(trial, geometries, terms)
-            best = trial if better(trial, best) else best
-    return describe(best, votes)
+            as_many = trial.pairs >= _AS_MANY * best.pairs
+            best = trial if as_many and trial.rms_px[3] < _BETTER * best.rms_px[3] else best
+    return replace(best, findings=_findings(best, votes))
+
+
+def _findings(model: PairModel, votes: float) -> tuple[Finding, ...]:
+    """votes : how far the bias stood out in the first vote."""
+    offset, error = model.mean_gap_px
+    _, after_constant, after_all, _ = model.rms_px
+    varies = len(model.bias_px) > 1 and after_constant > max(_LEAST_PROBLEM_PX, 1.5 * after_all)
+    few = model.pairs < _FEW_PAIRS
+    found = {
+        Finding.CALIBRATION_OFFSET: abs(offset) > max(_LEAST_PROBLEM_PX, _SIGNIFICANT * error),
+        Finding.OFFSET_VARIES: varies,
+        Finding.FEW_PAIRS: few,
+        Finding.UNCLEAR_OFFSET: not few and votes < _CLEAR_VOTE,
+        Finding.CAMERA_SHAKE: model.frame_px > max(0.1, model.scatter_px / 2),
+    }
+    return tuple(finding for finding, true in found.items() if true)
+
+
+@dataclass(frozen=True)
+class _LikelyPairs:
+    """Likely pairs of all frames, one row each; fields as in `PairGeometry`.
+
+    gap_px is less the frame's common shift; weight is the probability of the pair.
+    """
+
+    gap_px: Array
+    variance_px2: Array
+    points_mm: Array
+    size: Array
+    contrast: Array
+    scatter_factor: Array
+    weight: Array
+
+
+def _likely_pairs(
+    geometries: list[PairGeometry], shifts_px: Array, probability: list[Array]
+) -> _LikelyPairs:
+    weight = np.concatenate([p.ravel() for p in probability])
+    use = weight > 0.01
+    columns = {}
+    for field in fields(_LikelyPairs)[:-1]:
+        arrays: list[Array] = [getattr(g, field.name) for g in geometries]
+        columns[field.name] = np.concatenate([a.reshape(-1, *a.shape[2:]) for a in arrays])[use]
+    columns["gap_px"] -= np.repeat(shifts_px, [g.gap_px.size for g in geometries])[use]
+    return _LikelyPairs(**columns, weight=weight[use])
 
 
 def _improved(model: PairModel, geometries: list[PairGeometry], terms: int) -> PairModel:
     """One pass: probabilities of all pairs, then everything that follows from them."""
     found = [common_shift(g, model) for g in geometries]
     probability = [marginals(odds) for _, _, odds, _ in found]
-    weight = np.concatenate([p.ravel() for p in probability])
-    use = weight > 0.01
     shifts = np.array([shift for *_, shift in found])
     total = np.array([p.sum() for p in probability])
     counts = np.array([p.shape for p in probability])
     centred = shifts - np.average(shifts, weights=total + 1e-9)
-    flat = _Flat(geometries, centred, use)
-    weight = weight[use]
-    model = fit_bias(model, flat.points_mm, flat.raw_px - flat.shift_px, flat.variance_px2,
-                     flat.doubt, weight, terms)  # fmt: skip
-    lonely = 1 - (total.sum() + 0.5) / (counts.sum(0) + 1.0)
-    first, second = np.clip(lonely, _LEAST_LONELY, _MOST_LONELY)
+    pairs = _likely_pairs(geometries, centred, probability)
+    model = _with_bias(model, pairs, terms)
+    unmatched = 1 - (total.sum() + 0.5) / (counts.sum(0) + 1.0)
+    first, second = np.clip(unmatched, _LEAST_UNMATCHED, _MOST_UNMATCHED)
     mean, error = model.mean_gap_px
     frame_px = _frame_scatter(model, centred, total) if len(geometries) > 1 else 0.0
+    size_weight = pairs.weight / pairs.scatter_factor**2
     return replace(
         model,
         mean_gap_px=(mean, float(np.hypot(error, frame_px / np.sqrt(len(geometries))))),
         frame_px=frame_px,
-        size=_learnt(model.size, "size", flat.size, weight / flat.doubt**2),
-        contrast=_learnt(model.contrast, "contrast", flat.contrast, weight),
-        lonely=(float(first), float(second)),
+        size=_learnt(model.size, "size", pairs.size, size_weight),
+        contrast=_learnt(model.contrast, "contrast", pairs.contrast, pairs.weight),
+        unmatched_share=(float(first), float(second)),
         pairs=float(total.sum()),
     )
 
 
-class _Flat:
-    """Likely pairs of all frames, one row each."""
+def _with_bias(model: PairModel, pairs: _LikelyPairs, terms: int) -> PairModel:
+    """The model with bias, its covariance and the scatter; terms : 1, 4 or 10, see `PairModel`."""
+    weight = pairs.weight
+    if weight.sum() < 0.5:
+        return model
+    square = np.average((pairs.points_mm - model.origin_mm) ** 2, 0, weight)
+    reach = np.maximum(3 * np.sqrt(square), 1e-3)
+    model = replace(model, reach_mm=np.maximum(reach / 1.5, 0.1 * reach.max()))
+    constant, rms_px = _bias_fit(model, pairs, 1)
+    best, best_rms_px = (constant, rms_px) if terms == 1 else _bias_fit(model, pairs, terms)
+    mean = (float(constant.bias_px[0]), float(np.sqrt(constant.bias_covariance_px2[0, 0])))
+    return replace(best, mean_gap_px=mean, rms_px=(*rms_px[:2], *best_rms_px[1:]))
 
-    def __init__(
-        self, geometries: list[PairGeometry], shifts: Array, use: NDArray[np.bool_]
-    ) -> None:
-        def flat(name: str) -> Array:
-            arrays: list[Array] = [getattr(g, name) for g in geometries]
-            return np.concatenate([a.reshape(-1, *a.shape[2:]) for a in arrays])[use]
 
-        self.raw_px, self.variance_px2 = flat("gap_px"), flat("variance_px2")
-        self.size, self.contrast = flat("size"), flat("contrast")
-        self.doubt, self.points_mm = flat("doubt"), flat("points_mm")
-        sizes = [g.gap_px.size for g in geometries]
-        self.shift_px = np.repeat(shifts, sizes)[use]
+def _bias_fit(
+    model: PairModel, pairs: _LikelyPairs, terms: int
+) -> tuple[PairModel, tuple[float, float, float]]:
+    """The model with a bias of so many terms; then the RMS of the gaps, after it, and left out.
+
+    Reweighted least squares, tails tempered as of Student's t with 8 degrees of freedom.
+    """
+    gap_px, variance_px2, factor = pairs.gap_px, pairs.variance_px2, pairs.scatter_factor
+    basis = model.basis(pairs.points_mm, terms)
+    prior = _PRIOR_BIAS_SD_PX[:terms] ** -2
+    scatter = model.scatter_px
+    bias = np.zeros(terms)
+    bias[0] = model.bias_px[0]
+    residual = gap_px - basis @ bias
+    covariance: Array = np.zeros((terms, terms))
+    tempered = influence = lost = pairs.weight
+    for _ in range(8):
+        own = variance_px2 + (scatter * factor) ** 2
+        tempered = pairs.weight * 9 / (8 + residual**2 / own)
+        influence = tempered / own
+        covariance = np.asarray(np.linalg.inv((basis.T * influence) @ basis + np.diag(prior)))
+        bias = covariance @ (basis.T @ (influence * gap_px))
+        residual = gap_px - basis @ bias
+        lost = np.einsum("ni,ij,nj->n", basis, covariance, basis)
+        excess = (tempered * (residual**2 + lost - variance_px2) / factor**2).sum()
+        prior_squares = _PRIOR_SCATTER_PAIRS * _PRIOR_SCATTER_PX**2
+        free = pairs.weight.sum() + _PRIOR_SCATTER_PAIRS
+        scatter = float(np.sqrt(max((excess + prior_squares) / free, _SMALLEST_SCATTER_PX**2)))
+    left_out = residual / (1 - np.minimum(influence * lost, 0.95))
+    raw, after, predicted = (
+        float(np.sqrt(np.average(r**2, weights=tempered))) for r in (gap_px, residual, left_out)
+    )
+    found = replace(model, bias_px=bias, bias_covariance_px2=covariance, scatter_px=scatter)
+    return found, (raw, after, predicted)
 
 
 def _frame_scatter(model: PairModel, shifts: Array, total: Array) -> float:
@@ -160,25 +245,25 @@ def _frame_scatter(model: PairModel, shifts: Array, total: Array) -> float:
     return float(np.sqrt(np.mean(shifts[known] ** 2 + unsure[known])))
 
 
-def _learnt(cue: Cue, name: str, ratio: Array, weight: Array) -> Cue:
+def _learnt(old: LogRatioModel, name: str, ratio: Array, weight: Array) -> LogRatioModel:
     """Mean and covariance of the ratios over likely pairs, tails tempered (Student's t, 8)."""
     known = np.isfinite(ratio).all(-1)
     ratio, weight = ratio[known], weight[known]
     if weight.sum() < 0.5:
-        return cue
-    off = ratio - cue.difference
-    far = (off * np.linalg.solve(cue.scatter, off.T).T).sum(-1)
+        return old
+    off = ratio - old.difference
+    far = (off * np.linalg.solve(old.scatter, off.T).T).sum(-1)
     tempered = weight * (8 + ratio.shape[1]) / (8 + far)
     mean = tempered @ ratio / (tempered.sum() + 0.1)
     off = ratio - mean
     squares = (off.T * tempered) @ off + _PRIOR_PAIRS * _PRIOR[name]
     scatter = squares / (weight.sum() + _PRIOR_PAIRS) + _SMALLEST[name]
-    return replace(cue, difference=mean, scatter=scatter)
+    return replace(old, difference=mean, scatter=scatter)
 
 
 def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
-    """Means and spreads of all detections; outliers count as three sd, few draw to the usual."""
-    cues: dict[str, Cue] = {}
+    """Means and spreads of all detections; outliers count as 3 sd, few draw to the usual."""
+    learnt: dict[str, LogRatioModel] = {}
     for name, usual in _USUAL.items():
         means, squares, count = [], _USUAL_WEIGHT * usual, _USUAL_WEIGHT
         for c in range(2):
@@ -190,9 +275,9 @@ def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
             off = np.clip(off, -limit, limit)
             means.append(middle)
             squares, count = squares + off.T @ off, count + len(off)
-        old: Cue = getattr(model, name)
-        cues[name] = replace(old, means=np.array(means), spread=squares / count)
-    return replace(model, size=cues["size"], contrast=cues["contrast"])
+        old: LogRatioModel = getattr(model, name)
+        learnt[name] = replace(old, means=np.array(means), spread=squares / count)
+    return replace(model, size=learnt["size"], contrast=learnt["contrast"])
 
 
 def _vote(geometries: list[PairGeometry], model: PairModel) -> tuple[float, float]:

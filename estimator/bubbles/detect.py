@@ -9,14 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.flat_field import checked_image, normalised, nothing_to_see
-from telerig.estimator.bubbles.outline.ellipse_geometry import points_on, rough_distance
-from telerig.estimator.bubbles.outline.fit_types import Outlines, Start
-from telerig.estimator.bubbles.outline.measures import (
+from telerig.estimator.bubbles.outline.detection_table import (
+    DETECTION_COLUMNS,
+    HARMONIC_COLUMNS,
     outline_centroid,
-    outline_moments,
     outline_points,
 )
-from telerig.estimator.bubbles.outline.outline_fit import fit_outlines
+from telerig.estimator.bubbles.outline.ellipse_geometry import (
+    outline_moments,
+    points_on,
+    rough_distance,
+)
+from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, fit_outlines
 from telerig.estimator.bubbles.outline.regions import (
     Blob,
     Speck,
@@ -25,13 +29,13 @@ from telerig.estimator.bubbles.outline.regions import (
     noise_share,
 )
 from telerig.estimator.bubbles.outline.rim_pixels import close_pairs
-from telerig.estimator.bubbles.outline.second_attempt import (
-    agreed,
-    halves_at_waists,
-    unsound_parts,
+from telerig.estimator.bubbles.outline.split import (
+    Part,
+    confirmed_splits,
+    implausible_parts,
+    split_at_necks,
+    split_blobs,
 )
-from telerig.estimator.bubbles.outline.split import Part, split_blobs
-from telerig.estimator.bubbles.outline.types import DETECTION_COLUMNS, HARMONIC_COLUMNS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -113,16 +117,16 @@ def find_bubbles(
     dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
-    halves = halves_at_waists(outlines, parts, blobs, image.shape, min_diameter_px)
-    for _ in range(2 if halves else 0):
-        split = _replaced(parts, halves)
+    splits = split_at_necks(outlines, parts, blobs, image.shape, min_diameter_px)
+    for _ in range(2 if splits else 0):
+        split = [new for k, part in enumerate(parts) for new in splits.get(k, [part])]
         start = _start(split, blobs, sigma, dark_sigma)
         refitted = fit_outlines(ratio, start)
-        sound = agreed(halves, outlines, split, refitted)
-        if len(sound) == len(halves):
+        confirmed = confirmed_splits(splits, outlines, split, refitted)
+        if len(confirmed) == len(splits):
             parts, outlines = split, refitted
             break
-        halves = sound
+        splits = confirmed
     columns = _columns(outlines, parts, image.shape, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])
@@ -147,10 +151,6 @@ def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Speck]]:
         else:
             slender.append(Speck(u, v, (a * b) ** 0.5, f"{a / b:.1f} times as long as wide"))
     return kept, slender
-
-
-def _replaced(parts: list[Part], halves: dict[int, list[Part]]) -> list[Part]:
-    return [new for k, part in enumerate(parts) for new in halves.get(k, [part])]
 
 
 def _bubbles(columns: dict[str, Any], specks: list[Speck], noise: float, reason: str) -> Bubbles:
@@ -244,7 +244,7 @@ def _flags(
 def _merged(outlines: Outlines, parts: list[Part]) -> Mask:
     """What could not be split; and where one part of a blob turns out unsound, all those whose
     own outline is not mostly seen."""
-    merged: Mask = np.array([part.merged for part in parts]) | unsound_parts(outlines, parts)
+    merged: Mask = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
     unsound = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
     doubtful = np.array([part.blob in unsound for part in parts])
     return merged | (doubtful & (outlines.coverage < _MOSTLY_SEEN))

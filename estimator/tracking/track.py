@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.bubbles.outline.types import DETECTION_COLUMNS
+from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import match_pairs
 from telerig.estimator.bubbles.pairing.pair_model import PairModel

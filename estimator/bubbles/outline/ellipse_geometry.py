@@ -1,4 +1,4 @@
-"""Ellipses and what their outlines do: nearest points, displacements, harmonics, for many at once.
+"""Ellipses with harmonics: nearest points, displacements, area, curvature, for many at once.
 
 An ellipse is a row (u, v, a, b, angle). Points belong to ellipses through an index array, so that
 outlines of different length need no padding.
@@ -12,14 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.outline.types import HARMONICS
-
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 Index = NDArray[np.intp]
+Complex = NDArray[np.complex128]
+
+HARMONICS = (3, 4, 5, 6)
+"""Orders of an outline's normal displacement about its ellipse, see `outline_fit`."""
 
 ELLIPSE_PARAMETERS = 5
 """Displacements: centre along both axes, a, b, and the shear between the axes."""
+
+_SAMPLES = 64
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,7 @@ def rough_distance(ellipse: Array, u: Floats, v: Floats) -> Array:
     x, y = (du * cos + dv * sin) / a, (dv * cos - du * sin) / b
     level = np.sqrt(x * x + y * y) + 1e-12
     slope = np.sqrt((x / a) ** 2 + (y / b) ** 2) + 1e-12
-    distance: Array = (level - 1.0) * level / slope
-    return distance
+    return np.asarray((level - 1.0) * level / slope)
 
 
 def foot_points(ellipse: Array, counts: Index, u: Floats, v: Floats, *, rounds: int = 2) -> Foot:
@@ -149,3 +152,38 @@ def points_on(ellipse: Array, harmonics: Array, phi: Array) -> Array:
     u = ellipse[:, 0:1] + turn_cos * x - turn_sin * y
     v = ellipse[:, 1:2] + turn_sin * x + turn_cos * y
     return np.stack([u, v], axis=-1)
+
+
+def _sampled(ellipse: Array, harmonics: Array) -> tuple[Complex, Complex, Complex]:
+    """Outlines about their ellipses' centres as complex numbers (B, 64), and their first and
+    second derivatives by the anomaly, spectral and so exact to rounding."""
+    phi = np.linspace(0.0, 2.0 * np.pi, _SAMPLES, endpoint=False)
+    points = points_on(ellipse * [0.0, 0.0, 1.0, 1.0, 1.0], harmonics, phi)
+    place = points[..., 0] + 1j * points[..., 1]
+    turn = 1j * np.fft.fftfreq(_SAMPLES, 1.0 / _SAMPLES)
+    waves = np.fft.fft(place, axis=1) * turn
+    return place, np.fft.ifft(waves, axis=1), np.fft.ifft(waves * turn, axis=1)
+
+
+def outline_moments(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
+    """Area (B,) and area centroid (B, 2) inside outlines, by Green's theorem."""
+    place, slope, _ = _sampled(ellipse, harmonics)
+    step = np.pi / _SAMPLES
+    area = step * np.sum((np.conj(place) * slope).imag, axis=1)
+    u = step * np.sum(place.real**2 * slope.imag, axis=1) / area
+    v = -step * np.sum(place.imag**2 * slope.real, axis=1) / area
+    return area, ellipse[:, :2] + np.stack([u, v], axis=1)
+
+
+def outline_curvature(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
+    """Points (B, 64, 2) and curvature (B, 64) of outlines, positive where convex."""
+    place, slope, bend = _sampled(ellipse, harmonics)
+    curvature = (np.conj(slope) * bend).imag / np.abs(slope) ** 3
+    return ellipse[:, None, :2] + np.stack([place.real, place.imag], axis=-1), curvature
+
+
+def deepest_concavity(ellipse: Array, harmonics: Array) -> Array:
+    """Most inward curvature (B,) of outlines in units of 1 / radius, 0 where all is convex."""
+    _, curvature = outline_curvature(ellipse, harmonics)
+    radius = np.sqrt(ellipse[:, 2] * ellipse[:, 3])
+    return np.asarray(np.maximum(-np.min(curvature, axis=1) * radius, 0.0))

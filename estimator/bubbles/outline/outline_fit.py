@@ -1,7 +1,7 @@
 """Sub-pixel outlines: maximum-likelihood fit of ellipse and harmonics to the pixels at the rim.
 
 The model of a pixel is ``outer + (inner - outer) F``, with F the profile of a blurred disc
-(:mod:`bubble_profile`) at the pixel's distance from the outline and the ellipse's curvature there;
+(`rim_profile`) at the pixel's distance from the outline and the ellipse's curvature there;
 the outline is an ellipse with normal displacements of orders 3 to 6 in the eccentric anomaly. In
 that parametrisation the centre is orthogonal to the harmonics (b cos phi / h times cos k phi,
 integrated along the arc h dphi, is zero), so fitting them costs a whole outline nothing. Where a
@@ -10,7 +10,7 @@ part is hidden it does, and the shapes of the frame's whole outlines serve as pr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     moved,
     spread,
     turned_harmonics,
-)
-from telerig.estimator.bubbles.outline.fit_types import (
-    PIXEL_VARIANCE_PX2,
-    Outlines,
-    Start,
 )
 from telerig.estimator.bubbles.outline.prior import (
     ShapePrior,
@@ -50,6 +45,7 @@ Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+_PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 _MIN_SIGMA_PX = 0.3
 _OUTLIER_SIGMA = 4.5
 _WHOLE = 0.9
@@ -59,6 +55,68 @@ _FAR_SHIFT_PX, _CONVERGED_PX = 0.25, 0.02
 _HIDING_SIGMA = 3.0
 _MEAN_SLOPE = 0.35
 """RMS of the unit normal density within one sigma."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the fits begin: ``ellipse`` (B, 5), ``harmonics`` (B, 8), ``blur_px`` and ``inner``
+    level (B,), noise ``sigma_outer`` and ``sigma_inner`` (B,) as shares of the background."""
+
+    ellipse: Array
+    harmonics: Array
+    blur_px: Array
+    inner: Array
+    sigma_outer: Array
+    sigma_inner: Array
+
+    def __len__(self) -> int:
+        return int(self.ellipse.shape[0])
+
+    def __getitem__(self, index: Index) -> Start:
+        return Start(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Fitted outlines of B bubbles.
+
+    ``ellipse`` (B, 5), ``harmonics`` (B, 8; 0 where ``resolved`` is False), ``sigma_px`` blur of
+    optics and pixel, ``outer`` and ``inner`` levels, ``centre_covariance_px2`` (B, 2, 2),
+    ``sigma_outline_px`` of a harmonic's coefficient, ``chi2_dof``, ``coverage`` (share of the
+    outline that was seen), ``misfit_px`` (how far the rim strays from the outline, beyond noise)
+    and ``shift_px`` (largest displacement since the linearisation).
+    """
+
+    ellipse: Array
+    harmonics: Array
+    resolved: Mask
+    sigma_px: Array
+    outer: Array
+    inner: Array
+    centre_covariance_px2: Array
+    sigma_outline_px: Array
+    chi2_dof: Array
+    coverage: Array
+    misfit_px: Array
+    shift_px: Array
+
+    @property
+    def blur_px(self) -> Array:
+        """Blur (B,) of the optics alone."""
+        return np.asarray(np.sqrt(np.maximum(self.sigma_px**2 - _PIXEL_VARIANCE_PX2, 0.0)))
+
+    def state(self, index: Index) -> RimState:
+        """The outlines ``index`` as a point to go on from."""
+        every = (self.ellipse, self.harmonics, self.sigma_px, self.outer, self.inner)
+        return RimState(*(values[index] for values in every))
+
+    def updated(self, index: Index, other: Outlines) -> Outlines:
+        """These outlines with those at ``index`` replaced by ``other``."""
+        changed = {}
+        for field in fields(self):
+            changed[field.name] = getattr(self, field.name).copy()
+            changed[field.name][index] = getattr(other, field.name)
+        return Outlines(**changed)
 
 
 def fit_outlines(ratio: NDArray[np.float32], start: Start) -> Outlines:
@@ -72,7 +130,7 @@ def fit_outlines(ratio: NDArray[np.float32], start: Start) -> Outlines:
     state = RimState(
         start.ellipse,
         start.harmonics,
-        np.sqrt(start.blur_px**2 + PIXEL_VARIANCE_PX2),
+        np.sqrt(start.blur_px**2 + _PIXEL_VARIANCE_PX2),
         np.ones(len(start)),
         start.inner,
     )
@@ -131,7 +189,6 @@ class _Descent:
     covariance: Array
     residual: Single
     shift_px: Array
-    step_px: Array
 
 
 def _refined(
@@ -210,7 +267,7 @@ def _descend(
     for part, own in zip(pixels.parts(), step.astype(np.float32), strict=True):
         residual[part] -= own @ jacobian[:, part]
     since = np.max(np.abs(shifts - _shifts(first)), axis=1)
-    return _Descent(state, shifts, covariance, residual, since, reach)
+    return _Descent(state, shifts, covariance, residual, since)
 
 
 def _solved(information: Array, pull: Array) -> tuple[Array, Array]:
@@ -298,5 +355,4 @@ def _result(
         _coverage(pixels, linear, weight, state.sigma),
         _misfit(state, pixels, linear, descent.residual, hidden, start),
         descent.shift_px,
-        descent.step_px,
     )

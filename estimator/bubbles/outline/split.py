@@ -15,14 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.outline.arcs import (
+    arcs_between,
     contour_moments,
     fit_ellipses,
     notch_arcs,
 )
-from telerig.estimator.bubbles.outline.ellipse_geometry import rough_distance
+from telerig.estimator.bubbles.outline.ellipse_geometry import (
+    deepest_concavity,
+    outline_curvature,
+    rough_distance,
+)
+from telerig.estimator.bubbles.outline.outline_fit import Outlines
 from telerig.estimator.bubbles.outline.regions import Blob
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _CLEAN_PX, _CLEAN_SHARE = 0.15, 0.012
 _FIT_PX, _FIT_SHARE = 0.3, 0.03
@@ -32,6 +39,15 @@ _MAX_ARCS = 24
 _SPIRAL, _LEAST_IN_IMAGE = 200, 0.08
 _CANVAS_MARGIN_PX = 2
 """Outline points on the image's edge are left out, which narrows the blob by this much."""
+
+_NECKS = ((0.03, 2.5), (0.3, 1.3), (1.5, 0.0))
+"""Depth of a concavity and the chi2_dof above which it counts as a neck: strong shape modes have
+concavities too, but then the outline's harmonics describe them."""
+_MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
+_LARGEST_GROWTH, _LONG = 1.6, 2.3
+_SHARPEST_ORDER, _WHOLE = 35.0, 0.9
+_FLAT = 0.35
+_BETTER = 0.6
 
 
 @dataclass(frozen=True)
@@ -63,8 +79,7 @@ def split_blobs(blobs: list[Blob], shape: tuple[int, ...], *, min_diameter_px: f
 
 
 def _tolerance(ellipse: Array) -> Array:
-    tolerance: Array = _FIT_PX + _FIT_SHARE * np.sqrt(ellipse[..., 2] * ellipse[..., 3])
-    return tolerance
+    return np.asarray(_FIT_PX + _FIT_SHARE * np.sqrt(ellipse[..., 2] * ellipse[..., 3]))
 
 
 def _split(
@@ -206,3 +221,81 @@ def _covered(ellipses: Array, contour: Array) -> float:
     v, u = np.nonzero(canvas)
     gap = rough_distance(ellipses[:, None, :], (u + low[0])[None, :], (v + low[1])[None, :])
     return float(np.mean(np.any(gap < 0.7, axis=0)))
+
+
+def implausible_outlines(outlines: Outlines) -> Mask:
+    """Outlines (B,) that miss the rim, or have a neck: no single bubble has such an outline.
+
+    The slighter the neck, the worse the outline's harmonics must describe the rim. Outlines that
+    are partly hidden are not tested for necks.
+    """
+    depth = deepest_concavity(outlines.ellipse, outlines.harmonics)
+    radius = np.sqrt(outlines.ellipse[:, 2] * outlines.ellipse[:, 3])
+    sure = depth > 3.0 * _SHARPEST_ORDER * outlines.sigma_outline_px / radius
+    neck = np.any([(depth > least) & (outlines.chi2_dof > fit) for least, fit in _NECKS], axis=0)
+    neck &= sure & (outlines.coverage > _WHOLE)
+    return np.asarray(neck | (outlines.misfit_px > _MISFIT_PX + _MISFIT_SHARE * radius))
+
+
+def implausible_parts(outlines: Outlines, parts: list[Part]) -> Mask:
+    """Implausible outlines, and parts of a blob whose fit ended far from its start: then the
+    split was wrong."""
+    began = np.stack([part.ellipse for part in parts])
+    ended = outlines.ellipse
+    growth = np.sqrt(ended[:, 2] * ended[:, 3] / (began[:, 2] * began[:, 3]))
+    jump = np.hypot(ended[:, 0] - began[:, 0], ended[:, 1] - began[:, 1])
+    moved = np.maximum(growth, 1.0 / growth) > _LARGEST_GROWTH
+    moved |= (jump > 0.3 * began[:, 3] + 1.0) | (ended[:, 2] > _LONG * ended[:, 3])
+    moved &= np.array([part.shared for part in parts])
+    return implausible_outlines(outlines) | moved
+
+
+def split_at_necks(
+    outlines: Outlines,
+    parts: list[Part],
+    blobs: list[Blob],
+    shape: tuple[int, ...],
+    min_diameter_px: float,
+) -> dict[int, list[Part]]:
+    """For each part that is a whole blob with a neck, the two parts that a cut there gives.
+
+    The fitted outline shows a neck where blur hides the notch in the blob's raw outline.
+    """
+    alone = np.bincount([part.blob for part in parts]) == 1
+    necked = implausible_outlines(outlines) & (outlines.coverage > _WHOLE)
+    splits = {}
+    for index in np.flatnonzero(necked).tolist():
+        part = parts[index]
+        blob = blobs[part.blob]
+        if not alone[part.blob] or blob.touches_border:
+            continue
+        notches = _flattest(outlines.ellipse[index], outlines.harmonics[index])
+        if len(notches) != 2:
+            continue
+        arcs = arcs_between(blob.contour_px, notches)
+        found = parts_of_arcs(arcs, blob, part.blob, shape, min_diameter_px)
+        if len(found) == 2:
+            splits[index] = found
+    return splits
+
+
+def _flattest(ellipse: Array, harmonics: Array) -> Array:
+    """Places (n, 2) where the outline's curvature has a minimum far below that of a circle."""
+    points, curvature = outline_curvature(ellipse[None], harmonics[None])
+    turn = curvature[0] * np.sqrt(ellipse[2] * ellipse[3])
+    low = (turn < _FLAT) & (turn <= np.roll(turn, 1)) & (turn < np.roll(turn, -1))
+    return np.asarray(points[0][low])
+
+
+def confirmed_splits(
+    splits: dict[int, list[Part]], before: Outlines, parts: list[Part], after: Outlines
+) -> dict[int, list[Part]]:
+    """The splits of which both parts fit far better than the whole did."""
+    sound = ~implausible_parts(after, parts)
+    better = {}
+    for index, found in splits.items():
+        own = [k for k, part in enumerate(parts) if part.blob == found[0].blob]
+        limit = _BETTER * before.chi2_dof[index]
+        if all(sound[k] and after.chi2_dof[k] < limit for k in own):
+            better[index] = found
+    return better

@@ -55,16 +55,20 @@ def marginals(log_odds: Array) -> Array:
 
 
 def _components(possible: NDArray[np.bool_]) -> Iterator[tuple[Index, Index]]:
-    """Rows and columns that are connected by possible pairs."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    """Rows and columns that are connected by possible pairs.
 
-    n = len(possible)
-    i, j = np.nonzero(possible)
-    graph = coo_array((np.ones(len(i)), (i, n + j)), shape=(sum(possible.shape),) * 2)
-    labels = connected_components(graph, directed=False)[1]
-    for label in np.unique(labels[i]):
-        yield np.flatnonzero(labels[:n] == label), np.flatnonzero(labels[n:] == label)
+    The smallest row's number spreads over each component; on such small graphs this takes a tenth
+    of the time of `scipy.sparse.csgraph.connected_components`.
+    """
+    rows, none = np.arange(len(possible)), len(possible)
+    while True:
+        columns = np.min(np.where(possible, rows[:, None], none), axis=0, initial=none)
+        spread = np.minimum(rows, np.min(np.where(possible, columns, none), axis=1, initial=none))
+        if np.array_equal(spread, rows):
+            break
+        rows = spread
+    for label in np.unique(columns[columns < none]):
+        yield np.flatnonzero(rows == label), np.flatnonzero(columns == label)
 
 
 @lru_cache(maxsize=16)

@@ -1,4 +1,4 @@
-"""What two detections say of each other: the gap along the shared coordinate, heights, sizes.
+"""How two detections compare: the gap along the shared coordinate, the ratios of their sizes.
 
 Two views of one body share the planes that touch it and hold both viewing directions. So along
 the common perpendicular of the rays both silhouettes have the same top and the same bottom, for
@@ -15,7 +15,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.estimator.bubbles.outline.types import HARMONIC_COLUMNS, HARMONICS
+from telerig.estimator.bubbles.outline.detection_table import (
+    AXES_COLUMNS,
+    CENTRE_COLUMNS,
+    COVARIANCE_COLUMNS,
+    HARMONIC_COLUMNS,
+    centre_covariances,
+    columns,
+)
+from telerig.estimator.bubbles.outline.ellipse_geometry import points_on
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
@@ -97,17 +105,14 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
 
 def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     """Rays and sizes of a detection table.  Raises InputError for columns or values not there."""
-    missing = {"u_px", "v_px", "suu_px2", "suv_px2", "svv_px2", "a_px", "b_px"} - set(table)
+    missing = {*CENTRE_COLUMNS, *COVARIANCE_COLUMNS, *AXES_COLUMNS[:2]} - set(table)
     if missing:
         raise InputError(
             f"the detections of camera {camera.name!r} lack {', '.join(sorted(missing))}",
             todo="give the table that detect_bubbles returns",
         )
-    uv = np.stack([_column(table, c) for c in ("u_px", "v_px")], -1)
-    covariance = np.stack(
-        [_column(table, c) for c in ("suu_px2", "suv_px2", "suv_px2", "svv_px2")], -1
-    )
-    bad = ~(np.isfinite(uv).all(1) & np.isfinite(covariance).all(1))
+    uv, covariance = columns(table, CENTRE_COLUMNS), centre_covariances(table)
+    bad = ~(np.isfinite(uv).all(1) & np.isfinite(covariance).all((1, 2)))
     if bad.any():
         raise InputError(
             f"{int(bad.sum())} detections of camera {camera.name!r} have no finite centre or "
@@ -119,19 +124,18 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     across = np.einsum("i,nij->nj", (camera.camera_from_rig.rotation @ axis)[:2], mm_by_px)
     middle, height = outline_extent(table, across)
     known, scatter_factor, unsure = _trust(table)
-    extra = np.square(unsure * np.nan_to_num(_column(table, "a_px")))
-    area = np.pi * _column(table, "a_px") * _column(table, "b_px")
-    measured = _column(table, "area_px2")
-    area = np.where(measured > 0, measured, area)
+    a, b, measured, contrast = columns(table, ["a_px", "b_px", "area_px2", "contrast"]).T
+    extra = np.square(unsure * np.nan_to_num(a))
+    area = np.where(measured > 0, measured, np.pi * a * b)
     area_mm2 = area * np.abs(np.linalg.det(mm_by_px))
     with np.errstate(divide="ignore", invalid="ignore"):
         log_height = np.where(known & (height > 0), np.log(height), np.nan)
         log_width = np.log(area_mm2 / np.pi) - log_height
-        contrast = np.log(_column(table, "contrast"))
+        log_contrast = np.log(contrast)
     return View(
         camera, uv, origin, direction, mm_by_px,
-        covariance.reshape(-1, 2, 2) + extra[:, None, None] * np.eye(2), middle,
-        _finite(np.stack([log_height, log_width], -1)), _finite(contrast[:, None]),
+        covariance + extra[:, None, None] * np.eye(2), middle,
+        _finite(np.stack([log_height, log_width], -1)), _finite(log_contrast[:, None]),
         scatter_factor,
     )  # fmt: skip
 
@@ -172,23 +176,19 @@ def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
 
     The middle is relative to (u_px, v_px). Harmonics are used where they were fitted.
     """
-    a, b = _column(table, "a_px"), _column(table, "b_px")
-    angle = np.nan_to_num(_column(table, "angle_rad"))
+    a, b, angle = columns(table, AXES_COLUMNS).T
+    angle = np.nan_to_num(angle)
     turn = np.stack([np.cos(angle), np.sin(angle)], -1)
     along = (across * turn).sum(-1)
     beside = across[:, 1] * turn[:, 0] - across[:, 0] * turn[:, 1]
     half = np.hypot(a * along, b * beside)
     middle = np.zeros(len(table))
-    harmonics = np.stack([_column(table, c) for c in HARMONIC_COLUMNS], -1)
+    harmonics = columns(table, HARMONIC_COLUMNS)
     shaped = np.isfinite(harmonics).all(1)
     if shaped.any():
         phi = 2 * np.pi * np.arange(_OUTLINE_SAMPLES) / _OUTLINE_SAMPLES
-        cosine, sine = np.cos(phi), np.sin(phi)
-        a, b, along, beside = (v[shaped, None] for v in (a, b, along, beside))
-        normal = (b * cosine * along + a * sine * beside) / np.hypot(b * cosine, a * sine)
-        waves = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)])
-        displaced = harmonics[shaped] @ waves
-        profile = a * cosine * along + b * sine * beside + normal * displaced
+        centred = np.stack([np.zeros_like(a), np.zeros_like(a), a, b, angle], -1)[shaped]
+        profile = (points_on(centred, harmonics[shaped], phi) @ across[shaped, :, None])[..., 0]
         top, bottom = _peak(profile), -_peak(-profile)
         middle[shaped], half[shaped] = (top + bottom) / 2, (top - bottom) / 2
     return middle, half
@@ -213,28 +213,11 @@ def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
 
 def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array, Array]:
     """By the flags: is the size known, the factor for the scatter, the unsure share of the size."""
-    known, scatter_factor, unsure = (
-        np.ones(len(table), bool),
-        np.ones(len(table)),
-        np.zeros(len(table)),
-    )
-    if "flags" in table:
-        for i, text in enumerate(table["flags"].tolist()):
-            for word in text.split("|") if isinstance(text, str) and text else ():
-                known[i] &= word not in NO_SIZE_FLAGS
-                scatter_factor[i] = max(scatter_factor[i], _SCATTER_FACTOR.get(word, 1.0))
-                unsure[i] = max(unsure[i], _UNSURE_SHARE.get(word, 0.0))
-    return known, scatter_factor, unsure
-
-
-def _column(table: pd.DataFrame, name: str) -> Array:
-    """A column as numbers; NaN where there is none."""
-    if name not in table:
-        return np.full(len(table), np.nan)
-    values = table[name].to_numpy()
-    if values.dtype.kind not in "fiu":
-        values = pd.to_numeric(table[name], errors="coerce").to_numpy()
-    return values.astype(np.float64)
+    flags = flag_words(table)
+    known = np.array([not any(word in NO_SIZE_FLAGS for word in row) for row in flags], bool)
+    factor = [max((_SCATTER_FACTOR.get(word, 1.0) for word in row), default=1.0) for row in flags]
+    unsure = [max((_UNSURE_SHARE.get(word, 0.0) for word in row), default=0.0) for row in flags]
+    return known, np.array(factor), np.array(unsure)
 
 
 def _finite(values: Array) -> Array:

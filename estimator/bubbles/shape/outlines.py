@@ -8,7 +8,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.outline.types import HARMONIC_COLUMNS, HARMONICS
+from telerig.estimator.bubbles.outline.detection_table import (
+    AXES_COLUMNS,
+    CENTRE_COLUMNS,
+    HARMONIC_COLUMNS,
+    centre_covariances,
+    columns,
+    flag_words,
+)
+from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,11 +48,6 @@ class Outlines:
     shaped: Mask
     whole: Mask
 
-    @property
-    def ellipses_px2(self) -> Array:
-        """(M, 2, 2) R diag(a^2, b^2) R^T."""
-        return self.axes_px @ np.swapaxes(self.axes_px, -1, -2)
-
     def rows(self, keep: Mask) -> Outlines:
         """Some of the rows."""
         return Outlines(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
@@ -56,37 +59,31 @@ def outlines_from_table(table: pd.DataFrame, image_size_px: tuple[int, int]) -> 
     So do centres farther out than the image is large, axes of a ratio above 20, and harmonics
     above 30 % of the smaller axis.
     """
-    numbers = {
-        name: pd.to_numeric(table[name], errors="coerce").to_numpy(float)
-        if name in table
-        else np.full(len(table), np.nan)
-        for name in _COLUMNS
-    }
-    uv = np.stack([numbers["u_px"], numbers["v_px"]], -1)
-    suu, suv, svv = (numbers[f"s{n}_px2"] for n in ("uu", "uv", "vv"))
-    covariance = np.stack([suu, suv, suv, svv], -1).reshape(-1, 2, 2) + _FLOOR_PX2 * np.eye(2)
+    uv, covariance = columns(table, CENTRE_COLUMNS), centre_covariances(table)
+    suu, suv, svv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     size = np.asarray(image_size_px, float)
     located = (np.abs(uv - size / 2) < 1.5 * size).all(-1)
     located &= np.isfinite(suu) & np.isfinite(svv) & (suu > _LEAST_PX2) & (svv > _LEAST_PX2)
     located &= suu * svv - suv**2 > 1e-6 * suu * svv
-    a, b, angle = numbers["a_px"], numbers["b_px"], numbers["angle_rad"]
+    a, b, angle = columns(table, AXES_COLUMNS).T
     shaped = located & np.isfinite(angle) & np.isfinite(a) & (b > 0.05 * a) & (a >= b)
     rotation = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1)
     axes = rotation.reshape(-1, 2, 2) * np.stack([a, b], -1)[:, None, :]
-    displacement = np.stack([numbers[name] for name in HARMONIC_COLUMNS], -1)
-    sigma = numbers["sigma_outline_px"]
+    displacement = columns(table, HARMONIC_COLUMNS)
+    sigma = columns(table, ["sigma_outline_px"])[:, 0]
     known = (np.abs(displacement) < 0.3 * b[:, None]).all(-1)
     known &= (sigma**2 > _LEAST_PX2) & (sigma < b)
+    blocked = np.array([any(word in _BLOCKING for word in row) for row in flag_words(table)], bool)
     gain = _trace_from_displacement(*(np.where(shaped, axis, np.nan) for axis in (a, b)))
     return Outlines(
         uv,
-        covariance,
+        covariance + _FLOOR_PX2 * np.eye(2),
         axes,
         np.einsum("mij,mj->mi", gain, displacement),
         gain @ np.swapaxes(gain, -1, -2) * (sigma**2 + _FLOOR_PX2)[:, None, None],
         located,
         shaped,
-        shaped & known & ~_blocked(table),
+        shaped & known & ~blocked,
     )
 
 
@@ -103,16 +100,3 @@ def _trace_from_displacement(a_px: Array, b_px: Array) -> Array:
     speed = np.hypot(np.outer(b_px, np.cos(phi)), np.outer(a_px, np.sin(phi)))
     factor = speed / (a_px * b_px)[:, None]
     return np.asarray((factor @ weights.T).reshape(-1, len(outward), len(inward)))
-
-
-def _blocked(table: pd.DataFrame) -> Mask:
-    if "flags" not in table:
-        return np.zeros(len(table), bool)
-    words = table["flags"].fillna("").astype(str).str.split("|")
-    return np.array([any(word in _BLOCKING for word in row) for row in words], bool)
-
-
-_COLUMNS = (
-    "u_px", "v_px", "suu_px2", "suv_px2", "svv_px2", "a_px", "b_px", "angle_rad",
-    *HARMONIC_COLUMNS, "sigma_outline_px",
-)  # fmt: skip

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 Level = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-CELL_PX = 4
-"""Cells of this size are averaged before anything else."""
-
+_CELL_PX = 4
 DARK = 0.05
 """Relative depth from which on something may be a bubble."""
 
@@ -30,8 +28,7 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Level, Mask]:
     import cv2
 
     height, width = image.shape
-    size = (max(4, width // CELL_PX), max(4, height // CELL_PX))
-    log = np.log(np.maximum(cv2.resize(image.astype(np.float32), size, None, 0, 0, 3), 0.5))
+    log = log_cells(image, _CELL_PX)
     surface = bright_surface(log, 4)
     for _ in range(3):
         dark = _dark_things(log, surface)
@@ -40,6 +37,15 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Level, Mask]:
     level = np.exp(cv2.resize(surface, (width, height), interpolation=cv2.INTER_CUBIC))
     covered = cv2.resize(dark.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     return level.astype(np.float32), covered.astype(bool)
+
+
+def log_cells(image: NDArray[np.generic], cell_px: int) -> Level:
+    """Logarithm of the image, averaged over square cells first."""
+    import cv2
+
+    size = [max(4, extent // cell_px) for extent in reversed(image.shape)]
+    cells = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(np.log(np.maximum(cells, 0.5)))
 
 
 def fill_masked(
@@ -63,17 +69,14 @@ def fill_masked(
 
 def _holes(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:
     """Windows about the connected parts of a mask, with a margin of half their size."""
-    import cv2
+    from skimage.measure import label, regionprops
 
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    for k in range(1, count):
-        left, top, width, height, _ = (int(n) for n in stats[k])
-        margin = max(12, max(width, height) // 2)
-        window = (
-            slice(max(0, top - margin), top + height + margin),
-            slice(max(0, left - margin), left + width + margin),
-        )
-        yield window, labels[window] == k
+    labels = label(mask)
+    for region in regionprops(labels):
+        extent = max(side.stop - side.start for side in region.slice)
+        margin = max(12, extent // 2)
+        rows, columns = (slice(max(0, s.start - margin), s.stop + margin) for s in region.slice)
+        yield (rows, columns), labels[rows, columns] == region.label
 
 
 def _carried(residual: Level, known: Mask, across: tuple[float, float] | None = None) -> Level:
@@ -120,30 +123,30 @@ def _terms(shape: tuple[int, ...], degree: int) -> NDArray[np.float64]:
 
 
 def _dark_things(log: Level, surface: Level) -> Mask:
-    """Dark against the surface, hearts filled, grown by two cells; the screen's edge left out."""
+    """Dark against the surface, grown by two cells."""
     import cv2
-    from scipy import ndimage
 
     depth = surface - log
     noise = 1.4826 * float(np.median(np.abs(depth - np.median(depth))))
-    dark = depth > max(DARK, 5 * noise)
-    dark = without_screen_edge(ndimage.binary_fill_holes(dark))
+    dark = compact_things(depth > max(DARK, 5 * noise))
     grown = cv2.dilate(dark.astype(np.uint8), np.ones((5, 5), np.uint8))
     return np.asarray(grown, bool)
 
 
-def without_screen_edge(dark: Mask) -> Mask:
-    """``dark`` less what covers more than a third of a border: the screen's edge, no bubble."""
-    import cv2
+def compact_things(dark: Mask) -> Mask:
+    """``dark`` with bright centres filled; what covers a third of a border is the screen's edge."""
+    from scipy.ndimage import binary_fill_holes
+    from skimage.measure import label, regionprops
 
-    kept = dark.copy()
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8))
-    for k in range(1, count):
-        left, top, width, height, _ = stats[k]
-        at_side = left == 0 or left + width == dark.shape[1]
-        at_top = top == 0 or top + height == dark.shape[0]
-        if (at_side and height > _EDGE_SHARE * dark.shape[0]) or (
-            at_top and width > _EDGE_SHARE * dark.shape[1]
-        ):
-            kept[labels == k] = False
+    kept = np.asarray(binary_fill_holes(dark), bool)
+    height, width = kept.shape
+    for region in regionprops(label(kept)):
+        top, left, bottom, right = region.bbox
+        at_side, at_top = left == 0 or right == width, top == 0 or bottom == height
+        long_side, long_top = (
+            bottom - top > _EDGE_SHARE * height,
+            right - left > _EDGE_SHARE * width,
+        )
+        if (at_side and long_side) or (at_top and long_top):
+            kept[region.slice] &= ~region.image
     return kept

@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.bubbles.background.from_one_image import level_of_image
-from telerig.estimator.bubbles.background.layers import Layers, fit_layers
-from telerig.estimator.bubbles.background.subpixel_shift import crop_of_lab
+from telerig.estimator.bubbles.background.layers import crop_of_lab, fit_layers
 
 Array = NDArray[np.float64]
 Level = NDArray[np.float32]
 Shift = tuple[float, float]
 
 LEAST_FRAMES = 4
-"""Fewer frames cannot tell a bubble from the background by its motion."""
+"""With fewer frames the motion of the bubbles does not separate them from the background."""
 
 LEAST_TRAVEL_PX = 2.0
-"""Total travel from which on a layer that stays behind can be told from one that comes along."""
+"""Least total travel that separates what is fixed in the lab from what is fixed in the image."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Background:
     lab_factor : (Hl, Wl) what multiplies it, fixed in the lab; None without one. Its pixel (0, 0)
     is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
     covered : (H, W) True where a bubble hid the screen all the time, so that the level there is
-    interpolated. frames, gains : the frames it was made of, and their brightness.
+    interpolated. frames : those it was made of.
     noise : relative standard deviation of a pixel at the median level.
     """
 
@@ -45,9 +44,7 @@ class Background:
     lab_factor: Level | None = None
     lab_origin_px: tuple[int, int] = (0, 0)
     frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    gains: Array = field(default_factory=lambda: np.ones(0))
     noise: float = 0.0
-    notes: list[str] = field(default_factory=list)
 
     def at(self, frame_shift_px: Shift = (0.0, 0.0)) -> Level:
         """(H, W) level at the median brightness, with the lab displaced by (u, v) px.
@@ -61,21 +58,6 @@ class Background:
         return self.rig_level * crop_of_lab(
             self.lab_factor, self.lab_origin_px, frame_shift_px, (shape[0], shape[1]), 1.0
         )
-
-    def gain(self, image: NDArray[np.generic], frame_shift_px: Shift = (0.0, 0.0)) -> float:
-        """How much brighter than `at` an image is: the robust ratio outside bubbles."""
-        step = max(1, int(np.sqrt(image.size / 20_000)))
-        level = self.at(frame_shift_px)[::step, ::step]
-        ratio = image[::step, ::step].astype(np.float64) / np.maximum(level, 0.5)
-        for _ in range(3):
-            ratio = ratio[ratio > 0.9 * np.median(ratio)]
-        return float(np.median(ratio))
-
-    @classmethod
-    def from_image(cls, image: NDArray[np.generic]) -> Background:
-        """The large-scale level of a single image; what is dark and compact counts as a bubble."""
-        level, covered = level_of_image(image)
-        return cls(level, covered, notes=["the background is that of a single image"])
 
 
 def estimate_background(
@@ -103,31 +85,12 @@ def estimate_background(
         )
     frames, stack = _sample(images, np.flatnonzero(np.isfinite(shifts).all(1)), max_frames)
     if len(frames) < LEAST_FRAMES:
-        level, covered = level_of_image(stack.max(0))
-        note = f"only {len(frames)} frames: the background is a smooth surface"
-        return Background(level, covered, frames=frames, gains=np.ones(len(frames)), notes=[note])
+        return Background(*level_of_image(stack.max(0)), frames=frames)
     travel = shifts[frames]
     moving = bool(np.ptp(travel, axis=0).max() >= LEAST_TRAVEL_PX)
-    return _background(fit_layers(stack, travel if moving else None), frames)
-
-
-def _background(layers: Layers, frames: NDArray[np.int64]) -> Background:
-    notes = []
-    if layers.covered.any():
-        notes.append(
-            f"{np.mean(layers.covered):.2%} of the image is hidden by a bubble all the time: "
-            "the level there is interpolated"
-        )
-    return Background(
-        rig_level=np.exp(layers.rig),
-        covered=layers.covered,
-        lab_factor=None if layers.lab is None else np.exp(layers.lab),
-        lab_origin_px=layers.lab_origin_px,
-        frames=frames,
-        gains=np.exp(layers.gains),
-        noise=layers.noise,
-        notes=notes,
-    )
+    layers, covered, noise = fit_layers(stack, travel if moving else None)
+    lab = None if layers.lab is None else np.exp(layers.lab)
+    return Background(np.exp(layers.rig), covered, lab, layers.lab_origin_px, frames, noise)
 
 
 def _sample(

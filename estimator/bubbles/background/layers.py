@@ -1,4 +1,4 @@
-"""Two layers of a moving camera's background, told from each other and from bubbles.
+"""Two layers of a moving camera's background, separated from each other and from bubbles.
 
 Robust quantiles give a start; then the pixels under bubbles are marked frame by frame, and means
 over the rest, one layer after the other, sharpen both.
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.background.from_one_image import DARK, fill_masked, level_of_image
 from telerig.estimator.bubbles.background.masks import first_masks
-from telerig.estimator.bubbles.background.subpixel_shift import crop_of_lab, shifted
 
 Array = NDArray[np.float64]
 Log = NDArray[np.float32]
@@ -34,28 +33,19 @@ _ROUNDS = 3
 _BLOCK_ROWS = 64
 _LEAST_SEEN = 3
 _LEAST_SEEN_LAB = 2
-"""What a single frame shows of the lab cannot be told from a bubble."""
+"""In a single frame the lab and a bubble look alike."""
 
 
 @dataclass(frozen=True)
 class Layers:
-    """Logarithms: rig (H, W), lab (Hl, Wl) or None, gains (n,); noise relative, covered (H, W)."""
+    """Logarithms: rig (H, W), lab (Hl, Wl) or None, and gains (n,) of the frames.
+
+    The lab's pixel (0, 0) is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
+    """
 
     rig: Log
     lab: Log | None
     lab_origin_px: tuple[int, int]
-    gains: Array
-    noise: float
-    covered: Mask
-
-
-@dataclass(frozen=True)
-class _Model:
-    """What is known of the frames at some point of the estimate; fields as in `Layers`."""
-
-    rig: Log
-    lab: Log | None
-    origin_px: tuple[int, int]
     gains: Array
 
     def lab_in(self, shift_px: Array, rows: slice = slice(None)) -> Log | float:
@@ -63,8 +53,8 @@ class _Model:
         if self.lab is None:
             return 0.0
         first, last, _ = rows.indices(self.rig.shape[0])
-        shape = (last - first, self.rig.shape[1])
-        return crop_of_lab(self.lab, self.origin_px, (shift_px[0], shift_px[1] + first), shape, 0.0)
+        shape, shift = (last - first, self.rig.shape[1]), (shift_px[0], shift_px[1] + first)
+        return crop_of_lab(self.lab, self.lab_origin_px, shift, shape, 0.0)
 
 
 @dataclass(frozen=True)
@@ -82,30 +72,32 @@ class _Sample:
         return np.take(self.table, values)
 
 
-def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> Layers:
-    """Both layers of (n, H, W) images; shifts_px (n, 2), None for the rig layer alone."""
+def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Layers, Mask, float]:
+    """Both layers of (n, H, W) images; shifts_px (n, 2), None for the rig layer alone.
+
+    Then (H, W) where a bubble hid the screen all the time, and the relative noise of a pixel.
+    """
     shifts = np.zeros((len(stack), 2)) if shifts_px is None else shifts_px
     sample = _Sample(stack, shifts, _log_table(stack.dtype))
     gains = _first_gains(sample)
     empty = np.zeros(stack.shape[1:], np.float32)
     masks = first_masks(stack, shifts_px, gains)
-    model, spread, never = _first_rig(sample, _Model(empty, None, (0, 0), gains), masks)
+    layers, spread, never = _first_rig(sample, Layers(empty, None, (0, 0), gains), masks)
     for _ in range(_STARTS if shifts_px is not None else 0):
-        model = _first_lab(sample, model, masks)
-        model, spread, never = _first_rig(sample, model, masks)
-    model, marked, covered, usable = _uncovered(sample, *_marked(sample, model), spread, never)
+        layers = _first_lab(sample, layers, masks)
+        layers, spread, never = _first_rig(sample, layers, masks)
+    layers, marked, covered, usable = _uncovered(sample, *_marked(sample, layers), spread, never)
     for turn in range(_ROUNDS):
         if turn:
-            model, marked = _marked(sample, model)
-        model, seen = _mean_rig(sample, model, marked, covered)
-        if model.lab is not None:
-            model = _mean_lab(sample, model, marked)
-    noise = float(np.median(_noise(sample, model)[1]))
+            layers, marked = _marked(sample, layers)
+        layers, seen = _mean_rig(sample, layers, marked, covered)
+        if layers.lab is not None:
+            layers = _mean_lab(sample, layers, marked)
+    noise = float(np.median(_noise(sample, layers)[1]))
     hidden = covered & (seen < _least_seen(len(stack)))
     if hidden.any():
-        filled = fill_masked(model.rig, hidden, usable, _along_travel(sample, model))
-        model = replace(model, rig=filled)
-    return Layers(model.rig, model.lab, model.origin_px, model.gains, noise, hidden)
+        layers = _filled(sample, layers, hidden, usable)
+    return layers, hidden, noise
 
 
 def _log_table(kind: np.dtype[Any]) -> Log | None:
@@ -128,24 +120,25 @@ def _first_gains(sample: _Sample) -> Array:
     return gains
 
 
-def _first_rig(sample: _Sample, model: _Model, masks: Mask) -> tuple[_Model, Log, Mask]:
-    """The model with the frames' upper quantile, and how far the brighter frames spread.
+def _first_rig(sample: _Sample, layers: Layers, masks: Mask) -> tuple[Layers, Log, Mask]:
+    """The layers with the frames' upper quantile, and how far the brighter frames spread.
 
     masks : (n, H, W) what is left out. Then (H, W) the pixels that no two frames show, filled.
     """
     rig, spread = np.empty((2, *sample.stack.shape[1:]), np.float32)
     for rows in _blocks(rig.shape[0]):
-        log = sample.log(slice(None), rows) - model.gains[:, None, None].astype(np.float32)
+        log = sample.log(slice(None), rows) - layers.gains[:, None, None].astype(np.float32)
         for k, shift in enumerate(sample.shifts):
-            log[k] -= model.lab_in(shift, rows)
+            log[k] -= layers.lab_in(shift, rows)
         log[masks[:, rows]] = np.nan
         low, rig[rows], high = _quantiles(log, (UPPER - 0.1, UPPER, UPPER + 0.1))
         spread[rows] = high - low
     never = np.isnan(rig)
     rig[never] = 0
+    layers = replace(layers, rig=rig)
     if never.any():
-        rig = fill_masked(rig, never, ~never, _along_travel(sample, model))
-    return replace(model, rig=rig), np.nan_to_num(spread), never
+        layers = _filled(sample, layers, never, ~never)
+    return layers, np.nan_to_num(spread), never
 
 
 def _blocks(height: int) -> Iterator[slice]:
@@ -163,9 +156,9 @@ def _quantiles(values: Log, shares: tuple[float, ...]) -> Log:
     return np.ascontiguousarray(found.T).reshape(len(shares), height, width)
 
 
-def _first_lab(sample: _Sample, model: _Model, masks: Mask) -> _Model:
-    """The model with the lab layer's quantiles over the frames that saw each place."""
-    height, width = model.rig.shape
+def _first_lab(sample: _Sample, layers: Layers, masks: Mask) -> Layers:
+    """The layers with the lab layer's quantiles over the frames that saw each place."""
+    height, width = layers.rig.shape
     low, high = np.floor(sample.shifts.min(0)), np.ceil(sample.shifts.max(0))
     origin = (int(low[0]), int(low[1]))
     spread = (high - low).astype(int)
@@ -174,17 +167,17 @@ def _first_lab(sample: _Sample, model: _Model, masks: Mask) -> _Model:
         seen = [
             found
             for k in range(len(sample.stack))
-            if (found := _lab_rows(sample, model, k, masks[k], rows, origin, lab.shape[1]))
+            if (found := _lab_rows(sample, layers, k, masks[k], rows, origin, lab.shape[1]))
             is not None
         ]
         if seen:
             lab[rows] = np.nan_to_num(_quantiles(np.stack(seen), (UPPER,))[0], nan=0.0)
-    return _centred(replace(model, lab=lab, origin_px=origin))
+    return _centred(replace(layers, lab=lab, lab_origin_px=origin))
 
 
 def _lab_rows(
     sample: _Sample,
-    model: _Model,
+    layers: Layers,
     k: int,
     mask: Mask,
     rows: slice,
@@ -194,12 +187,12 @@ def _lab_rows(
     """What frame k shows in these rows of the lab, NaN beside it; None when it shows nothing."""
     left, top = sample.shifts[k] - origin
     column, row = math.floor(left), math.floor(top)
-    height = model.rig.shape[0]
+    height = layers.rig.shape[0]
     first, last = max(rows.start - row, 0), min(rows.stop - row, height)
     if first >= last:
         return None
     margin = slice(max(first - 2, 0), min(last + 2, height))
-    residual = sample.log(k, margin) - np.float32(model.gains[k]) - model.rig[margin]
+    residual = sample.log(k, margin) - np.float32(layers.gains[k]) - layers.rig[margin]
     residual[mask[margin]] = np.nan
     moved = shifted(residual, (column - left, row - top))
     out = np.full((rows.stop - rows.start, width), np.nan, np.float32)
@@ -209,28 +202,28 @@ def _lab_rows(
     return out
 
 
-def _centred(model: _Model) -> _Model:
+def _centred(layers: Layers) -> Layers:
     """The same sum of layers with the lab's median at 0."""
-    assert model.lab is not None
-    known = model.lab[model.lab != 0]
+    assert layers.lab is not None
+    known = layers.lab[layers.lab != 0]
     middle = np.float32(np.median(known)) if known.size else np.float32(0)
-    lab = np.where(model.lab != 0, model.lab - middle, 0).astype(np.float32)
-    return replace(model, lab=lab, rig=model.rig + middle)
+    lab = np.where(layers.lab != 0, layers.lab - middle, 0).astype(np.float32)
+    return replace(layers, lab=lab, rig=layers.rig + middle)
 
 
-def _residual(sample: _Sample, model: _Model, k: int) -> Log:
-    out = sample.log(k) - model.rig
-    out -= np.float32(model.gains[k])
-    out -= model.lab_in(sample.shifts[k])
+def _residual(sample: _Sample, layers: Layers, k: int) -> Log:
+    out = sample.log(k) - layers.rig
+    out -= np.float32(layers.gains[k])
+    out -= layers.lab_in(sample.shifts[k])
     return out
 
 
-def _noise(sample: _Sample, model: _Model) -> tuple[Array, Array]:
+def _noise(sample: _Sample, layers: Layers) -> tuple[Array, Array]:
     """Log levels and the relative noise at each, from the bright half of the residuals."""
     step = _step(sample)
     every = range(0, len(sample.stack), max(1, len(sample.stack) // 8))
-    residual = np.concatenate([_residual(sample, model, k)[::step, ::step].ravel() for k in every])
-    level = np.tile(model.rig[::step, ::step].ravel(), len(every))
+    residual = np.concatenate([_residual(sample, layers, k)[::step, ::step].ravel() for k in every])
+    level = np.tile(layers.rig[::step, ::step].ravel(), len(every))
     edges = np.quantile(level, np.linspace(0, 1, 7))
     levels, sigmas = [], []
     for low, high in pairwise(edges):
@@ -241,15 +234,15 @@ def _noise(sample: _Sample, model: _Model) -> tuple[Array, Array]:
     return np.array(levels), np.array(sigmas)
 
 
-def _marked(sample: _Sample, model: _Model) -> tuple[_Model, Mask]:
-    """The model with new gains, and (n, H, W) the pixels under bubbles and other outliers."""
-    levels, sigmas = _noise(sample, model)
-    sigma = np.interp(model.rig, levels, sigmas).astype(np.float32)
+def _marked(sample: _Sample, layers: Layers) -> tuple[Layers, Mask]:
+    """The layers with new gains, and (n, H, W) the pixels under bubbles and other outliers."""
+    levels, sigmas = _noise(sample, layers)
+    sigma = np.interp(layers.rig, levels, sigmas).astype(np.float32)
     marked = np.empty(sample.stack.shape, bool)
-    gains = model.gains.copy()
+    gains = layers.gains.copy()
     step = _step(sample)
     for k in range(len(sample.stack)):
-        residual = _residual(sample, model, k)
+        residual = _residual(sample, layers, k)
         thin = residual[::step, ::step]
         change = float(np.median(thin))
         near = np.abs(thin - change) < 3 * sigma[::step, ::step]
@@ -258,11 +251,11 @@ def _marked(sample: _Sample, model: _Model) -> tuple[_Model, Mask]:
         gains[k] += change
         marked[k] = _outliers(residual, sigma)
     middle = float(np.median(gains))
-    return replace(model, gains=gains - middle, rig=model.rig + np.float32(middle)), marked
+    return replace(layers, gains=gains - middle, rig=layers.rig + np.float32(middle)), marked
 
 
 def _outliers(residual: Log, sigma: Log) -> Mask:
-    """Dark things with their soft edges and bright hearts, and bright specks."""
+    """Dark things with their soft edges and bright centres, and bright specks."""
     import cv2
 
     soft = cv2.blur(residual, (5, 5))
@@ -276,8 +269,8 @@ def _outliers(residual: Log, sigma: Log) -> Mask:
 
 
 def _uncovered(
-    sample: _Sample, model: _Model, marked: Mask, spread: Log, never: Mask
-) -> tuple[_Model, Mask, Mask, Mask]:
+    sample: _Sample, layers: Layers, marked: Mask, spread: Log, never: Mask
+) -> tuple[Layers, Mask, Mask, Mask]:
     """The rig layer filled where a bubble kept it dark all the time, and the new marks.
 
     Then (H, W) where it was filled, and what is clean enough to fill from.
@@ -289,7 +282,7 @@ def _uncovered(
     """
     import cv2
 
-    dark = (np.log(level_of_image(np.exp(model.rig))[0]) - model.rig > DARK).astype(np.uint8)
+    dark = (np.log(level_of_image(np.exp(layers.rig))[0]) - layers.rig > DARK).astype(np.uint8)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     share = marked.mean(0, dtype=np.float32)
     usual = float(np.median(share))
@@ -300,24 +293,24 @@ def _uncovered(
         if np.mean(share[around] > usual + 0.25) > 0.5:
             covered |= thing
     if not covered.any():
-        return model, marked, covered.astype(bool), covered == 0
+        return layers, marked, covered.astype(bool), covered == 0
     edge = cv2.dilate(covered, np.ones((13, 13), np.uint8)) > covered
     hidden = covered.astype(bool) | (edge & (spread > STEADY))
     usable = (cv2.dilate(dark | covered, np.ones((5, 5), np.uint8)) == 0) & ~edge
-    filled = fill_masked(model.rig, hidden, usable, _along_travel(sample, model))
-    return *_marked(sample, replace(model, rig=filled)), hidden, usable
+    return *_marked(sample, _filled(sample, layers, hidden, usable)), hidden, usable
 
 
-def _along_travel(sample: _Sample, model: _Model) -> tuple[float, float] | None:
-    """The reach (u, v) px of the fill when the travel follows an image axis.
+def _filled(sample: _Sample, layers: Layers, hidden: Mask, usable: Mask) -> Layers:
+    """The rig layer interpolated where it is hidden, along the travel if that is an image axis.
 
     A pattern that is constant along the travel looks the same in both layers, and what one has of
-    it the other lacks: such stripes must go on through a hole.
+    it the other lacks: such stripes must continue through a hole.
     """
     spread_u, spread_v = np.ptp(sample.shifts, axis=0)
-    if model.lab is None or min(spread_u, spread_v) > 0.02 * max(spread_u, spread_v):
-        return None
-    return (1.0, np.inf) if spread_v > spread_u else (np.inf, 1.0)
+    across = (1.0, np.inf) if spread_v > spread_u else (np.inf, 1.0)
+    aslant = min(spread_u, spread_v) > 0.02 * max(spread_u, spread_v)
+    no_axis = layers.lab is None or aslant
+    return replace(layers, rig=fill_masked(layers.rig, hidden, usable, None if no_axis else across))
 
 
 def _least_seen(frames: int) -> int:
@@ -326,33 +319,33 @@ def _least_seen(frames: int) -> int:
 
 
 def _mean_rig(
-    sample: _Sample, model: _Model, marked: Mask, covered: Mask
-) -> tuple[_Model, NDArray[np.float32]]:
+    sample: _Sample, layers: Layers, marked: Mask, covered: Mask
+) -> tuple[Layers, NDArray[np.float32]]:
     """The rig layer as the mean of the frames' unmarked pixels, and (H, W) their number."""
     import cv2
 
-    total, seen = np.zeros(model.rig.shape, np.float32), np.zeros(model.rig.shape, np.float32)
+    total, seen = np.zeros(layers.rig.shape, np.float32), np.zeros(layers.rig.shape, np.float32)
     for k in range(len(sample.stack)):
         free = (~marked[k]).astype(np.uint8)
-        cv2.accumulate(_residual(sample, model, k), total, free)
+        cv2.accumulate(_residual(sample, layers, k), total, free)
         seen += free
     needed = np.where(covered, _least_seen(len(sample.stack)), _LEAST_SEEN)
-    rig = np.where(seen >= needed, model.rig + total / np.maximum(seen, 1), model.rig)
-    return replace(model, rig=rig.astype(np.float32)), seen
+    rig = np.where(seen >= needed, layers.rig + total / np.maximum(seen, 1), layers.rig)
+    return replace(layers, rig=rig.astype(np.float32)), seen
 
 
-def _mean_lab(sample: _Sample, model: _Model, marked: Mask) -> _Model:
+def _mean_lab(sample: _Sample, layers: Layers, marked: Mask) -> Layers:
     """The lab layer as the mean of the residuals that are free of marks."""
     import cv2
 
-    assert model.lab is not None
-    height, width = model.rig.shape
-    total, seen = np.zeros_like(model.lab), np.zeros_like(model.lab)
+    assert layers.lab is not None
+    height, width = layers.rig.shape
+    total, seen = np.zeros_like(layers.lab), np.zeros_like(layers.lab)
     for k, shift in enumerate(sample.shifts):
-        left, top = shift - model.origin_px
+        left, top = shift - layers.lab_origin_px
         column, row = math.floor(left), math.floor(top)
         fraction = (column - left, row - top)
-        residual = _residual(sample, model, k)
+        residual = _residual(sample, layers, k)
         residual[marked[k]] = 0
         near = cv2.dilate(marked[k].astype(np.uint8), np.ones((3, 3), np.uint8))
         free = (near == 0).astype(np.float32)
@@ -362,4 +355,43 @@ def _mean_lab(sample: _Sample, model: _Model, marked: Mask) -> _Model:
         total[place] += free * shifted(residual, fraction)
         seen[place] += free
     change = np.where(seen >= _LEAST_SEEN_LAB, total / np.maximum(seen, 1), 0)
-    return _centred(replace(model, lab=model.lab + change.astype(np.float32)))
+    return _centred(replace(layers, lab=layers.lab + change.astype(np.float32)))
+
+
+def crop_of_lab(
+    lab: Log,
+    origin_px: tuple[int, int],
+    shift_px: tuple[float, float],
+    shape: tuple[int, int],
+    outside: float,
+) -> Log:
+    """(H, W) of the lab seen at a shift (u, v), by cubic interpolation; ``outside`` beyond it."""
+    left, top = shift_px[0] - origin_px[0], shift_px[1] - origin_px[1]
+    column, row = math.floor(left), math.floor(top)
+    window = np.full((shape[0] + 3, shape[1] + 3), outside, np.float32)
+    r0, r1 = max(row - 1, 0), min(row + shape[0] + 2, lab.shape[0])
+    c0, c1 = max(column - 1, 0), min(column + shape[1] + 2, lab.shape[1])
+    if r0 < r1 and c0 < c1:
+        part = lab[r0:r1, c0:c1]
+        window[r0 - row + 1 : r1 - row + 1, c0 - column + 1 : c1 - column + 1] = part
+    return shifted(window, (left - column, top - row))[1:-2, 1:-2]
+
+
+def shifted(image: Log, shift_px: tuple[float, float]) -> Log:
+    """image(p + shift) for shifts below 1 px, by Catmull-Rom splines; borders replicated."""
+    import cv2
+
+    along_u, along_v = (_spline(shift) for shift in shift_px)
+    out = cv2.sepFilter2D(image, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(out, np.float32)
+
+
+def _spline(shift: float) -> NDArray[np.float32]:
+    """Five weights, of the pixels from -2 to +2."""
+    base = math.floor(shift)
+    x = np.abs(np.arange(-1, 3) - (shift - base))
+    near, far = 1 - 2.5 * x**2 + 1.5 * x**3, 2 - 4 * x + 2.5 * x**2 - 0.5 * x**3
+    weights = np.zeros(5, np.float32)
+    # the fourth weight of a non-negative shift falls on +2, that of a negative one on +1
+    weights[base + 1 : base + 5] = np.where(x <= 1, near, np.where(x < 2, far, 0.0))
+    return weights

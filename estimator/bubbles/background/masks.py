@@ -10,13 +10,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.background.from_one_image import bright_surface, without_screen_edge
+from telerig.estimator.bubbles.background.from_one_image import (
+    bright_surface,
+    compact_things,
+    log_cells,
+)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-CELL_PX = 2
-"""Cells of this size are averaged first."""
+_CELL_PX = 2
 
 DEEP = 0.2
 """Depth (of log grey) from which on a dark thing is a bubble, or dirt."""
@@ -40,15 +43,9 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
     import cv2
 
     height, width = stack.shape[1:]
-    size = (max(4, width // CELL_PX), max(4, height // CELL_PX))
-    log = np.stack(
-        [
-            np.log(np.maximum(cv2.resize(i.astype(np.float32), size, None, 0, 0, 3), 0.5)) - g
-            for i, g in zip(stack, gains)
-        ]
-    )
+    log = np.stack([log_cells(image, _CELL_PX) - gain for image, gain in zip(stack, gains)])
     surface = bright_surface(np.quantile(log, 0.8, axis=0).astype(np.float32), 4)
-    dark = np.stack([_dark_things(surface - frame) for frame in log])
+    dark = np.stack([compact_things(surface - frame > DEEP) for frame in log])
     keep = dark & ~_still(dark.mean(0), np.ones(dark.shape[1:], bool), 2)
     places = _lab_places(shifts_px, dark.shape)
     if places:
@@ -85,13 +82,6 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Mask) -> Mask:
     return np.asarray(never & np.isin(labels, outside[outside > 0]), bool)
 
 
-def _dark_things(depth: NDArray[np.float32]) -> Mask:
-    """Hearts filled; the screen's edge left out."""
-    from scipy import ndimage
-
-    return without_screen_edge(ndimage.binary_fill_holes(depth > DEEP))
-
-
 def _still(share: Array, known: Mask, margin: int) -> Mask:
     """Things dark in nearly all frames, grown by ``margin`` cells, beyond which few are dark."""
     import cv2
@@ -112,7 +102,7 @@ def _lab_places(shifts_px: Array | None, shape: tuple[int, ...]) -> list[tuple[s
     """Where each frame's cells lie on a canvas of the lab; empty when nothing moves."""
     if shifts_px is None:
         return []
-    shifts = np.rint(shifts_px / CELL_PX).astype(int)
+    shifts = np.rint(shifts_px / _CELL_PX).astype(int)
     return [(slice(v, v + shape[1]), slice(u, u + shape[2])) for u, v in shifts - shifts.min(0)]
 
 

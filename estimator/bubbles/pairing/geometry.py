@@ -22,6 +22,7 @@ from telerig.estimator.bubbles.outline.detection_table import (
     HARMONIC_COLUMNS,
     centre_covariances,
     columns,
+    flag_words,
 )
 from telerig.estimator.bubbles.outline.ellipse_geometry import points_on
 from telerig.rig import projection

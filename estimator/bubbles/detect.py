@@ -23,7 +23,7 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
 from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, fit_outlines
 from telerig.estimator.bubbles.outline.regions import (
     Blob,
-    Speck,
+    Rejected,
     dark_noise_share,
     find_blobs,
     noise_share,
@@ -45,7 +45,6 @@ Mask = NDArray[np.bool_]
 
 __all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
 
-_REJECTED_COLUMNS = ["u_px", "v_px", "radius_px", "reason"]
 _MAX_AXIS_RATIO = 3.0
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
@@ -103,17 +102,17 @@ def find_bubbles(
     image = checked_image(image, min_diameter_px, min_contrast)
     reason = nothing_to_see(image)
     if reason:
-        return _bubbles(_empty_columns(), [], np.nan, reason)
+        return _bubbles({}, [], np.nan, reason)
     ratio, clipped = normalised(image, background)
     sigma = max(noise_share(ratio), 1e-4)
-    blobs, specks = find_blobs(
+    blobs, rejected = find_blobs(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
     parts = split_blobs(blobs, image.shape, min_diameter_px=min_diameter_px)
     parts, slender = _without_slender(parts)
-    specks += slender
+    rejected += slender
     if not parts:
-        return _bubbles(_empty_columns(), specks, sigma, "no shadow dark and large enough")
+        return _bubbles({}, rejected, sigma, "no shadow dark and large enough")
     dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
@@ -130,8 +129,8 @@ def find_bubbles(
     columns = _columns(outlines, parts, image.shape, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])
-    specks += [
-        Speck(float(u), float(v), float(r), why)
+    rejected += [
+        Rejected(float(u), float(v), float(r), why)
         for u, v, r, why in zip(
             columns["u_px"], columns["v_px"], columns["d_eq_px"] / 2.0, against, strict=True
         )
@@ -139,37 +138,31 @@ def find_bubbles(
     ]
     kept_columns = {name: values[kept] for name, values in columns.items()}
     reason = "" if np.any(kept) else "no shadow has a bubble's outline"
-    return _bubbles(kept_columns, specks, sigma, reason)
+    return _bubbles(kept_columns, rejected, sigma, reason)
 
 
-def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Speck]]:
+def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:
     kept, slender = [], []
     for part in parts:
         u, v, a, b, _ = part.ellipse.tolist()
         if a <= _MAX_AXIS_RATIO * b:
             kept.append(part)
         else:
-            slender.append(Speck(u, v, (a * b) ** 0.5, f"{a / b:.1f} times as long as wide"))
+            slender.append(Rejected(u, v, (a * b) ** 0.5, f"{a / b:.1f} times as long as wide"))
     return kept, slender
 
 
-def _bubbles(columns: dict[str, Any], specks: list[Speck], noise: float, reason: str) -> Bubbles:
+def _bubbles(
+    columns: dict[str, Any], rejected: list[Rejected], noise: float, reason: str
+) -> Bubbles:
     import pandas as pd
 
-    accepted = pd.DataFrame(columns, columns=DETECTION_COLUMNS, copy=False)
+    empty = {name: np.empty(0, object if name == "flags" else float) for name in DETECTION_COLUMNS}
+    accepted = pd.DataFrame(columns or empty, columns=DETECTION_COLUMNS, copy=False)
     accepted.attrs["reason"] = reason
     accepted.attrs["noise"] = noise
-    rejected = pd.DataFrame(
-        [(speck.u_px, speck.v_px, speck.radius_px, speck.reason) for speck in specks],
-        columns=_REJECTED_COLUMNS,
-    )
-    return Bubbles(accepted, rejected, noise, reason)
-
-
-def _empty_columns() -> dict[str, Any]:
-    columns: dict[str, Any] = {name: np.empty(0) for name in DETECTION_COLUMNS}
-    columns["flags"] = np.empty(0, dtype=object)
-    return columns
+    table = pd.DataFrame(rejected, columns=list(Rejected._fields))
+    return Bubbles(accepted, table, noise, reason)
 
 
 def _start(parts: list[Part], blobs: list[Blob], sigma: float, dark_sigma: float) -> Start:
@@ -242,18 +235,19 @@ def _flags(
 
 
 def _merged(outlines: Outlines, parts: list[Part]) -> Mask:
-    """What could not be split; and where one part of a blob turns out unsound, all those whose
-    own outline is not mostly seen."""
+    """Blobs that could not be split, and implausible parts.
+
+    Where one part of a blob is implausible, so are all whose outline is not mostly seen.
+    """
     merged: Mask = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
-    unsound = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
-    doubtful = np.array([part.blob in unsound for part in parts])
-    return merged | (doubtful & (outlines.coverage < _MOSTLY_SEEN))
+    blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
+    suspect = np.array([part.blob in blobs for part in parts])
+    return merged | (suspect & (outlines.coverage < _MOSTLY_SEEN))
 
 
 def _defocused(outlines: Outlines) -> Mask:
     sharp = float(np.quantile(outlines.blur_px, 0.25))
-    defocused: Mask = outlines.blur_px > max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX)
-    return defocused
+    return np.asarray(outlines.blur_px > max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX))
 
 
 def _reasons(

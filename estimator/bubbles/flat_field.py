@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.estimator.bubbles.outline.regions import screen_level
 from telerig.estimator.images.checks import check_grey_image
 
 _UNIFORM_SHARE = 0.004
 _CLIPPED_SHARE = 0.5
 _WHITE_SHARE = 0.98
+_SHRINK = 8
+_SCREEN_PASSES = 3
+
+Grey = NDArray[np.float32]
 
 
 def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: float) -> NDArray[Any]:
@@ -49,15 +52,13 @@ def _full_scale(image: NDArray[Any]) -> float:
     return next((float(2**bits - 1) for bits in (10, 12, 14) if high <= 2**bits - 1), 65535.0)
 
 
-def normalised(
-    image: NDArray[Any], background: NDArray[Any] | None
-) -> tuple[NDArray[np.float32], bool]:
+def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Grey, bool]:
     """Grey over background, and whether the screen is clipped at the sensor's white."""
     import cv2
 
-    grey = image if image.dtype in (np.uint8, np.uint16, np.float32) else image.astype(np.float32)
+    grey = image.astype(np.float32, copy=False)
     if background is None:
-        screen = screen_level(grey.astype(np.float32))
+        screen = screen_level(grey)
     else:
         screen = np.asarray(background)
         if screen.shape != image.shape:
@@ -74,7 +75,7 @@ def normalised(
                 todo="give the level of the lit screen at every pixel",
             )
     screen = np.maximum(screen, 1e-6 * float(image.max()) + 1e-12)
-    ratio = cv2.divide(grey.astype(np.float32, copy=False), screen)
+    ratio = cv2.divide(grey, screen)
     sample = image[::8, ::8]
     clipped = bool(
         image.dtype.kind in "ui"
@@ -82,3 +83,29 @@ def normalised(
         and sample.max() >= _WHITE_SHARE * _full_scale(image)
     )
     return ratio, clipped
+
+
+def screen_level(image: Grey) -> Grey:
+    """Level of the lit screen (rows, columns), from an image with bubbles in front of it.
+
+    Bright closing over a quarter of the image at an eighth of its size, then a broad mean over
+    what is not darker than that; robust while the screen shows within a quarter of the image.
+    """
+    import cv2
+
+    rows, columns = image.shape
+    small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))
+    small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
+    reach = max(3, min(small_size) // 4 | 1)
+    kernel = np.ones((reach, reach), np.uint8)
+    level = cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REFLECT)
+    width = (2 * (reach // 3) + 1,) * 2
+    for _ in range(_SCREEN_PASSES):
+        lit = (small > 0.93 * level).astype(np.float32)
+        lit = cv2.erode(lit, np.ones((3, 3), np.uint8))
+        weight = cv2.GaussianBlur(lit, width, 0) + 1e-3 * cv2.GaussianBlur(lit, (0, 0), reach)
+        total = cv2.GaussianBlur(lit * small, width, 0)
+        total += 1e-3 * cv2.GaussianBlur(lit * small, (0, 0), reach)
+        level = np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), level).astype(np.float32)
+    screen: Grey = cv2.resize(level, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return screen

@@ -142,11 +142,8 @@ def compact_things(dark: Mask) -> Mask:
     height, width = kept.shape
     for region in regionprops(label(kept)):
         top, left, bottom, right = region.bbox
-        at_side, at_top = left == 0 or right == width, top == 0 or bottom == height
-        long_side, long_top = (
-            bottom - top > _EDGE_SHARE * height,
-            right - left > _EDGE_SHARE * width,
-        )
-        if (at_side and long_side) or (at_top and long_top):
+        along_side = (left == 0 or right == width) and bottom - top > _EDGE_SHARE * height
+        along_top = (top == 0 or bottom == height) and right - left > _EDGE_SHARE * width
+        if along_side or along_top:
             kept[region.slice] &= ~region.image
     return kept

@@ -113,8 +113,7 @@ def _turning(points: Array, arm: int) -> Array:
     back = points - np.roll(points, arm, axis=0)
     ahead = np.roll(points, -arm, axis=0) - points
     cross = back[:, 0] * ahead[:, 1] - back[:, 1] * ahead[:, 0]
-    turn: Array = np.arctan2(cross, np.sum(back * ahead, axis=1))
-    return turn
+    return np.asarray(np.arctan2(cross, np.sum(back * ahead, axis=1)))
 
 
 def _notches(turn: Array, arm: int) -> list[int]:

@@ -166,8 +166,7 @@ def _first_look(ratio: NDArray[np.float32], state: RimState, start: Start) -> Ri
 
 
 def _bulge(state: RimState) -> Array:
-    bulge: Array = np.sum(np.abs(state.harmonics), axis=1)
-    return bulge
+    return np.asarray(np.sum(np.abs(state.harmonics), axis=1))
 
 
 def _distance(state: RimState, pixels: Pixels, linear: Linear) -> Single:
@@ -222,8 +221,7 @@ def _window(state: RimState, pixels: Pixels, linear: Linear, start: Start, hidde
     kept &= ~unlike_rim(pixels, linear.foot, distance, residual, state.sigma, contrast)
     limit = _OUTLIER_SIGMA * np.maximum(_typical_residual(residual, pixels, kept), 1.0)
     kept &= np.abs(residual) < spread(limit, counts)
-    weight: Single = (inverse * kept).astype(np.float32)
-    return weight
+    return np.asarray((inverse * kept).astype(np.float32))
 
 
 def _typical_residual(residual: Single, pixels: Pixels, kept: Mask) -> Array:
@@ -286,8 +284,7 @@ def _limited(step: Array, state: RimState) -> Array:
     reach = np.max(np.abs(step[:, :BLUR]), axis=1)
     share = np.minimum(1.0, np.minimum(1.5, 0.3 * state.ellipse[:, 3]) / (reach + 1e-12))
     share = np.minimum(share, 0.4 * state.sigma / (np.abs(step[:, BLUR]) + 1e-12))
-    limited: Array = step * share[:, None]
-    return limited
+    return np.asarray(step * share[:, None])
 
 
 def _moved(state: RimState, shifts: Array) -> RimState:
@@ -302,8 +299,7 @@ def _coverage(pixels: Pixels, linear: Linear, weight: Single, sigma: Array) -> A
     angle = np.arctan2(linear.foot.sin[near], linear.foot.cos[near])
     slot = ((angle + np.pi) * (_BINS / (2.0 * np.pi))).astype(np.intp) % _BINS
     seen = np.bincount(pixels.owner[near] * _BINS + slot, minlength=pixels.bubbles * _BINS)
-    share: Array = np.mean(seen.reshape(-1, _BINS) > 0, axis=1)
-    return share
+    return np.asarray(np.mean(seen.reshape(-1, _BINS) > 0, axis=1))
 
 
 def _misfit(
@@ -319,8 +315,7 @@ def _misfit(
     count = np.maximum(pixels.sums(near.astype(np.float32)), 1.0)
     excess = pixels.sums(near * residual**2) / count - start.sigma_outer**2
     slope = _MEAN_SLOPE * (state.outer - state.inner) / state.sigma
-    misfit: Array = np.sqrt(np.maximum(excess, 0.0)) / np.maximum(slope, 1e-9)
-    return misfit
+    return np.asarray(np.sqrt(np.maximum(excess, 0.0)) / np.maximum(slope, 1e-9))
 
 
 def _result(

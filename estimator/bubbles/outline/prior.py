@@ -1,8 +1,8 @@
-"""What is expected of outlines and levels before a bubble is looked at."""
+"""Prior knowledge of a bubble's outline and grey levels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,12 +44,11 @@ class ShapePrior:
 
     def held_where(self, held: Mask) -> ShapePrior:
         """The same prior with the harmonics of the bubbles ``held`` (B,) tied to zero."""
-        share = np.where(held, _HELD, self.harmonic_share)
-        return ShapePrior(share, self.flattening, self.flattening_spread)
+        return replace(self, harmonic_share=np.where(held, _HELD, self.harmonic_share))
 
 
 def weak_prior(count: int, *, held: bool = False) -> ShapePrior:
-    """A prior that whole outlines do not feel; ``held`` ties the harmonics to where they are."""
+    """A prior too weak to affect whole outlines; ``held`` fixes the harmonics at their start."""
     return ShapePrior(
         np.full(count, _HELD if held else _FREE_HARMONIC),
         np.zeros((count, 2)),

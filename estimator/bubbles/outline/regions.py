@@ -1,8 +1,9 @@
-"""Dark blobs in front of a lit screen: background, noise, threshold, outlines to start from."""
+"""Dark blobs in front of a lit screen: noise, threshold, outlines to start from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,6 @@ from telerig.estimator.images.noise import clipped_sigma
 Array = NDArray[np.float64]
 Grey = NDArray[np.float32]
 
-_SHRINK = 8
-_SCREEN_PASSES = 3
 _NOISE_ROWS, _NOISE_SAMPLES = 96, 40_000
 _DARK_SHARE, _ENOUGH_DARK = 0.12, 120
 _FAINT_SHARE = 0.5
@@ -21,7 +20,7 @@ _LOW_SIGMA = 6.0
 _DARKEST = 0.05
 _LIT = 0.85
 _LEAST_OUTLINE, _STEEP_SHARE = 5, 0.6
-_MAX_CUT_HEART_SHARE = 0.6
+_MAX_CUT_CENTRE_SHARE = 0.6
 
 
 @dataclass(frozen=True)
@@ -37,40 +36,13 @@ class Blob:
     touches_border: bool
 
 
-@dataclass(frozen=True)
-class Speck:
+class Rejected(NamedTuple):
     """A dark region that is no bubble, and why."""
 
     u_px: float
     v_px: float
     radius_px: float
     reason: str
-
-
-def screen_level(image: Grey) -> Grey:
-    """Level of the lit screen (rows, columns), from an image with bubbles in front of it.
-
-    Bright closing over a quarter of the image at an eighth of its size, then a broad mean over
-    what is not darker than that; robust while the screen shows within a quarter of the image.
-    """
-    import cv2
-
-    rows, columns = image.shape
-    small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))
-    small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
-    reach = max(3, min(small_size) // 4 | 1)
-    kernel = np.ones((reach, reach), np.uint8)
-    level = cv2.morphologyEx(small, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REFLECT)
-    width = (2 * (reach // 3) + 1,) * 2
-    for _ in range(_SCREEN_PASSES):
-        lit = (small > 0.93 * level).astype(np.float32)
-        lit = cv2.erode(lit, np.ones((3, 3), np.uint8))
-        weight = cv2.GaussianBlur(lit, width, 0) + 1e-3 * cv2.GaussianBlur(lit, (0, 0), reach)
-        total = cv2.GaussianBlur(lit * small, width, 0)
-        total += 1e-3 * cv2.GaussianBlur(lit * small, (0, 0), reach)
-        level = np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), level).astype(np.float32)
-    screen: Grey = cv2.resize(level, (columns, rows), interpolation=cv2.INTER_LINEAR)
-    return screen
 
 
 def noise_share(ratio: Grey) -> float:
@@ -81,8 +53,7 @@ def noise_share(ratio: Grey) -> float:
     step = max(1, (ratio.shape[0] - 2) // _NOISE_ROWS)
     middle = np.arange(1, ratio.shape[0] - 1, step)
     above, here, below = ratio[middle - 1], ratio[middle], ratio[middle + 1]
-    vertical = above - 2.0 * here + below
-    response = (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
+    response = _second_differences(above, here, below)
     lit = np.minimum(np.minimum(above, here), below) > _LIT
     far = lit.copy()
     for shift in (1, 2, 3):
@@ -95,11 +66,17 @@ def noise_share(ratio: Grey) -> float:
     )
 
 
+def _second_differences(above: Grey, here: Grey, below: Grey) -> Grey:
+    """Along both axes, scaled to the noise of one pixel."""
+    vertical = above - 2.0 * here + below
+    return (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
+
+
 def dark_noise_share(ratio: Grey, blobs: list[Blob], sigma: float) -> float:
     """Noise within the dark rims, at most ``sigma``, that of the screen: photons are fewer there.
 
-    From second differences along both axes where three by three pixels are dark alike. What
-    structure the rims have makes it too large rather than too small.
+    From second differences along both axes where three by three pixels are dark alike. Structure
+    within the rims makes the estimate too large rather than too small.
     """
     import cv2
 
@@ -111,9 +88,7 @@ def dark_noise_share(ratio: Grey, blobs: list[Blob], sigma: float) -> float:
             continue
         even = (crop < blob.inner + _DARK_SHARE * (1.0 - blob.inner)).astype(np.uint8)
         even = cv2.erode(even, np.ones((5, 5), np.uint8), borderValue=0)[1:-1, 1:-1] > 0
-        vertical = crop[:-2] - 2.0 * crop[1:-1] + crop[2:]
-        response = (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
-        found.append(response[even])
+        found.append(_second_differences(crop[:-2], crop[1:-1], crop[2:])[even])
     values = np.concatenate(found) if found else np.empty(0, np.float32)
     if values.size < _ENOUGH_DARK:
         return sigma
@@ -122,7 +97,7 @@ def dark_noise_share(ratio: Grey, blobs: list[Blob], sigma: float) -> float:
 
 def find_blobs(
     ratio: Grey, *, sigma: float, min_contrast: float, min_diameter_px: float
-) -> tuple[list[Blob], list[Speck]]:
+) -> tuple[list[Blob], list[Rejected]]:
     """Dark regions of the normalised image that may be bubbles, and those too small or faint.
 
     Hysteresis: a region is what is darker than a faint shadow, and counts when it holds pixels
@@ -134,7 +109,7 @@ def find_blobs(
     mask = cv2.compare(ratio, low, cv2.CMP_LT)
     regions, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     blobs: list[Blob] = []
-    specks: list[Speck] = []
+    rejected: list[Rejected] = []
     too_small = f"smaller than {min_diameter_px:g} px"
     for region in regions:
         if len(region) < _LEAST_OUTLINE:
@@ -148,8 +123,8 @@ def find_blobs(
         blobs += found
         if not found:
             radius = 0.5 * float(np.sqrt(width * height))
-            specks.append(Speck(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
-    return blobs, specks
+            rejected.append(Rejected(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
+    return blobs, rejected
 
 
 def _trace(
@@ -196,14 +171,14 @@ def _trace(
 
 
 def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
-    """Join what is dark along the image's edges, so that a heart cut by the edge is a hole."""
+    """Join what is dark along the image's edges: a bright centre cut by the edge becomes a hole."""
     lines = (dark[0], dark[:, 0], dark[-1], dark[:, -1])
     for line, at_border in zip(lines, sides, strict=True):
         if not at_border:
             continue
         places = np.flatnonzero(line)
         for low, high in zip(places[:-1].tolist(), places[1:].tolist(), strict=True):
-            if 1 < high - low <= _MAX_CUT_HEART_SHARE * line.size:
+            if 1 < high - low <= _MAX_CUT_CENTRE_SHARE * line.size:
                 line[low:high] = 1
 
 

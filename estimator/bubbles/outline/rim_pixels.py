@@ -1,4 +1,4 @@
-"""The pixels along the rims of bubbles: gathered for all at once, cleared of hearts and dirt."""
+"""The pixels along the rims of bubbles: gathered for all at once, without glare and dirt."""
 
 from __future__ import annotations
 
@@ -93,28 +93,26 @@ def rim_pixels(
     ``thin``: one in two, one in four round large bubbles.
     """
     reach = _REACH_SIGMA * sigma + _REACH_PX + slack_px
-    rows, columns = ratio.shape
+    columns = ratio.shape[1]
     cos, sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
-    half_u = np.hypot(ellipse[:, 2] * cos, ellipse[:, 3] * sin) + reach
-    half_v = np.hypot(ellipse[:, 2] * sin, ellipse[:, 3] * cos) + reach
-    left = np.clip(np.ceil(ellipse[:, 0] - half_u), 0, columns).astype(np.intp)
-    right = np.clip(np.floor(ellipse[:, 0] + half_u) + 1, 0, columns).astype(np.intp)
-    top = np.clip(np.ceil(ellipse[:, 1] - half_v), 0, rows).astype(np.intp)
-    bottom = np.clip(np.floor(ellipse[:, 1] + half_v) + 1, 0, rows).astype(np.intp)
-    width, height = np.maximum(right - left, 0), np.maximum(bottom - top, 0)
+    a, b = ellipse[:, 2], ellipse[:, 3]
+    half = np.stack([np.hypot(a * cos, b * sin), np.hypot(a * sin, b * cos)], axis=1)
+    half += reach[:, None]
+    size = ratio.shape[::-1]
+    low = np.clip(np.ceil(ellipse[:, :2] - half), 0, size).astype(np.intp)
+    high = np.clip(np.floor(ellipse[:, :2] + half) + 1, 0, size).astype(np.intp)
     origin = np.round(ellipse[:, :2])
-    rings = []
-    for index in range(len(ellipse)):
-        step = 2 if thin and ellipse[index, 3] > _THIN_ABOVE_PX else 1
-        rings.append(
-            _ring(
-                ellipse[index],
-                origin[index],
-                np.arange(left[index], left[index] + width[index], step),
-                np.arange(top[index], top[index] + height[index], step),
-                float(reach[index]),
-            )
+    step = np.where(thin & (b > _THIN_ABOVE_PX), 2, 1)
+    rings = [
+        _ring(
+            ellipse[k],
+            origin[k],
+            np.arange(low[k, 0], high[k, 0], step[k]),
+            np.arange(low[k, 1], high[k, 1], step[k]),
+            float(reach[k]),
         )
+        for k in range(len(ellipse))
+    ]
     counts = np.array([len(ring[0]) for ring in rings], dtype=np.intp)
     u, v = (np.concatenate([ring[k] for ring in rings]) for k in (0, 1))
     start = (origin[:, 1] * columns + origin[:, 0]).astype(np.intp)
@@ -176,5 +174,4 @@ def unlike_rim(
     off = (mean > limit) & (mean * np.sqrt(count) > _UNLIKE_SIGMA) & (count > 1)
     off &= np.arange(rings) >= first_ring
     cut = np.where(np.any(off, axis=1), np.argmax(off, axis=1), rings).astype(np.float32)
-    unlike: Mask = depth > cut.take(sector) - spread(_MARGIN_SIGMA * sigma, pixels.counts)
-    return unlike
+    return np.asarray(depth > cut.take(sector) - spread(_MARGIN_SIGMA * sigma, pixels.counts))

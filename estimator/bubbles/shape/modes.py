@@ -1,9 +1,9 @@
-"""Where the volume's centre lies, given the outlines of two views: two accounts of the shape.
+"""Where the volume's centre lies, given the outlines of two views: two models of the shape.
 
 Both take the third-degree part of the body (even degrees leave the outlines' centres where the
-volume's is). `isotropic`: seven independent Gaussian coefficients; two views then tell all of the
-shift along the coordinate they share and nothing of the others. `zonal`: one mode, axisymmetric
-about the axis of a spheroid; all is told by its one amplitude.
+volume's is). `isotropic`: seven independent Gaussian coefficients; two views then determine the
+shift along the coordinate they share and leave the others open. `zonal`: one mode, axisymmetric
+about the axis of a spheroid; its one amplitude determines the whole shift.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Views:
-    """What M pairs of outlines say, about a point near the body.
+    """What M pairs of outlines measure, relative to a point near the body.
 
     measured : (M, 8): pixel residuals of the first and the second view (2 + 2) and the coefficients
     of cos 3 phi, sin 3 phi in both (2 + 2); noise : (M, 8, 8).  jacobian : (M, 8, 3) by the point
@@ -51,12 +51,12 @@ class Views:
 
 
 @dataclass(frozen=True)
-class Account:
-    """One account's answer.
+class Estimate:
+    """The estimate under one model of the shape.
 
     step_mm : (M, 3) from the point to the centre of volume; covariance_mm2 : (M, 3, 3);
     shift_px : (M, 4) expected displacement of the outlines' centres from the projected centre of
-    volume; log_evidence : (M,), comparable between accounts of the same `Views`.
+    volume; log_evidence : (M,), comparable between estimates from the same `Views`.
     """
 
     step_mm: Array
@@ -65,20 +65,20 @@ class Account:
     log_evidence: Array
 
 
-def isotropic(views: Views, frames: tuple[Array, Array]) -> Account:
+def isotropic(views: Views, frames: tuple[Array, Array]) -> Estimate:
     """frames : two (M, 3, 2), `EllipsePair.frames` of an ellipsoid that fits the outlines.
 
-    Across the shared coordinate, where this account knows nothing, the ellipses' centres are kept
-    as they are: to re-express them gains 1 % on average and loses 40 % for some modes.
+    Across the shared coordinate, where this model has no information, the ellipses' centres are
+    kept as they are: to re-express them gains 1 % on average and loses 40 % for some modes.
     """
     effect = third_degree_effect(views.axes_px, frames)
-    answer = _account(views, views.sigma[:, None, None] ** 2 * effect @ _t(effect))
+    answer = _estimate(views, views.sigma[:, None, None] ** 2 * effect @ _t(effect))
     blind, jacobian = views.blind_px(), views.jacobian[:, :4]
     back = np.linalg.solve(_t(jacobian) @ jacobian, _t(jacobian) @ blind[..., None])[..., 0]
     return replace(answer, step_mm=answer.step_mm - back, shift_px=answer.shift_px + blind)
 
 
-def zonal(views: Views, projections: tuple[Array, Array], axis_sigma: Array) -> Account:
+def zonal(views: Views, projections: tuple[Array, Array], axis_sigma: Array) -> Estimate:
     """The amplitude has the prior of `isotropic`'s root mean square: 7 sigma.
 
     projections : two (M, 2), where the pole appears in the outlines' unit circles.
@@ -92,7 +92,7 @@ def zonal(views: Views, projections: tuple[Array, Array], axis_sigma: Array) -> 
             moved[view] = projections[view] + axis_sigma[:, None] * direction
             change = _zonal_effect(views.axes_px, (moved[0], moved[1]))[..., None] - effect
             prior = prior + change @ _t(change)
-    return _account(views, (7 * views.sigma[:, None, None]) ** 2 * prior)
+    return _estimate(views, (7 * views.sigma[:, None, None]) ** 2 * prior)
 
 
 def uncorrected_covariance(
@@ -112,20 +112,22 @@ def uncorrected_covariance(
     return np.asarray(gain @ noise @ _t(gain) + by_shape @ _t(by_shape))
 
 
-def combine(accounts: list[Account], prior: Array) -> tuple[Account, Array]:
-    """Mean over accounts with their posterior probabilities (K, M), also returned; prior (K, M)."""
-    log_weight = np.stack([a.log_evidence for a in accounts]) + np.log(prior)
+def combine(estimates: list[Estimate], prior: Array) -> tuple[Estimate, Array]:
+    """Mean of K estimates by their posterior probabilities, and these (K, M); prior (K, M)."""
+    log_weight = np.stack([a.log_evidence for a in estimates]) + np.log(prior)
     top = log_weight.max(0)
     weight = np.exp(log_weight - top)
     total = weight.sum(0)
     weight /= total
-    steps = np.stack([a.step_mm for a in accounts])
+    steps = np.stack([a.step_mm for a in estimates])
     step = (weight[..., None] * steps).sum(0)
     apart = steps - step
-    second = np.stack([a.covariance_mm2 for a in accounts]) + apart[..., None] * apart[..., None, :]
+    second = (
+        np.stack([a.covariance_mm2 for a in estimates]) + apart[..., None] * apart[..., None, :]
+    )
     covariance = (weight[..., None, None] * second).sum(0)
-    shift = (weight[..., None] * np.stack([a.shift_px for a in accounts])).sum(0)
-    return Account(step, covariance, shift, top + np.log(total)), weight
+    shift = (weight[..., None] * np.stack([a.shift_px for a in estimates])).sum(0)
+    return Estimate(step, covariance, shift, top + np.log(total)), weight
 
 
 def third_degree_effect(axes_px: tuple[Array, Array], frames: tuple[Array, Array]) -> Array:
@@ -142,7 +144,7 @@ def _zonal_effect(axes_px: tuple[Array, Array], projections: tuple[Array, Array]
     return np.concatenate([*pixels, traces[0][1], traces[1][1]], -1)
 
 
-def _account(views: Views, prior: Array) -> Account:
+def _estimate(views: Views, prior: Array) -> Estimate:
     """Generalised least squares for the point, the shape being noise of covariance prior."""
     total = views.noise + prior
     inverse = np.linalg.inv(total)
@@ -153,7 +155,7 @@ def _account(views: Views, prior: Array) -> Account:
     misfit = _mv(inverse, views.measured) - _mv(_t(weighted), step)
     log_det = -np.linalg.slogdet(total)[1] - np.linalg.slogdet(normal)[1]
     log_evidence = 0.5 * (log_det - (views.measured * misfit).sum(-1))
-    return Account(step, covariance, _mv(prior, misfit)[:, :4], log_evidence)
+    return Estimate(step, covariance, _mv(prior, misfit)[:, :4], log_evidence)
 
 
 def _t(matrix: NDArray[Any]) -> Array:

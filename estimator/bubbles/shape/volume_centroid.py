@@ -1,7 +1,7 @@
 """The centre of a bubble's volume from its two outlines.
 
 An outline's centre is not the volume's: a third-degree shape mode of 5 % moves it by up to 4 % of
-the radius. The outline's own third harmonics tell part of that, see `body_modes` and
+the radius. The outline's own third harmonics give part of that shift, see `modes` and
 docs/decisions/007-volume-centroid.md.
 """
 
@@ -15,22 +15,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.shape import modes
-from telerig.estimator.bubbles.shape.ellipsoids import BodyShapes, body_shapes
 from telerig.estimator.bubbles.shape.modes import Views
 from telerig.estimator.bubbles.shape.outlines import Outlines, outlines_from_table
 from telerig.rig import silhouette
 from telerig.rig.camera import Camera
+from telerig.rig.silhouette import EllipsePair
 from telerig.rig.triangulation import stacked_jacobian, triangulate
 
 Array = NDArray[np.float64]
 
 DEFAULT_SHAPE_SIGMA = (0.005, 0.004)
 _ZONAL_SHARE = 0.2  # prior probability of a shape that is axisymmetric about the spheroid's axis
-_KNOWN_AXIS = 0.15  # rad: beyond this uncertainty of the axis that account is left out
+_KNOWN_AXIS = 0.15  # rad: beyond this uncertainty of the axis that shape model is left out
 _RUN_WEIGHT = 4.0  # harmonics' worth of the run's shape_sigma against a bubble's own four
 _DEFAULT_WEIGHT = 0.05  # in bubbles, of DEFAULT_SHAPE_SIGMA in what a run learns
 _LARGEST_SIGMA = 0.03  # one bubble's share in what a run learns
 _MODEL_ERROR, _CROSS_TERM = 0.02, 8.0  # second order: of the third harmonic, times the fourth
+_LEAST_COUPLING, _LARGEST_COUPLING = 0.01, 0.9
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def fit_bodies(
     _fill_points(bodies, outlines, cameras, located)
     located = bodies.used == "silhouettes"
     shaped = located & outlines[0].shaped & outlines[1].shaped
-    shaped[shaped] = _meet(bodies.silhouette_points_mm[shaped], outlines, cameras, shaped)
+    shaped[shaped] = _inside_both(bodies.silhouette_points_mm[shaped], outlines, cameras, shaped)
     whole = shaped & outlines[0].whole & outlines[1].whole
     for rows, correct in ((whole, True), (shaped & ~whole, False)):
         if np.any(rows):
@@ -190,13 +191,13 @@ def _fill_points(
     bodies.used[np.isfinite(bodies.covariance_mm2).all((1, 2))] = "silhouettes"
 
 
-def _meet(
+def _inside_both(
     points_mm: Array,
     outlines: tuple[Outlines, Outlines],
     cameras: tuple[Camera, Camera],
     rows: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """(M,) the triangulated point is seen inside both outlines: they may be one body's."""
+    """(M,) whether the triangulated point appears inside both outlines, as of one body."""
     pixels, _, _ = stacked_jacobian(cameras, points_mm)
     pair = [o.rows(rows) for o in outlines]
     gap = np.concatenate([o.uv_px for o in pair], -1) - pixels
@@ -217,7 +218,7 @@ def _fill_shapes(
     """Sizes; the centres of volume, or else what the shape adds to the outlines' centres' error."""
     pixels, jacobian, _ = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
     axes_px = (pair[0].axes_px, pair[1].axes_px)
-    shapes = body_shapes((jacobian[:, :2], jacobian[:, 2:]), axes_px)
+    shapes = _ellipsoids((jacobian[:, :2], jacobian[:, 2:]), axes_px)
     squares = np.linalg.eigvalsh(shapes.moments_mm2)
     bodies.semi_axes_mm[rows] = np.sqrt(squares[:, ::-1])
     bodies.d_eq_mm[rows], bodies.d_eq_sd_mm[rows] = _diameter(shapes, pair, sigma)
@@ -225,21 +226,21 @@ def _fill_shapes(
         _correct(bodies, pair, shapes, pixels, jacobian, rows, sigma, gap_sigma_px)
     else:
         bodies.covariance_mm2[rows] = modes.uncorrected_covariance(
-            _pixel_noise(pair), jacobian, axes_px, shapes.pair.frames(shapes.coupling), sigma[0]
+            _pixel_noise(pair), jacobian, axes_px, shapes.pair.frames(shapes.couplings[0]), sigma[0]
         )
 
 
 def _correct(
     bodies: Bodies,
     pair: tuple[Outlines, Outlines],
-    shapes: BodyShapes,
+    shapes: _Ellipsoids,
     pixels: Array,
     jacobian: Array,
     rows: NDArray[np.int64],
     sigma: Array,
     gap_sigma_px: float,
 ) -> None:
-    """Centres of volume: every account of the shape, weighted by its evidence."""
+    """Centres of volume: every shape model, weighted by its evidence."""
     measured, noise, conversion = _measured(pair, pixels)
     shared = _images(jacobian, (shapes.pair.shared, shapes.pair.shared))
     noise[:, :4, :4] += _gap_covariance(shared, gap_sigma_px)
@@ -254,15 +255,12 @@ def _correct(
         _images(jacobian, shapes.pair.sides),
         shared,
     )
-    accounts, shares = [], []
-    for coupling, share in shapes.couplings():
-        accounts.append(modes.isotropic(views, shapes.pair.frames(coupling)))
-        shares.append(share)
     axis_sigma = _axis_sigma(shapes, pair, sigma)
-    accounts.append(modes.zonal(views, shapes.poles, axis_sigma))
+    estimates = [modes.isotropic(views, shapes.pair.frames(c)) for c in shapes.couplings]
+    estimates.append(modes.zonal(views, shapes.poles, axis_sigma))
     zonal_share = np.where(axis_sigma < _KNOWN_AXIS, _ZONAL_SHARE, 1e-9)
-    prior = np.stack([*((1 - zonal_share) * p for p in shares), zonal_share])
-    answer, weight = modes.combine(accounts, prior)
+    prior = np.stack([(1 - zonal_share) * 0.5, (1 - zonal_share) * 0.5, zonal_share])
+    answer, weight = modes.combine(estimates, prior)
     correction = conversion - answer.shift_px
     bodies.points_mm[rows] = bodies.silhouette_points_mm[rows] + answer.step_mm
     bodies.covariance_mm2[rows] = answer.covariance_mm2
@@ -276,6 +274,44 @@ def _gap_covariance(shared: tuple[Array, Array], gap_sigma_px: float) -> Array:
     left, right = (image / np.linalg.norm(image, axis=-1, keepdims=True) for image in shared)
     apart = np.concatenate([left, -right], -1) / 2
     return gap_sigma_px**2 * apart[:, :, None] * apart[:, None, :]
+
+
+@dataclass(frozen=True)
+class _Ellipsoids:
+    """The ellipsoids that M pairs of outlines allow.
+
+    pair : their ellipses in mm.  moments_mm2, oblate_mm2 : (M, 3, 3) A A^T of the most spherical
+    ellipsoid and of the nearest oblate spheroid; couplings : two (M,), theirs (`EllipsePair`);
+    coupling_sigma : (M,) uncertainty of the first.  poles : two (M, 2), where the spheroid's pole
+    appears in the outlines' unit circles.
+    """
+
+    pair: EllipsePair
+    moments_mm2: Array
+    oblate_mm2: Array
+    couplings: tuple[Array, Array]
+    coupling_sigma: Array
+    poles: tuple[Array, Array]
+
+
+def _ellipsoids(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> _Ellipsoids:
+    """jacobians : two (M, 2, 3), px per mm.  axes_px : two (M, 2, 2), columns are semi-axes."""
+    pair = silhouette.ellipse_pair(jacobians, axes_px)
+    moments = silhouette.most_spherical(pair)
+    pole, oblate = silhouette.oblate_spheroid(pair)
+    poles = [
+        np.asarray(np.linalg.solve(a, j @ pole[..., None])[..., 0])
+        for a, j in zip(axes_px, jacobians)
+    ]
+    # The coupling is as large as the four like numbers of the anisotropy that are seen.
+    logs = np.log(np.linalg.eigvalsh(moments))
+    seen = ((logs - logs.mean(-1, keepdims=True)) ** 2).sum(-1)
+    round_, flat = (
+        np.clip(pair.coupling_of(m), -_LARGEST_COUPLING, _LARGEST_COUPLING)
+        for m in (moments, oblate)
+    )
+    sigma = np.sqrt(seen / 8 + _LEAST_COUPLING**2)
+    return _Ellipsoids(pair, moments, oblate, (round_, flat), sigma, (poles[0], poles[1]))
 
 
 def _images(jacobian: Array, directions: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -327,7 +363,7 @@ def _own_sigma(pair: tuple[Outlines, Outlines], sigma: float) -> Array:
 
 
 def _diameter(
-    shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: Array
+    shapes: _Ellipsoids, pair: tuple[Outlines, Outlines], sigma: Array
 ) -> tuple[Array, Array]:
     """(M,) volume's diameter and its standard deviation.
 
@@ -344,7 +380,7 @@ def _diameter(
     return diameter, diameter * np.sqrt(relative2)
 
 
-def _axis_sigma(shapes: BodyShapes, pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
+def _axis_sigma(shapes: _Ellipsoids, pair: tuple[Outlines, Outlines], sigma: Array) -> Array:
     """(M,) how well a spheroid's axis is known: errors of the ellipses over its flatness."""
     squares = np.linalg.eigvalsh(shapes.oblate_mm2)
     flatness = 1 - squares[:, 0] / squares[:, 2]

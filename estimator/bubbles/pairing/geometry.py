@@ -24,7 +24,7 @@ from telerig.estimator.bubbles.outline.detection_table import (
     columns,
     flag_words,
 )
-from telerig.estimator.bubbles.outline.ellipse_geometry import points_on
+from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
@@ -188,8 +188,11 @@ def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
     shaped = np.isfinite(harmonics).all(1)
     if shaped.any():
         phi = 2 * np.pi * np.arange(_OUTLINE_SAMPLES) / _OUTLINE_SAMPLES
-        centred = np.stack([np.zeros_like(a), np.zeros_like(a), a, b, angle], -1)[shaped]
-        profile = (points_on(centred, harmonics[shaped], phi) @ across[shaped, :, None])[..., 0]
+        cosine, sine = np.cos(phi), np.sin(phi)
+        a, b, along, beside = (v[shaped, None] for v in (a, b, along, beside))
+        normal = (b * cosine * along + a * sine * beside) / np.hypot(b * cosine, a * sine)
+        waves = np.stack([f(k * phi) for k in HARMONICS for f in (np.cos, np.sin)])
+        profile = a * cosine * along + b * sine * beside + normal * (harmonics[shaped] @ waves)
         top, bottom = _peak(profile), -_peak(-profile)
         middle[shaped], half[shaped] = (top + bottom) / 2, (top - bottom) / 2
     return middle, half

@@ -125,7 +125,7 @@ def test_what_was_watched_is_what_a_plain_calibration_finds(
     for name in views(paper_images)[:6]:
         arrive(paper_images, empty, name)
     with watching(empty, until_um=10.0) as it:
-        it.wait_for("enough, 10 um were asked for")
+        it.wait_for("enough, 10 µm were asked for")
         until(lambda: not it.thread.is_alive(), "the end")
     assert it.lines[-1].startswith("6 complete views") and len(it.lines) == 1
     plain = telerig.calibrate(load_dataset(empty), model="radial")

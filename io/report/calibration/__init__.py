@@ -1,1 +1,4 @@
-"""The page of a calibration, from its results folder alone. Read ``report`` first."""
+"""The page of a calibration: tables, figures, target shape, one dot, rig and next view.
+
+In: calibration.json, residuals.csv and what lies beside them. Out: report.html. Read ``report``.
+"""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.io.report.calibration.results import CalibrationResults
-from telerig.io.report.calibration.rig import common_plane, draw_plan
+from telerig.io.report.calibration.rig import common_plane, draw_plan, plate_corners
 from telerig.io.report.page.figures import (
     MODEL,
     MUTED,
@@ -38,12 +38,7 @@ def next_pictures(results: CalibrationResults) -> list[Picture]:
 
 def _corners(results: CalibrationResults) -> Array:
     """(4, 3) of the plate in the target's frame, half a spacing round the dots."""
-    xy = results.points_mm[:, :2]
-    low, high = xy.min(0), xy.max(0)
-    low, high = (low - (m := float((high - low).max()) / 12), high + m)
-    return np.array(
-        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
-    )
+    return plate_corners(results.points_mm, margin=1 / 12)
 
 
 def _moved(pose: Array, points_mm: Array) -> Array:

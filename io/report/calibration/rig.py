@@ -46,16 +46,21 @@ class RigOutline:
 
 def rig_outline(results: CalibrationResults) -> RigOutline:
     """Everything that the drawings show, in the rig frame (mm)."""
-    low, high = results.points_mm[:, :2].min(axis=0), results.points_mm[:, :2].max(axis=0)
-    plate = np.array(
-        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
-    )
+    plate = plate_corners(results.points_mm)
     poses = list(results.views.values())
     plates = np.array([pose.apply(plate) for pose in poses]).reshape(-1, 4, 3)
     dots = np.array([pose.apply(results.points_mm) for pose in poses])
     dots = dots.reshape(len(poses), -1, 3)
     cameras = tuple(_camera_outline(camera, plates.reshape(-1, 3)) for camera in results.cameras)
     return RigOutline(cameras, tuple(results.views), plates, dots)
+
+
+def plate_corners(points_mm: Array, margin: float = 0.0) -> Array:
+    """(4, 3) of the rectangle round dots (N, 3) in the target's frame, widened by a share of it."""
+    low, high = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
+    wider = margin * float((high - low).max())
+    (x0, y0), (x1, y1) = low - wider, high + wider
+    return np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
 
 
 def common_plane(results: CalibrationResults) -> Array:

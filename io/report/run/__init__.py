@@ -1,2 +1,4 @@
-"""The page of a run, tracked and perhaps smoothed, from its results folder alone. Read
-``report`` first."""
+"""The page of a run: its tracking, and its smoothing if there is one.
+
+In: a tracked run's results folder. Out: report.html. Read ``report`` first.
+"""

@@ -140,9 +140,9 @@ def predicted_sd(results: TrackResults) -> Picture:
         source = svg(figure)
     beyond = int(np.sum((sd > edges[-1]).any(axis=1)))
     caption = (
-        "What the outlines' noise and the doubt about the shape make of the position, per rig "
-        "axis; the legend has the medians. The calibration's share is common to all points and "
-        f"not counted. {number(beyond)} points lie beyond the plot."
+        "Standard deviation of the position from the noise of the outlines and the unknown shape "
+        "of the bubble, per rig axis; the legend gives the medians. The calibration's share is "
+        f"common to all points and is not included. {number(beyond)} points lie beyond the plot."
     )
     return Picture("Predicted standard deviation", source, caption)
 
@@ -309,19 +309,19 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
     place, miss = place[good], miss[good]
     step = len(miss) // _MOST_MARKS + 1
     reach = _reach(miss, _predicted_um(results))
-    middles, medians, doubt = _steps(place, miss)
+    middles, medians, error = _steps(place, miss)
     with drawing(2.9) as (figure, axes):
         axes.axhline(0, color=MUTED, linewidth=0.8)
         axes.plot(place[::step], miss[::step], ".", color=camera_colour(0), alpha=0.5,
                   markersize=2.5 if len(miss) > 1000 else 5, markeredgewidth=0)  # fmt: skip
-        axes.errorbar(middles, medians, doubt, color=MODEL, fmt="o-", markersize=3.5, linewidth=1.2,
+        axes.errorbar(middles, medians, error, color=MODEL, fmt="o-", markersize=3.5, linewidth=1.2,
                       label="median of a step")  # fmt: skip
         axes.set(xlabel=f"{name} / mm", ylabel="ray miss / µm", ylim=(-reach, 1.2 * reach))
         axes.legend(loc="upper right")
         source = png(figure, colours=SHADES) if len(miss) > 1000 else svg(figure)
     caption = (
         "The red line should lie on zero. A constant offset, a slope or a bow along it is the "
-        f"calibration's fault, not the bubbles'. {_worst_step(medians, doubt)}"
+        f"calibration error, not an effect of the bubbles. {_worst_step(medians, error)}"
     )
     return Picture(f"Ray miss against {name}", source, caption)
 
@@ -337,12 +337,12 @@ def _steps(place: Array, miss: Array) -> tuple[Array, Array, Array]:
     return middles, medians, np.array(error)
 
 
-def _worst_step(medians: Array, doubt: Array) -> str:
+def _worst_step(medians: Array, error: Array) -> str:
     if not len(medians):
         return "There are too few points for it."
     worst = int(np.argmax(np.abs(medians)))
-    most, error = abs(float(medians[worst])), float(doubt[worst])
-    return f"It strays by up to {number(most, 2)} ± {number(error, 1)} µm."
+    most, sd = abs(float(medians[worst])), float(error[worst])
+    return f"It strays by up to {number(most, 2)} ± {number(sd, 1)} µm."
 
 
 def seen_where(results: TrackResults, index: int) -> Picture:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.estimator.calibration.calibrate import CalibrationRun
-from telerig.io.files.atomic import atomic_folder, write_json_atomic
-from telerig.io.files.provenance import run_record
+from telerig.io.files.atomic import atomic_folder, plain, write_json_atomic
 from telerig.io.machine.parallel import Assistant, assistant
+from telerig.io.results.calibration import ComparisonFile
+from telerig.io.results.run_record import run_record
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.quality.comparison import RigComparison
@@ -107,7 +108,8 @@ def write_results(
         write_json_atomic(staged / "run.json", record)
         if change is not None:
             compared = {"earlier": options.get("compare"), **change.as_dict()}
-            write_json_atomic(staged / "comparison.json", compared)
+            file = staged / "comparison.json"
+            ComparisonFile.of(plain(compared), file).write(file)
         if len(run.calibration.cameras) == 2:
             write_uncertainty(run.calibration, staged / "uncertainty.npz")
         if run.detected is not None:

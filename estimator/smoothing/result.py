@@ -18,13 +18,12 @@ from telerig.estimator.smoothing.graph.stage_travel import (
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
+from telerig.io.results.smoothing import SmoothingFile
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-
-SMOOTHING_SCHEMA = 1
 
 
 @dataclass(frozen=True)
@@ -45,13 +44,13 @@ class Smoothing:
 
     def save(self, folder: str | Path) -> None:
         """Write trajectories.csv, shake.csv, smoothing.json and results.h5."""
-        from telerig.io.files.atomic import write_json_atomic
         from telerig.io.files.csv_table import write_table
 
         out = Path(folder)
         write_table(self.trajectories, out / "trajectories.csv")
         write_table(self.shake, out / "shake.csv")
-        write_json_atomic(out / "smoothing.json", {**self.verdict, **self.summary})
+        file = out / "smoothing.json"
+        SmoothingFile.of({**self.verdict, **self.summary}, file).write(file)
         write_hdf5(self, out / "results.h5")
 
 
@@ -61,7 +60,7 @@ def summary_of(solution: Solution) -> dict[str, Any]:
     problem, model = frame.problem, frame.model
     names = [c.name for c in problem.cameras]
     return {
-        "schema": SMOOTHING_SCHEMA,
+        "schema": SmoothingFile.SCHEMA,
         "cameras": names,
         "frames": len(problem.t_s),
         "bubbles": len(problem.bubbles),
@@ -73,6 +72,7 @@ def summary_of(solution: Solution) -> dict[str, Any]:
             n: f"along its depth, {_direction(c.camera_from_rig.rotation[2])} in rig axes"
             for n, c in zip(names, problem.cameras)
         },
+        "depth_axes": {n: c.camera_from_rig.rotation[2] for n, c in zip(names, problem.cameras)},
         "residuals": {
             "bubbles": _residuals(solution, 0),
             "references": _residuals(solution, 1),
@@ -202,5 +202,5 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
             arrays |= {"shake_covariance": found.shake, "bubble_covariance": found.bubbles}
         for name, array in arrays.items():
             states.create_dataset(name, data=array, compression="gzip")
-        file.attrs["schema"] = SMOOTHING_SCHEMA
+        file.attrs["schema"] = SmoothingFile.SCHEMA
         file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.tracking.detection import read_batch
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
-from telerig.io.files.provenance import run_record
+from telerig.io.results.run_record import RunFile, run_record
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -70,8 +69,8 @@ def smooth_run(
     )  # fmt: skip
     tracked = source.parent / "run.json"
     if tracked.is_file():
-        before = json.loads(tracked.read_bytes())
-        record["tracks"] = before.get("tracks", before)
+        before = RunFile.read(tracked)
+        record["tracks"] = before.tracks or before.content()
     with atomic_folder(folder) as staged:
         found.save(staged)
         write_json_atomic(staged / "run.json", record)

@@ -31,8 +31,9 @@ from telerig.estimator.tracking.track import (
 from telerig.estimator.tracking.tracks import events_table
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.files.csv_table import write_table
-from telerig.io.files.provenance import run_record
 from telerig.io.machine.parallel import ordered_map, quick_workers
+from telerig.io.results.run_record import run_record
+from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,7 +104,7 @@ def write_tracking(
         counts, worst = _write_rows(stream, staged, pairs)
         summary = summary_of(run, calibration, stream, counts, pairs.found())
         summary["worst_frames"] = worst.frames()
-        write_json_atomic(staged / "tracking.json", summary)
+        TrackingFile.of(summary, folder / "tracking.json").write(staged / "tracking.json")
         write_table(events_table(stream.events), staged / "events.csv")
         table = stream.followed.table if stream.followed is not None else None
         if table is not None:

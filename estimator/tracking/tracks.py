@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
 from telerig.estimator.tracking.detection import read_batch
+from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,7 +42,6 @@ class Tracks:
 
     def save(self, folder: str | Path) -> None:
         """Write detections.csv, tracks.csv, events.csv, tracking.json; references.csv if any."""
-        from telerig.io.files.atomic import write_json_atomic
         from telerig.io.files.csv_table import write_table
 
         out = Path(folder)
@@ -51,7 +51,8 @@ class Tracks:
             )
         if self.references is not None:
             write_table(self.references, out / "references.csv")
-        write_json_atomic(out / "tracking.json", dict(self.summary))
+        file = out / "tracking.json"
+        TrackingFile.of(self.summary, file).write(file)
 
 
 def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
@@ -67,14 +68,12 @@ def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
 
 def load_tracks(folder: str | Path) -> Tracks:
     """Read what `telerig track` wrote. Raises InputError when it is not there."""
-    import json
-
     place = Path(folder)
     files = [place / n for n in ("detections.csv", "tracks.csv", "events.csv", "tracking.json")]
     for file in files:
         if not file.is_file():
             raise InputError(f"there is no {file.name}", where=str(place), todo="run telerig track")
-    summary = json.loads(files[3].read_text(encoding="utf-8"))
+    summary = TrackingFile.read(files[3]).content()
     detections, table, events = (read_batch(file) for file in files[:3])
     marks = place / "references.csv"
     references = read_batch(marks) if marks.is_file() else None

@@ -81,7 +81,7 @@ def _content(cameras: tuple[Camera, ...], views: dict[str, Pose]) -> dict[str, A
                        "axes_angle_sd_deg": 6.9e-4, "space_sd_um": 0.51, "noise_floor_px": 0.0},
         "diagnostics": {"weak": ["depth scale of the right camera is weak"]},
         "notes": ["a note"],
-        "stage": {"scale_ppm": 52.0},
+        "stage": {},
     }  # fmt: skip
 
 

@@ -10,10 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.errors import CalibrationError
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.calibration.result.summary import summary
 from telerig.estimator.calibration.solver.covariance import point_shift_jacobian, rig_jacobian
+from telerig.io.files.atomic import atomic_path
+from telerig.io.files.csv_table import write_table
+from telerig.io.results.calibration import (
+    CalibrationFile,
+    CameraRecord,
+    PoseRecord,
+    read_joint_covariance,
+    write_joint_covariance,
+)
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
+from telerig.rig.projection import PARAMETERS
 from telerig.rig.triangulation import Triangulation, pixel_covariance, triangulate
 
 Array = NDArray[np.float64]
@@ -142,22 +153,99 @@ class Calibration:
 
     def report(self) -> str:
         """A summary in plain words."""
-        from telerig.estimator.calibration.result.summary import summary
+        return summary(self.record())
 
-        return summary(self)
+    def record(self) -> CalibrationFile:
+        """The content of calibration.json."""
+        content = {
+            "schema": CalibrationFile.SCHEMA,
+            "kind": CalibrationFile.KIND,
+            "name": self.name,
+            "pixel_origin": "centre",
+            "units": {"length": "mm", "image": "px", "angle": "rad unless the name ends in _deg"},
+            "gauge": self.diagnostics.get("gauge", ""),
+            "medium": self.medium,
+            "verdict": dict(self.verdict),
+            "cameras": {c.name: self._camera_record(c, f) for c, f in zip(self.cameras, self.free)},
+            "walls": {c.name: c.wall.as_dict() for c in self.cameras if c.wall is not None},
+            "target": {"dots": self.dot_ids, "points_mm": self.target_points_mm},
+            "views": {view: PoseRecord.of_pose(pose) for view, pose in self.target_poses.items()},
+            "covariance": {"names": self.covariance_names, "matrix": self.covariance},
+            "model": dict(self.model),
+            "stage": dict(self.stage),
+            "twin": dict(self.twin),
+            "statistics": dict(self.statistics),
+            "diagnostics": dict(self.diagnostics),
+            "notes": self.notes,
+        }
+        return CalibrationFile.model_validate(content)
+
+    def _camera_record(self, camera: Camera, free: tuple[str, ...]) -> CameraRecord:
+        deviations = {n: self.sd(f"{camera.name}.{n}") for n in free}
+        return CameraRecord(
+            image_size_px=camera.image_size_px,
+            rho_mm=camera.rho_mm,
+            parameters={p: camera[p] for p in PARAMETERS},
+            free=free,
+            standard_deviations={n: s if np.isfinite(s) else None for n, s in deviations.items()},
+            camera_from_rig=PoseRecord.of_pose(camera.camera_from_rig),
+        )
 
     def save(self, path: str | Path) -> None:
         """Write calibration.json, covariance.npz, dots.csv and residuals.csv into a folder.
 
         A path that ends in ``.json`` writes that file, and covariance.npz beside it.
         """
-        from telerig.estimator.calibration.result.files import save_calibration
-
-        save_calibration(self, Path(path))
+        place = Path(path)
+        alone = place.suffix == ".json"
+        folder = place.parent if alone else place
+        folder.mkdir(parents=True, exist_ok=True)
+        self.record().write(place if alone else folder / "calibration.json")
+        if self.joint_names:
+            with atomic_path(folder / "covariance.npz") as temporary:
+                write_joint_covariance(temporary, self.joint_names, self.joint_covariance)
+        else:
+            (folder / "covariance.npz").unlink(missing_ok=True)
+        for name, table in (("dots.csv", self.dots), ("residuals.csv", self.residuals)):
+            if table is not None and not alone:
+                write_table(table, folder / name)
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read ``calibration.json`` (or its folder), with covariance.npz if it is there."""
-    from telerig.estimator.calibration.result.files import read_calibration
+    """Read ``calibration.json`` (or its folder), with covariance.npz if it lies beside.
 
-    return read_calibration(Path(path))
+    Raises InputError when a file is missing, is not what telerig wrote, or is of a newer schema.
+    """
+    place = Path(path)
+    file = place / "calibration.json" if place.is_dir() else place
+    record = CalibrationFile.read(file)
+    if record.covariance is None:
+        raise InputError("has no covariance", where=str(file), todo=CalibrationFile.AGAIN)
+    names, joint = read_joint_covariance(file.parent / "covariance.npz")
+    rig = record.covariance.matrix
+    if names and not np.allclose(joint[: len(rig), : len(rig)], rig, rtol=1e-9, atol=0):
+        raise InputError(
+            "this covariance belongs to another calibration than the calibration.json beside it",
+            where=str(file.parent / "covariance.npz"),
+            todo="copy both files together, or delete this one",
+        )
+    return Calibration(
+        cameras=record.rig_cameras(behind_walls=True),
+        dot_ids=record.target.dots,
+        target_points_mm=record.target.points_mm,
+        target_poses={view: pose.pose() for view, pose in record.views.items()},
+        covariance=rig,
+        covariance_names=record.covariance.names,
+        free=tuple(camera.free for camera in record.cameras.values()),
+        name=record.name,
+        verdict=record.verdict.content(),
+        statistics=record.statistics,
+        twin=record.twin.content(),
+        model=record.model.content(),
+        diagnostics=record.diagnostics.content(),
+        notes=record.notes,
+        stage={} if record.stage is None else record.stage.content(),
+        medium=record.medium,
+        joint_names=names,
+        joint_covariance=joint,
+    )

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.io.results.calibration import CalibrationFile
 
 
-def summary(calibration: Calibration) -> str:
+def summary(calibration: CalibrationFile) -> str:
     """Verdict first, then residuals, cameras with standard deviations, twin, warnings."""
     s = calibration.statistics
     if "views" not in s:
         return _imported(calibration)
-    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.get('status', '?')}"]
-    lines += [f"  ! {reason}" for reason in calibration.verdict.get("reasons", [])]
+    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.status}"]
+    lines += [f"  ! {reason}" for reason in calibration.verdict.reasons]
     lines.append(
         f"  {s['views']} views, {s['dots_kept']} of {s['dots_measured']} dots kept "
         f"({s['share_kept']:.1%}), residual {s['rms_px']:.4f} px RMS per coordinate, "
@@ -25,13 +22,13 @@ def summary(calibration: Calibration) -> str:
             f"  the dots scatter by {s['noise_floor_px']:.4f} px beyond their image noise of "
             f"{s['image_noise_px']:.4f} px (print, compression or lens); it is in every covariance"
         )
-    lines.append(f"  model {calibration.model['words']}")
-    for camera, free in zip(calibration.cameras, calibration.free):
+    lines.append(f"  model {calibration.model.words}")
+    for camera_name, camera in calibration.cameras.items():
         parts = [
-            f"{name} {camera[name]:.6g} +- {calibration.sd(f'{camera.name}.{name}'):.2g}"
-            for name in free
+            f"{name} {camera.parameters[name]:.6g} +- {deviation or 0.0:.2g}"
+            for name, deviation in camera.standard_deviations.items()
         ]
-        lines.append(f"  camera {camera.name}: " + ", ".join(parts))
+        lines.append(f"  camera {camera_name}: " + ", ".join(parts))
     if "axes_angle_deg" in s:
         lines.append(
             f"  angle between the axes {s['axes_angle_deg']:.4f} +- {s['axes_angle_sd_deg']:.2g} "
@@ -43,35 +40,36 @@ def summary(calibration: Calibration) -> str:
             f"from {s['scatter_px']:.3g} px is good to {s['space_sd_um']:.2f} um per axis"
         )
     lines += _trust(calibration)
-    advice = calibration.diagnostics.get("next_view") or {}
+    advice = calibration.diagnostics.next_view
     lines += [f"  {advice['words']}"] if advice else []
     t = calibration.twin
     lines.append(
-        f"  mirror twin: cost {t['cost']:.9g} kept, {t['other_cost']:.9g} for the other; "
-        f"decided by {t['decided_by']}: {t['words']}"
+        f"  mirror twin: cost {t.cost:.9g} kept, {t.other_cost:.9g} for the other; "
+        f"decided by {t.decided_by}: {t.words}"
     )
-    lines += [f"  stage: {word}" for word in calibration.stage.get("notes", ())]
-    said = calibration.verdict.get("reasons", [])
-    notes = (*calibration.notes, *calibration.diagnostics["weak"])
+    if calibration.stage is not None:
+        lines += [f"  stage: {word}" for word in calibration.stage.notes]
+    said = calibration.verdict.reasons
+    notes = (*calibration.notes, *calibration.diagnostics.weak)
     lines += [f"  note: {note}" for note in notes if note not in said]
     return "\n".join(lines)
 
 
-def _trust(calibration: Calibration) -> list[str]:
+def _trust(calibration: CalibrationFile) -> list[str]:
     """What halves of the views and the residuals say of the stated uncertainty."""
-    halves = calibration.diagnostics.get("halves") or {}
-    structure = calibration.diagnostics.get("structure") or {}
+    halves = calibration.diagnostics.halves
+    structure = calibration.diagnostics.structure
     lines = [f"  {'' if halves.get('agree', True) else '! '}{halves['words']}"] if halves else []
     mark = "" if structure.get("sound", True) else "! "
     return lines + [f"  {mark}{words}" for words in structure.get("words", ())]
 
 
-def _imported(calibration: Calibration) -> str:
+def _imported(calibration: CalibrationFile) -> str:
     """Of cameras that were not calibrated here: what they are, and the notes."""
-    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.get('status', '?')}"]
-    for camera in calibration.cameras:
+    lines = [f"Calibration {calibration.name!r}: {calibration.verdict.status}"]
+    for name, camera in calibration.cameras.items():
         lines.append(
-            f"  camera {camera.name}: {camera['scale_px_per_mm']:.6g} px/mm, "
-            f"kappa {camera['kappa_per_mm']:.4g} per mm"
+            f"  camera {name}: {camera.parameters['scale_px_per_mm']:.6g} px/mm, "
+            f"kappa {camera.parameters['kappa_per_mm']:.4g} per mm"
         )
     return "\n".join(lines + [f"  note: {note}" for note in calibration.notes])

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_table
+from telerig.io.results.smoothing import SmoothingFile
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,14 +87,9 @@ def _whole_particles(points: pd.DataFrame) -> pd.DataFrame:
 def _verdict(file: Path) -> str:
     if not file.is_file():
         return ""
-    try:
-        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"cannot be read ({error})", where=str(file), todo="run `telerig smooth` again"
-        ) from error
-    flags = ", ".join(str(flag) for flag in found.get("flags", []))
-    return str(found.get("verdict", "")) + (f" ({flags})" if flags else "")
+    found = SmoothingFile.read(file)
+    flags = ", ".join(found.flags)
+    return (found.verdict or "") + (f" ({flags})" if flags else "")
 
 
 def unit_of(column: str) -> str:

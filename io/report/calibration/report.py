@@ -78,7 +78,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "notes": content.get("notes") or [],
         "absent": results.absent,
         "trust_words": _trust_words(results),
-        "comparison": results.comparison,
+        "comparison": results.comparison.content(),
         "advice": (content.get("diagnostics") or {}).get("next_view") or {},
         "dots_drawn": dots_are_drawn(results),
     }

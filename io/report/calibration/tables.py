@@ -153,27 +153,21 @@ def pose_rows(results: CalibrationResults) -> list[Row]:
     ]  # fmt: skip
 
 
-_STAGE = {
-    "axis", "axis_covariance_rad2", "encoder_scale", "encoder_scale_sd", "wander_sigma_mm",
-    "position_sigma_mm",
-}  # fmt: skip
-
-
 def stage_rows(results: CalibrationResults) -> list[Row]:
     """Travel axis and encoder scale from `stage_axis/`; empty without it."""
-    stage = results.content.get("stage") or {}
-    if not _STAGE.issubset(stage):
+    stage = results.file.stage
+    if stage is None or stage.axis_covariance_rad2 is None:
         return []
-    tilts = np.sqrt(np.diagonal(np.array(stage["axis_covariance_rad2"], float)))
-    scale, sd = (1e6 * float(stage[key]) for key in ("encoder_scale", "encoder_scale_sd"))
-    across, along = (1e3 * float(stage[f"{k}_sigma_mm"]) for k in ("wander", "position"))
+    tilts = np.degrees(np.sqrt(np.diagonal(stage.axis_covariance_rad2)))
+    scale = with_sd(1e6 * stage.encoder_scale, 1e6 * (stage.encoder_scale_sd or 0.0))
+    across, along = (1e3 * (s or 0.0) for s in (stage.wander_sigma_mm, stage.position_sigma_mm))
     return [
-        Row(("direction of travel in the rig frame", _fixed(stage["axis"], 6))),
-        Row(("sd of its two tilts (°)", _fixed(_degrees([float(t) for t in tilts]), 5))),
-        Row(("encoder reads too much (ppm of the travel)", with_sd(scale, sd)), True),
+        Row(("direction of travel in the rig frame", _fixed(stage.axis.tolist(), 6))),
+        Row(("sd of its two tilts (°)", _fixed(tilts.tolist(), 5))),
+        Row(("encoder reads too much (ppm of the travel)", scale), True),
         Row(("scatter of the readings along the axis (µm)", number(along, 2))),
         Row(("the carriage's wander across it (µm)", number(across, 2))),
-        Row(("chi² per degree of freedom of the dots", number(stage.get("chi2_dof"), 3))),
+        Row(("chi² per degree of freedom of the dots", number(stage.chi2_dof, 3))),
     ]
 
 
@@ -288,12 +282,11 @@ def worst_rows(results: CalibrationResults) -> list[Row]:
 def change_rows(results: CalibrationResults) -> list[Row]:
     """Of comparison.json: each quantity, its change with standard deviation, in deviations."""
     rows = []
-    for change in results.comparison.get("changes") or []:
-        deviations = change.get("deviations")
+    for change in results.comparison.changes:
         cells = (
-            str(change["quantity"]),
-            f"{with_sd(change['change'], change['sd'])} {change['unit']}",
-            f"{deviations:.1f}" if is_number(deviations) else ABSENT,
+            change.quantity,
+            f"{with_sd(change.change, change.sd)} {change.unit}",
+            ABSENT if change.deviations is None else f"{change.deviations:.1f}",
         )
-        rows.append(Row(cells, strong=is_number(deviations) and abs(deviations) > _MANY_SD))
+        rows.append(Row(cells, strong=abs(change.deviations or 0.0) > _MANY_SD))
     return rows

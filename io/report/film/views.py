@@ -15,7 +15,7 @@ from telerig.errors import InputError
 from telerig.io.files.csv_table import Column
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Progress, font, write_film
-from telerig.io.report.page.results_tables import optional_columns
+from telerig.io.results.tables import optional_columns
 
 if TYPE_CHECKING:
     import pandas as pd

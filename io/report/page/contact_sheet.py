@@ -10,7 +10,6 @@ import numpy as np
 
 from telerig.errors import InputError
 from telerig.io.report.page.figures import data_uri
-from telerig.io.report.page.results_files import read_picture
 
 BUDGET_BYTES = 1_500_000
 """Of JPEG: with the page's other parts a report stays below 8 MB."""
@@ -91,3 +90,11 @@ def _smaller(picture: bytes, file: Path, width_px: int) -> bytes:
     else:
         _, small = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY])
     return min(small.tobytes(), picture, key=len)
+
+
+def read_picture(file: Path) -> bytes:
+    """Raises InputError for a file that cannot be read."""
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(file)) from error

@@ -154,14 +154,14 @@ def test_missing(tmp_path: Path) -> None:
 def test_foreign_files(text: str, tmp_path: Path) -> None:
     file = tmp_path / "calibration.json"
     file.write_text(text)
-    with pytest.raises(InputError, match=r"calibration\.json.*not a calibration"):
+    with pytest.raises(InputError, match=r"calibration\.json: (is|cannot|garbles)"):
         load_calibration(file)
 
 
 def test_binary_file(tmp_path: Path) -> None:
     file = tmp_path / "calibration.json"
     file.write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match="not a calibration"):
+    with pytest.raises(InputError, match=r"calibration\.json: (cannot|garbles|lacks)"):
         load_calibration(file)
 
 
@@ -192,7 +192,7 @@ def test_newer_schema(saved: Path) -> None:
     ],
 )
 def test_damaged_files(change: Any, saved: Path) -> None:
-    with pytest.raises(InputError, match="not a calibration"):
+    with pytest.raises(InputError, match=r"calibration\.json: (cannot|garbles|lacks)"):
         load_calibration(edited(saved, change))
 
 

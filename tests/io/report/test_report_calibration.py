@@ -67,7 +67,7 @@ def test_page_says_verdict_parameters_and_everything_else(report: Path) -> None:
         "10.00000 ±\u00a00.00034", "0.002000 ±\u00a00.000048", "90.00000 ±\u00a00.00069", "98.9 %",
         "178 of 180", "0.510 µm", "none was enough", "99.25", "nominal rotation", "90 deviations",
         "depth scale of the right camera is weak", "a note", "the gauge in words", "packages.numpy",
-        "9.9", "stage.scale_ppm",
+        "9.9",
     ):  # fmt: skip
         assert words in text, words
 
@@ -90,7 +90,7 @@ def test_verdict_has_its_colour(folder: Path, status: str, colour: str) -> None:
 
 def test_one_camera_and_nothing_optional(tmp_path: Path) -> None:
     folder = write_calibration_folder(tmp_path / "mono", cameras=1)
-    _edit(folder, model={}, twin={}, covariance={}, statistics={"rms_px": None})
+    _edit(folder, model={}, twin={}, covariance=None, statistics={"rms_px": None})
     for name in OPTIONAL:
         (folder / name).rename(tmp_path / f"away {name}")
     text = Page(write_calibration_report(folder)).text
@@ -148,7 +148,7 @@ def test_files_that_do_not_fit_together_are_refused(folder: Path) -> None:
     file.write_text(file.read_text().replace("view05,right,14,", "view05,middle,14,"))
     with pytest.raises(InputError, match=r"row 181: calibration.json has no camera 'middle'"):
         read_results(folder)
-    with pytest.raises(InputError, match="lacks or garbles 'views'"):
+    with pytest.raises(InputError, match="garbles 'views'"):
         content = json.loads((folder / "calibration.json").read_text())
         del content["views"]
         (folder / "calibration.json").write_text(json.dumps(content))

@@ -17,6 +17,7 @@ from telerig.io.report.calibration.rig import common_plane, rig_outline, scene_j
 from telerig.io.report.calibration.target import target_shape
 from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page.number_format import nice_below, number, short_names, with_sd
+from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Target
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -33,11 +34,13 @@ def _results() -> CalibrationResults:
     points[7, 2] = 0.05
     seen = [(view, camera) for view in views for camera in ("left", "right")]
     root = 1e-3 * np.random.default_rng(4).standard_normal((45, 45))
+    target = Target(dots=np.arange(15), points_mm=points)
+    file = CalibrationFile.model_construct(target=target)
     return CalibrationResults(
-        content={}, cameras=(left, right), views=views, dot_ids=np.arange(15), points_mm=points,
+        file=file, cameras=(left, right), views=views,
         row_column=lattice, residuals=pd.DataFrame(seen, columns=["view", "camera"]),
         component={f"dot {i // 3}.{'xyz'[i % 3]}_mm": i for i in range(45)}, joint=root @ root.T,
-        run={}, overlays={}, dot_example={}, uncertainty={}, comparison={}, absent=(),
+        run={}, overlays={}, dot_example={}, uncertainty={}, comparison=ComparisonFile(), absent=(),
     )  # fmt: skip
 
 

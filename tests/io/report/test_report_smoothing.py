@@ -103,7 +103,6 @@ def test_without_smoothing_the_page_is_of_the_tracking_alone(folder: Path) -> No
         ("PARTIAL", "usable", "only in part"),
         ("UNRESOLVED", "rejected", "cannot separate the bubbles' motion from the rig's shake"),
         (None, "usable", "Not judged"),
-        ("NEW_WORD", "usable", "NEW WORD"),
     ],
 )
 def test_each_verdict_has_its_words_colour_and_remedy(
@@ -215,7 +214,7 @@ def test_long_runs_stay_small(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_hostile_names_stay_text(folder: Path) -> None:
     evil = "</script><b>x"
-    changed(folder, verdict=evil, flags=[evil], words=[evil],
+    changed(folder, flags=[evil], words=[evil],
           accelerometers={evil: {"scale": 1.0}},
           residuals={evil: {"pixels": 3, "outliers": 0}})  # fmt: skip
     html = write_track_report(folder).read_text(encoding="utf-8")

@@ -57,11 +57,11 @@ def test_numbers_are_those_of_the_signals(whole: Path) -> None:
 def test_depth_is_read_from_the_file_else_from_what_stands_still(folder: Path) -> None:
     results = read(folder)
     assert (results.unseen("left"), results.unseen("right")) == (("z",), ("x",))
-    oblique = {"left": "along its depth, (0.643, 0, 0.766) in rig axes"}
-    results = read(changed(folder, unseen=oblique))
+    oblique = {"left": [0.643, 0, 0.766]}
+    results = read(changed(folder, depth_axes=oblique))
     assert results.unseen("left") == () and results.seen("left") == ("x", "y", "z")
     np.testing.assert_allclose(results.depth("left"), [0.643, 0, 0.766], atol=1e-3)
-    results = read(changed(folder, "unseen"))
+    results = read(changed(folder, "depth_axes"))
     assert (results.unseen("left"), results.unseen("right")) == (("z",), ("x",))
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,22 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column
-from telerig.io.report.page.results_files import read_object
-from telerig.io.report.page.results_tables import read_columns
+from telerig.io.results.smoothing import (
+    AXES,
+    STATE,
+    TRAJECTORIES,
+    SmoothingFile,
+    shake_columns,
+)
+from telerig.io.results.smoothing import POSITION as PLACE
+from telerig.io.results.smoothing import VELOCITY as SPEED
+from telerig.io.results.tables import read_columns
+
+__all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
 
-SCHEMA = 1
-AXES = ("x", "y", "z")
-PLACE, SPEED = "{}_mm", "v{}_mm_s"
-"""Columns of trajectories.csv; with "s", "naive_" and "rts_" in front: sd and baselines."""
-
-_AGAIN = "smooth again (`telerig smooth`), or name the right results folder"
-_NUMBER = re.compile(r"-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 _ALONG = 0.9
 
 
@@ -35,15 +36,20 @@ _ALONG = 0.9
 class SmoothingResults:
     """The smoothing in memory.
 
-    content : smoothing.json as it stands. cameras : names, in the rig's order. trajectories,
+    file : smoothing.json. cameras : names, in the rig's order. trajectories,
     shake : the tables, by bubble and frame. up : (3,) unit vector in rig axes.
     """
 
-    content: Mapping[str, Any]
+    file: SmoothingFile
     cameras: tuple[str, ...]
     trajectories: pd.DataFrame
     shake: pd.DataFrame
     up: Array
+
+    @property
+    def content(self) -> Mapping[str, Any]:
+        """smoothing.json as it stands."""
+        return self.file.content()
 
     def part(self, name: str) -> Mapping[str, Any]:
         """An object of smoothing.json, empty where it is not there."""
@@ -69,10 +75,8 @@ class SmoothingResults:
 
     def depth(self, camera: str) -> Array | None:
         """(3,) direction in rig axes along which the camera sees nothing, if the file tells."""
-        words = self.part("unseen").get(camera)
-        numbers = [float(n) for n in _NUMBER.findall(str(words))][-3:]
-        length = np.linalg.norm(numbers) if len(numbers) == 3 else 0.0
-        return np.asarray(np.array(numbers) / length) if 0 < length < np.inf else None
+        found = self.file.depth_axes.get(camera)
+        return None if found is None else np.asarray(found / np.linalg.norm(found))
 
     def unseen(self, camera: str) -> tuple[str, ...]:
         """Axes along the camera's depth: its shake there is the prior's, not a measurement."""
@@ -94,60 +98,32 @@ def read_smoothing_results(folder: Path, up: Array) -> SmoothingResults | None:
     file = folder / "smoothing.json"
     if not file.is_file():
         return None
-    content = _content(file)
-    shake, cameras = _shake(folder / "shake.csv", content)
-    return SmoothingResults(content, cameras, _trajectories(folder / "trajectories.csv"), shake, up)
+    found = SmoothingFile.read(file)
+    shake, cameras = _shake(folder / "shake.csv", found)
+    return SmoothingResults(found, cameras, _trajectories(folder / "trajectories.csv"), shake, up)
 
 
-def _content(file: Path) -> Mapping[str, Any]:
-    content = read_object(file, _AGAIN)
-    schema = content.get("schema", SCHEMA)
-    if not isinstance(schema, int) or schema > SCHEMA:
-        raise InputError(
-            f"schema {schema} is newer than this version reads ({SCHEMA})",
-            where=str(file),
-            todo="update telerig",
-        )
-    expected: dict[str, type | tuple[type, ...]] = {
-        "verdict": str, "flags": list, "cameras": list, "model": dict, "residuals": dict,
-        "encoder": dict, "accelerometers": dict, "bubble_means": dict, "unseen": dict,
-        "words": (list, str), "axes": dict, "modes": list, "whiteness": dict,
-        "accelerometer_spectra": dict,
-    }  # fmt: skip
-    for name, kind in expected.items():
-        if content.get(name) is not None and not isinstance(content[name], kind):
-            raise InputError(f"garbles {name!r}", where=str(file), todo=_AGAIN)
-    return content
-
-
-def _shake(file: Path, content: Mapping[str, Any]) -> tuple[pd.DataFrame, tuple[str, ...]]:
+def _shake(file: Path, smoothing: SmoothingFile) -> tuple[pd.DataFrame, tuple[str, ...]]:
     found = [n.removesuffix("_x_mm") for n in _header(file) if n.endswith("_x_mm")]
     cameras = tuple(n for n in found if not (n[:1] == "s" and n[1:] in found))
-    known = [str(c) for c in content.get("cameras") or cameras]
+    known = list(smoothing.cameras or cameras)
     if not cameras or sorted(known) != sorted(cameras):
         what = f"its columns are of cameras {list(cameras)}, smoothing.json's are {known}"
-        raise InputError(what, where=f"{file} row 1", todo=_AGAIN)
-    columns = [Column("frame", "whole"), Column("t_s")]
-    for camera in known:
-        columns += [Column(f"{camera}_{axis}_mm") for axis in AXES]
-        columns += _optional([f"s{camera}_{axis}_mm" for axis in AXES])
-    columns += _optional(["position_mm", "sposition_mm"])
-    table = read_columns(file, columns)
+        raise InputError(what, where=f"{file} row 1", todo=SmoothingFile.AGAIN)
+    table = read_columns(file, shake_columns(known))
     _check_times(table, file, "")
     return table, tuple(known)
 
 
 def _trajectories(file: Path) -> pd.DataFrame:
     """Rows by bubble and frame. Columns that a run without bubbles leaves out are there, empty."""
-    patterns = (PLACE, SPEED)
-    always = [pattern.format(axis) for pattern in patterns for axis in AXES]
-    besides = [f"{kind}{name}" for kind in ("s", "naive_", "rts_") for name in always]
     _header(file)
-    names = [Column("frame", "whole"), Column("particle", "whole"), Column("t_s")]
-    table = read_columns(file, [*names, *_optional([*always, *besides, "observed"])])
-    missing = [name for name in always if name not in table]
+    table = read_columns(file, TRAJECTORIES)
+    missing = [name for name in STATE if name not in table]
     if len(table) and missing:
-        raise InputError(f"has no column {missing[0]}", where=f"{file} row 1", todo=_AGAIN)
+        raise InputError(
+            f"has no column {missing[0]}", where=f"{file} row 1", todo=SmoothingFile.AGAIN
+        )
     table = table.assign(**{name: np.zeros(0) for name in missing})
     table = table.sort_values(["particle", "frame"], kind="stable", ignore_index=True)
     for particle, mine in table.groupby("particle", sort=False):
@@ -155,16 +131,14 @@ def _trajectories(file: Path) -> pd.DataFrame:
     return table
 
 
-def _optional(names: Sequence[str]) -> list[Column]:
-    return [Column(name, required=False, blank=True) for name in names]
-
-
 def _header(file: Path) -> list[str]:
     try:
         with file.open(encoding="utf-8-sig") as stream:
             return [name.strip() for name in stream.readline().split(",")]
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", where=str(file), todo=_AGAIN) from error
+        raise InputError(
+            f"cannot be read: {error}", where=str(file), todo=SmoothingFile.AGAIN
+        ) from error
 
 
 def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:
@@ -172,4 +146,4 @@ def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:
     if len(steps) and not steps.min() > 0:
         frame = int(table["frame"].iloc[int(np.argmin(steps > 0)) + 1])
         what = f"the times{whose} do not increase at frame {frame}"
-        raise InputError(what, where=f"{file}, column t_s", todo=_AGAIN)
+        raise InputError(what, where=f"{file}, column t_s", todo=SmoothingFile.AGAIN)

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.report.calibration.results import read_cameras
 from telerig.io.report.run.tracking.results import TrackResults
+from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.tracking import POINT, SILHOUETTES
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
 
 _AGREE_MM, _NEAR_MM = 1e-4, 0.02
-_POINT = ["x_mm", "y_mm", "z_mm"]
-_SILHOUETTES = ["silhouettes_x_mm", "silhouettes_y_mm", "silhouettes_z_mm"]
 
 
 def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Camera] | None, str]:
@@ -31,7 +30,8 @@ def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Came
     )
     if file is None:
         return None, "calibration.json is neither in this folder nor in calibration/ beside it"
-    known = {camera.name: camera for camera in read_cameras(file)}
+    stated = CalibrationFile.read(file)
+    known = {camera.name: camera for camera in stated.rig_cameras(behind_walls=True)}
     if len(results.cameras) != 2 or not set(results.cameras) <= set(known):
         return None, f"calibration.json beside it has cameras {', '.join(known)}, not the run's"
     cameras = (known[results.cameras[0]], known[results.cameras[1]])
@@ -63,8 +63,8 @@ def _agree(results: TrackResults, cameras: tuple[Camera, Camera]) -> bool:
     rays = [camera.unproject(uv) for camera, uv in zip(cameras, pair_pixels(results, rows))]
     middle, miss = midpoint(*rays[0], *rays[1])
     stated = results.tracks["ray_miss_mm"].to_numpy(float)[rows]
-    names = _SILHOUETTES if set(_SILHOUETTES) <= set(results.tracks) else _POINT
-    away = np.linalg.norm(middle - results.tracks[names].to_numpy(float)[rows], axis=1)
+    names = SILHOUETTES if set(SILHOUETTES) <= set(results.tracks) else POINT
+    away = np.linalg.norm(middle - results.tracks[list(names)].to_numpy(float)[rows], axis=1)
     if np.median(np.abs(miss - stated)) > _AGREE_MM:
         return False
     return bool(np.nanmedian(away) < _NEAR_MM + np.median(np.abs(stated)))

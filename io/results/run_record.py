@@ -8,9 +8,26 @@ from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from telerig.io.results.record import Record
 
 PACKAGES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "scikit-image", "pandas")
+
+
+class RunFile(Record):
+    """run.json. ``tracks`` is the record of the tracking that a smoothing started from."""
+
+    AGAIN: ClassVar[str] = "run the command again that made this folder"
+
+    command: str = ""
+    telerig: str | None = None
+    seconds: dict[str, float] = Field(default_factory=dict)
+    options: dict[str, Any] = Field(default_factory=dict)
+    inputs_sha256: dict[str, str] = Field(default_factory=dict)
+    tracks: dict[str, Any] = Field(default_factory=dict)
 
 
 def sha256(path: Path) -> str:

@@ -1,0 +1,141 @@
+"""JSON files of a results folder as checked records.
+
+A record is a frozen pydantic model. Keys that this version does not know are kept, so that a newer
+file of the same schema is read and written without loss. Arrays are NumPy arrays of finite numbers
+with a stated shape.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator, ValidationError
+
+from telerig.errors import InputError
+from telerig.io.files.atomic import plain, write_json_atomic
+
+_LONGEST_MESSAGE = 400
+
+
+def _checked_array(*shape: int | None, kind: type = float) -> Callable[[Any], NDArray[Any]]:
+    """A validator for arrays of this shape, in which None is any length."""
+
+    def check(value: Any) -> NDArray[Any]:
+        try:
+            found: NDArray[Any] = np.array(value, kind)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError("is not an array of numbers") from error
+        if found.size == 0 and None in shape:
+            found = found.reshape([n or 0 for n in shape])
+        wanted = tuple(n if m is None else m for n, m in zip(found.shape, shape))
+        if found.ndim != len(shape) or found.shape != wanted:
+            stated = " x ".join("any" if n is None else str(n) for n in shape)
+            raise ValueError(f"has shape {found.shape}, not {stated}")
+        if not np.isfinite(found).all():
+            raise ValueError("holds a number that is not finite")
+        return found
+
+    return check
+
+
+_as_list = PlainSerializer(lambda array: array.tolist())
+_Floats = NDArray[np.float64]
+Vector3 = Annotated[_Floats, PlainValidator(_checked_array(3)), _as_list]
+Points3 = Annotated[_Floats, PlainValidator(_checked_array(None, 3)), _as_list]
+Matrix2 = Annotated[_Floats, PlainValidator(_checked_array(2, 2)), _as_list]
+Matrix3 = Annotated[_Floats, PlainValidator(_checked_array(3, 3)), _as_list]
+Matrix3x2 = Annotated[_Floats, PlainValidator(_checked_array(3, 2)), _as_list]
+Square = Annotated[_Floats, PlainValidator(_checked_array(None, None)), _as_list]
+Numbers = Annotated[_Floats, PlainValidator(_checked_array(None)), _as_list]
+Wholes = Annotated[NDArray[np.int64], PlainValidator(_checked_array(None, kind=np.int64)), _as_list]
+
+
+class Part(BaseModel):
+    """Part of a results file."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="allow", arbitrary_types_allowed=True, allow_inf_nan=False
+    )
+
+    def content(self) -> dict[str, Any]:
+        """What the file holds: the keys that were given, in the types of JSON."""
+        return dict(plain(self.model_dump(exclude_unset=True, by_alias=True)))
+
+
+class Record(Part):
+    """A whole JSON file of a results folder."""
+
+    KIND: ClassVar[str] = ""
+    """What the key ``kind`` has to say; "" where the file has no such key."""
+    SCHEMA: ClassVar[int] = 1
+    MISSING: ClassVar[str] = "there is no such file"
+    MAKE: ClassVar[str] = ""
+    """The command that makes the file."""
+    AGAIN: ClassVar[str] = ""
+    """What to do about a file that cannot be used."""
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """Read and check a file.
+
+        Raises InputError when it is missing, is of another kind or a newer schema, or does not
+        hold what the schema says.
+        """
+        if not file.is_file():
+            raise InputError(cls.MISSING, where=str(file), todo=f"run `{cls.MAKE}` first")
+        content = read_object(file, cls.AGAIN)
+        if cls.KIND and content.get("kind") != cls.KIND:
+            what = f"is not a {cls.KIND.removeprefix('telerig ')} file that telerig wrote"
+            raise InputError(what, where=str(file), todo=cls.AGAIN)
+        schema = content.get("schema", cls.SCHEMA)
+        if isinstance(schema, int) and schema > cls.SCHEMA:
+            raise InputError(
+                f"schema {str(schema)[:20]} is newer than this version reads ({cls.SCHEMA})",
+                where=str(file),
+                todo="update telerig",
+            )
+        return cls.of(content, file)
+
+    @classmethod
+    def read_if_there(cls, file: Path) -> Self:
+        """As `read`; an empty record where there is no file. For records without needed keys."""
+        return cls.read(file) if file.is_file() else cls()
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any], file: Path) -> Self:
+        """Check the content of ``file``. Raises InputError that names the key."""
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise InputError(_fault(error), where=str(file), todo=cls.AGAIN) from error
+
+    def write(self, file: Path) -> None:
+        """Write the file whole or not at all."""
+        write_json_atomic(file, self.content())
+
+
+def _fault(error: ValidationError) -> str:
+    """The first fault with its key, short enough for a terminal."""
+    faults = error.errors(include_url=False, include_input=False, include_context=False)
+    key = ".".join(str(part)[:60] for part in faults[0]["loc"][:6])
+    reason = faults[0]["msg"].removeprefix("Value error, ")
+    words = f"garbles {key!r}: {reason}" if key else reason
+    more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
+    return words[:_LONGEST_MESSAGE] + more
+
+
+def read_object(file: Path, todo: str) -> Mapping[str, Any]:
+    """A JSON object. Raises InputError for a file that holds none."""
+    try:
+        content = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        what = str(error)[:_LONGEST_MESSAGE]
+        raise InputError(f"cannot be read as JSON: {what}", where=str(file), todo=todo) from error
+    if not isinstance(content, dict):
+        raise InputError("is JSON, but not an object", where=str(file), todo=todo)
+    return content

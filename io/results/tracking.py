@@ -1,0 +1,116 @@
+"""The files of a tracked run: tracking.json, and the tables of tracks, detections and events."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from telerig.io.files.csv_table import Column
+from telerig.io.results.record import Part, Record, Vector3
+
+POINT = ("x_mm", "y_mm", "z_mm")
+SILHOUETTES = ("silhouettes_x_mm", "silhouettes_y_mm", "silhouettes_z_mm")
+COVARIANCE = ("sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2")
+PIXEL = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
+
+
+class WorstFrame(Part):
+    """A frame that a person should look at first, and why."""
+
+    frame: int
+    score: float | None = None
+    why: str = ""
+
+
+class Pairs(Part):
+    """What the pairs of the run say of both views: bias and scatter of the ray miss."""
+
+    bias_px: Any = None
+    scatter_px: float | None = None
+    frame_px: float | None = None
+    calibration_problem: bool = False
+    words: tuple[str, ...] = ()
+
+
+class RigChange(Part):
+    """How far a camera has moved against the other since the calibration."""
+
+    camera: str = ""
+    moved: bool = False
+    offset_mm: float | None = None
+    words: str | tuple[str, ...] = ()
+
+
+class TrackingFile(Record):
+    """tracking.json."""
+
+    KIND: ClassVar[str] = "telerig tracks"
+    MISSING: ClassVar[str] = "no tracks here"
+    MAKE: ClassVar[str] = "telerig track RUN"
+    AGAIN: ClassVar[str] = "track again (`telerig track`), or name the right results folder"
+
+    schema_: int = Field(1, alias="schema")
+    kind: str
+    run: str = ""
+    pixel_origin: str = "centre"
+    frame_of_reference: str = ""
+    image_size_px: dict[str, tuple[int, int] | None] = Field(default_factory=dict)
+    frames: int | None = None
+    detections: int | None = None
+    points: int | None = None
+    tracks: int | None = None
+    detections_without_partner_or_track: int | None = None
+    frames_without_bubbles: dict[str, Any] = Field(default_factory=dict)
+    events: dict[str, int] = Field(default_factory=dict)
+    pairs: Pairs | None = None
+    shape_sigma: Any = None
+    covariance: str = ""
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    rig_change: RigChange | None = None
+    references: dict[str, Any] | None = None
+    worst_frames: tuple[WorstFrame, ...] = ()
+    up: Vector3 | None = None
+
+
+def _numbers(names: Sequence[str], *, required: bool = True) -> list[Column]:
+    return [Column(name, required=required, blank=True) for name in names]
+
+
+def tracks_columns(cameras: Sequence[str]) -> list[Column]:
+    """Columns of tracks.csv."""
+    per_camera = [f"{camera}_{name}" for camera in cameras for name in PIXEL]
+    return [
+        Column("frame", "whole"),
+        Column("particle", "whole"),
+        Column("t_s"),
+        *_numbers([*POINT, *COVARIANCE, *per_camera, "ray_miss_mm", "d_eq_mm", "confidence"]),
+        *_numbers(["sd_eq_mm", *SILHOUETTES], required=False),
+        *(Column(name, "text", required=False, blank=True) for name in ("centre", "flags")),
+    ]
+
+
+DETECTIONS = [
+    Column("frame", "whole"),
+    Column("camera", "text"),
+    Column("particle", "whole", blank=True),
+    *_numbers(["u_px", "v_px"]),
+    *_numbers(["a_px", "b_px", "d_eq_px", "edge_px", "chi2_dof"], required=False),
+    *(Column(name, "text", required=False, blank=True) for name in ("flags", "reason")),
+]
+REFERENCES = [
+    Column("frame", "whole"),
+    Column("camera", "text"),
+    Column("mark", "text"),
+    *_numbers(["u_px", "v_px"]),
+    *_numbers(["sigma_px"], required=False),
+]
+EVENTS = [
+    Column("frame", "whole"),
+    Column("t_s", blank=True),
+    Column("kind", "text"),
+    Column("particles", "text", blank=True),
+    Column("reason", "text", blank=True),
+]

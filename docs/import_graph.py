@@ -61,7 +61,9 @@ def draw(graph: nx.DiGraph, file: Path) -> None:
     axes.set_ylim(-0.6, max(floors.values()) + 0.6)
     axes.axis("off")
     figure.savefig(file, dpi=130, bbox_inches="tight")
-    print(f"{graph.number_of_nodes()} folders, {graph.number_of_edges()} arrows: {file}")
+    sys.stdout.write(
+        f"{graph.number_of_nodes()} folders, {graph.number_of_edges()} arrows: {file}\n"
+    )
 
 
 if __name__ == "__main__":

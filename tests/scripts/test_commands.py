@@ -259,7 +259,7 @@ def test_nominal_rotation_on_the_wrong_side_shows_both_twins(small_copy):
     assert turned != text
     rig.write_text(turned)
     said = run("calibrate", small_copy, "--quiet", "--no-report")
-    assert "mirror twin: cost" in said
+    assert "mirror ambiguity: cost" in said
     calibration = telerig.load_calibration(small_copy / "results/calibration")
     assert calibration.statistics["inter_camera_rotvec_deg"][1] < -80
     np.testing.assert_allclose(calibration.twin["cost"], calibration.twin["other_cost"], rtol=1e-9)

@@ -44,8 +44,8 @@ def summary(calibration: CalibrationFile) -> str:
     lines += [f"  {advice['words']}"] if advice else []
     t = calibration.twin
     lines.append(
-        f"  mirror twin: cost {t.cost:.9g} kept, {t.other_cost:.9g} for the other; "
-        f"decided by {t.decided_by}: {t.words}"
+        f"  mirror ambiguity: cost {t.cost:.9g} of the kept solution, {t.other_cost:.9g} of its "
+        f"mirror image; decided by {t.decided_by}: {t.words}"
     )
     if calibration.stage is not None:
         lines += [f"  stage: {word}" for word in calibration.stage.notes]

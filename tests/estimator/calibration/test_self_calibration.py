@@ -231,7 +231,7 @@ def test_both_twins_cost_the_same_and_are_shown(paper: Any) -> None:
     twin = calibration.twin
     assert twin["cost"] == pytest.approx(twin["other_cost"], rel=1e-6)
     assert "0.9 degrees from the solution that is kept, 179" in twin["words"]
-    assert "mirror twin" in calibration.report()
+    assert "mirror ambiguity" in calibration.report()
 
 
 def test_the_nominal_side_decides(paper: Any) -> None:

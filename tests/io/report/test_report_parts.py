@@ -69,7 +69,9 @@ def test_target_shape_without_nominal_places_knows_only_heights() -> None:
     shape = target_shape(replace(_results(), row_column=np.full((15, 2), np.nan)))
     assert shape is not None and not shape.in_plane
     assert np.argmax(shape.off_um[:, 2]) == 7
-    few = replace(_results(), dot_ids=np.arange(4), points_mm=np.eye(4, 3), row_column=np.eye(4, 2))
+    target = Target(dots=np.arange(4), points_mm=np.eye(4, 3))
+    four = CalibrationFile.model_construct(target=target)
+    few = replace(_results(), file=four, row_column=np.eye(4, 2))
     assert target_shape(few) is None
 
 

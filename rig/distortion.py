@@ -77,19 +77,16 @@ def undistort(xy_distorted: Array, coefficients: Array) -> Array:
     xy = target.copy()
     for _ in range(_NEWTON_STEPS):
         residual = target - distort(xy, coefficients)
-        step = np.linalg.solve(_regular(distortion_jacobian(xy, coefficients)), residual[..., None])
-        step = step[..., 0]
+        slope = distortion_jacobian(xy, coefficients)
+        singular = (np.abs(np.linalg.det(slope)) <= 1e-12)[..., None, None]
+        slope = np.where(singular, np.eye(2), slope)
+        step = np.linalg.solve(slope, residual[..., None])[..., 0]
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         xy = xy + step * np.minimum(1.0, 0.3 / np.maximum(length, 1e-300))
         if np.max(length, initial=0.0) < 1e-15:
             break
     _check_inverse(target, xy, coefficients)
     return xy
-
-
-def _regular(matrix: Array) -> Array:
-    determinant = np.linalg.det(matrix)
-    return np.where((np.abs(determinant) > 1e-12)[..., None, None], matrix, np.eye(2))
 
 
 def _check_inverse(target: Array, xy: Array, coefficients: Array) -> None:
@@ -101,5 +98,5 @@ def _check_inverse(target: Array, xy: Array, coefficients: Array) -> None:
         raise GeometryError(
             f"the distortion cannot be inverted for {int(np.sum(bad))} of {bad.size} points, "
             f"the nearest {where:.2f} half-diagonals from the image centre",
-            todo="keep to pixels inside the image, or fit a simpler distortion model",
+            todo="use pixels inside the image only, or fit a simpler distortion model",
         )

@@ -42,7 +42,7 @@ def rotvec_from_rotation(rotation: ArrayLike) -> Array:
     """
     r = np.asarray(rotation, float)
     trace = np.trace(r, axis1=-2, axis2=-1)[..., None]
-    turned = np.swapaxes(r, -1, -2)
+    turned = r.mT
     outer = np.empty((*r.shape[:-2], 4, 4))
     outer[..., :3, :3] = r + turned
     outer[..., range(3), range(3)] = 1 - trace + 2 * np.diagonal(r, axis1=-2, axis2=-1)
@@ -88,11 +88,11 @@ class Pose:
 
     def apply(self, points_mm: ArrayLike) -> Array:
         """(..., N, 3) -> (..., N, 3)."""
-        rotated = np.asarray(points_mm, float) @ np.swapaxes(self.rotation, -1, -2)
+        rotated = np.asarray(points_mm, float) @ self.rotation.mT
         return np.asarray(rotated + self.translation_mm[..., None, :])
 
     def inverse(self) -> Pose:
-        back = np.swapaxes(self.rotation, -1, -2)
+        back = self.rotation.mT
         return Pose(back, -np.einsum("...ij,...j->...i", back, self.translation_mm))
 
     def __matmul__(self, other: Pose) -> Pose:

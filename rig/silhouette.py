@@ -51,7 +51,7 @@ def third_degree_traces(frames: Array) -> tuple[Array, Array]:
     """
     phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     circle = np.stack([np.cos(phi), np.sin(phi)])
-    values = third_degree(np.swapaxes(frames @ circle, -1, -2))
+    values = third_degree((frames @ circle).mT)
     first, third = (
         2 / _SAMPLES * np.stack([np.cos(k * phi), np.sin(k * phi)]) @ values for k in (1, 3)
     )
@@ -98,13 +98,13 @@ class EllipsePair:
         second = np.stack([zero, coupling, np.sqrt(1 - coupling**2)], -1)
         across = (np.stack([zero, one, zero], -1), second)
         first = np.stack([one, zero, zero], -1)
-        left, right = (np.stack([first, a], -1) @ _t(rim) for a, rim in zip(across, self.rims))
+        left, right = (np.stack([first, a], -1) @ rim.mT for a, rim in zip(across, self.rims))
         return left, right
 
     def coupling_of(self, moments_mm2: Array) -> Array:
         """(...): partial correlation of the two sides, given the shared coordinate, of A A^T."""
         basis = np.stack([self.shared, *self.sides], -2)
-        return _coupling(basis @ moments_mm2 @ _t(basis))
+        return _coupling(basis @ moments_mm2 @ basis.mT)
 
 
 def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> EllipsePair:
@@ -120,10 +120,10 @@ def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -
     side = [np.cross(shared, d) for d in view]
     rims, moments = [], []
     for jacobian, axes, alpha in zip(jacobians, axes_px, side):
-        back = _t(jacobian) @ np.linalg.inv(jacobian @ _t(jacobian))
+        back = jacobian.mT @ np.linalg.inv(jacobian @ jacobian.mT)
         extents = np.stack([shared, alpha], -2) @ back @ axes
         rims.append(_rim(extents))
-        moments.append(extents @ _t(extents))
+        moments.append(extents @ extents.mT)
     return EllipsePair(shared, (side[0], side[1]), (moments[0], moments[1]), (rims[0], rims[1]))
 
 
@@ -136,9 +136,9 @@ def most_spherical(pair: EllipsePair) -> Array:
     """
     inverse = np.linalg.inv(np.stack([pair.shared, *pair.sides], -2))
     moments = _joined(pair.moments_mm2)
-    moments[..., 1, 2] = _most_spherical(moments, _t(inverse) @ inverse)
+    moments[..., 1, 2] = _most_spherical(moments, inverse.mT @ inverse)
     moments[..., 2, 1] = moments[..., 1, 2]
-    return np.asarray(inverse @ moments @ _t(inverse))
+    return np.asarray(inverse @ moments @ inverse.mT)
 
 
 def oblate_spheroid(pair: EllipsePair) -> tuple[Array, Array]:
@@ -204,7 +204,3 @@ def _most_spherical(moments: Array, gram: Array) -> Array:
     constant = det1 * trace0 - 3 * trace1 * det0
     root = np.sqrt(np.maximum(linear**2 - 4 * square * constant, 0))
     return np.asarray(-2 * constant / (linear + np.copysign(root, linear)))
-
-
-def _t(matrix: Array) -> Array:
-    return np.swapaxes(matrix, -1, -2)

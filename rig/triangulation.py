@@ -228,5 +228,5 @@ def _midpoint_covariance(
         _, jacobian, _ = stacked_jacobian((camera,), points)
         gains.append(projectors[-1] @ np.linalg.pinv(jacobian))
     total = np.linalg.inv(projectors[0] + projectors[1])
-    spread = sum(g @ c @ np.swapaxes(g, -1, -2) for g, c in zip(gains, covariances))
-    return np.asarray(total @ spread @ np.swapaxes(total, -1, -2))
+    spread = sum(g @ c @ g.mT for g, c in zip(gains, covariances))
+    return np.asarray(total @ spread @ total.mT)

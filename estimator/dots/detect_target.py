@@ -37,24 +37,22 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     """Numbered dots of the target in a grey (H, W) image.
 
     Columns: dot row column u_px v_px suu_px2 suv_px2 svv_px2 a_px b_px angle_rad chi2_dof. The
-    numbers of a symmetric target without marks are one choice of several: see `find_target`.
+    numbers of a symmetric target without marks are one choice of several that fit equally well.
 
     Raises DetectionError when the target is not found or its numbers are ambiguous, InputError
     for what is no image.
     """
-    found = find_target(image, target)
+    found = numbered(measure_dots(image, polarity=target.polarity), target)
     if found.numbering.ambiguous:
         raise ambiguous_numbering(found.numbering, target)
     return found.table
 
 
-def find_target(image: NDArray[Any], target: Target) -> TargetDetection:
-    """Like `detect_target`, with what was rejected, and with ambiguous numberings returned."""
-    return numbered(measure_dots(image, polarity=target.polarity), target)
-
-
 def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
-    """The measured dots with their numbers. Raises DetectionError where none can be given."""
+    """The target among measured dots; ambiguous numberings are returned too.
+
+    Raises DetectionError where the dots cannot be numbered at all.
+    """
     numbering = number_dots(measured.dots, target)
     rows = measured.dots.iloc[numbering.table["index"].to_numpy()][MEASURED]
     unplaced = numbering.unplaced

@@ -1,4 +1,4 @@
-"""One dot as patch and fitted model, for the picture that every calibration paper shows."""
+"""One dot as image patch and fitted model, for the figure in the report."""
 
 from __future__ import annotations
 
@@ -38,12 +38,11 @@ def dot_example(
     dot = found.iloc[int(np.argmin(distance))]
     sigma = float(np.sqrt(dot["blur_px"] ** 2 + PIXEL_VARIANCE_PX2))
     shape = shape_from_axes(dot["a_px"], dot["b_px"], dot["angle_rad"])
-    columns, rows = np.arange(patch.shape[1], dtype=float), np.arange(patch.shape[0], dtype=float)
+    columns, rows = (np.arange(n, dtype=float) for n in patch.shape[::-1])
     u, v = np.meshgrid(columns, rows)
-    covered = coverage_on_grid(columns, rows, dot[["u_px", "v_px"]].to_numpy(float), shape, sigma)[
-        0
-    ]
-    model = _with_levels(patch, np.asarray(covered), u - dot["u_px"], v - dot["v_px"])
+    centre = (dot["u_px"], dot["v_px"])
+    covered, _ = coverage_on_grid(columns, rows, centre, shape, sigma)
+    model = _with_levels(patch, covered, u - dot["u_px"], v - dot["v_px"])
     numbers = {n: np.array(dot[n]) for n in ("a_px", "b_px", "angle_rad", "noise")}
     place = {
         "u0": np.array(float(u0)), "v0": np.array(float(v0)),

@@ -88,7 +88,7 @@ def quadrature_nodes(a_px: float, sigma_px: float) -> int:
 def coverage_on_grid(
     u_px: Array, v_px: Array, centre_px: ArrayLike, shape_px: ArrayLike, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
-    """Coverage of the pixels at columns ``u_px`` (U,) and rows ``v_px`` (V,), exactly.
+    """Exact coverage of the pixels at columns ``u_px`` (U,) and rows ``v_px`` (V,).
 
     Returns ``F`` (..., V, U) and its derivatives (..., 6, V, U) by centre (2), shape (3), sigma.
     ``centre_px`` (..., 2), ``shape_px`` (..., 3), ``sigma_px`` (...).
@@ -117,19 +117,13 @@ def coverage_on_grid(
 
     motions = (normal_u, normal_v, normal_u * c, normal_u * s + normal_v * c, normal_v * s)
     weights = np.stack(motions, axis=-2)
-    moved = (row_d[..., None, :, :] * weights[..., :, None, :]) @ _transpose(column_d)[
-        ..., None, :, :
-    ]
+    moved = (row_d[..., None, :, :] * weights[..., :, None, :]) @ column_d.mT[..., None, :, :]
     flux = normal_u[..., None, :]
-    integral = _transpose(column_p)
+    integral = column_p.mT
     coverage = (row_d * flux) @ integral
-    widened = (row_d * flux) @ _transpose(column_d1) + (row_d2 * flux) @ integral
+    widened = (row_d * flux) @ column_d1.mT + (row_d2 * flux) @ integral
     gradient = np.concatenate([moved, (sigma3 * widened)[..., None, :, :]], axis=-3)
     return coverage, gradient
-
-
-def _transpose(x: Array) -> Array:
-    return np.swapaxes(x, -1, -2)
 
 
 def foot_points(

@@ -139,13 +139,9 @@ def grey_levels(pixels: Pixels, theta: Array, levels: Array) -> tuple[Array, Arr
 def _first_levels(pixels: Pixels, jacobian: Array) -> Array:
     design = jacobian[:, 6:10] * pixels.there[:, None]
     pull = design @ pixels.grey[..., None]
-    information = design @ transposed(design) + _FEW_PIXELS * np.eye(4)
+    information = design @ design.mT + _FEW_PIXELS * np.eye(4)
     levels = np.linalg.solve(information, pull)[..., 0]
     return np.concatenate([levels, np.zeros((len(levels), 2))], axis=1)
-
-
-def transposed(x: Array) -> Array:
-    return np.swapaxes(x, -1, -2)
 
 
 def prior_rows(pixels: Pixels, parameters: Array) -> tuple[Array, Array]:

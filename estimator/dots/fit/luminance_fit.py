@@ -15,7 +15,6 @@ from telerig.estimator.dots.fit.luminance import (
     gather,
     grey_levels,
     prior_rows,
-    transposed,
 )
 from telerig.estimator.dots.fit.types import PARAMETERS, DotFit, Prior, Start, Window
 from telerig.estimator.images.noise import NoiseModel
@@ -84,8 +83,8 @@ def _normal_equations(pixels: Pixels, state: _State, dots: Ints) -> tuple[Array,
     rows, gap = prior_rows(pixels, state.parameters[dots])
     jacobian = state.jacobian if len(dots) == len(state.chi2) else state.jacobian[dots]
     weighted = jacobian * state.weight[dots, None]
-    information = weighted @ transposed(jacobian) + transposed(rows) @ rows
-    gradient = weighted @ state.residual[dots, :, None] + transposed(rows) @ gap[..., None]
+    information = weighted @ jacobian.mT + rows.mT @ rows
+    gradient = weighted @ state.residual[dots, :, None] + rows.mT @ gap[..., None]
     return information, gradient[..., 0]
 
 

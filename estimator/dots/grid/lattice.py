@@ -289,8 +289,8 @@ def _lattice(growth: _Growth, image_from_flat: Array, shapes_px2: Array) -> Latt
     places = growth.place[index]
     _, basis, _ = fit_neighbours(growth.at, growth.flat, places, growth.basis, itself=True)
     basis_px = basis @ image_from_flat.T
-    pitch_from_px = np.linalg.inv(np.swapaxes(basis_px, -1, -2))
-    shape = pitch_from_px @ shapes_px2[index] @ np.swapaxes(pitch_from_px, -1, -2)
+    pitch_from_px = np.linalg.inv(basis_px.mT)
+    shape = pitch_from_px @ shapes_px2[index] @ pitch_from_px.mT
     unplaced = np.flatnonzero(~growth.placed())
     reach = np.linalg.norm(basis, axis=2).min(axis=1)
     miss, next_to = cKDTree(growth.flat[index]).query(growth.flat[unplaced])

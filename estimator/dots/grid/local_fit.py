@@ -66,7 +66,7 @@ def apply_homography(homography: Array, points: ArrayLike) -> Array:
     """(..., N, 2) images of (..., N, 2) points under (..., 3, 3) homographies."""
     p = np.asarray(points, float)
     h = homography
-    mapped = p @ np.swapaxes(h[..., :2], -1, -2) + h[..., None, :, 2]
+    mapped = p @ h[..., :2].mT + h[..., None, :, 2]
     return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
 

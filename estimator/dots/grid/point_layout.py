@@ -162,7 +162,7 @@ def _affine_from_triangles(source: Array, target: Array) -> Array:
     ones = np.ones((*source.shape[:2], 1))
     rows = np.linalg.solve(np.concatenate([source, ones], 2), target)
     affine = np.zeros((len(source), 3, 3))
-    affine[:, :2], affine[:, 2, 2] = np.swapaxes(rows, 1, 2), 1.0
+    affine[:, :2], affine[:, 2, 2] = rows.mT, 1.0
     return affine
 
 

@@ -11,7 +11,13 @@ from places import REAL
 from scipy.ndimage import gaussian_filter
 
 from telerig.errors import DetectionError, InputError
-from telerig.estimator.dots.detect_target import MEASURED, detect_target, find_target
+from telerig.estimator.dots.detect_target import (
+    MEASURED,
+    TargetDetection,
+    detect_target,
+    numbered,
+)
+from telerig.estimator.dots.locate import measure_dots
 from telerig.rig.target import Target
 
 Array = NDArray[np.float64]
@@ -37,6 +43,10 @@ PRINTED = Target(
     mark_style="ring",
     extent="unbounded",
 )
+
+
+def find_target(image: Array, target: Target) -> TargetDetection:
+    return numbered(measure_dots(image, polarity=target.polarity), target)
 
 
 def pixel_from_mm(scale: float, tilt_deg: float, roll_deg: float, mirrored: bool) -> Array:

@@ -20,17 +20,17 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from track_score import FullScore, full_score
 
 import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
-from telerig.estimator.tracking.truth import TrackScore, score_tracks
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 
 
 def run_one(
     preset: str, seed: int, frames: int, bubbles: int | None, folder: Path
-) -> tuple[TrackScore, float]:
+) -> tuple[FullScore, float]:
     changes = {"frames": frames} | ({} if bubbles is None else {"bubbles": bubbles})
     config = run_preset(preset, **changes)
     data = telerig.simulate(config, rng=np.random.default_rng(seed), out=folder / str(seed))
@@ -42,7 +42,7 @@ def run_one(
     tracks = telerig.track(run, calibration)
     speed = run.frame_count / (time.perf_counter() - begun)
     truth = pd.read_csv(data.path / "truth" / "runs" / name / "bubbles.csv")
-    return score_tracks(tracks, truth, [c.name for c in cameras]), speed
+    return full_score(tracks, truth, [c.name for c in cameras]), speed
 
 
 def main() -> None:

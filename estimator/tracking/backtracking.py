@@ -1,23 +1,24 @@
-"""Tracks followed back before their birth and over their gaps, by what came later.
+"""Tracks followed back before their birth and over their gaps, by later frames.
 
-The tracker goes forward only. A bubble that is born hidden, or whose pairs were in doubt, is known
-better once later frames have been seen: its place is smoothed over all frames at hand, and
-detections that belong to no track are its own where nothing else explains them nearly as well.
+The tracker goes forward only. Where a bubble is born hidden, or in frames with doubtful pairs, its
+position is better known from later frames: it is smoothed over all frames at hand, and detections
+without a track are given to it where no other explanation is nearly as likely.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.tracking.association.likelihoods import best_assignment, gate2, size_score
-from telerig.estimator.tracking.association.single_camera import unrivalled
+from telerig.estimator.bubbles.pairing.matching import Prediction
+from telerig.estimator.tracking.association.likelihoods import gate2, size_score
+from telerig.estimator.tracking.association.single_camera import pair_pixels, projected, px_per_mm
 from telerig.estimator.tracking.filter.rts_smoother import smooth_points
 from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
-from telerig.estimator.tracking.frame_rows import Frame, Single, readings_of
+from telerig.estimator.tracking.frame_rows import Frame, Pairs, Single, readings_of
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian, triangulate
 
@@ -31,21 +32,12 @@ _REACH_FRAMES = 4
 """Frames beyond a track's ends that one pass looks at."""
 
 _VAGUE = 0.5
-"""Largest sd of a foretold pixel, as a share of the bubble's diameter."""
+"""Largest sd of a predicted pixel, as a share of the bubble's diameter."""
 
-_NOTHING = 1e-6
+_REGULARISATION = 1e-6
 _CONFIDENCE = 0.95
-_DOUBTFUL = {"overlap", "merged", "border"}
-
-
-@dataclass(frozen=True)
-class Foretold:
-    """Where particles that a frame does not show yet should be: points (K, 3), covariances."""
-
-    particles: Sequence[int]
-    points_mm: Array
-    covariance_mm2: Array
-    d_eq_mm: Array
+_DOUBTFUL = "overlap|merged|border"
+"""Flags of outlines of which only a part was seen."""
 
 
 def follow_back(
@@ -60,45 +52,51 @@ def follow_back(
     """
     motions = [f.motion for f in frames]
     sizes = _sizes(frames)
-    everyone = sorted(sizes)
     for frame in frames:
         if frame.number in changeable:
             _reconsider(frame, sizes)
     _release_wrong(frames, changeable, sizes, cameras, settings)
     for _ in range(_PASSES):
-        missing = _missing(frames, changeable, everyone)
+        missing = _missing(frames, changeable, sorted(sizes))
         particles = sorted({p for found in missing for p in found})
         if not particles:
             break
-        readings = readings_of(frames, particles, cameras)
-        points, covariances = smooth_points(readings, motions, settings)
+        points, covariances = smooth_points(
+            readings_of(frames, particles, cameras), motions, settings
+        )
         place = {p: k for k, p in enumerate(particles)}
         changed = False
         for i, frame in enumerate(frames):
             at = [place[p] for p in missing[i]]
             if at:
-                d_eq = np.array([sizes[p] for p in missing[i]])
-                told = Foretold(missing[i], points[i, at], covariances[i, at], d_eq)
-                changed |= _claim(frame, told, cameras, settings)
+                predicted = _prediction(missing[i], points[i, at], covariances[i, at], sizes)
+                changed |= _claim(frame, predicted, cameras, settings)
         if not changed:
             break
 
 
+def _prediction(
+    particles: Sequence[int], points: Array, covariances: Array, sizes: dict[int, float]
+) -> Prediction:
+    d_eq = np.array([sizes[p] for p in particles])
+    return Prediction(np.array(particles, np.int64), points, covariances, d_eq)
+
+
 def _sizes(frames: Sequence[Frame]) -> dict[int, float]:
-    """Median diameter (mm) of the tracks that can be followed; ids that were given are not."""
+    """Median diameter (mm) of the tracks that can be followed; tracks with given ids cannot."""
     found: dict[int, list[float]] = {}
     for frame in frames:
-        own = frame.pairs.particle == NO_PARTICLE
-        for column in np.flatnonzero(own & (frame.particle != NO_PARTICLE)):
-            d_eq = float(frame.d_eq_mm[column])
-            found.setdefault(int(frame.particle[column]), []).append(d_eq)
+        pairs = frame.pairs
+        own = (pairs.given == NO_PARTICLE) & (pairs.particle != NO_PARTICLE)
+        for particle, d_eq in zip(pairs.particle[own].tolist(), pairs.d_eq_mm[own].tolist()):
+            found.setdefault(particle, []).append(d_eq)
     enough = {p: np.array(d) for p, d in found.items() if len(d) >= _LEAST_POINTS}
     known = {p: d[np.isfinite(d)] for p, d in enough.items()}
     return {p: float(np.median(d)) if len(d) else float("nan") for p, d in known.items()}
 
 
 def _reconsider(frame: Frame, sizes: dict[int, float]) -> None:
-    """Two cameras that each saw a particle by itself may be a pair, or one of them is wrong."""
+    """Two cameras that each saw a particle alone may be a pair, or one of them is wrong."""
     for particle in {s.particle for s in frame.singles if len(frame.of(s.particle)) > 1}:
         if particle in sizes:
             frame.release(particle)
@@ -111,7 +109,7 @@ def _release_wrong(
     cameras: tuple[Camera, Camera],
     settings: TrackerSettings,
 ) -> None:
-    """Pairs with a doubtful outline where the bubble cannot be go on as the other one alone."""
+    """Undo pairs whose doubtful outline is where the bubble cannot be; the other view stays."""
     doubtful = [_doubtful(f) if f.number in changeable else np.zeros((0, 2), bool) for f in frames]
     ids = {int(p) for f, d in zip(frames, doubtful) for p in f.particle[: len(d)][d.any(1)]}
     place = {p: k for k, p in enumerate(sorted(ids & set(sizes)))}
@@ -122,48 +120,63 @@ def _release_wrong(
     for i, (frame, doubt) in enumerate(zip(frames, doubtful)):
         columns = [int(c) for c in np.flatnonzero(doubt.any(1)) if frame.particle[c] in place]
         k = [place[int(frame.particle[c])] for c in columns]
-        found = _left_out(frame, columns, smoothed[0][i, k], smoothed[1][i, k])
+        found = _without_own(frame.pairs, columns, smoothed[0][i, k], smoothed[1][i, k])
         for column, point, covariance in zip(columns, *found):
-            particle = int(frame.particle[column])
-            told = Foretold([particle], point[None], covariance[None], np.array([sizes[particle]]))
-            agrees = [_agrees(frame, c, column, told, cameras[c], settings) for c in (0, 1)]
+            particle, rows = int(frame.particle[column]), frame.pairs.rows[column].tolist()
+            predicted = _prediction([particle], point[None], covariance[None], sizes)
+            agrees = [
+                _distance2(frame, [(c, rows[c])], predicted, 0, cameras) <= gate2(settings, 2)
+                for c in (0, 1)
+            ]
             camera = int(agrees[1])
             if agrees[0] != agrees[1] and doubt[column, 1 - camera]:
-                row = int(frame.pairs.rows(camera)[column])
                 frame.particle[column] = NO_PARTICLE
-                _claim_single(frame, particle, camera, row, told, 0)
+                _claim_single(frame, camera, rows[camera], predicted, 0)
 
 
 def _doubtful(frame: Frame) -> NDArray[np.bool_]:
     """(M, 2) whether the outlines of each pair may be off: only a part of them was seen."""
-    out = [
-        [bool(_DOUBTFUL & set(str(word).split("|"))) for word in table["flags"].to_numpy()[rows]]
-        for table, rows in zip(frame.tables, (frame.pairs.first, frame.pairs.second))
-    ]
-    return np.array(out, bool).reshape(2, -1).T
+    return np.stack(
+        [
+            _flagged(table["flags"].iloc[frame.pairs.rows[:, c]])
+            for c, table in enumerate(frame.tables)
+        ],
+        -1,
+    )
 
 
-def _left_out(
-    frame: Frame, columns: Sequence[int], points: Array, covariances: Array
+def _flagged(flags: pd.Series[str]) -> NDArray[np.bool_]:
+    return flags.fillna("").astype(str).str.contains(_DOUBTFUL).to_numpy(bool)
+
+
+def _without_own(
+    pairs: Pairs, columns: Sequence[int], points: Array, covariances: Array
 ) -> tuple[Array, Array]:
-    """The smoothed points and their covariances without what the frame itself says of them."""
-    own = np.linalg.inv(frame.covariance_mm2[columns])
-    all_of_it = np.linalg.inv(covariances)
-    pull = all_of_it @ points[..., None] - own @ frame.points_mm[columns][..., None]
-    covariance = np.asarray(np.linalg.inv(all_of_it - own + _NOTHING * np.eye(3)), np.float64)
-    return np.asarray(covariance @ pull, float)[..., 0], covariance
+    """The smoothed points and covariances, the frame's own measurements removed from them."""
+    own, total = np.linalg.inv(pairs.covariance_mm2[columns]), np.linalg.inv(covariances)
+    pull = total @ points[..., None] - own @ pairs.points_mm[columns][..., None]
+    covariance = np.linalg.inv(total - own + _REGULARISATION * np.eye(3))
+    return np.asarray(covariance @ pull, float)[..., 0], np.asarray(covariance, np.float64)
 
 
-def _agrees(
-    frame: Frame, camera: int, column: int, told: Foretold, view: Camera, settings: TrackerSettings
-) -> bool:
-    """Whether a pair's outline is where the bubble is foretold; also when that is too vague."""
-    row = int(frame.pairs.rows(camera)[column])
-    uv, by_point, _ = stacked_jacobian((view,), told.points_mm)
-    spread = by_point[0] @ told.covariance_mm2[0] @ by_point[0].T
-    measured, noise = frame.pixels[camera]
-    left = measured[row] - uv[0] - frame.offset_px[camera]
-    return bool(left @ np.linalg.solve(spread + noise[row], left) <= gate2(settings, 2))
+def _distance2(
+    frame: Frame,
+    seen: Sequence[tuple[int, int]],
+    predicted: Prediction,
+    k: int,
+    cameras: tuple[Camera, Camera],
+) -> float:
+    """Squared Mahalanobis distance of rows (camera, row) from the k-th predicted particle."""
+    views = tuple(cameras[c] for c, _ in seen)
+    expected, by_point, _ = stacked_jacobian(views, predicted.points_mm[k : k + 1])
+    covariance = by_point[0] @ predicted.covariance_mm2[k] @ by_point[0].T
+    left = -expected[0]
+    for i, (c, row) in enumerate(seen):
+        at = slice(2 * i, 2 * i + 2)
+        centre, noise = frame.pixels[c]
+        covariance[at, at] += noise[row]
+        left[at] = centre[row] - expected[0, at] - frame.offset_px[c]
+    return float(left @ np.linalg.solve(covariance, left))
 
 
 def _missing(
@@ -182,84 +195,79 @@ def _missing(
 
 
 def _claim(
-    frame: Frame, told: Foretold, cameras: tuple[Camera, Camera], settings: TrackerSettings
+    frame: Frame, predicted: Prediction, cameras: tuple[Camera, Camera], settings: TrackerSettings
 ) -> bool:
-    """Give the frame's free detections to the foretold particles; whether any was given."""
-    found = [_nearest(frame, c, told, cameras[c], settings) for c in (0, 1)]
+    """Give the frame's free detections to the predicted particles; whether any was given."""
+    found = [_nearest(frame, c, predicted, cameras[c], settings) for c in (0, 1)]
     changed = False
-    for k, particle in enumerate(told.particles):
-        rows = found[0][k], found[1][k]
+    for k, rows in enumerate(zip(*found)):
         if max(rows) < 0:
             continue
         if min(rows) >= 0:
-            changed |= _claim_pair(frame, rows, k, told, cameras, settings)
+            changed |= _claim_pair(frame, rows, k, predicted, cameras, settings)
         else:
             camera = int(rows[0] < 0)
-            _claim_single(frame, particle, camera, rows[camera], told, k)
+            _claim_single(frame, camera, rows[camera], predicted, k)
             changed = True
     return changed
 
 
 def _nearest(
-    frame: Frame, camera: int, told: Foretold, view: Camera, settings: TrackerSettings
+    frame: Frame, camera: int, predicted: Prediction, view: Camera, settings: TrackerSettings
 ) -> list[int]:
     """The row of each particle in one camera, -1 where there is none or not without a rival."""
     free = np.flatnonzero(frame.owners(camera) == NO_PARTICLE)
-    uv_px, noise = (a[free] for a in frame.pixels[camera])
-    uv, by_point, _ = stacked_jacobian((view,), told.points_mm)
-    uv = uv + frame.offset_px[camera]
-    spread = by_point @ told.covariance_mm2 @ np.swapaxes(by_point, -1, -2)
-    scale = np.linalg.det(by_point @ np.swapaxes(by_point, -1, -2)) ** 0.25
-    sharp = np.linalg.eigvalsh(spread)[:, -1] <= (_VAGUE * scale * told.d_eq_mm) ** 2
-    between = uv_px[None] - uv[:, None]
-    covariance = spread[:, None] + noise[None]
-    distance2 = np.einsum("kli,klij,klj->kl", between, np.linalg.inv(covariance), between)
+    centre, noise = (a[free] for a in frame.pixels[camera])
+    expected = projected(view, predicted.points_mm, predicted.covariance_mm2)
+    scale = px_per_mm(expected.by_point)
+    sd2 = np.linalg.eigvalsh(expected.covariance_px2)[:, -1]
+    sharp = sd2 <= (_VAGUE * scale * predicted.d_eq_mm) ** 2
     measured_mm = frame.tables[camera]["d_eq_px"].to_numpy(float)[free] / scale[:, None]
-    near = (distance2 <= gate2(settings, 2)) & sharp[:, None]
-    row, local = np.nonzero(near)
-    certain = settings.detection_probability
-    base = np.log(certain / (1 - certain) / settings.new_per_px2) - np.log(2 * np.pi)
-    score = base - np.log(np.linalg.det(covariance))[row, local] / 2 - distance2[row, local] / 2
-    score = score + size_score(told.d_eq_mm[row], measured_mm[row, local], settings)
-    chosen = best_assignment(len(uv), row, local, score)
-    safe = unrivalled(row, local, score, chosen, settings.margin_nats)
-    return [int(free[j]) if ok else -1 for j, ok in zip(chosen, safe)]
+    chosen = pair_pixels(
+        expected,
+        centre - frame.offset_px[camera],
+        noise,
+        settings,
+        size_score=size_score(predicted.d_eq_mm[:, None], measured_mm, settings),
+        allowed=sharp[:, None],
+    )
+    return [int(free[j]) if j >= 0 else -1 for j in chosen]
 
 
-def _claim_single(
-    frame: Frame, particle: int, camera: int, row: int, told: Foretold, k: int
-) -> None:
-    frame.singles.append(Single(particle, camera, row, told.points_mm[k], float(told.d_eq_mm[k])))
+def _claim_single(frame: Frame, camera: int, row: int, predicted: Prediction, k: int) -> None:
+    particle, d_eq = int(predicted.ids[k]), float(predicted.d_eq_mm[k])
+    frame.singles.append(Single(particle, camera, row, predicted.points_mm[k], d_eq))
 
 
 def _claim_pair(
     frame: Frame,
     rows: tuple[int, int],
     k: int,
-    told: Foretold,
+    predicted: Prediction,
     cameras: tuple[Camera, Camera],
     settings: TrackerSettings,
 ) -> bool:
     """As one point where the two agree; else the one whose outline is whole, if one is."""
-    (uv, noise), particle = (
-        zip(*((a[r] for a in frame.pixels[c]) for c, r in enumerate(rows))),
-        told.particles[k],
-    )
-    expected, by_point, _ = stacked_jacobian(cameras, told.points_mm[k : k + 1])
-    covariance = by_point[0] @ told.covariance_mm2[k] @ by_point[0].T
-    covariance[:2, :2] += noise[0]
-    covariance[2:, 2:] += noise[1]
-    left = np.concatenate(uv) - expected[0] - frame.offset_px.ravel()
-    if left @ np.linalg.solve(covariance, left) <= gate2(settings, 4):
-        found = triangulate(cameras, (uv[0][None], uv[1][None]), (noise[0][None], noise[1][None]))
-        point, covariance = found.points_mm[0], found.covariance_mm2[0]
-        frame.claim(particle, rows, point, covariance, float(told.d_eq_mm[k]), _CONFIDENCE)
+    if _distance2(frame, list(enumerate(rows)), predicted, k, cameras) <= gate2(settings, 4):
+        uv, noise = zip(*([a[r : r + 1] for a in p] for p, r in zip(frame.pixels, rows)))
+        found = triangulate(cameras, uv, noise)
+        frame.claim(
+            Pairs(
+                np.array([rows], np.int64),
+                np.array([_CONFIDENCE]),
+                np.array([True]),
+                np.array([NO_PARTICLE]),
+                found.points_mm,
+                found.covariance_mm2,
+                predicted.d_eq_mm[k : k + 1],
+                predicted.ids[k : k + 1],
+            )
+        )
         return True
-    doubtful = [
-        _DOUBTFUL & set(str(t["flags"].iloc[r]).split("|")) for t, r in zip(frame.tables, rows)
-    ]
-    if bool(doubtful[0]) == bool(doubtful[1]):
+    first, second = (
+        bool(_flagged(t["flags"].iloc[r : r + 1])[0]) for t, r in zip(frame.tables, rows)
+    )
+    if first == second:
         return False
-    camera = int(bool(doubtful[0]))
-    _claim_single(frame, particle, camera, rows[camera], told, k)
+    _claim_single(frame, int(first), rows[int(first)], predicted, k)
     return True

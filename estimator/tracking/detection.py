@@ -1,4 +1,4 @@
-"""The bubbles of every frame, found over the cores; what is found is kept if the work stops."""
+"""Bubbles detected in every frame, in parallel; an interrupted run keeps its detections."""
 
 from __future__ import annotations
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
+Batch = tuple[int, int]
+"""First frame, and the one after the last."""
 
 FRAMES_FOR_WORKERS = 40
 """Below this, starting fresh worker processes costs more than it saves."""
@@ -41,10 +43,10 @@ _LARGEST_BATCH = 64
 
 @dataclass(frozen=True)
 class Scene:
-    """What every frame's detection shares.
+    """What the detections of all frames have in common.
 
     backgrounds : by camera; shift_px : by camera, (F, 2) travel of the rig, see `lab_shift_px`.
-    strips : by camera, dots fixed to the tank, which are taken out of the images.
+    strips : by camera, dots fixed to the tank, which are erased from the images.
     """
 
     run: RunData
@@ -55,7 +57,7 @@ class Scene:
 
     def image(self, camera: str, frame: int) -> NDArray[Any] | None:
         """(H, W) without the strip's dots; None where it is missing."""
-        return image_without_strip(self.run, self.strips, camera, frame)
+        return _image(self.run, self.strips, camera, frame)
 
 
 def make_scene(
@@ -78,7 +80,7 @@ def make_scene(
     return Scene(run, backgrounds, shifts, min_diameter_px, strips or {})
 
 
-def image_without_strip(
+def _image(
     run: RunData, strips: Mapping[str, StripInImages], camera: str, frame: int
 ) -> NDArray[Any] | None:
     image, strip = run.image(camera, frame), strips.get(camera)
@@ -88,17 +90,17 @@ def image_without_strip(
 def _background(
     run: RunData, shifts: dict[str, Array], strips: Mapping[str, StripInImages], camera: str
 ) -> Background:
-    images = partial(image_without_strip, run, strips, camera)
+    images = partial(_image, run, strips, camera)
     return estimate_background(images, run.frame_count, shift_px=shifts[camera])
 
 
 def lab_shift_px(
     camera: Camera, axis_rig: Array, position_mm: Array | None, frame_count: int
 ) -> Array:
-    """(F, 2) travel of the rig as seen in the image since the first frame.
+    """(F, 2) travel of the rig since the first frame, in px of the image.
 
-    What is fixed in the lab and seen at p at first is seen at p - shift. Evaluated in the middle
-    of the image at depth 0; frames without a stage position have 0.
+    A thing fixed in the lab and seen at p at first is seen at p - shift. Evaluated in the middle
+    of the image at depth 0; 0 in frames without a stage position.
     """
     if position_mm is None:
         return np.zeros((frame_count, 2))
@@ -110,34 +112,59 @@ def lab_shift_px(
 
 
 class DetectionStore:
-    """Batches of detections in files, so that an interrupted run goes on where it was.
+    """Batches of detections in files, so that an interrupted run continues where it stopped.
 
-    The folder belongs to one fingerprint of input and options; another one starts afresh.
+    The folder belongs to one fingerprint of input and options; with another one it is emptied.
+    Two kinds of tables stand in it: "detections" of bubbles, "dots" of a strip.
     """
 
     def __init__(self, folder: Path, fingerprint: str, frame_count: int, workers: int) -> None:
-        self.folder = folder
+        self.folder, self.frame_count = folder, frame_count
         size = int(np.clip(frame_count // (4 * workers), 4, _LARGEST_BATCH))
-        edges = [*range(0, frame_count, size), frame_count]
-        self.batches = list(pairwise(edges))
+        self.batches = list(pairwise([*range(0, frame_count, size), frame_count]))
         state = {"fingerprint": fingerprint, "batch": size}
         mark = folder / "work.json"
         if not (mark.is_file() and json.loads(mark.read_bytes()) == state):
             shutil.rmtree(folder, ignore_errors=True)
             write_json_atomic(mark, state)
 
-    def path(self, batch: tuple[int, int]) -> Path:
-        return self.folder / f"detections-{batch[0]:07d}.csv"
+    def path(self, batch: Batch, kind: str = "detections") -> Path:
+        return self.folder / f"{kind}-{batch[0]:07d}.csv"
 
-    @property
-    def missing(self) -> list[tuple[int, int]]:
-        return [b for b in self.batches if not self.path(b).is_file()]
+    def missing(self, kind: str = "detections") -> list[Batch]:
+        return [b for b in self.batches if not self.path(b, kind).is_file()]
 
     def tables(self) -> Iterator[pd.DataFrame]:
         return (read_batch(self.path(batch)) for batch in self.batches)
 
-    def remove(self) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
+    def fill(
+        self,
+        kind: str,
+        table_of: Callable[[Batch], pd.DataFrame],
+        progress: Progress | None,
+        name: str,
+    ) -> None:
+        """Make and write the tables that are missing, in parallel.
+
+        table_of : from (first, last) frame to the table; a `functools.partial` of a function.
+        progress, name : called with the name of the work and the number of frames done.
+        """
+        missing = self.missing(kind)
+        frames = sum(last - first for first, last in missing)
+        done = self.frame_count - frames
+        large = frames >= FRAMES_FOR_WORKERS
+        workers = min(cores(), len(missing)) if large else quick_workers(len(missing))
+        for first, last in ordered_map(partial(_write, self, kind, table_of), missing, workers):
+            done += last - first
+            if progress is not None:
+                progress(name, done, self.frame_count)
+
+
+def _write(
+    store: DetectionStore, kind: str, table_of: Callable[[Batch], pd.DataFrame], batch: Batch
+) -> Batch:
+    write_table(table_of(batch), store.path(batch, kind))
+    return batch
 
 
 def read_batch(path: Path) -> pd.DataFrame:
@@ -152,7 +179,7 @@ def read_batch(path: Path) -> pd.DataFrame:
 
 
 def fingerprint(run: RunData, options: dict[str, Any]) -> str:
-    """Changes when the recording, the options or the version do."""
+    """A hash of the recording's files, the options and the version."""
     from telerig.version import VERSION
 
     found = hashlib.sha256(json.dumps([VERSION, options], default=str).encode())
@@ -167,33 +194,21 @@ def fingerprint(run: RunData, options: dict[str, Any]) -> str:
 
 
 def detect_missing(scene: Scene, store: DetectionStore, progress: Progress | None) -> None:
-    """Detect in every frame that the store lacks."""
-    frames, missing = scene.run.frame_count, store.missing
-    done = frames - sum(last - first for first, last in missing)
-    if progress is not None:
-        progress("frames", done, frames)
-    large = frames - done >= FRAMES_FOR_WORKERS
-    workers = min(cores(), len(missing)) if large else quick_workers(len(missing))
-    work = partial(_detect_batch, scene, store)
-    for first, last in ordered_map(work, missing, workers):
-        done += last - first
-        if progress is not None:
-            progress("frames", done, frames)
+    """Detect bubbles in every frame that the store lacks."""
+    store.fill("detections", partial(_detect_batch, scene), progress, "frames")
 
 
-def _detect_batch(scene: Scene, store: DetectionStore, batch: tuple[int, int]) -> tuple[int, int]:
+def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:
     import pandas as pd
 
     tables = [
         _detect(scene, camera, frame) for frame in range(*batch) for camera in scene.run.cameras
     ]
-    kept = [t for t in tables if len(t)] or tables[:1]
-    write_table(pd.concat(kept, ignore_index=True), store.path(batch))
-    return batch
+    return pd.concat([t for t in tables if len(t)] or tables[:1], ignore_index=True)
 
 
 def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
-    """One image's bubbles; an image without one gives a row that only says why."""
+    """One image's bubbles; an image without any gives one row with the reason."""
     import pandas as pd
 
     image, strip = scene.image(camera, frame), scene.strips.get(camera)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from telerig.estimator.bubbles.pairing.matching import Prediction, match_pairs
 from telerig.estimator.bubbles.pairing.pair_model import PairModel
 from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
+from telerig.estimator.tracking.association.single_camera import px_per_mm
 from telerig.estimator.tracking.backtracking import follow_back
 from telerig.estimator.tracking.filter.types import (
     NO_PARTICLE,
@@ -21,7 +22,15 @@ from telerig.estimator.tracking.filter.types import (
     SingleMeasurements,
     TrackEvent,
 )
-from telerig.estimator.tracking.frame_rows import Frame, Pairs, Pixels, given_ids
+from telerig.estimator.tracking.frame_rows import (
+    CENTRE_PX,
+    COVARIANCE_MM2,
+    Frame,
+    Pairs,
+    Pixels,
+    Tables,
+    given_ids,
+)
 from telerig.estimator.tracking.occluded_bubbles import FRAMES_AFTER, FRAMES_BEFORE, shared_rows
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
@@ -30,9 +39,6 @@ from telerig.rig.triangulation import stacked_jacobian, triangulate
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
-_UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-_PER_CAMERA = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 _PAIRS_AT_ONCE = 512
 _LEAST_FOR_OFFSET = 3
 
@@ -64,30 +70,19 @@ class Linker:
     _waiting: int = 0
 
     def add(
-        self,
-        number: int,
-        t_s: float,
-        position_mm: float | None,
-        tables: tuple[pd.DataFrame, pd.DataFrame],
+        self, number: int, t_s: float, position_mm: float | None, tables: Tables
     ) -> Linked | None:
         """One frame; returns rows when enough of them are final."""
         predicted = self.tracker.predict(t_s, position_mm)
-        pairs = pair_frame(tables, self.cameras, self.model, predicted)
-        lonely = _unpaired(tables, pairs)
         pixels = _pixels(tables[0], self._wander), _pixels(tables[1], self._wander)
-        measured, offset_px = _measured(self.cameras, tables, pixels, pairs, lonely)
+        pairs, offset_px = pair_frame(tables, pixels, self.cameras, self.model, predicted)
+        everyone = (np.arange(len(table)) for table in tables)
+        first, second = (np.setdiff1d(i, rows) for i, rows in zip(everyone, pairs.rows.T))
+        lonely = (first, second)
+        measured = _measured(pairs, lonely, pixels, offset_px)
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
-            number,
-            t_s,
-            tables,
-            pixels,
-            offset_px,
-            pairs,
-            lonely,
-            measured,
-            result.alone,
-            result.motion,
+            number, t_s, tables, pixels, offset_px, pairs, lonely, result.alone, result.motion
         )
         self._settle(result)
         enough = self._waiting >= _PAIRS_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
@@ -95,7 +90,7 @@ class Linker:
 
     @property
     def _wander(self) -> float:
-        """How far a bubble's shape may move its outline's centre, as a share of its radius."""
+        """Sd of the shift of an outline's centre by a bubble's shape, as a share of its radius."""
         sigma = DEFAULT_SHAPE_SIGMA if self.shape_sigma is None else self.shape_sigma
         return WANDER * float(sigma[0])
 
@@ -112,10 +107,10 @@ class Linker:
             frame = self._open.pop(ids.frame)
             frame.settle(ids)
             self._closed.append(frame)
-            self._waiting += 1 + len(frame.pairs.first)
+            self._waiting += 1 + len(frame.pairs)
 
     def _flush(self, ahead: int) -> Linked:
-        """Rows of all closed frames but the last few, which tell where hidden bubbles went."""
+        """Rows of all closed frames but the last few, by which hidden bubbles are smoothed."""
         done = self._closed[: len(self._closed) - ahead]
         self._closed, self._waiting = self._closed[len(done) :], 0
         window = (self._before, done, self._closed)
@@ -132,9 +127,7 @@ class Linker:
         return Linked(found, _detections(done))
 
     def _tracks(self, frames: Sequence[Frame]) -> pd.DataFrame:
-        parts = [
-            [f.tables[c].iloc[(f.pairs.first, f.pairs.second)[c]] for f in frames] for c in (0, 1)
-        ]
+        parts = ([f.tables[c].iloc[f.pairs.rows[:, c]] for f in frames] for c in (0, 1))
         first, second = (pd.concat(part, ignore_index=True) for part in parts)
         bodies = fit_bodies(
             first,
@@ -143,7 +136,7 @@ class Linker:
             shape_sigma=self.shape_sigma,
             gap_sigma_px=float(np.hypot(self.model.frame_px, self.model.rms_px[0])),
         )
-        many = [len(f.pairs.first) for f in frames]
+        many = [len(f.pairs) for f in frames]
         table = pd.DataFrame(
             {
                 "frame": np.repeat([f.number for f in frames], many),
@@ -152,12 +145,12 @@ class Linker:
             }
         )
         table[["x_mm", "y_mm", "z_mm"]] = bodies.points_mm
-        table[COVARIANCE_MM2] = bodies.covariance_mm2[:, _UPPER[0], _UPPER[1]]
+        table[COVARIANCE_MM2] = bodies.covariance_mm2[:, *np.triu_indices(3)]
         shape = _shape_share_px2(self.cameras, bodies)
         for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
-            values = rows[_PER_CAMERA].to_numpy(float)
-            values[:, 2:] += shape[:, c][:, [0, 0, 1], [0, 1, 1]]
-            table[[f"{camera.name}_{name}" for name in _PER_CAMERA]] = values
+            values = rows[CENTRE_PX].to_numpy(float)
+            values[:, 2:] += shape[:, c][:, *np.triu_indices(2)]
+            table[[f"{camera.name}_{name}" for name in CENTRE_PX]] = values
             table[f"{camera.name}_du_px"] = bodies.du_px[:, c]
             table[f"{camera.name}_dv_px"] = bodies.dv_px[:, c]
         table["ray_miss_mm"] = bodies.ray_miss_mm
@@ -171,7 +164,7 @@ class Linker:
 
 
 def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
-    """(M, 2, 2, 2) per camera: what the bubble's shape adds to its centre's covariance."""
+    """(M, 2, 2, 2) per camera: share of the bubble's shape in its centre's covariance."""
     out = np.zeros((len(bodies.points_mm), 2, 2, 2))
     known = np.isfinite(bodies.covariance_mm2).all((1, 2))
     share = (bodies.covariance_mm2 - bodies.silhouette_covariance_mm2)[known]
@@ -185,38 +178,52 @@ def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
 
 
 def pair_frame(
-    tables: tuple[pd.DataFrame, pd.DataFrame],
+    tables: Tables,
+    pixels: tuple[Pixels, Pixels],
     cameras: tuple[Camera, Camera],
     model: PairModel,
     predicted: Prediction | None,
-) -> Pairs:
-    """Given ids pair up as they are; the rest is matched."""
+) -> tuple[Pairs, Array]:
+    """The triangulated pairs of a frame, and (2, 2) the common shift of each camera's pixels.
+
+    Detections with given ids pair up by these; the others are matched.
+    """
     ids = [given_ids(table) for table in tables]
-    common = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1])
-    rows = [np.array([np.flatnonzero(i == p)[0] for p in common], np.int64) for i in ids]
+    given = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1]).astype(np.int64)
+    rows = np.array([[np.flatnonzero(i == p)[0] for i in ids] for p in given], np.int64)
+    rows = rows.reshape(-1, 2)
+    confidence, ambiguous = np.ones(len(given)), np.zeros(len(given), bool)
     free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
-    if not (len(free[0]) and len(free[1])):
-        sure = np.ones(len(common))
-        return Pairs(rows[0], rows[1], sure, np.zeros(len(common), bool), common.astype(np.int64))
-    found = match_pairs(
-        tables[0].iloc[free[0]], tables[1].iloc[free[1]], cameras, model, predicted=predicted
+    if len(free[0]) and len(free[1]):
+        first, second = (table.iloc[i] for table, i in zip(tables, free))
+        found = match_pairs(first, second, cameras, model, predicted=predicted)
+        matched = np.stack([free[0][found.first], free[1][found.second]], -1)
+        rows = np.concatenate([rows, matched])
+        confidence = np.concatenate([confidence, found.confidence])
+        ambiguous = np.concatenate([ambiguous, found.ambiguous])
+        given = np.concatenate([given, np.full(len(found), NO_PARTICLE)])
+    (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))
+    points = triangulate(cameras, (uv_a, uv_b), (cov_a, cov_b))
+    expected, by_point, _ = stacked_jacobian(cameras, points.points_mm)
+    left = np.hstack([uv_a, uv_b]) - expected
+    offset = np.zeros((2, 2))
+    if len(left) >= _LEAST_FOR_OFFSET:
+        offset = np.median(left, axis=0).reshape(2, 2)
+    d_eq_mm2 = np.ones(len(rows))
+    for c, table in enumerate(tables):
+        scale = px_per_mm(by_point[:, 2 * c : 2 * c + 2])
+        d_eq_mm2 *= table["d_eq_px"].to_numpy(float)[rows[:, c]] / scale
+    pairs = Pairs(
+        rows,
+        confidence,
+        ambiguous,
+        given,
+        points.points_mm,
+        points.covariance_mm2,
+        np.sqrt(d_eq_mm2),
+        np.full(len(rows), NO_PARTICLE),
     )
-    none = np.full(len(found), NO_PARTICLE)
-    return Pairs(
-        np.concatenate([rows[0], free[0][found.first]]),
-        np.concatenate([rows[1], free[1][found.second]]),
-        np.concatenate([np.ones(len(common)), found.confidence]),
-        np.concatenate([np.zeros(len(common), bool), found.ambiguous]),
-        np.concatenate([common, none]).astype(np.int64),
-    )
-
-
-def _unpaired(tables: tuple[pd.DataFrame, pd.DataFrame], pairs: Pairs) -> tuple[Index, Index]:
-    first, second = (
-        np.setdiff1d(np.arange(len(table)), taken)
-        for table, taken in zip(tables, (pairs.first, pairs.second))
-    )
-    return first, second
+    return pairs, offset
 
 
 def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
@@ -228,54 +235,23 @@ def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
 
 
 def _measured(
-    cameras: tuple[Camera, Camera],
-    tables: tuple[pd.DataFrame, pd.DataFrame],
-    pixels: tuple[Pixels, Pixels],
-    pairs: Pairs,
-    lonely: tuple[Index, Index],
-) -> tuple[FrameMeasurements, Array]:
-    """What the tracker gets, and (2, 2) how far off each camera shows what both see."""
-    (uv_a, cov_a), (uv_b, cov_b) = pixels
-    found = triangulate(
-        cameras, (uv_a[pairs.first], uv_b[pairs.second]), (cov_a[pairs.first], cov_b[pairs.second])
-    )
-    expected, _, _ = stacked_jacobian(cameras, found.points_mm)
-    left = np.hstack([uv_a[pairs.first], uv_b[pairs.second]]) - expected
-    offset = np.zeros((2, 2))
-    if len(left) >= _LEAST_FOR_OFFSET:
-        offset = np.median(left, axis=0).reshape(2, 2)
+    pairs: Pairs, lonely: tuple[Index, Index], pixels: tuple[Pixels, Pixels], offset_px: Array
+) -> FrameMeasurements:
+    """The tracker's input; lonely : rows of the detections without a partner."""
+    (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, lonely))
     singles = SingleMeasurements(
         np.repeat([0, 1], [len(i) for i in lonely]).astype(np.int64),
-        np.concatenate([uv_a[lonely[0]] - offset[0], uv_b[lonely[1]] - offset[1]]),
-        np.concatenate([cov_a[lonely[0]], cov_b[lonely[1]]]),
+        np.concatenate([uv_a - offset_px[0], uv_b - offset_px[1]]),
+        np.concatenate([cov_a, cov_b]),
     )
-    measured = FrameMeasurements.create(
-        found.points_mm,
-        found.covariance_mm2,
-        d_eq_mm=_diameter_mm(cameras, tables, pairs, found.points_mm),
+    return FrameMeasurements.create(
+        pairs.points_mm,
+        pairs.covariance_mm2,
+        d_eq_mm=pairs.d_eq_mm,
         confidence=pairs.confidence,
-        particle=pairs.particle,
+        particle=pairs.given,
         singles=singles,
     )
-    return measured, offset
-
-
-def _diameter_mm(
-    cameras: tuple[Camera, Camera],
-    tables: tuple[pd.DataFrame, pd.DataFrame],
-    pairs: Pairs,
-    points_mm: Array,
-) -> Array:
-    """(M,) geometric mean of the two views' equivalent diameters, NaN where unknown."""
-    if not len(points_mm) or not all("d_eq_px" in table for table in tables):
-        return np.full(len(points_mm), np.nan)
-    _, jacobian, _ = stacked_jacobian(cameras, points_mm)
-    product = np.ones(len(points_mm))
-    for c, rows in enumerate((pairs.first, pairs.second)):
-        view = jacobian[:, 2 * c : 2 * c + 2]
-        px_per_mm = np.linalg.det(view @ np.swapaxes(view, -1, -2)) ** 0.25
-        product *= tables[c]["d_eq_px"].to_numpy(float)[rows] / px_per_mm
-    return np.sqrt(product)
 
 
 def _detections(frames: Sequence[Frame]) -> pd.DataFrame:

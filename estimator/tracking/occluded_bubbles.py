@@ -1,4 +1,4 @@
-"""Rows of tracks.csv for bubbles that one camera sees and the other hides behind another bubble."""
+"""Rows of tracks.csv for bubbles that one camera sees and another bubble hides from the other."""
 
 from __future__ import annotations
 
@@ -8,11 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.estimator.tracking.association.single_camera import projected, px_per_mm
 from telerig.estimator.tracking.filter.rts_smoother import smooth_points
 from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
-from telerig.estimator.tracking.frame_rows import Frame, Single, readings_of
+from telerig.estimator.tracking.frame_rows import (
+    CENTRE_PX,
+    COVARIANCE_MM2,
+    Frame,
+    Single,
+    readings_of,
+)
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import stacked_jacobian
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,21 +26,20 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FRAMES_BEFORE, FRAMES_AFTER = 15, 40
-"""Frames around a hidden one that tell where its bubble is."""
+"""Frames around a hidden one by which its position is smoothed."""
 
 FLAG = "shared"
 _SHARPNESS, _SHARPNESS_PX = 0.1, 3.0
 """Largest sd of a hidden centre, as a share of the bubble's diameter and in px."""
 
 _APART = 0.5
-"""Least distance of two bubbles' centres, as a share of what it is when they touch."""
+"""Least distance of two bubbles' centres, as a share of their distance when they touch."""
 
 _BEHIND = 0.25
-"""Sd of "behind that outline", as a share of the outline's semi-axis."""
-
+"""Standard deviation of a pixel "behind that outline", as a share of the outline's semi-axis."""
 
 _CONFIDENCE = 0.95
-"""Share of such points that are right, in simulated swarms."""
+"""Share of such points that were right in simulated swarms."""
 
 
 def shared_rows(
@@ -44,10 +49,10 @@ def shared_rows(
     cameras: tuple[Camera, Camera],
     settings: TrackerSettings,
 ) -> list[dict[str, Any]]:
-    """Rows for the hidden bubbles of ``frames``; what is around them is context.
+    """Rows for the hidden bubbles of ``frames``; the frames before and after are context.
 
-    The hidden view's pixel is that of the point; its covariance says no more than that the bubble
-    is behind that outline, so that motion is not counted twice when tracks are smoothed.
+    The hidden view's pixel is that of the point; its covariance states only that the bubble is
+    behind that outline, so that motion is not counted twice when tracks are smoothed.
     """
     every = [*before, *frames, *after]
     seen = {int(p) for f in every for p in f.particle}
@@ -61,7 +66,7 @@ def shared_rows(
     out = []
     for i, frame in enumerate(frames, len(before)):
         known = frame.particle != NO_PARTICLE
-        where, sizes = [*frame.points_mm[known]], frame.d_eq_mm[known].tolist()
+        where, sizes = [*frame.pairs.points_mm[known]], frame.pairs.d_eq_mm[known].tolist()
         singles = [s for s in frame.hidden() if s.particle in place]
         for single in sorted(singles, key=lambda s: np.trace(covariances[i, place[s.particle]])):
             k = place[single.particle]
@@ -77,7 +82,7 @@ def shared_rows(
 def _taken(
     single: Single, point_mm: Array, others_mm: Sequence[Array], sizes_mm: Sequence[float]
 ) -> bool:
-    """Whether another track's bubble is where this one would be."""
+    """Whether another track's bubble occupies the place of this one."""
     away = np.linalg.norm(np.reshape(others_mm, (-1, 3)) - point_mm, axis=1)
     return bool((away < _APART * (np.array(sizes_mm) + single.d_eq_mm) / 2).any())
 
@@ -89,39 +94,35 @@ def _row(
     covariance: Array,
     cameras: tuple[Camera, Camera],
 ) -> dict[str, Any] | None:
-    """None where the point is too vague, or no other bubble explains why it is not seen."""
+    """None where the point is too uncertain, or no other bubble explains why it is not seen."""
     seen = single.camera
     mine = frame.tables[seen].iloc[single.row]
     other = cameras[1 - seen]
-    uv, by_point, _ = stacked_jacobian((other,), point[None])
-    uv = uv + frame.offset_px[1 - seen]
-    spread = by_point[0] @ covariance @ by_point[0].T
-    px_per_mm = np.linalg.det(by_point[0] @ by_point[0].T) ** 0.25
-    diameter = single.d_eq_mm * px_per_mm
+    view = projected(other, point[None], covariance[None])
+    uv, spread = view.uv_px[0] + frame.offset_px[1 - seen], view.covariance_px2[0]
+    diameter = single.d_eq_mm * px_per_mm(view.by_point)[0]
     sd = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
-    reach = _outline_over(frame.tables[1 - seen], uv[0], diameter / 2)
+    reach = _outline_over(frame.tables[1 - seen], uv, diameter / 2)
     if not (sd <= min(_SHARPNESS * diameter, _SHARPNESS_PX) and reach > 0):
         return None
     behind = spread + (_BEHIND * reach) ** 2 * np.eye(2)
     per_camera = {
-        cameras[seen].name: mine[["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]].tolist(),
-        other.name: [*uv[0], behind[0, 0], behind[0, 1], behind[1, 1]],
+        cameras[seen].name: mine[CENTRE_PX].tolist(),
+        other.name: [*uv, behind[0, 0], behind[0, 1], behind[1, 1]],
     }
-    names = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
     flags = sorted({FLAG, *filter(None, str(mine["flags"] or "").split("|"))})
-    upper = ("xx", "xy", "xz", "yy", "yz", "zz")
     return {
         "frame": frame.number,
         "particle": single.particle,
         "t_s": frame.t_s,
-        **dict(zip(("x_mm", "y_mm", "z_mm"), point)),
-        **{f"s{n}_mm2": v for n, v in zip(upper, covariance[np.triu_indices(3)])},
-        **{f"{c}_{n}": v for c, values in per_camera.items() for n, v in zip(names, values)},
+        **{f"{x}_mm": v for x, v in zip("xyz", point)},
+        **dict(zip(COVARIANCE_MM2, covariance[np.triu_indices(3)])),
+        **{f"{c}_{n}": v for c, values in per_camera.items() for n, v in zip(CENTRE_PX, values)},
         **{f"{c}_{n}": 0.0 for c in per_camera for n in ("du_px", "dv_px")},
         "d_eq_mm": single.d_eq_mm,
         "confidence": _CONFIDENCE,
         "centre": "silhouettes",
-        **dict(zip(("silhouettes_x_mm", "silhouettes_y_mm", "silhouettes_z_mm"), point)),
+        **{f"silhouettes_{x}_mm": v for x, v in zip("xyz", point)},
         "flags": "|".join(flags),
     }
 

@@ -14,18 +14,14 @@ import numpy as np
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import find_bubbles, outline_points
-from telerig.estimator.rig_drift.from_pairs import PairCollector
 from telerig.estimator.tracking.detection import Progress, Scene, make_scene
 from telerig.estimator.tracking.link import Linked
 from telerig.estimator.tracking.track import (
     TrackingStream,
     TrackOptions,
-    add_counts,
     check_calibration,
-    count_rows,
     numbered_particles,
     stage_axis,
-    summary_of,
     tracking_stream,
 )
 from telerig.estimator.tracking.tracks import events_table
@@ -100,20 +96,19 @@ def write_tracking(
     work = folder.parent / f".{folder.name}.work"
     with atomic_folder(folder) as staged:
         stream = tracking_stream(run, calibration, work, options, stage)
-        pairs = PairCollector(calibration)
-        counts, worst = _write_rows(stream, staged, pairs)
-        summary = summary_of(run, calibration, stream, counts, pairs.found())
+        worst = _write_rows(stream, staged)
+        summary = stream.summary()
         summary["worst_frames"] = worst.frames()
         TrackingFile.of(summary, folder / "tracking.json").write(staged / "tracking.json")
         write_table(events_table(stream.events), staged / "events.csv")
-        table = stream.followed.table if stream.followed is not None else None
+        table = stream.marks.table if stream.marks is not None else None
         if table is not None:
-            shutil.copyfile(table, staged / "references.csv")
+            write_table(table, staged / "references.csv")
         write_json_atomic(staged / "run.json", _record(run, options, record))
         if run.detections is None:
             cameras = check_calibration(run, calibration)
             axis = stage_axis(run, calibration)
-            strips = stream.followed.strips if stream.followed is not None else None
+            strips = stream.marks.strips if stream.marks is not None else None
             scene = stream.scene or make_scene(
                 run, cameras, axis, options.min_diameter_px, strips=strips
             )
@@ -138,19 +133,15 @@ def _check_ids(detections: pd.DataFrame) -> None:
         )
 
 
-def _write_rows(
-    stream: TrackingStream, staged: Path, pairs: PairCollector
-) -> tuple[dict[str, Any], _Worst]:
-    counts, worst, begun = count_rows([]), _Worst(), False
+def _write_rows(stream: TrackingStream, staged: Path) -> _Worst:
+    worst, begun = _Worst(), False
     for part in stream.rows:
         for name, table in (("tracks", part.tracks), ("detections", part.detections)):
             with (staged / f"{name}.csv").open("a", encoding="utf-8", newline="") as file:
                 table.to_csv(file, index=False, header=not begun, lineterminator="\n")
         begun = True
-        add_counts(counts, part)
         worst.add(part)
-        pairs.add(part.tracks)
-    return counts, worst
+    return worst
 
 
 def _record(run: RunData, options: TrackOptions, record: Mapping[str, Any]) -> dict[str, Any]:

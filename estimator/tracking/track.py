@@ -1,4 +1,4 @@
-"""A run tracked: background, detection over the cores, pairs, tracks; streaming and resumable."""
+"""Tracking of a run: background, detection, pairs, tracks; row by row, and resumable."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
@@ -31,8 +31,13 @@ from telerig.estimator.tracking.detection import (
     make_scene,
 )
 from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
+from telerig.estimator.tracking.frame_rows import Tables
 from telerig.estimator.tracking.link import Linked, Linker
-from telerig.estimator.tracking.marks_of_run import Followed, follow_references, wanted
+from telerig.estimator.tracking.marks_of_run import (
+    FollowedMarks,
+    described_strip,
+    follow_references,
+)
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
@@ -40,21 +45,19 @@ from telerig.io.machine.parallel import cores
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
-    from telerig.estimator.rig_drift.drift import RigChange
     from telerig.estimator.tracking.filter.types import TrackEvent
 
 Array = NDArray[np.float64]
-Tables = tuple[pd.DataFrame, pd.DataFrame]
 
 MODEL_FRAMES = 60
-"""Frames spread over the run from which the pairs' common features are learnt."""
+"""Frames spread over the run from which the pair model is learnt."""
 
-_SURE = 0.99
+_RELIABLE = 0.99
 
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """min_diameter_px : smaller dark spots are dirt.  tracker : see `TrackerSettings`."""
+    """min_diameter_px : smaller dark spots count as dirt.  tracker : see `TrackerSettings`."""
 
     min_diameter_px: float = 8.0
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
@@ -62,15 +65,77 @@ class TrackOptions:
 
 @dataclass
 class TrackingStream:
-    """Finished rows as they come, then what is known at the end."""
+    """A run while it is tracked. Read ``rows`` to their end; then ask for the ``summary``.
 
-    rows: Iterator[Linked]
-    events: list[TrackEvent]
-    model: PairModel
-    shape_sigma: Array | None
+    rows : final rows of the tables, some frames at a time.  events : what happened to tracks.
+    shape_sigma : see `estimate_shape_sigma`.  frames_without : per camera, by reason, how often.
+    scene : None when all detections were there before.  marks : None without a strip of dots.
+    """
+
+    run: RunData
+    calibration: Calibration
+    linker: Linker
     frames_without: dict[str, dict[str, int]]
     scene: Scene | None
-    followed: Followed | None = None
+    marks: FollowedMarks | None
+    linked: Iterator[Linked]
+    detections: int = 0
+    points: int = 0
+    particles: set[Any] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._pairs = PairCollector(self.calibration)
+
+    @property
+    def events(self) -> list[TrackEvent]:
+        return self.linker.events
+
+    @property
+    def rows(self) -> Iterator[Linked]:
+        for part in self.linked:
+            self.detections += int(np.isfinite(part.detections["u_px"].to_numpy(float)).sum())
+            self.points += len(part.tracks)
+            self.particles |= set(part.tracks["particle"])
+            self._pairs.add(part.tracks)
+            yield part
+
+    def summary(self) -> dict[str, Any]:
+        """The content of tracking.json. Raises InputError when no bubble was found."""
+        run, model, kinds = self.run, self.linker.model, [e.kind for e in self.events]
+        if not self.detections:
+            raise InputError(
+                f"no bubble was found in {run.frame_count} frames",
+                where=str(run.path),
+                todo="look at the images; bubbles must be darker than the screen, and wider than "
+                "--min-diameter",
+            )
+        change = self._pairs.found()
+        content: dict[str, Any] = {
+            "schema": 1,
+            "kind": "telerig tracks",
+            "run": run.name,
+            "pixel_origin": "centre",
+            "frame_of_reference": "rig frame (the first camera's), mm",
+            "image_size_px": dict(run.image_sizes_px),
+            "frames": run.frame_count,
+            "detections": self.detections,
+            "points": self.points,
+            "tracks": len(self.particles),
+            "detections_without_partner_or_track": self.detections - 2 * self.points,
+            "frames_without_bubbles": self.frames_without,
+            "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
+            "pairs": with_change(model, change, self.calibration),
+            "shape_sigma": self.linker.shape_sigma,
+            "covariance": "Of the measurement. The calibration's share, common to all points, is "
+            "not in tracks.csv.",
+            "warnings": window_warnings(run.rig, self.calibration),
+            "notes": list(run.notes),
+        }
+        if change is not None:
+            content["rig_change"] = change.as_dict()
+        if self.marks is not None:
+            content["references"] = self.marks.summary
+        return content
 
 
 def track(
@@ -80,7 +145,7 @@ def track(
     options: TrackOptions | None = None,
     stage: Progress | None = None,
 ) -> Tracks:
-    """Find, match and follow the bubbles of a run.
+    """Detect, pair and follow the bubbles of a run.
 
     run : `telerig.io.dataset.run.load_run`, or ``dataset.runs[name].load()``.
     Raises InputError for recordings that cannot be used, CalibrationError for the calibration of
@@ -89,15 +154,15 @@ def track(
     with tempfile.TemporaryDirectory(prefix="telerig-") as work:
         stream = tracking_stream(run, calibration, Path(work) / "work", options, stage)
         parts = list(stream.rows)
-        marks = None if stream.followed is None else stream.followed.rows()
     tables = [p.tracks for p in parts if len(p.tracks)] or [p.tracks for p in parts[:1]]
-    joined = pd.concat(tables, ignore_index=True)
-    detections = pd.concat([p.detections for p in parts], ignore_index=True)
-    counts = count_rows(parts)
-    pairs = PairCollector(calibration)
-    pairs.add(joined)
-    summary = summary_of(run, calibration, stream, counts, pairs.found())
-    return Tracks(run.name, detections, joined, events_table(stream.events), summary, marks)
+    return Tracks(
+        run.name,
+        pd.concat([p.detections for p in parts], ignore_index=True),
+        pd.concat(tables, ignore_index=True),
+        events_table(stream.events),
+        stream.summary(),
+        None if stream.marks is None else stream.marks.table,
+    )
 
 
 def tracking_stream(
@@ -107,53 +172,52 @@ def tracking_stream(
     options: TrackOptions | None = None,
     stage: Progress | None = None,
 ) -> TrackingStream:
-    """Detect (keeping what is found in ``work``), learn how pairs look, then link lazily."""
+    """Detect (detections are kept in ``work``), learn the pair model, then link lazily."""
     chosen = options or TrackOptions()
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
-    first_id, labels, scene, followed = 0, None, None, None
+    first_id, labels, scene, marks = 0, None, None, None
     batches: Callable[[], Iterator[pd.DataFrame]]
     if run.detections is not None:
         table, labels = numbered_particles(_complete(run.detections))
         first_id = int(table["particle"].max()) + 1
         batches = partial(iter, (table,))
     else:
-        asked = {"options": repr(chosen), "cameras": repr(cameras)}
-        strip = wanted(run)
+        inputs = {"options": repr(chosen), "cameras": repr(cameras)}
+        strip = described_strip(run)
         if strip is not None:
-            asked |= {"references": repr(strip), "axis": repr(axis)}
-        mark = fingerprint(run, asked)
-        store = DetectionStore(work, mark, run.frame_count, cores())
-        followed = follow_references(run, cameras, axis, store, stage)
-        if store.missing:
-            strips = followed.strips if followed is not None else None
+            inputs |= {"references": repr(strip), "axis": repr(axis)}
+        store = DetectionStore(work, fingerprint(run, inputs), run.frame_count, cores())
+        marks = follow_references(run, cameras, axis, store, stage)
+        if store.missing():
+            strips = marks.strips if marks is not None else None
             scene = make_scene(run, cameras, axis, chosen.min_diameter_px, stage, strips)
             detect_missing(scene, store, stage)
         batches = store.tables
     without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
     sample = _sample(run, cameras, batches())
     model = estimate_pair_model(sample, cameras)
-    sigma = _shape_sigma(sample, cameras, model)
     tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
-    linker = Linker(cameras, model, tracker, sigma)
+    linker = Linker(cameras, model, tracker, _shape_sigma(sample, cameras, model))
     rows = _linked(run, cameras, batches(), linker, without, stage)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
-    return TrackingStream(rows, linker.events, model, sigma, without, scene, followed)
+    return TrackingStream(run, calibration, linker, without, scene, marks, rows)
 
 
 def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:
-    """A run shorter than what confirms a track confirms it by what it has."""
-    wanted = options.tracker
-    hits = max(1, min(wanted.confirm_hits, run.frame_count))
-    return replace(wanted, confirm_hits=hits, confirm_frames=max(hits, wanted.confirm_frames))
+    """In a run of fewer frames than confirm a track, all its frames do."""
+    settings = options.tracker
+    hits = max(1, min(settings.confirm_hits, run.frame_count))
+    return replace(settings, confirm_hits=hits, confirm_frames=max(hits, settings.confirm_frames))
 
 
 def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, Camera]:
     """The two cameras; raises CalibrationError when the run was not taken with them."""
     if len(calibration.cameras) != 2:
         raise CalibrationError(
-            f"tracking in space needs two cameras, the calibration has {len(calibration.cameras)}",
+            f"tracking in space needs two cameras, but the calibration has "
+            f"{len(calibration.cameras)}",
             todo="calibrate both cameras together",
         )
     names = [c.name for c in calibration.cameras]
@@ -177,23 +241,23 @@ def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, C
 
 def stage_axis(run: RunData, calibration: Calibration) -> Array:
     """(3,) unit travel direction in the rig frame: calibrated, from rig.toml, or upwards."""
-    axis = np.array([0.0, -1.0, 0.0])
+    axis: ArrayLike = (0.0, -1.0, 0.0)
     if calibration.stage:
-        axis = np.asarray(calibration.stage["axis"], float)
+        axis = calibration.stage["axis"]
     elif run.rig is not None and run.rig.stage is not None:
-        axis = np.asarray(run.rig.stage.axis, float)
-    return np.asarray(axis / np.linalg.norm(axis))
+        axis = run.rig.stage.axis
+    return np.asarray(np.asarray(axis, float) / np.linalg.norm(axis))
 
 
 def _complete(detections: pd.DataFrame) -> pd.DataFrame:
-    """A user's detections with every column that matching reads."""
+    """A user's detections, the columns that they lack filled with blanks."""
     missing = [name for name in DETECTION_COLUMNS if name not in detections]
     blank = {name: "" if name == "flags" else np.nan for name in missing}
     return detections.assign(**blank)
 
 
 def numbered_particles(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str] | None]:
-    """Given ids as numbers, -1 where blank; and their texts, None when all are whole numbers."""
+    """Given ids as numbers, -1 where blank; and their names, None when all are whole numbers."""
     texts = table["particle"].astype(str) if "particle" in table else pd.Series("", table.index)
     given = sorted(set(texts) - {""})
     if all(text.isascii() and text.isdecimal() and str(int(text)) == text for text in given):
@@ -206,7 +270,7 @@ def numbered_particles(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str
 
 
 def _labelled(part: Linked, labels: dict[int, str]) -> Linked:
-    """Given ids that are no numbers reach the output as they were."""
+    """The given names in place of numbers."""
 
     def named(particle: pd.Series[Any]) -> list[str]:
         return ["" if pd.isna(p) else labels.get(int(p), str(p)) for p in particle]
@@ -218,13 +282,12 @@ def _labelled(part: Linked, labels: dict[int, str]) -> Linked:
 
 
 def _split(table: pd.DataFrame, cameras: tuple[Camera, Camera]) -> dict[int, Tables]:
-    """By frame, the two cameras' bubbles; rows that only say why there is none are left out."""
+    """By frame, the two cameras' bubbles; rows that hold only a reason are left out."""
     kept = table[np.isfinite(table["u_px"].to_numpy(float))]
-    empty = kept.iloc[:0]
     found = dict(iter(kept.groupby(["frame", "camera"], sort=False)))
-    names = [c.name for c in cameras]
+    first, second = (c.name for c in cameras)
     return {
-        int(f): (found.get((f, names[0]), empty), found.get((f, names[1]), empty))
+        int(f): (found.get((f, first), kept.iloc[:0]), found.get((f, second), kept.iloc[:0]))
         for f in sorted(set(table["frame"]))
     }
 
@@ -232,24 +295,25 @@ def _split(table: pd.DataFrame, cameras: tuple[Camera, Camera]) -> dict[int, Tab
 def _sample(
     run: RunData, cameras: tuple[Camera, Camera], batches: Iterator[pd.DataFrame]
 ) -> list[Tables]:
-    wanted = set(np.linspace(0, run.frame_count - 1, MODEL_FRAMES).astype(int).tolist())
+    """The detections of `MODEL_FRAMES` frames."""
+    frames = np.linspace(0, run.frame_count - 1, MODEL_FRAMES).astype(int)
     return [
         tables
         for batch in batches
-        for frame, tables in _split(batch[batch["frame"].isin(wanted)], cameras).items()
+        for tables in _split(batch[batch["frame"].isin(frames)], cameras).values()
     ]
 
 
 def _shape_sigma(
     sample: list[Tables], cameras: tuple[Camera, Camera], model: PairModel
 ) -> Array | None:
-    """How much the outlines of this run deviate from ellipses, from pairs that are sure."""
+    """How much the outlines of this run deviate from ellipses, by its reliable pairs."""
     firsts, seconds = [], []
     for first, second in sample:
         found = match_pairs(first, second, cameras, model)
-        sure = found.confidence > _SURE
-        firsts.append(first.iloc[found.first[sure]])
-        seconds.append(second.iloc[found.second[sure]])
+        reliable = found.confidence > _RELIABLE
+        firsts.append(first.iloc[found.first[reliable]])
+        seconds.append(second.iloc[found.second[reliable]])
     if not sum(map(len, firsts)):
         return None
     return estimate_shape_sigma(
@@ -288,63 +352,6 @@ def _linked(
 def _count_reasons(batch: pd.DataFrame, without: dict[str, dict[str, int]]) -> None:
     if "reason" not in batch:
         return
-    told = batch[batch["reason"] != ""]
-    for camera, reason in zip(told["camera"].astype(str), told["reason"].astype(str)):
+    empty = batch[batch["reason"] != ""]
+    for camera, reason in zip(empty["camera"].astype(str), empty["reason"].astype(str)):
         without[camera][reason] = without[camera].get(reason, 0) + 1
-
-
-def count_rows(parts: list[Linked]) -> dict[str, Any]:
-    """What the tables hold; accumulated so that a long run need not be held."""
-    counts: dict[str, Any] = {"detections": 0, "points": 0, "unpaired": 0, "ids": set()}
-    for part in parts:
-        add_counts(counts, part)
-    return counts
-
-
-def add_counts(counts: dict[str, Any], part: Linked) -> None:
-    found = int(np.isfinite(part.detections["u_px"].to_numpy(float)).sum())
-    counts["detections"] += found
-    counts["points"] += len(part.tracks)
-    counts["unpaired"] += found - 2 * len(part.tracks)
-    counts["ids"] |= set(part.tracks["particle"])
-
-
-def summary_of(
-    run: RunData, calibration: Calibration, stream: TrackingStream, counts: dict[str, Any],
-    change: RigChange | None,
-) -> dict[str, Any]:  # fmt: skip
-    """The content of tracking.json; change : of the cameras since the calibration, if known."""
-    model, kinds = stream.model, [e.kind for e in stream.events]
-    if not counts["detections"]:
-        raise InputError(
-            f"no bubble was found in {run.frame_count} frames",
-            where=str(run.path),
-            todo="look at the images; bubbles must be darker than the screen, and wider than "
-            "--min-diameter",
-        )
-    content: dict[str, Any] = {
-        "schema": 1,
-        "kind": "telerig tracks",
-        "run": run.name,
-        "pixel_origin": "centre",
-        "frame_of_reference": "rig frame (the first camera's), mm",
-        "image_size_px": dict(run.image_sizes_px),
-        "frames": run.frame_count,
-        "detections": counts["detections"],
-        "points": counts["points"],
-        "tracks": len(counts["ids"]),
-        "detections_without_partner_or_track": counts["unpaired"],
-        "frames_without_bubbles": stream.frames_without,
-        "events": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
-        "pairs": with_change(model, change, calibration),
-        "shape_sigma": stream.shape_sigma,
-        "covariance": "of the measurement; the calibration's share, common to all points, is not "
-        "in tracks.csv",
-        "warnings": window_warnings(run.rig, calibration),
-        "notes": list(run.notes),
-    }
-    if change is not None:
-        content["rig_change"] = change.as_dict()
-    if stream.followed is not None:
-        content["references"] = stream.followed.summary
-    return content

@@ -10,16 +10,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.matching import Prediction
-from telerig.estimator.tracking.association.advance import Scan, advance
+from telerig.estimator.tracking.association.advance import Scan, advance, follow_labelled
 from telerig.estimator.tracking.association.hypotheses import Broken, Cluster, Decision, decide
-from telerig.estimator.tracking.association.labelled_tracks import follow_given
-from telerig.estimator.tracking.association.ledger import Ledger
-from telerig.estimator.tracking.association.single_camera import continue_alone, seen_alone
-from telerig.estimator.tracking.filter.motion import Transition, state_size, transition
-from telerig.estimator.tracking.filter.stage_input import StageMotion
-from telerig.estimator.tracking.filter.state import Common, Track, predict
+from telerig.estimator.tracking.association.open_frames import OpenFrames
+from telerig.estimator.tracking.association.single_camera import continue_alone
+from telerig.estimator.tracking.filter.motion import (
+    POSITION,
+    STATES,
+    VELOCITY,
+    StageMotion,
+    Transition,
+    transition,
+)
+from telerig.estimator.tracking.filter.state import Common, Track
 from telerig.estimator.tracking.filter.types import (
     NO_PARTICLE,
+    FrameIds,
     FrameMeasurements,
     FrameResult,
     Ids,
@@ -28,8 +34,7 @@ from telerig.estimator.tracking.filter.types import (
     TrackerSettings,
     TrackEvent,
 )
-from telerig.estimator.tracking.lifecycle.birth import born, extend, hopeless
-from telerig.estimator.tracking.lifecycle.death import ended, split_off
+from telerig.estimator.tracking.lifecycle import born, ended, extend, hopeless, split_off
 from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
@@ -68,9 +73,9 @@ class Tracker:
         self.clusters: list[Cluster] = []
         self.given: list[Track] = []
         self.tentative: list[Track] = []
-        self.common = Common.start(state_size(self.settings))
+        self.common = Common()
         self.stage = StageMotion()
-        self.ledger = Ledger()
+        self.frames = OpenFrames()
         self.last: tuple[int, float] | None = None
 
     def predict(self, t_s: float, position_mm: float | None = None) -> Prediction:
@@ -79,19 +84,18 @@ class Tracker:
         Raises InputError when t_s is not after the last frame's.
         """
         tracks = self._confirmed()
-        p, x = self.common.covariance, np.zeros((0, len(self.common.shift)))
-        spread = np.zeros((0, 3, 3))
+        x, spread = np.zeros((0, STATES)), np.zeros((0, 3, 3))
         if tracks and self.last is not None:
             stage = replace(self.stage)
             step, control, found = self._motion(stage, t_s, position_mm)
             x = np.array([t.filter.x for t in tracks])
-            x[:, 3:6] += found
+            x[:, VELOCITY] += found
             x = x @ step.matrix.T + control
-            own = np.array([t.filter.P for t in tracks]) + p
-            own = step.matrix @ own @ step.matrix.T + step.noise + step.common_noise
-            spread = own[:, :3, :3]
+            total = np.array([t.filter.P for t in tracks]) + self.common.covariance
+            total = step.matrix @ total @ step.matrix.T + step.noise + step.common_noise
+            spread = total[:, POSITION, POSITION]
         ids = np.array([t.particle for t in tracks], np.int64)
-        return Prediction(ids, x[:, :3], spread, np.array([t.d_eq_mm for t in tracks]))
+        return Prediction(ids, x[:, POSITION], spread, np.array([t.d_eq_mm for t in tracks]))
 
     def update(
         self,
@@ -108,9 +112,9 @@ class Tracker:
         self._check(frame, t_s, measured)
         motion = self._predict_all(t_s, position_mm)
         self.last = (frame, t_s)
-        self.ledger.open_frame(frame, t_s, len(measured), len(measured.singles))
+        self.frames.begin(frame, t_s, len(measured), len(measured.singles))
         events: list[TrackEvent] = []
-        gains = self._follow_given(frame, t_s, measured, events)
+        gains = self._follow_labelled(frame, t_s, measured, events)
         free = np.flatnonzero(measured.particle == NO_PARTICLE)
         scan = Scan(frame, t_s, measured, free, self.settings)
         grown, common, gain = advance(self.clusters, scan, self.common, gains)
@@ -119,9 +123,8 @@ class Tracker:
         alone = self._single(scan, common)
         self._births(scan, np.setdiff1d(free, claimed), common, gain, events)
         self._deaths(scan, events)
-        now = self.ledger.now(frame)
-        settled, gaps = self.ledger.settle(self._open_since(frame))
-        self.ledger.forget({t.particle for t in self._confirmed()})
+        now = self.frames.now(frame)
+        settled, gaps = self._close(self._open_since(frame))
         return FrameResult(frame, *now, (*events, *gaps), settled, alone, moved)
 
     def finish(self) -> FrameResult | None:
@@ -137,9 +140,12 @@ class Tracker:
         scan = Scan(frame, t_s, nothing, np.zeros(0, np.int64), self.settings)
         self._decide(self.clusters, scan, events, at_once=True)
         self.tentative = []
-        settled, gaps = self.ledger.settle(frame + 1)
+        settled, gaps = self._close(frame + 1)
         none = np.zeros(0, np.int64)
         return FrameResult(frame, none, none, (*events, *gaps), settled)
+
+    def _close(self, before_frame: int) -> tuple[tuple[FrameIds, ...], list[TrackEvent]]:
+        return self.frames.close(before_frame, {t.particle for t in self._confirmed()})
 
     def _confirmed(self) -> list[Track]:
         return [*self.given, *(t for c in self.clusters for t in c.tracks)]
@@ -179,9 +185,9 @@ class Tracker:
             raise InputError(f"time {t_s} s after {self.last[1]} s", todo="times must increase")
         moved = stage.step(position_mm, t_s, dt)
         axis = np.array(self.axis)
-        step = transition(self.settings, self.axis, round(dt, 12), moved.known, stage.in_lab)
-        control = step.drift.copy()
-        control[:3] -= axis * moved.moved_mm
+        step = transition(self.settings, self.axis, round(dt, 12), moved.known)
+        control = np.zeros(STATES)
+        control[POSITION] -= axis * moved.moved_mm
         return step, control, axis * moved.found_speed_mm_s
 
     def _predict_all(self, t_s: float, position_mm: float | None) -> Motion | None:
@@ -192,18 +198,18 @@ class Tracker:
         self.common = self.common.predicted(step)
         for track in self._every():
             if found.any():
-                track.filter.x = track.filter.x + np.pad(found, (3, len(control) - 6))
-            predict(track, step, control)
-        return Motion(step.matrix, step.noise, step.matrix[:, 3:6] @ found + control)
+                track.filter.x = track.filter.x + np.pad(found, (3, STATES - 6))
+            track.predict(step, control)
+        return Motion(step.matrix, step.noise, step.matrix[:, VELOCITY] @ found + control)
 
-    def _follow_given(
+    def _follow_labelled(
         self, frame: int, t_s: float, measured: FrameMeasurements, events: list[TrackEvent]
     ) -> list[Array]:
         columns = np.flatnonzero(measured.particle != NO_PARTICLE)
         scan = Scan(frame, t_s, measured, columns, self.settings)
-        self.common, gains, fresh = follow_given(self.given, scan, self.common)
+        self.common, gains, fresh = follow_labelled(self.given, scan, self.common)
         for column in columns.tolist():
-            self.ledger.write([(frame, column)], int(measured.particle[column]))
+            self.frames.write([(frame, column)], int(measured.particle[column]))
         for column in fresh:
             track = self._new(scan, column)
             track.particle = int(measured.particle[column])
@@ -213,7 +219,7 @@ class Tracker:
         return gains
 
     def _new(self, scan: Scan, column: int) -> Track:
-        """A track at a measurement, with the mean velocity of what rises."""
+        """A track at a measurement, with the mean rise velocity once velocities are the lab's."""
         velocity = np.array(self.axis) * (self.settings.rise_mm_s if self.stage.in_lab else 0.0)
         return born(scan, column, velocity, self.stage.in_lab, self._confirmed())
 
@@ -239,60 +245,60 @@ class Tracker:
         *,
         at_once: bool = False,
     ) -> Ids:
-        """Settle what can be settled; the columns of this frame that some track claims."""
+        """Decide the conflicts that can be decided; the columns that some track claims."""
         claimed, out = [], []
         for cluster in grown:
             histories = [h for b in cluster.branches for h in b.history.values()]
             claimed += [c for h in histories for f, c in h[-1:] if f == scan.frame and c >= 0]
-            verdict = decide(cluster, scan.frame, self.settings, at_once=at_once)
-            for track, entries in verdict.free:
-                self.ledger.write(entries, track.particle)
+            decision = decide(cluster, scan.frame, self.settings, at_once=at_once)
+            for track, entries in decision.free:
+                self.frames.write(entries, track.particle)
                 out.append(Cluster.of(track))
-            self._resolved(verdict, scan, events)
-            if verdict.broken:
-                out += [Cluster.of(t) for t in self._broken(verdict, scan, events)]
-            if verdict.still is not None:
-                out.append(verdict.still)
-                for particle, entries in verdict.still.branches[0].history.items():
-                    self.ledger.write(entries[-1:], particle)
+            self._resolved(decision, scan, events)
+            if decision.broken:
+                out += [Cluster.of(t) for t in self._broken(decision, scan, events)]
+            if decision.still is not None:
+                out.append(decision.still)
+                for particle, entries in decision.still.branches[0].history.items():
+                    self.frames.write(entries[-1:], particle)
         self.clusters = out
         return np.unique(np.array(claimed, np.int64))
 
-    def _resolved(self, verdict: Decision, scan: Scan, events: list[TrackEvent]) -> None:
-        waited = [(t.particle, len(entries)) for t, entries in verdict.free if len(entries) > 1]
+    def _resolved(self, decision: Decision, scan: Scan, events: list[TrackEvent]) -> None:
+        waited = [(t.particle, len(entries)) for t, entries in decision.free if len(entries) > 1]
         if waited:
             reason = f"conflict of {max(n for _, n in waited)} frames decided"
             self._event(events, "resolved", scan, tuple(p for p, _ in waited), reason)
 
-    def _broken(self, verdict: Decision, scan: Scan, events: list[TrackEvent]) -> list[Track]:
+    def _broken(self, decision: Decision, scan: Scan, events: list[TrackEvent]) -> list[Track]:
         """New ids for the tracks that go on behind a conflict."""
-        self.ledger.write((e for b in verdict.broken for e in b.entries), NO_PARTICLE)
-        old = tuple(b.track.particle for b in verdict.broken)
-        out = [self._renamed(b) for b in verdict.broken]
+        self.frames.write((e for b in decision.broken for e in b.entries), NO_PARTICLE)
+        old = tuple(b.track.particle for b in decision.broken)
+        out = [self._renamed(b) for b in decision.broken]
         new = [t for t in out if t is not None]
         reason = (
-            f"continuation not safe: the runner-up is {verdict.runner_up_nats:.1f} nats behind "
-            f"(margin {self.settings.margin_nats:g})"
+            f"continuation not safe: the log-likelihood ratio to the runner-up is "
+            f"{decision.runner_up_nats:.1f}, less than {self.settings.margin_nats:g}"
         )
         self._event(events, "break", scan, (*old, *(t.particle for t in new)), reason)
         return new
 
     def _renamed(self, broken: Broken) -> Track | None:
-        self.ledger.write(broken.kept, broken.track.particle)
+        self.frames.write(broken.kept, broken.track.particle)
         if not broken.new:
             return None
         broken.track.particle = self._take_id()
-        self.ledger.write(broken.new, broken.track.particle)
+        self.frames.write(broken.new, broken.track.particle)
         return broken.track
 
-    def _single(self, scan: Scan, common: Common) -> SeenAlone:
-        """Confirmed tracks that were missed in this frame, continued by one camera alone."""
+    def _single(self, scan: Scan, common: Common) -> dict[int, SeenAlone]:
+        """Continue confirmed tracks that were missed in this frame by one camera alone."""
         closed = [c.tracks[0] for c in self.clusters if not c.open]
         missed = [t for t in closed if t.seen_frame < scan.frame]
         found = continue_alone(missed, scan, self.cameras, common.covariance_mm2)
-        for track, single in found:
-            self.ledger.write_single(scan.frame, single, track.particle)
-        return seen_alone(found, common.covariance_mm2)
+        for track, single, _ in found:
+            self.frames.write_single(scan.frame, single, track.particle)
+        return {single: alone for _, single, alone in found}
 
     def _births(
         self,
@@ -305,8 +311,7 @@ class Tracker:
         """Tentative tracks go on, are confirmed or given up; what is left starts new ones."""
         rest = Scan(scan.frame, scan.t_s, scan.measured, free, scan.settings)
         going, common, gain = extend(self.tentative, rest, common, gain)
-        n = len(common.shift)
-        self.common = common.applied(np.zeros((n, 3)) if gain is None else gain)
+        self.common = common.applied(np.zeros((STATES, 3)) if gain is None else gain)
         used = [c for t in going for f, c in t.history[-1:] if f == scan.frame]
         self.tentative = []
         for track in going:
@@ -323,7 +328,7 @@ class Tracker:
 
     def _confirm(self, track: Track, scan: Scan, events: list[TrackEvent]) -> None:
         track.particle = self._take_id()
-        self.ledger.write(track.history, track.particle)
+        self.frames.write(track.history, track.particle)
         reason = f"first seen in frame {track.history[0][0]}"
         self._event(events, "birth", scan, (track.particle,), reason)
         events += split_off(track, self._confirmed(), scan)

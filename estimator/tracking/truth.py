@@ -55,9 +55,7 @@ def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) ->
     )
     error = measured - pixels(bubble[right], cameras, "{c}_{x}_px")
     in_view = int(whole(truth, cameras).sum())
-    return Score(
-        in_view, int(right.sum()), int(wrong), len(tracks), rms(error), rms(error + shift)
-    )
+    return Score(in_view, int(right.sum()), int(wrong), len(tracks), rms(error), rms(error + shift))
 
 
 def matched(

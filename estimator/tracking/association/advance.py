@@ -1,4 +1,4 @@
-"""One frame of the confirmed tracks: pair, spread the doubtful into hypotheses, update."""
+"""One frame of the confirmed tracks: pair, open hypotheses where pairings conflict, update."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from telerig.estimator.tracking.association.hypotheses import (
     Branch,
@@ -19,11 +21,12 @@ from telerig.estimator.tracking.association.hypotheses import (
 from telerig.estimator.tracking.association.likelihoods import (
     Pairs,
     alternatives,
+    assigned_with_shift,
     gate2,
     gated_pairs,
     joint_score,
-    settle_shift,
 )
+from telerig.estimator.tracking.filter.motion import POSITION
 from telerig.estimator.tracking.filter.state import Common, Track
 from telerig.estimator.tracking.filter.types import FrameMeasurements, Ids, TrackerSettings
 
@@ -34,7 +37,7 @@ _SLACK_NATS = 6.0
 
 @dataclass(frozen=True)
 class Scan:
-    """A frame to be worked in: the measurements that are free, and when it was taken."""
+    """A frame: its time, its measurements, and those of them (columns) that are free."""
 
     frame: int
     t_s: float
@@ -45,7 +48,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Child:
-    """A branch to be: from ``parents``, its edges (index into the pairs, -1: missed) per track."""
+    """A way to continue ``parents``: per track the index into the pairs, -1 where it is missed."""
 
     score: float
     parents: tuple[Branch, ...]
@@ -55,12 +58,7 @@ class Child:
 class Association:
     """The pairings of one frame, and the common shift that goes with the best of them."""
 
-    def __init__(
-        self,
-        clusters: Sequence[Cluster],
-        scan: Scan,
-        common: Common,
-    ) -> None:
+    def __init__(self, clusters: Sequence[Cluster], scan: Scan, common: Common) -> None:
         self.clusters, self.scan, self.prior = clusters, scan, common
         rows = [
             (c, b, t)
@@ -73,20 +71,20 @@ class Association:
         self.row_of = {id(t): i for i, (_, _, t) in enumerate(rows)}
         self.tracks = [t for _, _, t in rows]
         pairs = gated_pairs(self.tracks, scan.measured, scan.columns, common, scan.settings)
-        self.common, self.chosen = settle_shift(pairs, len(rows), first, common)
-        self.pairs = pairs
+        self.common, self.chosen = assigned_with_shift(pairs, len(rows), first, common)
+        self.pairs, self.owner = pairs, self.cluster_of[pairs.row]
         self.picked = np.flatnonzero(first[pairs.row] & (self.chosen[pairs.row] == pairs.column))
         self.edges = self._allowed()
 
     def mean_gain(self, others: Sequence[Array]) -> Array | None:
         """(n, 3) mean filter gain of the bubbles that are updated; None if there are none."""
-        p = [self.tracks[i].filter.P[:, :3] for i in self.pairs.row[self.picked]]
+        p = [self.tracks[i].filter.P[:, POSITION] for i in self.pairs.row[self.picked]]
         gains = [a @ b for a, b in zip(p, self.pairs.information[self.picked])]
         return np.mean([*others, *gains], axis=0) if others or gains else None
 
     def _allowed(self) -> Ids:
-        """Pairings inside their gate, the shift being told by the other clusters alone."""
-        pairs, owner = self.pairs, self.cluster_of[self.pairs.row]
+        """Pairings inside their gate, the common shift estimated from the other clusters alone."""
+        pairs, owner = self.pairs, self.owner
         information = np.zeros((len(self.clusters), 3, 3))
         np.add.at(information, owner[self.picked], pairs.information[self.picked])
         pull = np.zeros((len(self.clusters), 3))
@@ -104,29 +102,20 @@ class Association:
 
     def components(self) -> list[tuple[list[int], list[int]]]:
         """Clusters that share a measurement, each with its edges (indices into the pairs)."""
-        parent = list(range(len(self.clusters)))
-
-        def root(i: int) -> int:
-            while parent[i] != i:
-                i = parent[i]
-            return i
-
-        holder: dict[int, int] = {}
-        for e in self.edges:
-            c = int(self.cluster_of[self.pairs.row[e]])
-            other = holder.setdefault(int(self.pairs.column[e]), c)
-            a, b = sorted((root(c), root(other)))
-            parent[b] = a
-        groups: dict[int, tuple[list[int], list[int]]] = {}
-        for i in range(len(parent)):
-            groups.setdefault(root(i), ([], []))[0].append(i)
-        for e in self.edges:
-            groups[root(int(self.cluster_of[self.pairs.row[e]]))][1].append(int(e))
+        owner, many = self.owner[self.edges], len(self.clusters)
+        column, size = self.pairs.column[self.edges], many + len(self.scan.measured)
+        graph = coo_array((np.ones(len(owner)), (owner, many + column)), (size, size))
+        labels = connected_components(graph, directed=False)[1][:many]
+        groups: dict[int, tuple[list[int], list[int]]] = {int(g): ([], []) for g in labels}
+        for cluster, group in enumerate(labels.tolist()):
+            groups[group][0].append(cluster)
+        for edge, group in zip(self.edges.tolist(), labels[owner].tolist()):
+            groups[group][1].append(edge)
         return list(groups.values())
 
     def outside(self, members: Sequence[int]) -> Common:
-        """The common shift as the bubbles outside some clusters tell it."""
-        others = self.picked[~np.isin(self.cluster_of[self.pairs.row[self.picked]], members)]
+        """The common shift, estimated from the bubbles outside some clusters."""
+        others = self.picked[~np.isin(self.owner[self.picked], members)]
         return self.prior.informed(
             self.pairs.innovation_mm[others], self.pairs.covariance_mm2[others]
         )
@@ -141,7 +130,9 @@ def children(found: Association, members: Sequence[int], edges: Sequence[int]) -
     for e in edges:
         by_row.setdefault(int(pairs.row[e]), []).append(e)
     raw: list[Child] = []
-    for parents in _combinations([found.clusters[m] for m in members], settings):
+    every = product(*(found.clusters[m].branches for m in members))
+    ranked = sorted(every, key=lambda branches: -sum(b.weight for b in branches))
+    for parents in ranked[: settings.max_hypotheses]:
         rows = [found.row_of[id(t)] for b in parents for t in b.tracks]
         options = [
             [(int(pairs.column[e]), float(score[e])) for e in by_row.get(r, [])] for r in rows
@@ -154,20 +145,9 @@ def children(found: Association, members: Sequence[int], edges: Sequence[int]) -
             )
             used = np.array([e for e in chosen if e >= 0], int)
             raw.append(Child(start + joint_score(pairs, used, outside), parents, chosen))
-    scored = ((c.score, _key(c, pairs, found.scan.frame), i) for i, c in enumerate(raw))
+    histories = (_histories(c, pairs, found.scan.frame) for c in raw)
+    scored = ((c.score, merge_key(h.values()), i) for i, (c, h) in enumerate(zip(raw, histories)))
     return [Child(w, raw[i].parents, raw[i].edges) for w, i in merged(scored, settings)]
-
-
-def _combinations(
-    clusters: Sequence[Cluster], settings: TrackerSettings
-) -> list[tuple[Branch, ...]]:
-    every = product(*(c.branches for c in clusters))
-    ranked = sorted(every, key=lambda branches: -sum(b.weight for b in branches))
-    return ranked[: settings.max_hypotheses]
-
-
-def _key(child: Child, pairs: Pairs, frame: int) -> tuple[object, ...]:
-    return merge_key(list(_histories(child, pairs, frame).values()))
 
 
 def _histories(child: Child, pairs: Pairs, frame: int) -> History:
@@ -182,7 +162,7 @@ def _histories(child: Child, pairs: Pairs, frame: int) -> History:
 
 
 def grow(found: Association, members: Sequence[int], child: Child, mean_gain: Array) -> Branch:
-    """The branch of a child, its tracks updated with the common shift as it tells it."""
+    """The branch of a child, its tracks updated with the common shift that its pairings imply."""
     pairs, scan = found.pairs, found.scan
     used = np.array([e for e in child.edges if e >= 0], int)
     common = found.outside(members).informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
@@ -214,9 +194,8 @@ def advance(
 ) -> tuple[list[Cluster], Common, Array | None]:
     """The clusters after this frame (not decided yet), the common part, the mean gain.
 
-    other_gains : (n, 3) each, of the bubbles that were updated already.
-
-    Tracks without a rival are updated in place. A cluster whose history is not empty is open.
+    other_gains : (n, 3) each, of the bubbles that were updated already. Tracks without a rival are
+    updated in place. A cluster whose history is not empty is open.
     """
     found = Association(clusters, scan, common)
     mean_gain = found.mean_gain(other_gains)
@@ -233,3 +212,27 @@ def advance(
         every = children(found, members, edges)
         out.append(Cluster([grow(found, members, child, gain) for child in every]))
     return out, found.common, mean_gain
+
+
+def follow_labelled(
+    tracks: Sequence[Track], scan: Scan, common: Common
+) -> tuple[Common, list[Array], list[int]]:
+    """Update tracks whose ids came with the measurements, in place: no association is needed.
+
+    Returns the common shift that they imply, their gains, and the columns without a track yet.
+    """
+    columns = {int(scan.measured.particle[c]): int(c) for c in scan.columns}
+    at = [columns.pop(t.particle, -1) for t in tracks]
+    seen = [(t, c) for t, c in zip(tracks, at) if c >= 0]
+    fresh = sorted(columns.values())
+    if not seen:
+        return common, [], fresh
+    innovations = np.array([scan.measured.points_mm[c] - t.point_mm for t, c in seen])
+    noise = np.array([scan.measured.covariance_mm2[c] for _, c in seen])
+    p = np.array([t.filter.P[:, POSITION] for t, _ in seen])
+    covariance = p[:, POSITION] + noise
+    common = common.informed(innovations, covariance)
+    gains = p @ np.linalg.inv(covariance)
+    for track, column in zip(tracks, at):
+        continue_track(track, column, scan, common, gains.mean(0))
+    return Common(covariance=common.covariance), list(gains), fresh

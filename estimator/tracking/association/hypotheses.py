@@ -2,9 +2,9 @@
 
 Tracks that compete for measurements form a cluster; each of its branches is one way to continue
 all of them, with its log weight relative to the best. Branches with the same recent pairings are
-merged (weights added, the better past kept), hopeless ones dropped. A track that no two branches
-disagree on leaves the cluster. When the window is over, the best branch is taken if the runner-up
-is far enough behind; else the tracks that differ are broken.
+merged (weights added, the better past kept), improbable ones dropped. A track on which all
+branches agree leaves the cluster. When the window is over, the best branch is taken if the
+runner-up is far enough behind; else the tracks that differ are broken.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Broken:
-    """track : its best continuation, with all its entries; kept : those that are certain, new :
-    those that follow the conflict and stay together; entries between are nobody's."""
+    """track : its best continuation, with all its entries; kept : the certain ones before the
+    conflict; new : those that stay together after it; entries between belong to no track."""
 
     track: Track
     entries: list[tuple[int, int]]
@@ -88,7 +88,7 @@ def merged(
 ) -> list[tuple[float, int]]:
     """(weight, what it came from) of (weight, key, index): equal keys as one, best first, 0 on top.
 
-    Hopeless ones and those beyond the number allowed are left out.
+    Improbable ones and those beyond the largest number allowed are left out.
     """
     groups: dict[tuple[object, ...], list[tuple[float, int]]] = {}
     for weight, key, index in scored:
@@ -105,7 +105,8 @@ def merged(
     return kept[: settings.max_hypotheses]
 
 
-def merge_key(histories: Sequence[Sequence[tuple[int, int]]]) -> tuple[object, ...]:
+def merge_key(histories: Iterable[Sequence[tuple[int, int]]]) -> tuple[object, ...]:
+    """The recent pairings, by which branches are merged."""
     return tuple(tuple(h[-_MERGE_FRAMES:]) for h in histories)
 
 
@@ -125,22 +126,22 @@ def disputed(branches: Sequence[Branch], depth: int) -> set[int]:
 def decide(
     cluster: Cluster, frame: int, settings: TrackerSettings, *, at_once: bool = False
 ) -> Decision:
-    """What can leave the cluster in this frame; at_once: all of it, as if its window were over."""
+    """Which tracks leave the cluster in this frame; at_once: all, as if its window were over."""
     branches = cluster.branches
     if not cluster.open:
         return Decision(None, _leave(branches[0], cluster.tracks), [], np.inf)
     runner_up = -branches[1].weight
     over = frame - cluster.since_frame + 1 >= settings.window_frames
     if not (over or at_once):
-        hot = disputed(branches, _MERGE_FRAMES)
-        still = _remaining(cluster, hot, settings)
-        hot = hot if still else set()
-        free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in hot])
+        open_ids = disputed(branches, _MERGE_FRAMES)
+        still = _remaining(cluster, open_ids, settings)
+        open_ids = open_ids if still else set()
+        free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in open_ids])
         return Decision(still, free, [], runner_up)
     close = [b for b in branches if b.weight >= -settings.margin_nats]
-    hot = disputed(close, 1)
-    free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in hot])
-    broken = _break(close, [t for t in cluster.tracks if t.particle in hot])
+    open_ids = disputed(close, 1)
+    free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in open_ids])
+    broken = _break(close, [t for t in cluster.tracks if t.particle in open_ids])
     return Decision(None, free, broken, runner_up)
 
 
@@ -148,14 +149,14 @@ def _leave(best: Branch, tracks: list[Track]) -> list[tuple[Track, list[tuple[in
     return [(t, best.history.get(t.particle, [])) for t in tracks]
 
 
-def _remaining(cluster: Cluster, hot: set[int], settings: TrackerSettings) -> Cluster | None:
-    if not hot:
+def _remaining(cluster: Cluster, open_ids: set[int], settings: TrackerSettings) -> Cluster | None:
+    if not open_ids:
         return None
     branches = [
         Branch(
             b.weight,
-            [t for t in b.tracks if t.particle in hot],
-            {p: h for p, h in b.history.items() if p in hot},
+            [t for t in b.tracks if t.particle in open_ids],
+            {p: h for p, h in b.history.items() if p in open_ids},
         )
         for b in cluster.branches
     ]

@@ -1,7 +1,7 @@
-"""Which measurement may continue which track, and how likely each way of pairing them is.
+"""Which measurement may continue which track, and the likelihood of each way of pairing them.
 
 A pairing's score is its log-likelihood ratio against "the track was missed and the measurement is
-new": log P_D / (1 - P_D) + log N(innovation) - log(density of what is new) + the size's say.
+new": log P_D / (1 - P_D) + log N(innovation) - log(density of new ones) + log ratio of the sizes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Pairs:
     """Pairings inside the widest gate: row of a track, column of a measurement, both (E,).
 
     innovation_mm : (E, 3) without the common shift; covariance_mm2 : (E, 3, 3) of bubble and
-    measurement; information : its inverse; constant : (E,) the score's part without position.
+    measurement; information : its inverse; constant : (E,) the score without the distance.
     """
 
     row: Ids
@@ -45,7 +45,7 @@ class Pairs:
         return len(self.row)
 
     def distance2(self, shift_mm: Array) -> Array:
-        """(E,) squared Mahalanobis distances, the common shift taken off."""
+        """(E,) squared Mahalanobis distances, the common shift removed."""
         left = self.innovation_mm - shift_mm
         return np.asarray(np.einsum("ei,eij,ej->e", left, self.information, left))
 
@@ -55,6 +55,7 @@ class Pairs:
 
 @lru_cache(maxsize=64)
 def gate2(settings: TrackerSettings, dimensions: int = 3) -> float:
+    """Largest squared Mahalanobis distance inside the gate."""
     return float(chdtri(dimensions, 1 - settings.gate_probability))
 
 
@@ -65,12 +66,13 @@ def gated_pairs(
     common: Common,
     settings: TrackerSettings,
 ) -> Pairs:
-    """Pairings of tracks with the measurements ``columns`` inside the gate, shift unknown."""
+    """Pairings of tracks with the measurements ``columns`` inside the gate, the common shift
+    unknown."""
     if not len(tracks) or not len(columns):
         none = np.zeros(0, np.int64)
         return Pairs(none, none, *(np.zeros((0, 3, 3)[:k]) for k in (2, 3, 3, 1)))
-    x = np.array([t.filter.x[:3] for t in tracks])
-    p = np.array([t.filter.P[:3, :3] for t in tracks])
+    x = np.array([t.point_mm for t in tracks])
+    p = np.array([t.point_covariance_mm2 for t in tracks])
     z, r = measured.points_mm[columns], measured.covariance_mm2[columns]
     between = z[None] - x[:, None]
     spread = np.trace(p, axis1=1, axis2=2)[:, None] + np.trace(r, axis1=1, axis2=2)[None]
@@ -82,30 +84,18 @@ def gated_pairs(
     near = np.einsum("ei,eij,ej->e", left, total, left) <= gate2(settings)
     row, local, innovation, covariance = (a[near] for a in (row, local, innovation, covariance))
     column = columns[local]
-    constant = _constant(tracks, row, measured, column, covariance, settings)
-    return Pairs(row, column, innovation, covariance, np.linalg.inv(covariance), constant)
-
-
-def _constant(
-    tracks: Sequence[Track],
-    row: Ids,
-    measured: FrameMeasurements,
-    column: Ids,
-    covariance: Array,
-    settings: TrackerSettings,
-) -> Array:
     seen = settings.detection_probability
     density = -1.5 * _LOG_2PI - np.log(np.linalg.det(covariance)) / 2
     base = np.log(seen / (1 - seen) / settings.new_per_mm3)
     sure = np.log(np.clip(measured.confidence[column], 1e-3, 1.0))
     expected = np.array([t.d_eq_mm for t in tracks])[row]
-    alive = alive_score(np.array([t.misses for t in tracks]), settings)[row]
-    return np.asarray(
-        base + density + sure + alive + size_score(expected, measured.d_eq_mm[column], settings)
-    )
+    alive = _alive_score(np.array([t.misses for t in tracks]), settings)[row]
+    size = size_score(expected, measured.d_eq_mm[column], settings)
+    constant = base + density + sure + alive + size
+    return Pairs(row, column, innovation, covariance, np.linalg.inv(covariance), constant)
 
 
-def alive_score(misses: Ids, settings: TrackerSettings) -> Array:
+def _alive_score(misses: Ids, settings: TrackerSettings) -> Array:
     """(K,) log probability that a track not seen for so many frames is only missed, not gone."""
     missed = (1 - settings.detection_probability) * settings.missed_again_probability ** (
         np.maximum(misses, 1) - 1.0
@@ -114,7 +104,7 @@ def alive_score(misses: Ids, settings: TrackerSettings) -> Array:
 
 
 def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:
-    """(E,) log density of the size against one uniform over 5 mm; 0 where a size is unknown."""
+    """Log-likelihood ratio of sizes against a uniform density over 5 mm; 0 for an unknown size."""
     sigma = settings.size_scatter * expected_mm
     off = np.minimum(((measured_mm - expected_mm) / sigma) ** 2 / 2, settings.size_cap_nats)
     score = np.log(_SIZE_SPAN_MM / sigma) - _LOG_2PI / 2 - off
@@ -122,7 +112,7 @@ def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings
 
 
 def best_assignment(rows: int, row: Ids, column: Ids, score: Array) -> Ids:
-    """(rows,) column of each row, -1 where staying without is better; the best in total."""
+    """(rows,) column of each row, -1 for none, with the largest total score."""
     out = np.full(rows, -1)
     if not len(row):
         return out
@@ -134,16 +124,23 @@ def best_assignment(rows: int, row: Ids, column: Ids, score: Array) -> Ids:
     return out
 
 
-def settle_shift(
+def assigned_with_shift(
     pairs: Pairs, rows: int, best_rows: NDArray[np.bool_], common: Common
 ) -> tuple[Common, Ids]:
-    """The shift common to all and the assignment that goes with it, by turns; (rows,) columns."""
+    """The common shift and the assignment (rows,), estimated by turns.
+
+    best_rows : (rows,) which tracks take part.
+    """
     now, chosen = common, np.full(rows, -1)
     usable = np.flatnonzero(best_rows[pairs.row])
     for turn in range(_SHIFT_ROUNDS):
         score = pairs.scores(now.shift_mm)[usable]
         if turn == 0:
-            score = score + pairs.distance2(now.shift_mm)[usable] / 2 - _wide(pairs, usable, now)
+            # before the shift is known its covariance belongs to the distance
+            left = pairs.innovation_mm[usable] - now.shift_mm
+            total = np.linalg.inv(pairs.covariance_mm2[usable] + now.covariance_mm2)
+            wide = np.einsum("ei,eij,ej->e", left, total, left) / 2
+            score = score + pairs.distance2(now.shift_mm)[usable] / 2 - wide
         found = best_assignment(rows, pairs.row[usable], pairs.column[usable], score)
         if turn and np.array_equal(found, chosen):
             break
@@ -153,15 +150,19 @@ def settle_shift(
     return now, chosen
 
 
-def _wide(pairs: Pairs, edges: Ids, common: Common) -> Array:
-    """Half the squared distance with the common shift's spread: fair before the shift is known."""
-    left = pairs.innovation_mm[edges] - common.shift_mm
-    total = np.linalg.inv(pairs.covariance_mm2[edges] + common.covariance_mm2)
-    return np.asarray(np.einsum("ei,eij,ej->e", left, total, left) / 2)
+def unrivalled(row: Ids, column: Ids, score: Array, chosen: Ids, margin_nats: float) -> Ids:
+    """(K,) chosen, and no other pairing of its track or its measurement is within the margin."""
+    out = chosen >= 0
+    for r in np.flatnonzero(out):
+        mine = (row == r) & (column == chosen[r])
+        rival = ((row == r) | (column == chosen[r])) & ~mine
+        best_rival = np.max(score[rival], initial=-np.inf)
+        out[r] = best_rival < score[mine].max() - margin_nats
+    return np.asarray(out)
 
 
 def joint_score(pairs: Pairs, edges: Ids, common: Common) -> float:
-    """Log score of some pairings together, the common shift integrated out."""
+    """Log-likelihood ratio of some pairings together, the common shift integrated out."""
     if not len(edges):
         return 0.0
     left = pairs.innovation_mm[edges] - common.shift_mm
@@ -178,7 +179,7 @@ def alternatives(
 ) -> list[tuple[tuple[int, ...], float]]:
     """Every way to give each row one of its (column, score) options or none, near the best.
 
-    Depth first with a bound; the columns of each row (-1: none) and the total score.
+    Depth-first branch and bound; the columns of each row (-1: none) and the total score.
     """
     ordered = [sorted(o, key=lambda item: -item[1]) for o in options]
     bound = np.cumsum([max([0.0, *(s for _, s in o)]) for o in ordered[::-1]])[::-1].tolist() + [0]

@@ -1,4 +1,4 @@
-"""Bubbles that one camera alone sees keep their track alive: a 2-D update through the camera."""
+"""Pairing of tracks with detections of one camera alone, and the 2-D update through the camera."""
 
 from __future__ import annotations
 
@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from telerig.estimator.tracking.association.advance import Scan
-from telerig.estimator.tracking.association.likelihoods import best_assignment, gate2
+from telerig.estimator.tracking.association.likelihoods import best_assignment, gate2, unrivalled
+from telerig.estimator.tracking.filter.motion import POSITION
 from telerig.estimator.tracking.filter.state import Track
-from telerig.estimator.tracking.filter.types import (
-    Ids,
-    SeenAlone,
-    SingleMeasurements,
-    TrackerSettings,
-)
+from telerig.estimator.tracking.filter.types import SeenAlone, TrackerSettings
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 
@@ -24,85 +20,82 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What one camera should see of tracks: pixels (K, 2), by the rig point (K, 2, 3), and the
-    pixels' covariance (K, 2, 2) from the tracks' own."""
+class Projected:
+    """Points in one camera: pixels (K, 2), their derivatives by the rig point (K, 2, 3), and the
+    pixels' covariance (K, 2, 2) from the points' own."""
 
     uv_px: Array
     by_point: Array
     covariance_px2: Array
 
 
-def expected(camera: Camera, tracks: Sequence[Track], common_mm2: Array) -> Seen:
-    points = np.array([t.filter.x[:3] for t in tracks])
-    spread = np.array([t.filter.P[:3, :3] for t in tracks]) + common_mm2
-    uv, by_point, _ = stacked_jacobian((camera,), points)
-    return Seen(uv, by_point, by_point @ spread @ np.swapaxes(by_point, -1, -2))
+def projected(camera: Camera, points_mm: Array, covariance_mm2: Array) -> Projected:
+    """Of rig points (K, 3) with covariances (K, 3, 3)."""
+    uv, by_point, _ = stacked_jacobian((camera,), points_mm)
+    return Projected(uv, by_point, by_point @ covariance_mm2 @ np.swapaxes(by_point, -1, -2))
+
+
+def px_per_mm(by_point: Array) -> Array:
+    """(K,) scale across the line of sight, from derivatives (K, 2, 3) of pixels by the point."""
+    return np.asarray(np.linalg.det(by_point @ np.swapaxes(by_point, -1, -2)) ** 0.25)
+
+
+def pair_pixels(
+    expected: Projected,
+    uv_px: Array,
+    covariance_px2: Array,
+    settings: TrackerSettings,
+    *,
+    size_score: ArrayLike = 0.0,
+    allowed: ArrayLike = True,
+) -> list[int]:
+    """For each expected track the detection that continues it, -1 for none or with a rival.
+
+    uv_px (L, 2), covariance_px2 (L, 2, 2) : the detections.
+    size_score, allowed : (K, L) or less, log-likelihood ratio of the sizes, and pairings to try.
+    """
+    between = uv_px[None] - expected.uv_px[:, None]
+    covariance = expected.covariance_px2[:, None] + covariance_px2[None]
+    distance2 = np.einsum("kli,klij,klj->kl", between, np.linalg.inv(covariance), between)
+    row, column = np.nonzero((distance2 <= gate2(settings, 2)) & allowed)
+    seen = settings.detection_probability
+    base = np.log(seen / (1 - seen) / settings.new_per_px2) - np.log(2 * np.pi)
+    ratio = base - np.log(np.linalg.det(covariance)) / 2 - distance2 / 2 + size_score
+    score = ratio[row, column]
+    chosen = best_assignment(len(between), row, column, score)
+    safe = unrivalled(row, column, score, chosen, settings.margin_nats)
+    return [int(c) if ok else -1 for c, ok in zip(chosen, safe)]
 
 
 def update_pixels(
-    track: Track, uv_px: Array, covariance_px2: Array, seen_uv_px: Array, by_point: Array
+    track: Track, uv_px: Array, covariance_px2: Array, expected_px: Array, by_point: Array
 ) -> None:
     """filterpy's update with a pixel (2,), linearised where the track is expected."""
     h = np.zeros((2, len(track.filter.x)))
-    h[:, :3] = by_point
-    linear = uv_px - seen_uv_px + h @ track.filter.x
+    h[:, POSITION] = by_point
+    linear = uv_px - expected_px + h @ track.filter.x
     track.filter.update(linear.reshape(-1), R=covariance_px2, H=h)
-
-
-def pair_singles(
-    seen: Seen, singles: SingleMeasurements, indices: Ids, settings: TrackerSettings
-) -> list[tuple[int, int]]:
-    """(track, index into the singles) of the pairings without a rival within the margin."""
-    between = singles.uv_px[indices][None] - seen.uv_px[:, None]
-    covariance = seen.covariance_px2[:, None] + singles.covariance_px2[indices][None]
-    distance2 = np.einsum("kli,klij,klj->kl", between, np.linalg.inv(covariance), between)
-    row, local = np.nonzero(distance2 <= gate2(settings, 2))
-    certain = settings.detection_probability
-    base = np.log(certain / (1 - certain) / settings.new_per_px2) - np.log(2 * np.pi)
-    score = base - np.log(np.linalg.det(covariance))[row, local] / 2 - distance2[row, local] / 2
-    chosen = best_assignment(len(between), row, local, score)
-    safe = unrivalled(row, local, score, chosen, settings.margin_nats)
-    return [(int(r), int(indices[chosen[r]])) for r in np.flatnonzero(safe)]
 
 
 def continue_alone(
     missed: Sequence[Track], scan: Scan, cameras: Sequence[Camera], common_mm2: Array
-) -> list[tuple[Track, int]]:
-    """Update the tracks by the singles that are theirs; which single (its index) updated which."""
-    singles, out = scan.measured.singles, []
+) -> list[tuple[Track, int, SeenAlone]]:
+    """Update the tracks by single-camera measurements: track, index of the measurement, where the
+    track is then."""
+    singles = scan.measured.singles
+    out = []
     for index, camera in enumerate(cameras):
         mine = np.flatnonzero(singles.camera == index)
         if not len(mine) or not len(missed):
             continue
-        seen = expected(camera, missed, common_mm2)
-        for row, single in pair_singles(seen, singles, mine, scan.settings):
-            track, noise = missed[row], singles.covariance_px2[single]
-            update_pixels(track, singles.uv_px[single], noise, seen.uv_px[row], seen.by_point[row])
-            track.saw(scan.frame, scan.t_s, float("nan"))
-            out.append((track, single))
-    return out
-
-
-def seen_alone(found: Sequence[tuple[Track, int]], common_mm2: Array) -> SeenAlone:
-    """Where the tracks are after their updates by single cameras."""
-    if not found:
-        return SeenAlone()
-    return SeenAlone(
-        np.array([single for _, single in found], np.int64),
-        np.array([t.particle for t, _ in found], np.int64),
-        np.array([t.filter.x[:3] for t, _ in found]),
-        np.array([t.filter.P[:3, :3] for t, _ in found]) + common_mm2,
-        np.array([t.d_eq_mm for t, _ in found]),
-    )
-
-
-def unrivalled(row: Ids, column: Ids, score: Array, chosen: Ids, margin_nats: float) -> Ids:
-    """(K,) chosen and without a pairing of the same track or measurement nearly as good."""
-    out = chosen >= 0
-    for r in np.flatnonzero(out):
-        mine = (row == r) & (column == chosen[r])
-        rival = ((row == r) | (column == chosen[r])) & ~mine
-        best_rival = np.max(score[rival], initial=-np.inf)
-        out[r] = best_rival < score[mine].max() - margin_nats
-    return np.asarray(out)
+        points = np.array([t.point_mm for t in missed])
+        spread = np.array([t.point_covariance_mm2 for t in missed]) + common_mm2
+        expected = projected(camera, points, spread)
+        uv, noise = singles.uv_px[mine], singles.covariance_px2[mine]
+        for k, j in enumerate(pair_pixels(expected, uv, noise, scan.settings)):
+            if j >= 0:
+                track = missed[k]
+                update_pixels(track, uv[j], noise[j], expected.uv_px[k], expected.by_point[k])
+                track.saw(scan.frame, scan.t_s, float("nan"))
+                out.append((track, int(mine[j])))
+    return [(t, single, SeenAlone(t.point_mm, t.d_eq_mm)) for t, single in out]

@@ -1,7 +1,7 @@
-"""How bubbles move between two frames: exact discretisation for any interval.
+"""How bubbles, shake and stage move between two frames: exact discretisation for any interval.
 
-State of a bubble: position, velocity and optionally acceleration, three components each, in the
-rig frame; the velocity is that of the bubble in the lab as long as an encoder tells the stage's.
+State of a bubble: position, velocity, acceleration and drift velocity, three components each, in
+the rig frame. The velocity is relative to the lab once an encoder has given the stage's speed.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ from telerig.estimator.tracking.filter.types import TrackerSettings
 
 Array = NDArray[np.float64]
 
+POSITION, VELOCITY, ACCELERATION, DRIFT = (slice(3 * i, 3 * i + 3) for i in range(4))
+STATES = 12
+
 
 @dataclass(frozen=True)
 class Transition:
-    """Over one interval: x -> matrix @ x + drift, plus noise (both (n, n), drift (n,)).
+    """Over one interval: x -> matrix @ x, plus noise; all (12, 12).
 
-    common_noise : (n, n), what moves all bubbles alike: shake, and the stage without an encoder.
+    common_noise : of what moves all bubbles alike: shake, and the stage without an encoder.
     """
 
     matrix: Array
     noise: Array
-    drift: Array
     common_noise: Array
 
 
@@ -44,35 +46,22 @@ def van_loan(dynamics: Array, diffusion: Array, dt_s: float) -> tuple[Array, Arr
     return matrix, matrix @ exponential[:n, n:]
 
 
-def state_size(settings: TrackerSettings) -> int:
-    if not settings.acceleration_state:
-        return 6
-    return 12 if settings.zigzag_hz > 0 else 9
-
-
 def _along(settings: TrackerSettings) -> tuple[Array, Array]:
-    """Dynamics along the rise, per state, and the spectral density of the noise on each."""
-    order, driven = state_size(settings) // 3, 2 if settings.acceleration_state else 1
-    dynamics, density = np.zeros((order, order)), np.zeros((order, order))
-    dynamics[range(driven), range(1, driven + 1)] = 1.0
-    dynamics[1, 1] = -1 / settings.velocity_time_s
-    tau, variance = settings.acceleration_time_s, settings.rise_acceleration_mm_s2**2
-    if driven == 2:
-        dynamics[2, 2] = -1 / tau
-    density[driven, driven] = variance * (2 / tau if driven == 2 else 2 * tau)
+    """(4, 4) dynamics along the rise and spectral density: Singer's model, no drift."""
+    dynamics, density = np.zeros((4, 4)), np.zeros((4, 4))
+    dynamics[0, 1] = dynamics[1, 2] = 1.0
+    dynamics[2, 2] = -1 / settings.acceleration_time_s
+    density[2, 2] = settings.rise_acceleration_mm_s2**2 * (2 / settings.acceleration_time_s)
     return dynamics, density
 
 
 def _across(settings: TrackerSettings) -> tuple[Array, Array]:
-    """The same across the rise, where the velocity swings about a drift that wanders slowly."""
-    dynamics, density = _along(settings)
-    ratio = settings.lateral_acceleration_mm_s2 / settings.rise_acceleration_mm_s2
-    if len(dynamics) < 4:
-        return dynamics, density * ratio**2
-    turn = 2 * np.pi * settings.zigzag_hz
-    rate = 2 * settings.zigzag_damping * turn
-    dynamics[1, 1] = 0.0
-    dynamics[2, 1:] = -(turn**2), -rate, turn**2
+    """The same across the rise: the velocity oscillates about an Ornstein-Uhlenbeck drift."""
+    dynamics, density = np.zeros((4, 4)), np.zeros((4, 4))
+    omega = 2 * np.pi * settings.zigzag_hz
+    rate = 2 * settings.zigzag_damping * omega
+    dynamics[0, 1] = dynamics[1, 2] = 1.0
+    dynamics[2, 1:] = -(omega**2), -rate, omega**2
     dynamics[3, 3] = -1 / settings.drift_time_s
     density[2, 2] = 2 * rate * settings.lateral_acceleration_mm_s2**2
     density[3, 3] = 2 / settings.drift_time_s * settings.drift_sd_mm_s**2
@@ -81,38 +70,26 @@ def _across(settings: TrackerSettings) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=256)
 def transition(
-    settings: TrackerSettings,
-    up: tuple[float, float, float],
-    dt_s: float,
-    encoder: bool,
-    in_lab: bool,
+    settings: TrackerSettings, up: tuple[float, float, float], dt_s: float, encoder: bool
 ) -> Transition:
     """The step of every bubble over ``dt_s``; up is the unit vector of the rise.
 
-    encoder : it told the stage's motion; in_lab : velocities are the lab's, not the rig's.
+    encoder : whether it gives the stage's motion over this step.
     """
-    n = state_size(settings)
     along = np.outer(up, up)
-    full, noise = np.zeros((n, n)), np.zeros((n, n))
-    drift = np.zeros(n)
-    parts = ((_along(settings), along), (_across(settings), np.eye(3) - along))
-    for (dynamics, density), direction in parts:
-        matrix, spread = van_loan(dynamics, density, dt_s)
+    full, noise = np.zeros((STATES, STATES)), np.zeros((STATES, STATES))
+    for model, direction in ((_along(settings), along), (_across(settings), np.eye(3) - along)):
+        matrix, spread = van_loan(*model, dt_s)
         full += np.kron(matrix, direction)
         noise += np.kron(spread, direction)
-    if in_lab and np.isfinite(settings.velocity_time_s):
-        mean = np.zeros(n)
-        mean[3:6] = settings.rise_mm_s * np.array(up)
-        drift = mean - full @ mean
-        drift[:3] += dt_s * mean[3:6]
-    return Transition(full, noise, drift, _common_noise(settings, dt_s, n, encoder))
+    return Transition(full, noise, _common_noise(settings, dt_s, encoder))
 
 
-def _common_noise(settings: TrackerSettings, dt_s: float, n: int, encoder: bool) -> Array:
+def _common_noise(settings: TrackerSettings, dt_s: float, encoder: bool) -> Array:
     """Shake: steps of an Ornstein-Uhlenbeck offset; unknown stage: constant acceleration."""
-    out = np.zeros((n, n))
+    out = np.zeros((STATES, STATES))
     forgotten = -np.expm1(-dt_s / settings.shake_time_s)
-    out[:3, :3] = 2 * settings.shake_sd_mm**2 * forgotten * np.eye(3)
+    out[POSITION, POSITION] = 2 * settings.shake_sd_mm**2 * forgotten * np.eye(3)
     if not encoder:
         speed = settings.stage_acceleration_mm_s2 * dt_s
         gain = np.kron(np.array([dt_s / 2, 1.0]), np.eye(3)).reshape(3, 6).T * speed
@@ -121,15 +98,61 @@ def _common_noise(settings: TrackerSettings, dt_s: float, n: int, encoder: bool)
 
 
 def birth_covariance(settings: TrackerSettings, measured: Array, encoder: bool) -> Array:
-    """(n, n) of a new track at a measured point of covariance (3, 3)."""
-    out = np.zeros((state_size(settings),) * 2)
-    out[:3, :3] = measured
+    """(12, 12) of a new track at a measured point of covariance (3, 3)."""
+    out = np.zeros((STATES, STATES))
     speed = settings.birth_speed_sd_mm_s
     if not encoder:
         speed = settings.birth_speed_sd_no_encoder_mm_s
-    out[3:6, 3:6] = speed**2 * np.eye(3)
-    if settings.acceleration_state:
-        out[6:9, 6:9] = settings.lateral_acceleration_mm_s2**2 * np.eye(3)
-    if len(out) == 12:
-        out[9:, 9:] = settings.drift_sd_mm_s**2 * np.eye(3)
+    out[POSITION, POSITION] = measured
+    out[VELOCITY, VELOCITY] = speed**2 * np.eye(3)
+    out[ACCELERATION, ACCELERATION] = settings.lateral_acceleration_mm_s2**2 * np.eye(3)
+    out[DRIFT, DRIFT] = settings.drift_sd_mm_s**2 * np.eye(3)
     return out
+
+
+@dataclass(frozen=True)
+class StageStep:
+    """moved_mm : of the stage along its axis; known : whether the encoder gave it.
+
+    found_speed_mm_s : not 0 in the one step that ends with the second reading of the encoder:
+    until then velocities were relative to the rig.
+    """
+
+    moved_mm: float
+    known: bool
+    found_speed_mm_s: float
+
+
+@dataclass
+class StageMotion:
+    """The stage's motion as the filters' control input, with and without an encoder.
+
+    in_lab : velocities are relative to the lab, as the encoder has given a speed.
+    read_mm, read_t_s : the last reading; assumed_mm : the position that the filters assume.
+    """
+
+    in_lab: bool = False
+    read_mm: float = float("nan")
+    read_t_s: float = float("nan")
+    assumed_mm: float = float("nan")
+    speed_mm_s: float = 0.0
+
+    def step(self, position_mm: float | None, t_s: float, dt_s: float) -> StageStep:
+        """Without a reading (None, NaN) the last speed holds; the next reading corrects it."""
+        if position_mm is None or not np.isfinite(position_mm):
+            moved = self.speed_mm_s * dt_s if self.in_lab else 0.0
+            self.assumed_mm += moved
+            return StageStep(moved, False, 0.0)
+        if not np.isfinite(self.read_mm):
+            self._read(position_mm, t_s)
+            return StageStep(0.0, False, 0.0)
+        speed = (position_mm - self.read_mm) / (t_s - self.read_t_s)
+        moved = position_mm - self.assumed_mm if self.in_lab else speed * dt_s
+        found = 0.0 if self.in_lab else speed
+        self.in_lab, self.speed_mm_s = True, speed
+        self._read(position_mm, t_s)
+        return StageStep(moved, True, found)
+
+    def _read(self, position_mm: float, t_s: float) -> None:
+        self.read_mm = self.assumed_mm = float(position_mm)
+        self.read_t_s = float(t_s)

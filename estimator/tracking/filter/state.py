@@ -1,4 +1,4 @@
-"""One bubble's filter, and what all bubbles have in common.
+"""One bubble's Kalman filter, and the error that all bubbles have in common.
 
 The error of bubble i is own_i + common: `Track.filter` carries the own part (independent between
 bubbles), `Common` the part that shake and stage give to all alike. Both follow the same motion, so
@@ -10,29 +10,29 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.tracking.filter.motion import Transition
+from telerig.estimator.tracking.filter.motion import POSITION, STATES, Transition
 from telerig.estimator.tracking.filter.types import NO_PARTICLE
 
 Array = NDArray[np.float64]
 
 _SIZE_GAIN = 0.25
+_IDENTITY = np.eye(STATES)
 
 
 @dataclass
 class Track:
-    """A bubble under way.
+    """A bubble that is followed.
 
-    filter : filterpy KalmanFilter, state as in `track_motion`; d_eq_mm : running mean, NaN if
-    unknown; d_last_mm : the last measured, d_before_mm : the mean before that. seen : frame and
-    time of the last measurement; misses : frames since. history : (frame, point) of a track that
-    is not confirmed yet. parent, near : the track beside it when it was born, and when it was
-    missed first, with that one's size before.
+    filter : filterpy KalmanFilter, state as in `motion`; d_eq_mm : running mean, NaN if unknown;
+    d_last_mm : the last measured, d_before_mm : the mean before that. seen_frame, seen_t_s : of
+    the last measurement; misses : frames since. history : (frame, point) of a track that is not
+    confirmed yet. parent, near : id and former size of the nearest track at its birth, and when it
+    was first missed.
     """
 
     filter: Any
@@ -48,11 +48,26 @@ class Track:
     parent: tuple[int, float] | None = None
     near: tuple[int, float] | None = None
 
+    @property
+    def point_mm(self) -> Array:
+        """(3,) its position in the rig frame."""
+        return np.asarray(self.filter.x[POSITION])
+
+    @property
+    def point_covariance_mm2(self) -> Array:
+        """(3, 3) of the position, own part."""
+        return np.asarray(self.filter.P[POSITION, POSITION])
+
     def copy(self) -> Track:
         """Independent of the original: filterpy replaces its arrays, it never writes into them."""
         return replace(self, filter=copy(self.filter), history=list(self.history))
 
+    def predict(self, step: Transition, control: Array) -> None:
+        """control : (n,) added to the state: the stage's motion."""
+        self.filter.predict(u=control, B=_IDENTITY, F=step.matrix, Q=step.noise)
+
     def missed(self, shift: Array, mean_gain: Array, common_mm2: Array) -> None:
+        """No measurement in this frame; shift (n,) common to all, mean_gain (n, 3)."""
         self.misses += 1
         self.filter.x = self.filter.x + shift
         self.filter.P = self.filter.P + mean_gain @ common_mm2 @ mean_gain.T
@@ -65,12 +80,14 @@ class Track:
         self.filter.P = self.filter.P + unequal @ common_mm2 @ unequal.T
 
     def saw(self, frame: int, t_s: float, d_eq_mm: float) -> None:
+        """Record a measurement in a frame; d_eq_mm : NaN if unknown."""
         self.seen_frame, self.seen_t_s, self.misses, self.near = frame, t_s, 0, None
         if np.isfinite(d_eq_mm):
             self.d_last_mm, self.d_before_mm = d_eq_mm, self.d_eq_mm
-            first = not np.isfinite(self.d_eq_mm)
-            self.d_eq_mm += 0.0 if first else _SIZE_GAIN * (d_eq_mm - self.d_eq_mm)
-            self.d_eq_mm = d_eq_mm if first else self.d_eq_mm
+            if np.isfinite(self.d_eq_mm):
+                self.d_eq_mm += _SIZE_GAIN * (d_eq_mm - self.d_eq_mm)
+            else:
+                self.d_eq_mm = d_eq_mm
 
 
 def new_filter(x: Array, p: Array) -> Any:
@@ -83,38 +100,27 @@ def new_filter(x: Array, p: Array) -> Any:
     return kalman
 
 
-def predict(track: Track, step: Transition, control: Array) -> None:
-    """control : (n,) added to the state, the stage's motion and the mean velocity's drift."""
-    track.filter.predict(u=control, B=_identity(len(control)), F=step.matrix, Q=step.noise)
-
-
-@lru_cache(maxsize=4)
-def _identity(n: int) -> Array:
-    return np.eye(n)
-
-
 @dataclass(frozen=True)
 class Common:
-    """shift : (n,) of this frame, not yet added to the tracks; covariance : (n, n)."""
+    """The error common to all bubbles.
 
-    shift: Array
-    covariance: Array
+    shift : (n,) of this frame, not yet added to the tracks; covariance : (n, n).
+    """
 
-    @staticmethod
-    def start(n: int) -> Common:
-        return Common(np.zeros(n), np.zeros((n, n)))
+    shift: Array = field(default_factory=lambda: np.zeros(STATES))
+    covariance: Array = field(default_factory=lambda: np.zeros((STATES, STATES)))
 
     @property
     def shift_mm(self) -> Array:
-        return self.shift[:3]
+        return self.shift[POSITION]
 
     @property
     def covariance_mm2(self) -> Array:
-        return self.covariance[:3, :3]
+        return self.covariance[POSITION, POSITION]
 
     def predicted(self, step: Transition) -> Common:
         grown = step.matrix @ self.covariance @ step.matrix.T + step.common_noise
-        return Common(np.zeros(len(self.shift)), grown)
+        return Common(np.zeros(STATES), grown)
 
     def informed(self, innovations: Array, covariances: Array) -> Common:
         """After innovations (E, 3) of bubbles whose own covariances are (E, 3, 3)."""
@@ -123,12 +129,12 @@ class Common:
         information = np.linalg.inv(covariances)
         score = np.einsum("eij,ej->i", information, innovations - self.shift_mm)
         total = information.sum(0)
-        gain = self.covariance[:, :3] @ np.linalg.inv(np.eye(3) + total @ self.covariance_mm2)
-        lost = gain @ total @ self.covariance[:3]
+        gain = self.covariance[:, POSITION] @ np.linalg.inv(np.eye(3) + total @ self.covariance_mm2)
+        lost = gain @ total @ self.covariance[POSITION]
         return Common(self.shift + gain @ score, self.covariance - (lost + lost.T) / 2)
 
     def applied(self, mean_gain: Array) -> Common:
-        """What is left once the tracks have taken the shift and their measurements."""
-        keep = np.eye(len(self.shift))
-        keep[:, :3] -= mean_gain
-        return Common(np.zeros(len(self.shift)), keep @ self.covariance @ keep.T)
+        """The remainder once the tracks have taken the shift and their measurements."""
+        keep = np.eye(STATES)
+        keep[:, POSITION] -= mean_gain
+        return Common(np.zeros(STATES), keep @ self.covariance @ keep.T)

@@ -1,7 +1,8 @@
-"""What goes into the tracker, what comes out, and its settings."""
+"""Input, output and settings of the tracker."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -22,27 +23,23 @@ class TrackerSettings:
     rise_mm_s, birth_speed_sd_mm_s : velocity of a new track along the travel axis and its sd on
         each axis; without an encoder the mean is 0 and the sd birth_speed_sd_no_encoder_mm_s.
     lateral_acceleration_mm_s2, rise_acceleration_mm_s2 : RMS across and along the travel axis.
-    acceleration_time_s : how long an acceleration lasts. With `acceleration_state` it is a state
-        (Singer's model), else white noise of the same spectral density at 0 Hz.
-    zigzag_hz, zigzag_damping : with `acceleration_state`, how the velocity across the travel axis
-        swings, and the share of its critical damping: small for one frequency, 0.7 for any up to
-        it. 0 Hz: no swing, across as along the axis.
-    drift_sd_mm_s, drift_time_s : of the slow velocity across the axis about which it swings.
-    velocity_time_s : relaxation of the velocity towards the rise; inf: none.
+    acceleration_time_s : correlation time of the acceleration along the axis (Singer's model).
+    zigzag_hz, zigzag_damping : frequency at which the velocity across the travel axis oscillates,
+        and its damping ratio: small for one frequency, 0.7 for any up to it.
+    drift_sd_mm_s, drift_time_s : of the slow velocity across the axis about which it oscillates.
     shake_sd_mm, shake_time_s : offset common to all bubbles in a frame, sd and correlation time.
-    stage_acceleration_mm_s2 : of the stage, where the encoder does not tell its position.
-    size_scatter : relative sd of d_eq_mm from frame to frame; size_cap_nats bounds what one
-        wrong size can say.
+    stage_acceleration_mm_s2 : of the stage, where the encoder does not give its position.
+    size_scatter : relative sd of d_eq_mm from frame to frame; size_cap_nats : largest penalty
+        (log-likelihood) of a wrong size.
     detection_probability, missed_again_probability : of a bubble in a frame; of one that was
         missed in the frame before to be missed again. end_probability : to leave for good in a
         frame; so a track that was missed for long hardly claims a measurement.
-    new_per_mm3, new_per_px2 : density of what is no continuation (clutter, new bubbles) in space
-        and in one image.
-    gate_probability : of a true continuation to lie inside its gate.
-    margin_nats : a continuation this close to the runner-up is not safe when the window ends;
-        prune_nats : a hypothesis this far behind is dropped at once.
+    new_per_mm3, new_per_px2 : density of clutter and new bubbles in space and in one image.
+    gate_probability : that a true continuation lies inside its gate.
+    margin_nats : least log-likelihood ratio to the runner-up for a safe decision when the window
+        ends; prune_nats : hypotheses further behind the best are dropped at once.
     window_frames : how long a conflict may stay open. max_hypotheses : per conflict.
-    confirm_hits, confirm_frames : a new track needs hits in so many of its first frames.
+    confirm_hits, confirm_frames : a new track needs so many measurements in its first frames.
     gap_s, gap_frames : a track unseen for longer than both ends.
     balance_tolerance : of the volume, to call a birth a split or an end a merger.
     """
@@ -53,12 +50,10 @@ class TrackerSettings:
     lateral_acceleration_mm_s2: float = 3000.0
     rise_acceleration_mm_s2: float = 1800.0
     acceleration_time_s: float = 0.02
-    acceleration_state: bool = True
     zigzag_hz: float = 6.5
     zigzag_damping: float = 0.2
     drift_sd_mm_s: float = 100.0
     drift_time_s: float = 0.5
-    velocity_time_s: float = float("inf")
     shake_sd_mm: float = 0.3
     shake_time_s: float = 0.01
     stage_acceleration_mm_s2: float = 3000.0
@@ -81,38 +76,35 @@ class TrackerSettings:
     balance_tolerance: float = 0.25
 
     def __post_init__(self) -> None:
+        probabilities = ("detection_probability", "missed_again_probability", "gate_probability")
+        positive = ("acceleration_time_s", "drift_time_s", "shake_time_s", "size_scatter")
         for item in fields(self):
             value = getattr(self, item.name)
-            if not value >= 0:
-                raise InputError(f"{item.name} = {value}", todo="give a number of at least 0")
-        probabilities = ("detection_probability", "missed_again_probability", "gate_probability")
-        for name in probabilities:
-            if not 0 < getattr(self, name) < 1:
-                raise InputError(f"{name} = {getattr(self, name)}", todo="give it between 0 and 1")
-        for name in ("acceleration_time_s", "velocity_time_s", "shake_time_s", "size_scatter"):
-            if getattr(self, name) == 0:
-                raise InputError(f"{name} = 0", todo="give a positive number")
+            if item.name in probabilities:
+                good, todo = 0 < value < 1, "give a number between 0 and 1"
+            elif item.name in positive:
+                good, todo = value > 0, "give a positive number"
+            else:
+                good, todo = value >= 0, "give a number of at least 0"
+            if not good:
+                raise InputError(f"{item.name} = {value}", todo=todo)
         if not 1 <= self.confirm_hits <= self.confirm_frames:
             raise InputError(
-                f"{self.confirm_hits} hits of {self.confirm_frames} frames",
-                todo="confirm_hits from 1 to confirm_frames",
+                f"confirm_hits = {self.confirm_hits}, confirm_frames = {self.confirm_frames}",
+                todo="give confirm_hits from 1 to confirm_frames",
             )
-
-
-def _empty(*shape: int) -> Array:
-    return np.zeros(shape)
 
 
 @dataclass(frozen=True)
 class SingleMeasurements:
-    """Bubbles that one camera saw without a partner.
+    """Bubbles that one camera saw without a partner in the other.
 
     camera : (L,) index; uv_px : (L, 2); covariance_px2 : (L, 2, 2).
     """
 
     camera: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
-    uv_px: Array = field(default_factory=lambda: _empty(0, 2))
-    covariance_px2: Array = field(default_factory=lambda: _empty(0, 2, 2))
+    uv_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    covariance_px2: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -153,11 +145,11 @@ class FrameMeasurements:
         for name, values in (("d_eq_mm", size), ("confidence", sure), ("particle", ids)):
             if values.shape != (m,):
                 raise InputError(
-                    f"{name} of shape {values.shape} for {m} points", todo="one value per point"
+                    f"{name} has shape {values.shape} for {m} points", todo="give one per point"
                 )
         if not (np.isfinite(points).all() and np.isfinite(covariance).all()):
             raise InputError(
-                "points or covariances that are not finite",
+                "points or covariances are not finite",
                 todo="leave out bubbles that could not be triangulated",
             )
         given = ids[ids != NO_PARTICLE]
@@ -174,7 +166,7 @@ class FrameMeasurements:
 class TrackEvent:
     """kind : birth, death, gap, break, resolved, split or merge.
 
-    particles : the tracks it is about, the older first; frame, t_s : when; reason : in words.
+    particles : the tracks concerned, the older first; frame, t_s : when; reason : a sentence.
     """
 
     kind: str
@@ -195,18 +187,10 @@ class FrameIds:
 
 @dataclass(frozen=True)
 class SeenAlone:
-    """Tracks that were continued by single-camera measurements in a frame; S updates.
+    """A track after its update by one camera alone: point_mm (3,), d_eq_mm (NaN if unknown)."""
 
-    single : (S,) index of the measurement; particle : (S,) as of now; points_mm (S, 3),
-    covariance_mm2 (S, 3, 3) : where the bubble is by what its track and the measurement say;
-    d_eq_mm : (S,), NaN where unknown.
-    """
-
-    single: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
-    particle: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
-    points_mm: Array = field(default_factory=lambda: _empty(0, 3))
-    covariance_mm2: Array = field(default_factory=lambda: _empty(0, 3, 3))
-    d_eq_mm: Array = field(default_factory=lambda: _empty(0))
+    point_mm: Array
+    d_eq_mm: float
 
 
 @dataclass(frozen=True)
@@ -221,7 +205,7 @@ class Motion:
     offset: Array
 
     def shifted(self, shift: Array, covariance_mm2: Array) -> Motion:
-        """With what was found to be common to all, shift (n,), and how sure its place is (3, 3)."""
+        """With the common shift (n,) and the covariance of its position (3, 3)."""
         noise = self.noise.copy()
         noise[:3, :3] += covariance_mm2
         return Motion(self.matrix, noise, self.offset + shift)
@@ -233,7 +217,8 @@ class FrameResult:
 
     settled : the earlier frames (and this one, if nothing is open) whose ids are final now, in
         order; write these to the tables. events : what became known in this frame.
-    alone : the tracks that one camera alone continued in this frame. motion : None in the first.
+    alone : by index of the single measurement, the tracks that one camera alone continued.
+    motion : None in the first frame.
     """
 
     frame: int
@@ -241,5 +226,5 @@ class FrameResult:
     single: Ids
     events: tuple[TrackEvent, ...]
     settled: tuple[FrameIds, ...]
-    alone: SeenAlone = field(default_factory=SeenAlone)
+    alone: Mapping[int, SeenAlone] = field(default_factory=dict)
     motion: Motion | None = None

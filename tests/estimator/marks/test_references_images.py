@@ -213,7 +213,7 @@ def test_a_strip_in_one_view_only(data: Path, tmp_path: Path) -> None:
     output, summary = tracked(run)
     cameras = summary["references"]["cameras"]
     assert (cameras["left"]["marks"] >= 5, cameras["right"]["marks"]) == (True, 0)
-    assert "camera right: rig.toml tells of a strip" in output
+    assert "camera right: rig.toml describes a strip" in output
     table = pd.read_csv(tmp_path / "data" / "results" / "rise" / "references.csv")
     assert set(table["camera"]) == {"left"}
 

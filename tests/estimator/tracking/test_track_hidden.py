@@ -18,7 +18,7 @@ SIDE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 def _run(rng: np.random.Generator) -> tuple[list[Reading | None], list[Motion | None], np.ndarray]:
     """Readings of a bubble drawn from the motion model; HIDDEN frames lack the depth."""
-    step = transition(SETTINGS, (0.0, -1.0, 0.0), 0.004, True, True)
+    step = transition(SETTINGS, (0.0, -1.0, 0.0), 0.004, True)
     prior = birth_covariance(SETTINGS, np.zeros((3, 3)), True)
     x = rng.multivariate_normal(np.zeros(len(prior)), prior)
     root = np.linalg.cholesky(step.noise + 1e-14 * np.eye(len(x)))

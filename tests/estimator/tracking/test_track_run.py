@@ -147,9 +147,9 @@ def test_other_options_do_not_take_up_old_detections(rise: Path, tmp_path: Path)
     store = detection.DetectionStore(tmp_path / "work", "one", 20, 1)
     store.path(store.batches[0]).write_text("frame\n", encoding="utf-8")
     same = detection.DetectionStore(tmp_path / "work", "one", 20, 1)
-    assert len(same.missing) == len(same.batches) - 1
+    assert len(same.missing()) == len(same.batches) - 1
     other = detection.DetectionStore(tmp_path / "work", "two", 20, 1)
-    assert other.missing == other.batches
+    assert other.missing() == other.batches
 
 
 def test_a_frame_missing_in_one_camera_is_told(rise: Path, tmp_path: Path) -> None:

@@ -198,7 +198,7 @@ def test_state_does_not_grow_with_the_run() -> None:
         tracker.update(i, i / 500, frame_of([[10.0 * (i // 8), 0, 0]]), 0.0)
         sizes.append(len(pickle.dumps(tracker)))
     assert tracker.next_id > 40
-    assert len(tracker.ledger._seen) < 24
+    assert len(tracker.frames._seen) < 24
     assert max(sizes[200:]) < 1.1 * max(sizes[:200])
 
 

@@ -78,7 +78,8 @@ def linked(
                 found.loc[BACK, "u_px"] -= 0.3
                 copy["u_px"] += 0.3
                 found = pd.concat([found, copy], ignore_index=True)
-            tables.append(found)
+            # the two tables list the bubbles in different orders
+            tables.append(found if camera == 0 else found.iloc[::-1].reset_index(drop=True))
         assert linker.add(frame, DT_S * frame, None, (tables[0], tables[1])) is None
     last = linker.finish()
     assert last is not None

@@ -122,7 +122,7 @@ class Outlines:
 def fit_outlines(ratio: NDArray[np.float32], start: Start) -> Outlines:
     """Fit B outlines to the normalised image ``ratio`` (grey over background).
 
-    Pixels inside or near another bubble of ``start`` are left out, and so are hearts, dirt and
+    Pixels inside or near another bubble of ``start`` are left out, and so are glare, dirt and
     whatever else is unlike a rim. A first look at some of the pixels brings blur and levels; the
     fit to all is repeated for outlines that moved far or are partly hidden.
     """

@@ -153,7 +153,7 @@ def unlike_rim(
 ) -> Mask:
     """Pixels (N,) at and beyond the first ring that departs from the model, in each octant.
 
-    Rings are one pixel wide. Inside, a departure towards bright is a heart; outside, one towards
+    Rings are one pixel wide. Inside, a departure towards bright is glare; outside, one towards
     dark is dirt or a neighbour. ``residual`` is in units of the noise, ``contrast`` (B,) too. A
     ring counts when its mean is off by 1.5 % of the contrast and by 3 sigma of its own error.
     """

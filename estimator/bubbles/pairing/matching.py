@@ -164,7 +164,7 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
 
 
 def _prior_log_odds(n1: int, n2: int, unmatched: tuple[float, float]) -> float:
-    """Expected pairs over the product of expected lonely detections."""
+    """Expected pairs over the product of the expected detections without a partner."""
     alone = (max(n1 * unmatched[0], 1e-3), max(n2 * unmatched[1], 1e-3))
     pairs = max(np.sqrt(n1 * (1 - unmatched[0]) * n2 * (1 - unmatched[1])), 1e-3)
     return float(np.log(pairs / (alone[0] * alone[1])))

@@ -175,7 +175,7 @@ def test_without_the_recording_only_the_path_is_filmed(
     monkeypatch.setattr("telerig.io.report.film.path.STEP_DEG", 60)
     shutil.move(tmp_path / "runs" / "rise", tmp_path / "elsewhere")
     said = command(filmed, "--film", "--format", "gif")
-    assert "both views: left out" in said and "--run" in said
+    assert "both views is left out" in said and "--run" in said
     said = command(filmed, "--film", "--format", "gif", "--run", tmp_path / "elsewhere")
     assert "views.gif (" in said
     for camera in ("left", "right"):

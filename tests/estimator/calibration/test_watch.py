@@ -308,5 +308,5 @@ def test_options_of_watching(empty: Path) -> None:
     assert result.exit_code == 2 and "waits for images" in result.stderr
     for option in ("model", "solver", "medium", "dots"):
         result = runner.invoke(app, ["calibrate", str(empty), "--watch", f"--{option}", "nonsense"])
-        assert result.exit_code == 2 and "unknown" in result.stderr and "known: " in result.stderr
+        assert result.exit_code == 2 and "unknown" in result.stderr
         assert "watching" not in result.stdout

@@ -105,7 +105,7 @@ def smooth(
         chosen = solution.frame.model
         if chosen.learned:
             solution = with_hyperparameter_uncertainty(solution)
-    verdict = judge(problem, chosen, solution) if problem.bubbles else {}
+    verdict = judge(problem, chosen, solution)
     summary = summary_of(solution)
     change = refined_change(solution, calibration)
     if change is not None:

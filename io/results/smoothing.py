@@ -19,7 +19,7 @@ deviation and two simpler estimates."""
 
 
 class Verdict(StrEnum):
-    """Can the run tell the bubbles' motion from the rig's shake?"""
+    """Can the run tell the bubbles' motion from the rig's shake? From the best to the worst."""
 
     RESOLVED = "RESOLVED"
     PARTIAL = "PARTIAL"
@@ -27,6 +27,8 @@ class Verdict(StrEnum):
 
 
 class Flag(StrEnum):
+    """Conditions that qualify a verdict."""
+
     LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,30 +25,15 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
 )
 from telerig.factors.motion import start
+from telerig.io.results.smoothing import AXES, Flag, Verdict
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-AXES = ("x", "y", "z")
 RESOLVED_Q, PARTIAL_Q, RESOLVED_ETA = 1.25, 2.0, 0.99
 _MOST_FRAMES, _MOST_BUBBLES = 2000, 3
 _EDGE = 0.1
 _SEEN = 0.25
-
-
-class Verdict(StrEnum):
-    """From the best to the worst."""
-
-    RESOLVED = "RESOLVED"
-    PARTIAL = "PARTIAL"
-    UNRESOLVED = "UNRESOLVED"
-
-
-class Flag(StrEnum):
-    """Conditions that qualify a verdict."""
-
-    LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
-    SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,9 @@ import numpy as np
 
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
-from telerig.estimator.smoothing.verdict.identifiability import (
-    AXES,
-    AxisVerdict,
-    Flag,
-    Verdict,
-    verdicts,
-)
+from telerig.estimator.smoothing.verdict.identifiability import AxisVerdict, verdicts
 from telerig.estimator.smoothing.verdict.modes import Place, ShakeMode, shake_modes
+from telerig.io.results.smoothing import AXES, Flag, Verdict
 from telerig.rig.camera import Camera
 
 _STRIP = "fix a strip of dots to the tank inside both views"
@@ -46,11 +41,15 @@ _WEAK_DAMPING, _SLOW_HZ = 0.02, 5.0
 def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> dict[str, Any]:
     """The verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ``modes``.
 
-    solution : of the problem under the model, with covariances (else the answer is empty).
+    solution : of the problem under the model; without covariances the answer is empty. Without
+        bubbles there is nothing to judge, and only the modes are listed.
     """
-    found = verdicts(solution)
-    if not found:
+    if solution.covariances is None:
         return {}
+    found = verdicts(solution) if problem.bubbles else {}
+    modes = [_mode_json(mode) for mode in shake_modes(solution)]
+    if not found:
+        return {"modes": modes}
     worst = max((a.verdict for a in found.values()), key=list(Verdict).index)
     return {
         "verdict": str(worst),
@@ -59,7 +58,7 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
         "words": _sentences(problem, model, found),
         "remedy": "" if worst == Verdict.RESOLVED else remedy_of_verdict(problem),
         "left_out": [_unseen(camera) for camera in problem.cameras],
-        "modes": [_mode_json(mode) for mode in shake_modes(solution)],
+        "modes": modes,
     }
 
 

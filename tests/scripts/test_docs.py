@@ -157,3 +157,10 @@ def test_help_keeps_what_stands_in_brackets(command: str, words: str) -> None:
         text=True, capture_output=True, timeout=60, env={**os.environ, "COLUMNS": "160"},
     )  # fmt: skip
     assert words in done.stdout
+
+
+def test_architecture_names_what_is_there() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:rig|factors|estimator|io|scripts|tests)/[\w/]+(?:\.py)?)`", text)
+    gone = [p for p in named if not (ROOT / p).exists() and not (ROOT / f"{p}.py").exists()]
+    assert len(named) > 30 and not gone

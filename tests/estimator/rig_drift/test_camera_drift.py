@@ -321,7 +321,7 @@ def test_smoothing_without_refinement_warns_of_a_movement() -> None:
 
     summary = {"rig_change": {"camera": "right", "moved": True, "offset_mm": 0.0885}}
     (words,) = _moved(SimpleNamespace(summary=summary))
-    assert "'right' had moved" in words and "by +88 um" in words and "--refine-rig" in words
+    assert "'right' had moved" in words and "by +88 µm" in words and "--refine-rig" in words
     assert not _moved(SimpleNamespace(summary={})) and not _moved(object())
 
 

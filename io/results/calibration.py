@@ -115,13 +115,35 @@ class Mirror(Part):
     nominal_rotvec_deg: Numbers | None = None
 
 
+class LadderStep(Part):
+    """A lens model that was tried. Numbers are None for a model that was not fitted.
+
+    held_out : mean squared error of the prediction of left-out views.
+    """
+
+    model: str = ""
+    camera: str = ""
+    added: tuple[str, ...] = ()
+    taken: bool = True
+    chi2_gain: float | None = None
+    bic_gain: float | None = None
+    p_value: float | None = None
+    words: str = ""
+    parameters: int | None = None
+    chi2_dof: float | None = None
+    bic: float | None = None
+    rms_px: float | None = None
+    held_out: float | None = None
+    held_out_before: float | None = None
+
+
 class LensModel(Part):
     """The lens model of each camera, and the ladder of models that were tried."""
 
     name: str = ""
     by_camera: dict[str, str] = Field(default_factory=dict)
     words: str = ""
-    ladder: tuple[dict[str, Any], ...] = ()
+    ladder: tuple[LadderStep, ...] = ()
 
 
 class Stage(Part):

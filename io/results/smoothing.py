@@ -33,6 +33,16 @@ class Flag(StrEnum):
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
 
 
+class AttributedLine(Part):
+    """A spectral line, its owner, and the log-likelihood ratio against the other owner."""
+
+    owner: str = ""
+    frequency_hz: float
+    rms_mm: float | None = None
+    other_owner_costs_nats: float | None = None
+    ambiguous: bool = False
+
+
 class AxisVerdict(Part):
     """The verdict along one axis of the rig, and the numbers behind it."""
 
@@ -43,7 +53,28 @@ class AxisVerdict(Part):
     sigma_mm: float | None = None
     sigma_shake_known_mm: float | None = None
     shake_rms_mm: float | None = None
-    lines: tuple[dict[str, Any], ...] = ()
+    lines: tuple[AttributedLine, ...] = ()
+    words: str = ""
+
+
+class Mode(Part):
+    """A vibration of the rig: of the model, or a peak in the spectrum of the estimated shake."""
+
+    where: str
+    frequency_hz: float
+    damping: float | None = None
+    rms_mm: tuple[float, ...] | float | None = None
+    source: str = ""
+    remedy: str = ""
+
+
+class PixelResiduals(Part):
+    """Residuals of the pixels in units of their stated standard deviations."""
+
+    pixels: int = 0
+    outliers: int = 0
+    rms_sigmas: float | None = None
+    median_sigmas: float | None = None
 
 
 class SmoothingFile(Record):
@@ -56,10 +87,10 @@ class SmoothingFile(Record):
     verdict: Verdict | None = None
     flags: tuple[str, ...] = ()
     axes: dict[str, AxisVerdict] = Field(default_factory=dict)
-    words: str | tuple[str, ...] = ""
-    remedy: str | tuple[str, ...] = ""
+    words: str = ""
+    remedy: str = ""
     left_out: tuple[str, ...] = ()
-    modes: tuple[dict[str, Any], ...] = ()
+    modes: tuple[Mode, ...] = ()
     schema_: int = Field(1, alias="schema")
     cameras: tuple[str, ...] = ()
     frames: int | None = None
@@ -70,7 +101,7 @@ class SmoothingFile(Record):
     states: dict[str, Any] = Field(default_factory=dict)
     unseen: dict[str, Any] = Field(default_factory=dict)
     depth_axes: dict[str, Vector3] = Field(default_factory=dict)
-    residuals: dict[str, Any] = Field(default_factory=dict)
+    residuals: dict[str, PixelResiduals] = Field(default_factory=dict)
     whiteness: dict[str, Any] = Field(default_factory=dict)
     accelerometer_spectra: dict[str, Any] = Field(default_factory=dict)
     encoder: dict[str, Any] = Field(default_factory=dict)

@@ -27,7 +27,8 @@ class WorstFrame(Part):
 class Pairs(Part):
     """What the pairs of the run say of both views: bias and scatter of the ray miss."""
 
-    bias_px: Any = None
+    bias_px: float | tuple[float, ...] | None = None
+    rms_px: tuple[float | None, ...] = ()
     scatter_px: float | None = None
     frame_px: float | None = None
     calibration_problem: bool = False
@@ -40,7 +41,7 @@ class RigChange(Part):
     camera: str = ""
     moved: bool = False
     offset_mm: float | None = None
-    words: str | tuple[str, ...] = ()
+    words: str = ""
 
 
 class TrackingFile(Record):
@@ -62,7 +63,7 @@ class TrackingFile(Record):
     points: int | None = None
     tracks: int | None = None
     detections_without_partner_or_track: int | None = None
-    frames_without_bubbles: dict[str, Any] = Field(default_factory=dict)
+    frames_without_bubbles: dict[str, dict[str, int]] = Field(default_factory=dict)
     events: dict[str, int] = Field(default_factory=dict)
     pairs: Pairs | None = None
     shape_sigma: Any = None

@@ -50,12 +50,16 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
     modes = [_mode_json(mode) for mode in shake_modes(solution)]
     if not found:
         return {"modes": modes}
+    upright = AXES[int(np.abs(problem.up).argmax())]
+    sentences = {name: _of_axis(name, axis, name == upright) for name, axis in found.items()}
     worst = max((a.verdict for a in found.values()), key=list(Verdict).index)
     return {
         "verdict": str(worst),
         "flags": [str(flag) for flag in _flags(found)],
-        "axes": {name: _axis_json(axis) for name, axis in found.items()},
-        "words": _sentences(problem, model, found),
+        "axes": {
+            name: _axis_json(axis) | {"words": sentences[name]} for name, axis in found.items()
+        },
+        "words": " ".join([*sentences.values(), *_advice(problem, model, found)]),
         "remedy": "" if worst == Verdict.RESOLVED else remedy_of_verdict(problem),
         "left_out": [_unseen(camera) for camera in problem.cameras],
         "modes": modes,
@@ -103,14 +107,15 @@ def _mode_json(mode: ShakeMode) -> dict[str, Any]:
     }
 
 
-def _sentences(problem: SmoothingProblem, model: ShakeModel, found: dict[str, AxisVerdict]) -> str:
-    upright = AXES[int(np.abs(problem.up).argmax())]
-    parts = [_of_axis(name, axis, name == upright) for name, axis in found.items()]
+def _advice(
+    problem: SmoothingProblem, model: ShakeModel, found: dict[str, AxisVerdict]
+) -> list[str]:
+    parts = []
     if any(axis.verdict != Verdict.RESOLVED for axis in found.values()):
         parts.append(f"To resolve it, {remedy_of_verdict(problem)}.")
     if model.name == "learned":
         parts.append("The shake's modes were learned from this run.")
-    return " ".join(parts)
+    return parts
 
 
 def _of_axis(name: str, axis: AxisVerdict, upright: bool) -> str:

@@ -249,7 +249,7 @@ def trust_pictures(results: CalibrationResults) -> list[Picture]:
     if results.uncertainty:
         found.append(_map(results.uncertainty, "calibration_mm2", _CALIBRATION))
         found.append(_map(results.uncertainty, "measurement_mm2", _MEASUREMENT))
-    halves = (results.content.get("diagnostics") or {}).get("halves") or {}
+    halves = results.file.diagnostics.halves
     if "points_mm" in halves:
         found.append(_halves(halves))
     return found

@@ -29,7 +29,7 @@ _GAP = 0.06
 
 def next_pictures(results: CalibrationResults) -> list[Picture]:
     """Two pictures of the best pose; none in folders of before, or when no pose was found."""
-    advice = (results.content.get("diagnostics") or {}).get("next_view") or {}
+    advice = results.file.diagnostics.next_view
     if not advice.get("poses") or len(results.cameras) != 2:
         return []
     pose = np.array(advice["poses"][0]["rig_from_target"], float).reshape(4, 4)

@@ -23,10 +23,16 @@ from telerig.io.report.calibration.rig import dots_are_drawn, rig_plan, scene_js
 from telerig.io.report.calibration.target import target_pictures
 from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
 from telerig.io.report.page.figures import Picture
-from telerig.io.report.page.number_format import ABSENT, flat_rows, is_number
+from telerig.io.report.page.number_format import ABSENT, flat_rows
 from telerig.io.report.page.page import drawn_over_cores, render_page
+from telerig.io.results.calibration import Status
 
-_COLOURS = {"GOOD": "good", "USABLE": "usable", "REJECTED": "rejected"}
+_COLOURS = {
+    Status.GOOD: "good",
+    Status.USABLE: "usable",
+    Status.REJECTED: "rejected",
+    Status.IMPORTED: "usable",
+}
 _SHOWN = {
     "schema", "kind", "name", "pixel_origin", "units", "gauge", "verdict", "cameras", "target",
     "views", "covariance", "model", "twin", "statistics", "diagnostics", "notes",
@@ -60,34 +66,31 @@ def render(results: CalibrationResults, dot: list[Picture] | None = None) -> str
 
 
 def _words(results: CalibrationResults) -> dict[str, Any]:
-    content = results.content
-    verdict = content["verdict"]
-    twin = content.get("twin") or {}
-    costs = [twin.get("cost"), twin.get("other_cost")]
+    file = results.file
+    costs = (file.twin.cost, file.twin.other_cost)
     return {
-        "name": content.get("name") or "calibration",
-        "status": verdict["status"],
-        "colour": _COLOURS.get(str(verdict["status"]).split(",")[0].split()[0], "usable"),
-        "reasons": verdict.get("reasons") or [],
+        "name": file.name or "calibration",
+        "status": file.verdict.status,
+        "colour": _COLOURS[file.verdict.status],
+        "reasons": file.verdict.reasons,
         "cameras": results.camera_names,
-        "model": content.get("model") or {},
-        "twin": twin,
-        "twin_costs": [f"{c:.10g}" if is_number(c) else ABSENT for c in costs],
-        "gauge": content.get("gauge") or ABSENT,
-        "weak": (content.get("diagnostics") or {}).get("weak") or [],
-        "notes": content.get("notes") or [],
+        "model": file.model.content(),
+        "twin": file.twin.content(),
+        "twin_costs": [ABSENT if c is None else f"{c:.10g}" for c in costs],
+        "gauge": file.gauge or ABSENT,
+        "weak": file.diagnostics.weak,
+        "notes": file.notes,
         "absent": results.absent,
         "trust_words": _trust_words(results),
         "comparison": results.comparison.content(),
-        "advice": (content.get("diagnostics") or {}).get("next_view") or {},
+        "advice": file.diagnostics.next_view,
         "dots_drawn": dots_are_drawn(results),
     }
 
 
 def _trust_words(results: CalibrationResults) -> list[str]:
     """What halves and residuals say; nothing for folders of before."""
-    diagnostics = results.content.get("diagnostics") or {}
-    halves, structure = (diagnostics.get(k) or {} for k in ("halves", "structure"))
+    halves, structure = results.file.diagnostics.halves, results.file.diagnostics.structure
     found = [str(halves["words"])] if "words" in halves else []
     found += [str(words) for words in structure.get("words") or []]
     return [words[0].upper() + words[1:] + "." for words in found if words]
@@ -102,7 +105,7 @@ def _tables(results: CalibrationResults) -> dict[str, Any]:
         "parameters": tables.parameter_rows(results),
         "pose": tables.pose_rows(results),
         "stage": stage,
-        "stage_words": (results.content.get("stage") or {}).get("notes") or [],
+        "stage_words": () if results.file.stage is None else results.file.stage.notes,
         "ladder": tables.ladder_rows(results),
         "worst": tables.worst_rows(results),
         "changes": tables.change_rows(results),

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from telerig.errors import GeometryError
 from telerig.io.report.calibration.results import CalibrationResults
-from telerig.io.report.page.number_format import ABSENT, is_number, number, share, with_sd
+from telerig.io.report.page.number_format import ABSENT, number, share, with_sd
 from telerig.io.report.page.page import Figure, Row
+from telerig.io.results.calibration import CameraRecord, LadderStep
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -87,13 +88,13 @@ def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Fi
 
 def parameter_rows(results: CalibrationResults) -> list[Row]:
     """One row per parameter, one cell per camera: value +- sd, or that it was held."""
-    cameras = list(results.content["cameras"].values())
+    cameras = list(results.file.cameras.values())
     rows = []
     for name in PARAMETERS:
-        if name.startswith("wall_") and not results.content.get("walls"):
+        if name.startswith("wall_") and not results.file.walls:
             continue
         cells = [_parameter_cell(camera, name) for camera in cameras]
-        free = any(name in camera.get("free", []) for camera in cameras)
+        free = any(name in camera.free for camera in cameras)
         rows.append(Row((f"{_WORDS[name]} ({name})", *cells), faint=not free))
     largest = [_largest_distortion(camera) for camera in results.cameras]
     perspective = [f"{number(1e6 * c['kappa_per_mm'])} ppm" for c in results.cameras]
@@ -105,11 +106,11 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
     ]
 
 
-def _parameter_cell(camera: Mapping[str, Any], name: str) -> str:
-    value = camera["parameters"].get(name, 0.0)
-    if name not in camera.get("free", []):
+def _parameter_cell(camera: CameraRecord, name: str) -> str:
+    value = camera.parameters.get(name, 0.0)
+    if name not in camera.free:
         return f"{number(value, 7)} (held)"
-    return with_sd(value, (camera.get("standard_deviations") or {}).get(name))
+    return with_sd(value, camera.standard_deviations.get(name))
 
 
 def _field(camera: Camera) -> str:
@@ -136,7 +137,7 @@ def pose_rows(results: CalibrationResults) -> list[Row]:
         return []
     second = results.cameras[1]
     pose = second.camera_from_rig
-    nominal = (results.content.get("twin") or {}).get("nominal_rotvec_deg")
+    nominal = results.file.twin.nominal_rotvec_deg
     turn, place = _tangent_sd(results, "r", "_rad"), _tangent_sd(results, "t", "_mm")
     statistics = results.statistics
     return [
@@ -176,12 +177,11 @@ def _degrees(radians: list[float] | None) -> list[float] | None:
 
 
 def _rig_block(results: CalibrationResults, names: list[str]) -> Array | None:
-    block = results.content.get("covariance") or {}
-    known = list(block.get("names", []))
-    if not set(names) <= set(known):
+    block = results.file.covariance
+    if block is None or not set(names) <= set(block.names):
         return None
-    index = [known.index(name) for name in names]
-    return np.array(block["matrix"], float)[np.ix_(index, index)]
+    index = [block.names.index(name) for name in names]
+    return np.asarray(block.matrix[np.ix_(index, index)])
 
 
 def _tangent_names(results: CalibrationResults, kind: str, unit: str) -> list[str]:
@@ -215,48 +215,44 @@ def _fixed(values: Any, decimals: int) -> str:
 
 def ladder_rows(results: CalibrationResults) -> list[Row]:
     """The steps of the ladder of lens models, taken or not; empty when the model was given."""
-    model = results.content.get("model") or {}
+    model = results.file.model
     return [
         Row(
             (
-                _step_name(rung), *(_or_blank(rung.get(key), digits) for key, digits in _STEP),
-                _chance(rung.get("p_value")), _held_out(rung), _said(rung),
+                f"+ {', '.join(step.added)} ({step.camera})" if step.added else step.model,
+                _or_blank(step.parameters, 3),
+                _or_blank(step.rms_px, 4),
+                _or_blank(step.chi2_dof, 3),
+                _or_blank(step.chi2_gain, 3),
+                _or_blank(step.bic_gain, 3),
+                _chance(step.p_value),
+                _prediction(step),
+                step.words or ("taken" if step.added else ""),
             ),
-            strong=rung.get("model") == model.get("name"),
-            faint=not rung.get("taken", True),
+            strong=step.model == model.name,
+            faint=not step.taken,
         )
-        for rung in model.get("ladder") or []
-    ]  # fmt: skip
+        for step in model.ladder
+    ]
 
 
-_STEP = (("parameters", 3), ("rms_px", 4), ("chi2_dof", 3), ("chi2_gain", 3), ("bic_gain", 3))
+def _or_blank(value: float | None, digits: int) -> str:
+    return "" if value is None else number(value, digits)
 
 
-def _step_name(rung: Mapping[str, Any]) -> str:
-    added = ", ".join(rung.get("added") or [])
-    return f"+ {added} ({rung.get('camera')})" if added else str(rung.get("model"))
-
-
-def _or_blank(value: Any, digits: int) -> str:
-    return number(value, digits) if is_number(value) else ""
-
-
-def _chance(p_value: Any) -> str:
-    if not is_number(p_value):
+def _chance(p_value: float | None) -> str:
+    if p_value is None:
         return ""
     return "< 10⁻¹²" if p_value < 1e-12 else number(p_value, 2)
 
 
-def _held_out(rung: Mapping[str, Any]) -> str:
-    after, before = rung.get("held_out"), rung.get("held_out_before")
-    if not is_number(after):
+def _prediction(step: LadderStep) -> str:
+    """Of left-out views, before and after the step."""
+    if step.held_out is None:
         return ""
-    started = is_number(before) and bool(rung.get("added"))
-    return f"{number(before)} → {number(after)}" if started else number(after)
-
-
-def _said(rung: Mapping[str, Any]) -> str:
-    return str(rung.get("words") or ("taken" if rung.get("added") else ""))
+    after = number(step.held_out)
+    started = step.held_out_before is not None and step.added
+    return f"{number(step.held_out_before)} → {after}" if started else after
 
 
 def worst_rows(results: CalibrationResults) -> list[Row]:

@@ -136,7 +136,7 @@ def read_film_path(folder: Path, cameras: tuple[Camera, Camera] | None) -> FilmP
         rows,
         axes @ quadrics @ axes.T,
         (names[0], names[1], "height"),
-        f"{results.content.get('run') or folder.name}: {title}",
+        f"{results.file.run or folder.name}: {title}",
         (*notes, how),
     )
 

@@ -106,17 +106,17 @@ def _sheet(results: TrackResults, budget_bytes: int) -> ContactSheet:
 def _words(results: TrackResults) -> dict[str, Any]:
     content = results.content
     return {
-        "name": str(content.get("run") or "run"),
+        "name": results.file.run or "run",
         "verdict": tables.verdict(results),
         "figures": tables.key_numbers(results),
         "cameras": list(results.cameras),
         "pairs_rows": tables.pair_rows(results),
-        "pair_words": [str(word) for word in results.pairs.get("words") or []],
+        "pair_words": list(results.pairs.words),
         "flags": tables.flag_rows(results),
         "events": tables.event_rows(results),
         "event_words": tables.event_words(results),
-        "notes": [str(note) for note in content.get("notes") or []],
-        "covariance": content.get("covariance") or "",
+        "notes": list(results.file.notes),
+        "covariance": results.file.covariance,
         "extra": _rows({k: v for k, v in content.items() if k not in _SHOWN}, "tracking.json"),
         "run": _rows(results.run, "run.json"),
         "absent": results.absent,

@@ -118,11 +118,13 @@ def test_each_verdict_has_its_words_colour_and_remedy(
 
 def test_the_remedy_of_the_file_is_said_once(folder: Path) -> None:
     remedy = "fix a strip of dots to the tank"
-    changed(folder, verdict="UNRESOLVED", remedy=remedy, words="x: cannot be told apart.")
-    assert _judged(folder).sentences[-1] == f"To resolve it: {remedy}"
-    changed(folder, words=f"x: cannot be told apart. To resolve it: {remedy}.")
+    whole = f"x: cannot be told apart. To resolve it, {remedy}."
+    axes = {"x": {"verdict": "UNRESOLVED", "words": "x: cannot be told apart."}}
+    changed(folder, verdict="UNRESOLVED", remedy=remedy, words=whole, axes=axes)
     told = _judged(folder)
-    assert told.sentences[1:] == ("x: cannot be told apart.", f"To resolve it: {remedy}.")
+    assert told.sentences[1:] == ("x: cannot be told apart.", f"To resolve it, {remedy}")
+    changed(folder, "axes")  # a file from before
+    assert _judged(folder).sentences[1:] == (whole,)
 
 
 def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> None:
@@ -136,7 +138,7 @@ def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> Non
 
 
 def test_warnings_of_the_file_stand_beside_the_verdict(folder: Path) -> None:
-    changed(folder, warnings=["points are up to 79 um wrong; calibrate again"])
+    changed(folder, warnings=["points are up to 79 µm wrong; calibrate again"])
     told = _judged(folder)
     assert told.colour == "usable"
     assert told.warnings == ("Points are up to 79 µm wrong; calibrate again.",)
@@ -214,7 +216,7 @@ def test_long_runs_stay_small(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_hostile_names_stay_text(folder: Path) -> None:
     evil = "</script><b>x"
-    changed(folder, flags=[evil], words=[evil],
+    changed(folder, flags=[evil], words=evil,
           accelerometers={evil: {"scale": 1.0}},
           residuals={evil: {"pixels": 3, "outliers": 0}})  # fmt: skip
     html = write_track_report(folder).read_text(encoding="utf-8")

@@ -80,20 +80,19 @@ def test_spectra_obey_parseval_and_show_the_lines(whole: Path) -> None:
     assert naive.density[near, 1] > 1e3 * smooth.density[near, 1]
 
 
-def test_modes_of_the_model_are_listed_where_none_were_judged(folder: Path) -> None:
+def test_modes_are_listed_by_place(folder: Path) -> None:
     modes = [
-        {"frequency_hz": 20.0, "damping": 0.03, "rms_mm": [0, 0.12, 0], "camera": -1},
-        {"frequency_hz": 32.0, "damping": 0.01, "rms_mm": [0.02, 0.05, 0], "camera": 1},
+        {"where": "common", "frequency_hz": 20.0, "damping": 0.03, "rms_mm": [0, 0.12, 0]},
+        {"where": "arm right", "frequency_hz": 32.0, "damping": 0.01, "rms_mm": [0.02, 0.05, 0]},
+        {"where": "servo", "frequency_hz": 15.0, "damping": 0.3, "rms_mm": [0, 0.1, 0]},
     ]
     pitch = {"frequency_hz": 14.0, "damping": 0.02, "rms_rad": 1e-4, "camera": 0}
-    model = content()["model"] | {"modes": modes, "pitches": [pitch]}
-    rows, words = mode_rows(
-        read(changed(folder, model=model | {"carriage": {"servo": [0.1, 15, 0.3]}}))
-    )
-    common, arm, turning, servo = (row.cells for row in rows)
+    model = content()["model"] | {"pitches": [pitch]}
+    rows, words = mode_rows(read(changed(folder, modes=modes, model=model)))
+    common, arm, servo, turning = (row.cells for row in rows)
     assert common[:4] == ("all cameras alike (carriage, mount)", "20.0", "0.0300", "y: 120")
     assert arm[0] == "arm of right" and arm[3] == "x: 20.0, y: 50.0"
-    assert "turning" in turning[0] and servo[:3] == ("servo (following error)", "15", "0.300")
+    assert "turning" in turning[0] and servo[:3] == ("servo (following error)", "15.0", "0.300")
     assert "model" in words
 
 

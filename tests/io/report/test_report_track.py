@@ -123,7 +123,7 @@ def test_shake_learnt_from_the_run_accounts_for_the_ray_miss(folder: Path) -> No
     _edit_table(folder, "tracks", ray_miss_mm=0.08 * rng.standard_normal(len(table)))
     quiet = read_track_results(folder)
     assert "Rays miss by" in verdict(quiet).warnings[0]
-    pairs = quiet.pairs | {"frame_px": 1.5, "scatter_px": 0.2}
+    pairs = quiet.pairs.content() | {"frame_px": 1.5, "scatter_px": 0.2}
     results = read_track_results(_edit(folder, pairs=pairs))
     assert learnt_sd_mm(results) == pytest.approx(np.hypot(1.5, 0.2) / SCALE, rel=2e-3)
     assert not verdict(results).warnings

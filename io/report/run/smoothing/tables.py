@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,7 +27,8 @@ from telerig.io.report.run.smoothing.numbers import (
 )
 from telerig.io.report.run.smoothing.results import AXES, SPEED, SmoothingResults
 from telerig.io.report.run.tracking.results import TrackResults
-from telerig.io.report.run.tracking.tables import Verdict
+from telerig.io.report.run.tracking.tables import Headline
+from telerig.io.results.smoothing import AttributedLine, Flag, Mode, Verdict
 
 
 def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
         "verdict": verdict,
         "figures": smoothing_figures(results),
         "axes": axis_table(results),
-        "judged": bool(judged_axes(results.content)),
+        "judged": bool(results.file.axes),
         "swaps": swap_rows(results),
         "unseen": unseen_words(results),
         "mode_heads": MODE_HEADS,
@@ -67,90 +67,64 @@ _NOT_JUDGED = (
     "separate the two was not tested.",
 )
 _MEANING = {
-    "RESOLVED": (
+    Verdict.RESOLVED: (
         "RESOLVED: the data separate the motion of the bubbles from the shake of the rig",
         "good",
         "The uncertainty of the shake hardly widens the bands below.",
     ),
-    "PARTIAL": (
+    Verdict.PARTIAL: (
         "PARTIAL: the data separate the bubbles' motion from the rig's shake only in part",
         "usable",
         "Part of the shake may still stand in the trajectories, or part of the bubbles' motion in "
         "the shake; the bands below say how much.",
     ),
-    "UNRESOLVED": (
+    Verdict.UNRESOLVED: (
         "UNRESOLVED: the data cannot separate the bubbles' motion from the rig's shake",
         "rejected",
         "What is drawn below as motion of bubbles may be shake, and the other way round: do not "
         "interpret any motion as fast as the shake.",
     ),
 }
-_FLAGS = {
-    "LABEL_AMBIGUOUS": (
+_FLAGS: dict[str, str] = {
+    Flag.LABEL_AMBIGUOUS: (
         "A line in the spectrum could be the bubbles' or the rig's, and the data do not say whose "
         "it is. The bands are widened by what lies between the two readings."
     ),
-    "SHAKE_BELOW_NOISE": (
+    Flag.SHAKE_BELOW_NOISE: (
         "The shake is smaller than what the images can show. It does no harm here: the bubbles' "
         "motion is as good as it would be on a rig that stands still."
     ),
 }
-_HARMLESS = {"SHAKE_BELOW_NOISE"}
-_REMEDY_KEYS = ("remedy", "remedies")
+_HARMLESS = {Flag.SHAKE_BELOW_NOISE}
 _NAMES = {
     "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
 }  # fmt: skip
 _SURE_LOG_LIKELIHOOD_RATIO = 5.0
-_NEXT_AXIS = re.compile(r"(?<=\.) (?=[xyz](?: \([a-z]+\))?: |To resolve it)")
-_ELSEWHERE = {"words", "lines", "shake_rms_mm", *_REMEDY_KEYS}
+_ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 
 
-def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Verdict:
+def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headline:
     """What the smoother says of itself, with the remedy where there is one to take."""
-    content = results.content
-    word = str(content.get("verdict") or "").strip()
-    headline, colour, meaning = _MEANING.get(
-        word.upper(), (word.replace("_", " "), "usable", "") if word else _NOT_JUDGED
-    )
-    sentences = [meaning, *_by_axis(strings(content.get("words")))]
-    sentences += [f"Rig: {_micro(w)}." for w in strings(results.part("rig_change").get("words"))]
-    if word.upper() in ("PARTIAL", "UNRESOLVED"):
-        sentences += _remedy(content, " ".join(sentences))
+    file = results.file
+    headline, colour, meaning = _NOT_JUDGED if file.verdict is None else _MEANING[file.verdict]
+    of_axes = [axis.words for axis in file.axes.values() if axis.words]
+    sentences = [meaning, *(of_axes or [file.words])]
+    if file.rig_change is not None and file.rig_change.words:
+        sentences.append(f"Rig: {file.rig_change.words}.")
+    in_words = file.words and not of_axes  # files from before hold the remedy in their words
+    if file.verdict in (Verdict.PARTIAL, Verdict.UNRESOLVED) and not in_words:
+        sentences.append(f"To resolve it, {file.remedy or REMEDY}")
     flags = {
-        flag: f"{flag}: {_FLAGS.get(flag, flag.replace('_', ' ').lower())}"
-        for flag in strings(content.get("flags"))
+        flag: f"{flag}: {_FLAGS.get(flag, flag.replace('_', ' ').lower())}" for flag in file.flags
     }
     sentences += [text for flag, text in flags.items() if flag in _HARMLESS]
     warnings = [text for flag, text in flags.items() if flag not in _HARMLESS]
-    warnings += [_micro(sentence(w)) for w in strings(content.get("warnings"))]
+    warnings += [sentence(w) for w in file.warnings]
     warnings += _stale(results, tracks)
     if warnings and colour == "good":
         colour = "usable"
     known = tuple(dict.fromkeys(s for s in sentences if s))
-    return Verdict(headline, colour, known, tuple(warnings))
-
-
-def _remedy(content: Mapping[str, Any], told: str) -> list[str]:
-    """What to do about it, unless that has been told."""
-    given = [text for key in _REMEDY_KEYS for text in strings(content.get(key))] or [REMEDY]
-    fresh = [text for text in given if text.rstrip(".").lower() not in told.lower()]
-    return [f"To resolve it: {_micro(' '.join(fresh))}"] if fresh else []
-
-
-def _by_axis(texts: list[str]) -> list[str]:
-    """A sentence per axis by itself."""
-    return [_micro(part) for text in texts for part in _NEXT_AXIS.split(text)]
-
-
-def _micro(text: str) -> str:
-    return re.sub(r"\bum\b", "µm", text)
-
-
-def strings(value: Any) -> list[str]:
-    """A text or a list of them as a list."""
-    if isinstance(value, str):
-        return [value] if value.strip() else []
-    return [str(item) for item in value] if isinstance(value, list) else []
+    return Headline(headline, colour, known, tuple(warnings))
 
 
 def _stale(results: SmoothingResults, tracks: TrackResults) -> list[str]:
@@ -195,7 +169,7 @@ def _largest(values: list[float | None], factor: float = 1.0) -> str:
 
 def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
     """Heads, a column per rig axis, and rows: what was judged, then what the tables hold."""
-    judged = judged_axes(results.content)
+    judged = {name: axis.content() for name, axis in results.file.axes.items()}
     keys = [
         key for key in dict.fromkeys(k for one in judged.values() for k in one)
         if key not in _ELSEWHERE and any(one.get(key) != [] for one in judged.values())
@@ -220,16 +194,6 @@ def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
     ]  # fmt: skip
     rows += [Row((name, *cells)) for name, cells in columns.items()]
     return ["", *(_axis_name(results, axis) for axis in range(3))], rows
-
-
-def judged_axes(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What smoothing.json says of each axis, wherever it does; empty when nothing was judged."""
-    for part in (content.get("axes"), content.get("per_axis"), content):
-        if isinstance(part, Mapping):
-            found = {a: part[a] for a in AXES if isinstance(part.get(a), Mapping)}
-            if found:
-                return found
-    return {}
 
 
 def _axis_name(results: SmoothingResults, axis: int) -> str:
@@ -266,47 +230,47 @@ def _scaled(value: Any, factor: float = 1.0) -> str:
 
 def swap_rows(results: SmoothingResults) -> list[Row]:
     """Lines whose owner could be another: Hz, axes, RMS, what the other reading costs, owner."""
-    alike: dict[tuple[str, str, str], list[tuple[str, Mapping[str, Any]]]] = {}
-    for axis, judged in judged_axes(results.content).items():
-        lines = judged.get("lines")
-        for line in lines if isinstance(lines, list) else ():
-            if isinstance(line, Mapping):
-                hz, owner = number(line.get("frequency_hz")), str(line.get("owner") or ABSENT)
-                alike.setdefault((hz, owner, _identified_by(line)), []).append((axis, line))
+    alike: dict[tuple[str, str, str], list[tuple[str, AttributedLine]]] = {}
+    for axis, judged in results.file.axes.items():
+        for line in judged.lines:
+            key = (number(line.frequency_hz), line.owner or ABSENT, _identified_by(line))
+            alike.setdefault(key, []).append((axis, line))
     return [_swap_row(*key, lines) for key, lines in alike.items()]
 
 
-def _identified_by(line: Mapping[str, Any]) -> str:
-    cost: Any = line.get("other_owner_costs_nats")
-    if line.get("ambiguous"):
+def _identified_by(line: AttributedLine) -> str:
+    if line.ambiguous:
         return "not identifiable"
-    sure = is_number(cost) and cost >= _SURE_LOG_LIKELIHOOD_RATIO
+    sure = (line.other_owner_costs_nats or 0.0) >= _SURE_LOG_LIKELIHOOD_RATIO
     return "identified from the data" if sure else "identified from the priors of the bubbles"
 
 
-def _swap_row(hz: str, owner: str, told: str, lines: list[tuple[str, Mapping[str, Any]]]) -> Row:
-    """One line on all of its axes; of the costs the least."""
+def _swap_row(hz: str, owner: str, identified: str, lines: list[tuple[str, AttributedLine]]) -> Row:
+    """One line on all of its axes, with the smallest of their log-likelihood ratios."""
     axes = ", ".join(axis for axis, _ in lines)
-    sizes = ", ".join(_scaled(line.get("rms_mm"), 1e3) for _, line in lines)
-    costs = [line.get("other_owner_costs_nats") for _, line in lines]
-    least = min((float(c) for c in costs if c is not None and is_number(c)), default=None)
-    cost = ABSENT if least is None else f"{round(least, 1) + 0.0:.1f}"
-    return Row((hz, axes, sizes, cost, owner, told), strong=told == "not identifiable")
+    sizes = ", ".join(_scaled(line.rms_mm, 1e3) for _, line in lines)
+    costs = [c for _, line in lines if (c := line.other_owner_costs_nats) is not None]
+    cost = f"{round(min(costs), 1) + 0.0:.1f}" if costs else ABSENT
+    strong = identified == "not identifiable"
+    return Row((hz, axes, sizes, cost, owner, identified), strong=strong)
 
 
 def residual_rows(results: SmoothingResults) -> list[Row]:
     """Pixels of bubbles and references: how many, outliers, residuals in sigmas."""
-    rows = []
-    for name, found in results.part("residuals").items():
-        if not isinstance(found, Mapping) or not found.get("pixels"):
-            continue
-        outliers = found.get("outliers")
-        cells = (
-            number(found["pixels"]), number(outliers), share(outliers, found["pixels"]),
-            number(found.get("rms_sigmas")), number(found.get("median_sigmas")),
-        )  # fmt: skip
-        rows.append(Row((str(name), *cells)))
-    return rows
+    return [
+        Row(
+            (
+                name,
+                number(found.pixels),
+                number(found.outliers),
+                share(found.outliers, found.pixels),
+                number(found.rms_sigmas),
+                number(found.median_sigmas),
+            )
+        )
+        for name, found in results.file.residuals.items()
+        if found.pixels
+    ]
 
 
 def unseen_words(results: SmoothingResults) -> list[str]:
@@ -345,20 +309,12 @@ _PITCH = "stiffen the arm against twisting; camera's weight on the arm's axis"
 
 def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
     """The shake's modes with the remedies of smoothing.json, and where the modes come from."""
-    model = results.part("model")
-    judged = [m for m in results.content.get("modes") or [] if isinstance(m, Mapping)]
-    modes = judged or [m for m in model.get("modes") or [] if isinstance(m, Mapping)]
+    modes = results.file.modes
     rows = [_mode(mode, results.cameras) for mode in _merged(modes)]
-    rows += [_pitch(m, results.cameras) for m in model.get("pitches") or []
-             if isinstance(m, Mapping)]  # fmt: skip
-    servo = dict(model.get("carriage") or {}).get("servo")
-    if isinstance(servo, list) and not any(m.get("where") == "servo" for m in modes):
-        rms_mm, frequency_hz, damping = servo
-        mode = {"where": "servo", "frequency_hz": frequency_hz, "damping": damping}
-        rows.append(_mode(mode | {"rms_mm": rms_mm}, results.cameras))
+    rows += [_pitch(m, results.cameras) for m in results.part("model").get("pitches") or []]
     if not rows:
         return rows, "The model has no modes, and no peak in the spectrum of the shake was found."
-    if any(mode.get("source") != "estimate" for mode in modes):
+    if any(mode.source != "estimate" for mode in modes):
         return rows, "These are the modes of the model that the smoother used."
     return rows, (
         "The model has no modes: these are peaks in the spectrum of the estimated shake. The "
@@ -367,25 +323,21 @@ def mode_rows(results: SmoothingResults) -> tuple[list[Row], str]:
     )
 
 
-def _merged(modes: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def _merged(modes: Sequence[Mode]) -> list[Mode]:
     """A mode that is learned axis by axis as one, with the RMS of all of its axes."""
-    found: dict[Any, dict[str, Any]] = {}
+    found: dict[tuple[str, float], Mode] = {}
     for mode in modes:
-        key = (mode.get("where", mode.get("camera")), mode.get("frequency_hz"))
-        same, rms_mm = found.setdefault(key, dict(mode)), mode.get("rms_mm")
-        if isinstance(rms_mm, list) and isinstance(same.get("rms_mm"), list):
-            same["rms_mm"] = [
-                max((v for v in pair if is_number(v)), default=0.0)
-                for pair in zip(same["rms_mm"], rms_mm)
-            ]
+        key = (mode.where, mode.frequency_hz)
+        same = found.setdefault(key, mode)
+        if isinstance(mode.rms_mm, tuple) and isinstance(same.rms_mm, tuple):
+            largest = tuple(max(pair) for pair in zip(same.rms_mm, mode.rms_mm))
+            found[key] = same.model_copy(update={"rms_mm": largest})
     return list(found.values())
 
 
-def _mode(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
-    remedies = [text for key in _REMEDY_KEYS for text in strings(mode.get(key))]
-    cells = (number(mode.get(key)) for key in ("frequency_hz", "damping"))
-    where = _place(mode.get("where", mode.get("camera")), cameras)
-    return Row((where, *cells, _rms_um(mode.get("rms_mm")), "; ".join(remedies)))
+def _mode(mode: Mode, cameras: Sequence[str]) -> Row:
+    cells = (number(mode.frequency_hz), number(mode.damping), _rms_um(mode.rms_mm), mode.remedy)
+    return Row((_place(mode.where, cameras), *cells))
 
 
 def _place(camera: Any, cameras: Sequence[str]) -> str:
@@ -403,7 +355,7 @@ def _rms_um(rms_mm: Any) -> str:
     """Of one axis or three."""
     if is_number(rms_mm):
         return number(1e3 * rms_mm, 3)
-    if not isinstance(rms_mm, list):
+    if not isinstance(rms_mm, tuple):
         return ABSENT
     known = [(a, v) for a, v in zip(AXES, rms_mm) if is_number(v) and v > 0]
     return ", ".join(f"{axis}: {number(1e3 * value, 3)}" for axis, value in known) or "0"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.report.page.number_format import is_number
 from telerig.io.report.run.tracking.results import TrackResults
 
 Array = NDArray[np.float64]
@@ -41,8 +40,8 @@ def learnt_sd_mm(results: TrackResults) -> float | None:
     From ``frame_px`` and ``scatter_px`` of tracking.json; None where that is not known.
     """
     worth = _mm_per_px(results)
-    frame, scatter = (results.pairs.get(name) for name in ("frame_px", "scatter_px"))
-    if worth is None or not (is_number(frame) and is_number(scatter)):
+    frame, scatter = results.pairs.frame_px, results.pairs.scatter_px
+    if worth is None or frame is None or scatter is None:
         return None
     apart_px = np.linalg.norm(np.array([frame, scatter], float))
     return float(apart_px * np.linalg.norm(worth, axis=1).mean())
@@ -105,10 +104,9 @@ def rms(values: Array) -> float | None:
 
 def frame_count(results: TrackResults) -> int:
     """Of the run, else up to the last frame with a bubble."""
-    given = results.content.get("frames")
     tables = (results.tracks, results.detections)
     seen = max((int(t["frame"].max()) + 1 for t in tables if len(t)), default=0)
-    return max(int(given), seen) if isinstance(given, int) else seen
+    return max(results.file.frames or 0, seen)
 
 
 def per_frame(results: TrackResults) -> dict[str, NDArray[np.int64]]:

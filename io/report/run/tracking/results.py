@@ -18,6 +18,7 @@ from telerig.io.results.tracking import (
     EVENTS,
     POINT,
     REFERENCES,
+    Pairs,
     TrackingFile,
     tracks_columns,
 )
@@ -80,8 +81,8 @@ class TrackResults:
         return bool((self.references["camera"] == self.cameras[camera]).any())
 
     @property
-    def pairs(self) -> Mapping[str, Any]:
-        return {} if self.file.pairs is None else self.file.pairs.content()
+    def pairs(self) -> Pairs:
+        return self.file.pairs or Pairs()
 
     def image_size_px(self, camera: str) -> tuple[int, int] | None:
         """From tracking.json, if it tells."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.io.report.page.number_format import ABSENT, is_number, number, sentence, share
+from telerig.io.report.page.number_format import ABSENT, number, sentence, share
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.tracking.numbers import (
     NORMAL_MEDIAN,
@@ -33,7 +32,7 @@ _AMBIGUOUS = "ambiguous"
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Headline:
     """``colour`` : good, usable or rejected; ``sentences`` : good or bad; ``warnings`` : bad."""
 
     headline: str
@@ -42,19 +41,19 @@ class Verdict:
     warnings: tuple[str, ...]
 
 
-def verdict(results: TrackResults) -> Verdict:
+def verdict(results: TrackResults) -> Headline:
     """How much was found, how well it is known, and what is wrong."""
     points, tracks = len(results.tracks), len(track_lengths(results))
     frames = frame_count(results)
     if not points:
         headline = f"No bubble was followed in {_many(frames, 'frame')}"
-        return Verdict(headline, "rejected", (_matched_words(results),), _warnings(results))
+        return Headline(headline, "rejected", (_matched_words(results),), _warnings(results))
     headline = (
         f"{_many(tracks, 'track')}, {_many(points, 'position')} in space, {_many(frames, 'frame')}"
     )
     warnings = _warnings(results)
     sentences = (_matched_words(results), _precision_words(results), _miss_words(results))
-    return Verdict(headline, "usable" if warnings else "good", sentences, warnings)
+    return Headline(headline, "usable" if warnings else "good", sentences, warnings)
 
 
 def _many(count: int, word: str) -> str:
@@ -63,8 +62,8 @@ def _many(count: int, word: str) -> str:
 
 def _matched(results: TrackResults) -> tuple[int, int] | None:
     """Detections that belong to a bubble seen by both cameras, of all."""
-    found = len(results.detections) or results.content.get("detections")
-    if not isinstance(found, int) or found <= 0:
+    found = len(results.detections) or results.file.detections or 0
+    if found <= 0:
         return None
     return min(len(results.cameras) * len(results.tracks), found), found
 
@@ -98,9 +97,9 @@ def _miss_words(results: TrackResults) -> str:
     whole = ray_miss_ratio(results, _with_learnt(results), centred=True)
     if ratio > _MISS_TOO_LARGE and whole is not None and whole < _MISS_TOO_LARGE:
         text += (
-            f" The cameras' shake against each other ({number(results.pairs.get('frame_px'), 2)} "
+            f" The cameras' shake against each other ({number(results.pairs.frame_px, 2)} "
             f"px from frame to frame) and the scatter of the pairs "
-            f"({number(results.pairs.get('scatter_px'), 2)} px), as learnt from this run, account "
+            f"({number(results.pairs.scatter_px, 2)} px), as learnt from this run, account "
             "for that; they are not in the covariances of tracks.csv."
         )
     return text
@@ -114,8 +113,8 @@ def _with_learnt(results: TrackResults) -> Array | None:
 
 def _warnings(results: TrackResults) -> tuple[str, ...]:
     words = []
-    if results.pairs.get("calibration_problem"):
-        offsets = ", ".join(number(b) for b in _as_list(results.pairs.get("bias_px")))
+    if results.pairs.calibration_problem:
+        offsets = ", ".join(number(b) for b in _as_list(results.pairs.bias_px))
         words.append(
             "The two cameras disagree along their shared axis"
             + (f" (offset {offsets} px)" if offsets else "")
@@ -135,7 +134,7 @@ def _warnings(results: TrackResults) -> tuple[str, ...]:
             "More than half of the bubbles have no partner in the other camera or no track: look "
             "at the worst frames below."
         )
-    stated = [sentence(str(text)) for text in results.content.get("warnings") or []]
+    stated = [sentence(text) for text in results.file.warnings]
     return (*stated, *words)
 
 
@@ -193,20 +192,19 @@ def word_counts(flags: Iterable[str]) -> Counter[str]:
 
 def pair_rows(results: TrackResults) -> list[tuple[str, str]]:
     """What the two views of a bubble have in common, as learnt from the run."""
-    pairs = results.pairs
-    if not pairs:
+    pairs = results.file.pairs
+    if pairs is None:
         return []
     stages = ("as it is", "after a constant", "after the whole bias", "for pairs left out of it")
-    bias = [number(b) for b in _as_list(pairs.get("bias_px"))]
+    bias = [number(b) for b in _as_list(pairs.bias_px)]
     rows = [("offset along the shared axis, px", ", ".join(bias) or ABSENT)]
-    rows += [("scatter of a pair, px", number(pairs.get("scatter_px")))]
-    rows += [("shift common to a frame, px", number(pairs.get("frame_px")))]
-    values = _as_list(pairs.get("rms_px"))
-    return rows + [(f"RMS {stage}, px", number(value)) for stage, value in zip(stages, values)]
+    rows += [("scatter of a pair, px", number(pairs.scatter_px))]
+    rows += [("shift common to a frame, px", number(pairs.frame_px))]
+    return rows + [(f"RMS {stage}, px", number(rms)) for stage, rms in zip(stages, pairs.rms_px)]
 
 
-def _as_list(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list) else [value] if is_number(value) else []
+def _as_list(value: float | Sequence[float] | None) -> list[float]:
+    return [] if value is None else [value] if isinstance(value, float | int) else list(value)
 
 
 def flag_rows(results: TrackResults) -> list[Row]:
@@ -218,11 +216,11 @@ def flag_rows(results: TrackResults) -> list[Row]:
         Row((f"flag: {word}", *(number(counts[c][word]) for c in results.cameras)))
         for word in words
     ]
-    without = results.content.get("frames_without_bubbles") or {}
-    reasons = sorted({str(reason) for by in without.values() for reason in by or {}})
+    without = results.file.frames_without_bubbles
+    reasons = sorted({reason for by in without.values() for reason in by})
     rows += [
         Row((f"frames without: {reason}",
-             *(number((without.get(c) or {}).get(reason, 0)) for c in results.cameras)))
+             *(number(without.get(c, {}).get(reason, 0)) for c in results.cameras)))
         for reason in reasons
     ]  # fmt: skip
     seen = {c: found["camera"] == c for c in results.cameras}
@@ -243,8 +241,7 @@ def event_rows(results: TrackResults) -> list[Row]:
 
 def event_words(results: TrackResults) -> str:
     """How many of each kind there were."""
-    given = results.content.get("events") or {}
-    counts = given or results.events["kind"].value_counts().to_dict()
+    counts = results.file.events or results.events["kind"].value_counts().to_dict()
     told = [f"{kind}: {number(n)}" for kind, n in sorted(counts.items(), key=lambda item: -item[1])]
     rest = len(results.events) - MOST_EVENTS
     text = ", ".join(told) + "." if told else "Nothing is known of any event."
@@ -255,9 +252,6 @@ def event_words(results: TrackResults) -> str:
 
 def worst_words(results: TrackResults) -> dict[str, str]:
     """Frame as six digits -> why it is shown; in the file's order, pictured frames after that."""
-    worst = {
-        f"{w['frame']:06d}": str(w.get("why") or "")
-        for w in results.content.get("worst_frames") or []
-    }
+    worst = {f"{w.frame:06d}": w.why for w in results.file.worst_frames}
     pictured = sorted({frame for _, frame in results.pictures})
     return worst | {frame: "" for frame in pictured if frame not in worst}

@@ -104,7 +104,11 @@ def track_and_compare(
 
 
 def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> bool:
-    """Smooth without and with the accelerometers; whether the path with them is near the truth."""
+    """Smooth the run without and with the accelerometers, and print both errors.
+
+    Returns whether the bubble's path with accelerometers is within twice its stated deviation of
+    the simulated truth and below 0.6 of the error of triangulation.
+    """
     import pandas as pd
 
     from telerig.estimator.smoothing.results_folder import smooth_run

@@ -58,7 +58,7 @@ def numbers_of(option: str, text: str, count: int, separator: str, todo: str) ->
     except ValueError:
         numbers = []
     if len(numbers) != count:
-        raise InputError(f"{option} {text}", todo=todo)
+        raise InputError(f"{option} {text}: there is no such choice", todo=todo)
     return numbers
 
 
@@ -66,5 +66,5 @@ def chosen(option: str, text: str | None, choices: tuple[str, ...]) -> Any:
     """The text of an option, or None. Raises InputError for another word than ``choices``."""
     if text is not None and text not in choices:
         todo = "use " + " or ".join(f"{option} {word}" for word in choices)
-        raise InputError(f"{option} {text}", todo=todo)
+        raise InputError(f"{option} {text}: there is no such choice", todo=todo)
     return text

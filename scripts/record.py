@@ -39,7 +39,9 @@ def record(
             help="NAME=PORT replaces the port of a device in rig.toml; can be given several times."
         ),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig.toml [DATASET/rig.toml].")] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="The rig file [default: DATASET/rig.toml].")
+    ] = None,
     replay: Annotated[
         Path | None,
         typer.Option(help="Write the tables of this recording.raw again, byte for byte the same."),
@@ -261,7 +263,10 @@ def _clock_words(device: dict[str, Any]) -> Iterator[str]:
         yield "it sends no time stamps: its times are those of arrival, up to 16 ms late"
     if device["half_question_to_answer_ms"]:
         half = device["half_question_to_answer_ms"]
-        yield f"its times are known to {half:.2g} ms (half the time from question to answer)"
+        yield (
+            f"its times are known to ±{half:.2g} ms, half the time between the request to the "
+            "device and its answer"
+        )
 
 
 if __name__ == "__main__":

@@ -160,9 +160,10 @@ class WatchedFolder:
         return frozenset((p, s) for p, (s, i) in self._found.items() if i.view in complete)
 
     def detected(self) -> DatasetDots:
-        """All detections together.
+        """The dots of all images of all cameras that have arrived, in one table.
 
-        Raises DetectionError as `detected_together` does, CalibrationError when there are none.
+        Raises CalibrationError when no image has arrived, DetectionError when none shows the
+        target.
         """
         images = self.images()
         if self.dataset is None or not images:

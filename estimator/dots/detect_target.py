@@ -70,8 +70,8 @@ def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
     mirrored = "; some of them take the image for a mirrored one" if len(hands) > 1 else ""
     count = len(numbering.equivalents)
     return DetectionError(
-        f"{count} numberings of the {len(numbering.table)} dots fit about equally well"
-        f"{mirrored}: {found} of {wanted} marks were found",
+        f"the {len(numbering.table)} dots can be numbered in {count} ways that fit the image about "
+        f"equally well{mirrored}; {found} of the target's {wanted} marks were found",
         todo="keep all marks in view, clean and lit, or leave this image out",
     )
 

@@ -247,7 +247,11 @@ def _claim_pair(
     cameras: tuple[Camera, Camera],
     settings: TrackerSettings,
 ) -> bool:
-    """As one point where the two agree; else the one whose outline is whole, if one is."""
+    """Give the detections ``rows`` of the two cameras to the prediction of track k, if they fit.
+
+    Where both agree with it they become one point. Else the detection whose outline is whole is
+    taken alone, if only one is. Returns whether anything was taken.
+    """
     if _distance2(frame, list(enumerate(rows)), predicted, k, cameras) <= gate2(settings, 4):
         uv, noise = zip(*([a[r : r + 1] for a in p] for p, r in zip(frame.pixels, rows)))
         found = triangulate(cameras, uv, noise)

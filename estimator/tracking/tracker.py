@@ -79,8 +79,9 @@ class Tracker:
         self.last: tuple[int, float] | None = None
 
     def predict(self, t_s: float, position_mm: float | None = None) -> Prediction:
-        """Where the confirmed tracks are expected; changes nothing.
+        """Expected positions of the confirmed tracks in the rig frame; the tracker is not changed.
 
+        t_s : of the frame.  position_mm : of the stage then; None is extrapolated.
         Raises InputError when t_s is not after the last frame's.
         """
         tracks = self._confirmed()

@@ -216,7 +216,11 @@ def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
 
 
 def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array, Array]:
-    """By the flags: is the size known, the factor for the scatter, the unsure share of the size."""
+    """(N,) each, from the flags of the detections.
+
+    Whether the size is known, the factor on the standard deviation of the place, and the relative
+    standard deviation of the size.
+    """
     flags = flag_words(table)
     known = np.array([not any(word in NO_SIZE_FLAGS for word in row) for row in flags], bool)
     factor = [max((_SCATTER_FACTOR.get(word, 1.0) for word in row), default=1.0) for row in flags]

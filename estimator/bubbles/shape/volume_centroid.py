@@ -120,7 +120,7 @@ def _paired(
 ) -> tuple[Outlines, Outlines]:
     if len(first) != len(second):
         raise InputError(
-            f"{len(first)} outlines in the first camera and {len(second)} in the second",
+            f"{len(first)} bubble outlines in the first camera, but {len(second)} in the second",
             todo="row i of one table must be the same bubble as row i of the other",
         )
     left, right = (

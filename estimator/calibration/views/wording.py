@@ -64,7 +64,7 @@ def _start_words(problem: Problem, facing: Array) -> str:
     if facing[0] != facing[1]:
         return (
             f"hold the plate with its {side[facing[0]]} towards camera {first} and its "
-            f"{side[facing[1]]} towards camera {second}, tilted to both alike"
+            f"{side[facing[1]]} towards camera {second}, at the same angle to both cameras"
         )
     which = f"'s {side[facing[0]]}" if problem.target.two_sided else ""
     return f"face the plate{which} midway between the cameras"

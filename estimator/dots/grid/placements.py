@@ -37,7 +37,10 @@ class Placements:
     score: Array
 
     def columns_rows(self, places: Ints) -> Ints:
-        """(K, n, 2) column and row of (n, 2) places of the lattice."""
+        """(K, n, 2) column and row on the target, for each of the K placements.
+
+        places : (n, 2) indices of dots in the lattice of the image.
+        """
         turned = np.einsum("kab,nb->kna", self.turn, places)
         return np.asarray(turned - self.shift[:, None])
 

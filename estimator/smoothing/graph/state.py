@@ -69,7 +69,7 @@ class State:
 
     @property
     def mean_velocity(self) -> Array:
-        """(K, 3) of the bubbles, lab."""
+        """(K, 3) mean velocities of the K bubbles over the run, mm/s in the lab frame."""
         return self.means[:, :3]
 
     def encoder_scale(self, frame: Frame) -> float:

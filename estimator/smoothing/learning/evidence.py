@@ -181,10 +181,11 @@ class Factor:
         return float(self.count * each - self.square / 2)
 
     def spread(self) -> tuple[Array, Array]:
-        """Right sides (F, K, D) of states, and constants (c, K), whose squares add up.
+        """Right sides (F, K, D) of F frames' states and values (c, K) of the c constants.
 
-        Over the replicates' posterior means, and what not knowing the constants adds: the second
-        moments are the sum over K, and those of states whose constants are known.
+        Solved for, and their squares summed over the K columns, they give what has to be added to
+        the second moments of states whose constants are known: the replicates' posterior means,
+        and the uncertainty of the constants.
         """
         from scipy.linalg import solve_triangular
 

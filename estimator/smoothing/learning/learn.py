@@ -80,8 +80,8 @@ def learn(
 
     start : gives what is not learned. Its modes are kept and improved, unless they are the default
     guess (its name is "default"). Returns a model named "learned", with the standard deviations of
-    its log-parameters in ``learned``. Sensors are not learned from: with them a default start comes
-    back as it is, its broad band needs no modes.
+    its log-parameters in ``learned``. Accelerometers are not learned from: where there are any, a
+    default start is returned unchanged, since its broad band needs no modes.
     """
     options = options or Learning()
     if start.name == "default" and problem.accelerometers:

@@ -256,7 +256,7 @@ class _Part:
 
 
 def _fitted(stretch: Stretch, parts: Sequence[_Part], noise: Sequence[Array]) -> Array:
-    """(columns, draws) least squares of the noise."""
+    """(columns, draws) least-squares solutions of the stretch for each draw of the noise."""
     places, values = [np.zeros(0, np.int64)], [np.zeros(0)]
     side = np.zeros((stretch.size, noise[0].shape[-1]))
     for part, one in zip(parts, noise):

@@ -305,7 +305,7 @@ def _cells(line: str) -> tuple[str, list[float]] | None:
 
 
 def _wav(path: Path) -> Recording:
-    """Whole numbers are divided by their full scale, so 1 is full scale in every format."""
+    """Channels and rate of a WAV file; whole numbers are scaled so that ±1 is full scale."""
     from scipy.io import wavfile
 
     try:

@@ -56,7 +56,7 @@ def key_numbers(results: CalibrationResults) -> list[Figure]:
         Figure(
             "Chi-square",
             f"{number(s.get('chi2_dof'))} per dof",
-            f"1 is expected; {number(s.get('degrees_of_freedom'))} degrees of freedom",
+            f"about 1 if the stated noise is right; {number(s.get('degrees_of_freedom'))} dof",
         ),
         Figure(
             "Dots kept",

@@ -139,7 +139,10 @@ def band(axes: Any, t_s: Array, centre: Array, sd: Array, colour: str, label: st
 
 
 def room_left(axes: Any) -> None:
-    """For numbers of four digits beside the axis; times are written out."""
+    """Move the left edge of the axes so that tick labels of four digits fit beside them.
+
+    Ticks of a linear x axis (times) are written without a common offset.
+    """
     if axes.get_xscale() == "linear":
         axes.ticklabel_format(axis="x", useOffset=False)
     box = axes.get_position()

@@ -246,7 +246,7 @@ def _identified_by(line: AttributedLine) -> str:
 
 
 def _swap_row(hz: str, owner: str, identified: str, lines: list[tuple[str, AttributedLine]]) -> Row:
-    """One line on all of its axes, with the smallest of their log-likelihood ratios."""
+    """Row of one spectral line with all of its axes and the smallest of their likelihood ratios."""
     axes = ", ".join(axis for axis, _ in lines)
     sizes = ", ".join(_scaled(line.rms_mm, 1e3) for _, line in lines)
     costs = [c for _, line in lines if (c := line.other_owner_costs_nats) is not None]

@@ -38,7 +38,8 @@ from telerig.factors.measurements import image_of_point
 from telerig.io.dataset.dataset import load_dataset
 from telerig.io.exchange.export.halcon import halcon_cameras
 from telerig.io.exchange.export.opencv import camera_matrices
-from telerig.io.report.calibration.results import read_cameras, read_results
+from telerig.io.report.calibration.results import read_results
+from telerig.io.results.calibration import CalibrationFile
 from telerig.io.rig_file.description import WallDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.rig.camera import Camera
@@ -196,7 +197,10 @@ def test_files_keep_walls_and_medium(tank: Path, in_air: Calibration, tmp_path: 
         expected = traced(in_air.in_air().camera(name), WALLS[name], points)
         np.testing.assert_allclose(again.project(name, points), expected, rtol=0, atol=1e-9)
     assert not window_warnings(load_dataset(tank).rig, again)
-    assert all(c.wall is not None for c in read_cameras(tmp_path / "calibration.json"))
+    assert all(
+        c.wall is not None
+        for c in CalibrationFile.read(tmp_path / "calibration.json").rig_cameras(behind_walls=True)
+    )
     assert all(c.wall is None for c in read_results(tmp_path).cameras)
 
     content = json.loads((tmp_path / "calibration.json").read_text(encoding="utf-8"))

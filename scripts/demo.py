@@ -76,10 +76,10 @@ def track_and_compare(
     import pandas as pd
 
     from telerig.estimator.tracking.results_folder import write_tracking
+    from telerig.estimator.tracking.terminal_summary import tracking_words
     from telerig.estimator.tracking.track import TrackOptions
     from telerig.estimator.tracking.tracks import load_tracks
     from telerig.estimator.tracking.truth import score_tracks
-    from telerig.estimator.tracking.wording import tracking_words
 
     begun = time.perf_counter()
     (name,) = data.runs
@@ -112,8 +112,8 @@ def smooth_and_compare(data: Dataset, calibration: Calibration, quiet: bool) -> 
     import pandas as pd
 
     from telerig.estimator.smoothing.results_folder import smooth_run
+    from telerig.estimator.smoothing.terminal_summary import smoothing_words
     from telerig.estimator.smoothing.truth import motion_error
-    from telerig.estimator.smoothing.wording import smoothing_words
 
     (name,) = data.runs
     folder = data.results / name

@@ -15,7 +15,7 @@ from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens import considered_parameters
 from telerig.estimator.calibration.lens.choice import Choice, model_start
 from telerig.estimator.calibration.quality import checks
-from telerig.estimator.calibration.quality.residual_tests import residual_tests
+from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.split_half import split_half_check
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit

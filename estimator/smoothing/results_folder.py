@@ -13,7 +13,7 @@ from telerig.errors import InputError
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.smooth import smooth
-from telerig.estimator.tracking.detection import read_batch
+from telerig.estimator.tracking.detect_run import read_batch
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.results.run_record import RunFile, run_record

@@ -19,7 +19,7 @@ from telerig.estimator.marks.strip_dots import (
     learn_look,
 )
 from telerig.estimator.marks.tank_view import TankView
-from telerig.estimator.tracking.detection import Batch, DetectionStore, Progress, read_batch
+from telerig.estimator.tracking.detect_run import Batch, DetectionStore, Progress, read_batch
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.rig.camera import Camera
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import find_bubbles, outline_points
-from telerig.estimator.tracking.detection import Progress, Scene, make_scene
-from telerig.estimator.tracking.link import Linked
+from telerig.estimator.tracking.detect_run import Progress, Scene, make_scene
+from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.track import (
     TrackingStream,
     TrackOptions,

@@ -22,7 +22,7 @@ from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.from_pairs import PairCollector, with_change
-from telerig.estimator.tracking.detection import (
+from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     Progress,
     Scene,
@@ -32,7 +32,7 @@ from telerig.estimator.tracking.detection import (
 )
 from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracking.frame_rows import Tables
-from telerig.estimator.tracking.link import Linked, Linker
+from telerig.estimator.tracking.frames_to_rows import Linked, Linker
 from telerig.estimator.tracking.marks_of_run import (
     FollowedMarks,
     described_strip,

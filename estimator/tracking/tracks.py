@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
-from telerig.estimator.tracking.detection import read_batch
+from telerig.estimator.tracking.detect_run import read_batch
 from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:

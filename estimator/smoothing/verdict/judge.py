@@ -14,17 +14,12 @@ from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.identifiability import AxisVerdict, verdicts
 from telerig.estimator.smoothing.verdict.modes import Place, ShakeMode, shake_modes
-from telerig.io.results.smoothing import AXES, Flag, Verdict
+from telerig.io.results.smoothing import AXES, VERDICT_WORDS, Flag, Verdict
 from telerig.rig.camera import Camera
 
 _STRIP = "fix a strip of dots to the tank inside both views"
 _ARMS = "mount one accelerometer on each camera arm"
 _LONGER = "take a longer record, or one with more bubbles in view"
-_VERDICTS = {
-    Verdict.RESOLVED: "bubble motion and shake are separated",
-    Verdict.PARTIAL: "shake widens the positions {q:.2g} times",
-    Verdict.UNRESOLVED: "bubble motion and shake cannot be separated",
-}
 _REMEDIES = {
     Place.SERVO: "Tune the stage's controller: more damping, a softer ramp, less gain at this "
     "frequency.",
@@ -120,8 +115,9 @@ def _advice(
 
 def _of_axis(name: str, axis: AxisVerdict, upright: bool) -> str:
     title = f"{name} (vertical)" if upright else name
+    meaning = VERDICT_WORDS[axis.verdict].of_axis.format(q=axis.q)
     text = (
-        f"{title}: {_VERDICTS[axis.verdict].format(q=axis.q)} (standard deviation of a position "
+        f"{title}: {meaning} (standard deviation of a position "
         f"{1e3 * axis.sigma_mm:.3g} µm; {1e3 * axis.sigma_shake_known_mm:.3g} µm if the shake were "
         "known)."
     )

@@ -95,7 +95,7 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
             continue
         cells = [_parameter_cell(camera, name) for camera in cameras]
         free = any(name in camera.free for camera in cameras)
-        rows.append(Row((f"{_WORDS[name]} ({name})", *cells), faint=not free))
+        rows.append(Row((f"{_WORDS.get(name, name)} ({name})", *cells), faint=not free))
     largest = [_largest_distortion(camera) for camera in results.cameras]
     perspective = [f"{number(1e6 * c['kappa_per_mm'])} ppm" for c in results.cameras]
     return [

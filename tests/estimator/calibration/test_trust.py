@@ -10,7 +10,7 @@ import pytest
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.quality.comparison import _chance, compare_calibrations
-from telerig.estimator.calibration.quality.residual_tests import residual_tests
+from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
 
 STILL = range(10, 20)

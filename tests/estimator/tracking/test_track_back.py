@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import default_model
-from telerig.estimator.tracking.link import Linker
+from telerig.estimator.tracking.frames_to_rows import Linker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset

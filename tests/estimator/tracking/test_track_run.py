@@ -17,7 +17,7 @@ import telerig
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
-from telerig.estimator.tracking import detection
+from telerig.estimator.tracking import detect_run
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions
 from telerig.estimator.tracking.tracks import Tracks
@@ -118,7 +118,7 @@ def test_an_interrupted_run_goes_on_and_ends_alike(
     whole = tmp_path / "whole"
     tracked(rise, whole)
     seen: list[int] = []
-    original = detection._detect
+    original = detect_run._detect
 
     def stops(scene: Any, camera: str, frame: int) -> Any:
         if frame == 6:
@@ -129,13 +129,13 @@ def test_an_interrupted_run_goes_on_and_ends_alike(
         seen.append(frame)
         return original(scene, camera, frame)
 
-    monkeypatch.setattr(detection, "quick_workers", lambda tasks: 1)
-    monkeypatch.setattr(detection, "_detect", stops)
+    monkeypatch.setattr(detect_run, "quick_workers", lambda tasks: 1)
+    monkeypatch.setattr(detect_run, "_detect", stops)
     parts = tmp_path / "parts"
     with pytest.raises(KeyboardInterrupt):
         tracked(rise, parts)
     assert not parts.exists()
-    monkeypatch.setattr(detection, "_detect", counts)
+    monkeypatch.setattr(detect_run, "_detect", counts)
     tracked(rise, parts)
     assert min(seen) > 0 and max(seen) == FRAMES - 1
     for name in ("detections.csv", "tracks.csv", "events.csv"):
@@ -144,11 +144,11 @@ def test_an_interrupted_run_goes_on_and_ends_alike(
 
 
 def test_other_options_do_not_take_up_old_detections(rise: Path, tmp_path: Path) -> None:
-    store = detection.DetectionStore(tmp_path / "work", "one", 20, 1)
+    store = detect_run.DetectionStore(tmp_path / "work", "one", 20, 1)
     store.path(store.batches[0]).write_text("frame\n", encoding="utf-8")
-    same = detection.DetectionStore(tmp_path / "work", "one", 20, 1)
+    same = detect_run.DetectionStore(tmp_path / "work", "one", 20, 1)
     assert len(same.missing()) == len(same.batches) - 1
-    other = detection.DetectionStore(tmp_path / "work", "two", 20, 1)
+    other = detect_run.DetectionStore(tmp_path / "work", "two", 20, 1)
     assert other.missing() == other.batches
 
 

@@ -28,7 +28,7 @@ from telerig.io.report.run.smoothing.numbers import (
 from telerig.io.report.run.smoothing.results import AXES, SPEED, SmoothingResults
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.report.run.tracking.tables import Headline
-from telerig.io.results.smoothing import AttributedLine, Flag, Mode, Verdict
+from telerig.io.results.smoothing import VERDICT_WORDS, AttributedLine, Flag, Mode, Verdict
 
 
 def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str, Any]:
@@ -66,24 +66,10 @@ _NOT_JUDGED = (
     "The bands below are right if the model of bubbles and shake is right. Whether the data can "
     "separate the two was not tested.",
 )
-_MEANING = {
-    Verdict.RESOLVED: (
-        "RESOLVED: the data separate the motion of the bubbles from the shake of the rig",
-        "good",
-        "The uncertainty of the shake hardly widens the bands below.",
-    ),
-    Verdict.PARTIAL: (
-        "PARTIAL: the data separate the bubbles' motion from the rig's shake only in part",
-        "usable",
-        "Part of the shake may still stand in the trajectories, or part of the bubbles' motion in "
-        "the shake; the bands below say how much.",
-    ),
-    Verdict.UNRESOLVED: (
-        "UNRESOLVED: the data cannot separate the bubbles' motion from the rig's shake",
-        "rejected",
-        "What is drawn below as motion of bubbles may be shake, and the other way round: do not "
-        "interpret any motion as fast as the shake.",
-    ),
+_COLOURS = {
+    Verdict.RESOLVED: "good",
+    Verdict.PARTIAL: "usable",
+    Verdict.UNRESOLVED: "rejected",
 }
 _FLAGS: dict[str, str] = {
     Flag.LABEL_AMBIGUOUS: (
@@ -106,7 +92,10 @@ _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headline:
     """What the smoother says of itself, with the remedy where there is one to take."""
     file = results.file
-    headline, colour, meaning = _NOT_JUDGED if file.verdict is None else _MEANING[file.verdict]
+    headline, colour, meaning = _NOT_JUDGED
+    if file.verdict is not None:
+        colour = _COLOURS[file.verdict]
+        headline, meaning, _ = VERDICT_WORDS[file.verdict]
     of_axes = [axis.words for axis in file.axes.values() if axis.words]
     sentences = [meaning, *(of_axes or [file.words])]
     if file.rig_change is not None and file.rig_change.words:

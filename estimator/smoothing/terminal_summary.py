@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,17 +18,18 @@ _SCALE_FROM = {
     "run": "as measured by the marks of this run",
     "given": "taken as exact",
 }
-_NEXT_SENTENCE = re.compile(r"(?<=\.) (?=[xyz](?: \([a-z]+\))?: |To resolve it|The shake's)")
 
 
 def smoothing_words(found: Smoothing) -> str:
     """The verdict, the standard deviations, encoder and warnings, a line each."""
     verdict, summary, table = found.verdict, found.summary, found.trajectories
     lines = []
-    if verdict:
-        flags = ", ".join(verdict.get("flags", []))
-        lines.append(f"{verdict['verdict']}" + (f" ({flags})" if flags else ""))
-        lines += [f"  {line}" for line in _NEXT_SENTENCE.split(verdict.get("words", ""))]
+    if "verdict" in verdict:
+        flags = ", ".join(verdict["flags"])
+        lines.append(verdict["verdict"] + (f" ({flags})" if flags else ""))
+        lines += [f"  {axis['words']}" for axis in verdict["axes"].values()]
+        if verdict["remedy"]:
+            lines.append(f"  To resolve it, {verdict['remedy']}.")
     bubbles = "1 bubble" if summary["bubbles"] == 1 else f"{summary['bubbles']} bubbles"
     lines.append(f"{bubbles} in {summary['frames']} frames; priors: {found.model.name}")
     if len(table) and "sx_mm" in table:

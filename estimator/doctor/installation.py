@@ -16,7 +16,12 @@ from telerig.io.recording.ports import NO_PERMISSION, found_ports
 
 Status = Literal["ok", "note", "warning", "failure"]
 
-_IMPORTS = {"opencv-python-headless": "cv2", "scikit-image": "skimage", "pyserial": "serial"}
+_IMPORTS = {
+    "pillow": "PIL",
+    "opencv-python-headless": "cv2",
+    "scikit-image": "skimage",
+    "pyserial": "serial",
+}
 _EXTRAS = {"av": "films and AVI/MP4 input (video)", "distributed": "batches on a cluster (cluster)"}
 _OPENCV = ("opencv-python", "opencv-contrib-python", "opencv-contrib-python-headless")
 _OLDEST, _NEWEST = (3, 11), (3, 14)

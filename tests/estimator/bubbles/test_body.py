@@ -211,7 +211,7 @@ def test_unequal_tables_and_bad_priors_are_refused(
     measured: tuple[pd.DataFrame, pd.DataFrame, Array],
 ) -> None:
     first, second, _ = measured
-    with pytest.raises(InputError, match="12 outlines in the first camera and 11"):
+    with pytest.raises(InputError, match="12 bubble outlines in the first camera, but 11"):
         fit_bodies(first, second[:11], bodies.rig())
     for wrong in (0.0, -0.1, np.nan, [0.1, 0.2, 0.3]):
         with pytest.raises(InputError, match="shape_sigma"):

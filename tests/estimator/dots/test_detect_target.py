@@ -122,7 +122,7 @@ def test_an_undecided_image_is_an_error_that_counts_the_marks() -> None:
     plain = replace(RING, marks=((1, 2), (1, 3)))
     image, _ = draw(plain, pixel_from_mm(12.0, 20, 0, False))
     assert find_target(image, RING).numbering.ambiguous
-    with pytest.raises(DetectionError, match="2 of the target.s 3 marks were found"):
+    with pytest.raises(DetectionError, match=r"2 of the target's 3 marks were found"):
         detect_target(image, RING)
 
 

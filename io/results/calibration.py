@@ -170,7 +170,7 @@ class Stage(Part):
 class Diagnostics(Part):
     gauge: str = ""
     weak: tuple[str, ...] = ()
-    tilts_deg: dict[str, float] = Field(default_factory=dict)
+    tilts_deg: dict[str, float | None] = Field(default_factory=dict)
     halves: dict[str, Any] = Field(default_factory=dict)
     structure: dict[str, Any] = Field(default_factory=dict)
     next_view: dict[str, Any] = Field(default_factory=dict)

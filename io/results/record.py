@@ -110,7 +110,7 @@ class Record(Part):
     def of(cls, content: Mapping[str, Any], file: Path) -> Self:
         """Check the content of ``file``. Raises InputError that names the key."""
         try:
-            return cls.model_validate(content)
+            return cls.model_validate(plain(dict(content)))
         except ValidationError as error:
             raise InputError(_fault(error), where=str(file), todo=cls.AGAIN) from error
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.summary import summary
 from telerig.estimator.calibration.solver.covariance import point_shift_jacobian, rig_jacobian
-from telerig.io.files.atomic import atomic_path
+from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
 from telerig.io.results.calibration import (
     CalibrationFile,
@@ -165,17 +165,17 @@ class Calibration:
             "units": {"length": "mm", "image": "px", "angle": "rad unless the name ends in _deg"},
             "gauge": self.diagnostics.get("gauge", ""),
             "medium": self.medium,
-            "verdict": dict(self.verdict),
+            "verdict": plain(dict(self.verdict)),
             "cameras": {c.name: self._camera_record(c, f) for c, f in zip(self.cameras, self.free)},
             "walls": {c.name: c.wall.as_dict() for c in self.cameras if c.wall is not None},
             "target": {"dots": self.dot_ids, "points_mm": self.target_points_mm},
             "views": {view: PoseRecord.of_pose(pose) for view, pose in self.target_poses.items()},
             "covariance": {"names": self.covariance_names, "matrix": self.covariance},
-            "model": dict(self.model),
-            "stage": dict(self.stage),
-            "twin": dict(self.twin),
+            "model": plain(dict(self.model)),
+            "stage": plain(dict(self.stage)),
+            "twin": plain(dict(self.twin)),
             "statistics": dict(self.statistics),
-            "diagnostics": dict(self.diagnostics),
+            "diagnostics": plain(dict(self.diagnostics)),
             "notes": self.notes,
         }
         return CalibrationFile.model_validate(content)

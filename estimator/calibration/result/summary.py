@@ -44,8 +44,8 @@ def summary(calibration: CalibrationFile) -> str:
     lines += [f"  {advice['words']}"] if advice else []
     t = calibration.twin
     lines.append(
-        f"  mirror ambiguity: cost {t.cost:.9g} of the kept solution, {t.other_cost:.9g} of its "
-        f"mirror image; decided by {t.decided_by}: {t.words}"
+        f"  mirror ambiguity: cost {_cost(t.cost)} of the kept solution, {_cost(t.other_cost)} of "
+        f"its mirror image; decided by {t.decided_by}: {t.words}"
     )
     if calibration.stage is not None:
         lines += [f"  stage: {word}" for word in calibration.stage.notes]
@@ -53,6 +53,10 @@ def summary(calibration: CalibrationFile) -> str:
     notes = (*calibration.notes, *calibration.diagnostics.weak)
     lines += [f"  note: {note}" for note in notes if note not in said]
     return "\n".join(lines)
+
+
+def _cost(cost: float | None) -> str:
+    return "unknown" if cost is None else f"{cost:.9g}"
 
 
 def _trust(calibration: CalibrationFile) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,7 @@ from telerig.io.report.calibration.target import target_shape
 from telerig.io.report.overlays import GREEN, RED, draw_overlay
 from telerig.io.report.page.number_format import nice_below, number, short_names, with_sd
 from telerig.io.results.calibration import CalibrationFile, ComparisonFile, Target
+from telerig.io.results.tracking import TrackingFile
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -209,3 +211,13 @@ def test_numbers_in_words() -> None:
     assert [nice_below(x) for x in (0.9, 1, 4.9, 5, 730, 0)] == [0.5, 1, 2, 5, 500, 1]
     assert short_names(["view09", "view10"]) == ["09", "10"]
     assert short_names(["a", "a1"]) == ["a", "a1"] and short_names(["one"]) == ["one"]
+
+
+def test_records_take_numpy_scalars_and_write_nan_as_null(tmp_path: Path) -> None:
+    file = tmp_path / "tracking.json"
+    found = {"kind": "telerig tracks", "frames": np.int64(3), "pairs": {"scatter_px": np.nan},
+             "rig_change": {"moved": np.bool_(True), "offset_mm": np.float64(0.1)}}  # fmt: skip
+    TrackingFile.of(found, file).write(file)
+    read = TrackingFile.read(file)
+    assert read.frames == 3 and read.pairs is not None and read.pairs.scatter_px is None
+    assert read.rig_change is not None and read.rig_change.moved

@@ -1,15 +1,9 @@
-"""Motion priors as whitened linear factors, and linear factors as GTSAM takes them.
-
-A factor is |sum_k A_k x_k - b|^2 with unit noise. Arrays of factors of one shape are made in NumPy
-and handed over one by one: GTSAM's `JacobianFactor` takes up to three keys.
-"""
+"""Motion priors as whitened linear factors: the steps of several processes side by side."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,31 +80,3 @@ def start(components: Sequence[Component]) -> tuple[Array, Array]:
     """(n, n) covariance of the states at the start, and (n, K) their mean for given inputs."""
     covariance = block_diagonal([c.start_covariance for c in components])
     return covariance, block_diagonal([c.start_from_input for c in components])
-
-
-@lru_cache(maxsize=64)
-def _unit_noise(rows: int) -> Any:
-    import gtsam
-
-    return gtsam.noiseModel.Unit.Create(rows)
-
-
-def add_linear_factors(
-    graph: Any, keys: Sequence[ArrayLike], blocks: Sequence[Array], rhs: Array
-) -> None:
-    """Add M factors |sum_k blocks[k] x_keys[k] - rhs|^2 of unit noise to a GaussianFactorGraph.
-
-    keys : up to three of (M,) or one number.  blocks : (M, rows, columns) or (rows, columns) each.
-    rhs : (M, rows). Blocks without columns are left out.
-    """
-    import gtsam
-
-    count, rows = rhs.shape
-    kept = [(k, b) for k, b in zip(keys, blocks) if b.shape[-1]]
-    noise, factor = _unit_noise(rows), cast(Any, gtsam.JacobianFactor)
-    columns: list[Any] = []
-    for key, block in kept:
-        columns.append(np.broadcast_to(np.asarray(key), (count,)).tolist())
-        columns.append(np.broadcast_to(block, (count, *block.shape[-2:])))
-    for parts in zip(*columns, rhs):
-        graph.push_back(factor(*parts, noise))

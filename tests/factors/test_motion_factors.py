@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from telerig.factors import measurements
-from telerig.factors.motion import add_linear_factors, motion, start
+from telerig.factors.linear_factors import add_linear_factors
+from telerig.factors.motion import motion, start
 from telerig.factors.state_space import driven_mode, oscillator, ou_velocity
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -21,8 +21,9 @@ from scipy.linalg.blas import dtrsv
 from scipy.linalg.lapack import dpotrf
 
 from telerig.estimator.smoothing.graph.block_tridiagonal import eliminate_forward, inverses
-from telerig.estimator.smoothing.graph.blocks import Blocks, Linear
+from telerig.estimator.smoothing.graph.blocks import Blocks
 from telerig.estimator.smoothing.graph.state import Frame
+from telerig.factors.linear_factors import Linear
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

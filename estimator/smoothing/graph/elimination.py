@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph.blocks import Blocks, Linear
+from telerig.estimator.smoothing.graph.blocks import Blocks
 from telerig.estimator.smoothing.graph.state import Frame
-from telerig.factors.motion import add_linear_factors
+from telerig.factors.linear_factors import Linear, add_linear_factors
 
 Array = NDArray[np.float64]
 

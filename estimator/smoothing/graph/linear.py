@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.estimator.calibration.solver.covariance import rig_jacobian
-from telerig.estimator.smoothing.graph.blocks import Linear
 from telerig.estimator.smoothing.graph.state import Frame, State
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
 from telerig.factors import measurements
+from telerig.factors.linear_factors import Linear
 from telerig.factors.measurements import whitener_of
 from telerig.factors.motion import start
 from telerig.factors.state_space import log_det_of

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph import chain, elimination
-from telerig.estimator.smoothing.graph.blocks import Blocks, Linear
+from telerig.estimator.smoothing.graph.blocks import Blocks
 from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
 from telerig.estimator.smoothing.graph.state import (
     Frame,
@@ -24,6 +24,7 @@ from telerig.estimator.smoothing.graph.state import (
     times,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+from telerig.factors.linear_factors import Linear
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]

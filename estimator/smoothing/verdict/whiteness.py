@@ -16,7 +16,6 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from telerig.estimator.smoothing.graph.blocks import Linear
 from telerig.estimator.smoothing.graph.linear import (
     accelerometers,
     all_factors,
@@ -24,6 +23,7 @@ from telerig.estimator.smoothing.graph.linear import (
 )
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.state import Frame
+from telerig.factors.linear_factors import Linear
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

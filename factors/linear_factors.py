@@ -1,0 +1,75 @@
+"""Whitened linear factors: arrays of one shape, and their way into GTSAM.
+
+A factor is |sum_k A_k x_k - b|^2 with unit noise. Arrays of factors of one shape are made in NumPy
+and handed over one by one: GTSAM's `JacobianFactor` takes up to three keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """M factors of one shape.
+
+    keys : one (M,) each.  blocks : (M, rows, columns) each.  rhs : (M, rows).
+    log_det : (M,) of the whiteners.  weight : (M,) 0..1 of a robust fit, already in the rest.
+    """
+
+    keys: tuple[ArrayLike, ...]
+    blocks: tuple[Array, ...]
+    rhs: Array
+    log_det: Array
+    weight: Array | None = None
+
+    def squared(self, increments: Callable[[ArrayLike, int], Array]) -> float:
+        """Sum of squares at increments, which are given for keys (M,) of some size."""
+        error = -self.rhs
+        for key, block in zip(self.keys, self.blocks):
+            if block.shape[-1]:
+                step = increments(key, block.shape[-1])
+                error = error + np.einsum("...ij,...j->...i", block, step)
+        return float((error**2).sum())
+
+    def log_norm(self) -> float:
+        """log of the factors' normalisation, residuals apart."""
+        share = np.ones(len(self.rhs)) if self.weight is None else self.weight
+        each = self.log_det - self.rhs.shape[1] * 0.5 * np.log(2 * np.pi)
+        return float((share * each).sum())
+
+
+@lru_cache(maxsize=64)
+def _unit_noise(rows: int) -> Any:
+    import gtsam
+
+    return gtsam.noiseModel.Unit.Create(rows)
+
+
+def add_linear_factors(
+    graph: Any, keys: Sequence[ArrayLike], blocks: Sequence[Array], rhs: Array
+) -> None:
+    """Add M factors |sum_k blocks[k] x_keys[k] - rhs|^2 of unit noise to a GaussianFactorGraph.
+
+    keys : up to three of (M,) or one number.  blocks : (M, rows, columns) or (rows, columns) each.
+    rhs : (M, rows). Blocks without columns are left out.
+    """
+    import gtsam
+
+    count, rows = rhs.shape
+    kept = [(k, b) for k, b in zip(keys, blocks) if b.shape[-1]]
+    noise, factor = _unit_noise(rows), cast(Any, gtsam.JacobianFactor)
+    columns: list[Any] = []
+    for key, block in kept:
+        columns.append(np.broadcast_to(np.asarray(key), (count,)).tolist())
+        columns.append(np.broadcast_to(block, (count, *block.shape[-2:])))
+    for parts in zip(*columns, rhs):
+        graph.push_back(factor(*parts, noise))

@@ -85,7 +85,7 @@ def make_scene(
     dots = dots.assign(suu_px2=variance, suv_px2=0.0, svv_px2=variance)
     rig = rig_description(config, target)
     nominal = nominal_cameras(rig)
-    side = rig.second_from_first_rotvec_deg
+    side = next(iter(rig.rotvec_from_first_deg.values()), None)
     scene = Scene(cameras, target, poses, nominal, rig.target, side, dots)
     problem = scene.problem()
     if not np.array_equal(problem.uv_px, dots[["u_px", "v_px"]].to_numpy()):

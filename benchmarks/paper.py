@@ -64,7 +64,7 @@ def figures(data: telerig.Dataset, run: object, seed: int) -> dict[str, float | 
     free = space_error(calibration, cameras, volume)
     held = self_calibrate(
         detected.dots, nominal_cameras(data.rig), data.target, dots_free="nominal",
-        nominal_rotvec_deg=data.rig.second_from_first_rotvec_deg, model=calibration.model["name"],
+        nominal_rotvec_deg=data.rig.rotvec_from_first_deg, model=calibration.model["name"],
     )  # fmt: skip
     numbering = check_numbering(data.path, detected.dots)
     return {

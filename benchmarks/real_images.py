@@ -96,7 +96,7 @@ def case(data: telerig.Dataset, dots: object, dots_free: str, model: str, limit:
     result = self_calibrate(
         dots,  # type: ignore[arg-type]
         nominal_cameras(data.rig), data.target, model=model, dots_free=dots_free, outlier_sd=limit,
-        nominal_rotvec_deg=data.rig.second_from_first_rotvec_deg,
+        nominal_rotvec_deg=data.rig.rotvec_from_first_deg,
     )  # fmt: skip
     s = result.statistics
     return (

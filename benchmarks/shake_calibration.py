@@ -54,7 +54,7 @@ def calibrated(
         dots,
         list(nominal_cameras(rig)),
         rig.target,
-        nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
+        nominal_rotvec_deg=rig.rotvec_from_first_deg,
         model="kappa" if kappa_per_mm else "none",
     )
     left, right = (true[name] for name in ("left", "right"))

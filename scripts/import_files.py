@@ -156,6 +156,7 @@ def _import_cameras(
     from telerig.estimator.calibration.result.imported import calibration_from_cameras
     from telerig.io.exchange.importing.pinhole import nominal_toml
     from telerig.io.files.atomic import write_text_atomic
+    from telerig.io.rig_file.description import MOST_CAMERAS
 
     importer = CAMERA_IMPORTERS[name]
     cameras, _, notes = importer(files, **offered)
@@ -164,7 +165,7 @@ def _import_cameras(
         cameras, name=importer.program, sigma_px=sigma_px, notes=[source, *notes]
     )
     calibration.save(out)
-    if len(cameras) <= 2:
+    if len(cameras) <= MOST_CAMERAS:
         write_text_atomic(out / "nominal.toml", nominal_toml(cameras))
     for camera in cameras:
         say(

@@ -25,7 +25,7 @@ def simulate(
         str | None,
         typer.Argument(
             help="A calibration (paper, dense, scheimpflug, near_telecentric, symmetric, "
-            "unbounded, two_sided), or a run of bubbles (rise, swarm, crossing, S0 to S6)."
+            "unbounded, two_sided, three), or a run of bubbles (rise, swarm, crossing, S0 to S6)."
         ),
     ] = None,
     out: Annotated[

@@ -22,6 +22,7 @@ from telerig.estimator.calibration.calibrate import nominal_cameras
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.io.machine import parallel
+from telerig.io.rig_file.description import RigDescription
 from telerig.io.simulation.calibration.scene import View, hand_held_views, true_cameras, true_target
 from telerig.io.simulation.calibration_files import exact_dots, rig_description
 from telerig.io.simulation.config import SimulationConfig
@@ -57,7 +58,7 @@ class Scene:
     outlier: Any
     cameras: list[Camera]
     target: Target
-    nominal_rotvec_deg: tuple[float, float, float] | None
+    nominal_rotvec_deg: Any
     true_cameras: dict[str, Camera]
     true_views: dict[str, View]
     true_dots_mm: dict[int, Any]
@@ -107,6 +108,12 @@ def measured(
     return dots, outlier
 
 
+def _nominal(rig: RigDescription) -> Any:
+    """The nominal rotation of the second camera of a pair, or by camera for more."""
+    nominal = rig.rotvec_from_first_deg
+    return nominal if len(nominal) > 1 else next(iter(nominal.values()), None)
+
+
 def make_scene(
     config: str | SimulationConfig = "paper",
     seed: int = 0,
@@ -130,7 +137,7 @@ def make_scene(
         outlier,
         list(nominal_cameras(rig)),
         rig.target,
-        rig.second_from_first_rotvec_deg,
+        _nominal(rig),
         cameras,
         {v.name: v for v in views},
         dict(zip(target.ids.tolist(), target.points_mm)),

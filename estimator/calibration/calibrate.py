@@ -177,7 +177,7 @@ def solve_dots(
         table,
         with_windows(cameras, stated_windows(rig)) if medium == "water" else cameras,
         dataset.target,
-        nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
+        nominal_rotvec_deg=rig.rotvec_from_first_deg,
         model=model,
         dots_free=dots_free,
         solver=solver,

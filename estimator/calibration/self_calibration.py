@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -64,7 +64,7 @@ def self_calibrate(
     cameras: Sequence[Camera],
     target: Target,
     *,
-    nominal_rotvec_deg: Sequence[float] | None = None,
+    nominal_rotvec_deg: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
     model: Model = AUTO,
     dots_free: str = "3d",
     solver: str = "auto",
@@ -77,7 +77,8 @@ def self_calibrate(
 
     dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
     cameras : nominal, the first defines the rig frame.
-    nominal_rotvec_deg : of second_from_first; resolves the mirror ambiguity.
+    nominal_rotvec_deg : nominal <camera>_from_<first> rotation vectors by camera, or the second
+        camera's alone; they resolve the mirror ambiguity.
     model : a name of `telerig.rig.lens_models`, or "auto"; for all cameras, or by camera.
     dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
     solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
@@ -90,7 +91,7 @@ def self_calibrate(
     models = models_by_camera(model, [c.name for c in cameras])
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
-    nominal = None if nominal_rotvec_deg is None else np.asarray(nominal_rotvec_deg, float)
+    nominal = _nominal(nominal_rotvec_deg, cameras)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
     problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd))
     problem = replace(problem, solver="schur" if solver == "auto" else solver)
@@ -125,6 +126,14 @@ def self_calibrate(
     found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
     checked = _trust(fit.robust, joint, free)
     return replace(found, diagnostics={**found.diagnostics, **checked})
+
+
+def _nominal(
+    given: Mapping[str, Sequence[float]] | Sequence[float] | None, cameras: Sequence[Camera]
+) -> Array | None:
+    if isinstance(given, Mapping):
+        given = given.get(cameras[1].name) if len(cameras) > 1 else None
+    return None if given is None else np.asarray(given, float)
 
 
 def _trust(

@@ -261,9 +261,10 @@ def _views(count: int) -> str:
 
 def _generic(dataset: Dataset, count: int) -> str:
     """What to do first, before a calibration can say more."""
-    names, rotvec = list(dataset.rig.cameras), dataset.rig.second_from_first_rotvec_deg
+    names = list(dataset.rig.cameras)
     if len(names) < 2:
         return "tilt the target by 20 to 50 degrees, about another axis than before"
+    rotvec = dataset.rig.rotvec_from_first_deg.get(names[1])
     angle = 90.0 if rotvec is None else float(np.linalg.norm(rotvec))
     return first_views(names[0], names[1], angle)[min(count, RECOMMENDED_VIEWS - 1)]
 

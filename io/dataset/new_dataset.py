@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from string import Template
 
 from telerig.errors import InputError
 from telerig.io.files.atomic import write_text_atomic
+from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
 from telerig.io.rig_file.rig_file import description_from_toml
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -18,14 +20,15 @@ _NOT_IN_TOML = re.compile(r'["\\\x00-\x1f\x7f]')
 def new_dataset(
     folder: Path,
     *,
-    cameras: tuple[str, str] = ("left", "right"),
+    cameras: Sequence[str] = ("left", "right"),
     image_size_px: tuple[int, int] = (512, 512),
     scale_px_per_mm: float = 10.0,
     angle_deg: float = 90.0,
 ) -> list[Path]:
     """Make the folders of a dataset and its rig.toml; returns what was made, rig.toml first.
 
-    image_size_px : (width, height). angle_deg : from the first camera's axis to the second's.
+    cameras : two to four names. image_size_px : (width, height). angle_deg : from each camera's
+    axis to the next one's.
     What is there already stays: folders are completed, a rig.toml is never written over.
     Raises InputError for a folder that has one, or values that no rig can have.
     """
@@ -38,9 +41,13 @@ def new_dataset(
         encoding="utf-8"
     )
     text = Template(template).substitute(
-        name=_NOT_IN_TOML.sub("", place.resolve().name), first=cameras[0], second=cameras[1],
+        name=_NOT_IN_TOML.sub("", place.resolve().name), first=cameras[0],
+        others="".join(_camera(name, image_size_px, scale_px_per_mm) for name in cameras[1:]),
+        rotations="\n".join(
+            f"{rotvec_key(name, cameras[0])} = [0.0, {i * float(angle_deg)}, 0.0]"
+            for i, name in enumerate(cameras[1:], 1)
+        ),
         width=image_size_px[0], height=image_size_px[1], scale=float(scale_px_per_mm),
-        angle=float(angle_deg),
     )  # fmt: skip
     description_from_toml(text, where=str(rig))
     write_text_atomic(rig, text)
@@ -50,14 +57,22 @@ def new_dataset(
     return [rig, *folders]
 
 
-def _check(cameras: tuple[str, str], size: tuple[int, int], scale: float) -> None:
+def _camera(name: str, image_size_px: tuple[int, int], scale_px_per_mm: float) -> str:
+    width, height = image_size_px
+    size = f"image_size_px = [{width}, {height}]"
+    return f"[cameras.{name}]\n{size}\nscale_px_per_mm = {float(scale_px_per_mm)}\n\n"
+
+
+def _check(cameras: Sequence[str], size: tuple[int, int], scale: float) -> None:
+    if not 2 <= len(cameras) <= MOST_CAMERAS:
+        raise InputError(f"{len(cameras)} cameras", todo=f"name two to {MOST_CAMERAS}")
     for name in cameras:
         if not _NAME.fullmatch(name) or name == "carriage":
             raise InputError(
                 f"camera name {name!r}", todo="use letters, digits, _ and -; not 'carriage'"
             )
-    if cameras[0] == cameras[1]:
-        raise InputError("both cameras have one name", todo="name them apart")
+    if len(set(cameras)) < len(cameras):
+        raise InputError("two cameras have one name", todo="name them apart")
     if min(size) < 16:
         raise InputError(f"image size {size[0]} x {size[1]}", todo="give width x height in pixels")
     if not scale > 0:

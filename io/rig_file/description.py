@@ -20,6 +20,9 @@ from telerig.rig.windows import Wall
 SCHEMA = 1
 """The newest `schema` of rig.toml that is read, and the one that is written."""
 
+MOST_CAMERAS = 4
+"""Cameras that a rig may have."""
+
 CARRIAGE = "carriage"
 """`mounted_on` of an accelerometer that sits on the stage itself; no camera may be called so."""
 
@@ -185,7 +188,10 @@ class DeviceDescription(Table):
 class RigDescription:
     """The whole of `rig.toml`; the first camera's frame is the rig frame.
 
-    second_from_first_rotvec_deg : nominal rotation, decides the mirror ambiguity; None: not given.
+    rotvec_from_first_deg : by camera, the nominal rotation <camera>_from_<first>, for those that
+    the file gives; decides the mirror ambiguity.
+    tracking : the two cameras whose images of bubbles are paired, in the rig's order; None when
+    the file does not say, which means the first two.
     stage, references : None when the file has no such table.
     devices : sensors on serial lines, by name.
     """
@@ -193,7 +199,8 @@ class RigDescription:
     name: str
     cameras: Mapping[str, CameraDescription]
     target: Target
-    second_from_first_rotvec_deg: Vector | None = None
+    rotvec_from_first_deg: Mapping[str, Vector] = field(default_factory=dict)
+    tracking: tuple[str, str] | None = None
     stage: StageDescription | None = None
     accelerometers: Mapping[str, AccelerometerDescription] = field(default_factory=dict)
     references: ReferencesDescription | None = None
@@ -206,13 +213,23 @@ class RigDescription:
         return next(iter(self.cameras))
 
     @property
-    def second(self) -> str | None:
-        """Name of the second camera; None for a rig of one camera."""
-        return next(iter(list(self.cameras)[1:]), None)
+    def others(self) -> tuple[str, ...]:
+        """Names of every camera but the first."""
+        return tuple(self.cameras)[1:]
+
+    @property
+    def tracking_cameras(self) -> tuple[str, ...]:
+        """Names of the two cameras that tracking uses; one name for a rig of one camera."""
+        return self.tracking or tuple(self.cameras)[:2]
 
     def camera_name(self, camera: str | int) -> str:
         """The camera's name from its name or its index. Raises InputError for an unknown one."""
         return camera_named(camera, list(self.cameras), where="rig.toml")
+
+
+def rotvec_key(camera: str, first: str) -> str:
+    """The key of `[stereo]` that holds a camera's nominal rotation."""
+    return f"{camera}_from_{first}_rotvec_deg"
 
 
 def camera_named(camera: str | int, names: list[str], *, where: str) -> str:

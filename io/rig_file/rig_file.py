@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ from telerig.errors import InputError, nearest, suggestion
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.rig_file.description import (
     CARRIAGE,
+    MOST_CAMERAS,
     SCHEMA,
     AccelerometerDescription,
     CameraDescription,
@@ -25,6 +26,7 @@ from telerig.io.rig_file.description import (
     Table,
     Vector,
     WallDescription,
+    rotvec_key,
 )
 from telerig.io.rig_file.devices import devices_from_tables
 from telerig.io.rig_file.tables import Problem, Problems, field_types, read_table, subtables
@@ -34,7 +36,7 @@ from telerig.rig.target import Target
 
 TOP_LEVEL = [
     *("schema", "name", "cameras", "stereo", "target"),
-    *("stage", "accelerometers", "devices", "references", "walls"),
+    *("stage", "accelerometers", "devices", "references", "walls", "tracking"),
 ]
 
 _GRAZING = np.cos(np.deg2rad(85.0))
@@ -55,11 +57,16 @@ _HOMES = {
 """Where a key belongs that stands in a wrong table."""
 
 
+_ROTVEC_DEG = Annotated[
+    Vector | None, Field(description="three numbers in degrees, like [0.0, 90.0, 0.0]")
+]
+
+
 @dataclass(frozen=True)
-class _StereoTable(Table):
-    rotvec_deg: Annotated[
-        Vector | None, Field(description="three numbers in degrees, like [0.0, 90.0, 0.0]")
-    ] = None
+class _TrackingTable(Table):
+    cameras: Annotated[
+        tuple[str, str], Field(description='the names of two cameras, like ["left", "right"]')
+    ]
 
 
 def read_rig_toml(path: str | PathLike[str]) -> RigDescription:
@@ -165,7 +172,8 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
     cameras = _cameras(raw, problems)
     names = list(cameras)
     target = _target(raw, problems)
-    rotvec = _rotvec_deg(raw, names, problems)
+    rotvecs = _rotvecs_deg(raw, names, problems)
+    tracking = _tracking(raw, names, problems)
     stage = _stage(raw, names, problems)
     accelerometers = _accelerometers(raw, names, problems)
     references = _references(raw, problems)
@@ -177,7 +185,8 @@ def _description(raw: dict[str, Any], name: str, problems: Problems) -> RigDescr
         name=raw.get("name", name),
         cameras={key: camera for key, camera in cameras.items() if camera is not None},
         target=target,
-        second_from_first_rotvec_deg=rotvec,
+        rotvec_from_first_deg=rotvecs,
+        tracking=tracking,
         stage=stage,
         accelerometers=accelerometers,
         references=references,
@@ -210,11 +219,9 @@ def _check_camera_names(names: list[str], problems: Problems) -> None:
         what = "two names differ only in upper and lower case"
         todo = "give the cameras names that any file system keeps apart"
         problems.add("cameras", "", what, todo)
-    if len(names) > 2:
-        what = (
-            f"has {len(names)} cameras ({', '.join(names)}); telerig works with one or two for now"
-        )
-        todo = "keep two; write another dataset for another pair"
+    if len(names) > MOST_CAMERAS:
+        what = f"has {len(names)} cameras ({', '.join(names)}); a rig has {MOST_CAMERAS} at most"
+        todo = f"keep {MOST_CAMERAS}; write another dataset for the others"
         problems.add("cameras", "", what, todo)
 
 
@@ -230,16 +237,50 @@ def _target(raw: dict[str, Any], problems: Problems) -> Target | None:
     return table.target() if table is not None and not found else None
 
 
-def _rotvec_deg(raw: dict[str, Any], names: list[str], problems: Problems) -> Vector | None:
+def _rotvecs_deg(raw: dict[str, Any], names: list[str], problems: Problems) -> dict[str, Vector]:
+    """The nominal rotation of every camera but the first, of those that the file gives."""
     if "stereo" not in raw or not names:
-        return None
+        return {}
     if len(names) == 1:
         what = f"is given, but {names[0]} is the only camera"
         problems.add("stereo", "", what, "remove it, or add the second [cameras.<name>]")
+        return {}
+    camera_of = {f"rotvec_{i}_deg": name for i, name in enumerate(names[1:], 1)}
+    kind = make_dataclass(
+        "_StereoTable",
+        [(field, _ROTVEC_DEG, None) for field in camera_of],
+        bases=(Table,),
+        frozen=True,
+    )
+    keys = {field: rotvec_key(name, names[0]) for field, name in camera_of.items()}
+    table = read_table(kind, raw["stereo"], "stereo", problems, homes=_HOMES, keys=keys)
+    found = {name: getattr(table, field, None) for field, name in camera_of.items()}
+    return {name: rotvec for name, rotvec in found.items() if rotvec is not None}
+
+
+def _tracking(raw: dict[str, Any], names: list[str], problems: Problems) -> tuple[str, str] | None:
+    """The two cameras of `[tracking]`, in the order of the rig."""
+    if "tracking" not in raw or not names:
         return None
-    keys = {"rotvec_deg": f"{names[1]}_from_{names[0]}_rotvec_deg"}
-    table = read_table(_StereoTable, raw["stereo"], "stereo", problems, homes=_HOMES, keys=keys)
-    return table.rotvec_deg if table is not None else None
+    if len(names) == 1:
+        what = f"is given, but {names[0]} is the only camera"
+        problems.add("tracking", "", what, "remove it, or add the second [cameras.<name>]")
+        return None
+    table = read_table(_TrackingTable, raw["tracking"], "tracking", problems, homes=_HOMES)
+    if table is None:
+        return None
+    for name in table.cameras:
+        if name not in names:
+            what = f"there is no camera {name!r}"
+            problems.add("tracking", "cameras", what, suggestion(name, names))
+    first, second = table.cameras
+    if first == second:
+        what = f"names {first!r} twice"
+        problems.add("tracking", "cameras", what, "name two cameras")
+    if {first, second} - set(names):
+        return None
+    first, second = sorted(table.cameras, key=names.index)
+    return first, second
 
 
 def _stage(raw: dict[str, Any], names: list[str], problems: Problems) -> StageDescription | None:

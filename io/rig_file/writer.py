@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from telerig.io.rig_file.description import SCHEMA, RigDescription, Table
+from telerig.io.rig_file.description import SCHEMA, RigDescription, Table, rotvec_key
 from telerig.rig.target import Target
 
 Line = tuple[str, Any, str]
@@ -38,10 +38,13 @@ def rig_toml(rig: RigDescription) -> str:
     """The text of the rig file; keys whose value is None are left out."""
     blocks = [_lines([("schema", SCHEMA, ""), ("name", rig.name, "")])]
     blocks += [_block(f"cameras.{_key(c.name)}", _all_fields(c)) for c in rig.cameras.values()]
-    if rig.second_from_first_rotvec_deg is not None:
-        key = f"{rig.second}_from_{rig.first}_rotvec_deg"
+    if rig.rotvec_from_first_deg:
         comment = "nominal; decides the mirror ambiguity"
-        blocks.append(_block("stereo", [(key, rig.second_from_first_rotvec_deg, comment)]))
+        lines = [
+            (rotvec_key(name, rig.first), rotvec, comment)
+            for name, rotvec in rig.rotvec_from_first_deg.items()
+        ]
+        blocks.append(_block("stereo", lines))
     blocks.append(_block("target", _target(rig.target)))
     if rig.stage is not None:
         keys = {"axis": f"axis_{rig.first}", "up": f"up_{rig.first}"}
@@ -52,6 +55,8 @@ def rig_toml(rig: RigDescription) -> str:
     blocks += [_block(f"devices.{_key(d.name)}", _changed_fields(d)) for d in rig.devices.values()]
     if rig.references is not None:
         blocks.append(_block("references", _all_fields(rig.references)))
+    if rig.tracking is not None:
+        blocks.append(_block("tracking", [("cameras", rig.tracking, "whose images are paired")]))
     for wall in rig.walls.values():
         lines = [line for line in _all_fields(wall) if line[:2] != ("normal_sigma_deg", 0.0)]
         blocks.append(_block(f"walls.{_key(wall.camera)}", lines))

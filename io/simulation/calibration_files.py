@@ -80,8 +80,10 @@ def rig_description(config: SimulationConfig, target: TrueTarget) -> RigDescript
         for c in config.cameras
     }
     known = replace(config.target, scale_distance_mm=target.scale_distance_mm)
-    side = (0.0, float(config.angle_deg), 0.0) if len(cameras) == 2 else None
-    return RigDescription(config.name, cameras, known, second_from_first_rotvec_deg=side)
+    sides = {
+        name: (0.0, i * float(config.angle_deg), 0.0) for i, name in enumerate(cameras) if i > 0
+    }
+    return RigDescription(config.name, cameras, known, rotvec_from_first_deg=sides)
 
 
 def exact_dots(

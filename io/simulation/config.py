@@ -44,9 +44,9 @@ class CameraConfig:
 class SimulationConfig:
     """A rig, a target, hand-held poses and the quality of the images.
 
-    Rig: the second camera is turned by ``angle_deg`` about the rig's y axis, then by the mounting
-    error ``mount_rotvec_deg``, which the rig file does not know; the optical axes pass each other
-    at ``axis_gap_mm``. One or two cameras.
+    Rig: each camera is turned by ``angle_deg`` about the rig's y axis against the one before, then
+    by the mounting error ``mount_rotvec_deg`` (of alternating sign), which the rig file does not
+    know; the optical axes pass each other at ``axis_gap_mm``. One to four cameras.
 
     Target: true dots are off by ``target.print_sigma_mm`` in the plane and
     ``target.flatness_sigma_mm`` out of it, times ``print_factor``. The known distance is measured
@@ -56,8 +56,9 @@ class SimulationConfig:
     Poses: the angle between each optical axis and the plate's normal is within ``tilt_deg``, the
     roll within +-``roll_deg``, the middle of the target within +-``shift_mm`` of the rig's origin
     along the rig's axes. At least ``visible_fraction`` of the dots lie wholly inside the images,
-    ``border_px`` from their border, and the marks too if ``marks_visible``. The last
-    ``single_camera_views`` views are seen by one camera only, in turn.
+    ``border_px`` from their border, and the marks too if ``marks_visible``. All cameras see every
+    view, or the groups of ``seen_by`` (names of cameras) in turn; the plate is tilted towards those
+    that see it. The last ``single_camera_views`` views are seen by one camera only, in turn.
 
     Dot tables (no images): ``sigma_px`` per coordinate; a share ``outlier_fraction`` is off by
     ``outlier_px`` (standard deviation) besides. With ``sigma_px`` 0 the table is exact.
@@ -86,6 +87,7 @@ class SimulationConfig:
     visible_fraction: float = 1.0
     marks_visible: bool = True
     border_px: float = 6.0
+    seen_by: tuple[tuple[str, ...], ...] = ()
     single_camera_views: int = 0
     sigma_px: float = 0.01
     outlier_fraction: float = 0.0

@@ -96,6 +96,14 @@ def _like_paper(
     return SimulationConfig(name, cameras, target, shift_mm=(reach, reach, reach))
 
 
+def _three_cameras() -> tuple[CameraConfig, ...]:
+    return (
+        CameraConfig("left", centre_offset_px=(2.3, -1.7), scale_px_per_mm=10.04),
+        CameraConfig("middle", centre_offset_px=(-3.1, 0.8), scale_px_per_mm=9.97),
+        CameraConfig("right", centre_offset_px=(1.2, 2.6), scale_px_per_mm=10.02),
+    )
+
+
 def _unbounded_target() -> Target:
     marks = ((0, 0), (0, 5), (3, 0))
     grid = Target(extent="unbounded")
@@ -175,6 +183,19 @@ _CALIBRATIONS = (
         angle_deg=150.0,
         tilt_deg=(10.0, 60.0),
         background=0.1,
+    ),
+    SimulationConfig(
+        "three",
+        _three_cameras(),
+        _small_target(),
+        views=15,
+        angle_deg=60.0,
+        tilt_deg=(8.0, 65.0),
+        seen_by=(
+            ("left", "middle"),
+            ("middle", "right"),
+            ("left", "middle", "right"),
+        ),
     ),
 )
 

@@ -54,10 +54,20 @@ def test_init_makes_a_rig_file_that_says_what_was_asked(tmp_path):
     assert list(rig.cameras) == ["front", "side"]
     assert rig.cameras["side"].image_size_px == (1280, 800)
     assert rig.cameras["front"].scale_px_per_mm == 12.5
-    assert rig.second_from_first_rotvec_deg == (0.0, -75.0, 0.0)
+    assert rig.rotvec_from_first_deg == {"side": (0.0, -75.0, 0.0)}
     assert rig.name == "tank"
     assert (tmp_path / "tank" / "calibration" / "side").is_dir()
     assert (tmp_path / "tank" / "runs").is_dir()
+
+
+def test_init_of_four_cameras(tmp_path):
+    result = _asked("init", str(tmp_path / "tank"), "--cameras", "a,b,c,d", "--angle", "40")
+    assert result.exit_code == 0, result.output
+    rig = read_rig_toml(tmp_path / "tank" / "rig.toml")
+    assert list(rig.cameras) == ["a", "b", "c", "d"]
+    assert rig.rotvec_from_first_deg == {"b": (0, 40, 0), "c": (0, 80, 0), "d": (0, 120, 0)}
+    assert rig.tracking_cameras == ("a", "b")
+    assert all((tmp_path / "tank" / "calibration" / name).is_dir() for name in "abcd")
 
 
 def test_init_of_a_folder_whose_name_toml_would_misread(tmp_path):
@@ -97,8 +107,8 @@ def test_init_never_writes_over_a_rig_file(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--cameras", "left"], "give two names"),
-        (["--cameras", "left,left"], "both cameras have one name"),
+        (["--cameras", "left"], "give two to 4 names"),
+        (["--cameras", "left,left"], "two cameras have one name"),
         (["--cameras", "left,carriage"], "'carriage'"),
         (["--size", "512"], "give width x height"),
         (["--scale", "0"], "give a positive number"),

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
+from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, nearest_rotation
 
@@ -196,10 +197,12 @@ def _camera(name: str, one: Pinhole, upper: Array, distance_mm: float, pose: Pos
 def nominal_toml(cameras: Sequence[Camera]) -> str:
     """The tables [cameras.*] and [stereo] of rig.toml, for a calibration to start from.
 
-    docs/files.md says what else rig.toml needs. Raises InputError for more than two cameras.
+    docs/files.md says what else rig.toml needs. Raises InputError for more cameras than a
+    rig has.
     """
-    if not 1 <= len(cameras) <= 2:
-        raise InputError(f"{len(cameras)} cameras", todo="rig.toml describes one or two")
+    if not 1 <= len(cameras) <= MOST_CAMERAS:
+        todo = f"rig.toml describes one to {MOST_CAMERAS}"
+        raise InputError(f"{len(cameras)} cameras", todo=todo)
     lines = []
     for camera in cameras:
         width, height = camera.image_size_px
@@ -209,8 +212,9 @@ def nominal_toml(cameras: Sequence[Camera]) -> str:
             f"scale_px_per_mm = {camera['scale_px_per_mm']:.9g}",
             f"telecentricity_per_mm = {camera['kappa_per_mm']:.9g}",
         ]
-    if len(cameras) == 2:
-        rotvec_deg = np.degrees(cameras[1].camera_from_rig.rotvec_rad)
+    lines += ["[stereo]"] if len(cameras) > 1 else []
+    for camera in cameras[1:]:
+        rotvec_deg = np.degrees(camera.camera_from_rig.rotvec_rad)
         numbers = ", ".join(f"{value:.6f}" for value in rotvec_deg)
-        lines += ["[stereo]", f"{cameras[1].name}_from_{cameras[0].name}_rotvec_deg = [{numbers}]"]
+        lines.append(f"{rotvec_key(camera.name, cameras[0].name)} = [{numbers}]")
     return "\n".join(lines) + "\n"

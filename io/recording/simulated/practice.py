@@ -44,7 +44,7 @@ def practice_rig(devices: Sequence[DeviceDescription]) -> RigDescription:
         name="practice",
         cameras=cameras,
         target=Target(rows=3, columns=5, pitch_mm=(7.0, 7.0), dot_diameter_mm=2.4),
-        second_from_first_rotvec_deg=(0.0, 90.0, 0.0),
+        rotvec_from_first_deg={"right": (0.0, 90.0, 0.0)},
         stage=StageDescription((0.0, -1.0, 0.0), (0.0, -1.0, 0.0)),
         accelerometers={
             name: AccelerometerDescription(name, name.removeprefix("arm_"), axes, 22.5)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
+from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate
 from telerig.rig.camera import Camera
@@ -44,30 +45,35 @@ class View:
     cameras: tuple[str, ...]
 
 
-def nominal_rotation(config: SimulationConfig) -> Array:
-    """(3, 3) second_from_first as the rig file states it."""
-    return rotation_from_rotvec([0.0, np.radians(config.angle_deg), 0.0])
+def nominal_rotation(config: SimulationConfig, camera: int = 1) -> Array:
+    """(3, 3) <camera>_from_first of a camera, counted from 0, as the rig file states it."""
+    return rotation_from_rotvec([0.0, np.radians(camera * config.angle_deg), 0.0])
 
 
 def true_cameras(config: SimulationConfig) -> Mapping[str, Camera]:
-    """The cameras by name; the rig's origin is where the optical axes come closest.
+    """The cameras by name; the rig's origin is where the first two optical axes come closest.
 
-    Raises InputError unless there are one or two cameras of different names.
+    Raises InputError unless there are one to four cameras of different names.
     """
     names = [camera.name for camera in config.cameras]
-    if len(set(names)) != len(names) or not 1 <= len(names) <= 2:
-        raise InputError(f"a simulated rig of cameras {names}", todo="give one or two, named apart")
-    poses = [Pose.identity(), _second_from_rig(config)]
+    if len(set(names)) != len(names) or not 1 <= len(names) <= MOST_CAMERAS:
+        todo = f"give one to {MOST_CAMERAS}, named apart"
+        raise InputError(f"a simulated rig of cameras {names}", todo=todo)
+    poses = [Pose.identity(), *(_from_rig(config, i) for i in range(1, len(names)))]
     return {c.name: _camera(c, pose) for c, pose in zip(config.cameras, poses)}
 
 
-def _second_from_rig(config: SimulationConfig) -> Pose:
-    rotation = rotation_from_rotvec(np.radians(config.mount_rotvec_deg)) @ nominal_rotation(config)
+def _from_rig(config: SimulationConfig, camera: int) -> Pose:
+    """camera_from_rig: nominal, then the mounting error, of alternating sign from the second on."""
+    sign = 1.0 if camera % 2 else -1.0
+    mount = rotation_from_rotvec(np.radians(sign * np.array(config.mount_rotvec_deg)))
+    rotation = mount @ nominal_rotation(config, camera)
     between = np.cross(rotation[:, 2], [0.0, 0.0, 1.0])
     length = float(np.linalg.norm(between))
     if length < 1e-6:
         return Pose(rotation, np.zeros(3))
-    return Pose(rotation, config.axis_gap_mm * between / length)
+    beside = [0.0 if camera == 1 else config.axis_gap_mm, 0.0, 0.0]
+    return Pose(rotation, sign * config.axis_gap_mm * between / length + beside)
 
 
 def _camera(config: CameraConfig, camera_from_rig: Pose) -> Camera:
@@ -147,11 +153,17 @@ def hand_held_views(
 ) -> list[View]:
     """Random poses by rejection. Raises InputError when no pose meets the demands."""
     names = tuple(cameras)
+    groups = config.seen_by or (names,)
+    unknown = sorted({name for group in groups for name in group} - set(names))
+    if unknown:
+        raise InputError(
+            f"seen_by names {', '.join(unknown)}", todo=f"the cameras are {', '.join(names)}"
+        )
     digits = len(str(config.views - 1))
     views = []
     for i in range(config.views):
         single = config.views - 1 - i < config.single_camera_views and len(names) > 1
-        seeing = (names[i % len(names)],) if single else names
+        seeing = (names[i % len(names)],) if single else groups[i % len(groups)]
         normals = _plate_normals(config, [cameras[n] for n in seeing], rng)
         pose = _visible_pose(config, [cameras[n] for n in seeing], target, normals, rng)
         views.append(View(f"view{i:0{max(2, digits)}d}", pose, seeing))

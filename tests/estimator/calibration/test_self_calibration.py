@@ -53,7 +53,7 @@ def test_through_the_files_of_the_simulator(tmp_path: Any) -> None:
         dataset.dots(),
         nominal_cameras(rig),
         dataset.target,
-        nominal_rotvec_deg=rig.second_from_first_rotvec_deg,
+        nominal_rotvec_deg=rig.rotvec_from_first_deg,
     )
     truth = dataset.truth
     assert truth is not None

@@ -26,10 +26,10 @@ from telerig.rig.target import Target
 def test_every_table_of_the_file_is_read() -> None:
     rig = parse(FULL)
     assert rig.name == "tank 2"
-    assert (rig.first, rig.second) == ("left", "right")
+    assert (rig.first, rig.others) == ("left", ("right",))
     assert rig.cameras["left"] == CameraDescription("left", (640, 512), 10.0, 0.0)
     assert rig.cameras["right"] == CameraDescription("right", (512, 512), 11.0, None)
-    assert rig.second_from_first_rotvec_deg == (0.0, 90.0, 0.0)
+    assert rig.rotvec_from_first_deg == {"right": (0.0, 90.0, 0.0)}
     assert rig.target == Target(
         rows=3,
         columns=5,
@@ -74,10 +74,23 @@ def test_defaults_of_the_target() -> None:
     )  # fmt: skip
 
 
+def test_three_cameras_and_the_two_that_are_tracked(tmp_path: Path) -> None:
+    third = "[cameras.top]\nimage_size_px = [8, 8]\nscale_px_per_mm = 1.0\n[stereo]\n"
+    text = changed("[stereo]", third + "top_from_left_rotvec_deg = [-90.0, 0.0, 0.0]")
+    rig = parse(text)
+    assert rig.others == ("right", "top")
+    assert rig.rotvec_from_first_deg == {"right": (0, 90, 0), "top": (-90, 0, 0)}
+    assert rig.tracking is None and rig.tracking_cameras == ("left", "right")
+    rig = parse(text + '[tracking]\ncameras = ["top", "left"]\n')
+    assert rig.tracking_cameras == ("left", "top")
+    write_rig_toml(rig, tmp_path / "rig.toml")
+    assert read_rig_toml(tmp_path / "rig.toml") == rig
+
+
 def test_one_camera_is_legal() -> None:
     start, rest = FULL.split("[cameras.right]")
     rig = parse(start + rest[rest.index("[target]") :])
-    assert (rig.first, rig.second, rig.second_from_first_rotvec_deg) == ("left", None, None)
+    assert (rig.first, rig.others, rig.rotvec_from_first_deg) == ("left", (), {})
 
 
 def test_cameras_by_name_or_index() -> None:
@@ -154,7 +167,7 @@ ROUND_TRIPS = {
         FULL_RIG,
         cameras={"große": CameraDescription("große", (9, 9), 1.0), "b": FULL_RIG.cameras["right"]}
         | {"b": CameraDescription("b", (9, 9), 1.0)},
-        walls={}, accelerometers={},
+        walls={}, accelerometers={}, rotvec_from_first_deg={"b": (0.0, 90.0, 0.0)},
     ),
 }  # fmt: skip
 

@@ -127,10 +127,36 @@ def test_scale_dot_on_a_missing_mark() -> None:
     assert "has 7, which is a missing mark" in error_of(text)
 
 
-def test_more_than_two_cameras_are_refused_for_now() -> None:
-    third = "[cameras.top]\nimage_size_px = [1, 1]\nscale_px_per_mm = 1.0\n[stereo]"
-    message = error_of(changed("[stereo]", third))
-    assert "has 3 cameras (left, right, top)" in message and "for now" in message
+def _more_cameras(*names: str) -> str:
+    tables = (f"[cameras.{n}]\nimage_size_px = [1, 1]\nscale_px_per_mm = 1.0\n" for n in names)
+    return "".join(tables) + "[stereo]"
+
+
+def test_more_than_four_cameras_are_refused() -> None:
+    message = error_of(changed("[stereo]", _more_cameras("top", "below", "back")))
+    assert "has 5 cameras (left, right, top, below, back)" in message and "4 at most" in message
+
+
+def test_a_third_camera_under_a_wrong_key() -> None:
+    text = changed("[stereo]", _more_cameras("top"))
+    message = error_of(text.replace("[target]", "top_from_right_rotvec_deg = [0, 1, 2]\n[target]"))
+    assert "top_from_right_rotvec_deg" in message
+    assert "did you mean top_from_left_rotvec_deg" in message
+    message = error_of(text.replace("[target]", "top_from_left_rotvec_deg = [0, 1]\n[target]"))
+    assert "top_from_left_rotvec_deg" in message and "three numbers in degrees" in message
+
+
+@pytest.mark.parametrize(
+    ("cameras", "words"),
+    [
+        ('["left", "rihgt"]', "did you mean right"),
+        ('["left", "left"]', "names 'left' twice"),
+        ('["left"]', "the names of two cameras"),
+    ],
+)
+def test_the_cameras_of_tracking(cameras: str, words: str) -> None:
+    message = error_of(changed("[stage]", f"[tracking]\ncameras = {cameras}\n[stage]"))
+    assert "[tracking] cameras" in message and words in message
 
 
 @pytest.mark.parametrize("name", ['"a/b"', '"a,b"', '"my camera"', "carriage"])

@@ -251,4 +251,4 @@ def test_nominals_are_read_as_rig_toml(tmp_path: Path) -> None:
     assert second.telecentricity_per_mm == pytest.approx(cameras[1]["kappa_per_mm"], rel=1e-8)
     assert second.scale_px_per_mm == pytest.approx(cameras[1]["scale_px_per_mm"], rel=1e-8)
     turn = np.degrees(cameras[1].camera_from_rig.rotvec_rad)
-    np.testing.assert_allclose(rig.second_from_first_rotvec_deg, turn, atol=1e-6)
+    np.testing.assert_allclose(rig.rotvec_from_first_deg[cameras[1].name], turn, atol=1e-6)

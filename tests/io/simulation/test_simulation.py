@@ -64,10 +64,24 @@ def test_paper_shows_every_dot_whole_in_every_image(seed):
 def test_opaque_plates_show_both_cameras_their_front(name):
     config, cameras, target, views = scene(name)
     for view in views:
-        for camera in cameras.values():
+        for camera in (cameras[name] for name in view.cameras):
             assert image_jacobian(camera, view, target) > 0
             low, high = config.tilt_deg
             assert low - 1e-6 <= tilt_deg(camera, view) <= high + 1e-6
+
+
+def test_three_cameras_stand_in_a_fan_and_see_the_target_in_turn():
+    config, cameras, _, views = scene("three")
+    axes = np.array([camera.camera_from_rig.rotation[2] for camera in cameras.values()])
+    np.testing.assert_allclose(np.degrees(np.arccos(axes @ axes[0])), [0, 60, 120], atol=1.5)
+    assert all(camera.camera_from_rig.translation_mm[2] == 0 for camera in cameras.values())
+    assert [view.cameras for view in views[:3]] == list(config.seen_by)
+    assert config.seen_by[2] == tuple(cameras)
+
+
+def test_views_of_a_camera_that_is_not_there_are_refused():
+    with pytest.raises(InputError, match="seen_by names top"):
+        scene("three", seen_by=(("left", "top"),))
 
 
 def test_two_sided_plates_show_one_camera_their_back():
@@ -147,7 +161,7 @@ def test_dense_loses_some_dots_at_the_border():
 def test_every_preset_renders_dots_where_the_truth_says(name):
     config, cameras, target, views = scene(name)
     exact = exact_dots(config, cameras, target, views[:1])
-    for camera in cameras.values():
+    for camera in (cameras[seeing] for seeing in views[0].cameras):
         image = view_image(
             replace(config, noise=0.0, light_gradient=0.0, dirt=0),
             camera,
@@ -178,7 +192,7 @@ def test_dataset_without_images(tmp_path):
     error = both[["u_px_x", "v_px_x"]].to_numpy() - both[["u_px_y", "v_px_y"]].to_numpy()
     assert error.std() == pytest.approx(0.05, rel=0.15)
     assert list(dataset.rig.cameras) == ["left", "right"]
-    assert dataset.rig.second_from_first_rotvec_deg == (0.0, 90.0, 0.0)
+    assert dataset.rig.rotvec_from_first_deg == {"right": (0.0, 90.0, 0.0)}
     assert dataset.rig.target.scale_distance_mm == dataset.truth["target"]["scale_distance_mm"]
 
 
@@ -244,7 +258,7 @@ def test_one_camera_alone(tmp_path):
     config = preset("paper", views=2, cameras=(CameraConfig("mono", scale_px_per_mm=8.0),))
     dataset = simulate(config, rng=np.random.default_rng(0), out=tmp_path, images=False)
     assert list(dataset.rig.cameras) == ["mono"]
-    assert dataset.rig.second_from_first_rotvec_deg is None
+    assert dataset.rig.rotvec_from_first_deg == {}
 
 
 def test_outliers(tmp_path):

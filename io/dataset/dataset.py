@@ -10,6 +10,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import pandas as pd
+
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import choose_source, read_dots_csv
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
@@ -18,9 +20,8 @@ from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.rig.target import Target
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from telerig.io.dataset.run import RunData
+
 
 Source = Literal["images", "dots"]
 

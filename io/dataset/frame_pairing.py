@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Bools, Ints
 from telerig.errors import InputError
 from telerig.io.images.frames import FrameSource
 
 Pairing = Literal["auto", "numbers", "order"]
-Positions = NDArray[np.int64]
 
 _TODO = (
     "complete the images; number their names alike; name what is missing in the column "
@@ -23,9 +22,9 @@ _TODO = (
 def pair_frames(
     sources: Mapping[str, FrameSource],
     pair_by: Pairing,
-    missing: Mapping[str, NDArray[np.bool_]] | None,
+    missing: Mapping[str, Bools] | None,
     where: str,
-) -> tuple[dict[str, Positions], list[str]]:
+) -> tuple[dict[str, Ints], list[str]]:
     """(F,) position in each camera's source, -1 where the frame is missing; and notes.
 
     pair_by : "numbers" in the names, "order", or what fits ("auto").
@@ -54,7 +53,7 @@ def pair_frames(
     return _in_order(counts)
 
 
-def _trustworthy(numbers: Mapping[str, Positions], where: str) -> bool:
+def _trustworthy(numbers: Mapping[str, Ints], where: str) -> bool:
     """Whether the numbers in the names count frames: dense, and the same in every camera."""
     step = _step(numbers)
     spans = [int(n[-1] - n[0]) // step + 1 for n in numbers.values()]
@@ -78,13 +77,13 @@ def _trustworthy(numbers: Mapping[str, Positions], where: str) -> bool:
     return 2 * len(shared) >= min(map(len, sets))
 
 
-def _step(numbers: Mapping[str, Positions]) -> int:
+def _step(numbers: Mapping[str, Ints]) -> int:
     first = min(int(n[0]) for n in numbers.values())
     offsets = np.concatenate([n - first for n in numbers.values()])
     return int(np.gcd.reduce(offsets)) or 1
 
 
-def _by_numbers(numbers: Mapping[str, Positions]) -> tuple[dict[str, Positions], list[str]]:
+def _by_numbers(numbers: Mapping[str, Ints]) -> tuple[dict[str, Ints], list[str]]:
     step, first = _step(numbers), min(int(n[0]) for n in numbers.values())
     count = max(int(n[-1] - first) // step + 1 for n in numbers.values())
     notes = [f"the names of the images count in steps of {step}"] if step > 1 else []
@@ -97,15 +96,15 @@ def _by_numbers(numbers: Mapping[str, Positions]) -> tuple[dict[str, Positions],
     return positions, notes
 
 
-def _in_order(counts: Mapping[str, int]) -> tuple[dict[str, Positions], list[str]]:
+def _in_order(counts: Mapping[str, int]) -> tuple[dict[str, Ints], list[str]]:
     frames = np.arange(max(counts.values()), dtype=np.int64)
     positions = {name: np.where(frames < count, frames, -1) for name, count in counts.items()}
     return positions, [note for name, p in positions.items() for note in _missing_note(name, p)]
 
 
 def _by_missing(
-    sources: Mapping[str, FrameSource], missing: Mapping[str, NDArray[np.bool_]], where: str
-) -> tuple[dict[str, Positions], list[str]]:
+    sources: Mapping[str, FrameSource], missing: Mapping[str, Bools], where: str
+) -> tuple[dict[str, Ints], list[str]]:
     positions, notes = {}, []
     for name, source in sources.items():
         gone = missing[name]
@@ -126,7 +125,7 @@ def _by_missing(
     return positions, notes
 
 
-def _missing_note(camera: str, positions: Positions) -> list[str]:
+def _missing_note(camera: str, positions: Ints) -> list[str]:
     gone = np.flatnonzero(positions < 0)
     if not gone.size:
         return []

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError, suggestion
 from telerig.io.dataset.frame_pairing import Pairing, pair_frames
 from telerig.io.dataset.run_tables import (
@@ -28,10 +29,6 @@ from telerig.io.images.video import VIDEO_EXTENSIONS
 from telerig.io.rig_file.description import RigDescription, camera_named
 from telerig.io.rig_file.rig_file import read_rig_toml
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 RunSource = Literal["images", "detections"]
 
 
@@ -63,9 +60,7 @@ class RunData:
     notes: list[str] = field(default_factory=list)
     skip_unreadable: bool | None = None
     sources: Mapping[str, FrameSource] = field(default_factory=dict, repr=False, compare=False)
-    positions: Mapping[str, NDArray[np.int64]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
+    positions: Mapping[str, Ints] = field(default_factory=dict, repr=False, compare=False)
 
     def image(self, camera: str | int, frame: int) -> Image | None:
         """(height, width) as stored; None when the frame is missing in that camera.
@@ -253,7 +248,7 @@ def _open_sources(folder: Path, names: list[str]) -> dict[str, FrameSource]:
 
 def _paired(
     folder: Path, sources: Mapping[str, FrameSource], pair_by: Pairing, notes: list[str]
-) -> dict[str, NDArray[np.int64]]:
+) -> dict[str, Ints]:
     file, missing = folder / "frames.csv", None
     if file.is_file():
         table = read_frames_csv(file, None, list(sources))
@@ -329,7 +324,7 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
     return np.asarray(at, float)
 
 
-def _outside_record(t_s: Array, outside: NDArray[np.int64]) -> str:
+def _outside_record(t_s: Array, outside: Ints) -> str:
     """Which frames lie outside the stage's record, in words."""
     first, last = int(outside[0]), int(outside[-1])
     frames = f"frame {first}" if outside.size == 1 else f"{outside.size} frames ({first} to {last})"

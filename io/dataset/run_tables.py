@@ -8,11 +8,12 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.dataset.tables import (
     COVARIANCE,
@@ -23,10 +24,6 @@ from telerig.io.dataset.tables import (
 )
 from telerig.io.files.csv_table import Column, Rows, read_table, rows_of
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 Sizes = Mapping[str, tuple[int, int]]
 
 DETECTION_SIGMA_PX = 0.5
@@ -68,7 +65,7 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
 def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> None:
     frame, expected = table["frame"].to_numpy(), np.arange(len(table))
 
-    def refuse(bad: NDArray[np.bool_], what: Callable[[int], str], todo: str) -> None:
+    def refuse(bad: Bools, what: Callable[[int], str], todo: str) -> None:
         rows.refuse(bad, "frame", lambda i: f"is {frame[i]}{what(i)}", todo)
 
     again = table.duplicated("frame").to_numpy()

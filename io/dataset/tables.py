@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import pandas as pd
 
 from telerig.errors import InputError, suggestion
 from telerig.io.files.csv_table import Column, read_table, rows_of
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.rig.target import Target
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 AnySource = TypeVar("AnySource", bound=str)
 

@@ -10,16 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import atomic_path
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _EXPORT = "export the table as comma-separated UTF-8 with one header line"
 
@@ -47,8 +46,6 @@ def read_table(
     in ``columns`` are kept as well, as numbers if all their cells are. Raises InputError for a
     missing or unknown column, a cell that is not a finite number, a ragged row, an empty table.
     """
-    import pandas as pd
-
     file = Path(path)
     header, content, numbers = _cells(file)
     _check_header(header, columns, extra, file)
@@ -84,9 +81,7 @@ class Rows:
     file: Path
     numbers: Any
 
-    def refuse(
-        self, bad: NDArray[np.bool_], column: str, what: str | Callable[[int], str], todo: str
-    ) -> None:
+    def refuse(self, bad: Bools, column: str, what: str | Callable[[int], str], todo: str) -> None:
         """Raise InputError for the first of the ``bad`` rows, naming the others; or do nothing.
 
         what : what is wrong, or a function that says it for the position of a row in the table.
@@ -179,7 +174,7 @@ def _text(cells: Sequence[str], column: Column, rows: Rows) -> Any:
     return np.array([cell.strip() for cell in cells], dtype=object)
 
 
-def _number(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[np.float64]:
+def _number(cells: Sequence[str], column: Column, rows: Rows) -> Array:
     values = _floats(cells)
     bad = ~np.isfinite(values)
     if column.blank and bad.any():
@@ -210,7 +205,7 @@ def _extra(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
     return np.array(cells, dtype=object) if np.any(unreadable) else values
 
 
-def _floats(cells: Sequence[str]) -> NDArray[np.float64]:
+def _floats(cells: Sequence[str]) -> Array:
     """NaN for what is no number; Python's own conversion keeps every digit."""
     try:
         if "_" not in "".join(cells):

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.images.read import (
     Image,
@@ -47,7 +48,7 @@ class FrameSource(Protocol):
     def where(self, position: int) -> str:
         """File and frame, for errors."""
 
-    def numbers(self) -> NDArray[np.int64] | None:
+    def numbers(self) -> Ints | None:
         """(N,) what the names count, increasing; None when they do not count."""
 
 
@@ -71,7 +72,7 @@ class ImageFiles:
     def where(self, position: int) -> str:
         return str(self.path / self.names[position])
 
-    def numbers(self) -> NDArray[np.int64] | None:
+    def numbers(self) -> Ints | None:
         """The last number in each name, when the rest of the names is alike."""
         parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", Path(n).stem) for n in self.names]
         if not all(parts) or len({(m[1], m[3]) for m in parts if m}) != 1:
@@ -103,7 +104,7 @@ class PageFrames:
     def where(self, position: int) -> str:
         return f"{self.path} (page {position}, from 0)"
 
-    def numbers(self) -> NDArray[np.int64] | None:
+    def numbers(self) -> Ints | None:
         return None
 
     def read(self, position: int) -> Image:
@@ -178,7 +179,7 @@ def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
     return _Stack(int(page.dataoffsets[0]), count, (page.imagelength, page.imagewidth), dtype)
 
 
-def _page_offsets(path: Path) -> tuple[NDArray[np.int64], bool]:
+def _page_offsets(path: Path) -> tuple[Ints, bool]:
     """Where each page's header begins, and whether the chain of headers leads out of the file."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
@@ -207,7 +208,7 @@ def _page_offsets(path: Path) -> tuple[NDArray[np.int64], bool]:
     return _found(offsets, path), False
 
 
-def _found(offsets: list[int], path: Path) -> NDArray[np.int64]:
+def _found(offsets: list[int], path: Path) -> Ints:
     if not offsets:
         raise damaged(path, "it has no complete page")
     return np.array(offsets, np.int64)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
-Array = NDArray[np.float64]
+from telerig.arrays import Array, Ints
+
 Window = tuple[slice, slice]
-Index = NDArray[np.int64]
 
 
 def cell_coverage(polygon: Array, size: tuple[int, int]) -> Array:
@@ -52,7 +51,7 @@ def _pieces(polygon: Array) -> tuple[Array, Array]:
     )
 
 
-def _crossings(start: Array, step: Array) -> tuple[Index, Array]:
+def _crossings(start: Array, step: Array) -> tuple[Ints, Array]:
     """Which edges cross a whole number, and at which share of their length."""
     low = np.ceil(np.minimum(start, start + step)).astype(np.int64)
     high = np.floor(np.maximum(start, start + step)).astype(np.int64)

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Float32
 from telerig.errors import InputError
 
-Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+Image = NDArray[np.uint8] | NDArray[np.uint16] | Float32
 
 EXTENSIONS = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
@@ -229,7 +230,7 @@ def _native(pixels: NDArray[Any], file: Path) -> Image:
     )
 
 
-def _finite(pixels: NDArray[Any], file: Path) -> NDArray[np.float32]:
+def _finite(pixels: NDArray[Any], file: Path) -> Float32:
     bad = np.argwhere(~np.isfinite(pixels))
     if len(bad):
         row, column = bad[0]

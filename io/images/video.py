@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.images.read import Image, image_from_pixels
 
@@ -41,7 +42,7 @@ class VideoFrames:
     def where(self, position: int) -> str:
         return f"{self.path} (frame {position}, from 0)"
 
-    def numbers(self) -> NDArray[np.int64] | None:
+    def numbers(self) -> Ints | None:
         return None
 
     def read(self, position: int) -> Image:
@@ -101,7 +102,7 @@ class _Decoder:
         return time if self._last == -(1 << 62) else self._last + step
 
 
-def _frame_times(container: Any, path: Path) -> tuple[NDArray[np.int64], bool]:
+def _frame_times(container: Any, path: Path) -> tuple[Ints, bool]:
     """(N,) presentation times in order, from the packets alone; whether the file breaks off."""
     times: list[int] = []
     cut = False

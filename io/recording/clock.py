@@ -18,11 +18,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
+from telerig.arrays import Array, Bools, Ints
 
 RESTART_S = 0.5
 """A stamp that differs by more from the expected one belongs to another count."""

@@ -8,12 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol as Interface
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.io.rig_file.description import DeviceDescription, Kind
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LONGEST_LINE = 4096
 """More bytes than this without an end of line are malformed."""

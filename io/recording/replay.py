@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.io.recording.clock import ClockFit, host_times
 from telerig.io.recording.log import (
     END,
@@ -23,10 +24,6 @@ from telerig.io.recording.log import (
 )
 from telerig.io.recording.protocols import Readings, parser
 from telerig.io.rig_file.description import DeviceDescription
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 GAP_INTERVALS = 1.5
 """A step longer than so many usual ones is a gap."""

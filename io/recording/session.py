@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.recording.log import END, LOST, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.ports import open_port
@@ -63,7 +63,7 @@ class DeviceStatus:
         if device.poll is None and "t" in found.values and len(found.arrived_ns):
             self._count_gaps(found.values["t"], 2.0**device.time_bits if device.time_bits else 0.0)
 
-    def _count_gaps(self, stamps: NDArray[np.float64], wrap: float) -> None:
+    def _count_gaps(self, stamps: Array, wrap: float) -> None:
         steps = np.diff(np.concatenate([[self._last], stamps]))
         steps = np.mod(steps, wrap) if wrap else steps
         steps = steps[np.isfinite(steps) & (steps > 0)]

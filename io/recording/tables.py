@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.recording.frames import FrameTimes, frame_times
 from telerig.io.recording.log import damaged_bytes
 from telerig.io.recording.replay import GAP_INTERVALS, TIME_DIGITS, DeviceRecord, Replay, replay
-
-Array = NDArray[np.float64]
 
 _ROWS = 20_000
 _LISTED_GAPS = 200

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
 Picture = NDArray[np.uint8]
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 GREEN, RED, PAPER, INK = (40, 200, 70), (235, 45, 45), (255, 255, 255), (30, 30, 30)
@@ -137,7 +134,7 @@ def _write_indices(
     labels: Iterable[str],
     factor: float,
     colour: Colour,
-    taken: NDArray[np.bool_],
+    taken: Bools,
 ) -> None:
     """Each label in the middle of its ellipse, else at an end of the long axis, if there is room.
 
@@ -161,7 +158,7 @@ def write_label(
     label: str,
     centre: Array,
     colour: Colour,
-    taken: NDArray[np.bool_],
+    taken: Bools,
 ) -> bool:
     """Write text round a point, with a dark rim, unless other text is there; whether it was."""
     import cv2
@@ -318,7 +315,7 @@ def _write_beside(
     label: str,
     factor: float,
     colour: Colour,
-    taken: NDArray[np.bool_],
+    taken: Bools,
 ) -> None:
     points = (_finite(outline) + 0.5) * factor
     if not label or not len(points):

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, field_serializer, model_validator
 
+from telerig.arrays import Array
 from telerig.errors import InputError, TelerigError
 from telerig.io.files.csv_table import Column
 from telerig.io.results.record import (
@@ -29,8 +29,6 @@ from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import intrinsics_from
 from telerig.rig.windows import Wall
-
-Array = NDArray[np.float64]
 
 _AGAIN = "calibrate again (`telerig calibrate`), or name the right results folder"
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator, ValidationError
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import plain, write_json_atomic
 
@@ -44,7 +45,7 @@ def _checked_array(*shape: int | None, kind: type = float) -> Callable[[Any], ND
 
 
 _as_list = PlainSerializer(lambda array: array.tolist())
-_Floats = NDArray[np.float64]
+_Floats = Array
 Vector3 = Annotated[_Floats, PlainValidator(_checked_array(3)), _as_list]
 Points3 = Annotated[_Floats, PlainValidator(_checked_array(None, 3)), _as_list]
 Matrix2 = Annotated[_Floats, PlainValidator(_checked_array(2, 2)), _as_list]
@@ -52,7 +53,7 @@ Matrix3 = Annotated[_Floats, PlainValidator(_checked_array(3, 3)), _as_list]
 Matrix3x2 = Annotated[_Floats, PlainValidator(_checked_array(3, 2)), _as_list]
 Square = Annotated[_Floats, PlainValidator(_checked_array(None, None)), _as_list]
 Numbers = Annotated[_Floats, PlainValidator(_checked_array(None)), _as_list]
-Wholes = Annotated[NDArray[np.int64], PlainValidator(_checked_array(None, kind=np.int64)), _as_list]
+Wholes = Annotated[Ints, PlainValidator(_checked_array(None, kind=np.int64)), _as_list]
 
 
 class Part(BaseModel):

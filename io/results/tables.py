@@ -5,22 +5,18 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from telerig.io.files.csv_table import Column, read_table
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 def optional_columns(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
     """As `read_columns`; an empty table where there is no file."""
     if file.is_file():
         return read_columns(file, columns)
-    import pandas as pd
-
     always = [c.name for c in columns if c.required or c.kind == "text"]
     return _typed(pd.DataFrame({name: [] for name in always}), columns)
 
@@ -41,8 +37,6 @@ def read_columns(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
 
 def _quick(file: Path, columns: Sequence[Column]) -> pd.DataFrame | None:
     """None for anything unusual."""
-    import pandas as pd
-
     try:
         content = file.read_bytes()
         header = content.split(b"\n", 1)[0].decode("utf-8-sig").strip().split(",")

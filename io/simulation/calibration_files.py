@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.io.files.atomic import write_json_atomic
@@ -29,11 +30,6 @@ from telerig.io.simulation.images.sensor import digitise
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 TRUTH_SCHEMA = 1
 
@@ -96,8 +92,6 @@ def exact_dots(
 
     `inside` is 1 where the whole dot lies in the image, ``border_px`` off its border.
     """
-    import pandas as pd
-
     row, column = config.target.row_column_from_id(target.ids)
     tables = []
     for view in views:

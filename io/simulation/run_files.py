@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+from numpy.random import Generator
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.io.files.atomic import plain, write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.rig_file.description import (
@@ -35,12 +38,9 @@ from telerig.io.simulation.stage_axis import write_stage_axis
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import pandas as pd
-    from numpy.random import Generator
-
     Writer = Callable[[str, int, NDArray[Any]], None]
 
-Array = NDArray[np.float64]
+
 Views = dict[str, CameraView]
 
 RUN_TRUTH_SCHEMA = 1
@@ -119,11 +119,9 @@ def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
 
 
 def _write_clocks_and_sensors(
-    scene: RunScene, run: Path, lost: NDArray[np.bool_], rng: Generator, *, marks: bool
+    scene: RunScene, run: Path, lost: Bools, rng: Generator, *, marks: bool
 ) -> None:
     """marks : False where the marks are in the images, to be found there."""
-    import pandas as pd
-
     encoder_rng, accelerometer_rng, mark_rng = rng.spawn(3)
     run.mkdir(parents=True, exist_ok=True)
     frames = pd.DataFrame({"frame": np.arange(scene.config.frames), "t_s": scene.t_s})
@@ -138,7 +136,7 @@ def _write_clocks_and_sensors(
         write_table(references_table(scene, mark_rng), run / "references.csv")
 
 
-def _lost_frames(scene: RunScene, rng: Generator) -> NDArray[np.bool_]:
+def _lost_frames(scene: RunScene, rng: Generator) -> Bools:
     """(C, F) frames that a camera drops; each camera keeps its first one."""
     lost = rng.random((len(scene.cameras), scene.config.frames)) < scene.config.image.dropped
     lost[:, 0] = False
@@ -283,8 +281,6 @@ def _detected(
 
 
 def _joined(parts: list[dict[str, Any]]) -> pd.DataFrame:
-    import pandas as pd
-
     if not parts:
         return pd.DataFrame()
     return pd.DataFrame({key: np.concatenate([part[key] for part in parts]) for key in parts[0]})
@@ -295,10 +291,8 @@ def _write_truth(
     folder: Path,
     seed: dict[str, Any],
     rows: list[dict[str, Any]],
-    lost: NDArray[np.bool_],
+    lost: Bools,
 ) -> None:
-    import pandas as pd
-
     write_table(_joined(rows), folder / "bubbles.csv")
     columns: dict[str, Any] = {
         "frame": np.arange(scene.config.frames),

@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
@@ -18,8 +19,6 @@ from telerig.io.simulation.config import RunConfig
 from telerig.io.simulation.run.scene import AXIS_RIG
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-
-Array = NDArray[np.float64]
 
 _LEAST_VIEWS = 3
 _TRIES = 50
@@ -41,8 +40,6 @@ def write_stage_axis(
     The travel is ``stage.axis_travel_mm``, or less where the target would leave the images.
     Raises InputError for fewer than three views, or when no pose keeps the target in them.
     """
-    import pandas as pd
-
     if config.stage.axis_views < _LEAST_VIEWS:
         raise InputError(
             f"axis_views is {config.stage.axis_views}",

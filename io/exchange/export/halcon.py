@@ -29,8 +29,9 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
 from telerig.io.files.atomic import atomic_folder
@@ -43,8 +44,6 @@ from telerig.rig.distortion import (
     undistort,
 )
 from telerig.rig.pose import Pose
-
-Array = NDArray[np.float64]
 
 PERSPECTIVE_PX = 0.5
 """A lens whose residual perspective moves a point of the volume by more is exported as such."""

@@ -14,16 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
 from telerig.io.files.atomic import atomic_path
 from telerig.rig.camera import Camera
 from telerig.rig.distortion import COEFFICIENTS
 from telerig.rig.projection import standing_wall
 from telerig.rig.windows import ideal_jacobians
-
-Array = NDArray[np.float64]
 
 _OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "", "", "", "s1", "s2", "s3", "s4")
 _POINTS_PER_EDGE = 25

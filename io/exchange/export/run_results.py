@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_table
 from telerig.io.results.smoothing import SmoothingFile
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 LAB = (
     "lab: axes of the rig frame, origin where the rig frame's origin is at stage position 0 and "
@@ -97,13 +94,11 @@ def unit_of(column: str) -> str:
     return next((unit for end, unit in _UNITS.items() if column.endswith(end)), "1")
 
 
-def numbered(points: pd.DataFrame) -> tuple[NDArray[np.int64], list[str]]:
+def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:
     """(N,) whole numbers for the particles, and their names in the order of these numbers.
 
     Ids that are whole numbers stay as they are, and there are no names.
     """
-    import pandas as pd
-
     if points["particle"].dtype.kind == "i":
         return points["particle"].to_numpy(np.int64), []
     codes, names = pd.factorize(points["particle"])

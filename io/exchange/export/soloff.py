@@ -13,13 +13,11 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
 from telerig.io.files.atomic import atomic_folder, write_text_atomic
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
 
 POWERS = (
     (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1),

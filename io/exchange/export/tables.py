@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from telerig.errors import InputError
 from telerig.io.exchange.export.opencv import undistorted_matrix
@@ -16,9 +17,6 @@ from telerig.io.files.csv_table import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.projection import PARAMETERS
 from telerig.rig.windows import Wall
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 def write_hdf5(

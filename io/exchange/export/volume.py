@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

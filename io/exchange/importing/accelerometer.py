@@ -12,19 +12,16 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.text import read_text
 from telerig.io.files.csv_table import write_table
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "g": STANDARD_GRAVITY_M_S2,
@@ -61,8 +58,6 @@ def read_accelerations(
     sensor : its name in rig.toml. Raises InputError, naming the file and what it holds, when a
     channel, the times or the unit are missing, or a value is not a finite number.
     """
-    import pandas as pd
-
     layout = layout or Layout()
     recording = open_recording(Path(path), layout.group)
     names = _channels(recording, layout.channels)
@@ -81,8 +76,6 @@ def merge_accelerations(table: pd.DataFrame, path: str | PathLike[str]) -> list[
     Returns the names of the sensors whose readings were replaced. Raises InputError when the file
     that is there cannot be read, or the new one not written.
     """
-    import pandas as pd
-
     from telerig.io.dataset.run_tables import read_accelerometer_csv
 
     file = Path(path)

@@ -11,13 +11,11 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
 from telerig.io.exchange.importing.text import read_text
-
-Array = NDArray[np.float64]
 
 _LINES = ("calibration error", "pose error", "image size", "camera matrix", "camera matrix",
           "camera matrix", "distortion coefficients", "rotation vector", "rotation matrix",

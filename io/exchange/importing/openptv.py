@@ -15,8 +15,8 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
 from telerig.io.exchange.importing.text import read_text
@@ -24,8 +24,6 @@ from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.distortion import distort
 from telerig.rig.pose import Pose, rotation_from_rotvec
-
-Array = NDArray[np.float64]
 
 WORST_FIT_PX = 0.5
 """A camera whose distortion cannot be fitted better than this is refused."""

@@ -17,14 +17,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, nearest_rotation
-
-Array = NDArray[np.float64]
 
 _SHEAR_BESIDE_DISTORTION = 1e-5
 _RATIONAL, _TILT = slice(5, 8), slice(12, 14)

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
+from telerig.arrays import Ints
 from telerig.io.recording.protocols import poll_command
 from telerig.io.recording.simulated.signals import (
-    Ints,
     SimulatedDevice,
     answer,
     damage,

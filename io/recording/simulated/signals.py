@@ -7,13 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.io.recording.protocols import SYNC, xor_checksum
 from telerig.io.rig_file.description import DeviceDescription
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 TRAVEL_MM = 20.0
 PERIOD_S = 10.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.report.page.figures import (
     LEFT_OUT,
     MODEL,
@@ -17,8 +17,6 @@ from telerig.io.report.page.figures import (
     svg,
 )
 from telerig.io.report.page.number_format import number
-
-Array = NDArray[np.float64]
 
 _MESH = 40
 _MOST_SHAPES = 1500

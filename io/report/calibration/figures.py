@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.figures import (
     LEFT_OUT,
@@ -21,12 +22,6 @@ from telerig.io.report.page.figures import (
     svg,
 )
 from telerig.io.report.page.number_format import nice_below, number, short_names
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-
-Array = NDArray[np.float64]
 
 MOST_ARROWS = 1200
 _ARROW_CELLS = 24

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.calibration.rig import common_plane, draw_plan, plate_corners
 from telerig.io.report.page.figures import (
@@ -19,8 +19,6 @@ from telerig.io.report.page.figures import (
     drawing,
     svg,
 )
-
-Array = NDArray[np.float64]
 
 _MOST_MARKERS = 2000
 _GAP = 0.06

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import read_table
 from telerig.io.results.calibration import (
@@ -25,11 +26,6 @@ from telerig.io.results.calibration import (
 from telerig.io.results.run_record import RunFile
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 KEPT_WEIGHT = 0.5
 """A dot counts as kept above this weight."""
@@ -71,7 +67,7 @@ class CalibrationResults:
         return self.file.content()
 
     @property
-    def dot_ids(self) -> NDArray[np.int64]:
+    def dot_ids(self) -> Ints:
         """(N,)."""
         return self.file.target.dots
 
@@ -177,7 +173,7 @@ def _overlays(
     return {key: file for key, file in found.items() if file.is_file()}
 
 
-def _row_column(residuals: pd.DataFrame, dot_ids: NDArray[np.int64]) -> Array:
+def _row_column(residuals: pd.DataFrame, dot_ids: Ints) -> Array:
     known = residuals.drop_duplicates("dot").set_index("dot")[["row", "column"]]
     return known.reindex(dot_ids).to_numpy(float)
 

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.figures import MUTED, Picture, camera_colour, drawing, svg
 from telerig.io.report.page.number_format import short_names
 from telerig.io.report.page.scene import Trace, lines, scene_text, xyz
 from telerig.rig.camera import Camera
 from telerig.rig.projection import PARAMETERS
-
-Array = NDArray[np.float64]
 
 _BEFORE, _BEHIND = 1.7, 1.2
 """How far a drawn field reaches before and behind the poses, in radii of the poses."""

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.number_format import ABSENT, number, share, with_sd
@@ -17,8 +17,6 @@ from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
-
-Array = NDArray[np.float64]
 
 WORST = 15
 _MANY_SD = 3.0

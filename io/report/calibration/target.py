@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
 from telerig.io.report.page.figures import WIDTH_IN, Picture, drawing, svg
 from telerig.io.report.page.number_format import nice_below, number
-
-Array = NDArray[np.float64]
 
 _MOST_LABELS = 40
 _MOST_SHAPES = 1500

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column
 from telerig.io.machine.parallel import ordered_map, quick_workers
@@ -21,11 +22,6 @@ from telerig.io.report.run.tracking.results import TrackResults, read_track_resu
 from telerig.io.report.run.tracking.scene import thinned, track_colour
 from telerig.io.results.tables import optional_columns
 from telerig.rig.camera import Camera
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 STEP_DEG = 2
 MOST_POINTS = 3_000
@@ -88,9 +84,9 @@ class FilmPath:
 
     points_mm: Array
     sd_mm: Array
-    particle: NDArray[np.int64]
-    new: NDArray[np.bool_]
-    bodies: NDArray[np.int64]
+    particle: Ints
+    new: Bools
+    bodies: Ints
     quadrics_mm2: Array
     names: tuple[str, str, str]
     title: str
@@ -161,7 +157,7 @@ def _bodies(
     results: TrackResults,
     kept: pd.DataFrame,
     cameras: tuple[Camera, Camera] | None,
-) -> tuple[NDArray[np.int64], Array, str]:
+) -> tuple[Ints, Array, str]:
     """Rows of ``kept``, their quadrics in rig axes, and in words what is drawn."""
     here = kept[["frame", "particle"]].assign(row=np.arange(len(kept)))
     sizes = results.tracks[["frame", "particle", "d_eq_mm", *_PLACE]].merge(
@@ -514,9 +510,7 @@ def _draw_tracks(page: _Page, path: FilmPath, panel: Panel, matrix: Array, offse
             page.write(f"{path.particle[end]}", uv[end] + (8, 0), "lm", colour)
 
 
-def _shaded(
-    centres: Array, shapes: Array, particles: NDArray[np.int64]
-) -> tuple[Array, Array, Array]:
+def _shaded(centres: Array, shapes: Array, particles: Ints) -> tuple[Array, Array, Array]:
     """Three discs to a bubble as polygons (3 B, 48, 2), their face and their edge colours (RGBA).
 
     centres : (B, 2) px. shapes : (B, 2, 2), Q of the outlines x^T Q^-1 x = 1.

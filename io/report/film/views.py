@@ -6,21 +6,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Progress, font, write_film
 from telerig.io.results.tables import optional_columns
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
 Colour = tuple[int, int, int]

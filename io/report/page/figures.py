@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from telerig.arrays import Array
 
 CAMERA_COLOURS = ("#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0")
 KEPT, LEFT_OUT, MODEL, MUTED = "#1b7f3b", "#c62828", "#c62828", "#8a8f98"
@@ -112,8 +113,6 @@ def image_height_in(image_size_px: tuple[int, int], above_in: float = 0.0) -> fl
 def camera_colour(index: int) -> str:
     return CAMERA_COLOURS[index % len(CAMERA_COLOURS)]
 
-
-Array = NDArray[np.float64]
 
 SMOOTHED, NAIVE, RTS = "#1f5fa8", "#9aa0a8", "#c2570c"
 BAND_SDS = 2

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.report.page.figures import MUTED
 
-Array = NDArray[np.float64]
 Trace = dict[str, Any]
 
 _FEW_TICKS = 6

@@ -6,17 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _DIRECTIONS = 4000
 _TRIES = 2000
@@ -29,7 +26,7 @@ class TrueTarget:
     scale_distance_mm : the known distance as measured; None when the target has none.
     """
 
-    ids: NDArray[np.int64]
+    ids: Ints
     points_mm: Array
     diameter_mm: Array
     plate: Plate
@@ -122,7 +119,7 @@ def true_target(config: SimulationConfig, rng: np.random.Generator) -> TrueTarge
     return TrueTarget(ids, points, diameter, plate, _measured_distance(config, ids, points, rng))
 
 
-def _all_ids(config: SimulationConfig) -> NDArray[np.int64]:
+def _all_ids(config: SimulationConfig) -> Ints:
     target, margin = config.target, config.margin_dots
     if target.bounded:
         return target.ids()
@@ -134,7 +131,7 @@ def _all_ids(config: SimulationConfig) -> NDArray[np.int64]:
 
 
 def _measured_distance(
-    config: SimulationConfig, ids: NDArray[np.int64], points: Array, rng: np.random.Generator
+    config: SimulationConfig, ids: Ints, points: Array, rng: np.random.Generator
 ) -> float | None:
     if config.target.scale_dots is None:
         return None
@@ -214,7 +211,7 @@ def _visible_pose(
     )
 
 
-def _block_ids(config: SimulationConfig) -> NDArray[np.int64]:
+def _block_ids(config: SimulationConfig) -> Ints:
     target = config.target
     if target.bounded:
         return target.ids()

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 
-if TYPE_CHECKING:
-    from numpy.random import Generator
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+from telerig.arrays import Array, Float32
 
 _WAVES = 14
 _SPECK_REACH = 3.5

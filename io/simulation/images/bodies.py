@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
 
 MODES = tuple((degree, order) for degree in (2, 3, 4) for order in range(-degree, degree + 1))
 """(degree, order) of each coefficient; negative orders are the sine ones."""

@@ -11,14 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Float32, Ints
 from telerig.io.images.outline_raster import cell_coverage, overlap, pixel_weights, refined
 from telerig.io.simulation.images.backlight import Screen, Specks
 from telerig.io.simulation.images.bodies import outline_moments
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 CELLS = 4
 """Fine cells per pixel and direction."""
@@ -127,7 +124,7 @@ def absorption_patch(bubble: Silhouette) -> Patch:
     return Patch(int(first[1]) - pad, int(first[0]) - pad, total)
 
 
-def _inside(bubble: Silhouette, first: NDArray[np.int64], count: NDArray[np.int64]) -> Float32:
+def _inside(bubble: Silhouette, first: Ints, count: Ints) -> Float32:
     """(cells_v, cells_u) transmission behind the outline, at the fine cells' centres."""
     _, centre, second = outline_moments(bubble.outline_px)
     values, vectors = np.linalg.eigh(second)

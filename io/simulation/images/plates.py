@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.io.images.outline_raster import overlap, pixel_weights
 from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate, plate_from_pixel
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-
-Array = NDArray[np.float64]
 
 SUPERSAMPLING = 8
 """Cells per pixel and direction; cells on an outline are cut by its tangent besides."""
@@ -99,7 +97,7 @@ def disc_coverage(
 
 def _near_image(
     camera: Camera, pose: Pose, plate: Plate, centres: Array, diameter: Array, blur_px: float
-) -> NDArray[np.bool_]:
+) -> Bools:
     """(N,) whether a disc can reach the image; decided on the plate, never by far projections."""
     width, height = camera.image_size_px
     edge = np.linspace(0, 1, 9)
@@ -113,7 +111,7 @@ def _near_image(
 
 def _windows(
     camera: Camera, pose: Pose, plate: Plate, centres: Array, diameter: Array
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Ints, Ints]:
     """(N, 2) first pixel and (N, 2) number of pixels of the box round each disc, as (u, v)."""
     angle = np.arange(_RIM) * 2 * np.pi / _RIM
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM)], -1)
@@ -128,8 +126,8 @@ def _window_nodes(
     pose: Pose,
     plate: Plate,
     centres: Array,
-    first: NDArray[np.int64],
-    count: NDArray[np.int64],
+    first: Ints,
+    count: Ints,
 ) -> Array:
     """(N, 2, nodes, nodes) x, y from each disc's centre, at Chebyshev nodes of its window."""
     along = (first[:, None, :] - 0.5) + count[:, None, :] * (1 + _chebyshev(_NODES)[:, None]) / 2
@@ -139,7 +137,7 @@ def _window_nodes(
     return np.moveaxis(xy - centres[:, None, None, :2], -1, 1)
 
 
-def _cell_coverage(nodes: Array, size: NDArray[np.int64], radius_mm: float) -> Array:
+def _cell_coverage(nodes: Array, size: Ints, radius_mm: float) -> Array:
     """(cells_v, cells_u) share of every cell of a window that lies in the disc."""
     columns, rows = _interpolation(int(size[0])), _interpolation(int(size[1]))
     x, y = rows @ nodes @ columns.T

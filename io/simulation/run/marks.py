@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
+from numpy.random import Generator
 
+from telerig.arrays import Array, Ints
 from telerig.io.simulation.config import MARKS_AT, MARKS_JITTER
 from telerig.io.simulation.images.bubbles import Look, Silhouette
 from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
 from telerig.rig.camera import Camera
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from numpy.random import Generator
-
-Array = NDArray[np.float64]
 
 _OUTLINE_POINTS = 128
 
@@ -32,7 +27,7 @@ class Strip:
     diameter_mm: float
     look: Look
 
-    def seen(self, rig_from_lab_mm: Array) -> tuple[NDArray[np.int64], Array]:
+    def seen(self, rig_from_lab_mm: Array) -> tuple[Ints, Array]:
         """Numbers of the dots that reach into the image, and their (M, 2) centres in px."""
         rig = self.lab_mm + rig_from_lab_mm
         size = np.array(self.camera.image_size_px) - 1
@@ -110,8 +105,6 @@ def references_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
     Each camera has a strip of its own, at unknown uneven heights, so many in view at a time as
     the configuration says.
     """
-    import pandas as pd
-
     table = scene.config.table
     parts = []
     for j, (name, camera) in enumerate(scene.cameras.items()):
@@ -137,8 +130,6 @@ def strip_truth(scene: RunScene, strips: Sequence[Strip]) -> pd.DataFrame:
     frame, camera, dot (its number in that camera's strip), u_px, v_px of the projected centre,
     x_lab_mm, y_lab_mm, z_lab_mm, and whole: 1 when no part of it lies outside the image.
     """
-    import pandas as pd
-
     parts = []
     for j, (name, strip) in enumerate(zip(scene.cameras, strips)):
         size = np.array(strip.camera.image_size_px) - 1

@@ -8,17 +8,13 @@ lead with the path: (paths, steps, states). Heights are along the stage's axis, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.random import Generator
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import InputError
-
-if TYPE_CHECKING:
-    from numpy.random import Generator
-
-Array = NDArray[np.float64]
 
 POSITION, VELOCITY = 0, 1
 """Places of these states in every process below."""

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 
+from telerig.arrays import Array
 from telerig.io.simulation.config import BubbleConfig, Range
 from telerig.io.simulation.images.bodies import MODES
 from telerig.io.simulation.images.bubbles import Look
-
-if TYPE_CHECKING:
-    from numpy.random import Generator
-
-Array = NDArray[np.float64]
 
 _SURFACE_TENSION_N_M = 0.072
 _DENSITY_KG_M3 = 998.0

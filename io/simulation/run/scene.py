@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.simulation.config import MotionConfig, RunConfig
 from telerig.io.simulation.images.bodies import Bodies, bodies_about
@@ -27,11 +27,6 @@ from telerig.io.simulation.run.motion import (
 )
 from telerig.io.simulation.run.population import Population, random_population
 from telerig.rig.camera import Camera
-
-if TYPE_CHECKING:
-    from numpy.random import Generator
-
-Array = NDArray[np.float64]
 
 AXIS_RIG = np.array([0.0, -1.0, 0.0])
 """True travel of the stage in rig axes: upwards."""
@@ -101,7 +96,7 @@ class RunScene:
         """(3,) to add to a lab point to have it where a camera sees it, in rig axes."""
         return np.asarray(-AXIS_RIG * self.position_mm[frame] - self.shake_mm[camera, frame])
 
-    def bodies_lab(self, frame: int, chosen: NDArray[np.int64]) -> Bodies:
+    def bodies_lab(self, frame: int, chosen: Ints) -> Bodies:
         """Some of the bubbles, (M,), in the lab frame."""
         population, t = self.population, self.t_s[frame]
         swing = np.cos(2 * np.pi * population.swing_hz[chosen] * t + population.swing_rad[chosen])

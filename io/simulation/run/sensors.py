@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
+from numpy.random import Generator
 
 from telerig.io.rig_file.description import CARRIAGE
 from telerig.io.simulation.run.motion import accelerometer_readings
 from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
 
-if TYPE_CHECKING:
-    import pandas as pd
-    from numpy.random import Generator
-
-Array = NDArray[np.float64]
-
 
 def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
     """`stage.csv`: the carriage, servo error included, with the encoder's noise."""
-    import pandas as pd
-
     carriage, stage = scene.carriage, scene.config.stage
     step = _thinning(scene, stage.encoder_rate_hz)
     position = carriage.position_mm[::step]
@@ -32,8 +25,6 @@ def stage_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
 
 def accelerometer_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
     """`accelerometer.csv`: sensors on the carriage or on camera arms, axes those of the rig."""
-    import pandas as pd
-
     carriage, stage = scene.carriage, scene.config.stage
     step = _thinning(scene, stage.accelerometer_rate_hz)
     t = carriage.t_s[::step]

@@ -6,15 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.io.simulation.images.bodies import outline_moments, outline_px
 from telerig.io.simulation.images.bubbles import Silhouette
 from telerig.io.simulation.run.scene import AXIS_RIG, RunScene
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _EDGE_PX = 0.5
 
@@ -29,7 +26,7 @@ class CameraView:
     visible, whole, overlap : (M,) some of it in the image, all of it, outline crossed by another.
     """
 
-    particle: NDArray[np.int64]
+    particle: Ints
     outline_px: Array
     centre_px: Array
     silhouette_px: Array
@@ -94,7 +91,7 @@ def camera_view(scene: RunScene, frame: int, index: int) -> CameraView:
     )
 
 
-def _near(camera: Camera, points_mm: Array, d_eq_mm: Array) -> NDArray[np.int64]:
+def _near(camera: Camera, points_mm: Array, d_eq_mm: Array) -> Ints:
     """Bubbles that may reach the image; by linear projection, as far points may not project."""
     at_centre, slope = linear_projection(camera)
     uv = at_centre + points_mm @ slope.T
@@ -168,7 +165,7 @@ def truth_rows(scene: RunScene, frame: int, views: dict[str, CameraView]) -> dic
     return columns
 
 
-def _camera_columns(name: str, view: CameraView, particle: NDArray[np.int64]) -> dict[str, Any]:
+def _camera_columns(name: str, view: CameraView, particle: Ints) -> dict[str, Any]:
     place = {int(k): i for i, k in enumerate(view.particle)}
     rows = np.array([place.get(int(k), -1) for k in particle], int)
     known = rows >= 0

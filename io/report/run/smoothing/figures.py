@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array
 from telerig.io.report.page.figures import (
     CAMERA_COLOURS,
     LEFT_OUT,
@@ -39,10 +40,6 @@ from telerig.io.report.run.smoothing.results import AXES, PLACE, SPEED, Smoothin
 from telerig.io.report.run.tracking.numbers import median, rms
 from telerig.io.report.run.tracking.scene import track_colour
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
 PLACES = ("lab", "taken", "velocity", "shake", "spectra", "white")
 """Sections that hold drawings."""
 
@@ -69,8 +66,6 @@ def smoothing_drawings(results: SmoothingResults) -> list[tuple[str, Callable[[]
     judged = known_parts(results, "whiteness", "expected")
     return [*drawings, *([("white", partial(autocorrelation, results))] if judged else [])]
 
-
-Array = NDArray[np.float64]
 
 _MOST_BUBBLES = 60
 _FEW = 3

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array
 from telerig.io.report.run.smoothing.results import AXES, PLACE, SPEED, SmoothingResults
 from telerig.io.report.run.tracking.numbers import median, rms
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 LEAST_FRAMES = 32
 _LONGEST_SEGMENT = 1024

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.results.smoothing import (
     AXES,
@@ -23,11 +24,6 @@ from telerig.io.results.smoothing import VELOCITY as SPEED
 from telerig.io.results.tables import read_columns
 
 __all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 _ALONG = 0.9
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from telerig.io.report.page.number_format import (
     ABSENT,
@@ -445,8 +444,6 @@ def _owner(name: str, value: str, cameras: Sequence[str]) -> str:
     except ValueError:
         return value or "none"
 
-
-Array = NDArray[np.float64]
 
 WHITENESS_HEADS = ["camera", "residuals are", "next frame", "RMS, sigmas", "p"]
 _LARGER, _SMALLER = 1.25, 0.8

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.tracking import POINT, SILHOUETTES
@@ -40,13 +40,13 @@ def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Came
     )  # fmt: skip
 
 
-def pair_pixels(results: TrackResults, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+def pair_pixels(results: TrackResults, rows: Ints) -> list[Array]:
     """Per camera (N, 2), the outlines' centres."""
     return [results.tracks[[f"{c}_u_px", f"{c}_v_px"]].to_numpy(float)[rows]
             for c in results.cameras]  # fmt: skip
 
 
-def paired_rows(results: TrackResults) -> NDArray[np.int64]:
+def paired_rows(results: TrackResults) -> Ints:
     """Rows of tracks.csv that both cameras measured."""
     every = np.arange(len(results.tracks))
     good = np.isfinite(results.tracks["ray_miss_mm"].to_numpy(float))

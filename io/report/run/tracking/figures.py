@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.io.report.page.figures import (
     KEPT,
     LEFT_OUT,
@@ -24,8 +24,6 @@ from telerig.io.report.page.number_format import number, share
 from telerig.io.report.run.tracking.numbers import learnt_sd_mm, median, per_frame, ray_miss_sd_mm
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.report.run.tracking.scene import MANY_POINTS, SHADES, draw_tracks, thinned
-
-Array = NDArray[np.float64]
 
 _MOST_POINTS = 8_000
 _MOST_BINS = 400
@@ -81,7 +79,7 @@ def bubbles_in_time(results: TrackResults) -> Picture:
     return Picture("Bubbles per frame", source, caption)
 
 
-def _means(counts: NDArray[np.int64], edges: NDArray[np.int64]) -> Array:
+def _means(counts: Ints, edges: Ints) -> Array:
     if not len(counts):
         return np.zeros(len(edges) - 1)
     return np.asarray(np.add.reduceat(counts, edges[:-1]) / np.diff(edges))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.io.report.run.tracking.results import TrackResults
-
-Array = NDArray[np.float64]
 
 _MOST_ROWS = 20_000
 _LEAST_SPREAD_MM = 0.1
@@ -109,7 +107,7 @@ def frame_count(results: TrackResults) -> int:
     return max(results.file.frames or 0, seen)
 
 
-def per_frame(results: TrackResults) -> dict[str, NDArray[np.int64]]:
+def per_frame(results: TrackResults) -> dict[str, Ints]:
     """Bubbles in each frame (F,): by camera, and "both" for those with a place in space."""
     frames = frame_count(results)
     found = results.detections
@@ -120,6 +118,6 @@ def per_frame(results: TrackResults) -> dict[str, NDArray[np.int64]]:
     return counts | {"both": np.bincount(results.tracks["frame"], minlength=frames)}
 
 
-def track_lengths(results: TrackResults) -> NDArray[np.int64]:
+def track_lengths(results: TrackResults) -> Ints:
     """(K,) points of each track."""
     return np.asarray(results.tracks["particle"].value_counts().to_numpy(np.int64))

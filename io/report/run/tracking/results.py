@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import pandas as pd
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.results.run_record import RunFile
 from telerig.io.results.tables import optional_columns, read_columns
@@ -22,11 +24,6 @@ from telerig.io.results.tracking import (
     TrackingFile,
     tracks_columns,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 UP = (0.0, -1.0, 0.0)
 """In the rig frame, where tracking.json has no ``up``."""

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from telerig.arrays import Array
 from telerig.io.report.page.figures import Picture, drawing, png, svg
 from telerig.io.report.page.scene import Trace, lines, scene_text
 from telerig.io.report.run.tracking.results import TrackResults
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
 
 TRACK_COLOURS = (
     "#1f5fa8", "#c2570c", "#2e7d32", "#7b3fa0", "#a8324a", "#0f8a8a", "#8a6d00", "#5b4a42",

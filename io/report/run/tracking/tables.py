@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.io.report.page.number_format import ABSENT, number, sentence, share
 from telerig.io.report.page.page import Figure, Row
 from telerig.io.report.run.tracking.numbers import (
@@ -22,8 +22,6 @@ from telerig.io.report.run.tracking.numbers import (
     track_lengths,
 )
 from telerig.io.report.run.tracking.results import TrackResults
-
-Array = NDArray[np.float64]
 
 MOST_EVENTS = 60
 _MISS_TOO_LARGE = 3.0

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.io.report.page.figures import (
     LEFT_OUT,
     MUTED,
@@ -21,8 +22,6 @@ from telerig.io.report.run.tracking.cameras import pair_pixels, paired_rows
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
-
-Array = NDArray[np.float64]
 
 _LOOK_DOWN_DEG, _LOOK_DOWN_CLOSE_DEG = 25.0, 11.0
 _HEIGHT_IN = 2.5

@@ -16,8 +16,6 @@ from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]
 
-GRAVITY_MM_S2 = 9810.0
-
 
 @dataclass(frozen=True)
 class ImagePrediction:
@@ -80,7 +78,7 @@ class AccelerometerPrediction:
 
 def accelerometer_reading(
     acceleration_mm_s2: ArrayLike,
-    up: Array,
+    gravity_mm_s2: Array,
     axes: Array,
     bias_mm_s2: ArrayLike = 0.0,
     scale: ArrayLike = 0.0,
@@ -88,11 +86,12 @@ def accelerometer_reading(
     """axes . ((1 + scale) acceleration - g) + bias; specific force as the sensor gives it.
 
     acceleration_mm_s2 : (..., 3) of the mount, in rig axes, at the stamp minus the delay.
+    gravity_mm_s2 : (3,) g of the laboratory, downwards, in rig axes.
     axes : (3, 3), rows are the sensor's axes in rig coordinates.
     """
     acceleration = np.asarray(acceleration_mm_s2, float)
     gain = 1 + np.asarray(scale, float)[..., None]
-    force = gain * acceleration + GRAVITY_MM_S2 * up
+    force = gain * acceleration - gravity_mm_s2
     reading = force @ axes.T + np.asarray(bias_mm_s2, float)
     by_acceleration = np.broadcast_to(gain[..., None] * axes, (*reading.shape, 3))
     return AccelerometerPrediction(reading, by_acceleration, acceleration @ axes.T)

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 Array = NDArray[np.float64]
 
-GRAVITY_M_S2 = 9.80665
 _UNITS = (
     ("g", 1.0),
-    ("mm/s^2", 1000 * GRAVITY_M_S2),
+    ("mm/s^2", 1000 * STANDARD_GRAVITY_M_S2),
     ("mg or cm/s^2", 1000.0),
-    ("ft/s^2", GRAVITY_M_S2 / 0.3048),
+    ("ft/s^2", STANDARD_GRAVITY_M_S2 / 0.3048),
 )
 """Units that are recognised, and gravity in them. They lie so far apart that a factor of 1.5
 either way, as a hard start within a short record may cause it, does no harm; mg and cm/s^2 differ
@@ -62,10 +62,11 @@ def _check_gravity(size: float, where: str) -> None:
     """size : of the median reading, which should be gravity in m/s^2."""
     for unit, expected in _UNITS:
         if expected / _WITHIN < size < expected * _WITHIN:
+            factor = STANDARD_GRAVITY_M_S2 / expected
             raise InputError(
                 f"the sensor reads {size:.4g} at rest, where m/s^2 would be 9.81: it is in {unit}",
                 where=where,
-                todo=f"multiply ax_m_s2, ay_m_s2, az_m_s2 by {GRAVITY_M_S2 / expected:.6g}",
+                todo=f"multiply ax_m_s2, ay_m_s2, az_m_s2 by {factor:.6g}",
             )
     if size < _FLOATING_M_S2:
         raise InputError(
@@ -73,7 +74,7 @@ def _check_gravity(size: float, where: str) -> None:
             where=where,
             todo="give the specific force as the sensor measures it, 9.81 m/s^2 upwards at rest",
         )
-    if not 1 / _WITHIN < size / GRAVITY_M_S2 < _WITHIN:
+    if not 1 / _WITHIN < size / STANDARD_GRAVITY_M_S2 < _WITHIN:
         raise InputError(
             f"the sensor reads {size:.4g} at rest, which is gravity in no unit",
             where=where,

@@ -43,10 +43,12 @@ from telerig.estimator.smoothing.result import Smoothing, summary_of
 from telerig.estimator.smoothing.tables import shake as shake_table
 from telerig.estimator.smoothing.tables import trajectories
 from telerig.estimator.smoothing.verdict.judge import judge
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.rig_drift.drift import DriftPrior
+    from telerig.io.rig_file.description import StageDescription
 
 Array = NDArray[np.float64]
 Learn = Callable[[SmoothingProblem], ShakeModel]
@@ -165,8 +167,9 @@ def problem_of(
             where="smooth",
             todo="give t_s, the times at which offsets are wanted",
         )
-    up, encoder_sigma = _stage_geometry(rig)
-    travel = travel_of(calibration.stage, None if rig is None else rig.stage)
+    described = None if rig is None else rig.stage
+    up, encoder_sigma, gravity = _stage_geometry(described)
+    travel = travel_of(calibration.stage, described)
     axis = travel.axis
     record = stage_of(stage, times)
     if record is not None and travel.scale:
@@ -186,18 +189,18 @@ def problem_of(
         cameras, times, axis, up, bubbles,
         Observations.none() if tracked is None else tracked.observations,
         record, accelerometers_of(accelerometers, rig, cameras, times), marks, seen, share,
-        travel,
+        travel, gravity,
     )  # fmt: skip
     return problem, tracked, encoder_sigma
 
 
-def _stage_geometry(rig: Any) -> tuple[Array, float]:
-    """Up, and the encoder's sd; without a description, upwards in the images."""
-    described = None if rig is None else rig.stage
+def _stage_geometry(described: StageDescription | None) -> tuple[Array, float, float]:
+    """Up, the encoder's sd (mm) and gravity (m/s^2); not described: upwards in the images."""
     if described is None:
-        return np.array([0.0, -1.0, 0.0]), _ENCODER_SIGMA_MM
+        return np.array([0.0, -1.0, 0.0]), _ENCODER_SIGMA_MM, STANDARD_GRAVITY_M_S2
     up = np.asarray(described.up, float)
-    return up / np.linalg.norm(up), float(described.position_sigma_mm)
+    up = up / np.linalg.norm(up)
+    return up, float(described.position_sigma_mm), float(described.gravity_m_s2)
 
 
 def choose_model(

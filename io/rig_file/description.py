@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field
 
 from telerig.errors import InputError, suggestion
 from telerig.rig.target import Polarity, Target
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 from telerig.rig.windows import Wall
 
 SCHEMA = 1
@@ -70,6 +71,7 @@ class StageDescription(Table):
     """axis : nominal travel direction, up : away from gravity; unit vectors in rig axes.
 
     scale_sigma : sd of the encoder's relative scale error, 0 if it is exact; None: not stated.
+    gravity_m_s2 : of the laboratory; on Earth's surface it is between 9.76 and 9.84.
     """
 
     axis: Direction
@@ -79,6 +81,14 @@ class StageDescription(Table):
         float | None,
         Field(ge=0, lt=0.5, description="a share like 0.001: how far the scale may be off"),
     ] = None
+    gravity_m_s2: Annotated[
+        float,
+        Field(
+            ge=9.7,
+            le=9.9,
+            description="the laboratory's gravity in m/s^2, from 9.7 to 9.9, like 9.80665",
+        ),
+    ] = STANDARD_GRAVITY_M_S2
 
 
 @dataclass(frozen=True)

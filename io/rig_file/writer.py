@@ -24,6 +24,7 @@ _COMMENTS = {
     "axis": "nominal travel direction in the rig frame",
     "up": "away from gravity",
     "scale_sigma": "of the encoder, relative",
+    "gravity_m_s2": "of the laboratory",
     "mounted_on": 'a camera or "carriage"',
     "axes": "rows: the sensor's x, y, z axes in rig coordinates",
     "normal": "in the camera's frame",

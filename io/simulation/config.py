@@ -14,6 +14,9 @@ Vector = tuple[float, float, float]
 Oscillation = tuple[float, float, float]
 """RMS (mm), frequency (Hz), damping of a stochastic oscillation."""
 
+GRAVITY_M_S2 = 9.80665
+"""The unit g, and the gravity of a laboratory that states none; the simulator's own constant."""
+
 MARKS_AT = 0.88
 """Where a strip of marks stands, from the image's middle over half its width."""
 
@@ -192,6 +195,7 @@ class StageConfig:
     ``shake_lateral`` times that. shake_* : see `telerig.io.simulation.run.motion.rig_shake`.
     accelerometers : mounted on cameras' arms (by name) or on the "carriage"; written if any.
     accelerometer_delay_s : a reading stamped t describes t - delay.
+    gravity_m_s2 : of the laboratory; written into rig.toml.
     """
 
     follow: float = 1.0
@@ -216,6 +220,7 @@ class StageConfig:
     accelerometer_density_ug: float = 22.5
     accelerometer_bias_m_s2: float = 0.2
     accelerometer_delay_s: float = 0.0
+    gravity_m_s2: float = GRAVITY_M_S2
 
 
 @dataclass(frozen=True)

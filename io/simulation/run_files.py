@@ -100,7 +100,12 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
 def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
     """The rig file of a rig with a stage, and the sensors and marks that the run has."""
     x, y, z = (float(a) for a in AXIS_RIG)
-    stage = StageDescription((x, y, z), (x, y, z), max(config.stage.encoder_sigma_mm, 1e-4))
+    stage = StageDescription(
+        (x, y, z),
+        (x, y, z),
+        max(config.stage.encoder_sigma_mm, 1e-4),
+        gravity_m_s2=config.stage.gravity_m_s2,
+    )
     unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     sensors = {}
     for mount in config.stage.accelerometers:

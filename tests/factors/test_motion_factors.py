@@ -87,19 +87,20 @@ def test_pitch_shifts_with_depth() -> None:
 
 def test_accelerometer_at_rest_shows_gravity_upwards() -> None:
     axes = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-    read = measurements.accelerometer_reading(np.zeros(3), UP, axes)
-    np.testing.assert_allclose(read.reading_mm_s2, [-9810.0, 0, 0])
+    read = measurements.accelerometer_reading(np.zeros(3), -9806.65 * UP, axes)
+    np.testing.assert_allclose(read.reading_mm_s2, [-9806.65, 0, 0])
 
 
 def test_accelerometer_derivatives() -> None:
     rng = np.random.default_rng(5)
     a = rng.normal(size=(4, 3)) * 1000
     axes, bias = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
+    gravity = -9781.0 * UP
 
     def reading(x: Any, scale: float = 0.02) -> Any:
-        return measurements.accelerometer_reading(x, UP, axes, bias, scale).reading_mm_s2
+        return measurements.accelerometer_reading(x, gravity, axes, bias, scale).reading_mm_s2
 
-    found = measurements.accelerometer_reading(a, UP, axes, bias, 0.02)
+    found = measurements.accelerometer_reading(a, gravity, axes, bias, 0.02)
     np.testing.assert_allclose(found.by_acceleration, slope(reading, a, 1.0), atol=1e-9)
     by_scale = (reading(a, 0.03) - reading(a, 0.01)) / 0.02
     np.testing.assert_allclose(found.by_scale, by_scale, rtol=1e-9)

@@ -152,7 +152,7 @@ def _sensors(information: str, runs: Runs, run: int) -> tuple[Accelerometer, ...
     for i in {"arms": (0, 1), "carriage": (2,)}.get(information, ()):
         t = runs.t_s[0] + np.arange(runs.felt.shape[1]) / SAMPLE_HZ
         reading = np.zeros((len(t), 3))
-        reading[:, 1] = -9810 - runs.felt[i, :, run]
+        reading[:, 1] = -9806.65 - runs.felt[i, :, run]
         mount = i if information == "arms" else CARRIAGE
         out.append(Accelerometer(f"a{i}", mount, t, reading, np.eye(3), SAMPLE_SIGMA, BIAS_SIGMA))
     return tuple(out)

@@ -293,7 +293,9 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
     scale, delay = state.sensors[index, 3:].sum(), state.clocks[clock].sum()
     states = state.shake[node]
     acceleration = states @ rows.T + late[:, None] * (states @ jerk_rows.T)
-    read = measurements.accelerometer_reading(acceleration, problem.up, sensor.axes, bias, scale)
+    read = measurements.accelerometer_reading(
+        acceleration, problem.gravity_mm_s2, sensor.axes, bias, scale
+    )
     slope = _slope(sensor)
     project, white = sensed_directions(frame, index)
     by_shake = (project @ read.by_acceleration[0]) @ (

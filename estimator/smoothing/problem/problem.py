@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from telerig.errors import InputError
 from telerig.rig.camera import Camera
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -278,6 +279,7 @@ class SmoothingProblem:
     t_s : (F,) frame times.  axis, up : (3,) unit vectors in rig axes.
     observations, references : pixels of ``bubbles`` and of ``marks``.
     travel : how well axis and encoder are known; None: exactly.
+    gravity_m_s2 : of the laboratory, which accelerometers read at rest.
     """
 
     cameras: tuple[Camera, ...]
@@ -292,6 +294,12 @@ class SmoothingProblem:
     references: Observations = field(default_factory=Observations.none)
     calibration: CalibrationShare | None = None
     travel: Travel | None = None
+    gravity_m_s2: float = STANDARD_GRAVITY_M_S2
+
+    @property
+    def gravity_mm_s2(self) -> Array:
+        """(3,) the acceleration of gravity in rig axes, downwards."""
+        return -1000 * self.gravity_m_s2 * self.up
 
     @property
     def encoder_mm(self) -> Array:

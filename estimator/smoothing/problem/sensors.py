@@ -20,6 +20,7 @@ from telerig.estimator.smoothing.problem.problem import (
     check_increasing,
 )
 from telerig.rig.camera import Camera
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-MICRO_G_MM_S2 = 9.81e-3
+_MICRO_G_MM_S2 = 1e-3 * STANDARD_GRAVITY_M_S2
 _MARGIN_S = 0.25
 _MARK_SIGMA_MM = 100.0
 _FELT_PX = 2e-3
@@ -82,7 +83,7 @@ def accelerometers_of(
                 todo="put both on one clock",
             )
         rate = (near.sum() - 1) / (t[near][-1] - t[near][0])
-        sigma = fields["noise_density_ug_sqrt_hz"] * MICRO_G_MM_S2 * np.sqrt(rate / 2)
+        sigma = fields["noise_density_ug_sqrt_hz"] * _MICRO_G_MM_S2 * np.sqrt(rate / 2)
         out.append(
             Accelerometer(
                 str(name), _mount(str(name), fields["mounted_on"], cameras), t[near],

@@ -22,8 +22,8 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.text import read_text
 from telerig.io.files.csv_table import write_table
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
-STANDARD_GRAVITY_M_S2 = 9.80665
 UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "g": STANDARD_GRAVITY_M_S2,
          "mg": 1e-3 * STANDARD_GRAVITY_M_S2}  # fmt: skip
 _EXPORT_AGAIN = "export the recording again, or give another file"

@@ -11,6 +11,7 @@ from numpy.random import Generator
 from telerig.arrays import Array, Ints
 from telerig.io.recording.protocols import SYNC, xor_checksum
 from telerig.io.rig_file.description import DeviceDescription
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 TRAVEL_MM = 20.0
 PERIOD_S = 10.0
@@ -80,7 +81,11 @@ def true_values(sim: SimulatedDevice, number: Ints) -> dict[str, Array]:
         mm = TRAVEL_MM * (1 - np.cos(phase))
         return {"counts": np.round(mm * (sim.device.counts_per_mm or 1.0))}
     up = TRAVEL_MM * 1e-3 * (2 * np.pi / PERIOD_S) ** 2 * np.cos(phase)
-    axes = {"ax": 0.05 * np.sin(31 * phase), "ay": 9.81 + up, "az": 0.03 * np.cos(57 * phase)}
+    axes = {
+        "ax": 0.05 * np.sin(31 * phase),
+        "ay": STANDARD_GRAVITY_M_S2 + up,
+        "az": 0.03 * np.cos(57 * phase),
+    }
     digits = 0 if sim.device.protocol == "packets" else 4
     return {axis: np.round(a / sim.device.unit_m_s2, digits) for axis, a in axes.items()}
 

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.io.simulation.config import GRAVITY_M_S2
 
 POSITION, VELOCITY = 0, 1
 """Places of these states in every process below."""
 
-GRAVITY_M_S2 = 9.81
-MICRO_G_M_S2 = 9.81e-6
+MICRO_G_M_S2 = 1e-6 * GRAVITY_M_S2
 
 
 @dataclass(frozen=True)
@@ -328,13 +328,14 @@ def accelerometer_readings(
     rate_hz: float,
     density_ug_sqrt_hz: float,
     bias_m_s2: ArrayLike,
+    gravity_m_s2: float = GRAVITY_M_S2,
 ) -> Array:
     """(N, 3) accelerations in the rig frame -> (N, 3) readings in m/s^2: axes . (a - g) + bias.
 
     up : (3,) away from gravity; axes : (3, 3) rows are the sensor's axes in rig coordinates.
-    Noise per sample: density * sqrt(rate / 2).
+    gravity_m_s2 : of the laboratory. Noise per sample: density * sqrt(rate / 2).
     """
-    force = np.asarray(acceleration_mm_s2, float) / 1000 + GRAVITY_M_S2 * np.asarray(up, float)
+    force = np.asarray(acceleration_mm_s2, float) / 1000 + gravity_m_s2 * np.asarray(up, float)
     sigma = density_ug_sqrt_hz * MICRO_G_M_S2 * np.sqrt(rate_hz / 2)
     noise = sigma * rng.standard_normal(force.shape)
     return np.asarray(force @ np.asarray(axes, float).T + np.asarray(bias_m_s2) + noise)

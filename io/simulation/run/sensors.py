@@ -42,6 +42,7 @@ def accelerometer_table(scene: RunScene, rng: Generator) -> pd.DataFrame:
             rate_hz=1 / (t[1] - t[0]) if len(t) > 1 else stage.accelerometer_rate_hz,
             density_ug_sqrt_hz=stage.accelerometer_density_ug,
             bias_m_s2=stage.accelerometer_bias_m_s2 * rng.standard_normal(3),
+            gravity_m_s2=stage.gravity_m_s2,
         )
         columns: dict[str, Any] = {
             "t_s": t + stage.accelerometer_delay_s,

@@ -86,7 +86,7 @@ def problem(rng: np.random.Generator, *, sensors: bool = False, marks: bool = Fa
                 name,
                 j,
                 times,
-                9810 * UP @ turn.T + 300 * rng.normal(size=(len(times), 3)),
+                9806.65 * UP @ turn.T + 300 * rng.normal(size=(len(times), 3)),
                 turn,
                 7.0,
             )
@@ -262,7 +262,7 @@ def _add_sensors(given: Any, model: Any, whole: Dense, frame: Any, of_shake: Any
             assert abs(node_t[node] - t) < 1e-12
             for direction in frame.shake.seen[j]:
                 terms = of_shake(direction @ rows, node) | {bias: direction @ sensor.axes.T}
-                value = direction @ sensor.axes.T @ reading - 9810 * direction @ UP
+                value = direction @ sensor.axes.T @ reading - 9806.65 * direction @ UP
                 whole.rows.append((terms, value, sensor.sigma_mm_s2))
 
 

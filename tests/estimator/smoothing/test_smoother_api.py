@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -102,6 +102,7 @@ def simulated(
     delay_s: float = 0.0,
     encoder_scale: float = 0.0,
     pair: tuple[Camera, Camera] | None = None,
+    gravity_m_s2: float = 9.80665,
 ) -> Run:
     """Scenario S2 of the design over 0.6 s: 20 Hz shake, 0.5 px, one bubble."""
     rng = np.random.default_rng(seed)
@@ -130,12 +131,12 @@ def simulated(
     seen = [lab - UP * position[at, None] - offset[j, at] for j in range(2)]
     uv = [c.project(p) + SIGMA_PX * rng.normal(size=(FRAMES, 2)) for c, p in zip(pair, seen)]
     marks = marks_seen(pair, position[at], offset[:, at], rng)
-    sigma = 22.5 * 9.81e-6 * np.sqrt(1000)
+    sigma = 22.5 * 9.80665e-6 * np.sqrt(1000)
     sensors = {
         f"arm_{c.name}": {
             "t_s": grid + delay_s, "mounted_on": c.name, "axes": np.eye(3),
             "noise_density_ug_sqrt_hz": 22.5,
-            "a_m_s2": (UP * push[:, None] + felt[j]) / 1000 + 9.81 * UP
+            "a_m_s2": (UP * push[:, None] + felt[j]) / 1000 + gravity_m_s2 * UP
             + 0.2 * rng.normal(size=3) + sigma * rng.normal(size=(len(grid), 3)),
         }
         for j, c in enumerate(pair)
@@ -231,6 +232,23 @@ def test_arm_accelerometers_with_a_late_clock(run: Run) -> None:
     sensor = found.summary["accelerometers"]["arm_left"]
     assert sensor["delay_s"] == pytest.approx(1e-3, abs=3.5e-4)
     assert rms_um(found.trajectories, late.truth_mm) < 30
+
+
+def test_the_laboratorys_gravity_is_no_bias(run: Run) -> None:
+    """A run in a laboratory of 9.781 m/s^2 has the biases of the same run at 9.80665 m/s^2."""
+
+    def vertical_biases_mm_s2(one: Run, rig: Any) -> Any:
+        found = smooth(
+            one.tracks, one.calibration, stage=one.stage, accelerometers=one.accelerometers, rig=rig
+        )
+        return np.array([s["bias_y_mm_s2"] for s in found.summary["accelerometers"].values()])
+
+    usual = vertical_biases_mm_s2(run, RIG)
+    there = simulated(1, gravity_m_s2=9.781)
+    stated = SimpleNamespace(stage=replace(RIG.stage, gravity_m_s2=9.781), accelerometers={})
+    assert vertical_biases_mm_s2(there, stated) == pytest.approx(usual, abs=1e-6)
+    missing = vertical_biases_mm_s2(there, RIG) - usual
+    assert missing == pytest.approx([25.65, 25.65], abs=0.5), "then it is taken for a bias"
 
 
 def test_outliers_cost_little(run: Run) -> None:

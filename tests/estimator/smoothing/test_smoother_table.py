@@ -67,8 +67,8 @@ def scenario(bubbles: int, *, sensors: bool = False, marks: bool = False) -> Smo
     accelerometers = ()
     if sensors:
         grid = np.arange(round(FRAMES / RATE_HZ * 2000)) / 2000
-        rest = np.tile(9810 * UP, (len(grid), 1))
-        sigma = 22.5 * 9.81e-3 * np.sqrt(1000)
+        rest = np.tile(9806.65 * UP, (len(grid), 1))
+        sigma = 22.5 * 9.80665e-3 * np.sqrt(1000)
         accelerometers = tuple(
             Accelerometer(str(j), j, grid, rest, np.eye(3), sigma) for j in range(2)
         )

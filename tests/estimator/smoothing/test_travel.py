@@ -160,7 +160,7 @@ def test_accelerometer_spectra_before_and_after() -> None:
     t = np.arange(1200) / 1000
     push = 3000 * np.sin(2 * np.pi * 20 * t)[:, None] * UP
     sigma = 300.0
-    reading = push + 9810 * UP + sigma * rng.normal(size=(len(t), 3))
+    reading = push + 9806.65 * UP + sigma * rng.normal(size=(len(t), 3))
     sensor = Accelerometer("carriage", CARRIAGE, t - 0.2, reading, np.eye(3), sigma)
     model = replace(STILL, modes=(RigMode(20.0, 0.05, (0.1, 0.2, 0.1), CARRIAGE),))
     solution = solve(replace(problem(), accelerometers=(sensor,)), model, Options(robust=False))

@@ -61,6 +61,16 @@ def test_up_is_the_travel_axis_unless_given() -> None:
     assert stage.up == pytest.approx((0.0, -0.6, 0.8))
 
 
+def test_gravity_is_the_standard_one_unless_given() -> None:
+    stage = parse(FULL).stage
+    assert stage is not None and stage.gravity_m_s2 == 9.80665
+    stage = parse(changed("position_sigma", "gravity_m_s2 = 9.781\nposition_sigma")).stage
+    assert stage is not None and stage.gravity_m_s2 == 9.781
+    for wrong in ("981.0", "9.95", "1.0"):
+        message = error_of(changed("position_sigma", f"gravity_m_s2 = {wrong}\nposition_sigma"))
+        assert "[stage] gravity_m_s2" in message and "from 9.7 to 9.9" in message
+
+
 def test_defaults_of_the_target() -> None:
     text = FULL[: FULL.index("[stereo]")] + (
         "[target]\nrows = 4\ncolumns = 6\npitch_mm = [2.0, 3.0]\ndot_diameter_mm = 1.0\n"
@@ -161,7 +171,7 @@ ROUND_TRIPS = {
                       marks=((0, 0),), two_sided=True, plate_thickness_mm=2.0, plate_index=1.49,
                       print_sigma_mm=0.01, flatness_sigma_mm=0.5),
         walls={"right": WallDescription("right", (0.0, 0.6, 0.8), (1.0, 1.5, 1.33), 5.0, 80.0)},
-        stage=StageDescription((0.6, 0.0, 0.8), (0.0, 1.0, 0.0), 0.001),
+        stage=StageDescription((0.6, 0.0, 0.8), (0.0, 1.0, 0.0), 0.001, gravity_m_s2=9.781),
     ),
     "accented camera": dataclasses.replace(
         FULL_RIG,

@@ -90,6 +90,7 @@ def test_accelerometers_on_the_carriage_and_their_delay():
         accelerometers=("carriage",),
         accelerometer_delay_s=0.004,
         accelerometer_bias_m_s2=0.0,
+        gravity_m_s2=9.781,
         shake_mm=0.0,
         servo_rms_mm=0.0,
     )
@@ -99,8 +100,10 @@ def test_accelerometers_on_the_carriage_and_their_delay():
     assert set(table["sensor"]) == {"carriage"} and table["t_s"].iloc[0] == 0.004
     t = table["t_s"].to_numpy() - 0.004
     ramp = np.where(t < 0.1, np.pi / 2 * np.sin(np.pi * t / 0.1), 0.0) / 0.1
-    expected = 9.81 + 0.28 * ramp
+    assert data.rig.stage is not None and data.rig.stage.gravity_m_s2 == 9.781
+    expected = 9.781 + 0.28 * ramp
     noise = 22.5e-6 * 9.81 * np.sqrt(1000)
+    assert (-table["ay_m_s2"] - expected).mean() == pytest.approx(0, abs=0.5 * noise)
     assert (-table["ay_m_s2"] - expected).std() == pytest.approx(noise, rel=0.15)
     assert table["ax_m_s2"].std() == pytest.approx(noise, rel=0.15)
 

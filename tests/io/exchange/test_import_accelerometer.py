@@ -12,6 +12,7 @@ from scipy.io import savemat, wavfile
 from telerig.errors import InputError
 from telerig.io.dataset.run_tables import read_accelerometer_csv
 from telerig.io.exchange.importing.accelerometer import (
+    UNITS,
     Layout,
     layout_from,
     merge_accelerations,
@@ -122,6 +123,11 @@ def test_units_and_channels_are_never_guessed(tmp_path: Path) -> None:
         readings(other, unit="g")
     with pytest.raises(InputError, match="neither times nor a sampling rate"):
         readings(other, unit="g", channels=("p", "q", "r"))
+
+
+def test_the_unit_g_is_the_standard_one() -> None:
+    assert UNITS["g"] == 9.80665
+    assert UNITS["mg"] == pytest.approx(9.80665e-3, rel=1e-15)
 
 
 def test_bad_readings_are_named(tmp_path: Path) -> None:

@@ -76,9 +76,8 @@ def track_and_compare(
     import pandas as pd
 
     from telerig.estimator.tracking.results_folder import write_tracking
-    from telerig.estimator.tracking.terminal_summary import tracking_words
     from telerig.estimator.tracking.track import TrackOptions
-    from telerig.estimator.tracking.tracks import load_tracks
+    from telerig.estimator.tracking.tracks import load_tracks, tracking_words
     from telerig.estimator.tracking.truth import score_tracks
 
     begun = time.perf_counter()

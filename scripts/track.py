@@ -42,8 +42,8 @@ def track(
     from telerig.estimator.batch.jobs import check_run_name
     from telerig.estimator.tracking.calibration_of_run import calibration_for
     from telerig.estimator.tracking.results_folder import write_tracking
-    from telerig.estimator.tracking.terminal_summary import tracking_words
     from telerig.estimator.tracking.track import TrackOptions
+    from telerig.estimator.tracking.tracks import tracking_words
     from telerig.io.dataset.run import load_run
 
     if out is None:

@@ -158,8 +158,8 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
     from telerig.estimator.tracking.calibration_of_run import calibration_for
     from telerig.estimator.tracking.results_folder import write_tracking
-    from telerig.estimator.tracking.terminal_summary import tracking_words
     from telerig.estimator.tracking.track import TrackOptions
+    from telerig.estimator.tracking.tracks import tracking_words
     from telerig.io.dataset.run import load_run
 
     begun = time.perf_counter()

@@ -28,7 +28,7 @@ from telerig.estimator.bubbles.outline.regions import (
     find_blobs,
     noise_share,
 )
-from telerig.estimator.bubbles.outline.rim_pixels import close_pairs
+from telerig.estimator.bubbles.outline.rim_model import close_pairs
 from telerig.estimator.bubbles.outline.split import (
     Part,
     confirmed_splits,

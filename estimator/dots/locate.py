@@ -22,22 +22,20 @@ from telerig.estimator.dots.fit.candidates import (
     Polarity,
     edge_map,
     find_candidates,
-)
-from telerig.estimator.dots.fit.illumination import contrast_gradients, with_common_blur
-from telerig.estimator.dots.fit.luminance_fit import fit_dots
-from telerig.estimator.dots.fit.pixel_windows import (
-    close_neighbours,
-    dot_window,
-    without_neighbours,
-)
-from telerig.estimator.dots.fit.rejection import (
     is_ring,
     reason_against_blob,
     reason_against_fit,
     reference_radius_px,
     saturation_level,
 )
-from telerig.estimator.dots.fit.types import DotFit, Prior, Start, Window
+from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dots
+from telerig.estimator.dots.fit.surroundings import (
+    close_neighbours,
+    contrast_gradients,
+    dot_window,
+    with_common_blur,
+    without_neighbours,
+)
 from telerig.estimator.images.checks import check_grey_image
 from telerig.estimator.images.noise import (
     NoiseModel,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.pair_model import Finding
+from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
     RigChange,
@@ -27,7 +27,7 @@ from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, informatio
 if TYPE_CHECKING:
     import pandas as pd
 
-    from telerig.estimator.bubbles.pairing.pair_model import PairModel
+    from telerig.estimator.bubbles.pairing.matching import PairModel
     from telerig.estimator.calibration.result.calibration import Calibration
 
 Array = NDArray[np.float64]

@@ -1,28 +1,278 @@
-"""Tracks followed back before their birth and over their gaps, by later frames.
+"""What smoothed tracks add to frames whose ids are final.
 
 The tracker goes forward only. Where a bubble is born hidden, or in frames with doubtful pairs, its
-position is better known from later frames: it is smoothed over all frames at hand, and detections
-without a track are given to it where no other explanation is nearly as likely.
+position is better known from later frames: it is smoothed over all frames at hand (fixed-interval
+smoother of Rauch, Tung and Striebel, AIAA J. 3:1445, 1965), and detections without a track are given
+to it where no other explanation is nearly as likely (`follow_back`).
+
+One outline in one image may show two bubbles which the other image separates. One camera alone sees
+the hidden bubble; its depth in that camera follows from the motion between the frames in which both
+saw it (`shared_rows`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.pairing.matching import Prediction
-from telerig.estimator.tracking.association.likelihoods import gate2, size_score
-from telerig.estimator.tracking.association.single_camera import pair_pixels, projected, px_per_mm
-from telerig.estimator.tracking.filter.rts_smoother import smooth_points
-from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
-from telerig.estimator.tracking.frame_rows import Frame, Pairs, Single, readings_of
+from telerig.estimator.tracking.association.likelihoods import (
+    gate2,
+    pair_pixels,
+    projected,
+    px_per_mm,
+    size_score,
+)
+from telerig.estimator.tracking.filter.motion import POSITION, birth_covariance
+from telerig.estimator.tracking.filter.types import (
+    NO_PARTICLE,
+    FrameIds,
+    Ids,
+    Motion,
+    SeenAlone,
+    TrackerSettings,
+)
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian, triangulate
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 Array = NDArray[np.float64]
+
+_ANYWHERE_MM = 100.0
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Measurements of K bubbles in F frames in information form.
+
+    information : (F, K, 3, 3) on their points (1/mm2), 0 where nothing was seen.
+    pull : (F, K, 3) information @ point (1/mm).
+    """
+
+    information: Array
+    pull: Array
+
+    @staticmethod
+    def none(frames: int, bubbles: int) -> Readings:
+        return Readings(np.zeros((frames, bubbles, 3, 3)), np.zeros((frames, bubbles, 3)))
+
+    def add(
+        self, frame: int, bubble: int, value: Array, covariance: Array, by_point: Array
+    ) -> None:
+        """A measurement value (k,) = by_point (k, 3) @ point, with covariance (k, k)."""
+        weighted = np.linalg.solve(covariance, by_point).T
+        self.information[frame, bubble] += weighted @ by_point
+        self.pull[frame, bubble] += weighted @ value
+
+
+def smooth_points(
+    readings: Readings,
+    motions: Sequence[Motion | None],
+    settings: TrackerSettings,
+) -> tuple[Array, Array]:
+    """(F, K, 3) points (mm, rig) and (F, K, 3, 3) covariances.
+
+    motions : into each frame; the first is not used.
+    """
+    filtered, predicted = _filtered(readings, motions, settings)
+    x, p = filtered[-1]
+    out = [(x[:, POSITION], p[:, POSITION, POSITION])]
+    for k in range(len(filtered) - 2, -1, -1):
+        motion, (xf, pf), (xp, pp) = motions[k + 1], filtered[k], predicted[k + 1]
+        assert motion is not None
+        gain = np.swapaxes(np.linalg.solve(pp, motion.matrix @ pf), -1, -2)
+        x = xf + (gain @ (x - xp)[..., None])[..., 0]
+        p = pf + gain @ (p - pp) @ np.swapaxes(gain, -1, -2)
+        out.append((x[:, POSITION], p[:, POSITION, POSITION]))
+    points, covariances = zip(*out[::-1])
+    return np.array(points), np.array(covariances)
+
+
+def _filtered(
+    readings: Readings,
+    motions: Sequence[Motion | None],
+    settings: TrackerSettings,
+) -> tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]:
+    """States (K, n) and covariances (K, n, n) after and before each frame's readings."""
+    bubbles = readings.information.shape[1]
+    prior = birth_covariance(settings, _ANYWHERE_MM**2 * np.eye(3), encoder=False)
+    p = np.tile(prior, (bubbles, 1, 1))
+    x = np.zeros((bubbles, len(prior)))
+    total = readings.information.sum(0) + 1e-9 * np.eye(3)
+    x[:, POSITION] = np.linalg.solve(total, readings.pull.sum(0)[..., None])[..., 0]
+    filtered, predicted = [], []
+    for k, motion in enumerate(motions):
+        if k:
+            assert motion is not None
+            x = x @ motion.matrix.T + motion.offset
+            p = motion.matrix @ p @ motion.matrix.T + motion.noise
+        predicted.append((x, p))
+        x, p = _updated(x, p, readings.information[k], readings.pull[k])
+        filtered.append((x, p))
+    return filtered, predicted
+
+
+def _updated(x: Array, p: Array, information: Array, pull: Array) -> tuple[Array, Array]:
+    """States after a frame's information on their positions."""
+    mixed = np.eye(3) + information @ p[:, POSITION, POSITION]
+    gain = p[..., POSITION] @ np.linalg.inv(mixed)
+    left = pull - (information @ x[:, POSITION, None])[..., 0]
+    lost = gain @ information @ p[:, POSITION]
+    x = x + (gain @ left[..., None])[..., 0]
+    return x, p - (lost + np.swapaxes(lost, -1, -2)) / 2
+
+
+Tables = tuple["pd.DataFrame", "pd.DataFrame"]
+"""One frame's detections in the two cameras."""
+
+Pixels = tuple[Array, Array]
+"""(N, 2) centres and (N, 2, 2) covariances of a view's detections."""
+
+COVARIANCE_MM2 = ["sxx_mm2", "sxy_mm2", "sxz_mm2", "syy_mm2", "syz_mm2", "szz_mm2"]
+CENTRE_PX = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Rows of the two tables that show the same bubble, M of them.
+
+    rows : (M, 2); confidence, ambiguous : (M,); given : (M,) ids given by the user, -1 where the
+    pair was found here; points_mm (M, 3), covariance_mm2 (M, 3, 3), d_eq_mm (M,), NaN if unknown;
+    particle : (M,) of its track, -1 for none; known once the frame is settled.
+    """
+
+    rows: Ids
+    confidence: Array
+    ambiguous: NDArray[np.bool_]
+    given: Ids
+    points_mm: Array
+    covariance_mm2: Array
+    d_eq_mm: Array
+    particle: Ids
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def of(self, keep: NDArray[np.bool_]) -> Pairs:
+        return Pairs(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+    def and_also(self, other: Pairs) -> Pairs:
+        both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return Pairs(*(np.concatenate(columns) for columns in both))
+
+
+@dataclass(frozen=True)
+class Single:
+    """A particle that one camera sees alone: its row there, and its approximate position."""
+
+    particle: int
+    camera: int
+    row: int
+    point_mm: Array
+    d_eq_mm: float
+
+
+@dataclass
+class Frame:
+    """offset_px : (2, 2) per camera, shift of all that both cameras see; the cameras shake.
+
+    lonely : rows of the tables without a partner; alone : by index into these (first the first
+    camera's), tracks that one camera continued. singles : those in the end, after `settle`.
+    """
+
+    number: int
+    t_s: float
+    tables: Tables
+    pixels: tuple[Pixels, Pixels]
+    offset_px: Array
+    pairs: Pairs
+    lonely: tuple[Ids, Ids]
+    alone: Mapping[int, SeenAlone]
+    motion: Motion | None
+    singles: list[Single] = field(default_factory=list)
+
+    def settle(self, ids: FrameIds) -> None:
+        """Take over the tracker's final ids."""
+        self.pairs.particle[:] = ids.particle
+        cameras = np.repeat([0, 1], [len(rows) for rows in self.lonely])
+        rows = np.concatenate(self.lonely)
+        for index in np.flatnonzero(ids.single != NO_PARTICLE).tolist():
+            seen = self.alone[index]
+            camera, row = int(cameras[index]), int(rows[index])
+            self.singles.append(
+                Single(int(ids.single[index]), camera, row, seen.point_mm, seen.d_eq_mm)
+            )
+
+    @property
+    def particle(self) -> Ids:
+        """(M,) of the pairs."""
+        return self.pairs.particle
+
+    def owners(self, camera: int) -> Ids:
+        """(N,) particle of each of a camera's rows, -1 for none."""
+        out = given_ids(self.tables[camera]).copy()
+        taken = self.particle != NO_PARTICLE
+        out[self.pairs.rows[taken, camera]] = self.particle[taken]
+        for single in self.singles:
+            if single.camera == camera:
+                out[single.row] = single.particle
+        return out
+
+    def of(self, particle: int) -> list[Single]:
+        return [s for s in self.singles if s.particle == particle]
+
+    def hidden(self) -> list[Single]:
+        """Particles that exactly one camera sees."""
+        return [s for s in self.singles if len(self.of(s.particle)) == 1]
+
+    def release(self, particle: int) -> None:
+        """Its singles belong to no track again."""
+        self.singles = [s for s in self.singles if s.particle != particle]
+
+    def claim(self, pair: Pairs) -> None:
+        """Give the rows of one pair to its particle; pairs with only one of them are undone."""
+        same = self.pairs.rows == pair.rows
+        if same.all(1).any():
+            self.particle[same.all(1)] = pair.particle
+        else:
+            self.pairs = self.pairs.of(~same.any(1)).and_also(pair)
+
+
+def given_ids(table: pd.DataFrame) -> Ids:
+    """(N,) ids that came with the detections, -1 for none."""
+    if "particle" not in table:
+        return np.full(len(table), NO_PARTICLE)
+    return table["particle"].to_numpy(np.int64)
+
+
+def readings_of(
+    frames: Sequence[Frame], particles: Sequence[int], cameras: tuple[Camera, Camera]
+) -> Readings:
+    """The frames' measurements of the particles, in the particles' order."""
+    place = {p: k for k, p in enumerate(particles)}
+    out = Readings.none(len(frames), len(place))
+    for i, frame in enumerate(frames):
+        pairs = frame.pairs
+        for column in np.flatnonzero(np.isin(pairs.particle, list(place))):
+            k = place[int(pairs.particle[column])]
+            out.add(i, k, pairs.points_mm[column], pairs.covariance_mm2[column], np.eye(3))
+        for single in frame.singles:
+            if single.particle not in place:
+                continue
+            uv, by_point, _ = stacked_jacobian((cameras[single.camera],), single.point_mm[None])
+            measured, covariance = frame.pixels[single.camera]
+            left = measured[single.row] - frame.offset_px[single.camera] - uv[0]
+            value = left + by_point[0] @ single.point_mm
+            out.add(i, place[single.particle], value, covariance[single.row], by_point[0])
+    return out
+
 
 _LEAST_POINTS = 4
 """Points in space that a track needs to be followed."""
@@ -275,3 +525,111 @@ def _claim_pair(
         return False
     _claim_single(frame, int(first), rows[int(first)], predicted, k)
     return True
+
+
+FRAMES_BEFORE, FRAMES_AFTER = 15, 40
+"""Frames around a hidden one by which its position is smoothed."""
+
+FLAG = "shared"
+_SHARPNESS, _SHARPNESS_PX = 0.1, 3.0
+"""Largest sd of a hidden centre, as a share of the bubble's diameter and in px."""
+
+_APART = 0.5
+"""Least distance of two bubbles' centres, as a share of their distance when they touch."""
+
+_BEHIND = 0.25
+"""Standard deviation of a pixel "behind that outline", as a share of the outline's semi-axis."""
+"""Share of such points that were right in simulated swarms."""
+
+
+def shared_rows(
+    before: Sequence[Frame],
+    frames: Sequence[Frame],
+    after: Sequence[Frame],
+    cameras: tuple[Camera, Camera],
+    settings: TrackerSettings,
+) -> list[dict[str, Any]]:
+    """Rows for the hidden bubbles of ``frames``; the frames before and after are context.
+
+    The hidden view's pixel is that of the point; its covariance states only that the bubble is
+    behind that outline, so that motion is not counted twice when tracks are smoothed.
+    """
+    every = [*before, *frames, *after]
+    seen = {int(p) for f in every for p in f.particle}
+    particles = sorted({s.particle for f in frames for s in f.hidden()} & seen)
+    if not particles:
+        return []
+    readings = readings_of(every, particles, cameras)
+    motions = [f.motion for f in every]
+    points, covariances = smooth_points(readings, motions, settings)
+    place = {p: k for k, p in enumerate(particles)}
+    out = []
+    for i, frame in enumerate(frames, len(before)):
+        known = frame.particle != NO_PARTICLE
+        where, sizes = [*frame.pairs.points_mm[known]], frame.pairs.d_eq_mm[known].tolist()
+        singles = [s for s in frame.hidden() if s.particle in place]
+        for single in sorted(singles, key=lambda s: np.trace(covariances[i, place[s.particle]])):
+            k = place[single.particle]
+            point, covariance = points[i, k], covariances[i, k]
+            row = _row(frame, single, point, covariance, cameras)
+            if row is not None and not _taken(single, point, where, sizes):
+                out.append(row)
+                where.append(point)
+                sizes.append(single.d_eq_mm)
+    return out
+
+
+def _taken(
+    single: Single, point_mm: Array, others_mm: Sequence[Array], sizes_mm: Sequence[float]
+) -> bool:
+    """Whether another track's bubble occupies the place of this one."""
+    away = np.linalg.norm(np.reshape(others_mm, (-1, 3)) - point_mm, axis=1)
+    return bool((away < _APART * (np.array(sizes_mm) + single.d_eq_mm) / 2).any())
+
+
+def _row(
+    frame: Frame,
+    single: Single,
+    point: Array,
+    covariance: Array,
+    cameras: tuple[Camera, Camera],
+) -> dict[str, Any] | None:
+    """None where the point is too uncertain, or no other bubble explains why it is not seen."""
+    seen = single.camera
+    mine = frame.tables[seen].iloc[single.row]
+    other = cameras[1 - seen]
+    view = projected(other, point[None], covariance[None])
+    uv, spread = view.uv_px[0] + frame.offset_px[1 - seen], view.covariance_px2[0]
+    diameter = single.d_eq_mm * px_per_mm(view.by_point)[0]
+    sd = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
+    reach = _outline_over(frame.tables[1 - seen], uv, diameter / 2)
+    if not (sd <= min(_SHARPNESS * diameter, _SHARPNESS_PX) and reach > 0):
+        return None
+    behind = spread + (_BEHIND * reach) ** 2 * np.eye(2)
+    per_camera = {
+        cameras[seen].name: mine[CENTRE_PX].tolist(),
+        other.name: [*uv, behind[0, 0], behind[0, 1], behind[1, 1]],
+    }
+    flags = sorted({FLAG, *filter(None, str(mine["flags"] or "").split("|"))})
+    return {
+        "frame": frame.number,
+        "particle": single.particle,
+        "t_s": frame.t_s,
+        **{f"{x}_mm": v for x, v in zip("xyz", point)},
+        **dict(zip(COVARIANCE_MM2, covariance[np.triu_indices(3)])),
+        **{f"{c}_{n}": v for c, values in per_camera.items() for n, v in zip(CENTRE_PX, values)},
+        **{f"{c}_{n}": 0.0 for c in per_camera for n in ("du_px", "dv_px")},
+        "d_eq_mm": single.d_eq_mm,
+        "confidence": _CONFIDENCE,
+        "centre": "silhouettes",
+        **{f"silhouettes_{x}_mm": v for x, v in zip("xyz", point)},
+        "flags": "|".join(flags),
+    }
+
+
+def _outline_over(table: pd.DataFrame, uv_px: Array, radius_px: float) -> float:
+    """Semi-axis (px) of the largest outline that covers a part of the disc; 0 if there is none."""
+    away = np.hypot(table["u_px"] - uv_px[0], table["v_px"] - uv_px[1]).to_numpy(float)
+    long = table["a_px"].to_numpy(float)
+    covering = away < long + 0.5 * radius_px
+    return float(np.max(long[covering], initial=0.0))

@@ -10,11 +10,22 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.matching import Prediction, match_pairs
-from telerig.estimator.bubbles.pairing.pair_model import PairModel
+from telerig.estimator.bubbles.pairing.matching import PairModel, Prediction, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
-from telerig.estimator.tracking.association.single_camera import px_per_mm
-from telerig.estimator.tracking.backtracking import follow_back
+from telerig.estimator.tracking.association.likelihoods import px_per_mm
+from telerig.estimator.tracking.backtracking import (
+    CENTRE_PX,
+    COVARIANCE_MM2,
+    FRAMES_AFTER,
+    FRAMES_BEFORE,
+    Frame,
+    Pairs,
+    Pixels,
+    Tables,
+    follow_back,
+    given_ids,
+    shared_rows,
+)
 from telerig.estimator.tracking.filter.types import (
     NO_PARTICLE,
     FrameMeasurements,
@@ -22,16 +33,6 @@ from telerig.estimator.tracking.filter.types import (
     SingleMeasurements,
     TrackEvent,
 )
-from telerig.estimator.tracking.frame_rows import (
-    CENTRE_PX,
-    COVARIANCE_MM2,
-    Frame,
-    Pairs,
-    Pixels,
-    Tables,
-    given_ids,
-)
-from telerig.estimator.tracking.occluded_bubbles import FRAMES_AFTER, FRAMES_BEFORE, shared_rows
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian, triangulate

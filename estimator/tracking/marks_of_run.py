@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.marks.erasing import StripInImages
-from telerig.estimator.marks.following import Follower, Mark
+from telerig.estimator.marks.following import Follower, Mark, StripInImages, TankView
 from telerig.estimator.marks.strip_dots import (
     DotLook,
     DotSightings,
     find_dots,
     learn_look,
 )
-from telerig.estimator.marks.tank_view import TankView
 from telerig.estimator.tracking.detect_run import Batch, DetectionStore, Progress, read_batch
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.rig.camera import Camera

@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
-from telerig.estimator.bubbles.pairing.matching import match_pairs
-from telerig.estimator.bubbles.pairing.pair_model import PairModel
+from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.from_pairs import PairCollector, with_change
+from telerig.estimator.tracking.backtracking import Tables
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     Progress,
@@ -31,7 +31,6 @@ from telerig.estimator.tracking.detect_run import (
     make_scene,
 )
 from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
-from telerig.estimator.tracking.frame_rows import Tables
 from telerig.estimator.tracking.frames_to_rows import Linked, Linker
 from telerig.estimator.tracking.marks_of_run import (
     FollowedMarks,

@@ -1,8 +1,12 @@
-"""Bubbles followed through time in the rig frame, frame by frame."""
+"""Bubbles followed through time in the rig frame, frame by frame, from birth to death.
+
+A track is born tentative and confirmed after some hits; it ends when it was not seen for too long.
+The ids of a frame stay open while a conflict or a birth may change them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,19 +14,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.matching import Prediction
-from telerig.estimator.tracking.association.advance import Scan, advance, follow_labelled
-from telerig.estimator.tracking.association.hypotheses import Broken, Cluster, Decision, decide
-from telerig.estimator.tracking.association.open_frames import OpenFrames
-from telerig.estimator.tracking.association.single_camera import continue_alone
+from telerig.estimator.tracking.association.hypotheses import (
+    Broken,
+    Cluster,
+    Decision,
+    Scan,
+    advance,
+    continue_track,
+    decide,
+    follow_labelled,
+)
+from telerig.estimator.tracking.association.likelihoods import (
+    assigned_with_shift,
+    best_assignment,
+    gated_pairs,
+    pair_pixels,
+    projected,
+    unrivalled,
+    update_pixels,
+)
 from telerig.estimator.tracking.filter.motion import (
     POSITION,
     STATES,
     VELOCITY,
     StageMotion,
     Transition,
+    birth_covariance,
     transition,
 )
-from telerig.estimator.tracking.filter.state import Common, Track
+from telerig.estimator.tracking.filter.state import Common, Track, new_filter
 from telerig.estimator.tracking.filter.types import (
     NO_PARTICLE,
     FrameIds,
@@ -34,10 +54,207 @@ from telerig.estimator.tracking.filter.types import (
     TrackerSettings,
     TrackEvent,
 )
-from telerig.estimator.tracking.lifecycle import born, ended, extend, hopeless, split_off
 from telerig.rig.camera import Camera
 
+_SPARE = 16
+
+
+class OpenFrames:
+    """The ids of frames that are still open, and when each living particle was last seen."""
+
+    def __init__(self) -> None:
+        self._frames: dict[int, tuple[float, Ids, Ids]] = {}
+        self._seen: dict[int, int] = {}
+
+    def begin(self, frame: int, t_s: float, points: int, singles: int) -> None:
+        self._frames[frame] = (t_s, np.full(points, NO_PARTICLE), np.full(singles, NO_PARTICLE))
+
+    def write(self, entries: Iterable[tuple[int, int]], particle: int) -> None:
+        """entries : (frame, column), column -1 where it was missed; they replace the particle's
+        earlier entries in these frames."""
+        for frame, column in entries:
+            ids = self._frames[frame][1]
+            if particle != NO_PARTICLE:
+                ids[ids == particle] = NO_PARTICLE
+            if column >= 0:
+                ids[column] = particle
+
+    def write_single(self, frame: int, index: int, particle: int) -> None:
+        self._frames[frame][2][index] = particle
+
+    def now(self, frame: int) -> tuple[Ids, Ids]:
+        _, particle, single = self._frames[frame]
+        return particle.copy(), single.copy()
+
+    def close(
+        self, before_frame: int, alive: set[int]
+    ) -> tuple[tuple[FrameIds, ...], list[TrackEvent]]:
+        """The frames before ``before_frame``, and the gaps that their tracks bridge.
+
+        Particles that are not ``alive`` are forgotten now and then.
+        """
+        out, events = [], []
+        for frame in [f for f in self._frames if f < before_frame]:
+            t_s, particle, single = self._frames.pop(frame)
+            out.append(FrameIds(frame, particle, single))
+            for p in sorted({*particle.tolist(), *single.tolist()} - {NO_PARTICLE}):
+                missed = frame - self._seen.get(p, frame - 1) - 1
+                self._seen[p] = frame
+                if missed > 0:
+                    words = f"{missed} frames bridged" if missed > 1 else "1 frame bridged"
+                    events.append(TrackEvent("gap", frame, t_s, (p,), words))
+        if len(self._seen) > 2 * len(alive) + _SPARE:
+            self._seen = {p: f for p, f in self._seen.items() if p in alive}
+        return tuple(out), events
+
+
 Array = NDArray[np.float64]
+
+_TOUCHING = 1.5
+"""Largest distance of two centres, in diameters, of bubbles that may have been one."""
+
+
+def born(
+    scan: Scan, column: int, velocity_mm_s: Array, encoder: bool, tracks: Sequence[Track]
+) -> Track:
+    """A tentative track at a measurement; ``tracks``: the confirmed ones it may stem from."""
+    point = scan.measured.points_mm[column]
+    covariance = birth_covariance(scan.settings, scan.measured.covariance_mm2[column], encoder)
+    x = np.zeros(len(covariance))
+    x[POSITION], x[VELOCITY] = point, velocity_mm_s
+    out = Track(new_filter(x, covariance), born_frame=scan.frame, history=[(scan.frame, column)])
+    out.saw(scan.frame, scan.t_s, float(scan.measured.d_eq_mm[column]))
+    out.parent = _beside(point, tracks)
+    return out
+
+
+def extend(
+    tentative: Sequence[Track], scan: Scan, common: Common, mean_gain: Array | None
+) -> tuple[list[Track], Common, Array | None]:
+    """Continue the tentative tracks with the free measurements; those with a rival are given up.
+
+    Where no confirmed track determined the common shift (mean_gain None), they determine it.
+    """
+    if not tentative:
+        return [], common, mean_gain
+    pairs = gated_pairs(tentative, scan.measured, scan.columns, common, scan.settings)
+    if mean_gain is None:
+        everyone = np.ones(len(tentative), bool)
+        common, chosen = assigned_with_shift(pairs, len(tentative), everyone, common)
+    else:
+        score = pairs.scores(common.shift_mm)
+        chosen = best_assignment(len(tentative), pairs.row, pairs.column, score)
+    score = pairs.scores(common.shift_mm)
+    safe = unrivalled(pairs.row, pairs.column, score, chosen, scan.settings.margin_nats)
+    picked = np.flatnonzero(chosen[pairs.row] == pairs.column)
+    if mean_gain is None and len(picked):
+        p = np.array([tentative[r].filter.P[:, POSITION] for r in pairs.row[picked]])
+        mean_gain = (p @ pairs.information[picked]).mean(0)
+    gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
+    out = []
+    for i, track in enumerate(tentative):
+        if chosen[i] >= 0 and not safe[i]:
+            continue
+        continue_track(track, int(chosen[i]), scan, common, gain)
+        if chosen[i] >= 0:
+            track.history.append((scan.frame, int(chosen[i])))
+        out.append(track)
+    return out, common, mean_gain
+
+
+def hopeless(track: Track, frame: int, settings: TrackerSettings) -> bool:
+    """Whether a tentative track was missed too often to be confirmed."""
+    missed = frame - track.born_frame + 1 - len(track.history)
+    return missed > settings.confirm_frames - settings.confirm_hits
+
+
+def split_off(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[TrackEvent]:
+    """The event that a newly confirmed track is a part of the one it was born beside, if it is."""
+    parents = {t.particle: t for t in confirmed}
+    if track.parent is None or track.parent[0] not in parents:
+        return []
+    parent, before = parents[track.parent[0]], track.parent[1]
+    if not _volumes_balance(before, parent.d_last_mm, track.d_last_mm, scan.settings):
+        return []
+    reason = f"d_eq {before:.2f} mm became {parent.d_last_mm:.2f} and {track.d_last_mm:.2f} mm"
+    return [TrackEvent("split", scan.frame, scan.t_s, (parent.particle, track.particle), reason)]
+
+
+def ended(
+    tracks: Sequence[Track], confirmed: Sequence[Track], scan: Scan
+) -> tuple[set[int], list[TrackEvent]]:
+    """Particles unseen for too long, and the events; a track just lost remembers who was beside."""
+    dead, events = set(), []
+    for track in tracks:
+        if track.seen_frame == scan.frame:
+            continue
+        if track.near is None:
+            others = [t for t in confirmed if t.particle != track.particle]
+            track.near = _beside(track.point_mm, others)
+        unseen, frames = scan.t_s - track.seen_t_s, scan.frame - track.seen_frame
+        if unseen > scan.settings.gap_s and frames > scan.settings.gap_frames:
+            dead.add(track.particle)
+            events += _merged_into(track, confirmed, scan)
+            reason = f"not seen since frame {track.seen_frame}, {unseen:.3f} s"
+            events.append(TrackEvent("death", scan.frame, scan.t_s, (track.particle,), reason))
+    return dead, events
+
+
+def _merged_into(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[TrackEvent]:
+    others = {t.particle: t for t in confirmed}
+    if track.near is None or track.near[0] not in others:
+        return []
+    other, before = others[track.near[0]], track.near[1]
+    if not _volumes_balance(other.d_last_mm, before, track.d_eq_mm, scan.settings):
+        return []
+    reason = f"d_eq {before:.2f} and {track.d_eq_mm:.2f} mm became {other.d_last_mm:.2f} mm"
+    return [TrackEvent("merge", scan.frame, scan.t_s, (other.particle, track.particle), reason)]
+
+
+def _beside(point_mm: Array, tracks: Sequence[Track]) -> tuple[int, float] | None:
+    """The nearest track whose bubble could touch one at the point: its id, its size before."""
+    sized = [t for t in tracks if np.isfinite(t.d_eq_mm)]
+    if not sized:
+        return None
+    away = np.linalg.norm([t.point_mm - point_mm for t in sized], axis=1)
+    nearest = int(away.argmin())
+    track = sized[nearest]
+    if away[nearest] > _TOUCHING * track.d_eq_mm:
+        return None
+    before = track.d_before_mm if np.isfinite(track.d_before_mm) else track.d_eq_mm
+    return track.particle, before
+
+
+def _volumes_balance(
+    whole_mm: float, part_a_mm: float, part_b_mm: float, settings: TrackerSettings
+) -> bool:
+    """Whether the volumes of two diameters add up to that of a third, within the tolerance."""
+    off = abs(part_a_mm**3 + part_b_mm**3 - whole_mm**3)
+    return bool(off <= settings.balance_tolerance * whole_mm**3)
+
+
+def continue_alone(
+    missed: Sequence[Track], scan: Scan, cameras: Sequence[Camera], common_mm2: Array
+) -> list[tuple[Track, int, SeenAlone]]:
+    """Update the tracks by single-camera measurements: track, index of the measurement, where the
+    track is then."""
+    singles = scan.measured.singles
+    out = []
+    for index, camera in enumerate(cameras):
+        mine = np.flatnonzero(singles.camera == index)
+        if not len(mine) or not len(missed):
+            continue
+        points = np.array([t.point_mm for t in missed])
+        spread = np.array([t.point_covariance_mm2 for t in missed]) + common_mm2
+        expected = projected(camera, points, spread)
+        uv, noise = singles.uv_px[mine], singles.covariance_px2[mine]
+        for k, j in enumerate(pair_pixels(expected, uv, noise, scan.settings)):
+            if j >= 0:
+                track = missed[k]
+                update_pixels(track, uv[j], noise[j], expected.uv_px[k], expected.by_point[k])
+                track.saw(scan.frame, scan.t_s, float("nan"))
+                out.append((track, int(mine[j])))
+    return [(t, single, SeenAlone(t.point_mm, t.d_eq_mm)) for t, single in out]
 
 
 class Tracker:

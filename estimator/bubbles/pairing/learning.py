@@ -17,7 +17,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.estimator.bubbles.pairing.assignment import marginals
 from telerig.estimator.bubbles.pairing.geometry import (
     PairGeometry,
     View,
@@ -25,8 +24,14 @@ from telerig.estimator.bubbles.pairing.geometry import (
     shared_axis,
     view_of,
 )
-from telerig.estimator.bubbles.pairing.matching import appearance_log_odds, common_shift
-from telerig.estimator.bubbles.pairing.pair_model import Finding, LogRatioModel, PairModel
+from telerig.estimator.bubbles.pairing.matching import (
+    Finding,
+    LogRatioModel,
+    PairModel,
+    appearance_log_odds,
+    common_shift,
+    marginals,
+)
 from telerig.rig.camera import Camera
 
 Array = NDArray[np.float64]

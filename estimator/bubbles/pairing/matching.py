@@ -3,30 +3,263 @@
 Every combination gets log odds: how much better "one bubble seen twice" explains the two
 detections than "two detections without a partner". They come from the gap along the shared axis,
 the height along it, the width, the contrast, and the predicted tracks. (Blur is not used: views at
-an angle are out of focus at different depths.) One assignment is then the best as a whole, with the
-option to leave detections out, and each of its pairs has a posterior probability.
+an angle are out of focus at different depths.) `PairModel` holds what the two images of one bubble
+have in common in a run. One assignment is then the best as a whole, with the option to leave
+detections out; an assignment's probability is proportional to the product of exp(log odds) of its
+pairs, and each pair has a posterior probability.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from enum import Enum, auto
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.assignment import best_assignment, marginals
 from telerig.estimator.bubbles.pairing.geometry import (
     PairGeometry,
     pair_geometry,
     shared_axis,
     view_of,
 )
-from telerig.estimator.bubbles.pairing.pair_model import LogRatioModel, PairModel
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+NEGLIGIBLE = -9.0
+"""Log odds below which a pair is never considered: its probability stays under exp(-9)."""
+
+_EXACT_SIDE = 11
+_PASSES = 500
+
+
+def best_assignment(log_odds: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the assignment of highest probability; what is left out is not named."""
+    from scipy.optimize import linear_sum_assignment
+
+    gain = np.where(log_odds > 0, log_odds, 0.0)
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    kept = gain[rows, columns] > 0
+    return rows[kept].astype(np.int64), columns[kept].astype(np.int64)
+
+
+def marginals(log_odds: Array) -> Array:
+    """(N1, N2) log odds -> (N1, N2) posterior probability of each pair.
+
+    Exact per connected component with up to 11 detections on its smaller side (sum over all
+    assignments by dynamic programming over subsets); above that loopy belief propagation
+    (Williams and Lau, IEEE Trans. AES 50:2942, 2014), which always converges.
+    """
+    out = np.zeros(log_odds.shape)
+    possible = log_odds > NEGLIGIBLE
+    lone = possible & (possible.sum(1) == 1)[:, None] & (possible.sum(0) == 1)
+    out[lone] = 1 / (1 + np.exp(-log_odds[lone]))
+    for i, j in _components(possible & ~lone):
+        block = np.ix_(i, j)
+        part = np.where(possible[block], log_odds[block], -np.inf)
+        if min(len(i), len(j)) > _EXACT_SIDE:
+            out[block] = _belief_propagation(part)
+        elif len(j) <= len(i):
+            out[block] = _exact(part)
+        else:
+            out[block] = _exact(part.T).T
+    return out
+
+
+def _components(possible: NDArray[np.bool_]) -> Iterator[tuple[Index, Index]]:
+    """Rows and columns that are connected by possible pairs.
+
+    The smallest row's number spreads over each component; on such small graphs this takes a tenth
+    of the time of `scipy.sparse.csgraph.connected_components`.
+    """
+    rows, none = np.arange(len(possible)), len(possible)
+    while True:
+        columns = np.min(np.where(possible, rows[:, None], none), axis=0, initial=none)
+        spread = np.minimum(rows, np.min(np.where(possible, columns, none), axis=1, initial=none))
+        if np.array_equal(spread, rows):
+            break
+        rows = spread
+    for label in np.unique(columns[columns < none]):
+        yield np.flatnonzero(rows == label), np.flatnonzero(columns == label)
+
+
+@lru_cache(maxsize=16)
+def _without(columns: int) -> tuple[NDArray[np.int64], ...]:
+    """For each column the subsets that do not hold it."""
+    subsets = np.arange(1 << columns)
+    return tuple(subsets[(subsets >> j) & 1 == 0] for j in range(columns))
+
+
+def _exact(log_odds: Array) -> Array:
+    n, m = log_odds.shape
+    peak = np.maximum(log_odds.max(axis=1, initial=0.0), 0.0)
+    weight = np.exp(log_odds - peak[:, None])
+    alone = np.exp(-peak)
+    free = _without(m)
+    forward, backward = np.zeros((n + 1, 1 << m)), np.zeros((n + 1, 1 << m))
+    forward[0, 0], backward[n] = 1.0, 1.0
+    for i in range(n):
+        forward[i + 1] = alone[i] * forward[i]
+        for j in np.flatnonzero(weight[i]):
+            forward[i + 1, free[j] | (1 << j)] += weight[i, j] * forward[i, free[j]]
+    for i in reversed(range(n)):
+        backward[i] = alone[i] * backward[i + 1]
+        for j in np.flatnonzero(weight[i]):
+            backward[i, free[j]] += weight[i, j] * backward[i + 1, free[j] | (1 << j)]
+    out = np.zeros((n, m))
+    for i in range(n):
+        for j in np.flatnonzero(weight[i]):
+            out[i, j] = weight[i, j] * (forward[i, free[j]] @ backward[i + 1, free[j] | (1 << j)])
+    return np.asarray(out / backward[0, 0])
+
+
+def _belief_propagation(log_odds: Array) -> Array:
+    weight = np.exp(np.minimum(log_odds, 50.0))
+    back = np.ones_like(weight)
+    for _ in range(_PASSES):
+        incoming = weight * back
+        forth = weight / (1 + _others(incoming, 1))
+        new = 1 / (1 + _others(forth, 0))
+        change = np.abs(new - back).max()
+        back = new
+        if change < 1e-9:
+            break
+    incoming = weight * back
+    return np.asarray(incoming / (1 + incoming.sum(1, keepdims=True)))
+
+
+def _others(values: Array, axis: int) -> Array:
+    """Sums along the axis less each element, never below 0 by rounding."""
+    return np.asarray(np.maximum(values.sum(axis, keepdims=True) - values, 0.0))
+
+
+@dataclass(frozen=True)
+class LogRatioModel:
+    """How the logarithms of K properties compare between the two images of one bubble.
+
+    difference, scatter : (K,), (K, K) mean and covariance of first - second over true pairs.
+    means : (2, K) over all bubbles, in the first and in the second view.
+    spread : (K, K) covariance over all bubbles of a view.
+    """
+
+    difference: Array
+    scatter: Array
+    means: Array
+    spread: Array
+
+    @property
+    def sd(self) -> Array:
+        """(K,) scatter of each property."""
+        return np.sqrt(np.diag(self.scatter))
+
+
+class Finding(Enum):
+    """What `estimate_pair_model` found beside the numbers."""
+
+    NO_DETECTIONS = auto()
+    CALIBRATION_OFFSET = auto()
+    OFFSET_VARIES = auto()
+    FEW_PAIRS = auto()
+    UNCLEAR_OFFSET = auto()
+    CAMERA_SHAKE = auto()
+
+
+@dataclass(frozen=True)
+class PairModel:
+    """What the two images of one bubble have in common, learnt from a run (`estimate_pair_model`).
+
+    bias_px, bias_covariance_px2 : (B,), (B, B) coefficients of the gap's systematic part: 1, then
+        with B = 4 x y z, with B = 10 also xx yy zz xy xz yz of the rig point less ``origin_mm``
+        over ``reach_mm``.
+    scatter_px : of single gaps beyond the detections' own covariance.
+    frame_px : of a shift common to all gaps of a frame (the cameras shake).
+    size : of (height, width) in mm, along and across the shared axis.  contrast : of the contrast.
+    unmatched_share : share of the detections of each view without a partner.
+    span_px : length of the shared coordinate that both images cover, in px of the first.
+    pairs : number of pairs it rests on (a sum of probabilities); 0 for a model not learnt.
+    mean_gap_px : mean of the pairs' gaps (the best constant) and its standard error.
+    rms_px : root mean square of the gaps as they are, after the constant, after the whole bias,
+        and with every pair left out of its own bias.
+    """
+
+    bias_px: Array
+    bias_covariance_px2: Array
+    origin_mm: Array
+    reach_mm: Array
+    scatter_px: float
+    frame_px: float
+    size: LogRatioModel
+    contrast: LogRatioModel
+    unmatched_share: tuple[float, float]
+    span_px: float
+    pairs: float = 0.0
+    mean_gap_px: tuple[float, float] = (0.0, 0.0)
+    rms_px: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def calibration_problem(self) -> bool:
+        """Whether the gaps' systematic part is beyond chance and beyond half a pixel."""
+        return bool({Finding.CALIBRATION_OFFSET, Finding.OFFSET_VARIES} & set(self.findings))
+
+    def basis(self, points_mm: Array, terms: int | None = None) -> Array:
+        """(..., 3) rig points -> (..., B) terms of the bias."""
+        scaled = (points_mm - self.origin_mm) / self.reach_mm
+        x, y, z = np.moveaxis(np.clip(scaled, -1.5, 1.5), -1, 0)
+        every = [np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
+        return np.stack(every[: len(self.bias_px) if terms is None else terms], -1)
+
+    def bias(self, points_mm: Array) -> tuple[Array, Array]:
+        """(...,) systematic gap (px) at rig points, and its variance (px^2)."""
+        basis = self.basis(points_mm)
+        variance = np.einsum("...i,ij,...j", basis, self.bias_covariance_px2, basis)
+        return basis @ self.bias_px, np.asarray(variance)
+
+    def sentences(self, without: Collection[Finding] = ()) -> list[str]:
+        """The findings in plain words, one string each, but those in ``without``."""
+        if Finding.NO_DETECTIONS in self.findings:
+            return ["No frame has detections in both cameras: nothing was learnt about the pairs."]
+        offset, error = self.mean_gap_px
+        raw, after_constant, after_all, left_out = self.rms_px
+        texts = {
+            Finding.CALIBRATION_OFFSET: (
+                "This is a calibration problem: the coordinate that both cameras share is off by "
+                f"{offset:+.2f} px. With that constant removed, {after_constant:.2f} px RMS "
+                "remain. The matching removes the offset; the positions keep it until the rig is "
+                "calibrated again."
+            ),
+            Finding.OFFSET_VARIES: (
+                "The offset changes over the volume: a smooth function of position reduces the "
+                f"gaps from {after_constant:.2f} px RMS to {after_all:.2f} px "
+                f"({left_out:.2f} px for pairs left out of the fit). Possible causes are "
+                "distortion, refraction and the cameras' timing."
+            ),
+            Finding.FEW_PAIRS: (
+                "There are too few pairs to distinguish a biased calibration from wrong pairs."
+            ),
+            Finding.UNCLEAR_OFFSET: (
+                "The offset hardly stands out among the possible ones, because the bubbles' sizes "
+                "are too similar. Trust these pairs only where tracks confirm them, or calibrate "
+                "again."
+            ),
+            Finding.CAMERA_SHAKE: (
+                f"All gaps of a frame shift together by {self.frame_px:.2f} px RMS: the cameras "
+                "shake against each other."
+            ),
+        }
+        return [
+            f"The run gives {self.pairs:.1f} pairs. The two rays of a pair miss each other by "
+            f"{raw:.2f} px RMS along the axis that the cameras share, on average by "
+            f"{offset:+.2f} +- {error:.2f} px.",
+            *(text for finding, text in texts.items() if finding in {*self.findings} - {*without}),
+        ]
+
 
 SAFE_LOG_ODDS = 3.0
 """Posterior log odds (20 to 1) below which a pair is ambiguous."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
-from telerig.estimator.dots.grid.local_fit import apply_homography, fit_homography
+from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
 from telerig.factors.projection import State
 from telerig.rig.pose import nearest_rotation
 from telerig.rig.projection import INDEX

@@ -1,6 +1,5 @@
 """The numbering of dots: which dot of the target is which dot of the image.
 
 In: unordered dots. Out: row and column of each. Read ``numbering`` first; ``lattice`` finds the
-grid, ``placements`` lays the target onto it, ``marks`` weighs the marks, ``point_layout`` serves
-targets without a grid.
+grid, ``point_layout`` serves targets without a grid.
 """

@@ -1,8 +1,11 @@
 """Number the dots of one image: which dot of the target is each.
 
 The lattice tells which dots are neighbours; the marks, the extent of a bounded grid and the pitch
-ratio tell which dot is which. Where they do not suffice, the numbering is marked as ambiguous and
-lists all candidates: a wrong number would spoil a calibration, a missing image hardly matters.
+ratio tell which dot is which. Every placement of the target on the lattice gets a log-likelihood.
+One mark that is missed, or one dot that only looks like a mark, makes a numbering less likely but
+not impossible, so the evidence of each place is bounded on both sides. Where the evidence does not
+suffice, the numbering is marked as ambiguous and lists all candidates: a wrong number would spoil a
+calibration, a missing image hardly matters.
 """
 
 from __future__ import annotations
@@ -16,18 +19,246 @@ from numpy.typing import NDArray
 
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.grid.lattice import MIN_DOTS, Lattice, grow_lattice, shape_matrix
-from telerig.estimator.dots.grid.marks import MarkEvidence, mark_evidence
-from telerig.estimator.dots.grid.placements import (
-    MAX_TIED,
-    Placements,
-    rank_placements,
-    related_by_symmetry,
-)
 from telerig.estimator.dots.grid.point_layout import match_points
-from telerig.rig.target import Target
+from telerig.rig.target import QUARTER_TURNS, Target
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+LOG_MISSED_MARK = -4.0
+"""A mark that is seen as a plain dot."""
+LOG_FALSE_MARK = -7.5
+"""A plain dot that is seen as a mark."""
+LOG_UNSEEN_MARK = -2.0
+"""A mark where the image shows no lattice place, or the dot of a mark is lost."""
+LOG_FILLED_GAP = -5.0
+"""A dot (dirt, say) at the place of a mark of the style "missing"."""
+LOG_UNSURE_GAP = -0.7
+"""A mark of the style "missing" at an empty place that has too few dots round it to be a gap."""
+
+
+@dataclass(frozen=True)
+class MarkEvidence:
+    """Evidence for marks at the places of a lattice.
+
+    gain : (H, W) log-likelihood ratio of mark to plain dot; place (i, j) is gain[i + 1, j + 1].
+    seen : (K, 2) places that look like marks.
+    """
+
+    gain: Array
+    seen: Ints
+
+    def at(self, places: Ints) -> Array:
+        """(...,) log-likelihood ratio at (..., 2) places; marks outside the lattice are unseen."""
+        shifted = places + 1
+        inside = np.all((shifted >= 0) & (shifted < self.gain.shape), axis=-1)
+        clipped = np.clip(shifted, 0, np.array(self.gain.shape) - 1)
+        return np.where(inside, self.gain[clipped[..., 0], clipped[..., 1]], LOG_UNSEEN_MARK)
+
+    def is_seen(self, places: Ints) -> Bools:
+        """(...,) whether each of the (..., 2) places looks like a mark."""
+        if not len(self.seen):
+            return np.zeros(places.shape[:-1], bool)
+        return np.asarray(np.any(np.all(places[..., None, :] == self.seen, axis=-1), axis=-1))
+
+
+def relative_diameter(lattice: Lattice) -> Array:
+    """(n,) diameter of each dot in units of the lattice's own pitch, relative to the median dot."""
+    size = np.linalg.det(lattice.shape) ** 0.25
+    return np.asarray(size / np.median(size))
+
+
+def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
+    """(n,) probability that each dot looks like a mark of the target's style (not "missing").
+
+    rings : (n,) whether the image shows a ring.
+    """
+    if target.mark_style == "ring":
+        return rings.astype(float)
+    size = np.log(relative_diameter(lattice))
+    step = np.log(
+        (target.mark_diameter_mm or 1.5 * target.dot_diameter_mm) / target.dot_diameter_mm
+    )
+    spread = 1.5 * 1.4826 * float(np.median(np.abs(size)))
+    sigma = float(np.clip(spread, 0.05, max(abs(step) / 4, 0.05)))
+    odds = (size - step / 2) * step / sigma**2
+    return np.asarray(1 / (1 + np.exp(-np.clip(odds, -30, 30))))
+
+
+def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidence:
+    """Evidence at all places of the lattice and of a border one place wide.
+
+    rings : (n,) whether the image shows a ring.
+    """
+    shape = lattice.places.max(0) + 3
+    occupied = np.zeros(shape, bool)
+    occupied[tuple((lattice.places + 1).T)] = True
+    gain = np.full(shape, LOG_UNSEEN_MARK)
+    if target.mark_style == "missing":
+        gaps = _gaps(occupied, target.bounded)
+        lost = max(0.5, gaps.sum() - len(target.marks)) / occupied.sum()
+        gain[_count_around(occupied) >= 4] = LOG_UNSURE_GAP
+        gain[occupied] = LOG_FILLED_GAP
+        gain[gaps] = -np.clip(np.log(lost), -5.0, -1.5)
+        return MarkEvidence(gain, np.argwhere(gaps) - 1)
+    like = mark_likeness(lattice, rings, target)
+    gain[tuple((lattice.places + 1).T)] = mark_gain(like)
+    return MarkEvidence(gain, lattice.places[like > 0.4])
+
+
+def mark_gain(likeness: Array) -> Array:
+    """(n,) log-likelihood ratio of mark to plain dot, from the likeness of `mark_likeness` (n,)."""
+    missed, false = np.exp(LOG_MISSED_MARK), np.exp(LOG_FALSE_MARK)
+    as_mark = np.log(likeness * (1 - missed) + (1 - likeness) * missed)
+    as_plain = np.log(likeness * false + (1 - likeness) * (1 - false))
+    return np.asarray(as_mark - as_plain)
+
+
+def _gaps(occupied: Bools, bounded: bool) -> Bools:
+    """Empty places among dots; the border of a bounded grid needs dots on its inner side only."""
+    around = _count_around(occupied)
+    if not bounded:
+        return np.asarray(~occupied & (around >= 6))
+    inside = np.zeros(occupied.shape, bool)
+    inside[1:-1, 1:-1] = True
+    enough = np.maximum(3, 0.6 * _count_around(inside))
+    return np.asarray(~occupied & inside & (around >= enough))
+
+
+def _count_around(places: Bools) -> Ints:
+    """(H, W) how many of the eight neighbours are set."""
+    from scipy.ndimage import convolve
+
+    ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+    return np.asarray(convolve(places.astype(np.int64), ring, mode="constant"))
+
+
+LOG_DOT_OUTSIDE = -6.0
+"""Log-likelihood of a dot on the lattice where the target has none."""
+MARGIN = 4.0
+"""Placements within this log-likelihood of the best are taken as equally good."""
+MAX_TIED = 64
+
+_MIN_ASPECT_SIGMA = 0.03
+
+
+@dataclass(frozen=True)
+class Placements:
+    """K placements of the grid on a lattice, best first: (column, row) = turn @ place - shift.
+
+    turn : (K, 2, 2), det -1 where the image is mirrored; shift : (K, 2); score : (K,)
+    log-likelihoods.
+    """
+
+    turn: Ints
+    shift: Ints
+    score: Array
+
+    def columns_rows(self, places: Ints) -> Ints:
+        """(K, n, 2) column and row on the target, for each of the K placements.
+
+        places : (n, 2) indices of dots in the lattice of the image.
+        """
+        turned = np.einsum("kab,nb->kna", self.turn, places)
+        return np.asarray(turned - self.shift[:, None])
+
+    def places(self, columns_rows: Ints) -> Ints:
+        """(K, m, 2) places of (m, 2) columns and rows: the inverse of `columns_rows`."""
+        shifted = columns_rows + self.shift[:, None]
+        return np.asarray(np.einsum("kba,knb->kna", self.turn, shifted))
+
+    def take(self, which: Ints) -> Placements:
+        return Placements(self.turn[which], self.shift[which], self.score[which])
+
+
+def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: Target) -> Placements:
+    """All placements within `MARGIN` of the best, best first (unmirrored before mirrored).
+
+    Mirrored images are considered where the target's marks tell them apart.
+
+    Raises DetectionError when the image shows none of the marks that an unbounded grid needs,
+    InputError when an unbounded grid has no marks.
+    """
+    hands = (1, -1) if target.mirror_images_differ() else (1,)
+    turns = [turn * np.array([[hand], [1]]) for hand in hands for turn in QUARTER_TURNS]
+    aspect = _aspect_score(lattice, target)
+    parts = []
+    for turn in turns:
+        shifts, score = _shifts(lattice, evidence, target, turn)
+        score = score + aspect[int(turn[0, 0] == 0)]
+        parts.append((np.broadcast_to(turn, (len(shifts), 2, 2)), shifts, score))
+    every = Placements(*(np.concatenate(p) for p in zip(*parts)))
+    if not len(every.score):
+        raise DetectionError(
+            f"none of the target's {len(target.marks)} marks was found",
+            todo="an unbounded grid is numbered from its marks: keep them in view, and check "
+            "[target] marks, mark_style and mark_diameter_mm in rig.toml",
+        )
+    order = np.argsort(-np.round(every.score, 6), kind="stable")
+    return every.take(order[every.score[order] >= every.score[order[0]] - MARGIN])
+
+
+def _aspect_score(lattice: Lattice, target: Target) -> tuple[float, float]:
+    """Log-likelihoods, from the dots' shapes, that the lattice's first axis is x and is y."""
+    logs = 0.5 * np.log(lattice.shape[:, 1, 1] / lattice.shape[:, 0, 0])
+    middle = float(np.median(logs))
+    spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+    sigma = max(_MIN_ASPECT_SIGMA, 1.25 * spread / np.sqrt(len(logs)))
+    nominal = float(np.log(target.pitch_mm[0] / target.pitch_mm[1]))
+    along = [max(-0.5 * ((middle - s * nominal) / sigma) ** 2, -100.0) for s in (1, -1)]
+    return along[0], along[1]
+
+
+def _shifts(
+    lattice: Lattice, evidence: MarkEvidence, target: Target, turn: Ints
+) -> tuple[Ints, Array]:
+    if target.bounded:
+        shifts, score = _bounded_shifts(lattice.places @ turn.T, target)
+    elif target.marks:
+        seen = evidence.seen @ turn.T
+        shifts = np.unique((seen[:, None] - target.marks_column_row()).reshape(-1, 2), axis=0)
+        score = np.zeros(len(shifts))
+    else:
+        raise InputError(
+            "an unbounded grid without marks has no origin",
+            where="[target]",
+            todo="state marks, or extent = 'bounded'",
+        )
+    if target.marks:
+        score = score + evidence.at((target.marks_column_row() + shifts[:, None]) @ turn).sum(1)
+    return shifts, score
+
+
+def _bounded_shifts(turned: Ints, target: Target) -> tuple[Ints, Array]:
+    """(S, 2) shifts that keep most dots within rows x columns, and their log-likelihoods (S,)."""
+    size = np.array([target.columns, target.rows])
+    low = turned.min(0) - size + 1
+    span = turned.max(0) - low + size
+    count = np.zeros(span + 1, np.int64)
+    count[tuple((turned - low + 1).T)] = 1
+    total = count.cumsum(0).cumsum(1)
+    c, r = size
+    inside = total[c:, r:] - total[:-c, r:] - total[c:, :-r] + total[:-c, :-r]
+    outside = len(turned) - inside
+    near = np.argwhere(outside <= outside.min() + 8)
+    return near + low, LOG_DOT_OUTSIDE * outside[tuple(near.T)]
+
+
+def related_by_symmetry(placements: Placements, target: Target) -> bool:
+    """Whether the placements differ only by rotations that leave the target unchanged."""
+    hands = np.linalg.det(placements.turn)
+    if np.any(hands != hands[0]):
+        return False
+    marks = target.marks_column_row()
+    corners = np.array([[0, 0], [target.columns - 1, target.rows - 1]])
+    seen = placements.places(np.concatenate([marks, corners]))[0]
+    moved = placements.columns_rows(seen)
+    if target.bounded and np.any(np.sort(moved[:, len(marks) :], axis=1) != corners):
+        return False
+    wanted = {*map(tuple, marks.tolist())}
+    return all({*map(tuple, one[: len(marks)].tolist())} == wanted for one in moved)
+
 
 NEEDED = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
 OUTSIDE = "on the grid, outside the target's rows and columns"

@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from telerig.errors import DetectionError
-from telerig.estimator.dots.grid.lattice import MIN_DOTS, circle_from_ellipses
-from telerig.estimator.dots.grid.local_fit import (
+from telerig.estimator.dots.grid.lattice import (
+    MIN_DOTS,
     apply_homography,
+    circle_from_ellipses,
     fit_affine,
     fit_homography,
 )

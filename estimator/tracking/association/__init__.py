@@ -1,5 +1,5 @@
 """Which measurement continues which track.
 
 In: predicted tracks and one frame's measurements. Out: updated tracks, and open hypotheses. Read
-``likelihoods``, then ``advance``.
+``likelihoods``, then ``hypotheses``.
 """

@@ -1,4 +1,4 @@
-"""Conflicts that stay open: several ways to continue a few tracks, until one is left.
+"""One frame of the confirmed tracks: pair, keep several hypotheses where pairings conflict, update.
 
 Tracks that compete for measurements form a cluster; each of its branches is one way to continue
 all of them, with its log weight relative to the best. Branches with the same recent pairings are
@@ -11,11 +11,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from telerig.estimator.tracking.filter.state import Track
-from telerig.estimator.tracking.filter.types import TrackerSettings
+from telerig.estimator.tracking.association.likelihoods import (
+    Pairs,
+    alternatives,
+    assigned_with_shift,
+    gate2,
+    gated_pairs,
+    joint_score,
+)
+from telerig.estimator.tracking.filter.motion import POSITION
+from telerig.estimator.tracking.filter.state import Common, Track
+from telerig.estimator.tracking.filter.types import FrameMeasurements, Ids, TrackerSettings
 
 _MERGE_FRAMES = 2
 
@@ -201,3 +214,211 @@ def _agreed_links_from(paths: list[list[list[tuple[int, int]]]]) -> int:
             break
         start = earlier
     return start
+
+
+Array = NDArray[np.float64]
+
+_SLACK_NATS = 6.0
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A frame: its time, its measurements, and those of them (columns) that are free."""
+
+    frame: int
+    t_s: float
+    measured: FrameMeasurements
+    columns: Ids
+    settings: TrackerSettings
+
+
+@dataclass(frozen=True)
+class Child:
+    """A way to continue ``parents``: per track the index into the pairs, -1 where it is missed."""
+
+    score: float
+    parents: tuple[Branch, ...]
+    edges: tuple[int, ...]
+
+
+class Association:
+    """The pairings of one frame, and the common shift that goes with the best of them."""
+
+    def __init__(self, clusters: Sequence[Cluster], scan: Scan, common: Common) -> None:
+        self.clusters, self.scan, self.prior = clusters, scan, common
+        rows = [
+            (c, b, t)
+            for c, cluster in enumerate(clusters)
+            for b, branch in enumerate(cluster.branches)
+            for t in branch.tracks
+        ]
+        self.cluster_of = np.array([c for c, _, _ in rows], int)
+        first = np.array([b == 0 for _, b, _ in rows], bool)
+        self.row_of = {id(t): i for i, (_, _, t) in enumerate(rows)}
+        self.tracks = [t for _, _, t in rows]
+        pairs = gated_pairs(self.tracks, scan.measured, scan.columns, common, scan.settings)
+        self.common, self.chosen = assigned_with_shift(pairs, len(rows), first, common)
+        self.pairs, self.owner = pairs, self.cluster_of[pairs.row]
+        self.picked = np.flatnonzero(first[pairs.row] & (self.chosen[pairs.row] == pairs.column))
+        self.edges = self._allowed()
+
+    def mean_gain(self, others: Sequence[Array]) -> Array | None:
+        """(n, 3) mean filter gain of the bubbles that are updated; None if there are none."""
+        p = [self.tracks[i].filter.P[:, POSITION] for i in self.pairs.row[self.picked]]
+        gains = [a @ b for a, b in zip(p, self.pairs.information[self.picked])]
+        return np.mean([*others, *gains], axis=0) if others or gains else None
+
+    def _allowed(self) -> Ids:
+        """Pairings inside their gate, the common shift estimated from the other clusters alone."""
+        pairs, owner = self.pairs, self.owner
+        information = np.zeros((len(self.clusters), 3, 3))
+        np.add.at(information, owner[self.picked], pairs.information[self.picked])
+        pull = np.zeros((len(self.clusters), 3))
+        left = pairs.innovation_mm - self.prior.shift_mm
+        pulls = np.einsum("eij,ej->ei", pairs.information, left)
+        np.add.at(pull, owner[self.picked], pulls[self.picked])
+        prior = self.prior.covariance_mm2
+        others = information.sum(0) - information
+        outside = prior @ np.linalg.inv(np.eye(3) + others @ prior)
+        shift = np.einsum("cij,cj->ci", outside, pull.sum(0) - pull)[owner]
+        total = np.linalg.inv(pairs.covariance_mm2 + outside[owner])
+        off = left - shift
+        near = np.einsum("ei,eij,ej->e", off, total, off) <= gate2(self.scan.settings)
+        return np.flatnonzero(near)
+
+    def components(self) -> list[tuple[list[int], list[int]]]:
+        """Clusters that share a measurement, each with its edges (indices into the pairs)."""
+        owner, many = self.owner[self.edges], len(self.clusters)
+        column, size = self.pairs.column[self.edges], many + len(self.scan.measured)
+        graph = coo_array((np.ones(len(owner)), (owner, many + column)), (size, size))
+        labels = connected_components(graph, directed=False)[1][:many]
+        groups: dict[int, tuple[list[int], list[int]]] = {int(g): ([], []) for g in labels}
+        for cluster, group in enumerate(labels.tolist()):
+            groups[group][0].append(cluster)
+        for edge, group in zip(self.edges.tolist(), labels[owner].tolist()):
+            groups[group][1].append(edge)
+        return list(groups.values())
+
+    def outside(self, members: Sequence[int]) -> Common:
+        """The common shift, estimated from the bubbles outside some clusters."""
+        others = self.picked[~np.isin(self.owner[self.picked], members)]
+        return self.prior.informed(
+            self.pairs.innovation_mm[others], self.pairs.covariance_mm2[others]
+        )
+
+
+def children(found: Association, members: Sequence[int], edges: Sequence[int]) -> list[Child]:
+    """The likely ways to continue some clusters together, equal recent pasts merged, best first."""
+    settings, pairs = found.scan.settings, found.pairs
+    outside = found.outside(members)
+    score = pairs.scores(outside.shift_mm)
+    by_row: dict[int, list[int]] = {}
+    for e in edges:
+        by_row.setdefault(int(pairs.row[e]), []).append(e)
+    raw: list[Child] = []
+    every = product(*(found.clusters[m].branches for m in members))
+    ranked = sorted(every, key=lambda branches: -sum(b.weight for b in branches))
+    for parents in ranked[: settings.max_hypotheses]:
+        rows = [found.row_of[id(t)] for b in parents for t in b.tracks]
+        options = [
+            [(int(pairs.column[e]), float(score[e])) for e in by_row.get(r, [])] for r in rows
+        ]
+        start = sum(b.weight for b in parents)
+        for taken, _ in alternatives(options, settings.prune_nats + _SLACK_NATS):
+            chosen = tuple(
+                next((e for e in by_row.get(r, []) if pairs.column[e] == c), -1)
+                for r, c in zip(rows, taken)
+            )
+            used = np.array([e for e in chosen if e >= 0], int)
+            raw.append(Child(start + joint_score(pairs, used, outside), parents, chosen))
+    histories = (_histories(c, pairs, found.scan.frame) for c in raw)
+    scored = ((c.score, merge_key(h.values()), i) for i, (c, h) in enumerate(zip(raw, histories)))
+    return [Child(w, raw[i].parents, raw[i].edges) for w, i in merged(scored, settings)]
+
+
+def _histories(child: Child, pairs: Pairs, frame: int) -> History:
+    tracks = [(b, t) for b in child.parents for t in b.tracks]
+    return {
+        t.particle: [
+            *b.history.get(t.particle, []),
+            (frame, int(pairs.column[e]) if e >= 0 else -1),
+        ]
+        for (b, t), e in zip(tracks, child.edges)
+    }
+
+
+def grow(found: Association, members: Sequence[int], child: Child, mean_gain: Array) -> Branch:
+    """The branch of a child, its tracks updated with the common shift that its pairings imply."""
+    pairs, scan = found.pairs, found.scan
+    used = np.array([e for e in child.edges if e >= 0], int)
+    common = found.outside(members).informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
+    tracks = [t.copy() for b in child.parents for t in b.tracks]
+    for track, e in zip(tracks, child.edges):
+        column = int(pairs.column[e]) if e >= 0 else -1
+        continue_track(track, column, scan, common, mean_gain)
+    return Branch(child.score, tracks, _histories(child, pairs, scan.frame))
+
+
+def continue_track(track: Track, column: int, scan: Scan, common: Common, mean_gain: Array) -> None:
+    """Update in place with a measurement's column, or -1."""
+    if column < 0:
+        track.missed(common.shift, mean_gain, common.covariance_mm2)
+        return
+    measured = scan.measured
+    track.update(
+        measured.points_mm[column],
+        measured.covariance_mm2[column],
+        common.shift,
+        mean_gain,
+        common.covariance_mm2,
+    )
+    track.saw(scan.frame, scan.t_s, float(measured.d_eq_mm[column]))
+
+
+def advance(
+    clusters: Sequence[Cluster], scan: Scan, common: Common, other_gains: Sequence[Array] = ()
+) -> tuple[list[Cluster], Common, Array | None]:
+    """The clusters after this frame (not decided yet), the common part, the mean gain.
+
+    other_gains : (n, 3) each, of the bubbles that were updated already. Tracks without a rival are
+    updated in place. A cluster whose history is not empty is open.
+    """
+    found = Association(clusters, scan, common)
+    mean_gain = found.mean_gain(other_gains)
+    gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
+    out = []
+    for members, edges in found.components():
+        first = clusters[members[0]]
+        if len(members) == 1 and not first.open and len(first.tracks) == 1 and len(edges) < 2:
+            track = first.tracks[0]
+            column = int(found.chosen[found.row_of[id(track)]]) if edges else -1
+            continue_track(track, column, scan, found.common, gain)
+            out.append(Cluster([Branch(0.0, [track], {track.particle: [(scan.frame, column)]})]))
+            continue
+        every = children(found, members, edges)
+        out.append(Cluster([grow(found, members, child, gain) for child in every]))
+    return out, found.common, mean_gain
+
+
+def follow_labelled(
+    tracks: Sequence[Track], scan: Scan, common: Common
+) -> tuple[Common, list[Array], list[int]]:
+    """Update tracks whose ids came with the measurements, in place: no association is needed.
+
+    Returns the common shift that they imply, their gains, and the columns without a track yet.
+    """
+    columns = {int(scan.measured.particle[c]): int(c) for c in scan.columns}
+    at = [columns.pop(t.particle, -1) for t in tracks]
+    seen = [(t, c) for t, c in zip(tracks, at) if c >= 0]
+    fresh = sorted(columns.values())
+    if not seen:
+        return common, [], fresh
+    innovations = np.array([scan.measured.points_mm[c] - t.point_mm for t, c in seen])
+    noise = np.array([scan.measured.covariance_mm2[c] for _, c in seen])
+    p = np.array([t.filter.P[:, POSITION] for t, _ in seen])
+    covariance = p[:, POSITION] + noise
+    common = common.informed(innovations, covariance)
+    gains = p @ np.linalg.inv(covariance)
+    for track, column in zip(tracks, at):
+        continue_track(track, column, scan, common, gains.mean(0))
+    return Common(covariance=common.covariance), list(gains), fresh

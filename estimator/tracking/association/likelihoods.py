@@ -2,6 +2,7 @@
 
 A pairing's score is its log-likelihood ratio against "the track was missed and the measurement is
 new": log P_D / (1 - P_D) + log N(innovation) - log(density of new ones) + log ratio of the sizes.
+Measurements are points in space, or pixels of one camera alone.
 """
 
 from __future__ import annotations
@@ -11,12 +12,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import chdtri
 
+from telerig.estimator.tracking.filter.motion import POSITION
 from telerig.estimator.tracking.filter.state import Common, Track
 from telerig.estimator.tracking.filter.types import FrameMeasurements, Ids, TrackerSettings
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import stacked_jacobian
 
 Array = NDArray[np.float64]
 
@@ -200,3 +204,61 @@ def alternatives(
         free = [(c, s) for c, s in ordered[depth] if c not in taken]
         stack.extend(((*taken, c), score + s) for c, s in reversed(free))
     return [(taken, score) for taken, score in found if score >= best - within_nats]
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Points in one camera: pixels (K, 2), their derivatives by the rig point (K, 2, 3), and the
+    pixels' covariance (K, 2, 2) from the points' own."""
+
+    uv_px: Array
+    by_point: Array
+    covariance_px2: Array
+
+
+def projected(camera: Camera, points_mm: Array, covariance_mm2: Array) -> Projected:
+    """Of rig points (K, 3) with covariances (K, 3, 3)."""
+    uv, by_point, _ = stacked_jacobian((camera,), points_mm)
+    return Projected(uv, by_point, by_point @ covariance_mm2 @ np.swapaxes(by_point, -1, -2))
+
+
+def px_per_mm(by_point: Array) -> Array:
+    """(K,) scale across the line of sight, from derivatives (K, 2, 3) of pixels by the point."""
+    return np.asarray(np.linalg.det(by_point @ np.swapaxes(by_point, -1, -2)) ** 0.25)
+
+
+def pair_pixels(
+    expected: Projected,
+    uv_px: Array,
+    covariance_px2: Array,
+    settings: TrackerSettings,
+    *,
+    size_score: ArrayLike = 0.0,
+    allowed: ArrayLike = True,
+) -> list[int]:
+    """For each expected track the detection that continues it, -1 for none or with a rival.
+
+    uv_px (L, 2), covariance_px2 (L, 2, 2) : the detections.
+    size_score, allowed : (K, L) or less, log-likelihood ratio of the sizes, and pairings to try.
+    """
+    between = uv_px[None] - expected.uv_px[:, None]
+    covariance = expected.covariance_px2[:, None] + covariance_px2[None]
+    distance2 = np.einsum("kli,klij,klj->kl", between, np.linalg.inv(covariance), between)
+    row, column = np.nonzero((distance2 <= gate2(settings, 2)) & allowed)
+    seen = settings.detection_probability
+    base = np.log(seen / (1 - seen) / settings.new_per_px2) - np.log(2 * np.pi)
+    ratio = base - np.log(np.linalg.det(covariance)) / 2 - distance2 / 2 + size_score
+    score = ratio[row, column]
+    chosen = best_assignment(len(between), row, column, score)
+    safe = unrivalled(row, column, score, chosen, settings.margin_nats)
+    return [int(c) if ok else -1 for c, ok in zip(chosen, safe)]
+
+
+def update_pixels(
+    track: Track, uv_px: Array, covariance_px2: Array, expected_px: Array, by_point: Array
+) -> None:
+    """filterpy's update with a pixel (2,), linearised where the track is expected."""
+    h = np.zeros((2, len(track.filter.x)))
+    h[:, POSITION] = by_point
+    linear = uv_px - expected_px + h @ track.filter.x
+    track.filter.update(linear.reshape(-1), R=covariance_px2, H=h)

@@ -9,10 +9,13 @@ from matching_scenes import frame, recall_and_precision, rig, table, truth
 from places import REAL
 
 from telerig.errors import InputError
-from telerig.estimator.bubbles.pairing.assignment import best_assignment
 from telerig.estimator.bubbles.pairing.learning import default_model, estimate_pair_model
-from telerig.estimator.bubbles.pairing.matching import Prediction, match_pairs
-from telerig.estimator.bubbles.pairing.pair_model import Finding
+from telerig.estimator.bubbles.pairing.matching import (
+    Finding,
+    Prediction,
+    best_assignment,
+    match_pairs,
+)
 
 PAIR = REAL / "bubble_pair"
 

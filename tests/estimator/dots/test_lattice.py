@@ -14,11 +14,13 @@ from telerig.estimator.dots.grid.lattice import (
     OFF_PLACE,
     SECOND_DOT,
     Lattice,
+    apply_homography,
     circle_from_ellipses,
+    fit_affine,
+    fit_homography,
     grow_lattice,
     shape_matrix,
 )
-from telerig.estimator.dots.grid.local_fit import apply_homography, fit_affine, fit_homography
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from telerig.estimator.dots.fit import luminance
 from telerig.estimator.dots.fit.blurred_ellipse import coverage_on_grid, shape_from_axes
-from telerig.estimator.dots.fit.luminance_fit import fit_dots
-from telerig.estimator.dots.fit.rejection import reason_against_fit
-from telerig.estimator.dots.fit.types import DotFit, Prior, Reason, Start, Window
+from telerig.estimator.dots.fit.candidates import reason_against_fit
+from telerig.estimator.dots.fit.luminance import DotFit, Prior, Reason, Start, Window, fit_dots
 from telerig.estimator.images.noise import (
     NoiseModel,
     agreed_factor,

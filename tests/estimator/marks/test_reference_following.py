@@ -8,9 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from telerig.errors import GeometryError
-from telerig.estimator.marks.following import AMBIGUOUS, HIDDEN, MOVED, Follower
+from telerig.estimator.marks.following import AMBIGUOUS, HIDDEN, MOVED, Follower, TankView
 from telerig.estimator.marks.strip_dots import DotSightings
-from telerig.estimator.marks.tank_view import TankView
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 from telerig.rig.camera import Camera

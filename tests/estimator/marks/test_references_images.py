@@ -15,10 +15,8 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
-from telerig.estimator.marks.erasing import StripInImages
-from telerig.estimator.marks.following import HIDDEN
+from telerig.estimator.marks.following import HIDDEN, StripInImages, TankView
 from telerig.estimator.marks.strip_dots import find_dots, learn_look
-from telerig.estimator.marks.tank_view import TankView
 from telerig.estimator.smoothing.results_folder import smooth_run
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.config import RunConfig, StripConfig

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import telerig
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.pairing.learning import default_model
-from telerig.estimator.bubbles.pairing.pair_model import Finding
+from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,

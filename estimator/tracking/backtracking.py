@@ -2,8 +2,8 @@
 
 The tracker goes forward only. Where a bubble is born hidden, or in frames with doubtful pairs, its
 position is better known from later frames: it is smoothed over all frames at hand (fixed-interval
-smoother of Rauch, Tung and Striebel, AIAA J. 3:1445, 1965), and detections without a track are given
-to it where no other explanation is nearly as likely (`follow_back`).
+smoother of Rauch, Tung and Striebel, AIAA J. 3:1445, 1965), and detections without a track are
+given to it where no other explanation is nearly as likely (`follow_back`).
 
 One outline in one image may show two bubbles which the other image separates. One camera alone sees
 the hidden bubble; its depth in that camera follows from the motion between the frames in which both

@@ -1,4 +1,4 @@
-"""Tracks of a run: every detection, every 3-D point, what happened, and the summary in a few lines."""
+"""Tracks of a run: detections, points in space, events, and the summary in a few lines."""
 
 from __future__ import annotations
 

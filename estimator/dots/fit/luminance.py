@@ -1,4 +1,4 @@
-"""The luminance model of a dot (Lavest, Viala, Dhome, 1999) and its least-squares fit to the pixels.
+"""The luminance model of a dot (Lavest, Viala, Dhome, 1999) and its least-squares fit.
 
 A pixel's grey level is ``B0 + B1 x + B2 y`` plus the blurred image of an ellipse of grey level
 ``C + C1 x + C2 y``, with (x, y) the offset from the window's middle in units of the dot's radius

@@ -95,6 +95,13 @@ class Pose:
         back = self.rotation.mT
         return Pose(back, -np.einsum("...ij,...j->...i", back, self.translation_mm))
 
+    def adjoint(self) -> Array:
+        """(..., 6, 6): T Exp(x) T^-1 = Exp(adjoint x) for tangents x (rotation, translation)."""
+        out = np.zeros((*self.rotation.shape[:-2], 6, 6))
+        out[..., :3, :3] = out[..., 3:, 3:] = self.rotation
+        out[..., 3:, :3] = hat(self.translation_mm) @ self.rotation
+        return out
+
     def __matmul__(self, other: Pose) -> Pose:
         turned = np.einsum("...ij,...j->...i", self.rotation, other.translation_mm)
         return Pose(self.rotation @ other.rotation, turned + self.translation_mm)

@@ -1,7 +1,11 @@
-"""Points in space from their pixels in two cameras: mid-point of the rays, maximum likelihood."""
+"""Points in space from their pixels: mid-point of the rays, maximum likelihood.
+
+`triangulate` takes two cameras that see every point, `triangulate_views` any number of cameras of
+which each point is seen by some."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,13 +32,23 @@ class Triangulation:
     covariance_mm2 : (..., 3, 3) of the measurement; where a calibration triangulates, the
         calibration's own uncertainty is added, which measurement_covariance_mm2 leaves out.
     ray_miss_mm : (...,) signed distance of the two rays, along their common perpendicular
-        (first direction x second direction), from the first ray to the second.
+        (first direction x second direction), from the first ray to the second. Of
+        `triangulate_views` (..., C): the distance of each of the C cameras' rays from the point,
+        NaN where the camera does not see it.
+    seen_by : (...,) how many cameras saw each point; None: two saw all. A point that fewer than
+        two saw has no place: its numbers are NaN.
     """
 
     points_mm: Array
     covariance_mm2: Array
     ray_miss_mm: Array
     measurement_covariance_mm2: Array
+    seen_by: NDArray[np.int64] | None = None
+
+    @property
+    def unplaced(self) -> int:
+        """The number of points that fewer than two cameras saw."""
+        return 0 if self.seen_by is None else int((self.seen_by < 2).sum())
 
 
 def midpoint(
@@ -114,6 +128,101 @@ def triangulate(
     return Triangulation(points, covariance, miss, covariance)
 
 
+def triangulate_views(
+    cameras: Sequence[Camera],
+    uv_px: Sequence[ArrayLike],
+    sigma_px: ArrayLike | tuple[ArrayLike, ...],
+    method: str = "ml",
+) -> Triangulation:
+    """Points from their pixels in those of C cameras that see them.
+
+    uv_px : C arrays (..., 2), NaN where a camera does not see a point.
+    sigma_px : scalar, (...,) or covariances (..., 2, 2); a tuple of C for each camera's.
+    method : "ml" as in `triangulate`, started at the point nearest to all rays, or "midpoint",
+        that point.
+
+    A point that fewer than two cameras see has NaN for its numbers; ``seen_by`` counts them.
+    Raises InputError for unequal shapes or an unknown method, GeometryError where all rays of a
+    point are parallel.
+    """
+    pixels = [np.asarray(uv, float) for uv in uv_px]
+    shapes = {uv.shape for uv in pixels}
+    if len(pixels) != len(cameras) or len(shapes) != 1 or pixels[0].shape[-1:] != (2,):
+        raise InputError(
+            f"pixels of shapes {', '.join(str(uv.shape) for uv in pixels)} for {len(cameras)} "
+            "cameras do not belong together",
+            todo="give an array (N, 2) for each camera, row i of the same point in all",
+        )
+    if method not in ("ml", "midpoint"):
+        raise InputError(f"unknown method {method!r}", todo='use "ml" or "midpoint"')
+    shape = pixels[0].shape[:-1]
+    sigmas = sigma_px if isinstance(sigma_px, tuple) else (sigma_px,) * len(cameras)
+    uv = np.array([p.reshape(-1, 2) for p in pixels])
+    seen = np.isfinite(uv).all(-1)
+    noise = np.array(
+        [
+            seen_covariance(s, mine.reshape(shape)).reshape(-1, 2, 2)
+            for s, mine in zip(sigmas, seen, strict=True)
+        ]
+    )
+    count = uv.shape[1]
+    points, covariance = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    miss = np.full((count, len(cameras)), np.nan)
+    for pattern in np.unique(seen.T, axis=0):
+        used = np.flatnonzero(pattern)
+        rows = np.flatnonzero((pattern == seen.T).all(-1))
+        if len(used) < 2:
+            continue
+        some = tuple(camera for camera, sees in zip(cameras, pattern) if sees)
+        measured, own = uv[np.ix_(used, rows)], list(noise[np.ix_(used, rows)])
+        rays = [camera.unproject(pixel) for camera, pixel in zip(some, measured)]
+        place = nearest_to_rays(*(np.array(part) for part in zip(*rays)))
+        if method == "ml":
+            place, spread = _maximum_likelihood(some, measured, own, place)
+        else:
+            spread = _midpoint_covariance(some, place, own)
+        points[rows], covariance[rows] = place, spread
+        miss[np.ix_(rows, used)] = np.transpose([_distance(place, *ray) for ray in rays])
+    covariance = covariance.reshape(*shape, 3, 3)
+    return Triangulation(
+        points.reshape(*shape, 3),
+        covariance,
+        miss.reshape(*shape, -1),
+        covariance,
+        seen.sum(0).reshape(shape),
+    )
+
+
+def nearest_to_rays(origins: Array, directions: Array) -> Array:
+    """(..., 3) points of least summed squared distance from C rays each, (C, ..., 3) and unit.
+
+    Raises GeometryError where all rays of a point are parallel.
+    """
+    across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
+    total = across.sum(0)
+    if np.any(np.linalg.eigvalsh(total)[..., 0] < 1e-8):
+        raise GeometryError(
+            "the rays of all cameras that see a point are parallel",
+            todo="triangulate with cameras that look in different directions",
+        )
+    right = (across @ origins[..., None]).sum(0)
+    return np.asarray(np.linalg.solve(total, right)[..., 0])
+
+
+def _distance(points: Array, origin: Array, direction: Array) -> Array:
+    """(N,) distance of points from rays of unit directions."""
+    return np.asarray(np.linalg.norm(np.cross(points - origin, direction), axis=-1))
+
+
+def seen_covariance(sigma_px: ArrayLike, seen: NDArray[np.bool_]) -> Array:
+    """`pixel_covariance` (..., 2, 2) of pixels that are ``seen`` (...,); elsewhere 1 px^2."""
+    sigma = np.asarray(sigma_px, float)
+    if sigma.shape == seen.shape:
+        sigma = np.where(seen, sigma, 1.0)
+    covariance = pixel_covariance(sigma, seen.shape)
+    return np.where(seen[..., None, None], covariance, np.eye(2))
+
+
 def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Array, Array, Array]:
     """(..., 2C) pixels, (..., 2C, 3) by the rig point, (C, ..., 2, 20) by the intrinsics."""
     pixels, jacobians, by_intrinsics = [], [], []
@@ -127,8 +236,8 @@ def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Arr
 
 
 def _maximum_likelihood(
-    cameras: tuple[Camera, Camera],
-    uv_px: tuple[Array, Array],
+    cameras: tuple[Camera, ...],
+    uv_px: Sequence[Array] | Array,
     covariances: list[Array],
     points: Array,
 ) -> tuple[Array, Array]:
@@ -154,9 +263,9 @@ def _weights(covariance: Array) -> Array:
 
 
 def _gauss_newton(
-    cameras: tuple[Camera, Camera], measured: Array, weights: Array, points: Array
+    cameras: tuple[Camera, ...], measured: Array, weights: Array, points: Array
 ) -> tuple[Array, Array]:
-    """measured (4, N), weights (2, 3, N), points (3, N) -> points (3, N), covariance (N, 3, 3)."""
+    """C cameras: measured (2C, N), weights (C, 3, N), points (3, N) -> (3, N), (N, 3, 3)."""
     points = np.ascontiguousarray(points)
     inverse = np.empty((6, points.shape[1]))
     for _ in range(_STEPS):
@@ -218,7 +327,7 @@ def _symmetric_inverse(matrix: Array) -> Array:
 
 
 def _midpoint_covariance(
-    cameras: tuple[Camera, Camera], points: Array, covariances: list[Array]
+    cameras: tuple[Camera, ...], points: Array, covariances: list[Array]
 ) -> Array:
     """First order: the mid-point is the least-squares point of object-space ray distances."""
     projectors, gains = [], []
@@ -227,6 +336,6 @@ def _midpoint_covariance(
         projectors.append(np.eye(3) - direction[..., :, None] * direction[..., None, :])
         _, jacobian, _ = stacked_jacobian((camera,), points)
         gains.append(projectors[-1] @ np.linalg.pinv(jacobian))
-    total = np.linalg.inv(projectors[0] + projectors[1])
+    total = np.linalg.inv(sum(projectors[1:], projectors[0]))
     spread = sum(g @ c @ g.mT for g, c in zip(gains, covariances))
     return np.asarray(total @ spread @ total.mT)

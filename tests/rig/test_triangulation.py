@@ -13,7 +13,7 @@ from scipy.optimize import least_squares, minimize
 from telerig.errors import GeometryError, InputError
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-from telerig.rig.triangulation import midpoint, stacked_jacobian, triangulate
+from telerig.rig.triangulation import midpoint, stacked_jacobian, triangulate, triangulate_views
 
 LENSES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "ideal": ({}, {}),
@@ -247,3 +247,100 @@ def test_pixels_that_are_not_finite_are_an_error() -> None:
     pixels[1][2, 0] = np.nan
     with pytest.raises(InputError, match="1 of 4 points"):
         triangulate(cameras, tuple(pixels), 0.1)
+
+
+def fan(count: int = 3) -> tuple[Camera, ...]:
+    """Cameras 50 degrees apart about the vertical axis, none like another."""
+    poses = [Pose.from_rotvec([0.03 * i, 0.87 * i, 0], [0.1 * i, 0.2 * i, 0]) for i in range(count)]
+    return tuple(
+        Camera.create(f"camera {i}", (512, 480), 10.0 + i, camera_from_rig=pose, k1=0.01 * i)
+        for i, pose in enumerate(poses)
+    )
+
+
+NOISE = (0.05, 0.1, 0.2, 0.08)
+
+
+def seen_by_some(cameras: tuple[Camera, ...], count: int) -> list[Any]:
+    """Noisy pixels; which cameras see a point goes round over all combinations."""
+    rng = np.random.default_rng(4)
+    out = []
+    for c, camera in enumerate(cameras):
+        uv = camera.project(points(count)) + NOISE[c] * rng.standard_normal((count, 2))
+        uv[(np.arange(count) // 2**c) % 2 == 1] = np.nan
+        out.append(uv)
+    return out
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_views_ml_is_the_minimum_that_scipy_finds(count: int) -> None:
+    cameras, number = fan(count), 2**count
+    pixels = seen_by_some(cameras, number)
+    found = triangulate_views(cameras, pixels, NOISE[:count])
+    assert found.ray_miss_mm.shape == (number, count)
+    for i in range(number):
+        seen = [c for c in range(count) if np.isfinite(pixels[c][i]).all()]
+        assert found.seen_by is not None and found.seen_by[i] == len(seen)
+        assert np.isfinite(found.ray_miss_mm[i]).tolist() == [
+            c in seen and len(seen) > 1 for c in range(count)
+        ]
+        if len(seen) < 2:
+            assert np.isnan(found.points_mm[i]).all() and np.isnan(found.covariance_mm2[i]).all()
+            continue
+
+        def residual(x: Any, i: int = i, seen: list[int] = seen) -> Any:
+            return np.concatenate([(cameras[c].project(x) - pixels[c][i]) / NOISE[c] for c in seen])
+
+        fit = least_squares(residual, np.zeros(3), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        np.testing.assert_allclose(found.points_mm[i], fit.x, atol=1e-6)
+        expected = np.linalg.inv(fit.jac.T @ fit.jac)
+        np.testing.assert_allclose(found.covariance_mm2[i], expected, rtol=1e-4, atol=1e-9)
+        for c in seen:
+            origin, direction = cameras[c].unproject(pixels[c][i])
+            miss = np.linalg.norm(np.cross(found.points_mm[i] - origin, direction))
+            assert found.ray_miss_mm[i, c] == pytest.approx(miss, abs=1e-12)
+    assert found.unplaced == count + 1
+
+
+@pytest.mark.parametrize("method", ["ml", "midpoint"])
+@pytest.mark.parametrize("shape", [(), (1,), (3, 2)])
+def test_views_of_two_cameras_are_the_pair(method: str, shape: tuple[int, ...]) -> None:
+    cameras = fan(2)
+    truth = np.random.default_rng(1).uniform(-9, 9, (*shape, 3))
+    pixels = tuple(c.project(truth) + 0.3 for c in cameras)
+    pair = triangulate((cameras[0], cameras[1]), (pixels[0], pixels[1]), 0.1, method)
+    views = triangulate_views(cameras, pixels, 0.1, method)
+    np.testing.assert_allclose(views.points_mm, pair.points_mm, atol=1e-9)
+    np.testing.assert_allclose(views.covariance_mm2, pair.covariance_mm2, rtol=1e-7, atol=1e-12)
+    total = views.ray_miss_mm.sum(-1)
+    assert np.all(total >= np.abs(pair.ray_miss_mm) - 1e-9)
+    if method == "midpoint":
+        np.testing.assert_allclose(total, np.abs(pair.ray_miss_mm), atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["ml", "midpoint"])
+def test_views_scatter_as_their_covariance_says(method: str) -> None:
+    cameras, count = fan(3), 4000
+    truth = np.array([3.0, -2.0, 4.0])
+    rng = np.random.default_rng(7)
+    pixels = [
+        camera.project(truth) + sigma * rng.standard_normal((count, 2))
+        for camera, sigma in zip(cameras, NOISE)
+    ]
+    found = triangulate_views(cameras, pixels, NOISE[:3], method)
+    error = found.points_mm - truth
+    normed = np.linalg.solve(found.covariance_mm2, error[..., None])[..., 0]
+    assert (error * normed).sum(-1).mean() / 3 == pytest.approx(1, abs=0.05)
+
+
+def test_views_that_cannot_be_used() -> None:
+    cameras = fan(3)
+    uv = np.full((4, 2), 250.0)
+    with pytest.raises(InputError, match="do not belong together"):
+        triangulate_views(cameras, [uv, uv], 0.1)
+    with pytest.raises(InputError, match="do not belong together"):
+        triangulate_views(cameras, [uv, uv, uv[:2]], 0.1)
+    with pytest.raises(InputError, match="unknown method"):
+        triangulate_views(cameras, [uv, uv, uv], 0.1, "middle")
+    with pytest.raises(GeometryError, match="parallel"):
+        triangulate_views((cameras[0], cameras[0]), [uv, uv], 0.1)

@@ -12,7 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.summary import summary
-from telerig.estimator.calibration.solver.covariance import point_shift_jacobian, rig_jacobian
+from telerig.estimator.calibration.solver.covariance import (
+    POSE_COMPONENTS,
+    point_shift_jacobian,
+    rig_jacobian,
+)
 from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
 from telerig.io.results.calibration import (
@@ -25,7 +29,13 @@ from telerig.io.results.calibration import (
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
-from telerig.rig.triangulation import Triangulation, pixel_covariance, triangulate
+from telerig.rig.triangulation import (
+    Triangulation,
+    pixel_covariance,
+    seen_covariance,
+    triangulate,
+    triangulate_views,
+)
 
 Array = NDArray[np.float64]
 
@@ -38,7 +48,8 @@ class Calibration:
     dot_ids : (N,); target_points_mm : (N, 3) estimated dots in the target's frame.
     target_poses : view name -> rig_from_target.
     covariance : (P, P) of the rig block, ``covariance_names`` its components: the free intrinsics
-        of each camera, then the tangent (rotation, translation) of rig_from_<second>.
+        of each camera, then the tangent (rotation, translation) of rig_from_<camera> of each
+        camera but the first.
     free : per camera, names of the free intrinsics.
     joint_names, joint_covariance : the whole estimate, or empty when loaded without it.
     stage : travel axis and encoder scale with their covariance (`StageAxis.as_dict`), or empty.
@@ -102,30 +113,50 @@ class Calibration:
 
     def triangulate(
         self,
-        uv_first_px: ArrayLike,
-        uv_second_px: ArrayLike,
+        uv_first_px: ArrayLike | Mapping[str, ArrayLike],
+        uv_second_px: ArrayLike | None = None,
         *,
-        sigma_px: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+        sigma_px: ArrayLike | tuple[ArrayLike, ...] | Mapping[str, ArrayLike] | None = None,
         method: str = "ml",
         include_calibration: bool = True,
     ) -> Triangulation:
-        """Points in the rig frame from pixels in both cameras.
+        """Points in the rig frame from their pixels in two or more cameras.
 
-        sigma_px : pixel noise, a scalar, (N,), (N, 2, 2), or a pair of these for the two cameras;
-            None takes the scatter of this calibration's own dots.
+        uv_first_px, uv_second_px : (N, 2) pixels in the first and in the second camera; or, as the
+            only argument, pixels by the camera's name, NaN where a camera does not see a point.
+        sigma_px : pixel noise, a scalar, (N,), (N, 2, 2), or these for each camera: a pair, or by
+            the camera's name. None takes the scatter of this calibration's own dots.
         method : "ml" or "midpoint".
         include_calibration : add the calibration's share to ``covariance_mm2``. It is common to
             all points; ``measurement_covariance_mm2`` is the share that is not.
 
-        Raises CalibrationError for a single camera, InputError for shapes that do not match.
+        With pixels by name ``ray_miss_mm`` is (N, C), a column for each camera of this
+        calibration, and points that fewer than two cameras see are NaN (``unplaced`` counts them).
+        Raises CalibrationError for a single camera or an unknown name, InputError for shapes that
+        do not match.
         """
-        if len(self.cameras) != 2:
+        if len(self.cameras) < 2:
             raise CalibrationError(
                 "one camera cannot triangulate: the depth along its axis is never seen",
                 todo="calibrate two cameras",
             )
         sigma: Any = self.statistics.get("scatter_px", 0.02) if sigma_px is None else sigma_px
-        pair = (self.cameras[0], self.cameras[1])
+        if isinstance(uv_first_px, Mapping):
+            if uv_second_px is not None:
+                raise InputError(
+                    "pixels by camera and a second array of pixels",
+                    todo="give either a mapping of all cameras' pixels, or two arrays",
+                )
+            return self._triangulate_views(uv_first_px, sigma, method, include_calibration)
+        if uv_second_px is None:
+            raise InputError(
+                "pixels of one camera alone",
+                todo="give two arrays (N, 2), or a mapping of arrays by camera",
+            )
+        if isinstance(sigma, Mapping):
+            sigma = tuple(sigma[camera.name] for camera in self.cameras[:2])
+        two = self if len(self.cameras) == 2 else self.pair(0, 1)
+        pair = (two.cameras[0], two.cameras[1])
         found = triangulate(pair, (uv_first_px, uv_second_px), sigma, method)
         if not include_calibration:
             return found
@@ -135,13 +166,81 @@ class Calibration:
         for c in range(2):
             block = slice(2 * c, 2 * c + 2)
             information[..., block, block] = np.linalg.inv(pixel_covariance(sigmas[c], shape))
-        shift = point_shift_jacobian(pair, self.free, found.points_mm, information)
-        share = shift @ self.covariance @ np.swapaxes(shift, -1, -2)
-        return Triangulation(
-            found.points_mm,
-            found.covariance_mm2 + share,
-            found.ray_miss_mm,
-            found.measurement_covariance_mm2,
+        shift = point_shift_jacobian(pair, two.free, found.points_mm, information)
+        share = shift @ two.covariance @ np.swapaxes(shift, -1, -2)
+        return replace(found, covariance_mm2=found.covariance_mm2 + share)
+
+    def _triangulate_views(
+        self, uv_px: Mapping[str, ArrayLike], sigma: Any, method: str, include_calibration: bool
+    ) -> Triangulation:
+        """`triangulate` from pixels by camera."""
+        given = {self.camera(name).name: np.asarray(uv, float) for name, uv in uv_px.items()}
+        if len(given) < 2:
+            raise InputError(
+                f"pixels of {len(given)} camera(s)", todo="give those of two cameras or more"
+            )
+        shape = next(iter(given.values())).shape
+        pixels = [given.get(c.name, np.full(shape, np.nan)) for c in self.cameras]
+        if isinstance(sigma, Mapping):
+            unknown = sorted(set(given) - set(sigma))
+            if unknown:
+                todo = "give the pixel noise of every camera whose pixels are given"
+                raise InputError(f"sigma_px lacks {', '.join(unknown)}", todo=todo)
+            sigma = tuple(sigma.get(c.name, 1.0) for c in self.cameras)
+        elif isinstance(sigma, tuple):
+            todo = "give sigma_px by camera's name, as the pixels are"
+            raise InputError("sigma_px is a tuple", todo=todo)
+        found = triangulate_views(self.cameras, pixels, sigma, method)
+        if not include_calibration:
+            return found
+        sigmas = sigma if isinstance(sigma, tuple) else (sigma,) * len(self.cameras)
+        covariance = found.covariance_mm2.reshape(-1, 3, 3).copy()
+        points = found.points_mm.reshape(-1, 3)
+        placed = np.isfinite(points).all(-1)
+        count = 2 * len(self.cameras)
+        information = np.zeros((len(points), count, count))
+        for c, (uv, one) in enumerate(zip(pixels, sigmas)):
+            seen = np.isfinite(uv).all(-1)
+            block = slice(2 * c, 2 * c + 2)
+            noise = seen_covariance(one, seen).reshape(-1, 2, 2)
+            inverse = np.linalg.inv(noise) * seen.reshape(-1, 1, 1)
+            information[:, block, block] = inverse
+        shift = point_shift_jacobian(self.cameras, self.free, points[placed], information[placed])
+        covariance[placed] += shift @ self.covariance @ np.swapaxes(shift, -1, -2)
+        return replace(found, covariance_mm2=covariance.reshape(found.covariance_mm2.shape))
+
+    def pair(self, first: str | int, second: str | int) -> Calibration:
+        """The calibration of two of the cameras, in the same rig frame.
+
+        ``first`` must stand before ``second`` in `rig.toml`. The covariance is that of both
+        cameras with the first one's pose held: its uncertainty in the rig frame is common to
+        both, so it moves all points alike (an S-transformation of the gauge).
+        """
+        cameras = [self.camera(first), self.camera(second)]
+        a, b = (self.cameras.index(camera) for camera in cameras)
+        if a >= b:
+            raise CalibrationError(
+                f"cameras {cameras[0].name!r} and {cameras[1].name!r} are no pair in this order",
+                todo="name two cameras, in the order of rig.toml",
+            )
+        names = [f"{self.cameras[c].name}.{p}" for c in (a, b) for p in self.free[c]]
+        poses = [f"{cameras[1].name}.{p}" for p in POSE_COMPONENTS]
+        rows = np.zeros((len(names) + 6, len(self.covariance_names)))
+        index = {name: i for i, name in enumerate(self.covariance_names)}
+        for row, name in enumerate([*names, *poses]):
+            rows[row, index[name]] = 1.0
+        if a > 0:  # T_b Exp(x_b) seen from T_a Exp(x_a): x_b - Ad(b_from_a) x_a
+            b_from_a = cameras[1].camera_from_rig @ cameras[0].rig_from_camera
+            own = [index[f"{cameras[0].name}.{p}"] for p in POSE_COMPONENTS]
+            rows[-6:, own] = -b_from_a.adjoint()
+        return replace(
+            self,
+            cameras=(cameras[0], cameras[1]),
+            free=(self.free[a], self.free[b]),
+            covariance=rows @ self.covariance @ rows.T,
+            covariance_names=(*names, *poses),
+            joint_names=(),
+            joint_covariance=np.zeros((0, 0)),
         )
 
     def sd(self, name: str) -> float:

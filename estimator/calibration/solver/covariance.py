@@ -181,7 +181,7 @@ def rig_jacobian(
 
 
 def aligned_covariance(
-    cameras: tuple[Camera, Camera],
+    cameras: tuple[Camera, ...],
     free: tuple[tuple[str, ...], ...],
     covariance: Array,
     points_mm: Array,
@@ -192,14 +192,15 @@ def aligned_covariance(
 
 
 def aligned_shift(
-    cameras: tuple[Camera, Camera], free: tuple[tuple[str, ...], ...], points_mm: Array
+    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
     """(3 N, P): rig points by the rig block's parameters, their common rigid motion projected out.
 
     What is left is the error of shapes, distances and motions inside the rig; where the rig's own
     frame lies is a matter of definition (Baarda's S-transformation to the points' own frame).
     """
-    information = np.broadcast_to(np.eye(4), (len(points_mm), 4, 4))
+    rows = 2 * len(cameras)
+    information = np.broadcast_to(np.eye(rows), (len(points_mm), rows, rows))
     shift = point_shift_jacobian(cameras, free, points_mm, information)
     shift = shift.reshape(-1, shift.shape[-1])
     centred = points_mm - points_mm.mean(0)
@@ -209,7 +210,7 @@ def aligned_shift(
 
 
 def point_shift_jacobian(
-    cameras: tuple[Camera, Camera],
+    cameras: tuple[Camera, ...],
     free: tuple[tuple[str, ...], ...],
     points_mm: Array,
     information_px: Array,

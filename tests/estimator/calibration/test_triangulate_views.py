@@ -71,10 +71,8 @@ def test_the_calibrations_share_is_how_points_move_with_it(count: int) -> None:
     alone = calibration.triangulate(pixels, sigma_px=0.1, include_calibration=False)
     np.testing.assert_array_equal(found.measurement_covariance_mm2, alone.covariance_mm2)
     share = found.covariance_mm2 - alone.covariance_mm2
-    columns = []
-    for unit, sd in zip(
-        np.eye(len(calibration.covariance)), np.diag(calibration.covariance) ** 0.5
-    ):
+    columns, spread = [], np.sqrt(np.diag(calibration.covariance))
+    for unit, sd in zip(np.eye(len(spread)), spread):
         ends = [
             replace(calibration, cameras=moved(calibration, sign * sd * unit)).triangulate(
                 pixels, sigma_px=0.1, include_calibration=False

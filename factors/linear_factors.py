@@ -12,9 +12,9 @@ from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from telerig.arrays import Array
 
 
 @dataclass(frozen=True)

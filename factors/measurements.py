@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array, Ints
 from telerig.factors.state_space import Component, block_diagonal, discretise, distinct_steps
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class Motion:
     by_input: Array
     log_det: Array
     basis: Array
-    index: NDArray[np.int64]
+    index: Ints
 
     def residual(self, last: Array, following: Array, inputs: ArrayLike) -> Array:
         """(M, n) whitened residuals of states (M, n), (M, n) and inputs (M, K) or (K,)."""
@@ -36,7 +35,7 @@ class Motion:
         terms = ((self.by_next, following), (self.by_last, last), (self.by_input, constant))
         return np.asarray(sum(np.einsum("mij,mj->mi", a[i], x) for a, x in terms))
 
-    def in_basis(self, following: NDArray[np.int64]) -> tuple[Array, Array]:
+    def in_basis(self, following: Ints) -> tuple[Array, Array]:
         """(M, n, n) by_last and by_next for increments in the bases of the two states.
 
         following : (M,) index into ``basis`` of each step's second state.

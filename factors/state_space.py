@@ -13,12 +13,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _SERIES_TERMS = 26
 _SHORT_STEP = 0.5

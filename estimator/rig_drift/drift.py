@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.solver.covariance import POSE_COMPONENTS, rig_jacobian
 from telerig.rig.camera import Camera
@@ -29,7 +29,6 @@ from telerig.rig.triangulation import midpoint, stacked_jacobian
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
 
-Array = NDArray[np.float64]
 Free = tuple[tuple[str, ...], ...]
 Pair = tuple[Camera, Camera]
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from telerig.estimator.bubbles.pairing.matching import PairModel
     from telerig.estimator.calibration.result.calibration import Calibration
 
-Array = NDArray[np.float64]
 
 LEAST_PAIRS = 20
 LEAST_SEEN_S = 0.5
@@ -123,7 +122,7 @@ def rig_change(
     return replace(change, chance=chance), noise
 
 
-def _reliable(tracks: pd.DataFrame) -> NDArray[np.bool_]:
+def _reliable(tracks: pd.DataFrame) -> Bools:
     """Rows with pixels measured in both views, of pairs with high confidence and without flags."""
     keep = np.isfinite(tracks["ray_miss_mm"].to_numpy(float))
     if "confidence" in tracks:

@@ -12,12 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import minimize
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from telerig.arrays import Array, Bools, Ints
+
 Prior = tuple[Array, Array]
 
 _PEAKS = 3
@@ -55,7 +54,7 @@ class Series:
     def __len__(self) -> int:
         return len(self.miss_mm)
 
-    def of(self, keep: NDArray[np.bool_]) -> Series:
+    def of(self, keep: Bools) -> Series:
         return Series(*(getattr(self, column.name)[keep] for column in fields(self)))
 
     def residuals(self) -> Array:

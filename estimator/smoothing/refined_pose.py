@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
@@ -30,7 +30,6 @@ from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingPro
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
 
-Array = NDArray[np.float64]
 
 _LEAST_WANDER_PX = 5e-3
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     considered_variance,
@@ -22,8 +22,6 @@ from telerig.io.results.smoothing import SmoothingFile
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
     from telerig.estimator.rig_drift.drift import DriftPrior
     from telerig.io.rig_file.description import StageDescription
 
-Array = NDArray[np.float64]
 Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _COARSE_STEP_S = 2e-3

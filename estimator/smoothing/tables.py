@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
     carriage,
@@ -19,7 +19,6 @@ from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
 LONGEST_RTS = 5000
@@ -66,7 +65,7 @@ def _sigma(rows: Array, covariance: Array) -> Array:
     return np.asarray(np.sqrt(((rows @ covariance) * rows).sum(-1).clip(0)))
 
 
-def _observed(solution: Solution) -> NDArray[np.int64]:
+def _observed(solution: Solution) -> Ints:
     """1 where a camera saw the bubble and the pixel was not an outlier."""
     frame, obs = solution.frame, solution.frame.problem.observations
     out = np.zeros(frame.rows, np.int64)

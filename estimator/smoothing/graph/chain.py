@@ -16,17 +16,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dtrsv
 from scipy.linalg.lapack import dpotrf
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.block_tridiagonal import eliminate_forward, inverses
 from telerig.estimator.smoothing.graph.blocks import Blocks
 from telerig.estimator.smoothing.graph.state import Frame
 from telerig.factors.linear_factors import Linear
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_CONSTANTS = 60
 """Columns for what is constant ride along in every frame; with more GTSAM drops what has ended."""

@@ -15,15 +15,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
+from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.blocks import Blocks
 from telerig.estimator.smoothing.graph.state import Frame
 from telerig.factors.linear_factors import Linear, add_linear_factors
-
-Array = NDArray[np.float64]
 
 _NOTHING = np.zeros(0, np.int64)
 
@@ -159,7 +157,7 @@ def marginal_covariances(
     for first, second in pairs:
         seconds.setdefault(first, []).append(second)
     joint: dict[int, tuple[list[int], Array]] = {}
-    patterns: dict[tuple[Any, ...], NDArray[np.int64]] = {}
+    patterns: dict[tuple[Any, ...], Ints] = {}
     own_of: dict[int, Array] = {}
     cross_of: dict[tuple[int, int], Array] = {}
     for conditional, clique, parent in zip(conditionals[::-1], keys[::-1], parents[::-1]):
@@ -200,7 +198,7 @@ def _within(
     clique: list[int],
     parent: tuple[list[int], Array],
     sizes: Sequence[int],
-    patterns: dict[tuple[Any, ...], NDArray[np.int64]],
+    patterns: dict[tuple[Any, ...], Ints],
 ) -> Array:
     """Covariance of a clique's separator, out of its parent's clique."""
     keys, block = parent

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     BroadBand,
@@ -29,9 +29,6 @@ from telerig.factors.state_space import (
     white_jerk,
 )
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _SAME = 0.05
 _NEAR, _NEAR_S = 0.6, 1e-3

@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.covariance import rig_jacobian
 from telerig.estimator.smoothing.graph.state import Frame, State
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
@@ -19,9 +20,6 @@ from telerig.factors.linear_factors import Linear
 from telerig.factors.measurements import whitener_of
 from telerig.factors.motion import start
 from telerig.factors.state_space import log_det_of
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _SLOPE_S = 2e-3
 """Width of the filter that takes the readings' rate of change for the delay."""

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph import chain, elimination
 from telerig.estimator.smoothing.graph.blocks import Blocks
@@ -27,7 +28,6 @@ from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingPro
 from telerig.factors.linear_factors import Linear
 from telerig.rig.projection import INDEX
 
-Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
 

@@ -12,13 +12,11 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, Travel
 from telerig.rig.pose import across
-
-Array = NDArray[np.float64]
 
 SCALE_SIGMA = 1e-3
 """Of an encoder without a stated scale: lead screws, belts, thermal growth."""

@@ -7,8 +7,9 @@ from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.layout import (
     BubbleLayout,
     Nodes,
@@ -21,8 +22,6 @@ from telerig.estimator.smoothing.graph.layout import (
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.factors.motion import Motion, motion
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 T = TypeVar("T")
 
 

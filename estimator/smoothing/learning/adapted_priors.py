@@ -6,16 +6,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.linear import images
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import wider_scale_sigma
 from telerig.estimator.smoothing.learning.default_priors import DEFAULT_FLOOR, rescaled
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel
 from telerig.factors.state_space import broad_band_density
-
-Array = NDArray[np.float64]
 
 _INFLATE_BEYOND = 0.05
 _RESCALE_BEYOND = 0.2
@@ -158,7 +156,7 @@ def _noise_factor(solution: Solution) -> float:
     return found if found > sure else 1.0
 
 
-def leverages(solution: Solution) -> list[tuple[NDArray[np.int64], Array]]:
+def leverages(solution: Solution) -> list[tuple[Ints, Array]]:
     """By camera: some of the bubbles' pixels (m,), var(prediction) / var(noise) of each (m, 2)."""
     frame, found = solution.frame, solution.covariances
     if found is None or not frame.rows:

@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.likelihood import Fit, evidence, maximise
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import prior_of
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel, Zigzag
 
-Array = NDArray[np.float64]
 L = TypeVar("L", RigMode, Zigzag)
 
 AMBIGUOUS_LOG_RATIO = 5.0

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
@@ -20,8 +20,6 @@ from telerig.estimator.smoothing.problem.problem import (
     Stage,
     Zigzag,
 )
-
-Array = NDArray[np.float64]
 
 SHAKE_RMS_MM = 0.2
 DELAY_SIGMA_S = 0.002

@@ -18,8 +18,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.processes import (
@@ -37,9 +37,6 @@ from telerig.factors.state_space import (
     distinct_steps,
     slow_ou,
 )
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _STILL_MM = 1e-6
 _DIFFERENCE = 1e-4
@@ -86,7 +83,7 @@ def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
     return Factor(signal, model).posterior()
 
 
-def position_sigma(signal: Signal, model: ShakeModel, frames: NDArray[np.int64]) -> Array:
+def position_sigma(signal: Signal, model: ShakeModel, frames: Ints) -> Array:
     """(B, n) standard deviation of the moving items' positions at some frames."""
     return Factor(signal, model).position_sigma(frames)
 
@@ -212,7 +209,7 @@ class Factor:
         frames = len(signal.t_s)
         return SignalPosterior(self.log_evidence(), *(a.reshape(-1, frames) for a in found))
 
-    def position_sigma(self, frames: NDArray[np.int64]) -> Array:
+    def position_sigma(self, frames: Ints) -> Array:
         system, signal = self.system, self.signal
         movers = np.flatnonzero(signal.moving)
         sides, constants = self.spread()
@@ -225,7 +222,7 @@ class Factor:
         return np.asarray(np.sqrt(variance + (by_constant**2).sum(-1)))
 
 
-def runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice | NDArray[np.int64]]]:
+def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:
     """Each value of an index with where it stands, as a slice where that is one stretch."""
     order = np.argsort(index, kind="stable")
     values, first = np.unique(index[order], return_index=True)

@@ -8,13 +8,12 @@ from fnmatch import fnmatch
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled
 from telerig.estimator.smoothing.learning.parameters import FORCE, names_of
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel, Triple
 
-Array = NDArray[np.float64]
 Owner = int | str
 
 BUBBLE = "bubble"

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.graph.solve import Covariances, Solution
 from telerig.estimator.smoothing.learning.evidence import signal_posterior
 from telerig.estimator.smoothing.learning.lines_of_sight import (
@@ -23,8 +23,6 @@ from telerig.estimator.smoothing.learning.lines_of_sight import (
 from telerig.estimator.smoothing.learning.parameters import value_of, with_values
 from telerig.estimator.smoothing.learning.processes import processes
 from telerig.estimator.smoothing.problem.problem import ShakeModel
-
-Array = NDArray[np.float64]
 
 _FARTHEST = 0.5
 _Triple = tuple[Array, Array, Array]

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.attribution import (
     Attribution,
     attributions,
@@ -59,8 +59,6 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
     Zigzag,
 )
-
-Array = NDArray[np.float64]
 
 _STRONG = 20.0
 _ACROSS, _ACROSS_LOG_SIGMA = 0.5, 1.0

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.evidence import signal_evidence, signal_gradient
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import (
@@ -19,8 +19,6 @@ from telerig.estimator.smoothing.learning.parameters import (
 )
 from telerig.estimator.smoothing.learning.processes import depends_on
 from telerig.estimator.smoothing.problem.problem import ShakeModel
-
-Array = NDArray[np.float64]
 
 _IMPOSSIBLE = -1e12
 

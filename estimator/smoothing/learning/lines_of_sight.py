@@ -12,13 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
 from telerig.factors.measurements import image_of_point
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_BUBBLES = 6
 """So many bubbles, those seen longest, are what the rig's shake is learned from."""
@@ -49,7 +46,7 @@ class Signal:
     weight: Array
     item: Ints
     camera: Ints
-    moving: NDArray[np.bool_]
+    moving: Bools
     first: Ints
     start_mm: Array
     start_sigma_mm: Array

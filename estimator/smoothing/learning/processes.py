@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import FORCE
@@ -20,7 +19,6 @@ from telerig.factors.state_space import (
     slow_ou,
 )
 
-Array = NDArray[np.float64]
 Make = Callable[..., Component]
 
 _cached = lru_cache(maxsize=512)

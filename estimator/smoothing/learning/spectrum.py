@@ -6,14 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.processes import bubble_processes, shake_processes
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
 from telerig.factors.state_space import Component
-
-Array = NDArray[np.float64]
 
 LOWEST_HZ = 1.5
 _LEAST_PERIODS = 2.0

@@ -9,12 +9,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Triple = tuple[float, float, float]
 
 CARRIAGE = -1

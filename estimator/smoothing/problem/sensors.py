@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from telerig.estimator.calibration.result.calibration import Calibration
 
-Array = NDArray[np.float64]
 
 _MICRO_G_MM_S2 = 1e-3 * STANDARD_GRAVITY_M_S2
 _MARGIN_S = 0.25
@@ -237,7 +236,7 @@ def calibration_share(
     return CalibrationShare(root @ turn[felt].T, free, covariance, drift)
 
 
-def _near(t: Array, t_s: Array) -> NDArray[np.bool_]:
+def _near(t: Array, t_s: Array) -> Bools:
     return np.asarray((t >= t_s[0] - _MARGIN_S) & (t <= t_s[-1] + _MARGIN_S))
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.smoothing.problem.problem import Bubble, Observations
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from telerig.rig.camera import Camera
 
-Array = NDArray[np.float64]
 
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 _LOOSE_PX = 0.5

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.learning.attribution import Attribution, attributions
 from telerig.estimator.smoothing.learning.groups import Learning, groups_of
@@ -26,9 +26,6 @@ from telerig.estimator.smoothing.problem.problem import (
 )
 from telerig.factors.motion import start
 from telerig.io.results.smoothing import AXES, Flag, Verdict
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 RESOLVED_Q, PARTIAL_Q, RESOLVED_ETA = 1.25, 2.0, 0.99
 _MOST_FRAMES, _MOST_BUBBLES = 2000, 3
@@ -125,7 +122,7 @@ def without_sensors(problem: SmoothingProblem) -> SmoothingProblem:
     return replace(problem, accelerometers=(), marks=(), references=Observations.none())
 
 
-def _inner_rows(window: Window) -> NDArray[np.int64]:
+def _inner_rows(window: Window) -> Ints:
     """Rows of the bubbles' states, a tenth of each track left out at both ends."""
     at, out = 0, []
     for bubble in window.problem.bubbles:
@@ -135,7 +132,7 @@ def _inner_rows(window: Window) -> NDArray[np.int64]:
     return np.concatenate(out)
 
 
-def _position_sigma(solution: Solution, rows: NDArray[np.int64]) -> Array:
+def _position_sigma(solution: Solution, rows: Ints) -> Array:
     assert solution.covariances is not None
     at, covariance = solution.frame.bubble.position, solution.covariances.bubbles[rows]
     return np.asarray(np.sqrt(np.einsum("id,nde,ie->ni", at, covariance, at, optimize=True)))
@@ -182,7 +179,7 @@ def shake_rms(solution: Solution) -> Array:
     return out
 
 
-def _inner_frames(solution: Solution) -> NDArray[np.int64]:
+def _inner_frames(solution: Solution) -> Ints:
     count = len(solution.frame.problem.t_s)
     edge = int(_EDGE * count)
     return np.arange(edge, count - edge)

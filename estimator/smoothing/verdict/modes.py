@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _LOWEST_HZ = 2.0
 _MOST_PEAKS = 3

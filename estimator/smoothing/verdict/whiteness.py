@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.linear import (
     accelerometers,
     all_factors,
@@ -24,9 +24,6 @@ from telerig.estimator.smoothing.graph.linear import (
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.state import Frame
 from telerig.factors.linear_factors import Linear
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LAGS = 10
 _LEAST_PAIRS = 25

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from telerig.arrays import Array
 from telerig.estimator.tracking.filter.types import TrackerSettings
-
-Array = NDArray[np.float64]
 
 POSITION, VELOCITY, ACCELERATION, DRIFT = (slice(3 * i, 3 * i + 3) for i in range(4))
 STATES = 12

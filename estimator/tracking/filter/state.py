@@ -13,12 +13,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.tracking.filter.motion import POSITION, STATES, Transition
 from telerig.estimator.tracking.filter.types import NO_PARTICLE
-
-Array = NDArray[np.float64]
 
 _SIZE_GAIN = 0.25
 _IDENTITY = np.eye(STATES)

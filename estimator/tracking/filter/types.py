@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 
-Array = NDArray[np.float64]
-Ids = NDArray[np.int64]
+Ids = Ints
 
 NO_PARTICLE = -1
 

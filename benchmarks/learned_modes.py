@@ -67,7 +67,7 @@ def _heights(
     problem: SmoothingProblem, model: ShakeModel, lab: Array
 ) -> tuple[float, float, float]:
     solution = solve(problem, model, Options(robust=False))
-    frame, found = solution.frame, solution.covariances
+    frame, found = solution.graph, solution.covariances
     row = frame.bubble.position[1]
     bubble, at = frame.bubble_of_row, frame.frame_of_row
     edge = lab.shape[1] // 10

@@ -102,9 +102,9 @@ def _constants(result: Smoothing, run: Run) -> tuple[float, float]:
     """Delay found (ms) and the encoder's scale error (ppm) less the true ones; NaN if held."""
     solution = result.solution
     delay = scale = np.nan
-    if solution.frame.sensor_flags[1] and len(solution.delays_s):
+    if solution.graph.sensor_flags[1] and len(solution.delays_s):
         delay = 1e3 * float(np.mean(solution.delays_s) - run.case.delay_s)
-    if solution.frame.encoder_flags[0] and solution.state.encoder.size:
+    if solution.graph.encoder_flags[0] and solution.state.encoder.size:
         scale = 1e6 * float(solution.state.encoder[0] - run.case.encoder_scale)
     return delay, scale
 

@@ -100,7 +100,7 @@ def measured(run: Run, result: Smoothing, what: tuple[str, str, int], seconds: f
 
 def nees(result: Smoothing, off: Array, keep: NDArray[np.bool_]) -> float:
     """Mean of e' C^-1 e / 3 over all bubbles and frames."""
-    frame, found = result.solution.frame, result.solution.covariances
+    frame, found = result.solution.graph, result.solution.covariances
     assert found is not None
     row = frame.bubble.position
     covariance = row @ found.bubbles[keep] @ row.T

@@ -81,7 +81,7 @@ def main() -> None:
     def row(name: str, frames: int, what: str, repeats: int, call: Callable[[], Any]) -> Any:
         cpu, wall, result = timed(call, repeats)
         solution = getattr(result, "solution", result)
-        states = solution.frame.shake.size + solution.frame.bubble.size
+        states = solution.graph.shake.size + solution.graph.bubble.size
         peer = rts_seconds(states, min(frames, 2000)) * frames / min(frames, 2000)
         lines.append(
             f"| {name} | {frames:,} | {what} | {cpu:.2f} | {wall:.2f} | {states} | {peer:.2f} "

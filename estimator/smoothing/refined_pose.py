@@ -85,7 +85,7 @@ def with_wander(model: ShakeModel, refinement: Refinement) -> ShakeModel:
 
 def refined_change(solution: Solution, calibration: Calibration) -> RigChange | None:
     """The movement's posterior; None where the graph does not hold it."""
-    problem, found = solution.frame.problem, solution.covariances
+    problem, found = solution.graph.problem, solution.covariances
     share = problem.calibration
     if share is None or share.drift is None or found is None:
         return None

@@ -54,8 +54,8 @@ class Smoothing:
 
 def summary_of(solution: Solution) -> dict[str, Any]:
     """Hyper-parameters, constants with their standard deviations, residuals, in numbers."""
-    frame = solution.frame
-    problem, model = frame.problem, frame.model
+    graph = solution.graph
+    problem, model = graph.problem, graph.model
     names = [c.name for c in problem.cameras]
     return {
         "schema": SmoothingFile.SCHEMA,
@@ -65,7 +65,7 @@ def summary_of(solution: Solution) -> dict[str, Any]:
         "model": asdict(model),
         "log_evidence": solution.log_evidence,
         "passes": solution.passes,
-        "states": {"shake": list(frame.shake.labels), "nodes": len(frame.nodes.t_s)},
+        "states": {"shake": list(graph.shake.labels), "nodes": len(graph.nodes.t_s)},
         "unseen": {
             n: f"along its depth, {_direction(c.camera_from_rig.rotation[2])} in rig axes"
             for n, c in zip(names, problem.cameras)
@@ -106,17 +106,17 @@ def _residuals(solution: Solution, which: int) -> dict[str, Any]:
 
 def _encoder(solution: Solution) -> dict[str, Any]:
     """Scale and delay; ``scale_from`` : "run" where marks told it, else where it was known from."""
-    frame, block = solution.frame, _block(solution, "encoder")
-    if frame.problem.stage is None:
+    graph, block = solution.graph, _block(solution, "encoder")
+    if graph.problem.stage is None:
         return {}
-    travel = frame.problem.travel
+    travel = graph.problem.travel
     known = "given" if travel is None else travel.source
     out: dict[str, Any] = {
         "scale": total_scale(solution),
         "sscale": scale_sigma(solution),
-        "scale_from": "run" if frame.encoder_flags[0] else known,
+        "scale_from": "run" if graph.encoder_flags[0] else known,
     }
-    if frame.encoder_flags[1]:
+    if graph.encoder_flags[1]:
         out["delay_s"] = float(solution.state.encoder[-1])
         if block is not None:
             out["sdelay_s"] = float(np.sqrt(block[-1, -1]))
@@ -124,8 +124,8 @@ def _encoder(solution: Solution) -> dict[str, Any]:
 
 
 def _travel(solution: Solution) -> dict[str, Any]:
-    travel = solution.frame.problem.travel
-    if travel is None or solution.frame.problem.stage is None:
+    travel = solution.graph.problem.travel
+    if travel is None or solution.graph.problem.stage is None:
         return {}
     place, _ = considered_variance(solution)
     return {
@@ -137,28 +137,28 @@ def _travel(solution: Solution) -> dict[str, Any]:
 
 
 def _sensors(solution: Solution) -> dict[str, Any]:
-    frame = solution.frame
+    graph = solution.graph
     names = ["bias_x_mm_s2", "bias_y_mm_s2", "bias_z_mm_s2"]
-    names += ["scale"] * frame.sensor_flags[0]
+    names += ["scale"] * graph.sensor_flags[0]
     out = {}
-    for i, sensor in enumerate(frame.problem.accelerometers):
+    for i, sensor in enumerate(graph.problem.accelerometers):
         block, clocks = _block(solution, "sensors"), _block(solution, "clocks")
         found = _with_sd(names, solution.state.sensors[i], None if block is None else block[i])
         found["delay_s"] = float(solution.delays_s[i])
-        if clocks is not None and frame.sensor_flags[1]:
-            found["sdelay_s"] = float(np.sqrt(clocks[frame.clock_of[i], 0, 0]))
+        if clocks is not None and graph.sensor_flags[1]:
+            found["sdelay_s"] = float(np.sqrt(clocks[graph.clock_of[i], 0, 0]))
         out[sensor.name] = found
     return out
 
 
 def _means(solution: Solution) -> dict[str, Any]:
-    names = ["x_mm_s", "y_mm_s", "z_mm_s", "speed_mm_s"][: solution.frame.mean_size]
+    names = ["x_mm_s", "y_mm_s", "z_mm_s", "speed_mm_s"][: solution.graph.mean_size]
     block = _block(solution, "means")
     return {
         str(b.particle): _with_sd(
             names, solution.state.means[i], None if block is None else block[i]
         )
-        for i, b in enumerate(solution.frame.problem.bubbles)
+        for i, b in enumerate(solution.graph.problem.bubbles)
     }
 
 
@@ -181,7 +181,7 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
     from telerig.io.files.atomic import atomic_path
 
     solution = smoothing.solution
-    layout = solution.frame
+    layout = solution.graph
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         for name, table in (("trajectories", smoothing.trajectories), ("shake", smoothing.shake)):
             group = file.create_group(name)

@@ -104,7 +104,7 @@ def smooth(
         solution = solve(problem, chosen, options, progress)
     else:
         solution = _adapted_solution(problem, chosen, options, progress)
-        chosen = solution.frame.model
+        chosen = solution.graph.model
         if chosen.learned:
             solution = with_hyperparameter_uncertainty(solution)
     verdict = judge(problem, chosen, solution)

@@ -32,15 +32,15 @@ def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFram
     """
     import pandas as pd
 
-    frame, problem = solution.frame, solution.frame.problem
+    graph, problem = solution.graph, solution.graph.problem
     if not problem.bubbles:
         return pd.DataFrame({name: [] for name in ("frame", "particle", "t_s")})
-    layout, covariances = frame.bubble, solution.covariances
+    layout, covariances = graph.bubble, solution.covariances
     states = solution.state.bubbles
     columns: dict[str, Any] = {
-        "frame": frame.frame_of_row,
-        "particle": np.array([b.particle for b in problem.bubbles])[frame.bubble_of_row],
-        "t_s": problem.t_s[frame.frame_of_row],
+        "frame": graph.frame_of_row,
+        "particle": np.array([b.particle for b in problem.bubbles])[graph.bubble_of_row],
+        "t_s": problem.t_s[graph.frame_of_row],
     }
     columns |= _named(states @ layout.position.T, "{}_mm")
     columns |= _named(states @ layout.velocity.T, "v{}_mm_s")
@@ -67,24 +67,24 @@ def _sigma(rows: Array, covariance: Array) -> Array:
 
 def _observed(solution: Solution) -> Ints:
     """1 where a camera saw the bubble and the pixel was not an outlier."""
-    frame, obs = solution.frame, solution.frame.problem.observations
-    out = np.zeros(frame.rows, np.int64)
+    graph, obs = solution.graph, solution.graph.problem.observations
+    out = np.zeros(graph.rows, np.int64)
     kept = solution.weights[0] > 0.5
-    out[frame.row(obs.item[kept], obs.frame[kept])] = 1
+    out[graph.row(obs.item[kept], obs.frame[kept])] = 1
     return out
 
 
 def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
     """Naive and RTS positions and velocities; the diameter that the tracker found."""
-    frame, problem = solution.frame, solution.frame.problem
+    graph, problem = solution.graph, solution.graph.problem
     number = {b.particle: i for i, b in enumerate(problem.bubbles)}
     item = tracks["particle"].map(number).to_numpy(np.int64)
     seen = tracks["frame"].to_numpy(np.int64)
-    rows = frame.row(np.asarray(item), np.asarray(seen))
-    naive = np.full((frame.rows, 3), np.nan)
+    rows = graph.row(np.asarray(item), np.asarray(seen))
+    naive = np.full((graph.rows, 3), np.nan)
     naive[rows] = tracks[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     naive[rows] += problem.encoder_mm[seen, None] * problem.axis
-    covariance = np.tile(1e-4 * np.eye(3), (frame.rows, 1, 1))
+    covariance = np.tile(1e-4 * np.eye(3), (graph.rows, 1, 1))
     names = [["sxx", "sxy", "sxz"], ["sxy", "syy", "syz"], ["sxz", "syz", "szz"]]
     if f"{names[0][0]}_mm2" in tracks:
         for i, line in enumerate(names):
@@ -92,15 +92,15 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
                 covariance[rows, i, j] = tracks[f"{name}_mm2"].to_numpy(float)
     velocity, plain = np.full_like(naive, np.nan), np.full((2, *naive.shape), np.nan)
     for k in range(len(problem.bubbles)):
-        mine = slice(frame.first_row[k], frame.first_row[k + 1])
-        t = problem.t_s[frame.frame_of_row[mine]]
+        mine = slice(graph.first_row[k], graph.first_row[k + 1])
+        t = problem.t_s[graph.frame_of_row[mine]]
         velocity[mine] = _central_velocity(t, naive[mine])
         if 1 < len(t) <= LONGEST_RTS:
-            plain[:, mine] = _rts(t, naive[mine], covariance[mine], frame.model.bubble)
+            plain[:, mine] = _rts(t, naive[mine], covariance[mine], graph.model.bubble)
     out = _named(naive, "naive_{}_mm") | _named(velocity, "naive_v{}_mm_s")
     out |= _named(plain[0], "rts_{}_mm") | _named(plain[1], "rts_v{}_mm_s")
     if "d_eq_mm" in tracks:
-        diameter = np.full(frame.rows, np.nan)
+        diameter = np.full(graph.rows, np.nan)
         diameter[rows] = tracks["d_eq_mm"].to_numpy(float)
         out["d_eq_mm"] = diameter
     return out
@@ -155,8 +155,8 @@ def shake(solution: Solution) -> pd.DataFrame:
     """
     import pandas as pd
 
-    frame, problem, layout = solution.frame, solution.frame.problem, solution.frame.shake
-    states, covariances = frame.shake_at_frames(solution.state.shake), solution.covariances
+    graph, problem, layout = solution.graph, solution.graph.problem, solution.graph.shake
+    states, covariances = graph.shake_at_frames(solution.state.shake), solution.covariances
     columns: dict[str, Any] = {"frame": np.arange(len(states)), "t_s": problem.t_s}
     for c, camera in enumerate(problem.cameras):
         columns |= _named(states @ layout.offset[c].T, f"{camera.name}_{{}}_mm")

@@ -22,7 +22,7 @@ from scipy.linalg.lapack import dpotrf
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.block_tridiagonal import eliminate_forward, inverses
 from telerig.estimator.smoothing.graph.blocks import Blocks
-from telerig.estimator.smoothing.graph.state import Frame
+from telerig.estimator.smoothing.graph.state import GraphLayout
 from telerig.factors.linear_factors import Linear
 
 MOST_CONSTANTS = 60
@@ -42,7 +42,7 @@ class Places:
     width : columns of a frame.  constants : columns of what is constant.
     """
 
-    frame: Frame
+    graph: GraphLayout
     slot: Ints
     width: int
     constant_start: Ints
@@ -50,7 +50,7 @@ class Places:
 
     def of_keys(self, keys: Ints) -> tuple[Ints, Ints]:
         """(M,) frame, -1 for constants, and (M,) first column."""
-        base, counts = self.frame.base(), self.frame.counts()
+        base, counts = self.graph.base(), self.graph.counts()
         when = np.full(len(keys), -1)
         column = np.zeros(len(keys), np.int64)
         node = keys < base.bubbles
@@ -58,21 +58,21 @@ class Places:
         rest = keys >= base.means
         when[node] = keys[node]
         at = keys[row] - base.bubbles
-        when[row] = self.frame.node_of_row[at]
+        when[row] = self.graph.node_of_row[at]
         column[row] = counts.shake.size + self.slot[at] * counts.bubbles.size
         column[rest] = self.constant_start[keys[rest] - base.means]
         return when, column
 
 
-def is_chain_of_frames(frame: Frame) -> bool:
+def is_chain_of_frames(graph: GraphLayout) -> bool:
     """Whether a graph of frames alone has states to chain, and few constants."""
-    constants = sum(n * d for n, d in frame.counts()[2:])
-    return frame.shake.size > 0 and constants <= MOST_CONSTANTS
+    constants = sum(n * d for n, d in graph.counts()[2:])
+    return graph.shake.size > 0 and constants <= MOST_CONSTANTS
 
 
-def places_of(frame: Frame) -> Places:
-    counts = frame.counts()
-    bubbles = frame.problem.bubbles
+def places_of(graph: GraphLayout) -> Places:
+    counts = graph.counts()
+    bubbles = graph.problem.bubbles
     slot_of, free_from = np.zeros(len(bubbles), np.int64), list[int]()
     for k in sorted(range(len(bubbles)), key=lambda k: bubbles[k].first):
         free = [i for i, f in enumerate(free_from) if f <= bubbles[k].first]
@@ -83,7 +83,7 @@ def places_of(frame: Frame) -> Places:
     sizes = np.repeat([d for _, d in counts[2:]], [n for n, _ in counts[2:]]).astype(np.int64)
     starts = np.r_[0, np.cumsum(sizes)].astype(np.int64)
     width = counts.shake.size + len(free_from) * counts.bubbles.size
-    return Places(frame, slot_of[frame.bubble_of_row], width, starts[:-1], int(starts[-1]))
+    return Places(graph, slot_of[graph.bubble_of_row], width, starts[:-1], int(starts[-1]))
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class NormalEquations:
 
 
 def normal_equations(places: Places, factors: list[Linear]) -> NormalEquations:
-    count, width, constants = len(places.frame.nodes.t_s), places.width, places.constants
+    count, width, constants = len(places.graph.nodes.t_s), places.width, places.constants
     out = NormalEquations(
         np.zeros((count, width, width)),
         np.zeros((count, 1 + constants + width, width)),
@@ -195,10 +195,10 @@ def _summed(when: Ints, values: Array) -> tuple[Ints, Array]:
 
 def _fill_unused(out: NormalEquations, places: Places) -> None:
     """One on the diagonal of the slots that no bubble has at a frame."""
-    shake, bubble = (d for _, d in places.frame.counts()[:2])
+    shake, bubble = (d for _, d in places.graph.counts()[:2])
     slots = (places.width - shake) // bubble if bubble else 0
     used = np.zeros((len(out.own), slots), bool)
-    used[places.frame.node_of_row, places.slot] = True
+    used[places.graph.node_of_row, places.slot] = True
     for frames, slot in ((np.flatnonzero(~used[:, s]), s) for s in range(slots)):
         for i in range(shake + slot * bubble, shake + (slot + 1) * bubble):
             out.own[frames, i, i] = 1.0
@@ -224,10 +224,10 @@ class EliminatedChain:
 
     def blocks(self) -> Blocks:
         """Marginal covariances of all increments, and of shake with bubbles at the same frame."""
-        frame, places = self.places.frame, self.places
-        counts, constants = frame.counts(), places.constants
+        graph, places = self.places.graph, self.places
+        counts, constants = graph.counts(), places.constants
         shake, bubble = counts.shake.size, counts.bubbles.size
-        rows = np.arange(frame.rows)
+        rows = np.arange(graph.rows)
         at = shake + places.slot[:, None] * bubble + np.arange(bubble)
         own = [np.zeros((len(self.upper), shake, shake)), np.zeros((len(rows), bubble, bubble))]
         cross = np.zeros((len(rows), shake, bubble))
@@ -235,9 +235,9 @@ class EliminatedChain:
         of_constants = inverse.T @ inverse
         for first, found in _backward(self, of_constants):
             own[0][first : first + len(found)] = found[:, :shake, :shake]
-            inside = (frame.node_of_row >= first) & (frame.node_of_row < first + len(found))
+            inside = (graph.node_of_row >= first) & (graph.node_of_row < first + len(found))
             mine = np.flatnonzero(inside)
-            node, columns = frame.node_of_row[mine] - first, at[mine]
+            node, columns = graph.node_of_row[mine] - first, at[mine]
             own[1][mine] = found[node[:, None, None], columns[:, :, None], columns[:, None]]
             cross[mine] = found[node[:, None], :shake, columns].swapaxes(-1, -2)
         starts = np.r_[places.constant_start, constants]
@@ -247,7 +247,7 @@ class EliminatedChain:
             blocks = np.array([of_constants[s, s] for s in spans])
             own.append(blocks.reshape(number, size, size))
             key += number
-        own[0] = own[0][frame.nodes.of_frame]
+        own[0] = own[0][graph.nodes.of_frame]
         return Blocks(own, cross)
 
 
@@ -285,10 +285,10 @@ def _back_substituted(upper: Array, whitened: Array, constants: Array) -> Array:
 
 
 def _in_key_order(places: Places, states: Array, constants: Array) -> Array:
-    frame = places.frame
-    shake, bubble = (d for _, d in frame.counts()[:2])
+    graph = places.graph
+    shake, bubble = (d for _, d in graph.counts()[:2])
     columns = shake + places.slot[:, None] * bubble + np.arange(bubble)
-    of_rows = states[frame.node_of_row[:, None], columns]
+    of_rows = states[graph.node_of_row[:, None], columns]
     return np.concatenate([states[:, :shake].ravel(), of_rows.ravel(), constants])
 
 

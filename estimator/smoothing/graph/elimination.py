@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dtrtri
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.blocks import Blocks
-from telerig.estimator.smoothing.graph.state import Frame
+from telerig.estimator.smoothing.graph.state import GraphLayout
 from telerig.factors.linear_factors import Linear, add_linear_factors
 
 _NOTHING = np.zeros(0, np.int64)
@@ -30,7 +30,7 @@ _NOTHING = np.zeros(0, np.int64)
 class EliminatedGraph:
     """net : `gtsam.GaussianBayesNet`, one key a conditional.  vector : the solution."""
 
-    frame: Frame
+    graph: GraphLayout
     net: Any
     vector: Array
 
@@ -41,66 +41,66 @@ class EliminatedGraph:
 
     def blocks(self) -> Blocks:
         """Marginal covariances of all increments, and of shake with bubbles at the same frame."""
-        frame = self.frame
-        base, counts = frame.base(), frame.counts()
+        graph = self.graph
+        base, counts = graph.base(), graph.counts()
         families = [range(base[i], base[i] + n * (d > 0)) for i, (n, d) in enumerate(counts)]
-        at_frames = frame.nodes.of_frame.tolist() if counts.shake.size else []
-        rows = base.bubbles + np.arange(frame.rows)
-        pairs = list(zip(frame.node_of_row.tolist(), rows.tolist())) if counts.shake.size else []
+        at_frames = graph.nodes.of_frame.tolist() if counts.shake.size else []
+        rows = base.bubbles + np.arange(graph.rows)
+        pairs = list(zip(graph.node_of_row.tolist(), rows.tolist())) if counts.shake.size else []
         sizes = [d for n, d in counts for _ in range(n)]
         wanted = set(at_frames).union(*families[1:])
         found, found_cross = marginal_covariances(self.net, sizes, wanted, pairs)
         own = []
         for keys, (number, size) in zip([at_frames, *families[1:]], counts):
-            number = number if keys is not at_frames else len(frame.nodes.of_frame)
+            number = number if keys is not at_frames else len(graph.nodes.of_frame)
             own.append(np.array([found[k] for k in keys]).reshape(number, size, size))
         cross = np.array([found_cross[pair] for pair in pairs])
-        return Blocks(own, cross.reshape(frame.rows, counts.shake.size, counts.bubbles.size))
+        return Blocks(own, cross.reshape(graph.rows, counts.shake.size, counts.bubbles.size))
 
 
-def eliminate(frame: Frame, factors: list[Linear], *, cholesky: bool) -> EliminatedGraph:
+def eliminate(graph: GraphLayout, factors: list[Linear], *, cholesky: bool) -> EliminatedGraph:
     """The graph of all factors, solved: by QR, or by Cholesky where that does not refuse.
 
     Raises CalibrationError where it is undetermined.
     """
     import gtsam
 
-    graph = gtsam.GaussianFactorGraph()
+    factor_graph = gtsam.GaussianFactorGraph()
     for linear in factors:
-        add_linear_factors(graph, linear.keys, linear.blocks, linear.rhs)
-    _add_bonds(graph, frame)
-    net, solution = _eliminated(graph, _ordering(frame), cholesky)
-    return EliminatedGraph(frame, net, solution.vector())
+        add_linear_factors(factor_graph, linear.keys, linear.blocks, linear.rhs)
+    _add_bonds(factor_graph, graph)
+    net, solution = _eliminated(factor_graph, _ordering(graph), cholesky)
+    return EliminatedGraph(graph, net, solution.vector())
 
 
-def _add_bonds(graph: Any, frame: Frame) -> None:
+def _add_bonds(factor_graph: Any, graph: GraphLayout) -> None:
     """Empty factors between shake and bubbles where no image joins them.
 
     Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
     its first row on would share none.
     """
-    size = frame.counts().shake.size
-    seen = frame.row(frame.problem.observations.item, frame.problem.observations.frame)
-    alone = np.setdiff1d(np.arange(frame.rows), seen)
+    size = graph.counts().shake.size
+    seen = graph.row(graph.problem.observations.item, graph.problem.observations.frame)
+    alone = np.setdiff1d(np.arange(graph.rows), seen)
     if not size or not len(alone):
         return
-    keys = (frame.node_of_row[alone], frame.base().bubbles + alone)
-    blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, frame.bubble.size))
-    add_linear_factors(graph, keys, blocks, np.zeros((len(alone), 1)))
+    keys = (graph.node_of_row[alone], graph.base().bubbles + alone)
+    blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, graph.bubble.size))
+    add_linear_factors(factor_graph, keys, blocks, np.zeros((len(alone), 1)))
 
 
-def _eliminated(graph: Any, ordering: Any, cholesky: bool) -> tuple[Any, Any]:
+def _eliminated(factor_graph: Any, ordering: Any, cholesky: bool) -> tuple[Any, Any]:
     """Bayes net and solution."""
     import gtsam
 
     try:
         if cholesky:
             try:
-                net = graph.eliminateSequential(ordering)
+                net = factor_graph.eliminateSequential(ordering)
                 return net, net.optimize()
             except RuntimeError:
                 pass
-        net = graph.eliminateSequential(ordering, gtsam.EliminateQR)
+        net = factor_graph.eliminateSequential(ordering, gtsam.EliminateQR)
         return net, net.optimize()
     except RuntimeError as error:
         raise CalibrationError(
@@ -109,19 +109,19 @@ def _eliminated(graph: Any, ordering: Any, cholesky: bool) -> tuple[Any, Any]:
         ) from error
 
 
-def _ordering(frame: Frame) -> Any:
+def _ordering(graph: GraphLayout) -> Any:
     """Time order; what ends (a bubble's mean, a mark) right after it was last seen; rest last."""
     import gtsam
 
-    base, problem = frame.base(), frame.problem
-    nodes = np.arange(len(frame.nodes.t_s)) if frame.shake.size else np.zeros(0, np.int64)
-    rows = np.arange(frame.rows)
-    last_row = frame.node_of_row[frame.first_row[1:] - 1] if len(problem.bubbles) else _NOTHING
+    base, problem = graph.base(), graph.problem
+    nodes = np.arange(len(graph.nodes.t_s)) if graph.shake.size else np.zeros(0, np.int64)
+    rows = np.arange(graph.rows)
+    last_row = graph.node_of_row[graph.first_row[1:] - 1] if len(problem.bubbles) else _NOTHING
     last_mark = np.zeros(len(problem.marks), np.int64)
-    seen = frame.nodes.of_frame[problem.references.frame]
+    seen = graph.nodes.of_frame[problem.references.frame]
     np.maximum.at(last_mark, problem.references.item, seen)
     keys = [nodes, base.bubbles + rows, base.means + np.arange(len(problem.bubbles))]
-    when = [nodes, frame.node_of_row, last_row]
+    when = [nodes, graph.node_of_row, last_row]
     keys.append(base.marks + np.arange(len(problem.marks)))
     when.append(last_mark)
     rank = np.repeat(np.arange(4), [len(k) for k in keys])
@@ -130,7 +130,7 @@ def _ordering(frame: Frame) -> Any:
     out = gtsam.Ordering()
     for key in joined[order].tolist():
         out.push_back(key)
-    counts = frame.counts()
+    counts = graph.counts()
     for family in (3, 4, 6):
         number, size = counts[family]
         for key in range(base[family], base[family] + number * (size > 0)):

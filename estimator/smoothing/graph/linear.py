@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.covariance import rig_jacobian
-from telerig.estimator.smoothing.graph.state import Frame, State
+from telerig.estimator.smoothing.graph.state import GraphLayout, State
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
 from telerig.factors import measurements
 from telerig.factors.linear_factors import Linear
@@ -25,25 +25,25 @@ _SLOPE_S = 2e-3
 """Width of the filter that takes the readings' rate of change for the delay."""
 
 
-def priors_and_motion(frame: Frame, state: State) -> list[Linear]:
+def priors_and_motion(graph: GraphLayout, state: State) -> list[Linear]:
     """Everything but the measurements."""
-    out = _shake_motion(frame, state) + _bubble_motion(frame, state)
-    return out + _constant_priors(frame, state)
+    out = _shake_motion(graph, state) + _bubble_motion(graph, state)
+    return out + _constant_priors(graph, state)
 
 
-def _shake_motion(frame: Frame, state: State) -> list[Linear]:
-    layout = frame.shake
+def _shake_motion(graph: GraphLayout, state: State) -> list[Linear]:
+    layout = graph.shake
     if not layout.size:
         return []
-    keys = np.arange(len(frame.nodes.t_s))
-    steps = frame.shake_motion
+    keys = np.arange(len(graph.nodes.t_s))
+    steps = graph.shake_motion
     deviation = state.shake.copy()
     at = 0
     for i, component in enumerate(layout.components):
         if component.memoryless:
-            deviation[:, at] -= frame.nominal_mm
-        elif i == 0 and frame.problem.stage is not None:
-            deviation[:, at] -= frame.nominal_mm[0]
+            deviation[:, at] -= graph.nominal_mm
+        elif i == 0 and graph.problem.stage is not None:
+            deviation[:, at] -= graph.nominal_mm[0]
         at += component.size
     residual = steps.residual(deviation[:-1], deviation[1:], np.zeros(0))
     blocks = steps.in_basis(np.append(steps.index[1:], -1))
@@ -52,19 +52,19 @@ def _shake_motion(frame: Frame, state: State) -> list[Linear]:
     whitener = whitener_of(covariance)
     first = Linear(
         (keys[:1],),
-        ((whitener @ frame.shake_basis(0))[None],),
+        ((whitener @ graph.shake_basis(0))[None],),
         -(whitener @ deviation[0])[None],
         log_det_of(whitener)[None],
     )
     return [first, between]
 
 
-def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
-    problem, layout = frame.problem, frame.bubble
+def _bubble_motion(graph: GraphLayout, state: State) -> list[Linear]:
+    problem, layout = graph.problem, graph.bubble
     if not problem.bubbles:
         return []
-    base = frame.base()
-    firsts, rows = frame.first_row[:-1], frame.moving_rows
+    base = graph.base()
+    firsts, rows = graph.first_row[:-1], graph.moving_rows
     covariance, by_input = start(layout.components)
     whitener = whitener_of(covariance)
     places = np.array([b.start_mm for b in problem.bubbles])
@@ -72,29 +72,29 @@ def _bubble_motion(frame: Frame, state: State) -> list[Linear]:
     off = state.bubbles[firsts] - means @ by_input.T
     off[:, layout.path_position] -= places
     numbers = np.arange(len(firsts))
-    wide = _with_columns(-whitener @ by_input, frame.mean_size)
+    wide = _with_columns(-whitener @ by_input, graph.mean_size)
     begin = Linear(
         (base.bubbles + firsts, base.means + numbers),
-        (whitener @ frame.bubble_basis(firsts), np.broadcast_to(wide, (len(firsts), *wide.shape))),
+        (whitener @ graph.bubble_basis(firsts), np.broadcast_to(wide, (len(firsts), *wide.shape))),
         -off @ whitener.T,
         np.full(len(firsts), log_det_of(whitener)),
     )
     if not len(rows):
         return [begin]
-    steps, owner = frame.bubble_motion, frame.bubble_of_row[rows]
+    steps, owner = graph.bubble_motion, graph.bubble_of_row[rows]
     residual = steps.residual(state.bubbles[rows], state.bubbles[rows + 1], means[owner])
     i = steps.index
     blocks = (
-        *steps.in_basis(frame.row_basis[rows + 1]),
-        _with_columns(steps.by_input, frame.mean_size)[i],
+        *steps.in_basis(graph.row_basis[rows + 1]),
+        _with_columns(steps.by_input, graph.mean_size)[i],
     )
     keys = (base.bubbles + rows, base.bubbles + rows + 1, base.means + owner)
     return [begin, Linear(keys, blocks, -residual, steps.log_det[i])]
 
 
-def _constant_priors(frame: Frame, state: State) -> list[Linear]:
-    model, problem, base = frame.model, frame.problem, frame.base()
-    scale, delay = frame.sensor_flags
+def _constant_priors(graph: GraphLayout, state: State) -> list[Linear]:
+    model, problem, base = graph.model, graph.problem, graph.base()
+    scale, delay = graph.sensor_flags
     out = [_prior(base.means, state.means, model.bubble.mean_sigma_mm_s)]
     if problem.accelerometers:
         extra = [model.accelerometer_scale_sigma] * scale
@@ -102,11 +102,11 @@ def _constant_priors(frame: Frame, state: State) -> list[Linear]:
         out.append(_prior(base.sensors, state.sensors, sigma))
         if delay:
             given = np.array([a.delay_s for a in problem.accelerometers])
-            _, first = np.unique(frame.clock_of, return_index=True)
-            value = state.clocks + (frame.delays_s - given)[first, None]
+            _, first = np.unique(graph.clock_of, return_index=True)
+            value = state.clocks + (graph.delays_s - given)[first, None]
             out.append(_prior(base.clocks, value, model.accelerometer_delay_sigma_s))
     sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
-    sigmas = np.concatenate([sigmas[np.array(frame.encoder_flags)], np.ones(frame.share_size)])
+    sigmas = np.concatenate([sigmas[np.array(graph.encoder_flags)], np.ones(graph.share_size)])
     out.append(
         _prior(base.constants, np.concatenate([state.encoder, state.calibration])[None], sigmas)
     )
@@ -133,33 +133,33 @@ class Seen:
     residual: Array
 
 
-def images(frame: Frame, state: State, weight: Array) -> Seen:
+def images(graph: GraphLayout, state: State, weight: Array) -> Seen:
     """Pixels of the bubbles; weight (M,)."""
-    problem, layout = frame.problem, frame.bubble
+    problem, layout = graph.problem, graph.bubble
     obs = problem.observations
-    rows = frame.row(obs.item, obs.frame)
+    rows = graph.row(obs.item, obs.frame)
     states = state.bubbles[rows]
     points = states @ layout.position.T
-    basis = frame.bubble_basis(rows)
+    basis = graph.bubble_basis(rows)
     by_point = layout.position @ basis
     shift = np.einsum("mid,md->mi", layout.wander[obs.camera], states)
     extra = layout.wander[obs.camera] @ basis
-    keys = frame.base().bubbles + rows
-    return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
+    keys = graph.base().bubbles + rows
+    return _seen(graph, state, obs, weight, points, by_point, keys, shift, extra)
 
 
-def references(frame: Frame, state: State, weight: Array) -> Seen:
+def references(graph: GraphLayout, state: State, weight: Array) -> Seen:
     """Pixels of the marks fixed to the tank; weight (R,)."""
-    obs = frame.problem.references
+    obs = graph.problem.references
     points = state.marks[obs.item]
-    keys = frame.base().marks + obs.item
+    keys = graph.base().marks + obs.item
     extra, shift = np.zeros((len(obs), 2, 3)), np.zeros((len(obs), 2))
     by_point = np.broadcast_to(np.eye(3), (len(obs), 3, 3))
-    return _seen(frame, state, obs, weight, points, by_point, keys, shift, extra)
+    return _seen(graph, state, obs, weight, points, by_point, keys, shift, extra)
 
 
 def _seen(
-    frame: Frame,
+    graph: GraphLayout,
     state: State,
     obs: Observations,
     weight: Array,
@@ -170,19 +170,19 @@ def _seen(
     extra: Array,
 ) -> Seen:
     """``points`` (M, 3) of keys whose states move them by ``by_state``, their images ``extra``."""
-    problem, layout, base = frame.problem, frame.shake, frame.base()
-    inflation = frame.model.pixel_inflation
+    problem, layout, base = graph.problem, graph.shake, graph.base()
+    inflation = graph.model.pixel_inflation
     whitener = whitener_of(obs.covariance_px2) / inflation
     out, residual = [], np.zeros((len(obs), 2))
-    at_frames = frame.shake_at_frames(state.shake)
-    gain = 1 / (1 + state.encoder_scale(frame))
+    at_frames = graph.shake_at_frames(state.shake)
+    gain = 1 / (1 + state.encoder_scale(graph))
     position = gain * (at_frames @ layout.position)
     by_scale = -gain * position
     for c, camera in enumerate(problem.cameras):
         mine = np.flatnonzero(obs.camera == c)
         if not len(mine):
             continue
-        node = frame.nodes.of_frame[obs.frame[mine]]
+        node = graph.nodes.of_frame[obs.frame[mine]]
         shake = at_frames[obs.frame[mine]]
         seen = measurements.image_of_point(
             camera, points[mine], position[obs.frame[mine]], problem.axis,
@@ -193,12 +193,12 @@ def _seen(
             + seen.by_position[..., None] * (gain * layout.position)
             + seen.by_pitch[..., None] * layout.pitch[c]
         )
-        if frame.to_frames is not None:
-            by_shake = by_shake @ frame.to_frames[obs.frame[mine]]
+        if graph.to_frames is not None:
+            by_shake = by_shake @ graph.to_frames[obs.frame[mine]]
         off = seen.uv_px + shift[mine] - obs.uv_px[mine]
         by_rig = np.zeros((len(mine), 2, 0))
         if problem.calibration is not None and len(state.calibration):
-            by_rig = _by_calibration(frame, c, points[mine], position[obs.frame[mine]], shake)
+            by_rig = _by_calibration(graph, c, points[mine], position[obs.frame[mine]], shake)
             off += by_rig @ state.calibration
         by_travel = seen.by_position * by_scale[obs.frame[mine], None]
         w = whitener[mine]
@@ -207,8 +207,8 @@ def _seen(
         w = w * root[:, None, None]
         blocks = (
             w @ (seen.by_point @ by_state[mine] + extra[mine]),
-            w @ (by_shake @ frame.shake_basis(node)),
-            w @ np.concatenate([frame.by_encoder(by_travel, np.zeros_like(by_travel)), by_rig], -1),
+            w @ (by_shake @ graph.shake_basis(node)),
+            w @ np.concatenate([graph.by_encoder(by_travel, np.zeros_like(by_travel)), by_rig], -1),
         )
         rhs = -residual[mine] * root[:, None]
         log_det = log_det_of(whitener[mine])
@@ -218,76 +218,76 @@ def _seen(
 
 
 def _by_calibration(
-    frame: Frame, camera: int, points: Array, position: Array, shake: Array
+    graph: GraphLayout, camera: int, points: Array, position: Array, shake: Array
 ) -> Array:
     """(M, 2, r) pixels by the unit directions of the calibration's uncertainty."""
-    problem, share = frame.problem, frame.problem.calibration
+    problem, share = graph.problem, graph.problem.calibration
     assert share is not None
-    rig = points - position[:, None] * problem.axis - shake @ frame.shake.offset[camera].T
+    rig = points - position[:, None] * problem.axis - shake @ graph.shake.offset[camera].T
     rows = rig_jacobian(problem.cameras, share.free, rig)[..., 2 * camera : 2 * camera + 2, :]
     return np.asarray(rows @ share.root)
 
 
-def encoder(frame: Frame, state: State) -> list[Linear]:
+def encoder(graph: GraphLayout, state: State) -> list[Linear]:
     """Readings of the stage's position: at their own times, or interpolated at the frames.
 
     The carriage's states are in units of the reading, so that its scale is not a factor of what
     the encoder determines: the joint mode of (states, scale) would shrink the states' noise, by one
     unit of log-likelihood per reading and unit of log scale, where no data inform on the scale.
     """
-    problem, model, layout = frame.problem, frame.model, frame.shake
-    stage, nodes = problem.stage, frame.nodes
+    problem, model, layout = graph.problem, graph.model, graph.shake
+    stage, nodes = problem.stage, graph.nodes
     if stage is None:
         return []
     if model.carriage.kind != "readings":
         node, reading = nodes.of_encoder, stage.position_mm
         rows, rates = (np.tile(r, (len(node), 1)) for r in (layout.position, layout.velocity))
-        if frame.to_encoder is not None:
-            rows = np.einsum("i,mij->mj", layout.position, frame.to_encoder)
-            rates = np.einsum("i,mij->mj", layout.velocity, frame.to_encoder)
+        if graph.to_encoder is not None:
+            rows = np.einsum("i,mij->mj", layout.position, graph.to_encoder)
+            rates = np.einsum("i,mij->mj", layout.velocity, graph.to_encoder)
         speed = (state.shake[node] * rates).sum(-1)
     else:
         t = problem.t_s
         inside = (t >= stage.t_s[0] - 1e-9) & (t <= stage.t_s[-1] + 1e-9)
         node = nodes.of_frame[inside]
-        reading = frame.nominal_mm[node]
+        reading = graph.nominal_mm[node]
         rows = np.tile(layout.position, (len(node), 1))
-        speed = np.gradient(frame.nominal_mm, nodes.t_s)[node]
-    position = (state.shake[node] * rows).sum(-1) - state.encoder_delay_s(frame) * speed
+        speed = np.gradient(graph.nominal_mm, nodes.t_s)[node]
+    position = (state.shake[node] * rows).sum(-1) - state.encoder_delay_s(graph) * speed
     constants = [
-        frame.by_encoder(np.zeros_like(speed), -speed),
-        np.zeros((len(node), frame.share_size)),
+        graph.by_encoder(np.zeros_like(speed), -speed),
+        np.zeros((len(node), graph.share_size)),
     ]
-    by_shake = rows[:, None] @ frame.shake_basis(node)
+    by_shake = rows[:, None] @ graph.shake_basis(node)
     sigma = model.encoder_sigma_mm
     blocks = (by_shake / sigma, np.concatenate(constants, -1)[:, None] / sigma)
     log_det = np.full(len(node), -np.log(sigma))
     return [
         Linear(
-            (node, frame.base().constants), blocks, (reading - position)[:, None] / sigma, log_det
+            (node, graph.base().constants), blocks, (reading - position)[:, None] / sigma, log_det
         )
     ]
 
 
-def accelerometers(frame: Frame, state: State) -> list[Linear]:
+def accelerometers(graph: GraphLayout, state: State) -> list[Linear]:
     """Samples of all sensors, along the directions in which their mount's motion is modelled.
 
     Their information on the encoder's scale, by the carriage's own acceleration, is not used.
     """
-    return [_accelerometer(frame, state, i) for i in range(len(frame.problem.accelerometers))]
+    return [_accelerometer(graph, state, i) for i in range(len(graph.problem.accelerometers))]
 
 
-def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
-    problem, layout = frame.problem, frame.shake
+def _accelerometer(graph: GraphLayout, state: State, index: int) -> Linear:
+    problem, layout = graph.problem, graph.shake
     sensor = problem.accelerometers[index]
-    node, late = frame.nodes.of_accelerometers[index], frame.nodes.accelerometer_late_s[index]
-    gain = 1 / (1 + state.encoder_scale(frame))
+    node, late = graph.nodes.of_accelerometers[index], graph.nodes.accelerometer_late_s[index]
+    gain = 1 / (1 + state.encoder_scale(graph))
     jerk_rows = np.multiply.outer(gain * problem.axis, layout.jerk)
     jerk_rows += layout.offset_jerk[sensor.camera]
     rows = np.multiply.outer(gain * problem.axis, layout.acceleration)
     rows += layout.offset_acceleration[sensor.camera]
     bias = state.sensors[index, :3]
-    clock = frame.clock_of[index]
+    clock = graph.clock_of[index]
     scale, delay = state.sensors[index, 3:].sum(), state.clocks[clock].sum()
     states = state.shake[node]
     acceleration = states @ rows.T + late[:, None] * (states @ jerk_rows.T)
@@ -295,11 +295,11 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
         acceleration, problem.gravity_mm_s2, sensor.axes, bias, scale
     )
     slope = _slope(sensor)
-    project, white = sensed_directions(frame, index)
+    project, white = sensed_directions(graph, index)
     by_shake = (project @ read.by_acceleration[0]) @ (
-        (rows + late[:, None, None] * jerk_rows) @ frame.shake_basis(node)
+        (rows + late[:, None, None] * jerk_rows) @ graph.shake_basis(node)
     )
-    has_scale, has_delay = frame.sensor_flags
+    has_scale, has_delay = graph.sensor_flags
     by_scale, by_clock = read.by_scale[..., None], -slope[..., None]
     by_sensor = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(node), 3, 3)), by_scale[..., :has_scale]], -1
@@ -307,7 +307,7 @@ def _accelerometer(frame: Frame, state: State, index: int) -> Linear:
     blocks = (by_shake, project @ by_sensor, project @ by_clock[..., :has_delay])
     rhs = (sensor.reading_mm_s2 - read.reading_mm_s2 + delay * slope) @ project.T
     log_det = np.full(len(node), white)
-    keys = (node, frame.base().sensors + index, frame.base().clocks + clock)
+    keys = (node, graph.base().sensors + index, graph.base().clocks + clock)
     return Linear(keys, blocks, rhs, log_det)
 
 
@@ -326,47 +326,47 @@ def _slope(sensor: Accelerometer) -> Array:
     return np.asarray(slope / step, np.float64)
 
 
-def sensed_directions(frame: Frame, index: int) -> tuple[Array, float]:
+def sensed_directions(graph: GraphLayout, index: int) -> tuple[Array, float]:
     """(k, 3) whitened rows that take a reading to the directions of modelled motion; log det."""
-    sensor = frame.problem.accelerometers[index]
-    directions = np.eye(3) if sensor.camera == CARRIAGE else frame.shake.seen[sensor.camera]
+    sensor = graph.problem.accelerometers[index]
+    directions = np.eye(3) if sensor.camera == CARRIAGE else graph.shake.seen[sensor.camera]
     rows = directions @ np.linalg.inv(sensor.axes)
     whitener = whitener_of(rows @ rows.T * sensor.sigma_mm_s2**2)
     return np.asarray(whitener @ rows), float(log_det_of(whitener))
 
 
-def speeds(frame: Frame, state: State) -> list[Linear]:
+def speeds(graph: GraphLayout, state: State) -> list[Linear]:
     """How constant the bubbles' speed is, if that is part of the model."""
-    sigma = frame.model.bubble.speed_sigma_mm_s
-    if sigma is None or not frame.rows:
+    sigma = graph.model.bubble.speed_sigma_mm_s
+    if sigma is None or not graph.rows:
         return []
-    layout, base = frame.bubble, frame.base()
-    owner = frame.bubble_of_row
+    layout, base = graph.bubble, graph.base()
+    owner = graph.bubble_of_row
     velocity = state.bubbles @ layout.velocity.T
     value, by_velocity, by_speed = measurements.speed_residual(
-        velocity, state.means[owner, 3], frame.problem.up
+        velocity, state.means[owner, 3], graph.problem.up
     )
     by_mean = np.zeros((len(owner), 1, 4))
     by_mean[:, 0, 3] = by_speed / sigma
-    every = frame.bubble_basis(np.arange(frame.rows))
+    every = graph.bubble_basis(np.arange(graph.rows))
     by_state = (by_velocity @ layout.velocity)[:, None] @ every / sigma
-    keys = (base.bubbles + np.arange(frame.rows), base.means + owner)
+    keys = (base.bubbles + np.arange(graph.rows), base.means + owner)
     log_det = np.full(len(owner), -np.log(sigma))
     return [Linear(keys, (by_state, by_mean), -value[:, None] / sigma, log_det)]
 
 
-def all_factors(frame: Frame, state: State, weights: tuple[Array, Array]) -> list[Linear]:
+def all_factors(graph: GraphLayout, state: State, weights: tuple[Array, Array]) -> list[Linear]:
     """Every factor of the graph; weights of the bubbles' and of the marks' pixels."""
-    out = priors_and_motion(frame, state)
-    out += images(frame, state, weights[0]).linear + references(frame, state, weights[1]).linear
-    return out + encoder(frame, state) + accelerometers(frame, state) + speeds(frame, state)
+    out = priors_and_motion(graph, state)
+    out += images(graph, state, weights[0]).linear + references(graph, state, weights[1]).linear
+    return out + encoder(graph, state) + accelerometers(graph, state) + speeds(graph, state)
 
 
-def pixel_residuals(frame: Frame, state: State) -> tuple[Array, Array]:
+def pixel_residuals(graph: GraphLayout, state: State) -> tuple[Array, Array]:
     """Whitened residuals of the bubbles' (M, 2) and of the marks' pixels (R, 2)."""
-    problem = frame.problem
+    problem = graph.problem
     ones = np.ones(len(problem.observations)), np.ones(len(problem.references))
-    return images(frame, state, ones[0]).residual, references(frame, state, ones[1]).residual
+    return images(graph, state, ones[0]).residual, references(graph, state, ones[1]).residual
 
 
 def _with_columns(block: Array, columns: int) -> Array:

@@ -17,10 +17,10 @@ from telerig.estimator.smoothing.graph import chain, elimination
 from telerig.estimator.smoothing.graph.blocks import Blocks
 from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
 from telerig.estimator.smoothing.graph.state import (
-    Frame,
+    GraphLayout,
     State,
     first_guess,
-    frame_of,
+    graph_layout,
     moved,
     times,
 )
@@ -81,7 +81,7 @@ class Solution:
     last linearisation.  delays_s : (A,) the accelerometers'.
     """
 
-    frame: Frame
+    graph: GraphLayout
     state: State
     covariances: Covariances | None
     weights: tuple[Array, Array]
@@ -91,9 +91,9 @@ class Solution:
 
     @property
     def delays_s(self) -> Array:
-        delays = self.frame.delays_s
-        if self.frame.sensor_flags[1] and len(delays):
-            return np.asarray(delays + self.state.clocks[self.frame.clock_of, 0])
+        delays = self.graph.delays_s
+        if self.graph.sensor_flags[1] and len(delays):
+            return np.asarray(delays + self.state.clocks[self.graph.clock_of, 0])
         return delays
 
 
@@ -121,48 +121,48 @@ def _solve(
     start: Solution | None,
 ) -> Solution:
     delays = np.array([a.delay_s for a in problem.accelerometers])
-    frame = frame_of(problem, model, delays if start is None else start.frame.delays_s)
-    state = first_guess(frame)
+    graph = graph_layout(problem, model, delays if start is None else start.graph.delays_s)
+    state = first_guess(graph)
     weights = (np.ones(len(problem.observations)), np.ones(len(problem.references)))
     if start is not None:
-        weights, state = start.weights, _warm(frame, state, start)
+        weights, state = start.weights, _warm(graph, state, start)
     robust = Truncation(options.robust)
     last: _Pass | None = None
     exact = _is_linear(problem, model)
     done = 0
     for done in range(1, options.passes + _CLOCK_PASSES + 1):
-        if done > options.passes and not delays_have_moved(frame, state):
+        if done > options.passes and not delays_have_moved(graph, state):
             break
         progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
-        last = made = _linear_solve(frame, state, weights)
-        state = moved(frame, state, made.done.vector)
-        residuals = pixel_residuals(frame, state)
+        last = made = _linear_solve(graph, state, weights)
+        state = moved(graph, state, made.done.vector)
+        residuals = pixel_residuals(graph, state)
         fresh, changed = robust.update(weights, residuals)
-        still = made.largest_px < options.tolerance_px and not delays_have_moved(frame, state)
+        still = made.largest_px < options.tolerance_px and not delays_have_moved(graph, state)
         if (still or exact) and not changed and (done > 1 or start is not None or exact):
             break
         weights = fresh
-        frame, state, again = with_moved_nodes(frame, state)
+        graph, state, again = with_moved_nodes(graph, state)
         last = None if again or changed else last
     if last is None:
         weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
-        last = _linear_solve(frame, state, weights)
-        state = moved(frame, state, last.done.vector)
-        residuals = pixel_residuals(frame, state)
-    return _finish(frame, state, (weights, residuals), last, options, done, progress)
+        last = _linear_solve(graph, state, weights)
+        state = moved(graph, state, last.done.vector)
+        residuals = pixel_residuals(graph, state)
+    return _finish(graph, state, (weights, residuals), last, options, done, progress)
 
 
-def _warm(frame: Frame, state: State, start: Solution) -> State:
+def _warm(graph: GraphLayout, state: State, start: Solution) -> State:
     """The first guess with whatever of another solution has the same meaning here."""
     same = {
         name: value
         for name, value in vars(start.state).items()
         if value.shape == getattr(state, name).shape and name not in ("shake", "clocks")
     }
-    alike = frame.shake.labels == start.frame.shake.labels
-    if alike and frame.shake.size == start.frame.shake.size:
-        t = start.frame.nodes.t_s
-        columns = [np.interp(frame.nodes.t_s, t, c) for c in start.state.shake.T]
+    alike = graph.shake.labels == start.graph.shake.labels
+    if alike and graph.shake.size == start.graph.shake.size:
+        t = start.graph.nodes.t_s
+        columns = [np.interp(graph.nodes.t_s, t, c) for c in start.state.shake.T]
         same["shake"] = np.stack(columns, -1) if columns else state.shake
     return replace(state, **same)
 
@@ -192,37 +192,37 @@ class _Pass:
     squared: float
 
 
-def _linear_solve(frame: Frame, state: State, weights: tuple[Array, Array]) -> _Pass:
-    factors = all_factors(frame, state, weights)
-    done = _eliminated(frame, factors)
+def _linear_solve(graph: GraphLayout, state: State, weights: tuple[Array, Array]) -> _Pass:
+    factors = all_factors(graph, state, weights)
+    done = _eliminated(graph, factors)
     if not np.all(np.isfinite(done.vector)):
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
-    largest = _largest_shift_px(frame, done.vector)
-    squared = _squared(frame, factors, done.vector)
-    return _Pass(done, largest, _log_norm(frame, factors), squared)
+    largest = _largest_shift_px(graph, done.vector)
+    squared = _squared(graph, factors, done.vector)
+    return _Pass(done, largest, _log_norm(graph, factors), squared)
 
 
-def _eliminated(frame: Frame, factors: list[Linear]) -> Eliminated:
+def _eliminated(graph: GraphLayout, factors: list[Linear]) -> Eliminated:
     """By normal equations, or by QR, four times slower, where digits are short.
 
     The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
     good to 3e-6), and more than double precision has with steps as short as a sensor's. Else QR
     is for what Cholesky refuses.
     """
-    only_frames = len(frame.nodes.t_s) == len(frame.problem.t_s)
-    cholesky = only_frames and not frame.model.broad_bands
-    if cholesky and chain.is_chain_of_frames(frame):
-        places = chain.places_of(frame)
+    only_frames = len(graph.nodes.t_s) == len(graph.problem.t_s)
+    cholesky = only_frames and not graph.model.broad_bands
+    if cholesky and chain.is_chain_of_frames(graph):
+        places = chain.places_of(graph)
         try:
             return chain.eliminate(places, chain.normal_equations(places, factors))
         except np.linalg.LinAlgError:
             cholesky = False
-    return elimination.eliminate(frame, factors, cholesky=cholesky)
+    return elimination.eliminate(graph, factors, cholesky=cholesky)
 
 
-def _squared(frame: Frame, factors: list[Linear], vector: Array) -> float:
+def _squared(graph: GraphLayout, factors: list[Linear], vector: Array) -> float:
     """Sum of squares of all factors after the step."""
-    base, counts = np.array(frame.base()), frame.counts()
+    base, counts = np.array(graph.base()), graph.counts()
     sizes = [n * d for n, d in counts]
     starts = np.r_[0, np.cumsum(sizes)]
 
@@ -235,26 +235,26 @@ def _squared(frame: Frame, factors: list[Linear], vector: Array) -> float:
     return sum(f.squared(of_keys) for f in factors)
 
 
-def _log_norm(frame: Frame, factors: list[Linear]) -> float:
+def _log_norm(graph: GraphLayout, factors: list[Linear]) -> float:
     """log of the joint density's normalisation, the change to whitening bases included."""
-    shake, bubble = frame.shake_motion, frame.bubble_motion
+    shake, bubble = graph.shake_motion, graph.bubble_motion
     of_nodes = np.linalg.slogdet(shake.basis)[1][np.append(shake.index, -1)]
-    of_rows = np.linalg.slogdet(bubble.basis)[1][frame.row_basis]
+    of_rows = np.linalg.slogdet(bubble.basis)[1][graph.row_basis]
     return float(of_nodes.sum() + of_rows.sum()) + sum(f.log_norm() for f in factors)
 
 
-def _largest_shift_px(frame: Frame, vector: Array) -> float:
+def _largest_shift_px(graph: GraphLayout, vector: Array) -> float:
     """How far bubbles moved in this pass, in pixels of the finest camera."""
-    layout, (nodes, size) = frame.bubble, frame.counts()[0]
+    layout, (nodes, size) = graph.bubble, graph.counts()[0]
     start = nodes * size
-    states = vector[start : start + frame.rows * layout.size].reshape(-1, layout.size)
-    moves = times(frame.bubble_basis(np.arange(frame.rows)), states) @ layout.position.T
-    scale = max(c["scale_px_per_mm"] for c in frame.problem.cameras)
+    states = vector[start : start + graph.rows * layout.size].reshape(-1, layout.size)
+    moves = times(graph.bubble_basis(np.arange(graph.rows)), states) @ layout.position.T
+    scale = max(c["scale_px_per_mm"] for c in graph.problem.cameras)
     return float(np.max(np.abs(moves), initial=0.0) * scale)
 
 
 def _finish(
-    frame: Frame,
+    graph: GraphLayout,
     state: State,
     fitted: tuple[tuple[Array, Array], tuple[Array, Array]],
     last: _Pass,
@@ -266,28 +266,28 @@ def _finish(
 
     fitted : weights and residuals, of bubbles and of marks.
     """
-    dimension = sum(n * d for n, d in frame.counts())
+    dimension = sum(n * d for n, d in graph.counts())
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
     evidence -= last.done.log_det()
     found = None
     if options.covariances:
         progress("covariances", 0.0)
-        found = _covariances(frame, last.done.blocks())
+        found = _covariances(graph, last.done.blocks())
     progress("smoothing", 1.0)
-    return Solution(frame, state, found, *fitted, float(evidence), done)
+    return Solution(graph, state, found, *fitted, float(evidence), done)
 
 
-def _covariances(frame: Frame, blocks: Blocks) -> Covariances:
+def _covariances(graph: GraphLayout, blocks: Blocks) -> Covariances:
     """Marginals in physical units."""
     own = blocks.own
-    shake_basis = frame.shake_basis(frame.nodes.of_frame)
-    if frame.to_frames is not None:
-        shake_basis = frame.to_frames @ shake_basis
-    bubble_basis = frame.bubble_basis(np.arange(frame.rows))
+    shake_basis = graph.shake_basis(graph.nodes.of_frame)
+    if graph.to_frames is not None:
+        shake_basis = graph.to_frames @ shake_basis
+    bubble_basis = graph.bubble_basis(np.arange(graph.rows))
     shake = shake_basis @ own[0] @ np.swapaxes(shake_basis, -1, -2)
     bubbles = bubble_basis @ own[1] @ np.swapaxes(bubble_basis, -1, -2)
-    cross = shake_basis[frame.frame_of_row] @ blocks.cross @ np.swapaxes(bubble_basis, -1, -2)
-    encoder = frame.encoder_size
+    cross = shake_basis[graph.frame_of_row] @ blocks.cross @ np.swapaxes(bubble_basis, -1, -2)
+    encoder = graph.encoder_size
     return Covariances(
         shake, bubbles, cross, own[2], own[3], own[4][0, :encoder, :encoder],
         own[4][0, encoder:, encoder:], *own[5:],
@@ -334,21 +334,21 @@ def _truncated(squares: Array, bound: float, control: float) -> Array:
     return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, np.clip(between, 0, 1)))
 
 
-def delays_have_moved(frame: Frame, state: State) -> bool:
+def delays_have_moved(graph: GraphLayout, state: State) -> bool:
     """Whether a sensor's delay has moved so far that its samples belong elsewhere."""
-    if not (frame.sensor_flags[1] and frame.problem.accelerometers):
+    if not (graph.sensor_flags[1] and graph.problem.accelerometers):
         return False
     return bool(np.max(np.abs(state.clocks)) >= _DELAY_STEP_S)
 
 
-def with_moved_nodes(frame: Frame, state: State) -> tuple[Frame, State, bool]:
+def with_moved_nodes(graph: GraphLayout, state: State) -> tuple[GraphLayout, State, bool]:
     """Move the nodes of sensors whose estimated delay has moved."""
-    if not delays_have_moved(frame, state):
-        return frame, state, False
-    leap = np.clip(state.clocks[frame.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
-    fresh = frame_of(frame.problem, frame.model, frame.delays_s + leap)
+    if not delays_have_moved(graph, state):
+        return graph, state, False
+    leap = np.clip(state.clocks[graph.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
+    fresh = graph_layout(graph.problem, graph.model, graph.delays_s + leap)
     shake = np.stack(
-        [np.interp(fresh.nodes.t_s, frame.nodes.t_s, column) for column in state.shake.T], -1
+        [np.interp(fresh.nodes.t_s, graph.nodes.t_s, column) for column in state.shake.T], -1
     )
     clocks = np.zeros_like(state.clocks)
     return fresh, replace(state, shake=shake, clocks=clocks), True

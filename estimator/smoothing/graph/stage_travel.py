@@ -60,26 +60,26 @@ def wider_scale_sigma(solution: Solution) -> float | None:
 
     Twice the estimate, which the narrow prior has drawn towards 0.
     """
-    prior, travel = solution.frame.model.encoder_scale_sigma, solution.frame.problem.travel
+    prior, travel = solution.graph.model.encoder_scale_sigma, solution.graph.problem.travel
     assumed = travel is None or travel.source == "assumed"
-    if not solution.frame.encoder_flags[0] or not assumed:
+    if not solution.graph.encoder_flags[0] or not assumed:
         return None
-    off = abs(solution.state.encoder_scale(solution.frame))
+    off = abs(solution.state.encoder_scale(solution.graph))
     return 2 * off if off > _FAR * prior else None
 
 
 def considered_variance(solution: Solution) -> tuple[Array, Array]:
     """(rows, 3) variances of the bubbles' positions and velocities from scale and axis."""
-    at = solution.frame.frame_of_row
+    at = solution.graph.frame_of_row
     places, speeds = carriage(solution)
     return _variance(solution, places[at]), _variance(solution, speeds[at])
 
 
 def carriage(solution: Solution) -> tuple[Array, Array]:
     """(F,) position (mm) and velocity (mm/s) along the axis at the frames, scale taken off."""
-    frame, t = solution.frame, solution.frame.problem.t_s
-    readings = frame.shake_at_frames(solution.state.shake) @ frame.shake.position
-    position = readings / (1 + solution.state.encoder_scale(frame))
+    graph, t = solution.graph, solution.graph.problem.t_s
+    readings = graph.shake_at_frames(solution.state.shake) @ graph.shake.position
+    position = readings / (1 + solution.state.encoder_scale(graph))
     return position, np.asarray(np.gradient(position, t))
 
 
@@ -91,18 +91,18 @@ def carriage_sigma(solution: Solution, states_sigma: Array) -> Array:
 
 def scale_sigma(solution: Solution) -> float:
     """Posterior sd of the encoder's scale: of the variable, or what was known before."""
-    frame, found = solution.frame, solution.covariances
-    if frame.encoder_flags[0]:
+    graph, found = solution.graph, solution.covariances
+    if graph.encoder_flags[0]:
         return 0.0 if found is None else float(np.sqrt(found.encoder[0, 0]))
-    travel = frame.problem.travel
+    travel = graph.problem.travel
     return 0.0 if travel is None else float(np.sqrt(travel.covariance[2, 2]))
 
 
 def total_scale(solution: Solution) -> float:
     """(reading - travel) / travel: the calibrated scale and what the run adds to it."""
-    travel = solution.frame.problem.travel
+    travel = solution.graph.problem.travel
     before = 0.0 if travel is None else travel.scale
-    return float((1 + before) * (1 + solution.state.encoder_scale(solution.frame)) - 1)
+    return float((1 + before) * (1 + solution.state.encoder_scale(solution.graph)) - 1)
 
 
 def considered(travel: Travel, model: ShakeModel) -> Array:
@@ -113,9 +113,9 @@ def considered(travel: Travel, model: ShakeModel) -> Array:
 
 def _variance(solution: Solution, along: Array) -> Array:
     """(n, 3) variances of ``axis * along`` (n,)."""
-    travel, stage = solution.frame.problem.travel, solution.frame.problem.stage
+    travel, stage = solution.graph.problem.travel, solution.graph.problem.stage
     if travel is None or stage is None:
         return np.zeros((len(along), 3))
     turn = np.column_stack([travel.basis, -travel.axis])
-    each = np.diagonal(turn @ considered(travel, solution.frame.model) @ turn.T)
+    each = np.diagonal(turn @ considered(travel, solution.graph.model) @ turn.T)
     return np.asarray(along[:, None] ** 2 * each)

@@ -71,17 +71,17 @@ class State:
         """(K, 3) mean velocities of the K bubbles over the run, mm/s in the lab frame."""
         return self.means[:, :3]
 
-    def encoder_scale(self, frame: Frame) -> float:
+    def encoder_scale(self, graph: GraphLayout) -> float:
         """0 where it is held."""
-        return float(self.encoder[0]) if frame.encoder_flags[0] else 0.0
+        return float(self.encoder[0]) if graph.encoder_flags[0] else 0.0
 
-    def encoder_delay_s(self, frame: Frame) -> float:
+    def encoder_delay_s(self, graph: GraphLayout) -> float:
         """0 where it is held."""
-        return float(self.encoder[-1]) if frame.encoder_flags[1] else 0.0
+        return float(self.encoder[-1]) if graph.encoder_flags[1] else 0.0
 
 
 @dataclass(frozen=True)
-class Frame:
+class GraphLayout:
     """The fixed part of one linearisation: layouts, nodes and the keys' order.
 
     nominal_mm : (N,) the carriage's prior mean.  delays_s : (A,) at which the nodes are placed.
@@ -141,9 +141,9 @@ class Frame:
     def rows(self) -> int:
         return int(self.first_row[-1])
 
-    def row(self, bubble: Ints, frame: Ints) -> Ints:
+    def row(self, bubble: Ints, graph: Ints) -> Ints:
         first = np.array([b.first for b in self.problem.bubbles], np.int64)
-        return np.asarray(self.first_row[bubble] + frame - first[bubble])
+        return np.asarray(self.first_row[bubble] + graph - first[bubble])
 
     @property
     def mean_size(self) -> int:
@@ -193,7 +193,7 @@ class Frame:
         return Families(0, *np.cumsum(numbers)[:-1].tolist())
 
 
-def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> Frame:
+def graph_layout(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> GraphLayout:
     """Lay everything out for given delays of the accelerometers."""
     nodes = nodes_of(problem, model, delays_s.tolist())
     stage = problem.stage
@@ -208,7 +208,7 @@ def frame_of(problem: SmoothingProblem, model: ShakeModel, delays_s: Array) -> F
     bubble = bubble_layout(model.bubble, len(problem.cameras))
     moving = np.setdiff1d(np.arange(len(frame_of_row)), first_row[1:] - 1)
     t = problem.t_s[frame_of_row]
-    return Frame(
+    return GraphLayout(
         problem, model, shake, bubble, nodes, delays_s, clocks_of(problem), nominal, first_row,
         nodes.of_frame[frame_of_row],
         np.repeat(np.arange(len(lengths)), lengths),
@@ -232,48 +232,48 @@ def _basis_index(index: Ints, node: ArrayLike) -> Ints:
     return np.asarray(np.append(index, -1)[np.asarray(node)])
 
 
-def first_guess(frame: Frame) -> State:
+def first_guess(graph: GraphLayout) -> State:
     """Bubbles where the cameras first saw them, the carriage where the encoder was, no shake."""
-    problem = frame.problem
+    problem = graph.problem
     shake, bubbles, means, sensors, constants, marks, clocks = (
-        np.zeros(family) for family in frame.counts()
+        np.zeros(family) for family in graph.counts()
     )
     if problem.stage is not None:
-        _guess_carriage(frame, shake)
+        _guess_carriage(graph, shake)
     for k, bubble in enumerate(problem.bubbles):
-        rows = slice(frame.first_row[k], frame.first_row[k + 1])
+        rows = slice(graph.first_row[k], graph.first_row[k + 1])
         t = problem.t_s[bubble.first : bubble.last + 1]
         slope = np.zeros(3)
         if len(bubble) > 1:
             slope = np.polyfit(t - t.mean(), bubble.guess_mm, 1)[0]
-        bubbles[rows, frame.bubble.path_position] = bubble.guess_mm
-        bubbles[rows, frame.bubble.path_velocity] = slope
+        bubbles[rows, graph.bubble.path_position] = bubble.guess_mm
+        bubbles[rows, graph.bubble.path_velocity] = slope
         means[k, :3] = slope
         means[k, 3:] = max(float(np.linalg.norm(slope)), 1.0)
     if len(problem.marks):
         marks[:] = [m.guess_mm for m in problem.marks]
-    encoder, calibration = np.split(constants[0], [frame.encoder_size])
+    encoder, calibration = np.split(constants[0], [graph.encoder_size])
     return State(shake, bubbles, means, sensors, encoder, calibration, marks, clocks)
 
 
-def _guess_carriage(frame: Frame, shake: Array) -> None:
-    t, s = frame.nodes.t_s, frame.nominal_mm
+def _guess_carriage(graph: GraphLayout, shake: Array) -> None:
+    t, s = graph.nodes.t_s, graph.nominal_mm
     shake[:, 0] = s
-    if not frame.shake.components[0].memoryless:
+    if not graph.shake.components[0].memoryless:
         shake[:, 1] = np.gradient(s, t)
 
 
-def moved(frame: Frame, state: State, step: Array) -> State:
+def moved(graph: GraphLayout, state: State, step: Array) -> State:
     """The state after an increment, keys in their order."""
-    families = frame.counts()
+    families = graph.counts()
     parts = np.split(step, np.cumsum([n * d for n, d in families])[:-1])
     shake, bubbles, means, sensors, constants, marks, clocks = (
         p.reshape(family) for p, family in zip(parts, families)
     )
-    encoder, calibration = np.split(constants[0], [frame.encoder_size])
+    encoder, calibration = np.split(constants[0], [graph.encoder_size])
     return State(
-        state.shake + times(frame.shake_basis(np.arange(len(shake))), shake),
-        state.bubbles + times(frame.bubble_basis(np.arange(len(bubbles))), bubbles),
+        state.shake + times(graph.shake_basis(np.arange(len(shake))), shake),
+        state.bubbles + times(graph.bubble_basis(np.arange(len(bubbles))), bubbles),
         state.means + means,
         state.sensors + sensors,
         state.encoder + encoder,

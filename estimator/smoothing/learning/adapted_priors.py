@@ -35,7 +35,7 @@ def adapted(solution: Solution) -> ShakeModel | None:
 
     None if that is it.
     """
-    model = solution.frame.model
+    model = solution.graph.model
     inflation = _noise_factor(solution)
     better = model
     wide = wider_scale_sigma(solution)
@@ -48,7 +48,7 @@ def adapted(solution: Solution) -> ShakeModel | None:
         ratio = [
             np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)
         ]
-        floor = fitted_floor(solution.frame.problem.t_s, _offsets(solution), fresh.broad_bands)
+        floor = fitted_floor(solution.graph.problem.t_s, _offsets(solution), fresh.broad_bands)
         moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
         if max(np.max(np.abs(np.log(ratio))), moved) > _RESCALE_BEYOND:
             better = _with_floor(fresh, floor)
@@ -107,13 +107,13 @@ def _periodogram(series: Array, step_s: float) -> Array:
 
 def _offsets(solution: Solution) -> Array:
     """(F, C, 3) of each camera, mm."""
-    states = solution.frame.shake_at_frames(solution.state.shake)
-    return np.asarray(np.einsum("cid,fd->fci", solution.frame.shake.offset[:-1], states))
+    states = solution.graph.shake_at_frames(solution.state.shake)
+    return np.asarray(np.einsum("cid,fd->fci", solution.graph.shake.offset[:-1], states))
 
 
 def _offset_rms(solution: Solution) -> Array:
     """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
-    rows, found = solution.frame.shake.offset[:-1], solution.covariances
+    rows, found = solution.graph.shake.offset[:-1], solution.covariances
     square = _offsets(solution) ** 2
     if found is not None:
         square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
@@ -125,9 +125,9 @@ def _offset_rms(solution: Solution) -> Array:
 
 def _dominant_hz(solution: Solution) -> float:
     """RMS of the offsets' velocity over that of the offsets."""
-    frame, place = solution.frame, _offsets(solution)
-    states = frame.shake_at_frames(solution.state.shake)
-    speed = np.einsum("cid,fd->fci", frame.shake.offset_velocity[:-1], states)
+    graph, place = solution.graph, _offsets(solution)
+    states = graph.shake_at_frames(solution.state.shake)
+    speed = np.einsum("cid,fd->fci", graph.shake.offset_velocity[:-1], states)
     return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
 
 
@@ -158,21 +158,21 @@ def _noise_factor(solution: Solution) -> float:
 
 def leverages(solution: Solution) -> list[tuple[Ints, Array]]:
     """By camera: some of the bubbles' pixels (m,), var(prediction) / var(noise) of each (m, 2)."""
-    frame, found = solution.frame, solution.covariances
-    if found is None or not frame.rows:
+    graph, found = solution.graph, solution.covariances
+    if found is None or not graph.rows:
         return []
-    observed = frame.problem.observations
+    observed = graph.problem.observations
     out = []
-    linear = images(frame, solution.state, np.ones(len(observed))).linear
+    linear = images(graph, solution.state, np.ones(len(observed))).linear
     for camera, part in zip(np.unique(observed.camera), linear, strict=True):
-        row, node = np.asarray(part.keys[0]) - frame.base().bubbles, np.asarray(part.keys[1])
+        row, node = np.asarray(part.keys[0]) - graph.base().bubbles, np.asarray(part.keys[1])
         some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
         row, node = row[some], node[some]
-        at = frame.frame_of_row[row]
-        by_bubble = part.blocks[0][some] @ np.linalg.inv(frame.bubble_basis(row))
-        by_shake = part.blocks[1][some] @ np.linalg.inv(frame.shake_basis(node))
-        if frame.to_frames is not None:
-            by_shake = by_shake @ np.linalg.inv(frame.to_frames[at])
+        at = graph.frame_of_row[row]
+        by_bubble = part.blocks[0][some] @ np.linalg.inv(graph.bubble_basis(row))
+        by_shake = part.blocks[1][some] @ np.linalg.inv(graph.shake_basis(node))
+        if graph.to_frames is not None:
+            by_shake = by_shake @ np.linalg.inv(graph.to_frames[at])
         both = by_shake @ found.cross[row]
         leverage = (by_bubble @ found.bubbles[row] * by_bubble).sum(-1)
         leverage += (by_shake @ found.shake[at] * by_shake).sum(-1)

@@ -35,7 +35,7 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
     Bubbles beyond those that learning looks at get the mean spread of those. Unchanged without
     covariances or learned parameters.
     """
-    found, model, problem = solution.covariances, solution.frame.model, solution.frame.problem
+    found, model, problem = solution.covariances, solution.graph.model, solution.graph.problem
     if found is None or not model.learned or not problem.bubbles:
         return solution
     signals = [c for c in signals_of(problem, solution.weights) if c.samples]
@@ -44,7 +44,7 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
     # coordinates along the signals, which need not be at right angles, back into the lab
     lab = np.linalg.pinv(directions)
     bubbles = found.bubbles.copy()
-    for kind, rows in ((0, solution.frame.bubble.position), (1, solution.frame.bubble.velocity)):
+    for kind, rows in ((0, solution.graph.bubble.position), (1, solution.graph.bubble.velocity)):
         along = np.stack([_rows(solution, c, s[kind]) for c, s in zip(signals, spreads)], -1)
         into = np.linalg.pinv(rows) @ lab
         bubbles += np.einsum("ik,nk,jk->nij", into, along, into, optimize=True)
@@ -101,21 +101,21 @@ def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
 
 def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
     """(rows,) of the bubbles' states, from (B, F) of the signal's bubbles."""
-    frame = solution.frame
-    number = np.full(len(frame.problem.bubbles), -1)
+    graph = solution.graph
+    number = np.full(len(graph.problem.bubbles), -1)
     movers = signal.bubble[signal.moving]
     number[movers] = np.arange(len(movers))
-    mine = number[frame.bubble_of_row]
+    mine = number[graph.bubble_of_row]
     variance = np.broadcast_to(variance, (len(movers), variance.shape[-1]))
-    each = variance[mine, frame.frame_of_row]
-    return np.asarray(np.where(mine >= 0, each, variance.mean(0)[frame.frame_of_row]))
+    each = variance[mine, graph.frame_of_row]
+    return np.asarray(np.where(mine >= 0, each, variance.mean(0)[graph.frame_of_row]))
 
 
 def _shaken(
     solution: Solution, signals: list[Signal], spreads: list[Array], found: Covariances
 ) -> Array:
     """(F, D, D) covariance of the shake's states, offsets widened along what the cameras see."""
-    layout, out = solution.frame.shake, found.shake.copy()
+    layout, out = solution.graph.shake, found.shake.copy()
     for signal, variance in zip(signals, spreads):
         rows = np.einsum("i,cid->cd", signal.direction, layout.offset[list(signal.cameras)])
         if not np.any(rows):

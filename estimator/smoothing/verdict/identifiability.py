@@ -59,7 +59,7 @@ class AxisVerdict:
 
 def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
     """By axis; empty without bubbles or covariances."""
-    if solution.covariances is None or not solution.frame.problem.bubbles:
+    if solution.covariances is None or not solution.graph.problem.bubbles:
         return {}
     window = window_of(solution)
     if not window.problem.bubbles:
@@ -67,7 +67,7 @@ def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
     sigma, known = _sigmas(solution, window)
     eta, rms = shake_share(solution), shake_rms(solution)
     resolved = all(e is not None and e >= RESOLVED_ETA for e in eta)
-    lines = [] if resolved else _lines(window.problem, solution.frame.model)
+    lines = [] if resolved else _lines(window.problem, solution.graph.model)
     out = {}
     for axis, name in enumerate(AXES):
         mine = tuple(line for part, line in lines if part[axis] > 0.7)
@@ -101,18 +101,18 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
     still = solve(
         without_sensors(window.problem),
         replace(
-            solution.frame.model.without_shake(), carriage=CarriageModel(), encoder_scale_sigma=0.0
+            solution.graph.model.without_shake(), carriage=CarriageModel(), encoder_scale_sigma=0.0
         ),
         Options(robust=False),
     )
     assert still.covariances is not None and solution.covariances is not None
-    ours, whole = still.frame, solution.frame
+    ours, whole = still.graph, solution.graph
     rows = _inner_rows(window)
     bubble, frame = ours.bubble_of_row[rows], ours.frame_of_row[rows] + window.first
     same = whole.row(window.bubbles[bubble], frame)
     known = _position_sigma(still, rows)
-    if solution.frame.encoder_flags[0]:
-        model = replace(solution.frame.model, encoder_scale_sigma=0.0)
+    if solution.graph.encoder_flags[0]:
+        model = replace(solution.graph.model, encoder_scale_sigma=0.0)
         return _position_sigma(solve(window.problem, model, Options(robust=False)), rows), known
     return _position_sigma(solution, same), known
 
@@ -134,22 +134,22 @@ def _inner_rows(window: Window) -> Ints:
 
 def _position_sigma(solution: Solution, rows: Ints) -> Array:
     assert solution.covariances is not None
-    at, covariance = solution.frame.bubble.position, solution.covariances.bubbles[rows]
+    at, covariance = solution.graph.bubble.position, solution.covariances.bubbles[rows]
     return np.asarray(np.sqrt(np.einsum("id,nde,ie->ni", at, covariance, at, optimize=True)))
 
 
 def shake_share(solution: Solution) -> list[float | None]:
     """eta by axis: the least over the directions near the axis that a camera sees."""
-    frame, found = solution.frame, solution.covariances
+    graph, found = solution.graph, solution.covariances
     assert found is not None
     least: list[float | None] = [None, None, None]
-    if not frame.shake.size:
+    if not graph.shake.size:
         return least
-    before, _ = start(frame.shake.components)
+    before, _ = start(graph.shake.components)
     inner = _inner_frames(solution)
-    for camera, seen in enumerate(frame.shake.seen):
+    for camera, seen in enumerate(graph.shake.seen):
         for direction in seen:
-            row = direction @ frame.shake.offset[camera]
+            row = direction @ graph.shake.offset[camera]
             prior = float(row @ before @ row)
             if prior <= 0:
                 continue
@@ -162,16 +162,16 @@ def shake_share(solution: Solution) -> list[float | None]:
 
 def shake_rms(solution: Solution) -> Array:
     """(3,) RMS of the cameras' offsets, uncertainty included, of the camera that shakes most."""
-    frame, found = solution.frame, solution.covariances
+    graph, found = solution.graph, solution.covariances
     assert found is not None
     out = np.zeros(3)
-    if not frame.shake.size:
+    if not graph.shake.size:
         return out
     inner = _inner_frames(solution)
-    states = solution.state.shake[frame.nodes.of_frame[inner]]
-    for camera, seen in enumerate(frame.shake.seen):
+    states = solution.state.shake[graph.nodes.of_frame[inner]]
+    for camera, seen in enumerate(graph.shake.seen):
         for direction in seen:
-            row = direction @ frame.shake.offset[camera]
+            row = direction @ graph.shake.offset[camera]
             variance = np.einsum("d,fde,e->f", row, found.shake[inner], row)
             rms = float(np.sqrt(np.mean((states @ row) ** 2 + variance)))
             near = direction**2 > _SEEN
@@ -180,7 +180,7 @@ def shake_rms(solution: Solution) -> Array:
 
 
 def _inner_frames(solution: Solution) -> Ints:
-    count = len(solution.frame.problem.t_s)
+    count = len(solution.graph.problem.t_s)
     edge = int(_EDGE * count)
     return np.arange(edge, count - edge)
 
@@ -213,7 +213,7 @@ class Window:
 
 def window_of(solution: Solution) -> Window:
     """The middle of a solved run, outliers left out, with the bubbles seen longest there."""
-    problem = solution.frame.problem
+    problem = solution.graph.problem
     count = len(problem.t_s)
     first = max(0, (count - _MOST_FRAMES) // 2)
     end = min(count, first + _MOST_FRAMES)

@@ -58,11 +58,11 @@ def shake_modes(solution: Solution) -> list[ShakeMode]:
 
     Peaks of the carriage about its travel are the servo's.
     """
-    frame = solution.frame
-    names = [c.name for c in frame.problem.cameras]
+    graph = solution.graph
+    names = [c.name for c in graph.problem.cameras]
     rows = _from_offsets(solution, names)
-    if frame.model.modes:
-        rows = [_from_model(mode, names) for mode in frame.model.modes]
+    if graph.model.modes:
+        rows = [_from_model(mode, names) for mode in graph.model.modes]
     rows += _from_carriage(solution)
     return sorted(rows, key=lambda row: -max(row.rms_mm))
 
@@ -80,16 +80,16 @@ def _from_offsets(solution: Solution, names: Sequence[str]) -> list[ShakeMode]:
     There the cameras move alike (common), one alone or both independently (arms). An axis that one
     camera sees shares in the lines found so; a line that shows nowhere else has no known owner.
     """
-    frame, found = solution.frame, solution.covariances
-    if not frame.shake.size or not frame.model.broad_bands:
+    graph, found = solution.graph, solution.covariances
+    if not graph.shake.size or not graph.model.broad_bands:
         return []
-    rows = frame.shake.offset[:-1]
-    offsets = np.einsum("cid,fd->cfi", rows, frame.shake_at_frames(solution.state.shake))
+    rows = graph.shake.offset[:-1]
+    offsets = np.einsum("cid,fd->cfi", rows, graph.shake_at_frames(solution.state.shake))
     noise = 0.0
     if found is not None:
         variance = np.einsum("cid,fde,cie->", rows, found.shake, rows, optimize=True)
-        noise = float(variance) / len(rows) / len(frame.problem.t_s)
-    spectra = _spectra(frame.problem.t_s, offsets)
+        noise = float(variance) / len(rows) / len(graph.problem.t_s)
+    spectra = _spectra(graph.problem.t_s, offsets)
     if spectra is None:
         return []
     seen = np.abs(rows).sum(-1) > 0
@@ -204,7 +204,7 @@ def _half_width(total: Array, peak: int) -> int:
 
 def _from_carriage(solution: Solution) -> list[ShakeMode]:
     """Following errors: lines of the encoder's record after a smooth travel is taken off."""
-    problem, noise = solution.frame.problem, solution.frame.model.encoder_sigma_mm
+    problem, noise = solution.graph.problem, solution.graph.model.encoder_sigma_mm
     if problem.stage is None:
         return []
     t, position = problem.stage.t_s, problem.stage.position_mm

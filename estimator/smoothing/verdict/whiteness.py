@@ -22,7 +22,7 @@ from telerig.estimator.smoothing.graph.linear import (
     sensed_directions,
 )
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.state import Frame
+from telerig.estimator.smoothing.graph.state import GraphLayout
 from telerig.factors.linear_factors import Linear
 
 LAGS = 10
@@ -45,11 +45,11 @@ def pixel_whiteness(solution: Solution) -> dict[str, Any]:
     drawn from the model. ``verdict``: "as expected", or "correlated" where the test's p is below
     0.001. Empty where there are too few frames, or too much moves in them.
     """
-    obs, kept = solution.frame.problem.observations, solution.weights[0] > 0.5
+    obs, kept = solution.graph.problem.observations, solution.weights[0] > 0.5
     if not kept.any():
         return {}
     middle = int(np.sort(obs.frame[kept])[np.count_nonzero(kept) // 2])
-    stretch = stretch_of(solution.frame, middle)
+    stretch = stretch_of(solution.graph, middle)
     if stretch is None or stretch.inner[1] - stretch.inner[0] <= LAGS:
         return {}
     try:
@@ -57,7 +57,7 @@ def pixel_whiteness(solution: Solution) -> dict[str, Any]:
     except np.linalg.LinAlgError:
         return {}
     out: dict[str, Any] = {}
-    for camera, (which, residuals) in zip(solution.frame.problem.cameras, drawn):
+    for camera, (which, residuals) in zip(solution.graph.problem.cameras, drawn):
         both = np.concatenate([solution.residuals[0][which][..., None], residuals], -1)
         found = _lagged(both, obs.item[which], obs.frame[which])
         if found is not None:
@@ -112,13 +112,13 @@ def accelerometer_spectra(solution: Solution) -> dict[str, Any]:
 
     Summed over the directions in which its mount's motion is modelled; ``noise`` as stated.
     """
-    frame, state = solution.frame, solution.state
+    graph, state = solution.graph, solution.state
     out: dict[str, Any] = {}
-    for index, linear in enumerate(accelerometers(frame, state)):
-        sensor = frame.problem.accelerometers[index]
+    for index, linear in enumerate(accelerometers(graph, state)):
+        sensor = graph.problem.accelerometers[index]
         if len(sensor.t_s) < LAGS:
             continue
-        project, _ = sensed_directions(frame, index)
+        project, _ = sensed_directions(graph, index)
         unit = sensor.sigma_mm_s2 / 1000
         rate = 1 / float(np.median(np.diff(sensor.t_s)))
         frequency, before = _density(unit * sensor.reading_mm_s2 @ project.T, rate)
@@ -153,7 +153,7 @@ class Stretch:
     inner : (first, last) frames far enough from those that are held.
     """
 
-    frame: Frame
+    graph: GraphLayout
     column: Ints
     size: int
     inner: tuple[int, int]
@@ -170,16 +170,16 @@ class Stretch:
         return out
 
 
-def stretch_of(frame: Frame, middle: int) -> Stretch | None:
+def stretch_of(graph: GraphLayout, middle: int) -> Stretch | None:
     """About a frame, 200 frames or, where much moves, down to 40; None if that is too much, too."""
-    (nodes, shake), (_, bubble) = frame.counts()[:2]
-    when = np.r_[np.arange(nodes), frame.node_of_row]
-    sizes = np.repeat([shake, bubble], [nodes, frame.rows])
-    count = len(frame.problem.t_s)
+    (nodes, shake), (_, bubble) = graph.counts()[:2]
+    when = np.r_[np.arange(nodes), graph.node_of_row]
+    sizes = np.repeat([shake, bubble], [nodes, graph.rows])
+    count = len(graph.problem.t_s)
     for half in _HALF_FRAMES:
         first = int(np.clip(middle - half, 0, max(count - 2 * half, 0)))
         last = min(first + 2 * half, count) - 1
-        low, high = frame.nodes.of_frame[[first, last]]
+        low, high = graph.nodes.of_frame[[first, last]]
         inside = (when >= low) & (when <= high) & (sizes > 0)
         at_once = int(np.bincount(when[nodes:][inside[nodes:]], minlength=1).max())
         width = 2 * (shake + bubble * at_once)
@@ -192,7 +192,7 @@ def stretch_of(frame: Frame, middle: int) -> Stretch | None:
     column = np.full(len(when), -1)
     column[order] = starts[:-1]
     inner = (first + _EDGE * (first > 0), last - _EDGE * (last < count - 1))
-    return Stretch(frame, column, int(starts[-1]), inner)
+    return Stretch(graph, column, int(starts[-1]), inner)
 
 
 def drawn_residuals(
@@ -202,15 +202,15 @@ def drawn_residuals(
 
     Kept pixels in the inner frames. Raises numpy.linalg.LinAlgError where digits run out.
     """
-    frame, observed = solution.frame, solution.frame.problem.observations
-    parts = [_Part.of(stretch, f) for f in all_factors(frame, solution.state, solution.weights)]
+    graph, observed = solution.graph, solution.graph.problem.observations
+    parts = [_Part.of(stretch, f) for f in all_factors(graph, solution.state, solution.weights)]
     noise = [rng.standard_normal((*p.block.shape[:2], draws)) for p in parts]
     found = _fitted(stretch, parts, noise)
     inside = (observed.frame >= stretch.inner[0]) & (observed.frame <= stretch.inner[1])
     inside &= solution.weights[0] > 0.5
     pixels = iter(i for i, p in enumerate(parts) if p.of_bubbles)
     out = []
-    for c in range(len(frame.problem.cameras)):
+    for c in range(len(graph.problem.cameras)):
         mine = np.flatnonzero(observed.camera == c)
         residual = np.zeros((0, 2, draws))
         if len(mine):
@@ -236,7 +236,7 @@ class _Part:
 
     @classmethod
     def of(cls, stretch: Stretch, linear: Linear) -> _Part:
-        base, key = stretch.frame.base(), int(np.min(linear.keys[0]))
+        base, key = stretch.graph.base(), int(np.min(linear.keys[0]))
         of_bubbles = linear.weight is not None and base.bubbles <= key < base.means
         first = stretch.columns(linear)
         reached = first[:, 0] >= 0 if of_bubbles else np.any(first >= 0, axis=1)

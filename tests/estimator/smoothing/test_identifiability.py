@@ -107,7 +107,7 @@ def test_q_is_the_ratio_to_the_same_run_without_shake() -> None:
     solution = solve(problem, true_model(), QUIET)
     still = solve(problem, true_model().without_shake(), QUIET)
     assert solution.covariances is not None and still.covariances is not None
-    row = solution.frame.bubble.position[1]
+    row = solution.graph.bubble.position[1]
     each = [np.einsum("d,nde,e->n", row, s.covariances.bubbles, row) for s in (solution, still)]  # type: ignore[union-attr]
     ratio = np.sqrt(each[0] / each[1])[12:-12]
     assert verdicts(solution)["y"].q == pytest.approx(np.median(ratio), rel=1e-3)
@@ -119,7 +119,7 @@ def test_eta_follows_from_the_prior_and_what_is_left() -> None:
     assert solution.covariances is not None
     left = []
     for camera in (0, 1):
-        row = solution.frame.shake.offset[camera][1]
+        row = solution.graph.shake.offset[camera][1]
         inner = solution.covariances.shake[12:-12]
         left.append(np.einsum("d,fde,e->f", row, inner, row).mean())
     assert shake_share(solution)[1] == pytest.approx(1 - max(left) / 0.04, rel=1e-6)
@@ -165,7 +165,7 @@ def test_modes_are_read_from_estimated_shake_and_encoder_when_the_model_has_none
     solution = solve(problem, BANDS, QUIET)
     moving = replace(
         solution,
-        frame=replace(solution.frame, problem=replace(problem, stage=Stage(t, 50 * t + servo))),
+        frame=replace(solution.graph, problem=replace(problem, stage=Stage(t, 50 * t + servo))),
     )
     rows = {r.where: r for r in reversed(shake_modes(moving))}
     assert rows["common"].frequency_hz == pytest.approx(COMMON_HZ, abs=0.8)

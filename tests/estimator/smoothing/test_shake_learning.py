@@ -65,8 +65,8 @@ def test_evidence_means_and_deviations_equal_the_graphs(marks: int) -> None:
 
     frames = np.array([5, 30, 55])
     assert first.covariances is not None
-    states = first.state.bubbles @ first.frame.bubble.position.T
-    row = first.frame.bubble.position
+    states = first.state.bubbles @ first.graph.bubble.position.T
+    row = first.graph.bubble.position
     for signal in signals[:1]:
         found = signal_posterior(signal, true_model())
         place = (found.position_mm + signal.start_mm[:2, None]).ravel()
@@ -239,12 +239,12 @@ def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
         )
         for s in (1, -1)
     ]
-    row = solution.frame.bubble.position[1]
+    row = solution.graph.bubble.position[1]
     step = (moved[0].state.bubbles - moved[1].state.bubbles) @ row / 2
     added = wider.covariances.bubbles - solution.covariances.bubbles
     np.testing.assert_allclose(np.einsum("d,nde,e->n", row, added, row), step**2, atol=1e-9)
-    offset = solution.frame.shake.offset[1][1]
-    nodes = solution.frame.nodes.of_frame
+    offset = solution.graph.shake.offset[1][1]
+    nodes = solution.graph.nodes.of_frame
     step = (moved[0].state.shake - moved[1].state.shake)[nodes] @ offset / 2
     added = wider.covariances.shake - solution.covariances.shake
     np.testing.assert_allclose(np.einsum("d,nde,e->n", offset, added, offset), step**2, atol=1e-9)

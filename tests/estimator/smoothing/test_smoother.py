@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from telerig.estimator.smoothing.graph.solve import Options, solve
-from telerig.estimator.smoothing.graph.state import frame_of
+from telerig.estimator.smoothing.graph.state import graph_layout
 from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
     BroadBand,
@@ -168,17 +168,17 @@ def path_covariance(component: Component, t: Any) -> Any:
 
 def dense(given: SmoothingProblem, model: ShakeModel) -> tuple[Dense, Any, Any, Any]:
     """The problem as a joint Gaussian; ids of the shake's and the bubbles' components."""
-    frame = frame_of(given, model, np.zeros(len(given.accelerometers)))
+    graph = graph_layout(given, model, np.zeros(len(given.accelerometers)))
     whole = Dense([], [], [])
-    times = frame.nodes.t_s
+    times = graph.nodes.t_s
     at_node = lambda row, node, count: np.kron(np.eye(count)[node], row)  # noqa: E731
     shake = []
-    for i, c in enumerate(frame.shake.components):
+    for i, c in enumerate(graph.shake.components):
         mean = np.zeros(len(times) * c.size)
         if i == 0:
-            mean[:: c.size] = frame.nominal_mm if c.memoryless else frame.nominal_mm[0]
+            mean[:: c.size] = graph.nominal_mm if c.memoryless else graph.nominal_mm[0]
         shake.append(whole.add(mean, path_covariance(c, times)))
-    sizes = np.r_[0, np.cumsum([c.size for c in frame.shake.components])]
+    sizes = np.r_[0, np.cumsum([c.size for c in graph.shake.components])]
 
     def of_shake(row: Any, node: int, gain: float = 1.0) -> dict[int, Any]:
         return {
@@ -186,8 +186,8 @@ def dense(given: SmoothingProblem, model: ShakeModel) -> tuple[Dense, Any, Any, 
             for i in range(len(shake))
         }
 
-    bubbles, means = _add_bubbles(given, whole, frame)
-    bubble_sizes = np.r_[0, np.cumsum([c.size for c in frame.bubble.components])]
+    bubbles, means = _add_bubbles(given, whole, graph)
+    bubble_sizes = np.r_[0, np.cumsum([c.size for c in graph.bubble.components])]
 
     def of_bubble(k: int, f: int, row: Any) -> dict[int, Any]:
         """Rows on the components; the mean velocity moves positions by U t, velocities by U."""
@@ -205,8 +205,8 @@ def dense(given: SmoothingProblem, model: ShakeModel) -> tuple[Dense, Any, Any, 
         zero = camera.project(np.zeros(3))
         linear = np.stack([camera.project(e) - zero for e in np.eye(3)], -1)
         root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px2[m]))
-        node = int(frame.nodes.of_frame[seen.frame[m]])
-        rig_rows = np.outer(UP, frame.shake.position) + frame.shake.offset[seen.camera[m]]
+        node = int(graph.nodes.of_frame[seen.frame[m]])
+        rig_rows = np.outer(UP, graph.shake.position) + graph.shake.offset[seen.camera[m]]
         for line, value in zip(root @ linear, root @ (seen.uv_px[m] - zero)):
             terms = terms_of(line) | of_shake(line @ rig_rows, node, -1.0)
             whole.rows.append((terms, value, 1.0))
@@ -218,18 +218,18 @@ def dense(given: SmoothingProblem, model: ShakeModel) -> tuple[Dense, Any, Any, 
         add_pixels(
             given.observations,
             m,
-            lambda line, k=k, f=f: of_bubble(k, f, line @ frame.bubble.position),
+            lambda line, k=k, f=f: of_bubble(k, f, line @ graph.bubble.position),
         )
     marks = [whole.add(mark.guess_mm, mark.sigma_mm**2 * np.eye(3)) for mark in given.marks]
     for m in range(len(given.references)):
         which = marks[int(given.references.item[m])]
         add_pixels(given.references, m, lambda line, which=which: {which: line})
-    _add_sensors(given, model, whole, frame, of_shake)
-    return whole, (frame, shake, sizes), (bubbles, means, of_bubble), sum(pixel_log_dets)
+    _add_sensors(given, model, whole, graph, of_shake)
+    return whole, (graph, shake, sizes), (bubbles, means, of_bubble), sum(pixel_log_dets)
 
 
 def _add_bubbles(
-    given: SmoothingProblem, whole: Dense, frame: Any
+    given: SmoothingProblem, whole: Dense, graph: Any
 ) -> tuple[list[list[int]], list[int]]:
     """Ids of every bubble's components, and of its mean velocity."""
     bubbles, means = [], []
@@ -237,7 +237,7 @@ def _add_bubbles(
         t = given.t_s[b.first : b.last + 1]
         means.append(whole.add(np.zeros(3), 300.0**2 * np.eye(3)))
         ids = []
-        for i, c in enumerate(frame.bubble.components):
+        for i, c in enumerate(graph.bubble.components):
             mean = np.zeros(len(t) * c.size)
             if i < 3:
                 mean[::2] = b.start_mm[i]
@@ -246,21 +246,21 @@ def _add_bubbles(
     return bubbles, means
 
 
-def _add_sensors(given: Any, model: Any, whole: Dense, frame: Any, of_shake: Any) -> None:
-    node_t = frame.nodes.t_s
+def _add_sensors(given: Any, model: Any, whole: Dense, graph: Any, of_shake: Any) -> None:
+    node_t = graph.nodes.t_s
     if given.stage is not None:
         for t, value in zip(given.stage.t_s, given.stage.position_mm):
             if model.carriage.kind != "readings" or np.min(np.abs(given.t_s - t)) < 1e-12:
                 node = int(np.argmin(np.abs(node_t - t)))
                 assert abs(node_t[node] - t) < 1e-12
-                whole.rows.append((of_shake(frame.shake.position, node), value, 0.001))
+                whole.rows.append((of_shake(graph.shake.position, node), value, 0.001))
     for j, sensor in enumerate(given.accelerometers):
         bias = whole.add(np.zeros(3), sensor.bias_sigma_mm_s2**2 * np.eye(3))
-        rows = np.outer(UP, frame.shake.acceleration) + frame.shake.offset_acceleration[j]
+        rows = np.outer(UP, graph.shake.acceleration) + graph.shake.offset_acceleration[j]
         for t, reading in zip(sensor.t_s, sensor.reading_mm_s2):
             node = int(np.argmin(np.abs(node_t - t)))
             assert abs(node_t[node] - t) < 1e-12
-            for direction in frame.shake.seen[j]:
+            for direction in graph.shake.seen[j]:
                 terms = of_shake(direction @ rows, node) | {bias: direction @ sensor.axes.T}
                 value = direction @ sensor.axes.T @ reading - 9806.65 * direction @ UP
                 whole.rows.append((terms, value, sensor.sigma_mm_s2))
@@ -268,7 +268,7 @@ def _add_sensors(given: Any, model: Any, whole: Dense, frame: Any, of_shake: Any
 
 def compare(given: SmoothingProblem, model: ShakeModel) -> None:
     """Means to 1e-6 mm, covariances to 1e-6 relative, the evidence to 1e-5 nats."""
-    whole, (frame, shake, sizes), (_bubbles, _means, of_bubble), log_dets = dense(given, model)
+    whole, (graph, shake, sizes), (_bubbles, _means, of_bubble), log_dets = dense(given, model)
     mean, covariance, starts, evidence = whole.posterior()
     solution = solve(given, model, QUIET)
     found = solution.covariances
@@ -282,19 +282,19 @@ def compare(given: SmoothingProblem, model: ShakeModel) -> None:
 
     for k, b in enumerate(given.bubbles):
         for f in (b.first, (b.first + b.last) // 2, b.last):
-            r = int(frame.row(np.array([k]), np.array([f]))[0])
-            for rows in (frame.bubble.position, frame.bubble.velocity):
+            r = int(graph.row(np.array([k]), np.array([f]))[0])
+            for rows in (graph.bubble.position, graph.bubble.velocity):
                 whole_rows = np.array([spread(of_bubble(k, f, line)) for line in rows])
                 expected, got = whole_rows @ mean, rows @ solution.state.bubbles[r]
-                scale = 1.0 if rows is frame.bubble.position else 100.0
+                scale = 1.0 if rows is graph.bubble.position else 100.0
                 np.testing.assert_allclose(got, expected, atol=1e-6 * scale)
                 wanted = whole_rows @ covariance @ whole_rows.T
                 here = rows @ found.bubbles[r] @ rows.T
                 np.testing.assert_allclose(here, wanted, rtol=1e-6, atol=1e-6 * wanted.max())
     for f in (0, len(given.t_s) - 1):
-        node = int(frame.nodes.of_frame[f])
+        node = int(graph.nodes.of_frame[f])
         for c in range(2):
-            rows = frame.shake.offset[c]
+            rows = graph.shake.offset[c]
             whole_rows = np.zeros((3, starts[-1]))
             for i, which in enumerate(shake):
                 width = sizes[i + 1] - sizes[i]

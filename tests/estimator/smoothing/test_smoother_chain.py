@@ -107,9 +107,9 @@ def test_what_cholesky_refuses_goes_to_qr(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_chain_without_pivots_is_named(rng: np.random.Generator) -> None:
-    frame = solving.frame_of(*scene("five"), np.zeros(0))
-    places = chain.places_of(frame)
-    count, width = len(frame.nodes.t_s), places.width
+    graph = solving.graph_layout(*scene("five"), np.zeros(0))
+    places = chain.places_of(graph)
+    count, width = len(graph.nodes.t_s), places.width
     equations = chain.NormalEquations(
         np.tile(-np.eye(width), (count, 1, 1)),
         rng.normal(size=(count, 1 + places.constants + width, width)),
@@ -120,9 +120,9 @@ def test_a_chain_without_pivots_is_named(rng: np.random.Generator) -> None:
 
 
 def test_a_chain_that_keeps_too_few_digits_is_refused() -> None:
-    frame = solving.frame_of(*scene("five"), np.zeros(0))
-    places = chain.places_of(frame)
-    count, width, constants = len(frame.nodes.t_s), places.width, places.constants
+    graph = solving.graph_layout(*scene("five"), np.zeros(0))
+    places = chain.places_of(graph)
+    count, width, constants = len(graph.nodes.t_s), places.width, places.constants
     joined = np.zeros((count, 1 + constants + width, width))
     joined[0, 1 + constants :] = np.sqrt(1 - 1e-12) * np.eye(width)
     own = np.tile(np.eye(width), (count, 1, 1))
@@ -132,10 +132,10 @@ def test_a_chain_that_keeps_too_few_digits_is_refused() -> None:
 
 
 def test_slots_are_shared_by_bubbles_that_do_not_meet() -> None:
-    frame = solving.frame_of(*scene("five"), np.zeros(0))
-    places = chain.places_of(frame)
-    taken = set(zip(frame.node_of_row.tolist(), places.slot.tolist()))
-    assert len(taken) == frame.rows
+    graph = solving.graph_layout(*scene("five"), np.zeros(0))
+    places = chain.places_of(graph)
+    taken = set(zip(graph.node_of_row.tolist(), places.slot.tolist()))
+    assert len(taken) == graph.rows
     assert places.slot.max() == 2
 
 

@@ -40,15 +40,15 @@ def with_carriage(scenario: Scenario, information: str, bubbles: int) -> dict[st
 def compared(fit: Reference, found: Solution, run: int) -> dict[str, tuple[float, float]]:
     """Largest difference of means (mm, mm/s) and relative one of standard deviations."""
     assert found.covariances is not None
-    bubble, shake = found.frame.bubble, found.frame.shake
+    bubble, shake = found.graph.bubble, found.graph.shake
     out = {}
-    states = found.state.bubbles[: len(found.frame.problem.t_s)]
+    states = found.state.bubbles[: len(found.graph.problem.t_s)]
     blocks = found.covariances.bubbles[: len(states)]
     for what, row in (("position", UP @ bubble.position), ("velocity", UP @ bubble.velocity)):
         out[what] = _apart(fit, fit.row(what), states @ row, _sigma(row, blocks), run)
     if "common" not in fit.model.parts:
         return out
-    at_frames = found.frame.shake_at_frames(found.state.shake)
+    at_frames = found.graph.shake_at_frames(found.state.shake)
     for j in range(2):
         row = UP @ shake.offset[j]
         sigma = _sigma(row, found.covariances.shake)
@@ -111,7 +111,7 @@ def test_posteriors_are_those_that_are_possible(
     found = solve(problem(scenario, information, runs), model, Options(robust=False))
     assert found.covariances is not None
     blocks = found.covariances.bubbles[: scenario.frames][middle(scenario.frames)]
-    layout = found.frame.bubble
+    layout = found.graph.bubble
     position, velocity = _sigma(UP @ layout.position, blocks), _sigma(UP @ layout.velocity, blocks)
     assert 1e3 * np.sqrt(np.mean(position**2)) == pytest.approx(um, rel=0.01)
     assert np.sqrt(np.mean(velocity**2)) == pytest.approx(mm_s, rel=0.01)

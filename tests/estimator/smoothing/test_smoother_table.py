@@ -113,7 +113,7 @@ def test_vertical_standard_deviations_are_those_of_the_table(
     solution = solve(given, model, Options(robust=False))
     found = solution.covariances
     assert found is not None
-    layout, middle = solution.frame.bubble, slice(FRAMES // 10, FRAMES - FRAMES // 10)
+    layout, middle = solution.graph.bubble, slice(FRAMES // 10, FRAMES - FRAMES // 10)
 
     def rms(row: np.ndarray) -> float:
         variance = np.einsum("i,fij,j->f", row, found.bubbles[:FRAMES], row)

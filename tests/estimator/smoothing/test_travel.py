@@ -76,7 +76,7 @@ def problem(scale: float = 0.0, *, marks: bool = False, axis: Array = UP) -> Smo
 
 
 def place(solution: Solution) -> Array:
-    return np.asarray(solution.state.bubbles @ solution.frame.bubble.position.T)
+    return np.asarray(solution.state.bubbles @ solution.graph.bubble.position.T)
 
 
 def test_what_is_left_open_is_how_far_the_answer_moves() -> None:

@@ -11,7 +11,7 @@ from scipy.stats import kstest
 from shake_learning_data import run, true_model
 
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
-from telerig.estimator.smoothing.graph.state import frame_of
+from telerig.estimator.smoothing.graph.state import graph_layout
 from telerig.estimator.smoothing.learning.adapted_priors import adapted, leverages
 from telerig.estimator.smoothing.problem.problem import Observations, ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.whiteness import (
@@ -54,7 +54,7 @@ def test_p_is_uniform_where_the_model_is_right() -> None:
     """Residuals drawn from the model itself, judged by others: a false alarm as often as said."""
     problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=1.0, kept=0.7)
     solution = solved(problem)
-    stretch = stretch_of(solution.frame, 100)
+    stretch = stretch_of(solution.graph, 100)
     assert stretch is not None
     others = drawn_residuals(solution, stretch, 60, np.random.default_rng(2))
     found = []
@@ -71,7 +71,7 @@ def test_drawn_residuals_are_as_small_as_the_covariances_say() -> None:
     """An independent way: variance left = 1 - leverage, from the posterior's covariance."""
     problem, _, _ = run(np.random.default_rng(35), bubbles=2, seconds=0.4)
     solution = solved(problem)
-    stretch = stretch_of(solution.frame, 40)
+    stretch = stretch_of(solution.graph, 40)
     assert stretch is not None and stretch.inner == (0, 79)
     drawn = drawn_residuals(solution, stretch, 400, np.random.default_rng(1))
     for (which, residuals), (some, leverage) in zip(drawn, leverages(solution), strict=True):
@@ -119,22 +119,22 @@ def test_tracks_one_after_the_other_and_pauses() -> None:
         assert one["rms_sigmas"] == pytest.approx(one["expected_rms_sigmas"], rel=0.12)
     apart = tracks(replace(problem, bubbles=problem.bubbles[:2]), [(0, 99), (500, 599)])
     still = solved(apart, TRUE.without_shake())
-    assert still.frame.shake.size == 0
+    assert still.graph.shake.size == 0
     assert list(pixel_whiteness(still)) == ["left", "right"]
 
 
 def test_a_stretch_is_short_and_what_is_too_much_is_not_judged() -> None:
     problem, _, _ = run(np.random.default_rng(38), bubbles=3, seconds=2.5, marks=2)
-    frame = solved(problem).frame
-    width = frame.shake.size + 3 * frame.bubble.size
+    graph = solved(problem).graph
+    width = graph.shake.size + 3 * graph.bubble.size
     for middle, first, inner in ((250, 150, (162, 337)), (0, 0, (0, 187)), (499, 300, (312, 499))):
-        stretch = stretch_of(frame, middle)
+        stretch = stretch_of(graph, middle)
         assert stretch is not None
         assert stretch.size == 200 * width and stretch.inner == inner
         inside = np.flatnonzero(stretch.column[:500] >= 0)
         assert (inside[0], inside[-1]) == (first, first + 199)
     crowd, _, _ = run(np.random.default_rng(38), bubbles=40, seconds=0.3)
-    assert stretch_of(frame_of(crowd, TRUE, np.zeros(0)), 30) is None
+    assert stretch_of(graph_layout(crowd, TRUE, np.zeros(0)), 30) is None
 
 
 @pytest.mark.parametrize(("times", "wanted"), [(0.6, 1 / 0.6), (1.0, 1.0), (2.0, 1.0)])

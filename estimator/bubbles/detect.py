@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Bools
 from telerig.estimator.bubbles.flat_field import checked_image, normalised, nothing_to_see
 from telerig.estimator.bubbles.outline.detection_table import (
     DETECTION_COLUMNS,
@@ -40,8 +41,6 @@ from telerig.estimator.bubbles.outline.split import (
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 __all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
 
@@ -234,18 +233,18 @@ def _flags(
     return np.array(flags, dtype=object)
 
 
-def _merged(outlines: Outlines, parts: list[Part]) -> Mask:
+def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
     """Blobs that could not be split, and implausible parts.
 
     Where one part of a blob is implausible, so are all whose outline is not mostly seen.
     """
-    merged: Mask = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
+    merged: Bools = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
     blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
     suspect = np.array([part.blob in blobs for part in parts])
     return merged | (suspect & (outlines.coverage < _MOSTLY_SEEN))
 
 
-def _defocused(outlines: Outlines) -> Mask:
+def _defocused(outlines: Outlines) -> Bools:
     sharp = float(np.quantile(outlines.blur_px, 0.25))
     return np.asarray(outlines.blur_px > max(_DEFOCUS_FACTOR * sharp, _DEFOCUS_FLOOR_PX))
 

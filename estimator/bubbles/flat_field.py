@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Float32
 from telerig.errors import InputError
 from telerig.estimator.images.checks import check_grey_image
 
@@ -15,8 +16,6 @@ _CLIPPED_SHARE = 0.5
 _WHITE_SHARE = 0.98
 _SHRINK = 8
 _SCREEN_PASSES = 3
-
-Grey = NDArray[np.float32]
 
 
 def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: float) -> NDArray[Any]:
@@ -52,7 +51,7 @@ def _full_scale(image: NDArray[Any]) -> float:
     return next((float(2**bits - 1) for bits in (10, 12, 14) if high <= 2**bits - 1), 65535.0)
 
 
-def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Grey, bool]:
+def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Float32, bool]:
     """Grey over background, and whether the screen is clipped at the sensor's white."""
     import cv2
 
@@ -85,7 +84,7 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Gr
     return ratio, clipped
 
 
-def screen_level(image: Grey) -> Grey:
+def screen_level(image: Float32) -> Float32:
     """Level of the lit screen (rows, columns), from an image with bubbles in front of it.
 
     Bright closing over a quarter of the image at an eighth of its size, then a broad mean over
@@ -107,5 +106,5 @@ def screen_level(image: Grey) -> Grey:
         total = cv2.GaussianBlur(lit * small, width, 0)
         total += 1e-3 * cv2.GaussianBlur(lit * small, (0, 0), reach)
         level = np.where(weight > 1e-9, total / np.maximum(weight, 1e-9), level).astype(np.float32)
-    screen: Grey = cv2.resize(level, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    screen: Float32 = cv2.resize(level, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return screen

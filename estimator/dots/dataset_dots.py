@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.detect_target import (
     MEASURED,
@@ -63,7 +64,7 @@ class DatasetDots:
     rejected: pd.DataFrame
     images: tuple[ImageDots, ...] = ()
     notes: tuple[str, ...] = field(default=())
-    example: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    example: Mapping[str, Array] = field(default_factory=dict)
 
 
 def detect_dataset(

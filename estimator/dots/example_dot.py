@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.dots.fit.blurred_ellipse import (
     PIXEL_VARIANCE_PX2,
     coverage_on_grid,
     shape_from_axes,
 )
 from telerig.estimator.dots.locate import measure_dots
-
-Array = NDArray[np.float64]
 
 REACH = 1.7
 """Half-width of the patch in semi-major axes, besides five pixels."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Float32
 from telerig.errors import InputError
 from telerig.estimator.dots.fit.blurred_ellipse import PIXEL_VARIANCE_PX2, axes_from_shape
 from telerig.estimator.dots.fit.candidates import (
@@ -51,7 +52,6 @@ from telerig.io.machine.memory import keep_freed_memory
 if TYPE_CHECKING:
     import pandas as pd
 
-Grey = NDArray[np.float32]
 
 COLUMNS = [
     *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2", "a_px", "b_px", "angle_rad", "chi2_dof"),
@@ -126,7 +126,7 @@ def measure_dots(
     return _measure(grey, most_area, noise)
 
 
-def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> Grey:
+def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> Float32:
     image = np.asarray(image)
     check_grey_image(image, 8, "dots")
     if polarity not in ("auto", "white_on_black", "black_on_white"):
@@ -144,7 +144,7 @@ def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> Grey
     return image.astype(np.float32)
 
 
-def _measure(grey: Grey, found: Candidates, noise: NoiseModel) -> DotMeasurement:
+def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurement:
     saturation = saturation_level(grey)
     reference_px = reference_radius_px(found)
     rejected: list[tuple[Any, ...]] = []
@@ -205,7 +205,7 @@ def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel
 class _Scene:
     """The image (rows, columns), its blobs' labels, and the blobs whose dots are to be fitted."""
 
-    grey: Grey
+    grey: Float32
     labels: NDArray[np.int32]
     blobs: list[Candidate]
 

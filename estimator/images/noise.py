@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from telerig.arrays import Array, Bools, Float32
 
 # Second differences along both axes: zero on any plane, unit gain for white noise (Immerkaer 1996).
 _SECOND_DIFFERENCES = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
@@ -105,7 +105,7 @@ def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
     return sigma
 
 
-def high_pass(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def high_pass(image: Float32) -> Float32:
     """The image without its locally plane part, scaled to keep the variance of white noise."""
     import cv2
 
@@ -113,7 +113,7 @@ def high_pass(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT))
 
 
-def rough_sigma(response: NDArray[np.float32]) -> float:
+def rough_sigma(response: Float32) -> float:
     """A first guess of the noise: the quietest fifth of 8 x 8 tiles of the high-passed image."""
     rows, columns = (n // 8 * 8 for n in response.shape)
     tiles = response[:rows, :columns].reshape(rows // 8, 8, columns // 8, 8)
@@ -123,9 +123,9 @@ def rough_sigma(response: NDArray[np.float32]) -> float:
 
 
 def estimate_noise(
-    image: NDArray[np.float32],
-    response: NDArray[np.float32],
-    flat: NDArray[np.bool_],
+    image: Float32,
+    response: Float32,
+    flat: Bools,
     *,
     step: float,
     bins: int = 8,

@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import GeometryError
 from telerig.estimator.marks.strip_dots import DotLook, DotSightings
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -390,8 +389,8 @@ class StripInImages:
     view: TankView
     look: DotLook
     places_mm: Array
-    epochs: NDArray[np.int64]
-    epoch_starts: NDArray[np.int64]
+    epochs: Ints
+    epoch_starts: Ints
     shift_mm: Array
     position_mm: Array
     line_mm: tuple[float, float]
@@ -441,7 +440,7 @@ class StripInImages:
             _erase(out, centre, radius)
         return out
 
-    def are_dots(self, frame: int, bubbles: pd.DataFrame) -> NDArray[np.bool_]:
+    def are_dots(self, frame: int, bubbles: pd.DataFrame) -> Bools:
         """(n,) which rows of a table of detections are dots of the strip.
 
         They are told by their place and size; those that the border cuts, by the strip's line.

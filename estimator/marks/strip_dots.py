@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.dots.locate import measure_dots
 
 if TYPE_CHECKING:
     from telerig.estimator.dots.fit.candidates import Polarity
 
-Array = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 BORDER_PX = 1.5
@@ -160,7 +160,7 @@ def _round_dots(image: NDArray[Any], polarity: Polarity, diameter_px: float) -> 
     return np.asarray(table[good & np.isfinite(table).all(1)])
 
 
-def _bands(seen: Array, across: Array, diameter_px: float) -> list[NDArray[np.int64]]:
+def _bands(seen: Array, across: Array, diameter_px: float) -> list[Ints]:
     """Rows of ``seen`` by strip: dots at one distance from the line of travel in several images."""
     if not len(seen):
         return []

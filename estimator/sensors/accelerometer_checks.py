@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
-
-Array = NDArray[np.float64]
 
 _UNITS = (
     ("g", 1.0),

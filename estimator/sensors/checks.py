@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import InputError, suggestion
 from telerig.estimator.sensors.accelerometer_checks import (
     check_accelerometer,
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.io.dataset.run import RunData
 
-Array = NDArray[np.float64]
 
 _COVERED = 0.999
 _FOREIGN_PX = 5.0

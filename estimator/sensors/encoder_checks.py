@@ -9,9 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
-
-Array = NDArray[np.float64]
 
 _SIGMAS = 10.0
 _COUNTS = 4.0

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.association.likelihoods import (
     gate2,
@@ -32,7 +32,6 @@ from telerig.estimator.tracking.filter.motion import POSITION, birth_covariance
 from telerig.estimator.tracking.filter.types import (
     NO_PARTICLE,
     FrameIds,
-    Ids,
     Motion,
     SeenAlone,
     TrackerSettings,
@@ -43,7 +42,6 @@ from telerig.rig.triangulation import stacked_jacobian, triangulate
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 
 _ANYWHERE_MM = 100.0
 
@@ -148,19 +146,19 @@ class Pairs:
     particle : (M,) of its track, -1 for none; known once the frame is settled.
     """
 
-    rows: Ids
+    rows: Ints
     confidence: Array
-    ambiguous: NDArray[np.bool_]
-    given: Ids
+    ambiguous: Bools
+    given: Ints
     points_mm: Array
     covariance_mm2: Array
     d_eq_mm: Array
-    particle: Ids
+    particle: Ints
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def of(self, keep: NDArray[np.bool_]) -> Pairs:
+    def of(self, keep: Bools) -> Pairs:
         return Pairs(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     def and_also(self, other: Pairs) -> Pairs:
@@ -193,7 +191,7 @@ class Frame:
     pixels: tuple[Pixels, Pixels]
     offset_px: Array
     pairs: Pairs
-    lonely: tuple[Ids, Ids]
+    lonely: tuple[Ints, Ints]
     alone: Mapping[int, SeenAlone]
     motion: Motion | None
     singles: list[Single] = field(default_factory=list)
@@ -211,11 +209,11 @@ class Frame:
             )
 
     @property
-    def particle(self) -> Ids:
+    def particle(self) -> Ints:
         """(M,) of the pairs."""
         return self.pairs.particle
 
-    def owners(self, camera: int) -> Ids:
+    def owners(self, camera: int) -> Ints:
         """(N,) particle of each of a camera's rows, -1 for none."""
         out = given_ids(self.tables[camera]).copy()
         taken = self.particle != NO_PARTICLE
@@ -245,7 +243,7 @@ class Frame:
             self.pairs = self.pairs.of(~same.any(1)).and_also(pair)
 
 
-def given_ids(table: pd.DataFrame) -> Ids:
+def given_ids(table: pd.DataFrame) -> Ints:
     """(N,) ids that came with the detections, -1 for none."""
     if "particle" not in table:
         return np.full(len(table), NO_PARTICLE)
@@ -384,7 +382,7 @@ def _release_wrong(
                 _claim_single(frame, camera, rows[camera], predicted, 0)
 
 
-def _doubtful(frame: Frame) -> NDArray[np.bool_]:
+def _doubtful(frame: Frame) -> Bools:
     """(M, 2) whether the outlines of each pair may be off: only a part of them was seen."""
     return np.stack(
         [
@@ -395,7 +393,7 @@ def _doubtful(frame: Frame) -> NDArray[np.bool_]:
     )
 
 
-def _flagged(flags: pd.Series[str]) -> NDArray[np.bool_]:
+def _flagged(flags: pd.Series[str]) -> Bools:
     return flags.fillna("").astype(str).str.contains(_DOUBTFUL).to_numpy(bool)
 
 

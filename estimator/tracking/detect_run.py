@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background.from_run import Background, estimate_background
 from telerig.estimator.bubbles.detect import detect_bubbles
@@ -30,7 +31,6 @@ from telerig.rig.camera import Camera
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 Batch = tuple[int, int]
 """First frame, and the one after the last."""

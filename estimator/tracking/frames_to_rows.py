@@ -8,8 +8,8 @@ from itertools import chain
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.bubbles.pairing.matching import PairModel, Prediction, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
 from telerig.estimator.tracking.association.likelihoods import px_per_mm
@@ -36,9 +36,6 @@ from telerig.estimator.tracking.filter.types import (
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian, triangulate
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _PAIRS_AT_ONCE = 512
 _LEAST_FOR_OFFSET = 3
@@ -236,7 +233,7 @@ def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
 
 
 def _measured(
-    pairs: Pairs, lonely: tuple[Index, Index], pixels: tuple[Pixels, Pixels], offset_px: Array
+    pairs: Pairs, lonely: tuple[Ints, Ints], pixels: tuple[Pixels, Pixels], offset_px: Array
 ) -> FrameMeasurements:
     """The tracker's input; lonely : rows of the detections without a partner."""
     (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, lonely))
@@ -269,9 +266,7 @@ def _detections(frames: Sequence[Frame]) -> pd.DataFrame:
     return joined[leading + [name for name in joined if name not in leading]]
 
 
-def _joined_flags(
-    first: pd.Series[str], second: pd.Series[str], ambiguous: NDArray[np.bool_]
-) -> list[str]:
+def _joined_flags(first: pd.Series[str], second: pd.Series[str], ambiguous: Bools) -> list[str]:
     """The flags of both views, each word once."""
     return [
         "|".join(sorted({*filter(None, (a or "").split("|") + (b or "").split("|"))} | extra))

@@ -8,8 +8,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.marks.following import Follower, Mark, StripInImages, TankView
 from telerig.estimator.marks.strip_dots import (
     DotLook,
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from telerig.io.dataset.run import RunData
     from telerig.io.rig_file.description import ReferencesDescription
 
-Array = NDArray[np.float64]
 Looks = Mapping[str, DotLook]
 
 SAMPLE_FRAMES = 12
@@ -175,7 +174,7 @@ def _moved(follower: Follower, held_mm: Array) -> bool:
     return far > _MOVED_DIAMETERS * follower.diameter_mm
 
 
-def _mark_numbers(sightings: pd.DataFrame, kept: Mapping[str, list[Mark]]) -> NDArray[np.int64]:
+def _mark_numbers(sightings: pd.DataFrame, kept: Mapping[str, list[Mark]]) -> Ints:
     """(N,) mark of each sighting: 0.. and 1000.. by order of appearance; -1 for other dots."""
     numbers: dict[tuple[str, int], int] = {}
     base = 0

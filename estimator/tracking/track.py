@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
@@ -46,7 +47,6 @@ from telerig.rig.camera import Camera
 if TYPE_CHECKING:
     from telerig.estimator.tracking.filter.types import TrackEvent
 
-Array = NDArray[np.float64]
 
 MODEL_FRAMES = 60
 """Frames spread over the run from which the pair model is learnt."""

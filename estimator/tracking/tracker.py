@@ -10,8 +10,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.association.hypotheses import (
@@ -48,7 +49,6 @@ from telerig.estimator.tracking.filter.types import (
     FrameIds,
     FrameMeasurements,
     FrameResult,
-    Ids,
     Motion,
     SeenAlone,
     TrackerSettings,
@@ -63,7 +63,7 @@ class OpenFrames:
     """The ids of frames that are still open, and when each living particle was last seen."""
 
     def __init__(self) -> None:
-        self._frames: dict[int, tuple[float, Ids, Ids]] = {}
+        self._frames: dict[int, tuple[float, Ints, Ints]] = {}
         self._seen: dict[int, int] = {}
 
     def begin(self, frame: int, t_s: float, points: int, singles: int) -> None:
@@ -82,7 +82,7 @@ class OpenFrames:
     def write_single(self, frame: int, index: int, particle: int) -> None:
         self._frames[frame][2][index] = particle
 
-    def now(self, frame: int) -> tuple[Ids, Ids]:
+    def now(self, frame: int) -> tuple[Ints, Ints]:
         _, particle, single = self._frames[frame]
         return particle.copy(), single.copy()
 
@@ -107,8 +107,6 @@ class OpenFrames:
             self._seen = {p: f for p, f in self._seen.items() if p in alive}
         return tuple(out), events
 
-
-Array = NDArray[np.float64]
 
 _TOUCHING = 1.5
 """Largest distance of two centres, in diameters, of bubbles that may have been one."""
@@ -462,7 +460,7 @@ class Tracker:
         events: list[TrackEvent],
         *,
         at_once: bool = False,
-    ) -> Ids:
+    ) -> Ints:
         """Decide the conflicts that can be decided; the columns that some track claims."""
         claimed, out = [], []
         for cluster in grown:
@@ -521,7 +519,7 @@ class Tracker:
     def _births(
         self,
         scan: Scan,
-        free: Ids,
+        free: Ints,
         common: Common,
         gain: Array | None,
         events: list[TrackEvent],

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from telerig.arrays import Array, Bools
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from telerig.estimator.tracking.tracks import Tracks
 
-Array = NDArray[np.float64]
 
 NEAR_PX = 3.0
 """A point shows a bubble when both its pixels are this near to the bubble's true ones."""
@@ -60,7 +60,7 @@ def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) ->
 
 def matched(
     table: pd.DataFrame, truth: pd.DataFrame, cameras: Sequence[str]
-) -> tuple[pd.DataFrame, NDArray[np.bool_]]:
+) -> tuple[pd.DataFrame, Bools]:
     """For each point the true bubble that it shows and its ``row`` in truth, blank without one;
     and whether it is the only one to show it, and the bubble is whole in both images."""
     rows_of = truth.groupby("frame").indices

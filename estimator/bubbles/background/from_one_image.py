@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-Level = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from telerig.arrays import Array, Bools, Float32
 
 _CELL_PX = 4
 DARK = 0.05
@@ -18,7 +17,7 @@ _LEVEL_SCALE_CELLS = 3.0
 _EDGE_SHARE = 1 / 3
 
 
-def level_of_image(image: NDArray[np.generic]) -> tuple[Level, Mask]:
+def level_of_image(image: NDArray[np.generic]) -> tuple[Float32, Bools]:
     """(H, W) level in grey values, and (H, W) where it is interpolated under something dark.
 
     The screen is a surface of degree 4 (log level), fitted to the bright side, then the smoothed
@@ -39,7 +38,7 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Level, Mask]:
     return level.astype(np.float32), covered.astype(bool)
 
 
-def log_cells(image: NDArray[np.generic], cell_px: int) -> Level:
+def log_cells(image: NDArray[np.generic], cell_px: int) -> Float32:
     """Logarithm of the image, averaged over square cells first."""
     import cv2
 
@@ -49,8 +48,8 @@ def log_cells(image: NDArray[np.generic], cell_px: int) -> Level:
 
 
 def fill_masked(
-    log: Level, mask: Mask, usable: Mask, across: tuple[float, float] | None = None
-) -> Level:
+    log: Float32, mask: Bools, usable: Bools, across: tuple[float, float] | None = None
+) -> Float32:
     """``log`` with the masked pixels interpolated from the usable ones around them.
 
     A surface of degree 2 through each hole's neighbourhood, and what is left of it around the
@@ -67,7 +66,7 @@ def fill_masked(
     return surface
 
 
-def _holes(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:
+def _holes(mask: Bools) -> Iterator[tuple[tuple[slice, slice], Bools]]:
     """Windows about the connected parts of a mask, with a margin of half their size."""
     from skimage.measure import label, regionprops
 
@@ -79,7 +78,7 @@ def _holes(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:
         yield (rows, columns), labels[rows, columns] == region.label
 
 
-def _carried(residual: Level, known: Mask, across: tuple[float, float] | None = None) -> Level:
+def _carried(residual: Float32, known: Bools, across: tuple[float, float] | None = None) -> Float32:
     """Weighted means of what is known nearby, the finest scale that reaches a pixel first."""
     import cv2
 
@@ -99,7 +98,7 @@ def _carried(residual: Level, known: Mask, across: tuple[float, float] | None = 
     return result
 
 
-def bright_surface(log: Level, degree: int, known: Mask | None = None) -> Level:
+def bright_surface(log: Float32, degree: int, known: Bools | None = None) -> Float32:
     """Least squares over what is known and not much darker than the fit."""
     flat = log.ravel().astype(np.float64)
     usable = np.ones(flat.shape, bool) if known is None else known.ravel()
@@ -116,13 +115,13 @@ def bright_surface(log: Level, degree: int, known: Mask | None = None) -> Level:
     return fit.reshape(log.shape).astype(np.float32)
 
 
-def _terms(shape: tuple[int, ...], degree: int) -> NDArray[np.float64]:
+def _terms(shape: tuple[int, ...], degree: int) -> Array:
     v, u = (np.linspace(-1, 1, n) for n in shape)
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     return np.stack([np.outer(v**i, u**j).ravel() for i, j in powers], axis=1)
 
 
-def _dark_things(log: Level, surface: Level) -> Mask:
+def _dark_things(log: Float32, surface: Float32) -> Bools:
     """Dark against the surface, grown by two cells."""
     import cv2
 
@@ -133,7 +132,7 @@ def _dark_things(log: Level, surface: Level) -> Mask:
     return np.asarray(grown, bool)
 
 
-def compact_things(dark: Mask) -> Mask:
+def compact_things(dark: Bools) -> Bools:
     """``dark`` with bright centres filled; what covers a third of a border is the screen's edge."""
     from scipy.ndimage import binary_fill_holes
     from skimage.measure import label, regionprops

@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.bubbles.background.from_one_image import level_of_image
 from telerig.estimator.bubbles.background.layers import crop_of_lab, fit_layers
 
-Array = NDArray[np.float64]
-Level = NDArray[np.float32]
 Shift = tuple[float, float]
 
 LEAST_FRAMES = 4
@@ -39,14 +38,14 @@ class Background:
     noise : relative standard deviation of a pixel at the median level.
     """
 
-    rig_level: Level
-    covered: NDArray[np.bool_]
-    lab_factor: Level | None = None
+    rig_level: Float32
+    covered: Bools
+    lab_factor: Float32 | None = None
     lab_origin_px: tuple[int, int] = (0, 0)
-    frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    frames: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     noise: float = 0.0
 
-    def at(self, frame_shift_px: Shift = (0.0, 0.0)) -> Level:
+    def at(self, frame_shift_px: Shift = (0.0, 0.0)) -> Float32:
         """(H, W) level at the median brightness, with the lab displaced by (u, v) px.
 
         What is fixed in the lab and seen at pixel p at shift 0 is seen at p - shift. A shift that
@@ -95,9 +94,9 @@ def estimate_background(
 
 def _sample(
     images: Callable[[int], NDArray[np.generic] | None],
-    candidates: NDArray[np.int64],
+    candidates: Ints,
     max_frames: int,
-) -> tuple[NDArray[np.int64], NDArray[np.generic]]:
+) -> tuple[Ints, NDArray[np.generic]]:
     """Frames and their (n, H, W) images, unevenly spread.
 
     Even spacing at even speed would make every texture whose period is the spacing look the same

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.bubbles.background.from_one_image import (
     DARK,
     bright_surface,
@@ -27,9 +28,6 @@ from telerig.estimator.bubbles.background.from_one_image import (
     level_of_image,
     log_cells,
 )
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _CELL_PX = 2
 
@@ -44,7 +42,7 @@ _CHANGES = 0.25
 _LEAST_SEEN, _FEW = 5, 10
 
 
-def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Array) -> Mask:
+def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Array) -> Bools:
     """(n, H, W) pixels of n images that a bubble probably hides, where that happens often.
 
     Elsewhere quantiles over frames do better, as they need no threshold.
@@ -77,7 +75,7 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
     return masks
 
 
-def _fringe(stack: NDArray[np.generic], gains: Array, masks: Mask) -> Mask:
+def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
     """(H, W) pixels at the border of what is always hidden that hardly change: dirt beside it.
 
     A bubble's own border moves, if only by a pixel, and parts its still inside from the outside.
@@ -94,7 +92,7 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Mask) -> Mask:
     return np.asarray(never & np.isin(labels, outside[outside > 0]), bool)
 
 
-def _still(share: Array, known: Mask, margin: int) -> Mask:
+def _still(share: Array, known: Bools, margin: int) -> Bools:
     """Things dark in nearly all frames, grown by ``margin`` cells, beyond which few are dark."""
     import cv2
 
@@ -118,7 +116,7 @@ def _lab_places(shifts_px: Array | None, shape: tuple[int, ...]) -> list[tuple[s
     return [(slice(v, v + shape[1]), slice(u, u + shape[2])) for u, v in shifts - shifts.min(0)]
 
 
-def _share_in_lab(marks: Mask, places: list[tuple[slice, slice]]) -> tuple[Array, Array]:
+def _share_in_lab(marks: Bools, places: list[tuple[slice, slice]]) -> tuple[Array, Array]:
     """On the canvas: the share of the frames that see a cell which mark it, and their number."""
     size = [max(place[axis].stop for place in places) for axis in (0, 1)]
     total, seen = np.zeros(size), np.zeros(size)
@@ -127,8 +125,6 @@ def _share_in_lab(marks: Mask, places: list[tuple[slice, slice]]) -> tuple[Array
         seen[place] += 1
     return total / np.maximum(seen, 1), seen
 
-
-Log = NDArray[np.float32]
 
 UPPER = 0.8
 """Quantile over frames at the start: a bubble may darken a pixel in this share of them."""
@@ -151,12 +147,12 @@ class Layers:
     The lab's pixel (0, 0) is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
     """
 
-    rig: Log
-    lab: Log | None
+    rig: Float32
+    lab: Float32 | None
     lab_origin_px: tuple[int, int]
     gains: Array
 
-    def lab_in(self, shift_px: Array, rows: slice = slice(None)) -> Log | float:
+    def lab_in(self, shift_px: Array, rows: slice = slice(None)) -> Float32 | float:
         """(H, W) of the lab layer as a frame sees it, or some rows of it."""
         if self.lab is None:
             return 0.0
@@ -171,16 +167,16 @@ class _Sample:
 
     stack: NDArray[np.generic]
     shifts: Array
-    table: Log | None
+    table: Float32 | None
 
-    def log(self, frame: int | slice, rows: slice = slice(None), step: int = 1) -> Log:
+    def log(self, frame: int | slice, rows: slice = slice(None), step: int = 1) -> Float32:
         values: NDArray[Any] = self.stack[frame, rows][..., ::step, ::step]
         if self.table is None:
             return np.log(np.maximum(values.astype(np.float32), 1e-6))
         return np.take(self.table, values)
 
 
-def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Layers, Mask, float]:
+def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Layers, Bools, float]:
     """Both layers of (n, H, W) images; shifts_px (n, 2), None for the rig layer alone.
 
     Then (H, W) where a bubble hid the screen all the time, and the relative noise of a pixel.
@@ -208,7 +204,7 @@ def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Lay
     return layers, hidden, noise
 
 
-def _log_table(kind: np.dtype[Any]) -> Log | None:
+def _log_table(kind: np.dtype[Any]) -> Float32 | None:
     if kind not in (np.uint8, np.uint16):
         return None
     return np.log(np.maximum(np.arange(np.iinfo(kind).max + 1), 0.5)).astype(np.float32)
@@ -228,7 +224,7 @@ def _first_gains(sample: _Sample) -> Array:
     return gains
 
 
-def _first_rig(sample: _Sample, layers: Layers, masks: Mask) -> tuple[Layers, Log, Mask]:
+def _first_rig(sample: _Sample, layers: Layers, masks: Bools) -> tuple[Layers, Float32, Bools]:
     """The layers with the frames' upper quantile, and how far the brighter frames spread.
 
     masks : (n, H, W) what is left out. Then (H, W) the pixels that no two frames show, filled.
@@ -253,7 +249,7 @@ def _blocks(height: int) -> Iterator[slice]:
     return (slice(r, min(r + _BLOCK_ROWS, height)) for r in range(0, height, _BLOCK_ROWS))
 
 
-def _quantiles(values: Log, shares: tuple[float, ...]) -> Log:
+def _quantiles(values: Float32, shares: tuple[float, ...]) -> Float32:
     """(Q, H, W) quantiles over the first axis, NaN left out; NaN where fewer than two remain."""
     count, height, width = values.shape
     ordered = np.sort(np.ascontiguousarray(values.reshape(count, -1).T), axis=1)
@@ -264,7 +260,7 @@ def _quantiles(values: Log, shares: tuple[float, ...]) -> Log:
     return np.ascontiguousarray(found.T).reshape(len(shares), height, width)
 
 
-def _first_lab(sample: _Sample, layers: Layers, masks: Mask) -> Layers:
+def _first_lab(sample: _Sample, layers: Layers, masks: Bools) -> Layers:
     """The layers with the lab layer's quantiles over the frames that saw each place."""
     height, width = layers.rig.shape
     low, high = np.floor(sample.shifts.min(0)), np.ceil(sample.shifts.max(0))
@@ -287,11 +283,11 @@ def _lab_rows(
     sample: _Sample,
     layers: Layers,
     k: int,
-    mask: Mask,
+    mask: Bools,
     rows: slice,
     origin: tuple[int, int],
     width: int,
-) -> Log | None:
+) -> Float32 | None:
     """What frame k shows in these rows of the lab, NaN beside it; None when it shows nothing."""
     left, top = sample.shifts[k] - origin
     column, row = math.floor(left), math.floor(top)
@@ -319,7 +315,7 @@ def _centred(layers: Layers) -> Layers:
     return replace(layers, lab=lab, rig=layers.rig + middle)
 
 
-def _residual(sample: _Sample, layers: Layers, k: int) -> Log:
+def _residual(sample: _Sample, layers: Layers, k: int) -> Float32:
     out = sample.log(k) - layers.rig
     out -= np.float32(layers.gains[k])
     out -= layers.lab_in(sample.shifts[k])
@@ -342,7 +338,7 @@ def _noise(sample: _Sample, layers: Layers) -> tuple[Array, Array]:
     return np.array(levels), np.array(sigmas)
 
 
-def _marked(sample: _Sample, layers: Layers) -> tuple[Layers, Mask]:
+def _marked(sample: _Sample, layers: Layers) -> tuple[Layers, Bools]:
     """The layers with new gains, and (n, H, W) the pixels under bubbles and other outliers."""
     levels, sigmas = _noise(sample, layers)
     sigma = np.interp(layers.rig, levels, sigmas).astype(np.float32)
@@ -362,7 +358,7 @@ def _marked(sample: _Sample, layers: Layers) -> tuple[Layers, Mask]:
     return replace(layers, gains=gains - middle, rig=layers.rig + np.float32(middle)), marked
 
 
-def _outliers(residual: Log, sigma: Log) -> Mask:
+def _outliers(residual: Float32, sigma: Float32) -> Bools:
     """Dark things with their soft edges and bright centres, and bright specks."""
     import cv2
 
@@ -377,8 +373,8 @@ def _outliers(residual: Log, sigma: Log) -> Mask:
 
 
 def _uncovered(
-    sample: _Sample, layers: Layers, marked: Mask, spread: Log, never: Mask
-) -> tuple[Layers, Mask, Mask, Mask]:
+    sample: _Sample, layers: Layers, marked: Bools, spread: Float32, never: Bools
+) -> tuple[Layers, Bools, Bools, Bools]:
     """The rig layer filled where a bubble kept it dark all the time, and the new marks.
 
     Then (H, W) where it was filled, and what is clean enough to fill from.
@@ -408,7 +404,7 @@ def _uncovered(
     return *_marked(sample, _filled(sample, layers, hidden, usable)), hidden, usable
 
 
-def _filled(sample: _Sample, layers: Layers, hidden: Mask, usable: Mask) -> Layers:
+def _filled(sample: _Sample, layers: Layers, hidden: Bools, usable: Bools) -> Layers:
     """The rig layer interpolated where it is hidden, along the travel if that is an image axis.
 
     A pattern that is constant along the travel looks the same in both layers, and what one has of
@@ -427,8 +423,8 @@ def _least_seen(frames: int) -> int:
 
 
 def _mean_rig(
-    sample: _Sample, layers: Layers, marked: Mask, covered: Mask
-) -> tuple[Layers, NDArray[np.float32]]:
+    sample: _Sample, layers: Layers, marked: Bools, covered: Bools
+) -> tuple[Layers, Float32]:
     """The rig layer as the mean of the frames' unmarked pixels, and (H, W) their number."""
     import cv2
 
@@ -442,7 +438,7 @@ def _mean_rig(
     return replace(layers, rig=rig.astype(np.float32)), seen
 
 
-def _mean_lab(sample: _Sample, layers: Layers, marked: Mask) -> Layers:
+def _mean_lab(sample: _Sample, layers: Layers, marked: Bools) -> Layers:
     """The lab layer as the mean of the residuals that are free of marks."""
     import cv2
 
@@ -467,12 +463,12 @@ def _mean_lab(sample: _Sample, layers: Layers, marked: Mask) -> Layers:
 
 
 def crop_of_lab(
-    lab: Log,
+    lab: Float32,
     origin_px: tuple[int, int],
     shift_px: tuple[float, float],
     shape: tuple[int, int],
     outside: float,
-) -> Log:
+) -> Float32:
     """(H, W) of the lab seen at a shift (u, v), by cubic interpolation; ``outside`` beyond it."""
     left, top = shift_px[0] - origin_px[0], shift_px[1] - origin_px[1]
     column, row = math.floor(left), math.floor(top)
@@ -485,7 +481,7 @@ def crop_of_lab(
     return shifted(window, (left - column, top - row))[1:-2, 1:-2]
 
 
-def shifted(image: Log, shift_px: tuple[float, float]) -> Log:
+def shifted(image: Float32, shift_px: tuple[float, float]) -> Float32:
     """image(p + shift) for shifts below 1 px, by Catmull-Rom splines; borders replicated."""
     import cv2
 
@@ -494,7 +490,7 @@ def shifted(image: Log, shift_px: tuple[float, float]) -> Log:
     return np.asarray(out, np.float32)
 
 
-def _spline(shift: float) -> NDArray[np.float32]:
+def _spline(shift: float) -> Float32:
     """Five weights, of the pixels from -2 to +2."""
     base = math.floor(shift)
     x = np.abs(np.arange(-1, 3) - (shift - base))

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS, outline_moments, points_on
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 
 CENTRE_COLUMNS = ["u_px", "v_px"]
 COVARIANCE_COLUMNS = ["suu_px2", "suv_px2", "svv_px2"]

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from telerig.arrays import Array, Float32
+
 Floats = NDArray[np.floating[Any]]
 Index = NDArray[np.intp]
 Complex = NDArray[np.complex128]
@@ -40,7 +41,7 @@ class Foot:
     normal: Floats
 
 
-def spread(values: Array, counts: Index) -> NDArray[np.float32]:
+def spread(values: Array, counts: Index) -> Float32:
     """Values (..., B) repeated for the points of each of B owners: (..., N), single precision."""
     return np.repeat(np.asarray(values, dtype=np.float32), counts, axis=-1)
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     ELLIPSE_PARAMETERS,
     Index,
@@ -37,9 +37,6 @@ from telerig.estimator.bubbles.outline.rim_model import (
     rim_pixels,
     unlike_rim,
 )
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _LEVEL_SPREAD = 0.3
 _FREE_HARMONIC, _FREE_FLATTENING = 0.25, 1e3
@@ -65,7 +62,7 @@ class ShapePrior:
             self.harmonic_share[index], self.flattening[index], self.flattening_spread[index]
         )
 
-    def held_where(self, held: Mask) -> ShapePrior:
+    def held_where(self, held: Bools) -> ShapePrior:
         """The same prior with the harmonics of the bubbles ``held`` (B,) tied to zero."""
         return replace(self, harmonic_share=np.where(held, _HELD, self.harmonic_share))
 
@@ -79,7 +76,7 @@ def weak_prior(count: int, *, held: bool = False) -> ShapePrior:
     )
 
 
-def learnt_prior(ellipse: Array, harmonics: Array, whole: Mask, partial: Mask) -> ShapePrior:
+def learnt_prior(ellipse: Array, harmonics: Array, whole: Bools, partial: Bools) -> ShapePrior:
     """For outlines that are ``partial`` (B,) the shapes of the ``whole`` ones, for others none.
 
     With too few whole ones, partial outlines are taken to be round to 8 %.
@@ -158,8 +155,6 @@ def _add_flattening(
     pull[:, 4] -= weight * (shifts[:, 4] - radius * across)
 
 
-Single = NDArray[np.float32]
-
 _PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 _MIN_SIGMA_PX = 0.3
 _OUTLIER_SIGMA = 4.5
@@ -204,7 +199,7 @@ class Outlines:
 
     ellipse: Array
     harmonics: Array
-    resolved: Mask
+    resolved: Bools
     sigma_px: Array
     outer: Array
     inner: Array
@@ -234,7 +229,7 @@ class Outlines:
         return Outlines(**changed)
 
 
-def fit_outlines(ratio: NDArray[np.float32], start: Start) -> Outlines:
+def fit_outlines(ratio: Float32, start: Start) -> Outlines:
     """Fit B outlines to the normalised image ``ratio`` (grey over background).
 
     Pixels inside or near another bubble of ``start`` are left out, and so are glare, dirt and
@@ -265,7 +260,7 @@ def fit_outlines(ratio: NDArray[np.float32], start: Start) -> Outlines:
     return fit
 
 
-def _first_look(ratio: NDArray[np.float32], state: RimState, start: Start) -> RimState:
+def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
     """Ellipse, blur and levels from a share of the pixels within a narrow band."""
     pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state), thin=True)
     linear = linearised(state, pixels)
@@ -284,7 +279,7 @@ def _bulge(state: RimState) -> Array:
     return np.asarray(np.sum(np.abs(state.harmonics), axis=1))
 
 
-def _distance(state: RimState, pixels: Pixels, linear: Linear) -> Single:
+def _distance(state: RimState, pixels: Pixels, linear: Linear) -> Float32:
     bump = linear.displacements(pixels, _shifts(state))
     return np.asarray(linear.foot.distance - bump, dtype=np.float32)
 
@@ -301,12 +296,12 @@ class _Descent:
     state: RimState
     shifts: Array
     covariance: Array
-    residual: Single
+    residual: Float32
     shift_px: Array
 
 
 def _refined(
-    ratio: NDArray[np.float32],
+    ratio: Float32,
     state: RimState,
     start: Start,
     everyone: RimState,
@@ -323,7 +318,9 @@ def _refined(
     return _result(descent, pixels, linear, weight, hidden, start)
 
 
-def _window(state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Mask) -> Single:
+def _window(
+    state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Bools
+) -> Float32:
     """Weights (N,): inverse variances, 0 for what must not be looked at."""
     counts = pixels.counts
     grey, _, inside = rim_model(state, pixels, linear, _shifts(state))
@@ -339,7 +336,7 @@ def _window(state: RimState, pixels: Pixels, linear: Linear, start: Start, hidde
     return np.asarray((inverse * kept).astype(np.float32))
 
 
-def _typical_residual(residual: Single, pixels: Pixels, kept: Mask) -> Array:
+def _typical_residual(residual: Float32, pixels: Pixels, kept: Bools) -> Array:
     typical = np.ones(pixels.bubbles)
     for index, part in enumerate(pixels.parts()):
         own = np.abs(residual[part][kept[part]])
@@ -352,7 +349,7 @@ def _descend(
     state: RimState,
     pixels: Pixels,
     linear: Linear,
-    weight: Single,
+    weight: Float32,
     start: Start,
     prior: ShapePrior,
     *,
@@ -407,7 +404,7 @@ def _moved(state: RimState, shifts: Array) -> RimState:
     return replace(state, ellipse=ellipse, harmonics=turned_harmonics(shifts[:, BLUR:], turn))
 
 
-def _coverage(pixels: Pixels, linear: Linear, weight: Single, sigma: Array) -> Array:
+def _coverage(pixels: Pixels, linear: Linear, weight: Float32, sigma: Array) -> Array:
     """Share of the outline (B,) at which pixels at the edge were looked at."""
     close = np.abs(linear.foot.distance) < spread(1.2 * sigma + 0.3, pixels.counts)
     near = np.flatnonzero(close & (weight > 0.0))
@@ -418,7 +415,7 @@ def _coverage(pixels: Pixels, linear: Linear, weight: Single, sigma: Array) -> A
 
 
 def _misfit(
-    state: RimState, pixels: Pixels, linear: Linear, residual: Single, hidden: Mask, start: Start
+    state: RimState, pixels: Pixels, linear: Linear, residual: Float32, hidden: Bools, start: Start
 ) -> Array:
     """RMS distance (B,) between rim and outline: grey residuals over the edge's slope.
 
@@ -437,8 +434,8 @@ def _result(
     descent: _Descent,
     pixels: Pixels,
     linear: Linear,
-    weight: Single,
-    hidden: Mask,
+    weight: Float32,
+    hidden: Bools,
     start: Start,
 ) -> Outlines:
     """Covariances are widened by chi2_dof where that exceeds 1 by 3 sigma."""

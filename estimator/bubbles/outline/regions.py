@@ -8,10 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Float32
 from telerig.estimator.images.noise import clipped_sigma
-
-Array = NDArray[np.float64]
-Grey = NDArray[np.float32]
 
 _NOISE_ROWS, _NOISE_SAMPLES = 96, 40_000
 _DARK_SHARE, _ENOUGH_DARK = 0.12, 120
@@ -45,7 +43,7 @@ class Rejected(NamedTuple):
     reason: str
 
 
-def noise_share(ratio: Grey) -> float:
+def noise_share(ratio: Float32) -> float:
     """Noise of the normalised image where the screen is free, as a share of the background.
 
     From second differences along both axes (blind to any plane) on some rows.
@@ -66,13 +64,13 @@ def noise_share(ratio: Grey) -> float:
     )
 
 
-def _second_differences(above: Grey, here: Grey, below: Grey) -> Grey:
+def _second_differences(above: Float32, here: Float32, below: Float32) -> Float32:
     """Along both axes, scaled to the noise of one pixel."""
     vertical = above - 2.0 * here + below
     return (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
 
 
-def dark_noise_share(ratio: Grey, blobs: list[Blob], sigma: float) -> float:
+def dark_noise_share(ratio: Float32, blobs: list[Blob], sigma: float) -> float:
     """Noise within the dark rims, at most ``sigma``, that of the screen: photons are fewer there.
 
     From second differences along both axes where three by three pixels are dark alike. Structure
@@ -96,7 +94,7 @@ def dark_noise_share(ratio: Grey, blobs: list[Blob], sigma: float) -> float:
 
 
 def find_blobs(
-    ratio: Grey, *, sigma: float, min_contrast: float, min_diameter_px: float
+    ratio: Float32, *, sigma: float, min_contrast: float, min_diameter_px: float
 ) -> tuple[list[Blob], list[Rejected]]:
     """Dark regions of the normalised image that may be bubbles, and those too small or faint.
 
@@ -128,7 +126,7 @@ def find_blobs(
 
 
 def _trace(
-    ratio: Grey,
+    ratio: Float32,
     region: NDArray[np.int32],
     box: tuple[int, int, int, int],
     low: float,
@@ -183,7 +181,7 @@ def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
 
 
 def refined_contour(
-    ratio: Grey, points: NDArray[np.int_], half: float, contrast: float
+    ratio: Float32, points: NDArray[np.int_], half: float, contrast: float
 ) -> tuple[Array, float]:
     """Outline points (n, 2) moved along the gradient to the half level, and the edge's blur."""
     rows, columns = ratio.shape

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     ELLIPSE_PARAMETERS,
     HARMONICS,
@@ -27,10 +27,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     rough_distance,
     spread,
 )
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 _OCTANTS = 8
 _UNLIKE_SHARE, _UNLIKE_SIGMA = 0.015, 3.0
@@ -50,9 +46,9 @@ class Pixels:
     owner: Index
     counts: Index
     origin: Array
-    u: Single
-    v: Single
-    value: Single
+    u: Float32
+    v: Float32
+    value: Float32
 
     @property
     def bubbles(self) -> int:
@@ -64,7 +60,7 @@ class Pixels:
         edges = np.concatenate([[0], np.cumsum(self.counts)]).tolist()
         return (slice(low, high) for low, high in itertools.pairwise(edges))
 
-    def sums(self, values: Single) -> Array:
+    def sums(self, values: Float32) -> Array:
         """Sum (B,) of values (N,) over each bubble."""
         weights = values.astype(np.float64)
         return np.bincount(self.owner, weights, self.bubbles).astype(np.float64)
@@ -75,7 +71,7 @@ class Pixels:
         moved[:, :2] -= self.origin
         return moved
 
-    def hidden(self, ellipse: Array, everyone: Array, reach_px: Array, own: Index) -> Mask:
+    def hidden(self, ellipse: Array, everyone: Array, reach_px: Array, own: Index) -> Bools:
         """Pixels (N,) within ``reach_px`` (A,) of, or inside, any of the ellipses ``everyone``
         (A, 5) that is not their own, number ``own`` (B,) of these."""
         hidden = np.zeros(self.owner.size, dtype=np.bool_)
@@ -103,7 +99,7 @@ def close_pairs(
 
 
 def rim_pixels(
-    ratio: NDArray[np.float32], ellipse: Array, sigma: Array, slack_px: Array, *, thin: bool = False
+    ratio: Float32, ellipse: Array, sigma: Array, slack_px: Array, *, thin: bool = False
 ) -> Pixels:
     """Pixels of ``ratio`` within 3 sigma and ``slack_px`` (B,) of the ellipses (B, 5).
 
@@ -141,7 +137,7 @@ def rim_pixels(
 
 def _ring(
     ellipse: Array, origin: Array, columns: Index, rows: Index, reach: float
-) -> tuple[Single, Single]:
+) -> tuple[Float32, Float32]:
     """Places (n,), counted from ``origin``, of the pixels within ``reach`` of one ellipse."""
     local = ellipse.copy()
     local[:2] -= origin
@@ -166,8 +162,8 @@ def _ring(
 
 
 def unlike_rim(
-    pixels: Pixels, foot: Foot, distance: Single, residual: Single, sigma: Array, contrast: Array
-) -> Mask:
+    pixels: Pixels, foot: Foot, distance: Float32, residual: Float32, sigma: Array, contrast: Array
+) -> Bools:
     """Pixels (N,) at and beyond the first ring that departs from the model, in each octant.
 
     Rings are one pixel wide. Inside, a departure towards bright is glare; outside, one towards
@@ -224,11 +220,11 @@ class Linear:
     curvature's second derivative along the arc over 8, where the blur makes it matter."""
 
     foot: Foot
-    shape: Single
-    resolved: Mask
-    bending: Single | None
+    shape: Float32
+    resolved: Bools
+    bending: Float32 | None
 
-    def displacements(self, pixels: Pixels, shifts: Array) -> Single:
+    def displacements(self, pixels: Pixels, shifts: Array) -> Float32:
         """Outward displacement (N,) of the outline at each pixel's foot for shifts (B, 13)."""
         result = np.empty(self.shape.shape[1], dtype=np.float32)
         for part, own in zip(pixels.parts(), shifts.astype(np.float32), strict=True):
@@ -257,7 +253,7 @@ def linearised(state: RimState, pixels: Pixels) -> Linear:
     return Linear(foot, shape, resolved, _bending(state, pixels, foot) if bent else None)
 
 
-def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Single:
+def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Float32:
     """Second derivative of the curvature by the arc's length, over 8.
 
     Across the blur an arc runs at -(K y^2 / 2 + (K'' + 3 K^3) y^4 / 24) from its tangent, a circle
@@ -269,7 +265,7 @@ def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Single:
     square = foot.speed * foot.speed
     turn = gap * (foot.cos * foot.cos - foot.sin * foot.sin)
     slope = gap * foot.sin * foot.cos
-    bending: Single = (
+    bending: Float32 = (
         -0.375 * product * (turn - 6.0 * slope * slope / square) / (square**3 * foot.speed)
     )
     return bending
@@ -277,7 +273,7 @@ def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Single:
 
 def rim_model(
     state: RimState, pixels: Pixels, linear: Linear, shifts: Array
-) -> tuple[Single, Single, Single]:
+) -> tuple[Float32, Float32, Float32]:
     """Grey (N,), its Jacobian (16, N) and the share F (N,) of the bubble's own level.
 
     ``shifts`` (B, 13): displacements of the outline since the linearisation.
@@ -308,7 +304,7 @@ def rim_model(
 
 
 def normal_equations(
-    jacobian: Single, residual: Single, weight: Single, pixels: Pixels
+    jacobian: Float32, residual: Float32, weight: Float32, pixels: Pixels
 ) -> tuple[Array, Array]:
     """Information (B, 16, 16) and pull (B, 16) of weighted residuals (N,)."""
     information = np.empty((pixels.bubbles, PARAMETERS, PARAMETERS))
@@ -327,9 +323,9 @@ class Profile:
     """Share of the disc's light ``value`` at each place, with derivatives by distance and by
     curvature (both in units of the blur)."""
 
-    value: Single
-    by_distance: Single
-    by_curvature: Single
+    value: Float32
+    by_distance: Float32
+    by_curvature: Float32
 
 
 def blurred_disc(distance: Array, radius: Array) -> Array:
@@ -353,7 +349,7 @@ def blurred_disc(distance: Array, radius: Array) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _table() -> tuple[Single, int]:
+def _table() -> tuple[Float32, int]:
     from scipy.special import ndtr
 
     t = np.arange(-_DISTANCE_LIMIT, _DISTANCE_LIMIT + _DISTANCE_STEP / 2, _DISTANCE_STEP)
@@ -362,7 +358,7 @@ def _table() -> tuple[Single, int]:
     return np.stack(rows).astype(np.float32).ravel(), t.size
 
 
-def rim_profile(distance: Single, curvature: Single) -> Profile:
+def rim_profile(distance: Float32, curvature: Float32) -> Profile:
     """Profile at signed ``distance`` outside a rim of ``curvature``, both (N,) in units of blur.
 
     Bilinear in the table: good to 1e-4 of the contrast.

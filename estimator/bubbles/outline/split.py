@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     ELLIPSE_PARAMETERS,
     deepest_concavity,
@@ -26,8 +27,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
 )
 from telerig.estimator.bubbles.outline.outline_fit import Outlines
 from telerig.estimator.bubbles.outline.regions import Blob
-
-Array = NDArray[np.float64]
 
 _TURN_RAD = -0.1
 _POINT_SIGMA_PX = 0.2
@@ -240,8 +239,6 @@ def _add_roundness(information: Array, pull: Array, ellipse: Array, spread: Arra
     information[:, diagonal, diagonal] += 1e-6
 
 
-Mask = NDArray[np.bool_]
-
 _CLEAN_PX, _CLEAN_SHARE = 0.15, 0.012
 _FIT_PX, _FIT_SHARE = 0.3, 0.03
 _MIN_ARC_RAD = 1.0
@@ -434,7 +431,7 @@ def _covered(ellipses: Array, contour: Array) -> float:
     return float(np.mean(np.any(gap < 0.7, axis=0)))
 
 
-def implausible_outlines(outlines: Outlines) -> Mask:
+def implausible_outlines(outlines: Outlines) -> Bools:
     """Outlines (B,) that miss the rim, or have a neck: no single bubble has such an outline.
 
     The slighter the neck, the worse the outline's harmonics must describe the rim. Outlines that
@@ -448,7 +445,7 @@ def implausible_outlines(outlines: Outlines) -> Mask:
     return np.asarray(neck | (outlines.misfit_px > _MISFIT_PX + _MISFIT_SHARE * radius))
 
 
-def implausible_parts(outlines: Outlines, parts: list[Part]) -> Mask:
+def implausible_parts(outlines: Outlines, parts: list[Part]) -> Bools:
     """Implausible outlines, and parts of a blob whose fit ended far from its start: then the
     split was wrong."""
     began = np.stack([part.ellipse for part in parts])

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.estimator.bubbles.outline.detection_table import (
     AXES_COLUMNS,
@@ -28,8 +28,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
-
-Array = NDArray[np.float64]
 
 NO_SIZE_FLAGS = ("border", "merged")
 _SCATTER_FACTOR = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
@@ -215,7 +213,7 @@ def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
     return np.asarray(np.linalg.inv(by_point[..., :2]))
 
 
-def _trust(table: pd.DataFrame) -> tuple[NDArray[np.bool_], Array, Array]:
+def _trust(table: pd.DataFrame) -> tuple[Bools, Array, Array]:
     """(N,) each, from the flags of the detections.
 
     Whether the size is known, the factor on the standard deviation of the place, and the relative

@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.geometry import (
     PairGeometry,
@@ -33,8 +33,6 @@ from telerig.estimator.bubbles.pairing.matching import (
     marginals,
 )
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
 
 MOST_FRAMES = 60
 MOST_BIAS_PX = 20.0

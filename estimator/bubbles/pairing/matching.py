@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.bubbles.pairing.geometry import (
     PairGeometry,
     pair_geometry,
@@ -29,7 +30,6 @@ from telerig.estimator.bubbles.pairing.geometry import (
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 NEGLIGIBLE = -9.0
@@ -39,7 +39,7 @@ _EXACT_SIDE = 11
 _PASSES = 500
 
 
-def best_assignment(log_odds: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def best_assignment(log_odds: Array) -> tuple[Ints, Ints]:
     """Rows and columns of the assignment of highest probability; what is left out is not named."""
     from scipy.optimize import linear_sum_assignment
 
@@ -72,7 +72,7 @@ def marginals(log_odds: Array) -> Array:
     return out
 
 
-def _components(possible: NDArray[np.bool_]) -> Iterator[tuple[Index, Index]]:
+def _components(possible: Bools) -> Iterator[tuple[Index, Index]]:
     """Rows and columns that are connected by possible pairs.
 
     The smallest row's number spreads over each component; on such small graphs this takes a tenth
@@ -90,7 +90,7 @@ def _components(possible: NDArray[np.bool_]) -> Iterator[tuple[Index, Index]]:
 
 
 @lru_cache(maxsize=16)
-def _without(columns: int) -> tuple[NDArray[np.int64], ...]:
+def _without(columns: int) -> tuple[Ints, ...]:
     """For each column the subsets that do not hold it."""
     subsets = np.arange(1 << columns)
     return tuple(subsets[(subsets >> j) & 1 == 0] for j in range(columns))
@@ -286,7 +286,7 @@ class Prediction:
     ids : (K,); points_mm : (K, 3); covariance_mm2 : (K, 3, 3); d_eq_mm : (K,).
     """
 
-    ids: NDArray[np.int64]
+    ids: Ints
     points_mm: Array
     covariance_mm2: Array
     d_eq_mm: Array
@@ -304,13 +304,13 @@ class Matches:
     frame_shift_px : the shift common to this frame's gaps.
     """
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    first: Ints
+    second: Ints
     confidence: Array
     gap_px: Array
     gap_sigma: Array
     height_ratio: Array
-    ambiguous: NDArray[np.bool_]
+    ambiguous: Bools
     frame_shift_px: float = 0.0
 
     def __len__(self) -> int:

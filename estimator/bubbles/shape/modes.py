@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.rig import silhouette
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

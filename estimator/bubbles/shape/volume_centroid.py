@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.estimator.bubbles.outline.detection_table import (
     AXES_COLUMNS,
@@ -29,9 +30,6 @@ from telerig.rig import silhouette
 from telerig.rig.camera import Camera
 from telerig.rig.silhouette import EllipsePair
 from telerig.rig.triangulation import stacked_jacobian, triangulate
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SAMPLES = 32
 _LEAST_PX2 = 1e-12
@@ -56,11 +54,11 @@ class Outlines:
     axes_px: Array
     trace: Array
     trace_covariance: Array
-    located: Mask
-    shaped: Mask
-    whole: Mask
+    located: Bools
+    shaped: Bools
+    whole: Bools
 
-    def rows(self, keep: Mask) -> Outlines:
+    def rows(self, keep: Bools) -> Outlines:
         """Some of the rows."""
         return Outlines(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
@@ -266,7 +264,7 @@ def _fill_points(
     bodies: Bodies,
     outlines: tuple[Outlines, Outlines],
     cameras: tuple[Camera, Camera],
-    rows: NDArray[np.bool_],
+    rows: Bools,
 ) -> None:
     """The outlines' centres triangulated."""
     pair = [o.rows(rows) for o in outlines]
@@ -285,8 +283,8 @@ def _inside_both(
     points_mm: Array,
     outlines: tuple[Outlines, Outlines],
     cameras: tuple[Camera, Camera],
-    rows: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
+    rows: Bools,
+) -> Bools:
     """(M,) whether the triangulated point appears inside both outlines, as of one body."""
     pixels, _, _ = stacked_jacobian(cameras, points_mm)
     pair = [o.rows(rows) for o in outlines]
@@ -299,7 +297,7 @@ def _fill_shapes(
     bodies: Bodies,
     pair: tuple[Outlines, Outlines],
     cameras: tuple[Camera, Camera],
-    rows: NDArray[np.int64],
+    rows: Ints,
     sigma: Array,
     gap_sigma_px: float,
     *,
@@ -326,7 +324,7 @@ def _correct(
     shapes: _Ellipsoids,
     pixels: Array,
     jacobian: Array,
-    rows: NDArray[np.int64],
+    rows: Ints,
     sigma: Array,
     gap_sigma_px: float,
 ) -> None:

@@ -9,10 +9,10 @@ of M are the semi-axes. The point spread (Gaussian blur and square pixel) is a G
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-Array = NDArray[np.float64]
+from telerig.arrays import Array
 
 PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 _FOURTH = -1.0 / 120.0 / 24.0

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.dots.fit.blurred_ellipse import (
     approximate_distance_px,
     axes_from_shape,
@@ -21,8 +22,6 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
 )
 from telerig.estimator.dots.fit.luminance import PARAMETERS, DotFit, Reason
 
-Array = NDArray[np.float64]
-Grey = NDArray[np.float32]
 Polarity = Literal["white_on_black", "black_on_white"]
 
 _BLOCK = 4
@@ -81,13 +80,13 @@ class Candidates:
 class EdgeMap:
     """The smoothed image, its threshold surface, and where the image is flat (no edge near)."""
 
-    smooth: Grey
-    threshold: Grey
-    flat: NDArray[np.bool_]
+    smooth: Float32
+    threshold: Float32
+    flat: Bools
     has_edges: bool
 
 
-def edge_map(image: Grey, sigma: float) -> EdgeMap:
+def edge_map(image: Float32, sigma: float) -> EdgeMap:
     """Threshold surface of ``image`` (rows, columns) whose noise is about ``sigma`` grey levels."""
     import cv2
 
@@ -112,7 +111,7 @@ def edge_map(image: Grey, sigma: float) -> EdgeMap:
     return EdgeMap(smooth, threshold, flat, bool(np.any(strong)))
 
 
-def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _away_from(bright: Bools) -> Bools:
     """Pixels far from any crossing of the threshold: the greatest distance that leaves enough.
 
     They are chosen by place alone: choosing quiet pixels would bias the noise measured in them.
@@ -122,7 +121,7 @@ def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
     grey = bright.astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
-    flat: NDArray[np.bool_] = crossing == 0
+    flat: Bools = crossing == 0
     for distance in _FLAT_DISTANCES_PX:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * distance + 1, 2 * distance + 1))
         flat = np.asarray(cv2.dilate(crossing, disc) == 0)
@@ -132,7 +131,7 @@ def _away_from(bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return flat
 
 
-def _spread(values: Grey, weight: Grey) -> Grey:
+def _spread(values: Float32, weight: Float32) -> Float32:
     """Values weighted and interpolated to where there is no weight, from coarser scales."""
     import cv2
 
@@ -151,7 +150,7 @@ def _spread(values: Grey, weight: Grey) -> Grey:
     coarse = _spread(coarse_product / np.maximum(coarse_mass, 1e-30), coarse_mass)
     filled = cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_LINEAR)
     share = mass / (mass + 1e-3)
-    spread: Grey = share * local + (1.0 - share) * filled
+    spread: Float32 = share * local + (1.0 - share) * filled
     return spread
 
 
@@ -161,7 +160,7 @@ def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) 
     labels = np.zeros(edges.smooth.shape, np.int32)
     if not edges.has_edges:
         return Candidates(polarity, (), labels)
-    above: Grey = (edges.smooth - edges.threshold) * np.float32(sign)
+    above: Float32 = (edges.smooth - edges.threshold) * np.float32(sign)
     shown = [
         (outline, _first_look(outline, holes, labels.shape, min_diameter_px))
         for outline, holes in _outlines(above > 0)
@@ -179,7 +178,7 @@ def find_candidates(edges: EdgeMap, polarity: Polarity, min_diameter_px: float) 
 _Look = tuple[NDArray[np.int32], Candidate | None]
 
 
-def _with_pieces(shown: list[_Look], above: Grey, min_diameter_px: float) -> list[_Look]:
+def _with_pieces(shown: list[_Look], above: Float32, min_diameter_px: float) -> list[_Look]:
     """The outlines, where those of merged small dots are replaced by their pieces (`_pieces`)."""
     good = [look.area_px2 for _, look in shown if look is not None and not look.reason]
     large = _LARGE_PIECE * float(np.median(good)) if good else 0.0
@@ -211,7 +210,7 @@ def fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) 
 
 
 def _outlines(
-    inside: NDArray[np.bool_],
+    inside: Bools,
 ) -> list[tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]]:
     """Outer outline (N, 2) of each connected region, with the outlines of its holes."""
     import cv2
@@ -227,7 +226,7 @@ def _outlines(
     return [(outlines[k], tuple(holes.get(int(k), ()))) for k in np.flatnonzero(parents < 0)]
 
 
-def _pieces(above: Grey, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
+def _pieces(above: Float32, outline: NDArray[np.int32]) -> list[NDArray[np.int32]]:
     """Outlines of small dots whose blurs overlap, separated by a higher threshold.
 
     Only blobs that are nowhere thicker than the blur are separated: larger dots that touch in the
@@ -349,7 +348,7 @@ def is_ring(blob: Candidate) -> bool:
     return holes > _MIN_HOLE_SHARE * blob.area_px2
 
 
-def saturation_level(grey: Grey) -> float:
+def saturation_level(grey: Float32) -> float:
     """Grey level at which the sensor saturates: the top level if unusually many pixels have it,
     else infinity."""
     top = float(grey.max())
@@ -360,7 +359,7 @@ def saturation_level(grey: Grey) -> float:
 
 
 def _one_sided_saturation(
-    grey: Grey, centre: Array, shape: Array, margin: float, level: float
+    grey: Float32, centre: Array, shape: Array, margin: float, level: float
 ) -> float:
     """Length of the mean direction towards saturated pixels; 0 where they are all round."""
     if not np.isfinite(level):
@@ -378,7 +377,7 @@ def _one_sided_saturation(
 
 
 def reason_against_blob(
-    blob: Candidate, grey: Grey, reference_px: float, saturation: float
+    blob: Candidate, grey: Float32, reference_px: float, saturation: float
 ) -> Reason | None:
     """Reason to leave a blob out before any fit; None for a blob that may be a dot."""
     if blob.reason == Reason.TOUCHES_BORDER:
@@ -392,7 +391,7 @@ def reason_against_blob(
 
 
 def reason_against_fit(
-    fit: DotFit, grey: Grey, polarity: Polarity, usual_contrast: float, saturation: float
+    fit: DotFit, grey: Float32, polarity: Polarity, usual_contrast: float, saturation: float
 ) -> Reason | None:
     """Reason to leave a fitted dot out; None for a good one."""
     if fit.pixels <= PARAMETERS:

@@ -23,6 +23,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.dots.fit.blurred_ellipse import (
     approximate_distance_px,
     coverage_near_edge,
@@ -31,9 +32,6 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     semi_axes,
 )
 from telerig.estimator.images.noise import NoiseModel
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 PARAMETERS = 10
 """Free parameters of a fit; the two of the contrast gradient are held by their prior."""
@@ -82,7 +80,7 @@ class Window:
     grey: Array
     first_u: int
     first_v: int
-    mask: Mask
+    mask: Bools
 
 
 @dataclass(frozen=True)
@@ -162,8 +160,6 @@ class DotFit:
         return np.array([1.0, x, y])
 
 
-Ints = NDArray[np.int64]
-
 _FEW_PIXELS = 1e-9
 """Weight of grey level 0 against one pixel, so that too few pixels still have a solution."""
 EDGE_EXPANSION_LIMIT = 0.25
@@ -183,9 +179,9 @@ class Pixels:
     x: Array
     y: Array
     grey: Array
-    there: Mask
+    there: Bools
     counts: Ints
-    grids: tuple[tuple[Array, Array, Mask], ...]
+    grids: tuple[tuple[Array, Array, Bools], ...]
     origin: Array
     radius: Array
     noise: NoiseModel
@@ -302,13 +298,13 @@ _PIXELS_AT_ONCE = 8_000
 """Pixels of one chunk of dots, so that the arrays stay in a core's cache."""
 
 
-def _admissible(theta: Array, radius: Array) -> Mask:
+def _admissible(theta: Array, radius: Array) -> Bools:
     """(D,) whether theta is near the start of the fit: no fit may run away over the image."""
     a, b = semi_axes(theta[:, 2:5])
     sigma = theta[:, 5]
     near = np.max(np.abs(theta[:, :2]), axis=1) < radius + 2.0
     size = (a < 2.0 * radius + 3.0) & (b > _MIN_SEMI_AXIS_PX)
-    found: Mask = near & size & (sigma >= _MIN_SIGMA_PX) & (sigma <= 1.5 * a + 1.0)
+    found: Bools = near & size & (sigma >= _MIN_SIGMA_PX) & (sigma <= 1.5 * a + 1.0)
     return found
 
 
@@ -324,7 +320,7 @@ class _State:
     weight: Array
     chi2: Array
 
-    def take(self, dots: Ints, other: _State, rows: Mask) -> None:
+    def take(self, dots: Ints, other: _State, rows: Bools) -> None:
         """Replace the state of some dots by rows of another state."""
         for name, array in vars(self).items():
             array[dots] = getattr(other, name)[rows]
@@ -405,7 +401,7 @@ def _descend(
 
 
 def _try(
-    pixels: Pixels, state: _State, dots: Ints, moved: Array, sound: Mask, damping: Array
+    pixels: Pixels, state: _State, dots: Ints, moved: Array, sound: Bools, damping: Array
 ) -> None:
     """Take the steps that reduce chi-square; increase the damping of the others."""
     tried = dots[sound]
@@ -472,7 +468,7 @@ def _first(pixels: Pixels, starts: Sequence[Start]) -> tuple[Array, Array]:
 
 def _fit(
     pixels: Pixels, state: _State, iterations: int, tolerance: float, outlier_rounds: int
-) -> Mask:
+) -> Bools:
     """Bring the state to its minimum; returns (D,) which dots converged."""
     converged = np.zeros(len(pixels.x), dtype=np.bool_)
     dots: Ints = np.arange(len(pixels.x))
@@ -497,7 +493,7 @@ def _fit(
     return converged & (pixels.counts > PARAMETERS)
 
 
-def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> Mask:
+def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> Bools:
     """(N, P) which pixels of some dots are outliers."""
     whitened = np.abs(residual[dots]) / np.sqrt(variance[dots])
     limit = np.empty((len(dots), 1))
@@ -505,7 +501,7 @@ def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> M
         places = [count // 2, int(0.95 * (count - 1))]
         middle, high = np.partition(whitened[k, :count], places)[places]
         limit[k] = _OUTLIER_SIGMA * max(1.0, 1.4826 * middle, 0.51 * high)
-    bad: Mask = (whitened > limit) & pixels.there[dots]
+    bad: Bools = (whitened > limit) & pixels.there[dots]
     return bad
 
 
@@ -519,7 +515,7 @@ def _inverses(information: Array) -> Array:
     return covariance
 
 
-def _results(pixels: Pixels, state: _State, converged: Mask) -> list[DotFit]:
+def _results(pixels: Pixels, state: _State, converged: Bools) -> list[DotFit]:
     information, _ = _normal_equations(pixels, state, np.arange(len(pixels.x)))
     covariance = _inverses(information)
     used = state.weight > 0.0
@@ -556,7 +552,7 @@ def _results(pixels: Pixels, state: _State, converged: Mask) -> list[DotFit]:
     ]
 
 
-def _mean_where(values: Array, where: Mask, otherwise: float) -> Array:
+def _mean_where(values: Array, where: Bools, otherwise: float) -> Array:
     """(D,) means over the chosen pixels of (D, P); ``otherwise`` where none is chosen."""
     count = np.count_nonzero(where, axis=1)
     total = np.sum(np.where(where, values, 0.0), axis=1)

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.dots.fit.blurred_ellipse import (
     approximate_distance_px,
     coverage_on_grid,
@@ -21,9 +22,6 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
 from telerig.estimator.dots.fit.candidates import Candidate, fill
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 CLEAR_SIGMA = 3.5
 _MAX_MARGIN_PX = 12.0
 _THIN_ABOVE_PIXELS, _COARSE_ABOVE_PIXELS = 3000, 800
@@ -31,7 +29,7 @@ _EDGE_SIGMA = 2.7
 
 
 def dot_window(
-    grey: NDArray[np.float32],
+    grey: Float32,
     labels: NDArray[np.int32],
     blob: Candidate,
     start: Start,
@@ -58,7 +56,7 @@ def dot_window(
     du = np.arange(low[0], high[0]) - start.centre_px[0]
     dv = np.arange(low[1], high[1]) - start.centre_px[1]
     distance = approximate_distance_px(start.shape_px, du[None, :], dv[:, None])
-    mask: Mask = (distance < outer) & (distance > -max(8.0, reach))
+    mask: Bools = (distance < outer) & (distance > -max(8.0, reach))
     clear = CLEAR_SIGMA * start.sigma_px
     around = (low, high, int(np.ceil(max(clear, outer))) + 1)
     gap = _distance_to_others(labels, (blob.label,), *around)
@@ -81,7 +79,7 @@ def dot_window(
     return Window(grey[crop].astype(np.float64), int(low[0]), int(low[1]), mask)
 
 
-def _distance_to(marked: Mask) -> Array:
+def _distance_to(marked: Bools) -> Array:
     import cv2
 
     distance: Array = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, 5) - 0.5

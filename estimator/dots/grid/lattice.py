@@ -12,13 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import DetectionError
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 NEIGHBOURS: Ints = np.array(
     [(i, j) for i in range(-2, 3) for j in range(-2, 3) if (i, j) != (0, 0)], np.int64
@@ -251,7 +249,7 @@ class _Growth:
         self.basis[seed] = basis
         self._put(np.array([seed]), np.array([[self.half, self.half]]))
 
-    def placed(self) -> NDArray[np.bool_]:
+    def placed(self) -> Bools:
         return np.asarray(self.place[:, 0] >= 0)
 
     def score(self, pitch_ratio: float) -> float:

@@ -15,16 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.grid.lattice import MIN_DOTS, Lattice, grow_lattice, shape_matrix
 from telerig.estimator.dots.grid.point_layout import match_points
 from telerig.rig.target import QUARTER_TURNS, Target
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 LOG_MISSED_MARK = -4.0
 """A mark that is seen as a plain dot."""
@@ -427,7 +423,7 @@ def _ids(columns_rows: Ints, target: Target) -> Ints:
     return np.where(there, ids, -1)
 
 
-def _check_fits(lattice: Lattice, on_target: NDArray[np.bool_], target: Target) -> None:
+def _check_fits(lattice: Lattice, on_target: Bools, target: Target) -> None:
     size = lattice.places.max(0) + 1
     if on_target.sum() < max(MIN_DOTS, 0.75 * len(on_target)):
         raise DetectionError(

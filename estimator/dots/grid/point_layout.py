@@ -12,9 +12,10 @@ from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from telerig.arrays import Array, Ints
 from telerig.errors import DetectionError
 from telerig.estimator.dots.grid.lattice import (
     MIN_DOTS,
@@ -23,9 +24,6 @@ from telerig.estimator.dots.grid.lattice import (
     fit_affine,
     fit_homography,
 )
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _NEAR = 5
 _TRIANGLES = 240

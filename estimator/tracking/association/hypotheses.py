@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.tracking.association.likelihoods import (
     Pairs,
     alternatives,
@@ -28,7 +28,7 @@ from telerig.estimator.tracking.association.likelihoods import (
 )
 from telerig.estimator.tracking.filter.motion import POSITION
 from telerig.estimator.tracking.filter.state import Common, Track
-from telerig.estimator.tracking.filter.types import FrameMeasurements, Ids, TrackerSettings
+from telerig.estimator.tracking.filter.types import FrameMeasurements, TrackerSettings
 
 _MERGE_FRAMES = 2
 
@@ -216,8 +216,6 @@ def _agreed_links_from(paths: list[list[list[tuple[int, int]]]]) -> int:
     return start
 
 
-Array = NDArray[np.float64]
-
 _SLACK_NATS = 6.0
 
 
@@ -228,7 +226,7 @@ class Scan:
     frame: int
     t_s: float
     measured: FrameMeasurements
-    columns: Ids
+    columns: Ints
     settings: TrackerSettings
 
 
@@ -268,7 +266,7 @@ class Association:
         gains = [a @ b for a, b in zip(p, self.pairs.information[self.picked])]
         return np.mean([*others, *gains], axis=0) if others or gains else None
 
-    def _allowed(self) -> Ids:
+    def _allowed(self) -> Ints:
         """Pairings inside their gate, the common shift estimated from the other clusters alone."""
         pairs, owner = self.pairs, self.owner
         information = np.zeros((len(self.clusters), 3, 3))

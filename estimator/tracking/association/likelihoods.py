@@ -12,17 +12,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.special import chdtri
 
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.tracking.filter.motion import POSITION
 from telerig.estimator.tracking.filter.state import Common, Track
-from telerig.estimator.tracking.filter.types import FrameMeasurements, Ids, TrackerSettings
+from telerig.estimator.tracking.filter.types import FrameMeasurements, TrackerSettings
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
-
-Array = NDArray[np.float64]
 
 _LOG_2PI = float(np.log(2 * np.pi))
 _SIZE_SPAN_MM = 5.0
@@ -38,8 +37,8 @@ class Pairs:
     measurement; information : its inverse; constant : (E,) the score without the distance.
     """
 
-    row: Ids
-    column: Ids
+    row: Ints
+    column: Ints
     innovation_mm: Array
     covariance_mm2: Array
     information: Array
@@ -66,7 +65,7 @@ def gate2(settings: TrackerSettings, dimensions: int = 3) -> float:
 def gated_pairs(
     tracks: Sequence[Track],
     measured: FrameMeasurements,
-    columns: Ids,
+    columns: Ints,
     common: Common,
     settings: TrackerSettings,
 ) -> Pairs:
@@ -99,7 +98,7 @@ def gated_pairs(
     return Pairs(row, column, innovation, covariance, np.linalg.inv(covariance), constant)
 
 
-def _alive_score(misses: Ids, settings: TrackerSettings) -> Array:
+def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
     """(K,) log probability that a track not seen for so many frames is only missed, not gone."""
     missed = (1 - settings.detection_probability) * settings.missed_again_probability ** (
         np.maximum(misses, 1) - 1.0
@@ -115,7 +114,7 @@ def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings
     return np.where(np.isfinite(score), score, 0.0)
 
 
-def best_assignment(rows: int, row: Ids, column: Ids, score: Array) -> Ids:
+def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
     """(rows,) column of each row, -1 for none, with the largest total score."""
     out = np.full(rows, -1)
     if not len(row):
@@ -129,8 +128,8 @@ def best_assignment(rows: int, row: Ids, column: Ids, score: Array) -> Ids:
 
 
 def assigned_with_shift(
-    pairs: Pairs, rows: int, best_rows: NDArray[np.bool_], common: Common
-) -> tuple[Common, Ids]:
+    pairs: Pairs, rows: int, best_rows: Bools, common: Common
+) -> tuple[Common, Ints]:
     """The common shift and the assignment (rows,), estimated by turns.
 
     best_rows : (rows,) which tracks take part.
@@ -154,7 +153,7 @@ def assigned_with_shift(
     return now, chosen
 
 
-def unrivalled(row: Ids, column: Ids, score: Array, chosen: Ids, margin_nats: float) -> Ids:
+def unrivalled(row: Ints, column: Ints, score: Array, chosen: Ints, margin_nats: float) -> Ints:
     """(K,) chosen, and no other pairing of its track or its measurement is within the margin."""
     out = chosen >= 0
     for r in np.flatnonzero(out):
@@ -165,7 +164,7 @@ def unrivalled(row: Ids, column: Ids, score: Array, chosen: Ids, margin_nats: fl
     return np.asarray(out)
 
 
-def joint_score(pairs: Pairs, edges: Ids, common: Common) -> float:
+def joint_score(pairs: Pairs, edges: Ints, common: Common) -> float:
     """Log-likelihood ratio of some pairings together, the common shift integrated out."""
     if not len(edges):
         return 0.0

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 
-Ids = Ints
-
 NO_PARTICLE = -1
 
 
@@ -102,7 +100,7 @@ class SingleMeasurements:
     camera : (L,) index; uv_px : (L, 2); covariance_px2 : (L, 2, 2).
     """
 
-    camera: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     uv_px: Array = field(default_factory=lambda: np.zeros((0, 2)))
     covariance_px2: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
@@ -122,7 +120,7 @@ class FrameMeasurements:
     covariance_mm2: Array
     d_eq_mm: Array
     confidence: Array
-    particle: Ids
+    particle: Ints
     singles: SingleMeasurements
 
     @staticmethod
@@ -181,8 +179,8 @@ class FrameIds:
     """Final: particle : (M,) and single : (L,) ids of a frame's measurements, -1 for none."""
 
     frame: int
-    particle: Ids
-    single: Ids
+    particle: Ints
+    single: Ints
 
 
 @dataclass(frozen=True)
@@ -222,8 +220,8 @@ class FrameResult:
     """
 
     frame: int
-    particle: Ids
-    single: Ids
+    particle: Ints
+    single: Ints
     events: tuple[TrackEvent, ...]
     settled: tuple[FrameIds, ...]
     alone: Mapping[int, SeenAlone] = field(default_factory=dict)

@@ -39,7 +39,7 @@ OFTEN = 0.4
 
 _STILL, _GONE, _RING_SHARE = 0.9, 0.3, 0.7
 _CHANGES = 0.25
-_LEAST_SEEN, _FEW = 5, 10
+_KNOWN_STILL, _FEW = 5, 10
 
 
 def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Array) -> Bools:
@@ -60,7 +60,7 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
     places = _lab_places(shifts_px, dark.shape)
     if places:
         share, seen = _share_in_lab(dark, places)
-        still = _still(share, seen >= min(_LEAST_SEEN, len(dark)), 3)
+        still = _still(share, seen >= min(_KNOWN_STILL, len(dark)), 3)
         keep &= ~np.stack([still[place] for place in places])
     grow = np.ones((5, 5), np.uint8)
     grown = np.stack([cv2.dilate(mask.astype(np.uint8), grow) for mask in keep])

@@ -146,7 +146,7 @@ class Linker:
         table[COVARIANCE_MM2] = bodies.covariance_mm2[:, *np.triu_indices(3)]
         shape = _shape_share_px2(self.cameras, bodies)
         for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
-            values = rows[CENTRE_PX].to_numpy(float)
+            values = rows[CENTRE_PX].to_numpy(float, copy=True)
             values[:, 2:] += shape[:, c][:, *np.triu_indices(2)]
             table[[f"{camera.name}_{name}" for name in CENTRE_PX]] = values
             table[f"{camera.name}_du_px"] = bodies.du_px[:, c]

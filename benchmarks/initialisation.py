@@ -104,7 +104,7 @@ def random_config(rng: np.random.Generator, two_sided: bool) -> SimulationConfig
 def judge(scene: Scene) -> tuple[str, str]:
     """(cause, detail) of a failure; empty strings for a good start."""
     problem = with_plate(scene.problem())
-    nominal = np.array(scene.nominal_rotvec_deg)
+    nominal = {1: np.array(scene.nominal_rotvec_deg)}
     truth = scene.true_state(problem)
     try:
         start = best_start(problem, problem.nominal_mm)

@@ -20,17 +20,17 @@ from telerig.estimator.calibration.solver.robust import (
     pixel_residuals,
     squared_distance,
 )
-from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice
+from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
 from telerig.factors.projection import State
 from telerig.rig.lens_models import joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.projection import INDEX
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import triangulate, triangulate_views
 
 Array = NDArray[np.float64]
 
 GAUGE = (
-    "rig frame = first camera's frame, its origin where the two optical axes come closest; image "
+    "rig frame = first camera's frame, its origin where the {two} optical axes come closest; image "
     "centres held at the middle of the image unless the model frees them; target frame tied to "
     "the nominal dot positions by the dots' priors"
 )
@@ -73,7 +73,7 @@ def calibration_from_fit(
     free: tuple[tuple[str, ...], ...],
     weak: list[str],
     *,
-    nominal_rotvec_deg: Array | None,
+    nominal_rotvec_deg: Nominal,
     name: str,
 ) -> Calibration:
     """Assemble the public result.
@@ -102,7 +102,7 @@ def calibration_from_fit(
         twin=_mirror(fit, nominal_rotvec_deg),
         model=_model(fit),
         diagnostics={
-            "gauge": GAUGE,
+            "gauge": GAUGE.format(two="two" if len(cameras) <= 2 else "first two"),
             "weak": weak,
             "tilts_deg": {
                 f"{problem.views[v]}/{problem.cameras[c].name}": t
@@ -206,21 +206,12 @@ def _geometry(fit: Fit, joint: JointCovariance) -> dict[str, Any]:
     out = _target_shape(problem, state, joint)
     if len(problem.cameras) < 2:
         return out
-    turn = state.rig_from_camera[1, :3, :3].T
-    rotvec = rotvec_from_rotation(turn)
-    angle = float(np.arccos(np.clip(turn[2, 2], -1, 1)))
-    names, covariance = joint.rig_block()
-    second = problem.cameras[1].name
-    index = [names.index(f"{second}.{p}") for p in ("rx_rad", "ry_rad")]
-    # the first axis in second-camera coordinates; a turn about x, y of the second tips its axis
-    slope = np.array([-turn[1, 2], turn[0, 2]]) / max(np.sin(angle), 1e-12)
-    sd = float(np.sqrt(slope @ covariance[np.ix_(index, index)] @ slope))
-    out |= {
-        "inter_camera_rotvec_deg": np.degrees(rotvec).tolist(),
-        "axes_angle_deg": float(np.degrees(angle)),
-        "axes_angle_formal_sd_deg": float(np.degrees(sd)),
-        "axes_angle_sd_deg": float(np.degrees(np.hypot(sd, _angle_systematic(fit, angle)))),
-    }
+    out |= _from_first(fit, joint, 1)
+    if len(problem.cameras) > 2:
+        out["from_first"] = {
+            problem.cameras[c].name: _from_first(fit, joint, c)
+            for c in range(1, len(problem.cameras))
+        }
     kappas = state.intrinsics[:, INDEX["kappa_per_mm"]]
     if all(abs(k) > 1e-9 for k in kappas):
         centres = [
@@ -230,7 +221,27 @@ def _geometry(fit: Fit, joint: JointCovariance) -> dict[str, Any]:
     return out
 
 
-def _angle_systematic(fit: Fit, angle_rad: float) -> float:
+def _from_first(fit: Fit, joint: JointCovariance, camera: int) -> dict[str, Any]:
+    """Rotation of a camera against the first, and the angle between their axes."""
+    turn = fit.robust.solution.state.rig_from_camera[camera, :3, :3].T
+    rotvec = rotvec_from_rotation(turn)
+    angle = float(np.arccos(np.clip(turn[2, 2], -1, 1)))
+    names, covariance = joint.rig_block()
+    name = fit.robust.problem.cameras[camera].name
+    index = [names.index(f"{name}.{p}") for p in ("rx_rad", "ry_rad")]
+    # the first axis in this camera's coordinates; a turn about its x, y tips its axis
+    slope = np.array([-turn[1, 2], turn[0, 2]]) / max(np.sin(angle), 1e-12)
+    sd = float(np.sqrt(slope @ covariance[np.ix_(index, index)] @ slope))
+    systematic = _angle_systematic(fit, angle, camera)
+    return {
+        "inter_camera_rotvec_deg": np.degrees(rotvec).tolist(),
+        "axes_angle_deg": float(np.degrees(angle)),
+        "axes_angle_formal_sd_deg": float(np.degrees(sd)),
+        "axes_angle_sd_deg": float(np.degrees(np.hypot(sd, systematic))),
+    }
+
+
+def _angle_systematic(fit: Fit, angle_rad: float, camera: int) -> float:
     """How far the angle moves when the image centres are held at the middle of the image.
 
     With strong perspective the angle trades with the centres; the centres come from the
@@ -238,7 +249,7 @@ def _angle_systematic(fit: Fit, angle_rad: float) -> float:
     """
     if fit.centre_held is None:
         return 0.0
-    return float(angle_rad - np.arccos(fit.centre_held[1, 2, 2]))
+    return float(angle_rad - np.arccos(fit.centre_held[camera, 2, 2]))
 
 
 def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dict[str, Any]:
@@ -267,14 +278,16 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
     """
     if len(problem.cameras) < 2:
         return {}
-    pixels, truth = _paired(problem, state)
+    pixels, truth = _seen_in_space(problem, state)
     if len(truth) == 0:
         return {}
-    pair = (calibration.cameras[0], calibration.cameras[1])
-    sigma = calibration.statistics["scatter_px"]
-    found = triangulate(pair, (pixels[:, 0], pixels[:, 1]), sigma)
+    cameras, sigma = calibration.cameras, calibration.statistics["scatter_px"]
+    if len(cameras) == 2:
+        found = triangulate((cameras[0], cameras[1]), (pixels[0], pixels[1]), sigma)
+    else:
+        found = triangulate_views(cameras, list(pixels), sigma)
     some = found.points_mm[:: max(1, len(truth) // 200)]
-    shared = aligned_covariance(pair, calibration.free, calibration.covariance, some)
+    shared = aligned_covariance(cameras, calibration.free, calibration.covariance, some)
     measurement = np.trace(found.covariance_mm2, axis1=-2, axis2=-1).mean() / 3
     from_calibration = np.trace(shared) / len(shared)
     error = found.points_mm - truth
@@ -283,21 +296,24 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
         "space_sd_um": float(1e3 * np.sqrt(measurement + from_calibration)),
         "space_sd_measurement_um": float(1e3 * np.sqrt(measurement)),
         "space_sd_calibration_um": float(1e3 * np.sqrt(from_calibration)),
-        "ray_miss_rms_um": float(1e3 * np.sqrt((found.ray_miss_mm**2).mean())),
+        "ray_miss_rms_um": float(1e3 * np.sqrt(np.nanmean(found.ray_miss_mm**2))),
     }
 
 
-def _paired(problem: Problem, state: State) -> tuple[Array, Array]:
-    """(K, 2, 2) pixels of dots kept in both cameras of a view, (K, 3) their fitted places."""
+def _seen_in_space(problem: Problem, state: State) -> tuple[Array, Array]:
+    """(C, K, 2) pixels of dots kept in two cameras of a view or more, NaN elsewhere, and the dots'
+    (K, 3) fitted places.
+    """
     key = problem.view * len(problem.dot_ids) + problem.dot
     kept = problem.weight > 0.5
-    first, second = (np.flatnonzero(kept & (problem.camera == c)) for c in (0, 1))
-    _, i, j = np.intersect1d(key[first], key[second], return_indices=True)
-    first, second = first[i], second[j]
-    poses = state.rig_from_target[problem.view[first]]
-    dots = state.dots_mm[problem.dot[first]]
-    points = np.einsum("kij,kj->ki", poses[:, :3, :3], dots) + poses[:, :3, 3]
-    return np.stack([problem.uv_px[first], problem.uv_px[second]], 1), points
+    found, row = np.unique(key[kept], return_inverse=True)
+    pixels = np.full((len(problem.cameras), len(found), 2), np.nan)
+    pixels[problem.camera[kept], row] = problem.uv_px[kept]
+    several = np.isfinite(pixels[..., 0]).sum(0) > 1
+    view, dot = np.divmod(found[several], len(problem.dot_ids))
+    poses = state.rig_from_target[view]
+    points = np.einsum("kij,kj->ki", poses[:, :3, :3], state.dots_mm[dot]) + poses[:, :3, 3]
+    return pixels[:, several], points
 
 
 def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
@@ -340,14 +356,19 @@ def _kappa_hint(fit: Fit) -> str:
     )
 
 
-def _mirror(fit: Fit, nominal_rotvec_deg: Array | None) -> dict[str, Any]:
+def _mirror(fit: Fit, nominal_rotvec_deg: Nominal) -> dict[str, Any]:
+    """``nominal_rotvec_deg`` is one vector of a pair, and by camera of more."""
     assert fit.mirror is not None
+    cameras = fit.robust.problem.cameras
+    stated: Any = {cameras[c].name: list(rotvec) for c, rotvec in nominal_rotvec_deg.items()}
+    if len(cameras) <= 2:
+        stated = next(iter(stated.values()), None)
     return {
         "cost": fit.robust.solution.cost,
         "other_cost": fit.mirrored_cost,
         "decided_by": fit.mirror.decided_by,
         "words": fit.mirror.words,
-        "nominal_rotvec_deg": None if nominal_rotvec_deg is None else list(nominal_rotvec_deg),
+        "nominal_rotvec_deg": stated or None,
     }
 
 

@@ -41,6 +41,7 @@ from telerig.estimator.calibration.start import (
 from telerig.estimator.calibration.start.unknown_target import dots_from_images
 from telerig.estimator.calibration.views.next_view import next_view
 from telerig.factors.projection import State, whitened_error
+from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.rig.camera import Camera
 from telerig.rig.lens_models import (
     AUTO,
@@ -73,7 +74,9 @@ def self_calibrate(
     notes: Sequence[str] = (),
     name: str = "",
 ) -> Calibration:
-    """Calibrate one or two cameras from measured dots.
+    """Calibrate one to four cameras from measured dots.
+
+    Not every camera has to see every view: shared views must connect all cameras.
 
     dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
     cameras : nominal, the first defines the rig frame.
@@ -86,8 +89,9 @@ def self_calibrate(
 
     Raises CalibrationError when the views cannot determine a calibration, with the remedy.
     """
-    if len(cameras) not in (1, 2):
-        raise InputError(f"{len(cameras)} cameras", todo="a rig has one camera or two")
+    if not 1 <= len(cameras) <= MOST_CAMERAS:
+        todo = f"a rig has one to {MOST_CAMERAS} cameras"
+        raise InputError(f"{len(cameras)} cameras", todo=todo)
     models = models_by_camera(model, [c.name for c in cameras])
     if solver not in SOLVERS:
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
@@ -103,12 +107,13 @@ def self_calibrate(
         problem, words = symmetric_target.number_consistently(problem, nominal)
         found_notes += [checks.Note("symmetric target", w) for w in words]
         start_dots = problem.nominal_mm
-    problem = with_plate(problem)
-    start = best_start(problem, start_dots)
+    problem = with_plate(problem, nominal)
+    start = best_start(problem, start_dots, nominal)
     mirror = mirror_ambiguity.choose_start(start, problem, nominal)
     start = tilt_signs.with_tilt_signs(problem, mirror.state)
+    found_notes += checks.position_notes(problem, start)
     fit = _fit(problem, start, models, solver, progress)
-    if len(cameras) == 2 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
+    if len(cameras) > 1 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
         fit, mirror = _on_the_right_side(fit, nominal)
     final, solution = fit.robust.problem, fit.robust.solution
     considered = considered_parameters.considered_groups(fit.choice, len(cameras))
@@ -130,10 +135,20 @@ def self_calibrate(
 
 def _nominal(
     given: Mapping[str, Sequence[float]] | Sequence[float] | None, cameras: Sequence[Camera]
-) -> Array | None:
-    if isinstance(given, Mapping):
-        given = given.get(cameras[1].name) if len(cameras) > 1 else None
-    return None if given is None else np.asarray(given, float)
+) -> dict[int, Array]:
+    """Nominal rotation vectors (degrees) by the camera's index, of those that are given."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        return {1: np.asarray(given, float)} if len(cameras) > 1 else {}
+    names = [c.name for c in cameras]
+    unknown = sorted(set(given) - set(names[1:]))
+    if unknown:
+        raise InputError(
+            f"nominal rotations of {', '.join(unknown)}",
+            todo=f"the cameras beside the first are {', '.join(names[1:]) or 'none'}",
+        )
+    return {names.index(n): np.asarray(r, float) for n, r in given.items()}
 
 
 def _trust(
@@ -170,7 +185,7 @@ def hold_dots(problem: Problem, dots_free: str) -> Problem:
     return replace(problem, dot_sigma_mm=sigma)
 
 
-def with_plate(problem: Problem) -> Problem:
+def with_plate(problem: Problem, nominal: mirror_ambiguity.Nominal | None = None) -> Problem:
     """Where a two-sided plate is seen from behind, the side that fits the pixels better."""
     target = problem.target
     if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
@@ -181,13 +196,18 @@ def with_plate(problem: Problem) -> Problem:
     options = [replace(problem, plate_shift=np.where(hands == h, -hands, 0.0)) for h in (1, -1)]
     costs = []
     for option in options:
-        start = best_start(option, option.nominal_mm)
+        start = best_start(option, option.nominal_mm, nominal)
         costs.append(solve(option, start, max_iterations=20).cost)
     return options[int(np.argmin(costs))]
 
 
-def best_start(problem: Problem, dots_mm: Array) -> State:
-    """Of the closed-form starts, the one of least cost after a short solve."""
+def best_start(
+    problem: Problem, dots_mm: Array, nominal: mirror_ambiguity.Nominal | None = None
+) -> State:
+    """Of the closed-form starts, the one of least cost after a short solve.
+
+    nominal : decides between starts that fit alike (`mirror_ambiguity.consistent_start`).
+    """
     if len(problem.cameras) == 1:
         return known_target.mono_state(problem, dots_mm)
     starts = known_target.stereo_states(problem, dots_mm)
@@ -198,7 +218,8 @@ def best_start(problem: Problem, dots_mm: Array) -> State:
         perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)
         candidate = problem.with_model("kappa" if perspective else "none")
         fits.append(solve(candidate, start, max_iterations=15, relative=1e-4))
-    return min(fits, key=lambda f: f.cost).state
+    states, costs = [f.state for f in fits], [f.cost for f in fits]
+    return mirror_ambiguity.consistent_start(states, costs, problem, nominal or {})
 
 
 def _fit(
@@ -293,7 +314,7 @@ def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Arr
 
 
 def _on_the_right_side(
-    fit: Fit, nominal: Array | None
+    fit: Fit, nominal: mirror_ambiguity.Nominal
 ) -> tuple[Fit, mirror_ambiguity.MirrorChoice]:
     """The final fit may know the sign of kappa that the start did not."""
     problem, solution = fit.robust.problem, fit.robust.solution

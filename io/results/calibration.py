@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
@@ -104,13 +105,16 @@ class Covariance(Part):
 
 
 class Mirror(Part):
-    """Which of the two mirror-symmetric solutions was kept, and what decided."""
+    """Which of the two mirror-symmetric solutions was kept, and what decided.
+
+    nominal_rotvec_deg : of the second of two cameras, or by camera of more.
+    """
 
     cost: float | None = None
     other_cost: float | None = None
     decided_by: str = ""
     words: str = ""
-    nominal_rotvec_deg: Numbers | None = None
+    nominal_rotvec_deg: Numbers | Mapping[str, Numbers] | None = None
 
 
 class LadderStep(Part):

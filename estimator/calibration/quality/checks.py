@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
-from telerig.estimator.calibration.start.known_target import ImageMap, image_maps
+from telerig.estimator.calibration.start.known_target import ImageMap, image_maps, overlap_tree
 from telerig.estimator.dots.grid.numbering import check_handedness
+from telerig.factors.projection import State
 from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
@@ -20,6 +21,10 @@ RECOMMENDED_VIEWS = 6
 MINIMUM_DOTS = 4
 PARALLEL_DEG = 3.0
 SMALL_TILT_DEG = 10.0
+PERSPECTIVE = 0.01
+"""kappa * rho from which on a lens shows the depth of a view."""
+LOOSE = 0.03
+"""How much less the views fix an offset than the best fixed one, to call it undetermined."""
 CLEAR_MISFIT = 0.1
 """Misfit of an image's map, over the spread of its dots, up to which the map is believed."""
 
@@ -52,10 +57,13 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     opaque plate.
     """
     maps = image_maps(problem, dots_mm)
-    stereo = len(problem.cameras) == 2
-    shared = [v for v in range(len(problem.views)) if all((v, c) in maps for c in range(2))]
+    stereo = len(problem.cameras) > 1
+    views, cameras = range(len(problem.views)), range(len(problem.cameras))
+    shared = [v for v in views if sum((v, c) in maps for c in cameras) > 1]
     usable = shared if stereo else sorted({v for v, _ in maps})
     _refuse_too_few(problem, usable, stereo=stereo, unknown_dots=unknown_dots)
+    if stereo:
+        _refuse_thin_links(problem, set(maps))
     mirrored = _mirrored_note(problem, maps)
     tilts = {k: _tilt_deg(m.jacobian) for k, m in maps.items()}
     _refuse_parallel(problem, maps, usable)
@@ -63,7 +71,7 @@ def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreChe
     if len(usable) < RECOMMENDED_VIEWS:
         words = (
             f"only {len(usable)} views can be used in "
-            f"{'both cameras' if stereo else 'the camera'}: {RECOMMENDED_VIEWS} or more are "
+            f"{_those(problem)}: {RECOMMENDED_VIEWS} or more are "
             "recommended. With fewer, lens distortion and the dots' own positions become "
             "uncertain first (see their standard deviations)"
         )
@@ -102,7 +110,7 @@ def _refuse_too_few(
     if len(usable) >= needed:
         return
     kind = "unknown" if unknown_dots else "known"
-    both = " in both cameras" if stereo else ""
+    both = f" in {_those(problem)}" if stereo else ""
     counts = {
         (problem.views[v], problem.cameras[c].name): int(np.sum(rows))
         for v in range(len(problem.views))
@@ -115,7 +123,67 @@ def _refuse_too_few(
         f"needs at least {needed}. Undetermined with fewer: {undetermined}."
         + (f" Too few dots in: {poor}." if poor else ""),
         todo=f"take at least {RECOMMENDED_VIEWS} views at different tilts, seen by "
-        + ("both cameras" if stereo else "the camera"),
+        + _those(problem),
+    )
+
+
+def _those(problem: Problem) -> str:
+    """The cameras that must see a view, in words."""
+    known = {1: "the camera", 2: "both cameras"}
+    return known.get(len(problem.cameras), "two cameras or more")
+
+
+def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
+    """Every camera must share two views with another one of those that lead to the first."""
+    for a, b in overlap_tree(problem, images):
+        count = sum({(v, a), (v, b)} <= images for v in range(len(problem.views)))
+        if count < 2:
+            names = [problem.cameras[c].name for c in (a, b)]
+            raise CalibrationError(
+                f"cameras {names[0]!r} and {names[1]!r} have {count} view in common, which leaves "
+                "the sign of the tilts open: two inter-camera rotations fit alike",
+                todo="add views at other tilts that both of them see",
+            )
+
+
+def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
+    """Cameras whose offset against the others no view fixes, though their rotation is known.
+
+    A telecentric camera sees no depth, so a view of two cameras fixes their offset along the
+    common perpendicular of their axes alone, and one of three cameras closes what is left. The
+    views' positions are eliminated from the linear equations of all offsets; see docs/theory.md.
+    """
+    count = len(problem.cameras)
+    kappa_rho = state.intrinsics[:, INDEX["kappa_per_mm"]] * np.array(problem.rho_mm)
+    if count < 3 or np.all(np.abs(kappa_rho) > PERSPECTIVE):
+        return ()
+    turns = np.swapaxes(state.rig_from_camera[:, :3, :3], -1, -2)
+    free = np.zeros((count, 2, 2 * count - 3))
+    free[1, :, 0] = np.array([-1, 1]) * turns[1][1::-1, 2]
+    for c in range(2, count):
+        free[c, :, 2 * c - 3 : 2 * c - 1] = np.eye(2)
+    normal = np.zeros((free.shape[-1],) * 2)
+    for v in range(len(problem.views)):
+        mine = (problem.view == v) & (problem.weight > 0)
+        seen = np.flatnonzero(np.bincount(problem.camera[mine], minlength=count) >= MINIMUM_DOTS)
+        if len(seen) > 1:
+            place, rows = np.concatenate(turns[seen, :2]), np.concatenate(free[seen])
+            left = rows - place @ np.linalg.lstsq(place, rows, rcond=1e-9)[0]
+            normal += left.T @ left
+    values, vectors = np.linalg.eigh(normal)
+    loose = vectors[:, values < LOOSE**2 * values[-1]]
+    size = np.linalg.norm(np.einsum("cij,jk->cik", free, loose), axis=1)
+    cameras = sorted({int(c) for c in size.argmax(0)}) if size.size else []
+    return tuple(
+        Note(
+            "offset",
+            f"camera {problem.cameras[c].name!r}: no view is seen by it and two other cameras at "
+            "once, so its offset across the common perpendiculars of the optical axes is not "
+            "determined, and points that it sees together with two others are wrong by it. Add a "
+            "view that three cameras see at once",
+            affects_verdict=True,
+        )
+        for c in cameras
     )
 
 

@@ -2,16 +2,19 @@
 
 Each image gives an affine (or local) map of the target plane, whose singular values are the scale
 and the cosine of the tilt, up to the sign of the tilt. The signs come from the one inter-camera
-rotation that fits all views; `mirror_ambiguity` decides between the two mirror solutions.
+rotation that fits all views, for each pair of cameras along a tree of cameras that share views;
+`mirror_ambiguity` decides between the two mirror solutions.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
 from telerig.factors.projection import State
@@ -134,37 +137,118 @@ def _refined(rotation: Array, plain: Array, crossed: Array) -> tuple[Array, floa
 
 
 def stereo_states(problem: Problem, dots_mm: Array, count: int = 2) -> list[State]:
-    """Starting states of a stereo problem, best first; which mirror solution each is, is open."""
+    """Starting states of two cameras or more, best first.
+
+    count : inter-camera rotations that are tried for each pair of cameras that share views. Which
+    of the two mirror solutions each state is, is open.
+    Raises CalibrationError where no chain of shared views connects all cameras.
+    """
     maps = image_maps(problem, dots_mm)
-    both = [v for v in range(len(problem.views)) if (v, 0) in maps and (v, 1) in maps]
     rotations = {k: rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
-    first = np.array([rotations[v, 0] for v in both])
-    second = np.array([rotations[v, 1] for v in both])
     states = []
-    for second_from_first in rotation_hypotheses(first, second, count):
-        chosen = _signs(rotations, second_from_first, problem)
-        states.append(_assemble(problem, dots_mm, maps, chosen, second_from_first))
+    for cameras in _camera_rotations(rotations, problem, count):
+        chosen, _ = _signs(rotations, cameras, problem)
+        states.append(_assemble(problem, dots_mm, maps, chosen, cameras))
     return states
 
 
-def _signs(
-    rotations: dict[tuple[int, int], Array], second_from_first: Array, problem: Problem
-) -> dict[int, Array]:
-    """rig_from_target rotation of each view, with the tilt signs that agree with both cameras."""
-    out = {}
-    for v in range(len(problem.views)):
-        a, b = rotations.get((v, 0)), rotations.get((v, 1))
-        if a is None and b is None:
-            continue
-        if a is None or b is None:
-            out[v] = second_from_first.T @ b if b is not None else rotations[v, 0]
-            continue
-        left = [a, mirrored(a)]
-        pairs = [(second_from_first @ x, y, x) for x in left for y in (b, mirrored(b))]
-        agreed = min(pairs, key=lambda p: float(angle_between(p[0], p[1])))
-        back = second_from_first.T @ agreed[1]
-        out[v] = nearest_rotation(agreed[2] + back)
+def _camera_rotations(
+    rotations: dict[tuple[int, int], Array], problem: Problem, count: int
+) -> list[Array]:
+    """(C, 3, 3) camera_from_rig of every start worth trying, best first.
+
+    Along a tree of cameras that share views, each pair has ``count`` rotations, and either may
+    be mirrored against the pair before it. Views of three cameras rank the combinations; the best
+    2^(C - 1) are kept, which are as many as a chain of pairs leaves open.
+    """
+    edges = overlap_tree(problem, set(rotations))
+    hypotheses: list[list[Array]] = []
+    for a, b in edges:
+        both = [v for v in range(len(problem.views)) if {(v, a), (v, b)} <= set(rotations)]
+        first = np.array([rotations[v, a] for v in both])
+        second = np.array([rotations[v, b] for v in both])
+        found = rotation_hypotheses(first, second, count)
+        first_pair = not hypotheses
+        hypotheses.append(found if first_pair else [*found, *(mirrored(r) for r in found)])
+    out = []
+    for choice in itertools.product(*hypotheses):
+        cameras = np.tile(np.eye(3), (len(problem.cameras), 1, 1))
+        for (a, b), b_from_a in zip(edges, choice):
+            cameras[b] = b_from_a @ cameras[a] if a else b_from_a
+        out.append(cameras)
+    if len(edges) > 1:
+        costs = [_signs(rotations, cameras, problem)[1] for cameras in out]
+        out = [out[i] for i in np.argsort(costs, kind="stable")[: 2 ** len(edges)]]
     return out
+
+
+def overlap_tree(problem: Problem, images: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Pairs of cameras (parent, child) that share the most views, from the first camera on.
+
+    images : (view, camera) that can be used. Raises CalibrationError where the cameras fall into
+    groups without a common view.
+    """
+    count = len(problem.cameras)
+    seen = np.zeros((len(problem.views), count))
+    seen[tuple(np.array(sorted(images), int).reshape(-1, 2).T)] = 1
+    shared = np.triu(seen.T @ seen, 1)
+    if count == 2 and shared[0, 1]:
+        return [(0, 1)]
+    from scipy.sparse import csr_matrix  # here, since two cameras do without
+    from scipy.sparse.csgraph import (
+        breadth_first_order,
+        connected_components,
+        minimum_spanning_tree,
+    )
+
+    groups, group = connected_components(csr_matrix(shared), directed=False)
+    if groups > 1:
+        names = [
+            " and ".join(c.name for c, of in zip(problem.cameras, group) if of == g)
+            for g in range(groups)
+        ]
+        raise CalibrationError(
+            f"cameras {', and cameras '.join(names)} have no view in common, so nothing says how "
+            "one group stands to the other",
+            todo="add views of the target that cameras of both groups see, each with "
+            "4 dots or more",
+        )
+    tree = minimum_spanning_tree(csr_matrix(-shared))
+    order, parent = breadth_first_order(tree, 0, directed=False)
+    return [(int(parent[c]), int(c)) for c in order[1:]]
+
+
+def _signs(
+    rotations: dict[tuple[int, int], Array], cameras: Array, problem: Problem
+) -> tuple[dict[int, Array], float]:
+    """rig_from_target rotation of each view, with the tilt signs that agree in all its cameras.
+
+    cameras : (C, 3, 3) camera_from_rig. Also the sum of the squared angles between the cameras.
+    """
+    out, cost = {}, 0.0
+    for v in range(len(problem.views)):
+        seen = [c for c in range(len(cameras)) if (v, c) in rotations]
+        if not seen:
+            continue
+        first, others = seen[0], seen[1:]
+        back = cameras[first].T
+        if not others:
+            out[v] = back @ rotations[v, first] if first else rotations[v, first]
+            continue
+        best = np.inf
+        for sign in (rotations[v, first], mirrored(rotations[v, first])):
+            rotation = back @ sign if first else sign
+            total, together = 0.0, rotation
+            for c in others:
+                either = [rotations[v, c], mirrored(rotations[v, c])]
+                angles = [float(angle_between(cameras[c] @ rotation, y)) for y in either]
+                nearest = int(np.argmin(angles))
+                total += angles[nearest] ** 2
+                together = together + cameras[c].T @ either[nearest]
+            if total < best:
+                best, out[v] = total, nearest_rotation(together)
+        cost += best
+    return out, cost
 
 
 def mono_state(problem: Problem, dots_mm: Array) -> State:
@@ -179,9 +263,12 @@ def _assemble(
     dots_mm: Array,
     maps: dict[tuple[int, int], ImageMap],
     rotations: dict[int, Array],
-    second_from_first: Array | None,
+    camera_from_rig: Array | None,
 ) -> State:
-    """Scales, view positions and baseline that go with the rotations."""
+    """Scales, view positions and baselines that go with the rotations.
+
+    camera_from_rig : (C, 3, 3) rotations, None for a single camera.
+    """
     state = nominal_state(problem)
     intrinsics, views, cameras = (
         state.intrinsics.copy(), state.rig_from_target.copy(), state.rig_from_camera.copy(),
@@ -194,13 +281,14 @@ def _assemble(
     for v, rotation in rotations.items():
         views[v, :3, :3] = rotation
     shifts = {k: m.offset_px / scale[k[1]] for k, m in maps.items()}
-    if second_from_first is None:
+    if camera_from_rig is None:
         for (v, _), shift in shifts.items():
             views[v, :2, 3] = shift
     else:
-        baseline = _place_views(views, shifts, second_from_first)
-        cameras[1, :3, :3] = second_from_first.T
-        cameras[1, :3, 3] = -second_from_first.T @ np.r_[baseline, 0]
+        baselines = _place_views(views, shifts, camera_from_rig)
+        for c in range(1, len(cameras)):
+            cameras[c, :3, :3] = camera_from_rig[c].T
+            cameras[c, :3, 3] = -camera_from_rig[c].T @ np.r_[baselines[c], 0]
     start = State(intrinsics, cameras, views, dots_mm.copy())
     for c, camera in enumerate(problem.cameras):
         kappa = perspective_from_maps(maps, start, c)
@@ -231,13 +319,35 @@ def perspective_from_maps(
     return float(kappas[order[int(np.searchsorted(share, 0.5))]])
 
 
-def _place_views(
-    views: Array, shifts: dict[tuple[int, int], Array], second_from_first: Array
-) -> Array:
-    """Write each view's translation; return the second camera's (2,) offset, gauge-fixed.
+def _place_views(views: Array, shifts: dict[tuple[int, int], Array], cameras: Array) -> Array:
+    """Write each view's translation; return the cameras' (C, 2) offsets, gauge-fixed.
 
     Along the image of the first axis in the second camera the offset trades with every depth and
-    is held at zero; across it, it is the mean disagreement.
+    is held at zero.
+    """
+    if len(cameras) == 2:
+        return np.array([np.zeros(2), _place_views_of_two(views, shifts, cameras[1])])
+    along = cameras[1][:2, 2] / np.linalg.norm(cameras[1][:2, 2])
+    freedom = np.zeros((len(cameras), 2, 2 * len(cameras) - 3))
+    freedom[1, :, 0] = -along[1], along[0]
+    for c in range(2, len(cameras)):
+        freedom[c, :, 2 * c - 3 : 2 * c - 1] = np.eye(2)
+    at = 3 * len(views)
+    design = np.zeros((len(shifts), 2, at + freedom.shape[-1]))
+    for row, (v, c) in zip(design, shifts):
+        row[:, 3 * v : 3 * v + 3] = cameras[c][:2]
+        row[:, at:] = freedom[c]
+    right = np.array(list(shifts.values())).ravel()
+    found, *_ = np.linalg.lstsq(design.reshape(len(right), -1), right, rcond=1e-9)
+    views[:, :3, 3] = found[:at].reshape(-1, 3)
+    return np.asarray(freedom @ found[at:])
+
+
+def _place_views_of_two(
+    views: Array, shifts: dict[tuple[int, int], Array], second_from_first: Array
+) -> Array:
+    """`_place_views` for two cameras, with medians: across the first axis the offset is the mean
+    disagreement.
     """
     along = second_from_first[:2, 2]
     length = np.linalg.norm(along)

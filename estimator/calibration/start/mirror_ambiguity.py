@@ -1,11 +1,14 @@
 """The mirror ambiguity: two rigs, mirror images of each other in depth, give the same pixels.
 
-What decides between them: the nominal rotation of the second camera, the sign of strong
-perspective (farther dots are smaller), or the refraction in a two-sided plate.
+What decides between them: the nominal rotations of the cameras, the sign of strong perspective
+(farther dots are smaller), or the refraction in a two-sided plate. Of three cameras or more, where
+no view is seen by three at once, each pair has mirror images of its own, which only the relief of
+the dots and the nominal rotations tell apart: `consistent_start` decides them together.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +24,12 @@ from telerig.rig.projection import INDEX
 Array = NDArray[np.float64]
 _KAPPA = INDEX["kappa_per_mm"]
 _D = np.diag([1.0, 1.0, -1.0, 1.0])
+
+Nominal = Mapping[int, Array]
+"""Nominal rotation vectors (degrees) of cameras against the first, those that are known."""
+
+ALIKE_FACTOR, ALIKE_COST = 1.5, 20.0
+"""A start fits as well as the best one up to this factor of its cost and this cost besides."""
 
 ENTOCENTRIC = 0.01
 """kappa * rho beyond which a lens is a perspective one: no telecentric lens errs by 0.6 degrees."""
@@ -46,11 +55,77 @@ def mirrored_state(state: State) -> State:
     return State(intrinsics, cameras, views, state.dots_mm * [1.0, 1.0, -1.0])
 
 
-def angle_to_nominal_deg(state: State, nominal_rotvec_deg: Array) -> float:
-    """Angle between the inter-camera rotation of a state and the nominal one."""
+def angle_to_nominal_deg(state: State, nominal_rotvec_deg: Nominal) -> float:
+    """Angle between the inter-camera rotations of a state and the nominal ones: the largest."""
+    return max(
+        _angle_deg(state.rig_from_camera[c, :3, :3].T, rotvec_deg)
+        for c, rotvec_deg in nominal_rotvec_deg.items()
+    )
+
+
+def _angle_deg(rotation: Array, nominal_rotvec_deg: Array) -> float:
     nominal = rotation_from_rotvec(np.radians(nominal_rotvec_deg))
-    turn = rotvec_from_rotation(state.rig_from_camera[1, :3, :3].T @ nominal.T)
-    return float(np.degrees(np.linalg.norm(turn)))
+    return float(np.degrees(np.linalg.norm(rotvec_from_rotation(rotation @ nominal.T))))
+
+
+def consistent_start(
+    states: Sequence[State], costs: Sequence[float], problem: Problem, nominal: Nominal
+) -> State:
+    """Of starts that were fitted roughly, the one to go on with; its own mirror image stays open.
+
+    costs : of the fits. Of those that fit alike, the one nearest to the nominal rotations, itself
+    or its mirror image.
+    Raises CalibrationError where the nominal rotations do not tell them apart.
+    """
+    best = int(np.argmin(costs))
+    if len(problem.cameras) == 2:
+        return states[best]
+    alike = [i for i, cost in enumerate(costs) if cost < ALIKE_FACTOR * costs[best] + ALIKE_COST]
+    different = [best]
+    for i in alike:
+        apart = [_apart_deg(states[i], states[j], range(len(problem.cameras))) for j in different]
+        if i != best and min(apart) > TIE_DEG:
+            different.append(i)
+    if len(different) == 1:
+        return states[best]
+    angles = []
+    for i in different:
+        both = (states[i], mirrored_state(states[i]))
+        angles.append(min(angle_to_nominal_deg(s, nominal) for s in both) if nominal else 0.0)
+    order = np.argsort(angles)
+    other = different[order[1]]
+    if angles[order[1]] - angles[order[0]] < TIE_DEG:
+        chosen = states[different[order[0]]]
+        unsure = [
+            c
+            for c in range(1, len(problem.cameras))
+            if _apart_deg(chosen, states[other], [c]) > TIE_DEG
+        ] or list(range(1, len(problem.cameras)))
+        names = " and ".join(repr(problem.cameras[c].name) for c in unsure)
+        raise CalibrationError(
+            f"{len(different)} rigs fit these views alike, mirror images of each other in camera "
+            f"{names}: no view is seen by three cameras at once",
+            where="rig.toml [stereo]",
+            todo=f"add {_lines(problem, unsure)}, 20 degrees is near enough; or add views that "
+            "three cameras see at once",
+        )
+    return states[different[int(order[0])]]
+
+
+def _apart_deg(a: State, b: State, cameras: Sequence[int] | range) -> float:
+    """The largest angle between the cameras of two states, one of them mirrored if nearer."""
+
+    def largest(other: State) -> float:
+        turns = [other.rig_from_camera[c, :3, :3].T @ a.rig_from_camera[c, :3, :3] for c in cameras]
+        return float(np.degrees(max(np.linalg.norm(rotvec_from_rotation(t)) for t in turns)))
+
+    return min(largest(b), largest(mirrored_state(b)))
+
+
+def _lines(problem: Problem, cameras: Sequence[int]) -> str:
+    """The lines of `[stereo]` that give the nominal rotations of some cameras."""
+    first, names = problem.cameras[0].name, [problem.cameras[c].name for c in cameras]
+    return " and ".join(f"{n}_from_{first}_rotvec_deg = [0.0, 90.0, 0.0]" for n in names)
 
 
 def perspective_sign(state: State, problem: Problem) -> int:
@@ -63,7 +138,7 @@ def perspective_sign(state: State, problem: Problem) -> int:
     return 0
 
 
-def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Array | None) -> MirrorChoice:
+def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
     """The solution to go on with before the final fit.
 
     One camera: undecided. The plate's refraction decides where no nominal rotation is given.
@@ -72,7 +147,7 @@ def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Array | Non
     if len(problem.cameras) == 1:
         words = "one camera: the mirrored solution has the same pixels and nothing decides"
         return MirrorChoice(state, "mono", words)
-    if nominal_rotvec_deg is not None or not np.any(problem.plate_shift):
+    if nominal_rotvec_deg or not np.any(problem.plate_shift):
         return choose_solution(state, problem, nominal_rotvec_deg)
     both = (state, mirrored_state(state))
     costs = [solve(problem, s, max_iterations=20).cost for s in both]
@@ -80,17 +155,19 @@ def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Array | Non
     return MirrorChoice(both[int(np.argmin(costs))], BY_PLATE, words)
 
 
-def choose_solution(
-    state: State, problem: Problem, nominal_rotvec_deg: Array | None
-) -> MirrorChoice:
-    """The solution on the right side, by the nominal rotation or by strong perspective.
+def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
+    """The solution on the right side, by the nominal rotations or by strong perspective.
 
     Raises CalibrationError when both solutions are alike far from the nominal rotation, when
     nothing decides, or when nominal rotation and perspective contradict each other.
     """
     other = mirrored_state(state)
     perspective = perspective_sign(state, problem)
-    if nominal_rotvec_deg is not None:
+    stated = [
+        f"{problem.cameras[c].name}_from_{problem.cameras[0].name}_rotvec_deg"
+        for c in nominal_rotvec_deg
+    ]
+    if nominal_rotvec_deg:
         angles = [angle_to_nominal_deg(s, nominal_rotvec_deg) for s in (state, other)]
         margin = abs(angles[0] - angles[1])
         nearest = int(np.argmin(angles))
@@ -99,7 +176,7 @@ def choose_solution(
                 f"the two mirror solutions are {angles[0]:.0f} and {angles[1]:.0f} degrees from "
                 "the nominal rotation: too alike to choose",
                 where="rig.toml [stereo]",
-                todo="correct the nominal second_from_first_rotvec_deg to within 20 degrees",
+                todo=f"correct {' and '.join(stated)} to within 20 degrees",
             )
         words = (
             f"the nominal rotation in rig.toml: {angles[nearest]:.1f} degrees from the solution "
@@ -111,7 +188,7 @@ def choose_solution(
                 f"lenses on the other ({words}); farther dots are smaller only in the solution "
                 "that the nominal rotation rejects",
                 where="rig.toml [stereo]",
-                todo="check the sign of second_from_first_rotvec_deg",
+                todo=f"check the sign of {' and '.join(stated)}",
             )
         if not perspective:
             return MirrorChoice((state, other)[nearest], "nominal rotation", words)
@@ -123,7 +200,7 @@ def choose_solution(
     raise CalibrationError(
         "nothing says on which side the second camera stands: both mirror solutions fit alike",
         where="rig.toml [stereo]",
-        todo="add the nominal second_from_first_rotvec_deg, 20 degrees is near enough",
+        todo=f"add {_lines(problem, [1])}, 20 degrees is near enough",
     )
 
 

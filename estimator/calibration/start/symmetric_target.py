@@ -1,7 +1,7 @@
 """A target without marks looks the same after a turn: one numbering for all images.
 
-Within a view, both cameras' numberings must agree with one inter-camera rotation. Between views,
-only the print errors of the dots differ after a turn, and they must be alike in all views.
+Within a view, the numberings of two cameras must agree with one inter-camera rotation. Between
+views, only the print errors of the dots differ after a turn, and they must be alike in all views.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust import robust_solve
 from telerig.estimator.calibration.start import known_target
+from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.factors.projection import State, whitened_residuals
 from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
 from telerig.rig.target import Target
@@ -32,27 +33,26 @@ def turns(target: Target) -> list[Ints]:
     return [np.rot90(grid, k * (4 // order)).ravel() for k in range(order)]
 
 
-def number_consistently(
-    problem: Problem, nominal_rotvec_deg: Array | None
-) -> tuple[Problem, list[str]]:
-    """Images renumbered so that both cameras and all views agree, and notes on how it was decided.
+def number_consistently(problem: Problem, nominal_rotvec_deg: Nominal) -> tuple[Problem, list[str]]:
+    """Images renumbered so that all cameras and all views agree, and notes on how it was decided.
 
-    Raises CalibrationError when two numberings explain the two cameras alike.
+    Raises CalibrationError when two numberings explain two cameras alike.
     """
     labels = turns(problem.target)
-    if len(problem.cameras) == 2:
+    if len(problem.cameras) > 1:
         problem = _numbered_alike_in_cameras(problem, labels, nominal_rotvec_deg)
     problem, contrast = _numbered_alike_in_views(problem, labels)
     problem, about_scale = _scale_of_any_turn(problem, labels)
+    cameras = "both cameras" if len(problem.cameras) <= 2 else "all cameras"
     many = f"{len(labels)}-fold symmetric target without marks"
     if contrast > 3:
         return problem, [
-            f"{many}: numbered so that both cameras and all views agree; the dots' print errors "
+            f"{many}: numbered so that {cameras} and all views agree; the dots' print errors "
             f"decide the turn ({contrast:.0f} standard deviations in the least certain view)",
             *about_scale,
         ]
     return problem, [
-        f"{many}: both cameras agree within each view. Between views the dots' print errors are "
+        f"{many}: {cameras} agree within each view. Between views the dots' print errors are "
         f"too small to decide the turn ({contrast:.1f} standard deviations in the least certain "
         "view), so the dots' estimated positions may be averages over turns; marks on the target "
         "would decide it",
@@ -90,18 +90,67 @@ def _relabel(problem: Problem, choice: dict[tuple[int, int], Ints]) -> Problem:
 
 
 def _numbered_alike_in_cameras(
-    problem: Problem, labels: list[Ints], nominal_rotvec_deg: Array | None
+    problem: Problem, labels: list[Ints], nominal_rotvec_deg: Nominal
 ) -> Problem:
-    """The turn of the second camera's numbering in each view that one rotation explains."""
+    """In each view, the numberings of all cameras turned to that of the first that sees it.
+
+    Pair by pair: first those of the tree of cameras that share most views, then the others.
+    """
+    images = set(known_target.image_maps(problem, problem.nominal_mm))
+    tree = known_target.overlap_tree(problem, images)
+    order = [0, *(c for _, c in tree)]
+    every = [(a, b) for i, a in enumerate(order) for b in order[i + 1 :]]
+    pairs = [*tree, *(pair for pair in every if pair not in tree)]
+    numbered = {(v, min(seen, key=order.index)) for v, seen in _cameras_of(images).items()}
+    for a, b in pairs:
+        both = [v for v, c in sorted(numbered) if c == a and {(v, b)} <= images - numbered]
+        if both:
+            problem = _numbered_alike_in_pair(
+                problem, labels, both, (a, b), _nominal_of_pair(nominal_rotvec_deg, a, b)
+            )
+            numbered |= {(v, b) for v in both}
+    return problem
+
+
+def _cameras_of(images: set[tuple[int, int]]) -> dict[int, list[int]]:
+    """By view, the cameras that see it."""
+    out: dict[int, list[int]] = {}
+    for v, c in images:
+        out.setdefault(v, []).append(c)
+    return out
+
+
+def _nominal_of_pair(nominal_rotvec_deg: Nominal, a: int, b: int) -> Array | None:
+    """(3, 3) nominal rotation b_from_a, where both are known."""
+    known = {0: np.zeros(3), **nominal_rotvec_deg}
+    if not {a, b} <= set(known):
+        return None
+    of_a, of_b = (rotation_from_rotvec(np.radians(known[c])) for c in (a, b))
+    return of_b @ of_a.T if a else of_b
+
+
+def _numbered_alike_in_pair(
+    problem: Problem,
+    labels: list[Ints],
+    both: list[int],
+    pair: tuple[int, int],
+    nominal: Array | None,
+) -> Problem:
+    """The turn of one camera's numbering that one rotation against the other explains.
+
+    both : views that the two cameras see. nominal : (3, 3) of the second from the first.
+    """
+    first, second = pair
     maps = known_target.image_maps(problem, problem.nominal_mm)
-    both = [v for v in range(len(problem.views)) if (v, 0) in maps and (v, 1) in maps]
     rotation = {k: known_target.rotation_from_jacobian(m.jacobian)[0] for k, m in maps.items()}
     spin = [_spin(k, len(labels)) for k in range(len(labels))]
-    options = np.array([[_pairs(rotation[v, 0], rotation[v, 1] @ s) for s in spin] for v in both])
+    options = np.array(
+        [[_pairs(rotation[v, first], rotation[v, second] @ s) for s in spin] for v in both]
+    )
     hypotheses = []
     for candidate in options.reshape(-1, 3, 3):
         refined, cost = _consensus(candidate, options)
-        distance = _to_nominal_deg(refined, nominal_rotvec_deg)
+        distance = _to_nominal_deg(refined, nominal)
         hypotheses.append((cost + (distance / 60) ** 2, refined))
     best = min(hypotheses, key=lambda h: h[0])[1]
     angles = known_target.angle_between(options, best).min(2)
@@ -109,13 +158,20 @@ def _numbered_alike_in_cameras(
     close = np.flatnonzero(ranked[:, 1] - ranked[:, 0] < np.radians(TIE_DEG) / 5)
     if len(close):
         raise CalibrationError(
-            "two numberings of the symmetric target explain both cameras alike in view "
+            "two numberings of the symmetric target explain "
+            f"{_names(problem, pair)} alike in view "
             f"{problem.views[both[int(close[0])]]!r}",
             todo="put marks on the target, or leave this view out",
         )
     # image v of the second camera agrees once turned by spin k: its ids follow the turn back
-    choice = {(v, 1): labels[-int(k)] for v, k in zip(both, angles.argmin(1))}
+    choice = {(v, second): labels[-int(k)] for v, k in zip(both, angles.argmin(1))}
     return _relabel(problem, choice)
+
+
+def _names(problem: Problem, pair: tuple[int, int]) -> str:
+    if len(problem.cameras) == 2:
+        return "both cameras"
+    return "cameras " + " and ".join(repr(problem.cameras[c].name) for c in pair)
 
 
 def _spin(k: int, order: int) -> Array:
@@ -139,10 +195,9 @@ def _consensus(rotation: Array, options: Array) -> tuple[Array, float]:
     return rotation, float((worst**2).mean() / np.radians(2) ** 2)
 
 
-def _to_nominal_deg(rotation: Array, nominal_rotvec_deg: Array | None) -> float:
-    if nominal_rotvec_deg is None:
+def _to_nominal_deg(rotation: Array, nominal: Array | None) -> float:
+    if nominal is None:
         return 0.0
-    nominal = rotation_from_rotvec(np.radians(nominal_rotvec_deg))
     both = np.array([rotation, known_target.mirrored(rotation)])
     return float(np.degrees(known_target.angle_between(both, nominal).min()))
 
@@ -150,7 +205,7 @@ def _to_nominal_deg(rotation: Array, nominal_rotvec_deg: Array | None) -> float:
 def _numbered_alike_in_views(problem: Problem, labels: list[Ints]) -> tuple[Problem, float]:
     """Turn whole views until their print errors look like those of the others."""
     held = replace(problem, dot_sigma_mm=np.full_like(problem.dot_sigma_mm, 1e-6))
-    if len(problem.cameras) == 2:
+    if len(problem.cameras) > 1:
         start = known_target.stereo_states(held, held.nominal_mm, count=1)[0]
     else:
         start = known_target.mono_state(held, held.nominal_mm)

@@ -19,6 +19,9 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
 
 Array = NDArray[np.float64]
+LEAST_VIEWS = 4
+"""Of one camera, for the shape of a target of unknown dots."""
+
 _SWEEPS = 200
 
 
@@ -31,7 +34,9 @@ def dots_from_images(problem: Problem) -> Array:
     Raises CalibrationError when the views do not determine the target's shape.
     """
     maps, plane = _factorise(problem)
-    metric = _metric([m for (_, c), m in maps.items() if c == 0])
+    views = np.bincount([c for _, c in maps], minlength=len(problem.cameras))
+    one = 0 if views[0] >= LEAST_VIEWS else int(views.argmax())
+    metric = _metric([m for (_, c), m in maps.items() if c == one])
     # M plane^T = (M L) (L^-1 plane^T) with C = L L^T: rows of M L are rows of a scaled rotation
     shape = plane @ np.linalg.inv(np.linalg.cholesky(metric)).T
     shape = shape * _scale_factor(problem, shape)
@@ -87,10 +92,11 @@ def _plane_points(
 
 
 def _metric(maps: list[Array]) -> Array:
-    """(2, 2) C = Q Q^T from the first camera's maps."""
-    if len(maps) < 4:
+    """(2, 2) C = Q Q^T from the maps of one camera, the first where it has views enough."""
+    if len(maps) < LEAST_VIEWS:
         raise CalibrationError(
-            f"the first camera has {len(maps)} usable views; unknown dots need at least 4",
+            f"no camera has more than {len(maps)} usable views; unknown dots need at least "
+            f"{LEAST_VIEWS}",
             todo="add views at other tilts",
         )
     size = np.mean([np.linalg.norm(m) for m in maps])

@@ -172,12 +172,16 @@ def test_unusable_rows_are_refused(change: Any, words: str, paper: Any) -> None:
     assert f"view {row['view']}" in error.value.where
 
 
-def test_no_dots_three_cameras_and_unknown_choices(paper: Any) -> None:
+def test_no_dots_too_many_cameras_and_unknown_choices(paper: Any) -> None:
     with pytest.raises(CalibrationError, match="no dots in any image"):
         paper.changed(lambda d: d[:0]).calibrate("radial")
-    with pytest.raises(InputError, match="3 cameras"):
-        third = replace(paper.cameras[1], name="third")
-        replace(paper, cameras=[*paper.cameras, third]).calibrate("radial")
+    more = [replace(paper.cameras[1], name=name) for name in ("third", "fourth", "fifth")]
+    with pytest.raises(InputError, match="5 cameras"):
+        replace(paper, cameras=[*paper.cameras, *more]).calibrate("radial")
+    with pytest.raises(CalibrationError, match="left and right, and cameras third have no view"):
+        replace(paper, cameras=[*paper.cameras, more[0]]).calibrate("radial")
+    with pytest.raises(InputError, match="nominal rotations of top"):
+        paper.calibrate("radial", nominal_rotvec_deg={"top": (0, 90, 0)})
     with pytest.raises(CalibrationError, match="unknown model 'best'"):
         paper.calibrate("best")
     with pytest.raises(CalibrationError, match="unknown choice"):

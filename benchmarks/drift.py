@@ -30,13 +30,8 @@ from telerig.estimator.rig_drift.drift import (
     offset_roll_pitch,
 )
 from telerig.estimator.rig_drift.from_pairs import rig_change
-from telerig.estimator.smoothing.problem.problem import (
-    CARRIAGE,
-    BubbleModel,
-    RigMode,
-    ShakeModel,
-    Zigzag,
-)
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.config import RunConfig
 from telerig.io.simulation.presets import run_preset

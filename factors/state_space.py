@@ -356,6 +356,17 @@ def _steps(components: Sequence[Component], which: Sequence[int], lengths_s: Arr
     )  # fmt: skip
 
 
+def exact_step(drift: Array, noise: Array, dt_s: float) -> tuple[Array, Array]:
+    """(n, n) transition and covariance of x' = F x + L w over one step.
+
+    drift : (n, n) F.  noise : (n, m) L.  The covariance may be singular.
+    """
+    transition, covariance = _exact_steps(
+        drift[None], noise[None], np.array([dt_s]), _integrations(drift, noise)
+    )
+    return transition[0], covariance[0]
+
+
 def _exact_steps(drift: Array, noise: Array, dt_s: Array, orders: Array) -> tuple[Array, Array]:
     """Transitions and covariances (M, n, n) of steps dt_s (M,); drift (M, n, n), noise (M, n, m).
 

@@ -13,8 +13,8 @@ from telerig.estimator.smoothing.graph.stage_travel import (
     carriage_sigma,
     considered_variance,
 )
-from telerig.estimator.smoothing.problem.problem import BubbleModel
-from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
+from telerig.factors.bubble_motion import BubbleModel, bubble_processes
+from telerig.factors.state_space import discretise, distinct_steps
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -127,8 +127,8 @@ def _rts(
 
     seen = np.asarray(np.isfinite(position_mm).all(1))
     lengths, index = distinct_steps(np.diff(t_s))
-    bubble = ou_velocity(model.velocity_sigma_mm_s, model.velocity_tau_s)
-    steps = discretise([bubble], lengths)[0]
+    path = bubble_processes(model, np.zeros(3))[0]
+    steps = discretise([path.component], lengths)[0]
     # of one axis: position, velocity, mean velocity
     transition, noise = np.tile(np.eye(3), (len(t_s), 1, 1)), np.zeros((len(t_s), 3, 3))
     transition[1:, :2, :2] = steps.transition[0, index]

@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from telerig.estimator.smoothing.problem.problem import (
     Bubble,
-    BubbleModel,
     Mark,
     Observations,
     RigMode,
     ShakeModel,
     SmoothingProblem,
-    Zigzag,
 )
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.io.simulation.run.motion import rig_shake, stochastic_paths
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -27,7 +27,6 @@ from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     Accelerometer,
     Bubble,
-    BubbleModel,
     CarriageModel,
     Mark,
     Observations,
@@ -35,8 +34,8 @@ from telerig.estimator.smoothing.problem.problem import (
     ShakeModel,
     SmoothingProblem,
     Stage,
-    Zigzag,
 )
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

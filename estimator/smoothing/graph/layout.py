@@ -11,11 +11,11 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     BroadBand,
-    BubbleModel,
     RigMode,
     ShakeModel,
     SmoothingProblem,
 )
+from telerig.factors.bubble_motion import BubbleModel, bubble_processes
 from telerig.factors.state_space import (
     Component,
     block_diagonal,
@@ -23,7 +23,6 @@ from telerig.factors.state_space import (
     driven_mode,
     forced_mass,
     independent,
-    ou_velocity,
     resonance,
     slow_ou,
     white_jerk,
@@ -218,23 +217,13 @@ def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
 
 def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
     """The same for all bubbles."""
-    parts: list[tuple[Component, int]] = [
-        (
-            ou_velocity(
-                model.velocity_sigma_mm_s,
-                model.velocity_tau_s,
-                start_sigma_mm=model.start_sigma_mm,
-            ),
-            axis,
-        )
-        for axis in range(3)
+    processes = [
+        (process, axis)
+        for axis, direction in enumerate(np.eye(3))
+        for process in bubble_processes(model, direction)
     ]
-    parts += [
-        (resonance(rms, z.frequency_hz, z.damping, z.force_hz), axis)
-        for z in model.zigzags
-        for axis, rms in enumerate(z.rms_mm)
-        if rms > 0
-    ]
+    processes.sort(key=lambda one: one[0].stem)
+    parts = [(process.component, axis) for process, axis in processes]
     motion = sum(c.size for c, _ in parts)
     extra: list[Component] = []
     if model.wander_px > 0:

@@ -17,7 +17,8 @@ from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.likelihood import Fit, evidence, maximise
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import prior_of
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel, Zigzag
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, ShakeModel
+from telerig.factors.bubble_motion import Zigzag
 
 L = TypeVar("L", RigMode, Zigzag)
 

@@ -12,14 +12,13 @@ from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     BroadBand,
-    BubbleModel,
     CarriageModel,
     RigMode,
     ShakeModel,
     SmoothingProblem,
     Stage,
-    Zigzag,
 )
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 
 SHAKE_RMS_MM = 0.2
 DELAY_SIGMA_S = 0.002

@@ -23,11 +23,12 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.processes import (
-    Process,
-    bubble_processes,
+    moving_processes,
+    names_of_process,
     shake_processes,
 )
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
+from telerig.factors.bubble_motion import Process
 from telerig.factors.measurements import whitener_of
 from telerig.factors.motion import Motion, motion, start
 from telerig.factors.state_space import (
@@ -90,7 +91,7 @@ def position_sigma(signal: Signal, model: ShakeModel, frames: Ints) -> Array:
 
 def _system(signal: Signal, model: ShakeModel) -> _System:
     shake = [(p.component, p.camera) for p in shake_processes(signal, model)]
-    bubble = [p.component for p in bubble_processes(signal, model)]
+    bubble = [p.component for p in moving_processes(signal, model)]
     if not shake and not signal.moving.any():
         shake = [(slow_ou(_STILL_MM, 1.0), CARRIAGE)]
     parts = [c for c, _ in shake] + bubble * int(signal.moving.sum())
@@ -316,7 +317,7 @@ def signal_gradient(signal: Signal, model: ShakeModel, names: Sequence[str]) -> 
     if "pixel_inflation" in names:
         seen = factor.count * int((signal.weight > 0).sum())
         slope[names.index("pixel_inflation")] = moments.residual - seen
-    shake, bubble = shake_processes(signal, model), bubble_processes(signal, model)
+    shake, bubble = shake_processes(signal, model), moving_processes(signal, model)
     changes = _changes([*shake, *bubble], names)
     if changes:
         expected = _expected(factor, moments, shake, bubble, changes)
@@ -330,7 +331,7 @@ def _changes(found: list[Process], names: Sequence[str]) -> list[_Change]:
     return [
         _Change(i, where[name], sign, p.moved(last, np.exp(sign * _DIFFERENCE)))
         for i, p in enumerate(found)
-        for name, last in p.names.items()
+        for name, last in names_of_process(p).items()
         if name in where
         for sign in (1, -1)
     ]

@@ -12,7 +12,8 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled
 from telerig.estimator.smoothing.learning.parameters import FORCE, names_of
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel, Triple
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
+from telerig.factors.bubble_motion import Triple
 
 Owner = int | str
 

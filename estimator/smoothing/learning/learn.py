@@ -57,8 +57,8 @@ from telerig.estimator.smoothing.problem.problem import (
     RigMode,
     ShakeModel,
     SmoothingProblem,
-    Zigzag,
 )
+from telerig.factors.bubble_motion import Zigzag
 
 _STRONG = 20.0
 _ACROSS, _ACROSS_LOG_SIGMA = 0.5, 1.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
-from telerig.estimator.smoothing.learning.processes import bubble_processes, shake_processes
+from telerig.estimator.smoothing.learning.processes import moving_processes, shake_processes
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
 from telerig.factors.state_space import Component
 
@@ -124,7 +124,7 @@ def _spectra(signal: Signal, model: ShakeModel, where: int | str) -> tuple[Array
 def _expected(signal: Signal, model: ShakeModel, where: int | str, frequency: Array) -> Array:
     movers = max(int(signal.moving.sum()), 1)
     shake, cameras = shake_processes(signal, model), len(signal.cameras)
-    bubble = [p.component for p in bubble_processes(signal, model)]
+    bubble = [p.component for p in moving_processes(signal, model)]
     common = [p.component for p in shake if p.camera == CARRIAGE]
     own = [p.component for p in shake if p.camera != CARRIAGE]
     if where == "bubble" and movers > 1:

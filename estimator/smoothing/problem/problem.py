@@ -11,46 +11,12 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
+from telerig.factors.bubble_motion import BubbleModel, Triple
 from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
-Triple = tuple[float, float, float]
-
 CARRIAGE = -1
 """In place of a camera's index: a sensor on the carriage, or a mode common to all cameras."""
-
-
-@dataclass(frozen=True)
-class Zigzag:
-    """A stochastic oscillation of the bubbles' paths; RMS along the rig's x, y, z, 0 for none.
-
-    force_hz : as of `RigMode`.
-    """
-
-    frequency_hz: float
-    damping: float
-    rms_mm: Triple
-    force_hz: float | None = None
-
-
-@dataclass(frozen=True)
-class BubbleModel:
-    """Priors of every bubble.
-
-    velocity_sigma_mm_s, velocity_tau_s : Ornstein-Uhlenbeck velocity about a constant mean.
-    start_sigma_mm, mean_sigma_mm_s : of the first position and the mean velocity, each axis.
-    zigzags : oscillations besides.  wander_px, wander_tau_s : of the centroid in each image,
-        0 for none.  speed_sigma_mm_s : how constant the speed is, None to leave it free.
-    """
-
-    velocity_sigma_mm_s: float = 10.0
-    velocity_tau_s: float = 0.3
-    start_sigma_mm: float = 100.0
-    mean_sigma_mm_s: float = 300.0
-    zigzags: tuple[Zigzag, ...] = ()
-    wander_px: float = 0.0
-    wander_tau_s: float = 0.1
-    speed_sigma_mm_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -124,7 +90,7 @@ class ShakeModel:
     learned : sd of log-parameters, by name, of a model that was learned.
     """
 
-    bubble: BubbleModel = BubbleModel()
+    bubble: BubbleModel = field(default_factory=BubbleModel)
     modes: tuple[RigMode, ...] = ()
     broad_bands: tuple[BroadBand, ...] = ()
     pitches: tuple[PitchMode, ...] = ()

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import expm
 
 from telerig.arrays import Array
 from telerig.estimator.tracking.filter.types import TrackerSettings
+from telerig.factors.bubble_motion import lateral_motion, rise_motion
+from telerig.factors.state_space import exact_step
 
 POSITION, VELOCITY, ACCELERATION, DRIFT = (slice(3 * i, 3 * i + 3) for i in range(4))
 STATES = 12
@@ -31,41 +32,6 @@ class Transition:
     common_noise: Array
 
 
-def van_loan(dynamics: Array, diffusion: Array, dt_s: float) -> tuple[Array, Array]:
-    """(n, n) transition and noise of dx = A x dt + dw, E[dw dw'] = D dt, over dt.
-
-    C. F. Van Loan, IEEE Trans. Automatic Control 23:395 (1978).
-    """
-    n = len(dynamics)
-    block = np.zeros((2 * n, 2 * n))
-    block[:n, :n], block[:n, n:], block[n:, n:] = -dynamics, diffusion, dynamics.T
-    exponential = expm(block * dt_s)
-    matrix = exponential[n:, n:].T
-    return matrix, matrix @ exponential[:n, n:]
-
-
-def _along(settings: TrackerSettings) -> tuple[Array, Array]:
-    """(4, 4) dynamics along the rise and spectral density: Singer's model, no drift."""
-    dynamics, density = np.zeros((4, 4)), np.zeros((4, 4))
-    dynamics[0, 1] = dynamics[1, 2] = 1.0
-    dynamics[2, 2] = -1 / settings.acceleration_time_s
-    density[2, 2] = settings.rise_acceleration_mm_s2**2 * (2 / settings.acceleration_time_s)
-    return dynamics, density
-
-
-def _across(settings: TrackerSettings) -> tuple[Array, Array]:
-    """The same across the rise: the velocity oscillates about an Ornstein-Uhlenbeck drift."""
-    dynamics, density = np.zeros((4, 4)), np.zeros((4, 4))
-    omega = 2 * np.pi * settings.zigzag_hz
-    rate = 2 * settings.zigzag_damping * omega
-    dynamics[0, 1] = dynamics[1, 2] = 1.0
-    dynamics[2, 1:] = -(omega**2), -rate, omega**2
-    dynamics[3, 3] = -1 / settings.drift_time_s
-    density[2, 2] = 2 * rate * settings.lateral_acceleration_mm_s2**2
-    density[3, 3] = 2 / settings.drift_time_s * settings.drift_sd_mm_s**2
-    return dynamics, density
-
-
 @lru_cache(maxsize=256)
 def transition(
     settings: TrackerSettings, up: tuple[float, float, float], dt_s: float, encoder: bool
@@ -75,9 +41,17 @@ def transition(
     encoder : whether it gives the stage's motion over this step.
     """
     along = np.outer(up, up)
+    rise = rise_motion(settings.rise_acceleration_mm_s2, settings.acceleration_time_s)
+    lateral = lateral_motion(
+        settings.lateral_acceleration_mm_s2,
+        settings.zigzag_hz,
+        settings.zigzag_damping,
+        settings.drift_sd_mm_s,
+        settings.drift_time_s,
+    )
     full, noise = np.zeros((STATES, STATES)), np.zeros((STATES, STATES))
-    for model, direction in ((_along(settings), along), (_across(settings), np.eye(3) - along)):
-        matrix, spread = van_loan(*model, dt_s)
+    for model, direction in ((rise, along), (lateral, np.eye(3) - along)):
+        matrix, spread = exact_step(*model, dt_s)
         full += np.kron(matrix, direction)
         noise += np.kron(spread, direction)
     return Transition(full, noise, _common_noise(settings, dt_s, encoder))

@@ -34,7 +34,8 @@ from telerig.estimator.smoothing.learning.parameters import (
     with_low_pass_force,
     with_values,
 )
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode, Zigzag
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
+from telerig.factors.bubble_motion import Zigzag
 
 
 def test_a_force_with_a_corner_is_told_from_a_white_one() -> None:

@@ -43,7 +43,8 @@ from telerig.estimator.smoothing.learning.spectrum import (
     density,
     unexplained,
 )
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel, Zigzag
+from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel
+from telerig.factors.bubble_motion import Zigzag
 from telerig.factors.state_space import broad_band, driven_mode, oscillator
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -15,7 +15,6 @@ from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
     BroadBand,
     Bubble,
-    BubbleModel,
     CarriageModel,
     Mark,
     Observations,
@@ -23,8 +22,8 @@ from telerig.estimator.smoothing.problem.problem import (
     ShakeModel,
     SmoothingProblem,
     Stage,
-    Zigzag,
 )
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.factors.state_space import Component
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -15,14 +15,9 @@ import pytest
 
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.smoothing.problem.problem import (
-    BubbleModel,
-    CarriageModel,
-    RigMode,
-    ShakeModel,
-    Zigzag,
-)
+from telerig.estimator.smoothing.problem.problem import CarriageModel, RigMode, ShakeModel
 from telerig.estimator.smoothing.smooth import smooth
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.factors.state_space import (
     Component,
     discretise,

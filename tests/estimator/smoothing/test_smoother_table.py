@@ -14,7 +14,6 @@ from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
     Bubble,
-    BubbleModel,
     CarriageModel,
     Mark,
     Observations,
@@ -22,8 +21,8 @@ from telerig.estimator.smoothing.problem.problem import (
     ShakeModel,
     SmoothingProblem,
     Stage,
-    Zigzag,
 )
+from telerig.factors.bubble_motion import BubbleModel, Zigzag
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

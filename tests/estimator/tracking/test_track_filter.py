@@ -7,25 +7,26 @@ import pytest
 from tracker_runs import SIGMA_MM, STILL, UP, Array, cameras, frame_of
 
 from telerig.estimator.tracking.association.likelihoods import projected, update_pixels
-from telerig.estimator.tracking.filter.motion import DRIFT, birth_covariance, transition, van_loan
+from telerig.estimator.tracking.filter.motion import DRIFT, birth_covariance, transition
 from telerig.estimator.tracking.filter.types import FrameMeasurements, TrackerSettings
 from telerig.estimator.tracking.tracker import Tracker
+from telerig.factors.state_space import exact_step
 
 # --- motion
 
 
-def test_van_loan_is_the_closed_form_of_a_wiener_velocity() -> None:
+def test_a_step_is_the_closed_form_of_a_wiener_velocity() -> None:
     dt, q = 0.013, 7.0
-    f, noise = van_loan(np.array([[0.0, 1], [0, 0]]), np.diag([0.0, q]), dt)
+    f, noise = exact_step(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [np.sqrt(q)]]), dt)
     assert f == pytest.approx(np.array([[1, dt], [0, 1]]), abs=1e-15)
     closed = q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
     assert noise == pytest.approx(closed, rel=1e-12)
 
 
-def test_van_loan_is_the_closed_form_of_an_ornstein_uhlenbeck_velocity() -> None:
+def test_a_step_is_the_closed_form_of_an_ornstein_uhlenbeck_velocity() -> None:
     dt, tau, sd = 0.05, 0.3, 10.0
     dynamics = np.array([[0.0, 1], [0, -1 / tau]])
-    f, noise = van_loan(dynamics, np.diag([0.0, 2 * sd**2 / tau]), dt)
+    f, noise = exact_step(dynamics, np.array([[0.0], [sd * np.sqrt(2 / tau)]]), dt)
     keep = np.exp(-dt / tau)
     assert f == pytest.approx(np.array([[1, tau * (1 - keep)], [0, keep]]), rel=1e-12)
     assert noise[1, 1] == pytest.approx(sd**2 * (1 - keep**2), rel=1e-10)

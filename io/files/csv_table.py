@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,11 @@ from telerig.arrays import Array, Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import atomic_path
 
+_EVERY_DIGIT: dict[str, Any] = (
+    {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
+    else {"float_precision": "round_trip"}
+)  # fmt: skip
+"""For `pandas.read_csv`, whose default parser rounds correctly from pandas 3.1 on."""
 _EXPORT = "export the table as comma-separated UTF-8 with one header line"
 
 
@@ -47,6 +53,9 @@ def read_table(
     missing or unknown column, a cell that is not a finite number, a ragged row, an empty table.
     """
     file = Path(path)
+    table = _sound_table(file, columns, "keep" if extra else "refuse")
+    if table is not None and len(table):
+        return table
     header, content, numbers = _cells(file)
     _check_header(header, columns, extra, file)
     if not numbers:
@@ -59,9 +68,26 @@ def read_table(
     values = {}
     for name, cells in zip(header, content):
         column = known.get(name)
-        convert = _extra if column is None else _CONVERT[column.kind]
+        convert = _CONVERT[column.kind] if column else _extra
         values[name] = convert(cells, column or Column(name), Rows(file, numbers))
     return pd.DataFrame(values, index=pd.Index(numbers, name="file_row"))
+
+
+def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = False) -> pd.DataFrame:
+    """Those of the ``columns`` that a table of results has; a text column is blank without it.
+
+    A header without rows is legal, because a run may have no tracks. optional : a file that is not
+    there reads as one without rows. Raises InputError as `read_table` does.
+    """
+    if optional and not file.is_file():
+        table = pd.DataFrame({c.name: [] for c in columns if c.required})
+    else:
+        sound = _sound_table(file, columns, "leave out")
+        table = read_table(file, columns, extra=True) if sound is None else sound
+    missing = {c.name: "" for c in columns if c.kind == "text" and c.name not in table}
+    table = table.reset_index(drop=True).assign(**missing)
+    kinds = {c.name: _DTYPES[c.kind, c.blank] for c in columns if c.name in table}
+    return table[list(kinds)].astype(kinds)
 
 
 def write_table(table: pd.DataFrame, path: str | PathLike[str]) -> None:
@@ -103,34 +129,73 @@ def rows_of(table: pd.DataFrame, file: Path) -> Rows:
     return Rows(file, table.index)
 
 
-def _cells(file: Path) -> tuple[list[str], list[Sequence[str]], list[int]]:
+def _sound_table(
+    file: Path, columns: Sequence[Column], others: Literal["refuse", "keep", "leave out"]
+) -> pd.DataFrame | None:
+    """The table by pandas' fast reader; None for anything unusual, whose error `_cells` tells."""
+    try:
+        content = file.read_bytes()
+        header = content.split(b"\n", 1)[0].decode("utf-8-sig").rstrip("\r").split(",")
+    except (OSError, UnicodeDecodeError):
+        return None
+    known = {column.name: column for column in columns}
+    names = header if others != "leave out" else [name for name in header if name in known]
+    lines = content.count(b"\n") + (not content.endswith(b"\n"))
+    if (
+        b'"' in content
+        or content.count(b",") != lines * (len(header) - 1)
+        or len(set(header)) < len(header)
+        or any(column.required and column.name not in header for column in columns)
+        or (others == "refuse" and not set(header) <= set(known))
+    ):
+        return None
+    kinds = {n: _DTYPES[known[n].kind, known[n].blank] if n in known else str for n in names}
+    numeric = [name for name, kind in kinds.items() if kind is not str]
+    try:
+        table = pd.read_csv(
+            BytesIO(content), usecols=names, dtype=kinds, keep_default_na=False,
+            na_values={name: [""] for name in numeric}, skip_blank_lines=False,
+            encoding="utf-8-sig", **_EVERY_DIGIT,
+        )  # fmt: skip
+    except (ValueError, pd.errors.ParserError):
+        return None
+    rows = Rows(file, pd.RangeIndex(2, len(table) + 2, name="file_row"))
+    for name in names:
+        cells, column = table[name], known.get(name)
+        if column is None:
+            table[name] = _extra(cells.tolist(), Column(name), rows)
+            continue
+        if name not in numeric:
+            table[name] = cells = cells.str.strip()
+            bad = (cells == "") & (not column.blank)
+        else:
+            bad = ~np.isfinite(cells) & ~(cells.isna() & column.blank)
+            bad |= (cells % 1 > 0) & (column.kind == "whole")
+        if bad.any():
+            return None
+    return table.set_index(rows.numbers)
+
+
+def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
     """Header, the cells column by column, and each row's number; blank lines are passed over."""
-    text = _decoded(file)
-    lines = text.split("\n")
+    lines = _decoded(file).split("\n")
     numbers = [i for i, line in enumerate(lines, 1) if line.strip(", \r")]
     if not numbers:
         raise InputError("is empty", where=str(file), todo=_EXPORT)
-    lines = [lines[i - 1] for i in numbers]
+    first = lines[numbers[0] - 1]
     for mark, word in ((";", "semicolons"), ("\t", "tabs")):
-        if mark in lines[0] and "," not in lines[0]:
+        if mark in first and "," not in first:
             what = f"the columns are separated by {word}"
             raise InputError(what, where=f"{file} row {numbers[0]}", todo=_EXPORT)
-    if '"' in text:
-        rows = [next(csv.reader([line]), []) for line in lines]
-        counts = [len(row) for row in rows]
-        flat = [cell for row in rows for cell in row]
-    else:
-        counts = [line.count(",") + 1 for line in lines]
-        flat = ",".join(lines).split(",")
-    width = counts[0]
-    Rows(file, numbers).refuse(
-        np.array(counts) != width,
+    header, *rows = (next(csv.reader([lines[i - 1]]), []) for i in numbers)
+    Rows(file, numbers[1:]).refuse(
+        np.array([len(row) != len(header) for row in rows], bool),
         "",
-        lambda i: f"has {counts[i]} cells, the header has {width}",
+        lambda i: f"has {len(rows[i])} cells, the header has {len(header)}",
         "complete the row; a decimal comma must be a point",
     )
-    header = [name.strip() for name in flat[:width]]
-    return header, [flat[width + k :: width] for k in range(width)], numbers[1:]
+    content = list(zip(*rows)) or [()] * len(header)
+    return [name.strip() for name in header], content, numbers[1:]
 
 
 def _decoded(file: Path) -> str:
@@ -197,6 +262,11 @@ def _whole(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
 
 
 _CONVERT: dict[str, Callable[..., Any]] = {"number": _number, "whole": _whole, "text": _text}
+_DTYPES: dict[tuple[str, bool], Any] = {
+    ("number", False): np.float64, ("number", True): np.float64,
+    ("whole", False): np.int64, ("whole", True): np.float64,
+    ("text", False): str, ("text", True): str,
+}  # fmt: skip
 
 
 def _extra(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
@@ -207,12 +277,7 @@ def _extra(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
 
 def _floats(cells: Sequence[str]) -> Array:
     """NaN for what is no number; Python's own conversion keeps every digit."""
-    try:
-        if "_" not in "".join(cells):
-            return np.array(cells, dtype=object).astype(np.float64)
-    except ValueError:
-        pass
-    return np.array([_float(cell) for cell in cells])
+    return np.array([_float(cell) for cell in cells], float)
 
 
 def _float(cell: str) -> float:

@@ -13,14 +13,13 @@ import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column
+from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Picture, Progress, font, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.cameras import run_cameras
 from telerig.io.report.run.tracking.results import TrackResults, read_track_results
 from telerig.io.report.run.tracking.scene import thinned, track_colour
-from telerig.io.results.tables import optional_columns
 from telerig.rig.camera import Camera
 
 STEP_DEG = 2
@@ -201,7 +200,7 @@ def _ellipses(
         Column("camera", "text"),
         Column("particle", "text", blank=True),
     ]
-    table: pd.DataFrame = optional_columns(folder / "detections.csv", [*key, *names])
+    table = read_columns(folder / "detections.csv", [*key, *names], optional=True)
     if cameras is None or not len(table) or any(name not in table for name in _ELLIPSE):
         return None
     table = table[table["particle"] != ""]

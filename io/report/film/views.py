@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.io.files.csv_table import Column
+from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Progress, font, write_film
-from telerig.io.results.tables import optional_columns
 
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
@@ -100,9 +99,8 @@ def read_outlines(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
         )  # fmt: skip
     numbers = [Column(name, required=False, blank=True) for name in (*_ELLIPSE, *_SHAPE)]
     keys = [Column("frame", "whole"), Column("camera", "text")]
-    table: pd.DataFrame = optional_columns(
-        file, [*keys, Column("particle", "text", blank=True), *numbers]
-    )
+    particle = Column("particle", "text", blank=True)
+    table = read_columns(file, [*keys, particle, *numbers])
     absent: dict[str, Any] = {name: 0.0 for name in _SHAPE if name not in table}
     absent |= {name: np.nan for name in _ELLIPSE if name not in table}
     table = table.assign(**absent)

@@ -12,6 +12,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.io.files.csv_table import read_columns
 from telerig.io.results.smoothing import (
     AXES,
     STATE,
@@ -21,7 +22,6 @@ from telerig.io.results.smoothing import (
 )
 from telerig.io.results.smoothing import POSITION as PLACE
 from telerig.io.results.smoothing import VELOCITY as SPEED
-from telerig.io.results.tables import read_columns
 
 __all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
 

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.io.files.csv_table import read_columns
 from telerig.io.results.run_record import RunFile
-from telerig.io.results.tables import optional_columns, read_columns
 from telerig.io.results.tracking import (
     DETECTIONS,
     EVENTS,
@@ -97,8 +97,8 @@ def read_track_results(folder: Path) -> TrackResults:
     cameras = _cameras(file, folder / "tracks.csv")
     tracks = read_columns(folder / "tracks.csv", tracks_columns(cameras))
     detections = _detections(folder / "detections.csv", cameras)
-    events = optional_columns(folder / "events.csv", EVENTS)
-    references = optional_columns(folder / "references.csv", REFERENCES)
+    events = read_columns(folder / "events.csv", EVENTS, optional=True)
+    references = read_columns(folder / "references.csv", REFERENCES, optional=True)
     run = RunFile.read_if_there(folder / "run.json").content()
     pictures = _pictures(folder, cameras)
     absent = {
@@ -138,7 +138,7 @@ def _cameras(tracking: TrackingFile, file: Path) -> tuple[str, ...]:
 
 
 def _detections(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
-    table: pd.DataFrame = optional_columns(file, DETECTIONS)
+    table = read_columns(file, DETECTIONS, optional=True)
     strange = ~table["camera"].isin(cameras).to_numpy(bool)
     if strange.any():
         row = int(np.flatnonzero(strange)[0])

@@ -61,7 +61,10 @@ def batch(
             "both --workers and --scheduler are given",
             todo="leave out --workers: a cluster has its own number of workers",
         )
-    index, of = _share(share)
+    first, _, last = share.partition("/")
+    if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
+        raise InputError(f"--share {share}", todo="give I/N with I from 1 to N, like 3/40")
+    index, of = int(first) - 1, int(last)
     check_options(calibration, model, medium)
     jobs = jobs_of(datasets, calibration=calibration, model=model, medium=medium, report=report)
     mine = share_of(jobs, index, of)
@@ -76,13 +79,6 @@ def batch(
     say_written(out, report and of == 1)
     if any(r["status"] != DONE for r in records):
         raise typer.Exit(EXIT_REJECTED)
-
-
-def _share(text: str) -> tuple[int, int]:
-    first, _, last = text.partition("/")
-    if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
-        raise InputError(f"--share {text}", todo="give I/N with I from 1 to N, like 3/40")
-    return int(first) - 1, int(last)
 
 
 if __name__ == "__main__":

@@ -60,7 +60,13 @@ def record(
     Exit code 0: recorded. 2: a device, port or file cannot be used; the message says what to do.
     """
     if ports:
-        _list_ports()
+        from telerig.io.recording.ports import known_ports
+
+        found = known_ports()
+        for text in found:
+            say(text)
+        if not found:
+            say("there is no serial port; practise with telerig simulate --devices --out practice")
         return
     from telerig.io.recording.tables import refuse_existing, write_tables
 
@@ -91,14 +97,6 @@ def _recorded(
         raise InputError(
             "no run is given", todo="name a new folder: telerig record DATASET/runs/NAME"
         )
-    description = _rig(run, rig)
-    devices = _devices(description, ports)
-    cameras = list(description.cameras)
-    with stopped_by_signals() as stop, _display(quiet) as tell:
-        return record_run(devices, run, cameras=cameras, seconds=seconds, stop=stop, tell=tell)
-
-
-def _rig(run: Path, rig: Path | None) -> RigDescription:
     from telerig.io.rig_file.rig_file import read_rig_toml
 
     file = rig or run.resolve().parent.parent / "rig.toml"
@@ -116,7 +114,10 @@ def _rig(run: Path, rig: Path | None) -> RigDescription:
             todo='add a table [devices.encoder] with kind = "encoder", port and counts_per_mm; '
             "see docs/recording.md",
         )
-    return description
+    devices = _devices(description, ports)
+    cameras = list(description.cameras)
+    with stopped_by_signals() as stop, _display(quiet) as tell:
+        return record_run(devices, run, cameras=cameras, seconds=seconds, stop=stop, tell=tell)
 
 
 def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
@@ -144,16 +145,6 @@ def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
                     todo="give each device its own port",
                 )
     return devices
-
-
-def _list_ports() -> None:
-    from telerig.io.recording.ports import known_ports
-
-    found = known_ports()
-    for text in found:
-        say(text)
-    if not found:
-        say("there is no serial port; practise with telerig simulate --devices --out practice")
 
 
 @contextmanager

@@ -134,7 +134,8 @@ def load_dataset(
     """
     folder = _dataset_folder(Path(path))
     rig = read_rig_toml(folder / "rig.toml")
-    runs = _runs(folder / "runs")
+    found = [p for p in _entries(folder / "runs") if p.is_dir()]
+    runs = {p.name: Run(p.name, p) for p in found}
     chosen = _choose_source(folder, rig, source, need_views)
     notes: list[str] = []
     views: tuple[View, ...] = ()
@@ -176,11 +177,6 @@ def _dataset_folder(path: Path) -> Path:
             todo=todo + "write one with `telerig init`",
         )
     return path
-
-
-def _runs(folder: Path) -> dict[str, Run]:
-    found = [p for p in _entries(folder) if p.is_dir()]
-    return {p.name: Run(p.name, p) for p in found}
 
 
 def _entries(folder: Path) -> list[Path]:

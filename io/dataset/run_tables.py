@@ -58,7 +58,14 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
         "times must increase from frame to frame",
     )
     if "missing" in table:
-        _check_missing(table, cameras, rows)
+        named = [cell.split("|") if cell else [] for cell in table["missing"]]
+        unknown = [next((c for c in names if c not in cameras), None) for names in named]
+        rows.refuse(
+            np.array([name is not None for name in unknown], bool),
+            "missing",
+            lambda i: f"names {unknown[i]!r}, which is no camera of the rig",
+            f"join names of cameras by |; known: {', '.join(cameras)}",
+        )
     return table.reset_index(drop=True)
 
 
@@ -88,17 +95,6 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
             where=f"{rows.file} row {rows.numbers[-1]}",
             todo="add the missing rows, or remove the images that do not belong to the run",
         )
-
-
-def _check_missing(table: pd.DataFrame, cameras: list[str], rows: Rows) -> None:
-    named = [cell.split("|") if cell else [] for cell in table["missing"]]
-    unknown = [next((c for c in names if c not in cameras), None) for names in named]
-    rows.refuse(
-        np.array([name is not None for name in unknown], bool),
-        "missing",
-        lambda i: f"names {unknown[i]!r}, which is no camera of the rig",
-        f"join names of cameras by |; known: {', '.join(cameras)}",
-    )
 
 
 def read_run_toml(path: Path) -> tuple[float, float]:

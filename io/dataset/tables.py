@@ -66,7 +66,12 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
     if rig.target.bounded:
         _check_dots(table, rig.target, file)
     else:
-        _number_unbounded(table, rig.target, file)
+        # The ids of `Target` in place of the file's opaque ones, from row and column.
+        todo = f"rows and columns count from the origin mark, within +-{FARTHEST}"
+        for column in ("row", "column"):
+            far = table[column].abs().to_numpy() > FARTHEST
+            rows_of(table, file).refuse(far, column, "is too far from the origin mark", todo)
+        table["dot"] = rig.target.id_from_row_column(table["row"], table["column"])
     _check_repeats(table, rig.target, file)
     known = fill_covariance(table, file, DEFAULT_SIGMA_PX, of="the dot's centre")
     columns = DOTS_COLUMNS + [name for name in ("chi2_dof",) if name in table]
@@ -120,15 +125,6 @@ def _check_inside(table: pd.DataFrame, column: str, size: Any, file: Path) -> No
         lambda i: f"is {value[i]:g}, outside the image of {size[i]:.0f} px",
         "correct the cell, or image_size_px = [width, height] in rig.toml",
     )
-
-
-def _number_unbounded(table: pd.DataFrame, target: Target, file: Path) -> None:
-    """The ids of `Target` in place of the file's opaque ones, from row and column."""
-    todo = f"rows and columns count from the origin mark, within +-{FARTHEST}"
-    for column in ("row", "column"):
-        far = table[column].abs().to_numpy() > FARTHEST
-        rows_of(table, file).refuse(far, column, "is too far from the origin mark", todo)
-    table["dot"] = target.id_from_row_column(table["row"], table["column"])
 
 
 def _check_dots(table: pd.DataFrame, target: Target, file: Path) -> None:
@@ -185,7 +181,13 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
             todo="give all three columns, or sigma_px alone",
         )
     if given:
-        _check_covariance(table, file)
+        uu, uv, vv = (table[name].to_numpy() for name in COVARIANCE)
+        rows_of(table, file).refuse(
+            (uu <= 0) | (vv <= 0) | (uu * vv <= uv**2),
+            "suu_px2",
+            lambda i: f"[[{uu[i]:g}, {uv[i]:g}], [{uv[i]:g}, {vv[i]:g}]] is no covariance",
+            "variances must be positive and suu svv > suv^2",
+        )
         return True
     known = "sigma_px" in table
     sigma = table["sigma_px"].to_numpy() if known else np.full(len(table), default_sigma_px)
@@ -197,13 +199,3 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
     )
     table["suu_px2"], table["suv_px2"], table["svv_px2"] = sigma**2, 0.0 * sigma, sigma**2
     return known
-
-
-def _check_covariance(table: pd.DataFrame, file: Path) -> None:
-    uu, uv, vv = (table[name].to_numpy() for name in COVARIANCE)
-    rows_of(table, file).refuse(
-        (uu <= 0) | (vv <= 0) | (uu * vv <= uv**2),
-        "suu_px2",
-        lambda i: f"[[{uu[i]:g}, {uv[i]:g}], [{uv[i]:g}, {vv[i]:g}]] is no covariance",
-        "variances must be positive and suu svv > suv^2",
-    )

@@ -152,7 +152,7 @@ def _sound_table(
     kinds = {n: _DTYPES[known[n].kind, known[n].blank] if n in known else str for n in names}
     numeric = [name for name, kind in kinds.items() if kind is not str]
     try:
-        table = pd.read_csv(
+        table: pd.DataFrame = pd.read_csv(
             BytesIO(content), usecols=names, dtype=kinds, keep_default_na=False,
             na_values={name: [""] for name in numeric}, skip_blank_lines=False,
             encoding="utf-8-sig", **_EVERY_DIGIT,
@@ -173,7 +173,8 @@ def _sound_table(
             bad |= (cells % 1 > 0) & (column.kind == "whole")
         if bad.any():
             return None
-    return table.set_index(rows.numbers)
+    table.index = rows.numbers
+    return table
 
 
 def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:

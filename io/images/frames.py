@@ -231,7 +231,19 @@ def open_frames(folder: Path, camera: str) -> FrameSource | None:
         return None
     path = found[0]
     if path.is_dir():
-        return _image_files(path)
+        files = list_images(path)
+        names: dict[str, str] = {}
+        for file in files:
+            other = names.setdefault(file.stem, file.name)
+            if other != file.name:
+                raise InputError(
+                    f"{other} and {file.name} are the same frame twice",
+                    where=str(path),
+                    todo="the name without its extension is the frame: remove or rename one",
+                )
+        if len(files) == 1 and files[0].suffix.lower() in PAGE_EXTENSIONS:
+            _refuse_pages(files[0], path)
+        return ImageFiles(path, tuple(file.name for file in files))
     if path.suffix.lower() in PAGE_EXTENSIONS:
         return PageFrames(path)
     return VideoFrames(path)
@@ -244,22 +256,6 @@ def camera_entries(folder: Path, camera: str) -> list[Path]:
     found = sorted(p for p in files if p.is_file())
     inner = folder / camera
     return [inner, *found] if inner.is_dir() and list_images(inner) else found
-
-
-def _image_files(folder: Path) -> ImageFiles:
-    files = list_images(folder)
-    names: dict[str, str] = {}
-    for file in files:
-        other = names.setdefault(file.stem, file.name)
-        if other != file.name:
-            raise InputError(
-                f"{other} and {file.name} are the same frame twice",
-                where=str(folder),
-                todo="the name without its extension is the frame: remove or rename one",
-            )
-    if len(files) == 1 and files[0].suffix.lower() in PAGE_EXTENSIONS:
-        _refuse_pages(files[0], folder)
-    return ImageFiles(folder, tuple(file.name for file in files))
 
 
 def _refuse_pages(file: Path, folder: Path) -> None:

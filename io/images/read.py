@@ -40,7 +40,16 @@ def read_image(
     format, that holds several pages, colour or non-finite values, or has another size.
     """
     file = Path(path)
-    data = _bytes(file)
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror}",
+            where=str(file),
+            todo="check the path and its permissions",
+        ) from error
+    if not data:
+        raise InputError("is empty (0 bytes)", where=str(file), todo=_COPY)
     image = image_from_pixels(_decoder(data, file)(data, file), file)
     if expected_size_px is not None:
         check_size(image, expected_size_px, str(file))
@@ -71,20 +80,6 @@ def natural(name: str) -> tuple[Any, ...]:
     """Sorting key in which runs of digits count as numbers."""
     parts = re.split(r"(\d+)", name)
     return tuple(int(p) if i % 2 else p.lower() for i, p in enumerate(parts)), name
-
-
-def _bytes(file: Path) -> bytes:
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror}",
-            where=str(file),
-            todo="check the path and its permissions",
-        ) from error
-    if not data:
-        raise InputError("is empty (0 bytes)", where=str(file), todo=_COPY)
-    return data
 
 
 def _decoder(data: bytes, file: Path) -> Callable[[bytes, Path], NDArray[Any]]:
@@ -219,7 +214,16 @@ def _native(pixels: NDArray[Any], file: Path) -> Image:
     if pixels.dtype in (np.uint8, np.uint16):
         return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
     if pixels.dtype.kind == "f":
-        return _finite(pixels, file)
+        bad = np.argwhere(~np.isfinite(pixels))
+        if len(bad):
+            row, column = bad[0]
+            raise InputError(
+                f"has {len(bad)} pixels that are NaN or infinite, the first at column "
+                f"{column}, row {row}",
+                where=str(file),
+                todo="save the raw 8- or 16-bit image, or replace those pixels",
+            )
+        return np.ascontiguousarray(pixels, dtype=np.float32)
     if pixels.dtype.kind in "iu" and pixels.min() >= 0 and pixels.max() <= 65535:
         return np.ascontiguousarray(pixels, dtype=np.uint16)
     raise InputError(
@@ -228,19 +232,6 @@ def _native(pixels: NDArray[Any], file: Path) -> Image:
         todo="save it with 8 or 16 bits per pixel (not 1 bit: a "
         "thresholded image has lost its sub-pixel information)",
     )
-
-
-def _finite(pixels: NDArray[Any], file: Path) -> Float32:
-    bad = np.argwhere(~np.isfinite(pixels))
-    if len(bad):
-        row, column = bad[0]
-        raise InputError(
-            f"has {len(bad)} pixels that are NaN or infinite, the first at column "
-            f"{column}, row {row}",
-            where=str(file),
-            todo="save the raw 8- or 16-bit image, or replace those pixels",
-        )
-    return np.ascontiguousarray(pixels, dtype=np.float32)
 
 
 def check_size(pixels: Image, expected: tuple[int, int], where: str) -> None:

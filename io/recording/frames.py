@@ -38,7 +38,14 @@ def frame_times(records: list[DeviceRecord]) -> FrameTimes:
     for record, number in zip(reversed(records), reversed(numbers)):
         t_s[number] = record.t_s
     for record, number in zip(records, numbers):
-        for frame in _skipped(record, number, count):
+        # Frames that the line skipped while its bytes were undamaged.
+        skipped = [*range(int(number[0])), *range(int(number[-1]) + 1, count)]
+        damaged_s = np.array([*record.malformed_s, *(t for away in record.away_s for t in away)])
+        for i in np.flatnonzero(np.diff(number) > 1):
+            begin, end = record.t_s[i] - 1e-3, record.t_s[i + 1] + 0.1
+            if not np.any((damaged_s >= begin) & (damaged_s <= end)):
+                skipped += range(int(number[i]) + 1, int(number[i + 1]))
+        for frame in skipped:
             missing[frame] += record.device.cameras
     unreported = np.isnan(t_s)
     known = np.flatnonzero(~unreported)
@@ -79,14 +86,3 @@ def _aligned(records: list[DeviceRecord]) -> list[Ints]:
         shifted.append(number + int(np.round(np.median(apart))))
     lowest = min(int(n[0]) for n in shifted)
     return [n - lowest for n in shifted]
-
-
-def _skipped(record: DeviceRecord, number: Ints, count: int) -> list[int]:
-    """Frames that the line skipped while its bytes were undamaged."""
-    skipped = [*range(int(number[0])), *range(int(number[-1]) + 1, count)]
-    damaged_s = np.array([*record.malformed_s, *(t for away in record.away_s for t in away)])
-    for i in np.flatnonzero(np.diff(number) > 1):
-        begin, end = record.t_s[i] - 1e-3, record.t_s[i + 1] + 0.1
-        if not np.any((damaged_s >= begin) & (damaged_s <= end)):
-            skipped += range(int(number[i]) + 1, int(number[i + 1]))
-    return skipped

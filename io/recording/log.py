@@ -12,10 +12,10 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from telerig.errors import InputError
 from telerig.io.rig_file.description import DeviceDescription
@@ -69,7 +69,12 @@ class RawLog:
         self._waiting = [MAGIC + _CRC.pack(len(text)) + text + _CRC.pack(zlib.crc32(text))]
         self.bytes = 0
         self.flush()
-        _keep_name(path.parent)
+        # Bring the folder's list of files to the disk: a power cut could lose the new one.
+        handle = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
     def append(self, entry: Entry) -> None:
         self._waiting.append(packed(entry))
@@ -105,15 +110,6 @@ def _make(folder: Path) -> None:
         raise InputError(
             "is a file, and a folder is needed", where=str(folder), todo="give another name"
         ) from error
-
-
-def _keep_name(folder: Path) -> None:
-    """Bring the folder's list of files to the disk: a power cut could lose the new one."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def packed(entry: Entry) -> bytes:
@@ -173,7 +169,10 @@ def _open(path: Path) -> tuple[LogHeader, int]:
     if len(crc) < _CRC.size or _CRC.unpack(crc)[0] != zlib.crc32(text):
         raise _no_log(path, "has a damaged header, so its devices are not known")
     try:
-        header = _header(json.loads(text))
+        raw = json.loads(text)
+        devices = tuple(DeviceDescription(**d) for d in raw["devices"])
+        devices = tuple(replace(d, cameras=tuple(d.cameras)) for d in devices)
+        header = LogHeader(raw["start_ns"], raw["started"], tuple(raw["cameras"]), devices)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"has a header that this version of telerig does not know ({error})",
@@ -185,12 +184,6 @@ def _open(path: Path) -> tuple[LogHeader, int]:
 
 def _no_log(path: Path, what: str) -> InputError:
     return InputError(what, where=str(path), todo="give the recording.raw of a run")
-
-
-def _header(raw: Mapping[str, Any]) -> LogHeader:
-    devices = tuple(DeviceDescription(**d) for d in raw["devices"])
-    devices = tuple(replace(d, cameras=tuple(d.cameras)) for d in devices)
-    return LogHeader(raw["start_ns"], raw["started"], tuple(raw["cameras"]), devices)
 
 
 def _pieces(path: Path, start: int) -> Iterator[Entry | int]:

@@ -103,7 +103,13 @@ def record(
         raise InputError("no device to record", todo="add a table [devices.<name>] to rig.toml")
     stop = stop or threading.Event()
     log_path = folder / LOG_NAME
-    ports = _open_all(devices)
+    ports: list[Any] = []
+    try:
+        for device in devices:
+            ports.append(open_port(device))
+    except InputError:
+        _close_all(ports)
+        raise
     try:
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         header = LogHeader(time.monotonic_ns(), now, tuple(cameras), tuple(devices))
@@ -118,17 +124,6 @@ def record(
             log_path.rename(folder / FAILED_NAME)
             raise
     return log_path
-
-
-def _open_all(devices: Sequence[DeviceDescription]) -> list[Any]:
-    ports: list[Any] = []
-    try:
-        for device in devices:
-            ports.append(open_port(device))
-    except InputError:
-        _close_all(ports)
-        raise
-    return ports
 
 
 def _close_all(ports: list[Any]) -> None:

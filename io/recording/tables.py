@@ -16,7 +16,7 @@ from telerig.errors import InputError
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.recording.frames import FrameTimes, frame_times
 from telerig.io.recording.log import damaged_bytes
-from telerig.io.recording.replay import GAP_INTERVALS, TIME_DIGITS, DeviceRecord, Replay, replay
+from telerig.io.recording.replay import GAP_INTERVALS, TIME_DIGITS, DeviceRecord, replay
 
 _ROWS = 20_000
 _LISTED_GAPS = 200
@@ -53,7 +53,19 @@ def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = 
             if kind == "accelerometer":
                 text = chain(text, _of_others(out / name, {r.device.name for r in records}))
             rows[name] = _write(beside / name, text, out / name)
-        summary = _summary(found, frames, path, rows)
+        header = found.header
+        summary = {
+            "schema": 1,
+            "started": header.started,
+            "seconds": round(found.end_s, 6),
+            "clock": "t_s is the host's monotonic clock since the begin of the recording",
+            "closed": found.ended,
+            "log_bytes": path.stat().st_size,
+            "log_damaged_bytes": damaged_bytes(path),
+            "rows": rows,
+            "devices": {r.device.name: _device_summary(r) for r in found.records},
+            "frames": _frames_summary(frames) if "frames.csv" in rows else None,
+        }
         write_json_atomic(beside / "recording.json", summary)
     return Recording(out, summary, rows)
 
@@ -140,22 +152,6 @@ def _write(path: Path, text: Iterable[str], final: Path) -> int:
             todo="make room on the disk, then run `telerig record --replay` on the recording.raw",
         ) from error
     return lines
-
-
-def _summary(found: Replay, frames: FrameTimes, log: Path, rows: dict[str, int]) -> dict[str, Any]:
-    header = found.header
-    return {
-        "schema": 1,
-        "started": header.started,
-        "seconds": round(found.end_s, 6),
-        "clock": "t_s is the host's monotonic clock since the begin of the recording",
-        "closed": found.ended,
-        "log_bytes": log.stat().st_size,
-        "log_damaged_bytes": damaged_bytes(log),
-        "rows": rows,
-        "devices": {r.device.name: _device_summary(r) for r in found.records},
-        "frames": _frames_summary(frames) if "frames.csv" in rows else None,
-    }
 
 
 def _device_summary(record: DeviceRecord) -> dict[str, Any]:

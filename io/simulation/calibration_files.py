@@ -56,7 +56,28 @@ def write_calibration(
     views = hand_held_views(settings, cameras, target, scene_rng)
     exact = exact_dots(settings, cameras, target, views)
     write_rig_toml(complete(rig_description(settings, target)), folder / "rig.toml")
-    truth = _truth(settings, seed, cameras, target, views)
+    row, column = settings.target.row_column_from_id(target.ids)
+    truth = {
+        "schema": TRUTH_SCHEMA,
+        "pixel_origin": "centre",
+        "seed": seed,
+        "cameras": {name: _camera_truth(camera) for name, camera in cameras.items()},
+        "target": {
+            "dot": target.ids,
+            "row": row,
+            "column": column,
+            "points_mm": target.points_mm,
+            "scale_distance_mm": target.scale_distance_mm,
+        },
+        "views": {
+            view.name: {
+                "rig_from_target": _pose_truth(view.rig_from_target),
+                "cameras": view.cameras,
+            }
+            for view in views
+        },
+        "config": settings,
+    }
     write_json_atomic(folder / "truth" / "truth.json", truth)
     write_table(exact, folder / "truth" / "dots.csv")
     if images:
@@ -161,7 +182,17 @@ def view_image(
     rng: np.random.Generator,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """(height, width) one image of the target with random light and noise."""
-    light = _random_light(config, camera.image_size_px, rng)
+    angle = rng.uniform(0, 2 * np.pi)
+    gain = np.exp(config.exposure_spread * rng.standard_normal())
+    place = rng.uniform(0, 1, 2) * camera.image_size_px
+    glare = (float(place[0]), float(place[1]), config.glare_radius_px, config.glare)
+    gradient = config.light_gradient * np.array([np.cos(angle), np.sin(angle)])
+    light = Light(
+        float(gain),
+        (float(gradient[0]), float(gradient[1])),
+        config.vignetting,
+        glare if config.glare > 0 else None,
+    )
     grey = render(camera, rig_from_target, target.plate, light, blur_px=config.blur_px)
     return digitise(
         grey,
@@ -170,53 +201,6 @@ def view_image(
         shot_noise=config.shot_noise,
         bit_depth=config.bit_depth,
     )
-
-
-def _random_light(
-    config: SimulationConfig, size_px: tuple[int, int], rng: np.random.Generator
-) -> Light:
-    angle = rng.uniform(0, 2 * np.pi)
-    gain = np.exp(config.exposure_spread * rng.standard_normal())
-    place = rng.uniform(0, 1, 2) * size_px
-    glare = (float(place[0]), float(place[1]), config.glare_radius_px, config.glare)
-    gradient = config.light_gradient * np.array([np.cos(angle), np.sin(angle)])
-    return Light(
-        float(gain),
-        (float(gradient[0]), float(gradient[1])),
-        config.vignetting,
-        glare if config.glare > 0 else None,
-    )
-
-
-def _truth(
-    config: SimulationConfig,
-    seed: dict[str, Any],
-    cameras: Mapping[str, Camera],
-    target: TrueTarget,
-    views: list[View],
-) -> dict[str, Any]:
-    row, column = config.target.row_column_from_id(target.ids)
-    return {
-        "schema": TRUTH_SCHEMA,
-        "pixel_origin": "centre",
-        "seed": seed,
-        "cameras": {name: _camera_truth(camera) for name, camera in cameras.items()},
-        "target": {
-            "dot": target.ids,
-            "row": row,
-            "column": column,
-            "points_mm": target.points_mm,
-            "scale_distance_mm": target.scale_distance_mm,
-        },
-        "views": {
-            view.name: {
-                "rig_from_target": _pose_truth(view.rig_from_target),
-                "cameras": view.cameras,
-            }
-            for view in views
-        },
-        "config": config,
-    }
 
 
 def _camera_truth(camera: Camera) -> dict[str, Any]:

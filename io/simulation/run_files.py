@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +59,29 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     calibration_rng, scene_rng, sensor_rng, image_rng, table_rng, stage_rng = rng.spawn(6)
 
     def complete(rig: RigDescription) -> RigDescription:
-        return _with_run_parts(rig, config)
+        # The rig file of a rig with a stage, and the sensors and marks that the run has.
+        x, y, z = (float(a) for a in AXIS_RIG)
+        stage = StageDescription(
+            (x, y, z),
+            (x, y, z),
+            max(config.stage.encoder_sigma_mm, 1e-4),
+            gravity_m_s2=config.stage.gravity_m_s2,
+        )
+        unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        sensors = {}
+        for mount in config.stage.accelerometers:
+            name = mount if mount == CARRIAGE else f"arm_{mount}"
+            sensors[name] = AccelerometerDescription(
+                name,
+                mount,
+                unit,
+                max(config.stage.accelerometer_density_ug, LEAST_ACCELEROMETER_SIGMA),
+                max(config.stage.accelerometer_bias_m_s2, LEAST_ACCELEROMETER_SIGMA),
+            )
+        marks = ReferencesDescription() if config.table.references else None
+        if config.strip is not None:
+            marks = ReferencesDescription(dot_diameter_mm=config.strip.diameter_mm)
+        return replace(rig, stage=stage, accelerometers=sensors, references=marks)
 
     cameras, target = write_calibration(
         config.calibration, folder, calibration_rng, images=images, complete=complete
@@ -69,8 +91,23 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     scene = run_scene(config, cameras, scene_rng)
     strips = random_strips(scene, rng.spawn(1)[0]) if config.strip and images else []
     run = folder / "runs" / config.name
-    lost = _lost_frames(scene, image_rng)
-    _write_clocks_and_sensors(scene, run, lost, sensor_rng, marks=not strips)
+    # (C, F) frames that a camera drops; each camera keeps its first one.
+    lost = image_rng.random((len(scene.cameras), scene.config.frames)) < scene.config.image.dropped
+    lost[:, 0] = False
+    lost = np.asarray(lost)
+    # marks : False where the marks are in the images, to be found there.
+    encoder_rng, accelerometer_rng, mark_rng = sensor_rng.spawn(3)
+    run.mkdir(parents=True, exist_ok=True)
+    frames = pd.DataFrame({"frame": np.arange(scene.config.frames), "t_s": scene.t_s})
+    if lost.any():
+        names = np.array(list(scene.cameras))
+        frames["missing"] = ["|".join(names[gone]) for gone in lost.T]
+    write_table(frames, run / "frames.csv")
+    write_table(stage_table(scene, encoder_rng), run / "stage.csv")
+    if scene.config.stage.accelerometers:
+        write_table(accelerometer_table(scene, accelerometer_rng), run / "accelerometer.csv")
+    if (not strips) and scene.config.table.references:
+        write_table(references_table(scene, mark_rng), run / "references.csv")
     truth: list[dict[str, Any]] = []
     detections: list[dict[str, Any]] = []
     with ExitStack() as stack:
@@ -95,57 +132,6 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     _write_truth(scene, known, seed, truth, lost)
     if strips:
         write_table(strip_truth(scene, strips), known / "references.csv")
-
-
-def _with_run_parts(rig: RigDescription, config: RunConfig) -> RigDescription:
-    """The rig file of a rig with a stage, and the sensors and marks that the run has."""
-    x, y, z = (float(a) for a in AXIS_RIG)
-    stage = StageDescription(
-        (x, y, z),
-        (x, y, z),
-        max(config.stage.encoder_sigma_mm, 1e-4),
-        gravity_m_s2=config.stage.gravity_m_s2,
-    )
-    unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    sensors = {}
-    for mount in config.stage.accelerometers:
-        name = mount if mount == CARRIAGE else f"arm_{mount}"
-        sensors[name] = AccelerometerDescription(
-            name,
-            mount,
-            unit,
-            max(config.stage.accelerometer_density_ug, LEAST_ACCELEROMETER_SIGMA),
-            max(config.stage.accelerometer_bias_m_s2, LEAST_ACCELEROMETER_SIGMA),
-        )
-    marks = ReferencesDescription() if config.table.references else None
-    if config.strip is not None:
-        marks = ReferencesDescription(dot_diameter_mm=config.strip.diameter_mm)
-    return replace(rig, stage=stage, accelerometers=sensors, references=marks)
-
-
-def _write_clocks_and_sensors(
-    scene: RunScene, run: Path, lost: Bools, rng: Generator, *, marks: bool
-) -> None:
-    """marks : False where the marks are in the images, to be found there."""
-    encoder_rng, accelerometer_rng, mark_rng = rng.spawn(3)
-    run.mkdir(parents=True, exist_ok=True)
-    frames = pd.DataFrame({"frame": np.arange(scene.config.frames), "t_s": scene.t_s})
-    if lost.any():
-        names = np.array(list(scene.cameras))
-        frames["missing"] = ["|".join(names[gone]) for gone in lost.T]
-    write_table(frames, run / "frames.csv")
-    write_table(stage_table(scene, encoder_rng), run / "stage.csv")
-    if scene.config.stage.accelerometers:
-        write_table(accelerometer_table(scene, accelerometer_rng), run / "accelerometer.csv")
-    if marks and scene.config.table.references:
-        write_table(references_table(scene, mark_rng), run / "references.csv")
-
-
-def _lost_frames(scene: RunScene, rng: Generator) -> Bools:
-    """(C, F) frames that a camera drops; each camera keeps its first one."""
-    lost = rng.random((len(scene.cameras), scene.config.frames)) < scene.config.image.dropped
-    lost[:, 0] = False
-    return np.asarray(lost)
 
 
 class _Renderer:
@@ -309,27 +295,26 @@ def _write_truth(
             columns[f"{name}_shake_{letter}_mm"] = scene.shake_mm[j, :, axis]
         columns[f"{name}_lost"] = lost[j].astype(int)
     write_table(pd.DataFrame(columns), folder / "cameras.csv")
-    write_json_atomic(folder / "truth.json", _summary(scene, seed))
-
-
-def _summary(scene: RunScene, seed: dict[str, Any]) -> Mapping[str, Any]:
     population, config = scene.population, plain(scene.config)
     if config["strip"] is None:
         del config["strip"]
-    return {
-        "schema": RUN_TRUTH_SCHEMA,
-        "pixel_origin": "centre",
-        "seed": seed,
-        "axis_rig": AXIS_RIG,
-        "modes": MODES,
-        "particles": {
-            "d_eq_mm": population.d_eq_mm,
-            "semi_axes_proportions": population.semi_axes_mm,
-            "modes_static": population.modes_static,
-            "modes_swing": population.modes_swing,
-            "swing_hz": population.swing_hz,
-            "spin_hz": population.spin_hz,
-        },
-        "pairs_closest_s": scene.closest_s,
-        "config": config,
-    }
+        write_json_atomic(
+            folder / "truth.json",
+            {
+                "schema": RUN_TRUTH_SCHEMA,
+                "pixel_origin": "centre",
+                "seed": seed,
+                "axis_rig": AXIS_RIG,
+                "modes": MODES,
+                "particles": {
+                    "d_eq_mm": population.d_eq_mm,
+                    "semi_axes_proportions": population.semi_axes_mm,
+                    "modes_static": population.modes_static,
+                    "modes_swing": population.modes_swing,
+                    "swing_hz": population.swing_hz,
+                    "spin_hz": population.spin_hz,
+                },
+                "pairs_closest_s": scene.closest_s,
+                "config": config,
+            },
+        )

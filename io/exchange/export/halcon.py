@@ -104,7 +104,9 @@ def halcon_cameras(
 def _halcon_camera(camera: Camera, points: Array) -> HalconCamera:
     from scipy.linalg import polar
 
-    perspective = _is_perspective(camera, points)
+    moved = camera.project(points) - camera.with_parameters(kappa_per_mm=0.0).project(points)
+    largest_px = np.linalg.norm(moved, axis=-1).max()
+    perspective = bool(camera["kappa_per_mm"] > 0 and largest_px > PERSPECTIVE_PX)
     kappa = camera["kappa_per_mm"]
     linear = _linear_map(camera)
     if max(abs(linear[0, 1]), abs(linear[1, 0])) <= _DIAGONAL * camera["scale_px_per_mm"]:
@@ -118,16 +120,26 @@ def _halcon_camera(camera: Camera, points: Array) -> HalconCamera:
     spin = np.eye(3)
     spin[:2, :2] = rotation
     pose = Pose(spin, np.array([0, 0, 1 / kappa if perspective else 0.0])) @ camera.camera_from_rig
-    kind = _kind(perspective, "tilt" in values, distorted)
-    notes = _notes(camera, distorted, perspective)
-    made = HalconCamera(camera.name, kind, values, pose, Misfit(0, 0, 0), notes)
+    words = ["area_scan"]
+    if "tilt" in values:
+        words += ["tilt", "image_side_telecentric" if perspective else "bilateral_telecentric"]
+    elif not perspective:
+        words.append("telecentric")
+    kind = "_".join([*words, "polynomial" if distorted else "division"])
+    notes = []
+    if camera.wall is not None:
+        notes.append("the refractive window is left out, because HALCON's models have none")
+    if distorted:
+        notes.append("the distortion is fitted, because HALCON's maps distorted to undistorted")
+    if camera["kappa_per_mm"] != 0 and not perspective:
+        notes.append(
+            f"the residual perspective kappa = {camera['kappa_per_mm']:.4g} per mm is left out, "
+            "because a telecentric model has none"
+        )
+    if camera["image_convergence_per_mm"] != 0 and (camera["tilt_x"] or camera["tilt_y"]):
+        notes.append("image_convergence_per_mm of the tilted sensor is left out")
+    made = HalconCamera(camera.name, kind, values, pose, Misfit(0, 0, 0), tuple(notes))
     return replace(made, misfit=Misfit.between(made.project(points), camera.project(points)))
-
-
-def _is_perspective(camera: Camera, points: Array) -> bool:
-    moved = camera.project(points) - camera.with_parameters(kappa_per_mm=0.0).project(points)
-    largest_px = np.linalg.norm(moved, axis=-1).max()
-    return bool(camera["kappa_per_mm"] > 0 and largest_px > PERSPECTIVE_PX)
 
 
 def _linear_map(camera: Camera) -> Array:
@@ -158,15 +170,6 @@ def _sensor(camera: Camera, stretch: Array) -> dict[str, float]:
     }
 
 
-def _kind(perspective: bool, tilted: bool, distorted: bool) -> str:
-    words = ["area_scan"]
-    if tilted:
-        words += ["tilt", "image_side_telecentric" if perspective else "bilateral_telecentric"]
-    elif not perspective:
-        words.append("telecentric")
-    return "_".join([*words, "polynomial" if distorted else "division"])
-
-
 def _fitted_distortion(camera: Camera, stretch: Array, rotation: Array) -> dict[str, float]:
     """Least squares over the image, in HALCON's direction, in which the model is linear."""
     width, height = camera.image_size_px
@@ -183,22 +186,6 @@ def _fitted_distortion(camera: Camera, stretch: Array, rotation: Array) -> dict[
         for value, (name, power) in zip(found, _POLYNOMIAL.items())
     }
     return {name: in_metres[name] for name in ("k1", "k2", "k3", "p1", "p2")}
-
-
-def _notes(camera: Camera, distorted: bool, perspective: bool) -> tuple[str, ...]:
-    notes = []
-    if camera.wall is not None:
-        notes.append("the refractive window is left out, because HALCON's models have none")
-    if distorted:
-        notes.append("the distortion is fitted, because HALCON's maps distorted to undistorted")
-    if camera["kappa_per_mm"] != 0 and not perspective:
-        notes.append(
-            f"the residual perspective kappa = {camera['kappa_per_mm']:.4g} per mm is left out, "
-            "because a telecentric model has none"
-        )
-    if camera["image_convergence_per_mm"] != 0 and (camera["tilt_x"] or camera["tilt_y"]):
-        notes.append("image_convergence_per_mm of the tilted sensor is left out")
-    return tuple(notes)
 
 
 def _pixel_from_camera(points_m: Array, values: dict[str, float]) -> Array:

@@ -164,27 +164,23 @@ def write_opencv(matrices: Sequence[Matrices], path: str | PathLike[str]) -> Non
             storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
             for one in matrices:
                 storage.startWriteStruct("", cv2.FILE_NODE_MAP)
-                for name, value in _content(one).items():
+                content: dict[str, Any] = {
+                    "name": one.camera,
+                    "image_width": one.image_size_px[0],
+                    "image_height": one.image_size_px[1],
+                    "undistorted": one.undistorted,
+                    "undistorted_rms_px": one.undistorted_misfit.rms_px,
+                    "undistorted_max_px": one.undistorted_misfit.max_px,
+                    "affine": one.affine,
+                    "affine_rms_px": one.affine_misfit.rms_px,
+                    "affine_max_px": one.affine_misfit.max_px,
+                }
+                if one.camera_matrix is not None and one.distortion is not None:
+                    content["camera_matrix"] = one.camera_matrix
+                    content["distortion_coefficients"] = one.distortion.reshape(1, -1)
+                for name, value in content.items():
                     storage.write(name, value)
                 storage.endWriteStruct()
             storage.endWriteStruct()
         finally:
             storage.release()
-
-
-def _content(one: Matrices) -> dict[str, Any]:
-    content: dict[str, Any] = {
-        "name": one.camera,
-        "image_width": one.image_size_px[0],
-        "image_height": one.image_size_px[1],
-        "undistorted": one.undistorted,
-        "undistorted_rms_px": one.undistorted_misfit.rms_px,
-        "undistorted_max_px": one.undistorted_misfit.max_px,
-        "affine": one.affine,
-        "affine_rms_px": one.affine_misfit.rms_px,
-        "affine_max_px": one.affine_misfit.max_px,
-    }
-    if one.camera_matrix is not None and one.distortion is not None:
-        content["camera_matrix"] = one.camera_matrix
-        content["distortion_coefficients"] = one.distortion.reshape(1, -1)
-    return content

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
@@ -145,7 +145,13 @@ def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
     if layout.scale_m_s2 is not None:
         if layout.unit is not None:
             raise InputError("both a unit and scale_m_s2 are given", todo="give one of them")
-        return _finite(layout.scale_m_s2)
+        values = np.asarray(layout.scale_m_s2, float)
+        if values.shape not in ((), (3,)) or not np.isfinite(values).all() or not values.all():
+            raise InputError(
+                f"scale_m_s2 is {layout.scale_m_s2!r}",
+                todo="give one number or three, none of them zero",
+            )
+        return values
     units = [layout.unit or recording.units.get(name) or "" for name in names]
     if all(name.endswith("_m_s2") for name in names) and layout.unit is None:
         units = ["m/s2"] * 3
@@ -158,15 +164,6 @@ def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
             f"give unit ({', '.join(UNITS)}), or scale_m_s2, the m/s^2 of a reading of 1",
         )
     return np.array([UNITS[unit] for unit in units])
-
-
-def _finite(scale: ArrayLike) -> Array:
-    values = np.asarray(scale, float)
-    if values.shape not in ((), (3,)) or not np.isfinite(values).all() or not values.all():
-        raise InputError(
-            f"scale_m_s2 is {scale!r}", todo="give one number or three, none of them zero"
-        )
-    return values
 
 
 def _check_readings(recording: Recording, names: Sequence[str], raw: Array, t_s: Array) -> None:

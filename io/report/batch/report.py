@@ -18,11 +18,10 @@ from telerig.io.files.atomic import write_text_atomic
 from telerig.io.report.page.figures import (
     CAMERA_COLOURS,
     LEFT_OUT,
+    Curve,
     Picture,
-    above,
+    draw_curves,
     drawing,
-    room_left,
-    svg,
 )
 from telerig.io.report.page.number_format import ABSENT, is_number, number
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
@@ -75,25 +74,25 @@ def _checked(job: Any) -> Job:
 def render(jobs: Sequence[Job], folder: Path) -> str:
     """The page as text. folder : where it will lie, for the links."""
     failed = [j for j in jobs if j["status"] != _DONE]
-    context = {
-        "name": Path(folder).resolve().name,
-        "headline": _headline(jobs, failed),
-        "colour": "good" if not failed else ("rejected" if len(failed) == len(jobs) else "usable"),
-        "figures": _key_numbers(jobs),
-        "failures": [_failure(j) for j in failed],
-        "calibrations": [_calibration(j, folder) for j in jobs if j["kind"] == "calibrate"],
-        "runs": _runs(jobs, folder),
-        "pictures": [p for p in drawn_over_cores(_drawings(jobs)) if p is not None],
-    }
-    return render_page("template_batch.html", context, "")
-
-
-def _headline(jobs: Sequence[Job], failed: Sequence[Job]) -> str:
     runs = {(j["dataset"], j["run"]) for j in jobs if j["run"]}
     lost = {(j["dataset"], j["run"]) for j in failed if j["run"]}
     datasets = len({j["dataset"] for j in jobs})
     words = f"{len(runs) - len(lost)} of {len(runs)} runs done" if runs else "No runs"
-    return f"{words}, {datasets} dataset" + ("s" if datasets != 1 else "")
+    lines: dict[tuple[str, str], dict[str, Job]] = {}
+    for job in jobs:
+        if job["run"]:
+            lines.setdefault((job["dataset"], job["run"]), {})[job["kind"]] = job
+    context = {
+        "name": Path(folder).resolve().name,
+        "headline": (f"{words}, {datasets} dataset" + ("s" if datasets != 1 else "")),
+        "colour": "good" if not failed else ("rejected" if len(failed) == len(jobs) else "usable"),
+        "figures": _key_numbers(jobs),
+        "failures": [_failure(j) for j in failed],
+        "calibrations": [_calibration(j, folder) for j in jobs if j["kind"] == "calibrate"],
+        "runs": ([_run(dataset, run, kinds, folder) for (dataset, run), kinds in lines.items()]),
+        "pictures": [p for p in drawn_over_cores(_drawings(jobs)) if p is not None],
+    }
+    return render_page("template_batch.html", context, "")
 
 
 def _key_numbers(jobs: Sequence[Job]) -> list[Figure]:
@@ -131,14 +130,6 @@ def _calibration(job: Job, folder: Path) -> Line:
     )
     link = _link(job, folder, "calibration")
     return Line(Path(job["dataset"]).name, link, cells, job["status"] != _DONE)
-
-
-def _runs(jobs: Sequence[Job], folder: Path) -> list[Line]:
-    lines: dict[tuple[str, str], dict[str, Job]] = {}
-    for job in jobs:
-        if job["run"]:
-            lines.setdefault((job["dataset"], job["run"]), {})[job["kind"]] = job
-    return [_run(dataset, run, kinds, folder) for (dataset, run), kinds in lines.items()]
 
 
 def _run(dataset: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line:
@@ -191,44 +182,42 @@ def _values(
     values = np.array([[_float((j.get("figures") or {}).get(n)) for n in names] for j in mine])
     if not np.isfinite(values).any():
         return None
-    with drawing(2.4) as (figure, axes):
-        for i, name in enumerate(names):
-            axes.plot(np.arange(1, len(mine) + 1), values[:, i], "o", ms=3.5,
-                      color=CAMERA_COLOURS[i], label=name.split("_")[0])  # fmt: skip
-        for at in np.flatnonzero(~np.isfinite(values).any(1)):
-            axes.axvline(at + 1, color=LEFT_OUT, lw=0.8)
-        axes.set(xlabel="in the order of the batch", ylabel=label)
-        axes.set_xlim(0.5, len(mine) + 0.5)
-        _finish(axes, legend=len(names) > 1)
-        return Picture(title, svg(figure), caption + " A red line: no result.")
+    place = np.arange(1.0, len(mine) + 1)
+    dots = {"marker": "o", "markersize": 3.5, "linestyle": "none"}
+    curves = [
+        Curve(place, values[:, i], CAMERA_COLOURS[i], name.split("_")[0], style=dots)
+        for i, name in enumerate(names)
+    ]
+    none = place[~np.isfinite(values).any(1)]
+    caption += " A red line: no result."
+    return _by_job(title, "in the order of the batch", label, curves, caption, none)
 
 
 def _times(jobs: Sequence[Job]) -> Picture | None:
     timed = [j for j in jobs if is_number(j.get("seconds"))]
-    if not timed:
-        return None
-    with drawing(2.4) as (figure, axes):
-        for kind, colour in _COLOUR.items():
-            seconds = [float(j["seconds"]) for j in timed if j["kind"] == kind]
-            if seconds:
-                axes.plot(np.arange(1, len(seconds) + 1), seconds, "o", ms=3.5, color=colour,
-                          label=kind)  # fmt: skip
-        axes.set(xlabel="job", ylabel="time / s")
-        _finish(axes, legend=True)
-        caption = "Wall time of every job, of those taken from the journal too."
-        return Picture("Time", svg(figure), caption)
+    curves = []
+    for kind, colour in _COLOUR.items():
+        seconds = np.array([float(j["seconds"]) for j in timed if j["kind"] == kind])
+        dots = {"marker": "o", "markersize": 3.5, "linestyle": "none"}
+        curves.append(Curve(np.arange(1.0, len(seconds) + 1), seconds, colour, kind, style=dots))
+    caption = "Wall time of every job, of those taken from the journal too."
+    return _by_job("Time", "job", "time / s", curves, caption) if timed else None
 
 
-def _finish(axes: Any, *, legend: bool) -> None:
-    """From zero, whole numbers of jobs, and the legend over the points."""
+def _by_job(
+    title: str, xlabel: str, ylabel: str, curves: Sequence[Curve], caption: str, none: Any = ()
+) -> Picture:
+    """Points from zero over whole numbers of jobs. none : jobs without a result."""
     from matplotlib.ticker import MaxNLocator
 
-    axes.set_ylim(0, None)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    room_left(axes)
-    if legend:
-        above(axes)
-    axes.grid(True)
+    legend = "above" if len(curves) > 1 else ""
+    with drawing(2.4, legend=legend, grid=True, xlabel=xlabel, ylabel=ylabel) as sheet:
+        draw_curves(sheet, curves)
+        for job in none:
+            sheet.axes.axvline(job, color=LEFT_OUT, lw=0.8)
+        sheet.axes.set_ylim(0, None)
+        sheet.axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    return Picture(title, sheet.source, caption)
 
 
 def _float(value: Any) -> float:

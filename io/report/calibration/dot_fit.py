@@ -14,7 +14,6 @@ from telerig.io.report.page.figures import (
     Picture,
     drawing,
     png,
-    svg,
 )
 from telerig.io.report.page.number_format import number
 
@@ -72,17 +71,17 @@ def _image(example: Mapping[str, Array]) -> Picture:
     x, y = float(example["a_px"]) * np.cos(turn), float(example["b_px"]) * np.sin(turn)
     cos, sin = np.cos(float(example["angle_rad"])), np.sin(float(example["angle_rad"]))
     u, v = float(example["u_px"]), float(example["v_px"])
-    with drawing(3.6) as (figure, axes):
-        axes.imshow(example["patch"], cmap="gray", extent=_extent(example), interpolation="nearest")
-        axes.plot(u + x * cos - y * sin, v + x * sin + y * cos, color=LEFT_OUT, linewidth=1)
-        axes.plot(u, v, "+", color=LEFT_OUT, markersize=9)
-        axes.set(xlabel="u / px", ylabel="v / px")
-        source = svg(figure)
+    with drawing(3.6) as sheet:
+        grey = {"cmap": "gray", "extent": _extent(example), "interpolation": "nearest"}
+        sheet.axes.imshow(example["patch"], **grey)
+        sheet.axes.plot(u + x * cos - y * sin, v + x * sin + y * cos, color=LEFT_OUT, linewidth=1)
+        sheet.axes.plot(u, v, "+", color=LEFT_OUT, markersize=9)
+        sheet.axes.set(xlabel="u / px", ylabel="v / px")
     caption = (
         f"The pixels of one dot and the fitted ellipse, centre ({u:.3f}, {v:.3f}) px; the line "
         "should run through the middle of the blurred edge all the way round."
     )
-    return Picture("One dot", source, caption)
+    return Picture("One dot", sheet.source, caption)
 
 
 def _surface(example: Mapping[str, Array]) -> Picture:
@@ -118,24 +117,22 @@ def _profile(example: Mapping[str, Array]) -> Picture:
     distance, patch, model = distance[near], example["patch"][near], example["model"][near]
     noise = float(example["noise"])
     order = np.argsort(distance)
-    with drawing(3.6) as (figure, axes):
-        box = axes.get_position()
-        axes.set_position((box.x0, box.y0 + 0.3 * box.height, box.width, 0.7 * box.height))
-        lower = figure.add_axes((box.x0, box.y0, box.width, 0.22 * box.height), sharex=axes)
+    with drawing(3.6, legend="best", ylabel="grey value") as sheet:
+        box = sheet.axes.get_position()
+        sheet.axes.set_position((box.x0, box.y0 + 0.3 * box.height, box.width, 0.7 * box.height))
+        place = (box.x0, box.y0, box.width, 0.22 * box.height)
+        lower = sheet.figure.add_axes(place, sharex=sheet.axes)
         pixels = {"color": "#666666", "rasterized": len(patch) > _MOST_SHAPES}
-        axes.plot(distance, patch, ".", markersize=3, label="pixels", **pixels)
-        axes.plot(distance[order], model[order], color=MODEL, linewidth=1, label="model")
-        axes.set(ylabel="grey value")
-        axes.legend(loc="best")
-        axes.tick_params(labelbottom=False)
+        sheet.axes.plot(distance, patch, ".", markersize=3, label="pixels", **pixels)
+        sheet.axes.plot(distance[order], model[order], color=MODEL, linewidth=1, label="model")
+        sheet.axes.tick_params(labelbottom=False)
         lower.plot(distance, (patch - model) / (noise or 1.0), ".", markersize=2.5, **pixels)
         lower.axhline(0, color=MODEL, linewidth=0.8)
         lower.set(xlabel="distance from the ellipse / px (outside > 0)", ylabel="misfit")
-        source = svg(figure)
     rms = float(np.sqrt(np.mean((patch - model) ** 2)))
     caption = (
         "Every pixel against its distance from the ellipse, and the model; misfits over "
         f"the noise should be a level band within ±3 (RMS {number(rms)} grey values, noise "
         f"{number(noise)})."
     )
-    return Picture("Profile and model", source, caption)
+    return Picture("Profile and model", sheet.source, caption)

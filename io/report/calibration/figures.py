@@ -14,12 +14,12 @@ from telerig.io.report.page.figures import (
     LEFT_OUT,
     MODEL,
     MUTED,
+    WIDTH_IN,
     Picture,
     camera_colour,
     drawing,
     image_axes,
     image_height_in,
-    svg,
 )
 from telerig.io.report.page.number_format import nice_below, number, short_names
 
@@ -40,34 +40,30 @@ def residual_field(results: CalibrationResults, index: int) -> Picture:
     start, arrow, averaged = _arrows(kept, camera.image_size_px)
     above = 0.28
     height = image_height_in(camera.image_size_px, above)
-    with drawing(height) as (figure, axes):
-        _shrink(axes, above / height)
-        image_axes(axes, camera.image_size_px)
-        quiver = _quiver(axes, start, arrow * magnified, camera_colour(index))
-        _quiver(axes, *_left_out_arrows(left_out, magnified, _LONGEST * width), LEFT_OUT)
+    with drawing(height) as sheet:
+        box = sheet.axes.get_position()
+        sheet.axes.set_position((box.x0, box.y0, box.width, box.height - above / height))
+        image_axes(sheet.axes, camera.image_size_px)
+        quiver = _quiver(sheet.axes, start, arrow * magnified, camera_colour(index))
+        strange = magnified * left_out[["du_px", "dv_px"]].to_numpy()
+        length = np.maximum(np.hypot(*strange.T), 1e-300)[:, None]
+        strange = strange * np.minimum(1.0, _LONGEST * width / length)
+        _quiver(sheet.axes, left_out[["u_px", "v_px"]].to_numpy(), strange, LEFT_OUT)
         key_px = nice_below(0.15 * width / magnified)
-        axes.quiverkey(
+        sheet.axes.quiverkey(
             quiver, 0.02, 1 + 0.5 * above / height, key_px * magnified,
             f"{number(key_px, 1)} px, drawn {magnified:,.0f} times as long",
             labelpos="E", coordinates="axes", labelsep=0.06,
         )  # fmt: skip
-        source = svg(figure)
-    return Picture(f"Residuals, camera {camera.name}", source, _field_caption(left_out, averaged))
-
-
-def _field_caption(left_out: pd.DataFrame, averaged: bool) -> str:
-    text = "Arrows in all directions are noise; arrows that swirl or point outwards together "
-    text += "are distortion that the model misses."
+    caption = (
+        "Arrows in all directions are noise; arrows that swirl or point outwards together "
+        "are distortion that the model misses."
+    )
     if averaged:
-        text += " There are too many dots for one arrow each: each arrow is the mean of a cell."
+        caption += " There are too many dots for one arrow each: each arrow is the mean of a cell."
     if len(left_out):
-        text += f" Red: {len(left_out)} left out, cut to {_LONGEST:.0%} of the image's width."
-    return text
-
-
-def _shrink(axes: Any, share: float) -> None:
-    box = axes.get_position()
-    axes.set_position((box.x0, box.y0, box.width, box.height - share))
+        caption += f" Red: {len(left_out)} left out, cut to {_LONGEST:.0%} of the image's width."
+    return Picture(f"Residuals, camera {camera.name}", sheet.source, caption)
 
 
 def _quiver(axes: Any, start: Array, arrow: Array, colour: str) -> Any:
@@ -92,59 +88,42 @@ def _arrows(table: pd.DataFrame, size_px: tuple[int, int]) -> tuple[Array, Array
     return means[:, :2], means[:, 2:], True
 
 
-def _left_out_arrows(table: pd.DataFrame, magnified: float, longest: float) -> tuple[Array, Array]:
-    arrow = magnified * table[["du_px", "dv_px"]].to_numpy()
-    length = np.maximum(np.hypot(*arrow.T), 1e-300)[:, None]
-    return table[["u_px", "v_px"]].to_numpy(), arrow * np.minimum(1.0, longest / length)
-
-
 def residual_histogram(results: CalibrationResults) -> Picture:
     """All residual coordinates against the normal distribution that the noise predicts."""
     table = results.residuals
     whitened = "whitened_u" in table
     columns = ["whitened_u", "whitened_v"] if whitened else ["du_px", "dv_px"]
     kept = table.loc[table["kept"], columns].to_numpy().ravel()
-    sigma = 1.0 if whitened else float(np.sqrt(np.mean(kept**2))) if len(kept) else 1.0
-    sigma = sigma or 1.0
+    rms = float(np.sqrt(np.mean(kept**2))) if len(kept) else float("nan")
+    sigma = 1.0 if whitened or not rms > 0 else rms
     edges = np.linspace(-5, 5, 41) * sigma
-    with drawing(2.9) as (figure, axes):
+    xlabel = "residual / its sigma" if whitened else "residual / px"
+    with drawing(2.9, legend="above", xlabel=xlabel, ylabel="density") as sheet:
         for i, name in enumerate(results.camera_names):
             mine = table.loc[table["kept"] & (table["camera"] == name), columns].to_numpy()
-            axes.stairs(
-                _density(mine.ravel(), edges), edges, color=camera_colour(i), linewidth=1.4,
-                label=name, fill=i == 0, alpha=0.45 if i == 0 else 1,
+            count, _ = np.histogram(mine, edges)
+            sheet.axes.stairs(
+                count / max(mine.size, 1) / np.diff(edges), edges, color=camera_colour(i),
+                linewidth=1.4, label=name, fill=i == 0, alpha=0.45 if i == 0 else 1,
             )  # fmt: skip
         x = np.linspace(edges[0], edges[-1], 120)
         curve = np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
         label = "unit normal" if whitened else f"normal, sigma {number(sigma)} px"
-        axes.plot(x, curve, color="black", label=label)
-        axes.set(xlabel="residual / its sigma" if whitened else "residual / px", ylabel="density")
-        axes.set(
-            xlim=(edges[0], edges[-1]), ylim=(0, 1.45 * max(curve.max(), axes.get_ylim()[1] / 1.3))
-        )
-        axes.legend(loc="upper left")
-        source = svg(figure)
-    beyond = int(np.sum(np.abs(kept) > edges[-1]))
-    caption = _histogram_caption(whitened, kept, beyond)
-    return Picture("Distribution of the residuals", source, caption)
-
-
-def _histogram_caption(whitened: bool, kept: Array, beyond: int) -> str:
+        sheet.axes.plot(x, curve, color="black", label=label)
+        sheet.axes.set(xlim=(edges[0], edges[-1]), ylim=(0, None))
     if whitened:
-        spread = f"{np.sqrt(np.mean(kept**2)):.2f}" if len(kept) else "unknown"
-        text = (
+        caption = (
             "Residuals over their own predicted noise should follow the black curve, a little "
-            f"narrower because they were fitted (here {spread}); fat tails are outliers."
+            f"narrower because they were fitted (here {number(rms)}); fat tails are outliers."
         )
     else:
-        text = "Steps should follow the curve, a normal distribution of the same RMS; fat tails"
-        text += " are outliers."
-    return text + (f" {beyond} kept values lie beyond the plot." if beyond else "")
-
-
-def _density(values: Array, edges: Array) -> Array:
-    count, _ = np.histogram(values, edges)
-    return np.asarray(count / max(len(values), 1) / np.diff(edges))
+        caption = (
+            "Steps should follow the curve, a normal distribution of the same RMS; fat tails are "
+            "outliers."
+        )
+    beyond = int(np.sum(np.abs(kept) > edges[-1]))
+    caption += f" {beyond} kept values lie beyond the plot." if beyond else ""
+    return Picture("Distribution of the residuals", sheet.source, caption)
 
 
 _GRID = 6
@@ -161,23 +140,21 @@ def coverage(results: CalibrationResults, index: int) -> Picture:
     size = camera.image_size_px
     edges = [np.linspace(-0.5, n - 0.5, _GRID + 1) for n in size]
     count, _ = np.histogramdd(uv, bins=edges)
-    with drawing(image_height_in(size)) as (figure, axes):
-        image_axes(axes, size)
-        axes.pcolormesh(
+    with drawing(image_height_in(size)) as sheet:
+        image_axes(sheet.axes, size)
+        sheet.axes.pcolormesh(
             *edges, np.where(count.T > 0, np.nan, 1.0), cmap="Reds", vmin=0, vmax=5,
             edgecolors="#e3e5e8", linewidth=0.4,
         )  # fmt: skip
-        axes.plot(
+        sheet.axes.plot(
             *uv.T, ".", color=camera_colour(index), markersize=5, markeredgewidth=0,
             alpha=0.7, rasterized=len(uv) > _MOST_MARKERS,
         )  # fmt: skip
-        source = svg(figure)
-    empty = int(np.sum(count == 0))
     caption = (
-        f"{len(uv)} dots of all views; {empty} of {_GRID**2} cells (red) were never reached, and "
-        "there the distortion is extrapolated."
+        f"{len(uv)} dots of all views; {int(np.sum(count == 0))} of {_GRID**2} cells (red) were "
+        "never reached, and there the distortion is extrapolated."
     )
-    return Picture(f"Coverage, camera {camera.name}", source, caption)
+    return Picture(f"Coverage, camera {camera.name}", sheet.source, caption)
 
 
 def tilt_angles_rad(results: CalibrationResults, index: int) -> tuple[list[str], Array, Array]:
@@ -199,8 +176,19 @@ def tilt_angles_rad(results: CalibrationResults, index: int) -> tuple[list[str],
 def tilts(results: CalibrationResults) -> Picture:
     """Tilt and its direction for every view and camera, as a disc with 90 degrees at its rim."""
     every: list[float] = []
-    with drawing(4.0) as (figure, axes):
-        _disc(axes)
+    turn = np.linspace(0, 2 * np.pi, 91)
+    with drawing(4.0) as sheet:
+        axes, thin = sheet.axes, {"color": MUTED, "linewidth": 0.4}
+        for degrees in (30, 60, 90):
+            axes.plot(degrees * np.cos(turn), degrees * np.sin(turn), color=MUTED, linewidth=0.6)
+            words = {"color": MUTED, "ha": "center", "va": "bottom", "fontsize": 7.5}
+            axes.text(0, -degrees, f"{degrees}°", **words)
+        axes.plot([-90, 90], [0, 0], [0, 0], [-90, 90], **thin)
+        axes.text(92, 0, "+u", va="center", color=MUTED)
+        axes.text(0, 93, "+v", ha="center", va="top", color=MUTED)
+        axes.set(xlim=(-100, 104), ylim=(102, -100), aspect="equal")
+        axes.axis("off")
+        axes.set_position((0.02, 0.02, 0.96, 1 - 0.04 * WIDTH_IN / 4.0))
         for i, camera in enumerate(results.cameras):
             views, tilt, direction = tilt_angles_rad(results, i)
             radius = np.degrees(tilt)
@@ -211,28 +199,12 @@ def tilts(results: CalibrationResults) -> Picture:
                 for view, a, b in zip(short_names(views), x, y):
                     axes.annotate(view, (a, b), (4, 3), textcoords="offset points", fontsize=7)
         axes.legend(loc="upper left", bbox_to_anchor=(-0.1, 1.04))
-        source = svg(figure)
     span = f"from {min(every):.0f} to {max(every):.0f} degrees" if every else "unknown"
     caption = (
         f"One mark per view: distance from the middle is the tilt ({span}), direction is where the "
         "target leans in the image; marks should go round the disc at 20 to 70 degrees."
     )
-    return Picture("Tilts of the target", source, caption)
-
-
-def _disc(axes: Any) -> None:
-    turn = np.linspace(0, 2 * np.pi, 91)
-    for degrees in (30, 60, 90):
-        axes.plot(degrees * np.cos(turn), degrees * np.sin(turn), color=MUTED, linewidth=0.6)
-        axes.text(0, -degrees, f"{degrees}°", color=MUTED, ha="center", va="bottom", fontsize=7.5)
-    axes.plot([-90, 90], [0, 0], [0, 0], [-90, 90], color=MUTED, linewidth=0.4)
-    axes.text(92, 0, "+u", va="center", color=MUTED)
-    axes.text(0, 93, "+v", ha="center", va="top", color=MUTED)
-    axes.set(xlim=(-100, 104), ylim=(102, -100))
-    axes.set_aspect("equal")
-    axes.axis("off")
-    box = axes.figure.bbox_inches
-    axes.set_position((0.02, 0.02, 0.96, 1 - 0.04 * box.width / box.height))
+    return Picture("Tilts of the target", sheet.source, caption)
 
 
 _LEVELS = 8
@@ -270,19 +242,18 @@ def _map(arrays: Mapping[str, Array], name: str, words: tuple[str, str]) -> Pict
     flat = level <= level.min() + 1e-6
     x, z = (np.unique(points[flat, i]) for i in (0, 2))
     grid = sd_um[flat].reshape(len(x), len(z))
-    with drawing(3.6) as (figure, axes):
+    limits: dict[str, Any] = {"xlim": (x[0], x[-1]), "ylim": (z[0], z[-1]), "aspect": "equal"}
+    with drawing(3.6, xlabel="x / mm", ylabel="z / mm", **limits) as sheet:
         if np.ptp(grid) > 1e-3 * grid.max():
-            filled = axes.contourf(x, z, grid.T, levels=_LEVELS, cmap="viridis")
-            figure.colorbar(filled, ax=axes, label="µm")
+            filled = sheet.axes.contourf(x, z, grid.T, levels=_LEVELS, cmap="viridis")
+            sheet.figure.colorbar(filled, ax=sheet.axes, label="µm")
         else:
-            axes.text(0.5, 0.5, f"{number(grid.mean(), 3)} µm everywhere", ha="center",
-                      va="center", transform=axes.transAxes)  # fmt: skip
-        axes.set(xlabel="x / mm", ylabel="z / mm", xlim=(x[0], x[-1]), ylim=(z[0], z[-1]))
-        axes.set_aspect("equal")
-        source = svg(figure)
+            everywhere = f"{number(grid.mean(), 3)} µm everywhere"
+            middle = {"ha": "center", "va": "center", "transform": sheet.axes.transAxes}
+            sheet.axes.text(0.5, 0.5, everywhere, **middle)
     caption = words[1].format(sigma=number(float(arrays["sigma_px"]), 3))
     caption += f" {number(grid.min(), 3)} to {number(grid.max(), 3)} µm."
-    return Picture(words[0], source, caption)
+    return Picture(words[0], sheet.source, caption)
 
 
 def _halves(halves: Mapping[str, Any]) -> Picture:
@@ -298,15 +269,13 @@ def _halves(halves: Mapping[str, Any]) -> Picture:
     spacing = np.ptp(x) / max(len(np.unique(x)) - 1, 1)
     longest = float(np.hypot(*shift[flat][:, [0, 2]].T).max())
     factor = 0.7 * spacing / max(longest, float(sd.max()), 1e-9)
-    with drawing(3.9) as (figure, axes):
+    with drawing(3.9, xlabel="x / mm", ylabel="z / mm") as sheet:
         for a, b, s in zip(x, z, sd[flat]):
             radius = factor * float(np.sqrt(np.mean(s[[0, 2]] ** 2)))
-            axes.add_patch(Circle((a, b), radius, facecolor=MUTED, alpha=0.25, linewidth=0))
-        axes.quiver(x, z, *(factor * shift[flat][:, [0, 2]]).T, angles="xy", scale_units="xy",
-                    scale=1, color=MODEL, width=0.006)  # fmt: skip
-        axes.set(xlabel="x / mm", ylabel="z / mm")
-        axes.set_aspect("equal", adjustable="datalim")
-        source = svg(figure)
+            sheet.axes.add_patch(Circle((a, b), radius, facecolor=MUTED, alpha=0.25, linewidth=0))
+        sheet.axes.quiver(x, z, *(factor * shift[flat][:, [0, 2]]).T, angles="xy",
+                          scale_units="xy", scale=1, color=MODEL, width=0.006)  # fmt: skip
+        sheet.axes.set_aspect("equal", adjustable="datalim")
     caption = (
         f"Split-half check. Arrows show by how much a calibration from {halves['views'][0]} views "
         f"and one from the other {halves['views'][1]} place the same pixels differently (longest "
@@ -315,4 +284,4 @@ def _halves(halves: Mapping[str, Any]) -> Picture:
         "mostly a rotation and a scale. If most arrows are much longer than the radius, the "
         "covariance is too small."
     )
-    return Picture("Split-half check", source, caption)
+    return Picture("Split-half check", sheet.source, caption)

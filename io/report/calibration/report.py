@@ -68,6 +68,10 @@ def render(results: CalibrationResults, dot: list[Picture] | None = None) -> str
 def _words(results: CalibrationResults) -> dict[str, Any]:
     file = results.file
     costs = (file.twin.cost, file.twin.other_cost)
+    # What halves and residuals say; nothing for folders of before.
+    halves, structure = results.file.diagnostics.halves, results.file.diagnostics.structure
+    found = [str(halves["words"])] if "words" in halves else []
+    found += [str(words) for words in structure.get("words") or []]
     return {
         "name": file.name or "calibration",
         "status": file.verdict.status,
@@ -81,19 +85,11 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "weak": file.diagnostics.weak,
         "notes": file.notes,
         "absent": results.absent,
-        "trust_words": _trust_words(results),
+        "trust_words": ([words[0].upper() + words[1:] + "." for words in found if words]),
         "comparison": results.comparison.content(),
         "advice": file.diagnostics.next_view,
         "dots_drawn": dots_are_drawn(results),
     }
-
-
-def _trust_words(results: CalibrationResults) -> list[str]:
-    """What halves and residuals say; nothing for folders of before."""
-    halves, structure = results.file.diagnostics.halves, results.file.diagnostics.structure
-    found = [str(halves["words"])] if "words" in halves else []
-    found += [str(words) for words in structure.get("words") or []]
-    return [words[0].upper() + words[1:] + "." for words in found if words]
 
 
 def _tables(results: CalibrationResults) -> dict[str, Any]:

@@ -103,7 +103,14 @@ def read_results(folder: Path) -> CalibrationResults:
     run = RunFile.read_if_there(folder / "run.json")
     comparison = ComparisonFile.read_if_there(folder / "comparison.json")
     overlays = _overlays(folder / "overlays", cameras, views)
-    absent = _absent(residuals, joint, run, overlays, example)
+    words = {
+        "dots.csv with covariances (residuals are shown in px only)": "whitened_u" in residuals,
+        "covariance.npz (no standard deviations of the target's shape)": bool(joint.size),
+        "run.json (no versions, no hashes of what went in)": bool(run.content()),
+        "overlays/ (no pictures of the dots that were found)": bool(overlays),
+        "dot_example.npz (no picture of a dot and its fit)": bool(example),
+    }
+    absent = tuple(text for text, present in words.items() if not present)
     return CalibrationResults(
         file,
         cameras,
@@ -176,16 +183,3 @@ def _overlays(
 def _row_column(residuals: pd.DataFrame, dot_ids: Ints) -> Array:
     known = residuals.drop_duplicates("dot").set_index("dot")[["row", "column"]]
     return known.reindex(dot_ids).to_numpy(float)
-
-
-def _absent(
-    residuals: pd.DataFrame, joint: Array, run: RunFile, overlays: object, example: object
-) -> tuple[str, ...]:
-    words = {
-        "dots.csv with covariances (residuals are shown in px only)": "whitened_u" in residuals,
-        "covariance.npz (no standard deviations of the target's shape)": bool(joint.size),
-        "run.json (no versions, no hashes of what went in)": bool(run.content()),
-        "overlays/ (no pictures of the dots that were found)": bool(overlays),
-        "dot_example.npz (no picture of a dot and its fit)": bool(example),
-    }
-    return tuple(text for text, present in words.items() if not present)

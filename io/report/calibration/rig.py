@@ -9,7 +9,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
-from telerig.io.report.page.figures import MUTED, Picture, camera_colour, drawing, svg
+from telerig.io.report.page.figures import MUTED, Picture, camera_colour, drawing
 from telerig.io.report.page.number_format import short_names
 from telerig.io.report.page.scene import Trace, lines, scene_text, xyz
 from telerig.rig.camera import Camera
@@ -82,19 +82,16 @@ def _camera_outline(camera: Camera, points_mm: Array) -> CameraOutline:
     middle = float(depth.mean())
     half_field = 0.5 * min(camera.image_size_px) / camera["scale_px_per_mm"]
     reach = max(float(np.abs(depth - middle).max()), half_field)
-    near = _nearest_depth(camera, middle - _BEFORE * reach)
+    # ``wanted_mm``, but well in front of the centre of perspective if there is one.
+    wanted_mm = middle - _BEFORE * reach
+    kappa = camera["kappa_per_mm"]
+    near = max(wanted_mm, -0.95 / kappa) if kappa > 0 else wanted_mm
     field = np.array([_section(camera, z) for z in (near, middle + _BEHIND * reach)])
     centre = _on_axis(camera, near)
     face = centre + 0.55 * (field[0] - centre)
     back = camera.camera_from_rig.rotation[2] * 0.7 * half_field
     axis = [_on_axis(camera, near), _on_axis(camera, middle + _BEHIND * reach)]
     return CameraOutline(camera.name, field, np.array([face - back, face]), np.array(axis))
-
-
-def _nearest_depth(camera: Camera, wanted_mm: float) -> float:
-    """``wanted_mm``, but well in front of the centre of perspective if there is one."""
-    kappa = camera["kappa_per_mm"]
-    return max(wanted_mm, -0.95 / kappa) if kappa > 0 else wanted_mm
 
 
 def _section(camera: Camera, depth_mm: float) -> Array:
@@ -179,16 +176,14 @@ def _target_traces(outline: RigOutline) -> list[Trace]:
 
 def rig_plan(results: CalibrationResults) -> Picture:
     """Cameras, fields and targets, projected along the common perpendicular of the axes."""
-    with drawing(4.2) as (figure, axes):
-        draw_plan(axes, results)
-        axes.legend(loc="upper right")
-        source = svg(figure)
+    with drawing(4.2, legend="upper right") as sheet:
+        draw_plan(sheet.axes, results)
     caption = (
         "The plane of the optical axes, seen along their common perpendicular: the targets (grey) "
         "should fill where the fields overlap. Where the boxes stand along their axes is drawn, "
         "not measured."
     )
-    return Picture("The rig in plan", source, caption)
+    return Picture("The rig in plan", sheet.source, caption)
 
 
 def draw_plan(axes: Any, results: CalibrationResults) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.io.report.calibration.results import CalibrationResults
-from telerig.io.report.page.figures import WIDTH_IN, Picture, drawing, svg
+from telerig.io.report.page.figures import WIDTH_IN, Picture, drawing
 from telerig.io.report.page.number_format import nice_below, number
 
 _MOST_LABELS = 40
@@ -76,8 +76,7 @@ def target_pictures(results: CalibrationResults) -> list[Picture]:
     shape = target_shape(results)
     if shape is None:
         return []
-    pictures = [_in_plane(results, shape)] if shape.in_plane else []
-    return [*pictures, _heights(results, shape)]
+    return [*([_in_plane(shape)] if shape.in_plane else []), _heights(shape)]
 
 
 def _axes_height_in(place_mm: Array) -> float:
@@ -93,13 +92,16 @@ def _target_axes(axes: Any, place_mm: Array) -> None:
     axes.set_aspect("equal")
 
 
-def _in_plane(results: CalibrationResults, shape: TargetShape) -> Picture:
+def _in_plane(shape: TargetShape) -> Picture:
+    from matplotlib.collections import EllipseCollection
+
     off, sd = shape.off_um[:, :2], shape.sd_um[:, :2]
     extent = np.ptp(shape.place_mm, axis=0).max()
     typical = max(float(np.quantile(np.hypot(*off.T), 0.9)), 1e-9)
     per_um = nice_below(0.08 * extent / typical * 1e3) / 1e3
     height = _axes_height_in(shape.place_mm) + 0.25
-    with drawing(height) as (figure, axes):
+    with drawing(height) as sheet:
+        axes = sheet.axes
         _target_axes(axes, shape.place_mm)
         box = axes.get_position()
         axes.set_position((box.x0, box.y0, box.width, box.height - 0.25 / height))
@@ -108,54 +110,46 @@ def _in_plane(results: CalibrationResults, shape: TargetShape) -> Picture:
             color="#1f5fa8", width=0.005,
         )  # fmt: skip
         if sd.any() and len(sd) <= _MOST_SHAPES:
-            _circles(axes, shape.place_mm + off * per_um, sd * per_um)
+            tip, (wide, high) = shape.place_mm + off * per_um, 2 * sd.T * per_um
+            rings = EllipseCollection(
+                wide, high, np.zeros(len(sd)), units="xy", offsets=tip, linewidths=0.8,
+                offset_transform=axes.transData, facecolors="none", edgecolors="#c2570c",
+            )  # fmt: skip
+            axes.add_collection(rings)
         key = nice_below(1.5 * typical)
         axes.quiverkey(
             quiver, 0.5, 1 + 0.12 / height, key * per_um, f"{number(key, 1)} µm", labelpos="E"
         )
-        source = svg(figure)
     caption = (
         f"Arrows (drawn {1e3 * per_um:,.0f} times as long) from a perfect, evenly stretched grid "
         f"to the estimated dots: RMS {number(_rms(off))} µm per axis, known to {_known(sd)}; rings "
         "are one sd."
     )
-    return Picture("Print errors in the plane", source, caption)
+    return Picture("Print errors in the plane", sheet.source, caption)
 
 
-def _circles(axes: Any, tip: Array, sd: Array) -> None:
-    from matplotlib.collections import EllipseCollection
-
-    axes.add_collection(
-        EllipseCollection(
-            2 * sd[:, 0], 2 * sd[:, 1], np.zeros(len(sd)), units="xy", offsets=tip, linewidths=0.8,
-            offset_transform=axes.transData, facecolors="none", edgecolors="#c2570c",
-        )
-    )  # fmt: skip
-
-
-def _heights(results: CalibrationResults, shape: TargetShape) -> Picture:
+def _heights(shape: TargetShape) -> Picture:
     height, sd = shape.off_um[:, 2], shape.sd_um[:, 2]
     limit = max(float(np.abs(height).max()), 1e-9)
-    with drawing(_axes_height_in(shape.place_mm) + 0.7) as (figure, axes):
-        _target_axes(axes, shape.place_mm)
+    with drawing(_axes_height_in(shape.place_mm) + 0.7) as sheet:
+        _target_axes(sheet.axes, shape.place_mm)
         size = np.clip(9000 / len(height), 12, 320)
-        dots = axes.scatter(
+        dots = sheet.axes.scatter(
             *shape.place_mm.T, c=height, s=size, cmap="RdBu_r", vmin=-limit, vmax=limit,
             edgecolors="#555555", linewidths=0.4, rasterized=len(height) > _MOST_SHAPES,
         )  # fmt: skip
         if len(height) <= _MOST_LABELS:
             for place, z in zip(shape.place_mm, height):
                 shade = "white" if abs(z) > 0.65 * limit else "black"
-                axes.text(*place, f"{z:.0f}", ha="center", va="center", fontsize=7, color=shade)
-        figure.colorbar(
-            dots, ax=axes, orientation="horizontal", fraction=0.06, pad=0.2, label="height / µm"
-        )
-        source = svg(figure)
+                words = {"ha": "center", "va": "center", "fontsize": 7, "color": shade}
+                sheet.axes.text(*place, f"{z:.0f}", **words)
+        below = {"orientation": "horizontal", "fraction": 0.06, "pad": 0.2}
+        sheet.figure.colorbar(dots, ax=sheet.axes, label="height / µm", **below)
     caption = (
         f"Height of each dot over the best plane along the target's z: RMS {number(_rms(height))} "
         f"µm, known to {_known(sd)}; a smooth bow is bending, a patchwork is the print."
     )
-    return Picture("Out of the plane", source, caption)
+    return Picture("Out of the plane", sheet.source, caption)
 
 
 def _known(sd_um: Array) -> str:

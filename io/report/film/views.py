@@ -207,7 +207,14 @@ def _view(
     drawing = np.ascontiguousarray(picture)
     for bubble in found:
         colour = _ALONE if bubble.particle is None else _bright(bubble.particle)
-        _tail(drawing, (bubble.tail_px + 0.5) * factor - 0.5, colour)
+        # Where the bubble came from; each place is a small dot on the line.
+        points = (bubble.tail_px + 0.5) * factor - 0.5
+        import cv2
+
+        if len(points) > 1:
+            cv2.polylines(drawing, [_fixed(points)], False, colour, 1, cv2.LINE_AA, _BITS)
+        for point in _fixed(points):
+            cv2.circle(drawing, (int(point[0]), int(point[1])), 24, colour, -1, cv2.LINE_AA, _BITS)
         ring = (bubble.outline_px + 0.5) * factor - 0.5
         cv2.polylines(drawing, [_fixed(ring)], True, colour, 1, cv2.LINE_AA, _BITS)
         if bubble.particle is not None:
@@ -218,16 +225,6 @@ def _view(
     for words, place, colour in labels:
         _words(page, words, place, "lm", colour)
     return page
-
-
-def _tail(picture: Picture, points: Array, colour: Colour) -> None:
-    """Where the bubble came from; each place is a small dot on the line."""
-    import cv2
-
-    if len(points) > 1:
-        cv2.polylines(picture, [_fixed(points)], False, colour, 1, cv2.LINE_AA, _BITS)
-    for point in _fixed(points):
-        cv2.circle(picture, (int(point[0]), int(point[1])), 24, colour, -1, cv2.LINE_AA, _BITS)
 
 
 def _fixed(points: Array) -> NDArray[np.int32]:

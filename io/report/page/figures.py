@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,9 @@ KEPT, LEFT_OUT, MODEL, MUTED = "#1b7f3b", "#c62828", "#c62828", "#8a8f98"
 WIDTH_IN = 4.4
 """Width of every figure: its text is as large as the page's at 420 px, and legible at 360 px."""
 
+LEFT_IN, RIGHT_IN, BOTTOM_IN = 0.7, 0.12, 0.45
+"""Margins of a figure; on the left there is room for tick labels of four digits."""
+
 _STYLE = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -26,11 +29,14 @@ _STYLE = {
     "axes.linewidth": 0.7,
     "axes.edgecolor": "#555555",
     "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "grid.color": "#e3e5e8",
     "legend.frameon": False,
     "legend.fontsize": 8,
+    "legend.columnspacing": 1.2,
+    "legend.handlelength": 1.3,
 }
 
 
@@ -50,24 +56,46 @@ def prepare_drawing() -> None:
     import matplotlib.figure  # noqa: F401
 
 
+@dataclass
+class Sheet:
+    """A figure that is being drawn.
+
+    points : how many marks and vertices it holds; with many it is stored as pixels.
+    source : its data URI, once the drawing is finished.
+    """
+
+    figure: Any
+    axes: Any
+    points: int = 0
+    source: str = ""
+
+
 @contextmanager
-def drawing(height_in: float) -> Iterator[tuple[Any, Any]]:
-    """A figure and its axes in the report's style, `WIDTH_IN` wide."""
+def drawing(
+    height_in: float, *, legend: str = "", grid: bool = False, **settings: Any
+) -> Iterator[Sheet]:
+    """A figure and its axes in the report's style, `WIDTH_IN` wide.
+
+    legend : "above" the axes, or a place in them by its name in matplotlib; "" for none.
+    settings : of the axes, as ``axes.set`` takes them.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(_STYLE):
         figure = Figure(figsize=(WIDTH_IN, height_in))
-        left, right, bottom, top = 0.58, 0.12, 0.45, 0.12
-        box = (
-            left / WIDTH_IN,
-            bottom / height_in,
-            1 - (left + right) / WIDTH_IN,
-            1 - (bottom + top) / height_in,
-        )
-        axes = figure.add_axes(box)
+        top = 0.3 if legend == "above" else 0.12
+        box = (LEFT_IN, BOTTOM_IN, WIDTH_IN - LEFT_IN - RIGHT_IN, height_in - BOTTOM_IN - top)
+        axes = figure.add_axes(tuple(np.array(box) / [WIDTH_IN, height_in, WIDTH_IN, height_in]))
         axes.locator_params(nbins=5)
-        yield figure, axes
+        axes.set(**settings)
+        axes.grid(grid)
+        sheet = Sheet(figure, axes)
+        yield sheet
+        if legend and axes.get_legend_handles_labels()[1]:
+            above = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 4, "borderpad": 0.2}
+            axes.legend(**(above if legend == "above" else {"loc": legend}))
+        sheet.source = png(figure, _DPI, _SHADES) if sheet.points > _MANY else svg(figure)
 
 
 def svg(figure: Any) -> str:
@@ -107,7 +135,8 @@ def image_axes(axes: Any, image_size_px: tuple[int, int]) -> None:
 def image_height_in(image_size_px: tuple[int, int], above_in: float = 0.0) -> float:
     """Height of a figure that holds `image_axes`, with room ``above_in`` for a legend."""
     width, height = image_size_px
-    return float(min(7.0, 0.57 + (WIDTH_IN - 0.7) * height / width)) + above_in
+    inside = (WIDTH_IN - LEFT_IN - RIGHT_IN) * height / width
+    return float(min(7.0, BOTTOM_IN + 0.12 + inside)) + above_in
 
 
 def camera_colour(index: int) -> str:
@@ -119,48 +148,42 @@ BAND_SDS = 2
 _MANY = 1_500
 _SHADES = 64
 _DPI = 190
-_ROOM = 0.035
 
 
-def line(axes: Any, t_s: Array, values: Array, colour: str, label: str = "", **how: Any) -> None:
-    """``values`` against time; nothing where none is finite."""
-    if np.isfinite(values).any():
-        axes.plot(t_s, values, color=colour, label=label, **({"linewidth": 0.9} | how))
+@dataclass(frozen=True)
+class Curve:
+    """A line of a plot.
 
-
-def band(axes: Any, t_s: Array, centre: Array, sd: Array, colour: str, label: str = "") -> None:
-    """``centre`` ± `BAND_SDS` sd as a surface."""
-    if not np.isfinite(sd).any():
-        return
-    far = BAND_SDS * sd
-    axes.fill_between(t_s, centre - far, centre + far, color=colour, alpha=0.25,
-                      linewidth=0, label=label)  # fmt: skip
-
-
-def room_left(axes: Any) -> None:
-    """Move the left edge of the axes so that tick labels of four digits fit beside them.
-
-    Ticks of a linear x axis (times) are written without a common offset.
+    x, y : (N,). sd : (N,) of a band of ± `BAND_SDS` of it, or None. style : as matplotlib's plot
+    takes it.
     """
-    if axes.get_xscale() == "linear":
-        axes.ticklabel_format(axis="x", useOffset=False)
-    box = axes.get_position()
-    axes.set_position((box.x0 + _ROOM, box.y0, box.width - _ROOM, box.height))
+
+    x: Array
+    y: Array
+    colour: str
+    label: str = ""
+    sd: Array | None = None
+    style: Mapping[str, Any] = field(default_factory=dict)
 
 
-def above(axes: Any, *, inverted: bool = False) -> None:
-    """The legend over the lines, with room for it; ``inverted`` turns the axis round as well."""
-    low, high = axes.get_ylim()
-    room = 0.17 * (high - low)
-    axes.set_ylim(*((high, low - room) if inverted else (low, high + room)))
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(loc="upper left", ncols=4, columnspacing=1.0, handlelength=1.2,
-                    borderaxespad=0.1)  # fmt: skip
-
-
-def source_of(figure: Any, points: int) -> str:
-    """Shapes for short series, pixels for long ones."""
-    return png(figure, dpi=_DPI, colours=_SHADES) if points > _MANY else svg(figure)
+def draw_curves(sheet: Sheet, curves: Iterable[Curve]) -> None:
+    """Draw the curves that have finite values, each band below its line; each label stands once."""
+    labels: set[str] = set()
+    for curve in curves:
+        fresh = curve.label if curve.label not in labels else ""
+        if curve.sd is not None and np.isfinite(curve.sd).any():
+            far = BAND_SDS * curve.sd
+            words = f"± {BAND_SDS} sd" if fresh else ""
+            sheet.axes.fill_between(
+                curve.x, curve.y - far, curve.y + far, color=curve.colour, alpha=0.25, linewidth=0,
+                label=words,
+            )  # fmt: skip
+            sheet.points += len(curve.x)
+        if np.isfinite(curve.y).any():
+            style = {"linewidth": 0.9} | dict(curve.style)
+            sheet.axes.plot(curve.x, curve.y, color=curve.colour, label=fresh, **style)
+            sheet.points += len(curve.x)
+            labels.add(curve.label)
 
 
 def limits(*series: Array, beyond: float = 0.08) -> tuple[float, float] | None:

@@ -27,7 +27,20 @@ def scene_text(
     up : (3,) unit vector, up on the screen. distance : of the eye; from afar it looks a little
     lower, where tilted boxes reach farthest. ratio : of the box' sides, None: true proportions.
     """
-    layout = _layout(up, distance)
+    axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
+    lower = [-min(0.3 * (distance - 1), 0.12) * float(part) for part in up]
+    view = {
+        "up": dict(zip("xyz", up)),
+        "center": dict(zip("xyz", lower)),
+        "eye": dict(zip("xyz", _eye(up, distance))),
+    }
+    layout: dict[str, Any] = {
+        "scene": axes | {"aspectmode": "data", "camera": view},
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"},
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MUTED, "activecolor": "#333333"},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+    }
     if ratio is not None:
         layout["scene"] |= {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio))}
         for name in ("xaxis", "yaxis", "zaxis"):
@@ -54,20 +67,3 @@ def _eye(up: Sequence[float], distance: float) -> list[float]:
     eye = 0.8 * np.array(up, float)
     eye[[i for i in range(3) if i != axis]] += (0.85, -1.0)
     return [float(part) for part in distance * eye]
-
-
-def _layout(up: Sequence[float], distance: float) -> dict[str, Any]:
-    axes = {f"{a}axis": {"title": {"text": f"{a} / mm"}, "showspikes": False} for a in "xyz"}
-    lower = [-min(0.3 * (distance - 1), 0.12) * float(part) for part in up]
-    view = {
-        "up": dict(zip("xyz", up)),
-        "center": dict(zip("xyz", lower)),
-        "eye": dict(zip("xyz", _eye(up, distance))),
-    }
-    return {
-        "scene": axes | {"aspectmode": "data", "camera": view},
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "legend": {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"},
-        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MUTED, "activecolor": "#333333"},
-        "paper_bgcolor": "rgba(0,0,0,0)",
-    }

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from telerig.io.files.atomic import write_text_atomic
-from telerig.io.report.page.contact_sheet import BUDGET_BYTES, ContactSheet, picture_sheet
+from telerig.io.report.page.contact_sheet import BUDGET_BYTES, picture_sheet
 from telerig.io.report.page.number_format import flat_rows
 from telerig.io.report.page.page import drawn_over_cores, plotly_javascript, render_page
 from telerig.io.report.run.smoothing.figures import PLACES, smoothing_drawings
@@ -79,7 +79,12 @@ def render(
         context["smoothing"] = smoothing_words(smoothing, results)
     drawn = [p.source for group in context.values() for p in _list(group) if hasattr(p, "source")]
     left = PAGE_BYTES - len(plotly_javascript()) - len(scene) - sum(map(len, drawn))
-    context["sheet"] = _sheet(results, max(0, int(left / _BASE64)))
+    columns = [column for c in results.cameras for column in (c, binary_column(c))]
+    rows = list(tables.worst_words(results)) if results.pictures else []
+    context["sheet"] = picture_sheet(
+        rows, columns, results.pictures, small_width_px=_SMALL_WIDTH_PX,
+        budget_bytes=min(BUDGET_BYTES, max(0, int(left / _BASE64))),
+    )  # fmt: skip
     return render_page("template_track.html", context, scene)
 
 
@@ -92,15 +97,6 @@ def _in_space(results: TrackResults, smoothing: SmoothingResults | None) -> Trac
 
 def _list(group: Any) -> list[Any]:
     return group if isinstance(group, list) else []
-
-
-def _sheet(results: TrackResults, budget_bytes: int) -> ContactSheet:
-    columns = [column for c in results.cameras for column in (c, binary_column(c))]
-    rows = list(tables.worst_words(results)) if results.pictures else []
-    return picture_sheet(
-        rows, columns, results.pictures, small_width_px=_SMALL_WIDTH_PX,
-        budget_bytes=min(BUDGET_BYTES, budget_bytes),
-    )  # fmt: skip
 
 
 def _words(results: TrackResults) -> dict[str, Any]:

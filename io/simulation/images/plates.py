@@ -61,7 +61,17 @@ def render(
         )
         dirt = np.minimum(dirt, 1)
         grey += dirt * (plate.dirt_albedo - grey)
-    return _lit(grey, light, width, height)
+    half_diagonal = np.hypot(width, height) / 2
+    u = (np.arange(width) - (width - 1) / 2) / half_diagonal
+    v = (np.arange(height)[:, None] - (height - 1) / 2) / half_diagonal
+    field = 1 + light.gradient[0] * u + light.gradient[1] * v - light.vignetting * (u**2 + v**2)
+    lit = light.gain * field * grey
+    if light.glare is not None:
+        u_px, v_px, radius, strength = light.glare
+        du = (np.arange(width) - u_px) / radius
+        dv = (np.arange(height)[:, None] - v_px) / radius
+        lit += strength * np.exp(-(du**2 + dv**2) / 2)
+    return np.asarray(lit)
 
 
 def disc_coverage(
@@ -81,7 +91,12 @@ def disc_coverage(
     near = _near_image(camera, rig_from_target, plate, centres_mm, diameter_mm, blur_px)
     centres, diameter, hole = centres_mm[near], diameter_mm[near], hole_mm[near]
     first, count = _windows(camera, rig_from_target, plate, centres, diameter)
-    nodes = _window_nodes(camera, rig_from_target, plate, centres, first, count)
+    # (N, 2, nodes, nodes) x, y from each disc's centre, at Chebyshev nodes of its window.
+    along = (first[:, None, :] - 0.5) + count[:, None, :] * (1 + _chebyshev(_NODES)[:, None]) / 2
+    uv = np.empty((len(centres), _NODES, _NODES, 2))
+    uv[..., 0], uv[..., 1] = along[:, None, :, 0], along[:, :, None, 1]
+    xy = plate_from_pixel(camera, rig_from_target, uv, plate, centres[:, None, None, 2])
+    nodes = np.moveaxis(xy - centres[:, None, None, :2], -1, 1)
     pad = int(np.ceil(5 * blur_px)) + 1
     out = np.zeros((height + 2 * pad, width + 2 * pad))
     for corner, size, local, outer, inner in zip(first, count, nodes, diameter, hole):
@@ -121,42 +136,22 @@ def _windows(
     return first, np.ceil(uv.max(1)).astype(np.int64) - first + 1
 
 
-def _window_nodes(
-    camera: Camera,
-    pose: Pose,
-    plate: Plate,
-    centres: Array,
-    first: Ints,
-    count: Ints,
-) -> Array:
-    """(N, 2, nodes, nodes) x, y from each disc's centre, at Chebyshev nodes of its window."""
-    along = (first[:, None, :] - 0.5) + count[:, None, :] * (1 + _chebyshev(_NODES)[:, None]) / 2
-    uv = np.empty((len(centres), _NODES, _NODES, 2))
-    uv[..., 0], uv[..., 1] = along[:, None, :, 0], along[:, :, None, 1]
-    xy = plate_from_pixel(camera, pose, uv, plate, centres[:, None, None, 2])
-    return np.moveaxis(xy - centres[:, None, None, :2], -1, 1)
-
-
 def _cell_coverage(nodes: Array, size: Ints, radius_mm: float) -> Array:
     """(cells_v, cells_u) share of every cell of a window that lies in the disc."""
     columns, rows = _interpolation(int(size[0])), _interpolation(int(size[1]))
     x, y = rows @ nodes @ columns.T
     square = x * x + y * y
     coverage = (square < radius_mm**2).astype(float)
-    jacobian = _mean_jacobian(x, y)
+    # (2, 2) mean change of plate coordinates (mm) per cell, as d(x, y) / d(u, v).
+    by_u = [np.mean(a[:, -1] - a[:, 0]) / (a.shape[1] - 1) for a in (x, y)]
+    by_v = [np.mean(a[-1] - a[0]) / (a.shape[0] - 1) for a in (x, y)]
+    jacobian = np.array([by_u, by_v]).T
     reach = 0.75 * float(np.linalg.norm(jacobian))
     band = np.abs(square - radius_mm**2) < reach * (2 * radius_mm + reach)
     distance = np.sqrt(square[band])
     outward = np.stack([x[band], y[band]], -1) / np.maximum(distance, 1e-12)[:, None]
     coverage[band] = _half_plane_share(radius_mm - distance, outward @ jacobian)
     return np.asarray(coverage)
-
-
-def _mean_jacobian(x: Array, y: Array) -> Array:
-    """(2, 2) mean change of plate coordinates (mm) per cell, as d(x, y) / d(u, v)."""
-    by_u = [np.mean(a[:, -1] - a[:, 0]) / (a.shape[1] - 1) for a in (x, y)]
-    by_v = [np.mean(a[-1] - a[0]) / (a.shape[0] - 1) for a in (x, y)]
-    return np.array([by_u, by_v]).T
 
 
 def _half_plane_share(depth: Array, slope: Array) -> Array:
@@ -217,17 +212,3 @@ def _plate_and_background(camera: Camera, pose: Pose, plate: Plate, blur_px: flo
         spread = np.hypot(by_u, by_v) * np.sqrt(blur_px**2 + 1 / 12)
         share *= ndtr((place - low) / spread) * ndtr((high - place) / spread)
     return plate.background_albedo + share * (plate.plate_albedo - plate.background_albedo)
-
-
-def _lit(grey: Array, light: Light, width: int, height: int) -> Array:
-    half_diagonal = np.hypot(width, height) / 2
-    u = (np.arange(width) - (width - 1) / 2) / half_diagonal
-    v = (np.arange(height)[:, None] - (height - 1) / 2) / half_diagonal
-    field = 1 + light.gradient[0] * u + light.gradient[1] * v - light.vignetting * (u**2 + v**2)
-    lit = light.gain * field * grey
-    if light.glare is not None:
-        u_px, v_px, radius, strength = light.glare
-        du = (np.arange(width) - u_px) / radius
-        dv = (np.arange(height)[:, None] - v_px) / radius
-        lit += strength * np.exp(-(du**2 + dv**2) / 2)
-    return np.asarray(lit)

@@ -102,7 +102,13 @@ class RunScene:
         swing = np.cos(2 * np.pi * population.swing_hz[chosen] * t + population.swing_rad[chosen])
         modes = population.modes_static[chosen] + population.modes_swing[chosen] * swing
         spin = 2 * np.pi * population.spin_hz[chosen] * t + population.spin_rad[chosen]
-        rotation = _facing(self.lab_mm_s[chosen, frame], spin)
+        # (M, 3, 3) lab_from_body with z along the velocity, turned about it.
+        z = _unit(self.lab_mm_s[chosen, frame])
+        start = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
+        x = _unit(start - z * np.sum(start * z, -1, keepdims=True))
+        y = np.cross(z, x)
+        cosine, sine = np.cos(spin)[:, None], np.sin(spin)[:, None]
+        rotation = np.stack([x * cosine + y * sine, y * cosine - x * sine, z], -1)
         return bodies_about(
             self.lab_mm[chosen, frame],
             rotation,
@@ -118,19 +124,15 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     speed = config.stage.follow * _mean_rise(config.motion)
     carriage = _carriage(config, len(cameras), speed, stage_rng)
     position = carriage.position_mm[carriage.frames]
-    size_mm = _view_mm(config)
+    # (2,) nominal width and height of the first camera's view.
+    first = config.calibration.cameras[0]
+    size_mm = np.array(first.image_size_px) / first.nominal_scale_px_per_mm
     count = _bubble_count(config, position, size_mm)
     population = random_population(config.bubble, count, shape_rng)
     paths = _paths(config, count, path_rng)
     lab, velocity, closest = _lab_paths(config, paths, path_rng)
     start = _starts(config, lab, position, population.d_eq_mm, size_mm, place_rng)
     return RunScene(config, cameras, carriage, population, lab + start[:, None], velocity, closest)
-
-
-def _view_mm(config: RunConfig) -> Array:
-    """(2,) nominal width and height of the first camera's view."""
-    first = config.calibration.cameras[0]
-    return np.array(first.image_size_px) / first.nominal_scale_px_per_mm
 
 
 def _mean_rise(motion: MotionConfig) -> float:
@@ -318,13 +320,3 @@ def _start(
     else:
         up = rng.uniform(-0.5, 0.5) * height * min(config.motion.spread) - mean_rise_mm
     return np.asarray((up + position_mm) * AXIS_RIG + across @ _ACROSS)
-
-
-def _facing(velocity: Array, spin_rad: Array) -> Array:
-    """(M, 3, 3) lab_from_body with z along the velocity, turned about it."""
-    z = _unit(velocity)
-    start = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
-    x = _unit(start - z * np.sum(start * z, -1, keepdims=True))
-    y = np.cross(z, x)
-    cosine, sine = np.cos(spin_rad)[:, None], np.sin(spin_rad)[:, None]
-    return np.stack([x * cosine + y * sine, y * cosine - x * sine, z], -1)

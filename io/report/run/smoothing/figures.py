@@ -17,15 +17,11 @@ from telerig.io.report.page.figures import (
     NAIVE,
     RTS,
     SMOOTHED,
+    Curve,
     Picture,
-    above,
-    band,
     camera_colour,
+    draw_curves,
     drawing,
-    limits,
-    line,
-    room_left,
-    source_of,
 )
 from telerig.io.report.page.number_format import is_number, number
 from telerig.io.report.run.smoothing.numbers import (
@@ -77,31 +73,26 @@ _BANDS = "Bands are ± 2 sd."
 def places(results: SmoothingResults, axis: int) -> Picture:
     """One lab coordinate of every bubble; up is up. Naive and RTS beneath where bubbles are few."""
     shown = results.bubbles[:_MOST_BUBBLES]
-    name, points, few = PLACE.format(AXES[axis]), 0, len(shown) <= _FEW
-    with drawing(2.6) as (figure, axes):
-        for i, particle in enumerate(shown):
-            table = results.track(particle)
-            t, value = table["t_s"].to_numpy(float), column(table, name)
-            if few:
-                line(axes, t, column(table, f"naive_{name}"), NAIVE, "" if i else "naive")
-                line(axes, t, column(table, f"rts_{name}"), RTS, "" if i else "RTS", linewidth=0.6)
-            band(axes, t, value, column(table, f"s{name}"), track_colour(particle))
-            line(axes, t, value, track_colour(particle), "" if i else "smoothed")
-            points += (4 if few else 2) * len(t)
-        axes.set(xlabel="t / s", ylabel=f"lab {AXES[axis]} / mm")
-        room_left(axes)
-        if few:
-            above(axes, inverted=results.up[axis] < -0.5)
-        elif results.up[axis] < -0.5:
-            axes.invert_yaxis()
-        axes.grid(True)
-        source = source_of(figure, points)
-    caption = "The axis is turned round, so that up is up. " if results.up[axis] < -0.5 else ""
-    sd = median(column(results.trajectories, f"s{name}"))
-    caption += f"A colour per bubble. {_BANDS} The sd is {_um(sd)} (median): look closer below."
+    name, curves = PLACE.format(AXES[axis]), []
+    for particle in shown:
+        table = results.track(particle)
+        t = table["t_s"].to_numpy(float)
+        if len(shown) <= _FEW:
+            thin = {"linewidth": 0.6}
+            curves.append(Curve(t, column(table, f"naive_{name}"), NAIVE, "naive"))
+            curves.append(Curve(t, column(table, f"rts_{name}"), RTS, "RTS", style=thin))
+        sd = column(table, f"s{name}")
+        label = "smoothed" if len(shown) <= _FEW else ""
+        curves.append(Curve(t, column(table, name), track_colour(particle), label, sd))
+    median_sd = median(column(results.trajectories, f"s{name}"))
+    caption = (
+        f"{_upside_down(results, axis)}A colour per bubble. {_BANDS} The sd is {_um(median_sd)} "
+        "(median): look closer below."
+    )
     if len(shown) < len(results.bubbles):
         caption += f" The {len(shown)} longest of {number(len(results.bubbles))} are drawn."
-    return Picture(f"{AXES[axis]} against time", source, caption)
+    label = f"lab {AXES[axis]} / mm"
+    return _in_time(results, axis, f"{AXES[axis]} against time", label, curves, caption)
 
 
 def closer(results: SmoothingResults, axis: int) -> Picture:
@@ -112,24 +103,19 @@ def closer(results: SmoothingResults, axis: int) -> Picture:
     name, t = PLACE.format(AXES[axis]), table["t_s"].to_numpy(float)
     smooth, naive, rts = (column(table, kind + name) for kind in ("", "naive_", "rts_"))
     straight = _straight(t, smooth)
-    with drawing(2.6) as (figure, axes):
-        dots = {"linestyle": "none", "marker": ".", "markersize": 4}
-        line(axes, t, naive - straight, NAIVE, "naive", **dots)
-        line(axes, t, rts - straight, RTS, "RTS")
-        band(axes, t, smooth - straight, column(table, f"s{name}"), SMOOTHED, "± 2 sd")
-        line(axes, t, smooth - straight, SMOOTHED, "smoothed")
-        _unobserved(axes, table)
-        axes.set(xlabel="t / s", ylabel=f"lab {AXES[axis]}, less a line / mm")
-        room_left(axes)
-        above(axes, inverted=results.up[axis] < -0.5)
-        axes.grid(True)
-        source = source_of(figure, 4 * len(t))
+    dots = {"linestyle": "none", "marker": ".", "markersize": 4}
+    curves = [
+        Curve(t, naive - straight, NAIVE, "naive", style=dots),
+        Curve(t, rts - straight, RTS, "RTS"),
+        Curve(t, smooth - straight, SMOOTHED, "smoothed", column(table, f"s{name}")),
+    ]
     slope = (straight[-1] - straight[0]) / (t[-1] - t[0]) if len(t) > 1 else 0.0
     caption = (
         f"Bubble {results.bubbles[0]}, {number(len(t))} frames of its middle, without a straight "
         f"line of {number(float(slope), 3)} mm/s. {_BANDS}{_marks(table)}"
     )
-    return Picture(f"{AXES[axis]}, closer", source, caption)
+    label = f"lab {AXES[axis]}, less a line / mm"
+    return _in_time(results, axis, f"{AXES[axis]}, closer", label, curves, caption, table)
 
 
 def taken_off(results: SmoothingResults, axis: int) -> Picture:
@@ -139,70 +125,87 @@ def taken_off(results: SmoothingResults, axis: int) -> Picture:
     t, smooth = table["t_s"].to_numpy(float), column(table, name)
     sd = 1e3 * column(table, f"s{name}")
     naive, rts = (1e3 * (column(table, kind + name) - smooth) for kind in ("naive_", "rts_"))
-    with drawing(2.6) as (figure, axes):
-        _three(axes, t, [np.zeros(len(t)), naive, rts], sd)
-        _unobserved(axes, table)
-        axes.set(xlabel="t / s", ylabel=f"{AXES[axis]}, less smoothed / µm")
-        found = limits(naive, rts, 2 * sd, -2 * sd)
-        if found:
-            axes.set_ylim(*found)
-        axes.grid(True)
-        room_left(axes)
-        above(axes)
-        source = source_of(figure, 4 * len(t))
     off, own = rms(naive), median(sd)
     times = f", {number(off / own, 2)} times the sd of smoothed" if off and own else ""
     caption = (
         f"Naive minus smoothed is {number(off, 3)} µm RMS{times}; RTS minus smoothed is "
         f"{number(rms(rts), 3)} µm. {_BANDS}{_marks(table)} {where}"
     )
-    return Picture(f"{AXES[axis]}: what smoothing took off", source, caption)
+    title, label = f"{AXES[axis]}: what smoothing took off", f"{AXES[axis]}, less smoothed / µm"
+    curves = _three(t, np.zeros(len(t)), naive, rts, sd)
+    return _in_time(results, None, title, label, curves, caption, table)
 
 
 def velocities(results: SmoothingResults, axis: int) -> Picture:
     """The longest track's velocity: smoothed with its band, naive, RTS."""
     table, where = detail(results)
     name = SPEED.format(AXES[axis])
-    t = table["t_s"].to_numpy(float)
     smooth, naive, rts = (column(table, kind + name) for kind in ("", "naive_", "rts_"))
     sd = column(table, f"s{name}")
-    with drawing(2.6) as (figure, axes):
-        _three(axes, t, [smooth, naive, rts], sd)
-        _unobserved(axes, table)
-        axes.set(xlabel="t / s", ylabel=f"v{AXES[axis]} / (mm/s)")
-        room_left(axes)
-        axes.grid(True)
-        above(axes, inverted=results.up[axis] < -0.5)
-        source = source_of(figure, 4 * len(t))
     caption = (
         f"Naive scatters by {number(rms(naive - smooth), 3)} mm/s RMS about smoothed, whose sd is "
-        f"{number(median(sd), 3)} mm/s (median). {_BANDS}{_marks(table)} {where}"
+        f"{number(median(sd), 3)} mm/s (median). {_BANDS}{_marks(table)} {where} "
+        f"{_upside_down(results, axis)}"
     )
-    if results.up[axis] < -0.5:
-        caption += " The axis is turned round, so that up is up."
-    return Picture(f"Velocity in {AXES[axis]}", source, caption)
+    title, label = f"Velocity in {AXES[axis]}", f"v{AXES[axis]} / (mm/s)"
+    curves = _three(table["t_s"].to_numpy(float), smooth, naive, rts, sd)
+    return _in_time(results, axis, title, label, curves, caption, table)
 
 
 def detail(results: SmoothingResults) -> tuple[pd.DataFrame, str]:
     """The longest track, its middle where it is very long; and which that is, in words."""
     particle = results.bubbles[0]
-    table = results.track(particle)
-    what = f"Bubble {particle}"
-    if len(results.bubbles) > 1:
-        what += ", the longest track"
+    table, cut = _middle(results.track(particle), "its middle")
+    longest = ", the longest track" if len(results.bubbles) > 1 else ""
+    return table, f"Bubble {particle}{longest}{cut.replace(' ', ', ', 1) if cut else '.'}"
+
+
+def _middle(table: pd.DataFrame, of: str) -> tuple[pd.DataFrame, str]:
+    """At most `_WINDOW` rows of the middle; a sentence on it, "" where that is the whole table."""
     if len(table) <= _WINDOW:
-        return table, f"{what}."
+        return table, ""
     first = (len(table) - _WINDOW) // 2
-    return table.iloc[first : first + _WINDOW], f"{what}, {number(_WINDOW)} frames of its middle."
+    return table.iloc[first : first + _WINDOW], f" {number(_WINDOW)} frames of {of}."
 
 
-def _three(axes: Any, t: Array, values: list[Array], sd: Array) -> None:
-    """Smoothed, naive, RTS in this order, smoothed on top."""
-    smooth, naive, rts = values
-    line(axes, t, naive, NAIVE, "naive", linewidth=0.7)
-    line(axes, t, rts, RTS, "RTS", linewidth=0.9)
-    band(axes, t, smooth, sd, SMOOTHED, "± 2 sd")
-    line(axes, t, smooth, SMOOTHED, "smoothed", linewidth=1.1)
+def _three(t: Array, smooth: Array, naive: Array, rts: Array, sd: Array) -> list[Curve]:
+    """Smoothed on top of naive and RTS."""
+    return [
+        Curve(t, naive, NAIVE, "naive", style={"linewidth": 0.7}),
+        Curve(t, rts, RTS, "RTS"),
+        Curve(t, smooth, SMOOTHED, "smoothed", sd, style={"linewidth": 1.1}),
+    ]
+
+
+def _in_time(
+    results: SmoothingResults,
+    axis: int | None,
+    title: str,
+    label: str,
+    curves: Sequence[Curve],
+    caption: str,
+    table: pd.DataFrame | None = None,
+    height_in: float = 2.6,
+) -> Picture:
+    """A plot against time. axis : of the rig, turned round where it points down; None: upright.
+
+    table : a track, whose frames without an image get red ticks.
+    """
+    settings: dict[str, Any] = {"xlabel": "t / s", "ylabel": label}
+    with drawing(height_in, legend="above", grid=True, **settings) as sheet:
+        draw_curves(sheet, curves)
+        if table is not None:
+            t = table["t_s"].to_numpy(float)[column(table, "observed") == 0]
+            sheet.axes.plot(t, np.full(len(t), 0.015), "|", color=LEFT_OUT, markersize=5,
+                            transform=sheet.axes.get_xaxis_transform(), zorder=5)  # fmt: skip
+        if axis is not None and _upside_down(results, axis):
+            sheet.axes.invert_yaxis()
+    return Picture(title, sheet.source, caption)
+
+
+def _upside_down(results: SmoothingResults, axis: int) -> str:
+    """What to say where the axis points down; "" elsewhere."""
+    return "The axis is turned round, so that up is up. " if results.up[axis] < -0.5 else ""
 
 
 def _straight(t: Array, values: Array) -> Array:
@@ -210,13 +213,6 @@ def _straight(t: Array, values: Array) -> Array:
     if there.sum() < 2:
         return np.full(len(t), median(values) or 0.0)
     return np.asarray(np.polyval(np.polyfit(t[there] - t[0], values[there], 1), t - t[0]))
-
-
-def _unobserved(axes: Any, table: pd.DataFrame) -> None:
-    missing = column(table, "observed") == 0
-    t = table["t_s"].to_numpy(float)[missing]
-    axes.plot(t, np.full(len(t), 0.015), "|", color=LEFT_OUT, markersize=5,
-              transform=axes.get_xaxis_transform(), zorder=5)  # fmt: skip
 
 
 def _marks(table: pd.DataFrame) -> str:
@@ -235,76 +231,56 @@ _MOST_DB = 99.0
 
 def shake_in_time(results: SmoothingResults, camera: str, axis: str) -> Picture:
     """A camera's offset from where the encoder has it, with its band."""
-    table = results.shake
-    note = ""
-    if len(table) > _WINDOW:
-        first = (len(table) - _WINDOW) // 2
-        table = table.iloc[first : first + _WINDOW]
-        note = f" {number(_WINDOW)} frames of the run's middle."
+    table, note = _middle(results.shake, "the run's middle")
     t = table["t_s"].to_numpy(float)
     value = 1e3 * column(table, f"{camera}_{axis}_mm")
     sd = 1e3 * column(table, f"s{camera}_{axis}_mm")
-    colour = camera_colour(results.cameras.index(camera))
-    with drawing(2.3) as (figure, axes):
-        band(axes, t, value, sd, colour)
-        line(axes, t, value, colour)
-        axes.set(xlabel="t / s", ylabel=f"{axis} / µm")
-        found = limits(value - 2 * sd, value + 2 * sd) or limits(value)
-        if found:
-            axes.set_ylim(*found)
-        room_left(axes)
-        axes.grid(True)
-        source = source_of(figure, 3 * len(t))
     size = shake_rms_um(results, camera, axis)
     caption = (
         f"RMS {number(size, 3)} µm over the run, sd of the estimate {number(median(sd), 3)} µm "
-        f"(median). The band is ± 2 sd.{_oblique(results, camera, axis)}{note}"
+        f"(median). The band is ± 2 sd.{note}"
     )
-    return Picture(f"Shake of camera {camera} in {axis}", source, caption)
-
-
-def _oblique(results: SmoothingResults, camera: str, axis: str) -> str:
     depth = results.depth(camera)
     part = 0.0 if depth is None else abs(float(depth[AXES.index(axis)]))
-    if part < _PARTLY:
-        return ""
-    return (
-        f" This axis lies partly ({100 * part:.0f} %) along the camera's depth, which it does not "
-        "see: the band holds the prior's spread there."
-    )
+    if part >= _PARTLY:
+        caption += (
+            f" This axis lies partly ({100 * part:.0f} %) along the camera's depth, which it does "
+            "not see: the band holds the prior's spread there."
+        )
+    title, colour = f"Shake of camera {camera} in {axis}", results.cameras.index(camera)
+    curves = [Curve(t, value, camera_colour(colour), sd=sd)]
+    return _in_time(results, None, title, f"{axis} / µm", curves, caption, height_in=2.3)
 
 
 def velocity_before_and_after(results: SmoothingResults, axis: int) -> Picture | None:
     """Spectrum of the bubbles' velocity: naive, RTS, smoothed."""
     kinds = (("naive_", NAIVE, "naive"), ("rts_", RTS, "RTS"), ("", SMOOTHED, "smoothed"))
-    spectra = {label: (velocity_spectrum(results, kind), colour) for kind, colour, label in kinds}
-    found = {label: (s, colour) for label, (s, colour) in spectra.items() if s is not None}
+    found = {
+        label: (spectrum, colour)
+        for kind, colour, label in kinds
+        if (spectrum := velocity_spectrum(results, kind)) is not None
+    }
     if "smoothed" not in found:
         return None
-    with drawing(2.6) as (figure, axes):
-        _mark_modes(axes, results)
-        for label, (spectrum, colour) in found.items():
-            _draw_spectrum(axes, spectrum, axis, colour, label)
-        _finish(axes, [s for s, _ in found.values()], [axis], f"v{AXES[axis]} / ((mm/s)²/Hz)")
-        above_log(axes)
-        source = source_of(figure, 0)
-    caption = _velocity_words(found, axis) + _resolution(found["smoothed"][0])
-    return Picture(f"Spectrum of the velocity in {AXES[axis]}", source, caption)
-
-
-def _velocity_words(found: dict[str, tuple[Spectrum, str]], axis: int) -> str:
+    smooth = found["smoothed"][0]
+    caption = ""
     if "naive" not in found:
-        return "There is no naive trajectory to compare with. "
-    naive, smooth = found["naive"][0], found["smoothed"][0]
-    if naive.density.shape != smooth.density.shape:
-        return ""
-    before, after = naive.density[1:, axis], smooth.density[1:, axis]
-    gain = 10 * np.log10(np.maximum(before, 1e-30) / np.maximum(after, 1e-30))
-    at = int(np.argmax(before - after))
-    return (
-        f"Smoothing takes off most at {number(float(naive.frequency_hz[1 + at]), 3)} Hz: "
-        f"{min(gain[at], _MOST_DB):.0f} dB. What the motion itself holds should stay where it was. "
-    )
+        caption = "There is no naive trajectory to compare with. "
+    elif (naive := found["naive"][0]).density.shape == smooth.density.shape:
+        before, after = naive.density[1:, axis], smooth.density[1:, axis]
+        gain = 10 * np.log10(np.maximum(before, 1e-30) / np.maximum(after, 1e-30))
+        at = int(np.argmax(before - after))
+        caption = (
+            f"Smoothing takes off most at {number(float(naive.frequency_hz[1 + at]), 3)} Hz: "
+            f"{min(gain[at], _MOST_DB):.0f} dB. What the motion itself holds should stay where it "
+            "was. "
+        )
+    curves = [
+        Curve(s.frequency_hz[1:], s.density[1:, axis], colour, label, style=_THICK)
+        for label, (s, colour) in found.items()
+    ]
+    title, unit = f"Spectrum of the velocity in {AXES[axis]}", f"v{AXES[axis]} / ((mm/s)²/Hz)"
+    return _spectra(title, unit, curves, caption + _resolution(smooth), _modes_hz(results))
 
 
 def _resolution(spectrum: Spectrum) -> str:
@@ -317,57 +293,50 @@ def shake_spectra(results: SmoothingResults, camera: str) -> Picture | None:
     seen = results.seen(camera)
     if spectrum is None or not seen:
         return None
-    with drawing(2.6) as (figure, axes):
-        _mark_modes(axes, results)
-        for axis in seen:
-            i = AXES.index(axis)
-            _draw_spectrum(axes, spectrum, i, CAMERA_COLOURS[i], axis)
-        _finish(axes, [spectrum], [AXES.index(a) for a in seen], "shake / (µm²/Hz)")
-        above_log(axes)
-        source = source_of(figure, 0)
-    peaks = []
+    frequency, curves, peaks = spectrum.frequency_hz[1:], [], []
     for axis in seen:
-        density = spectrum.density[1:, AXES.index(axis)]
-        at = float(spectrum.frequency_hz[1 + int(np.argmax(density))])
-        peaks.append(f"{number(at, 3)} Hz in {axis}")
+        i = AXES.index(axis)
+        density = spectrum.density[1:, i]
+        curves.append(Curve(frequency, density, CAMERA_COLOURS[i], axis, style=_THICK))
+        peaks.append(f"{number(float(frequency[int(np.argmax(density))]), 3)} Hz in {axis}")
     caption = f"Strongest at {', '.join(peaks)}. {_resolution(spectrum)}"
-    return Picture(f"Spectrum of the shake of camera {camera}", source, caption)
+    title = f"Spectrum of the shake of camera {camera}"
+    return _spectra(title, "shake / (µm²/Hz)", curves, caption, _modes_hz(results))
 
 
-def _draw_spectrum(axes: Any, spectrum: Spectrum, axis: int, colour: str, label: str) -> None:
-    axes.plot(spectrum.frequency_hz[1:], spectrum.density[1:, axis], color=colour, label=label,
-              linewidth=1.1)  # fmt: skip
+_THICK = {"linewidth": 1.1}
 
 
-def _finish(axes: Any, spectra: Sequence[Spectrum], which: Sequence[int], label: str) -> None:
+def _spectra(
+    title: str, label: str, curves: Sequence[Curve], caption: str, marked_hz: Sequence[float] = ()
+) -> Picture:
+    """Power densities on axes of powers of ten, dotted lines at the frequencies ``marked_hz``."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    values = np.concatenate([s.density[1:, i] for s in spectra for i in which])
-    axes.set(xlabel="frequency / Hz", ylabel=label, xscale="log", yscale="log")
-    highest = max(float(s.frequency_hz[-1]) for s in spectra)
-    axes.set_xlim(min(float(s.frequency_hz[1]) for s in spectra), highest)
+    values = np.concatenate([curve.y for curve in curves])
     top = float(values.max()) if len(values) and values.max() > 0 else 1.0
     bottom = max(float(values[values > 0].min(initial=top)), top * 10**-_DECADES)
-    axes.set_ylim(bottom / 2, top * 2)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.grid(True)
-    room_left(axes)
+    limits = min(curve.x[0] for curve in curves), max(curve.x[-1] for curve in curves)
+    settings: dict[str, Any] = {
+        "xlabel": "frequency / Hz",
+        "ylabel": label,
+        "xscale": "log",
+        "yscale": "log",
+    }
+    with drawing(2.6, legend="above", grid=True, **settings) as sheet:
+        for frequency_hz in marked_hz:
+            sheet.axes.axvline(frequency_hz, color=MUTED, linewidth=0.7, linestyle=":")
+        draw_curves(sheet, curves)
+        sheet.axes.set(xlim=limits, ylim=(bottom / 2, top * 2))
+        sheet.axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        sheet.axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        sheet.axes.xaxis.set_minor_formatter(NullFormatter())
+    return Picture(title, sheet.source, caption)
 
 
-def above_log(axes: Any) -> None:
-    """Room for the legend, on an axis of powers of ten."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high * (high / low) ** 0.16)
-    axes.legend(loc="upper left", ncols=4, columnspacing=1.0, handlelength=1.2, borderaxespad=0.1)
-
-
-def _mark_modes(axes: Any, results: SmoothingResults) -> None:
-    """Dotted lines at the frequencies of the model's modes."""
-    model = results.part("model")
-    for mode in model.get("modes") or []:
-        axes.axvline(float(mode["frequency_hz"]), color=MUTED, linewidth=0.7, linestyle=":")
+def _modes_hz(results: SmoothingResults) -> list[float]:
+    """Frequencies of the model's modes."""
+    return [float(mode["frequency_hz"]) for mode in results.part("model").get("modes") or []]
 
 
 _LITTLE = 0.5
@@ -376,27 +345,23 @@ _LITTLE = 0.5
 def autocorrelation(results: SmoothingResults) -> Picture:
     """Of the bubbles' pixels, against the lag in frames, by camera, beside the model's."""
     known = known_parts(results, "whiteness", "expected")
-    with drawing(2.3) as (figure, axes):
-        for camera, found in known.items():
-            lags = np.arange(1, len(found["expected"]) + 1)
-            index = results.cameras.index(camera) if camera in results.cameras else 0
-            axes.plot(
-                lags, np.array(found["autocorrelation"], float), "o-",
-                color=camera_colour(index), label=camera, linewidth=0.9,
-            )  # fmt: skip
-        models = [np.array(found["expected"], float) for found in known.values()]
-        axes.plot(lags, np.mean(models, 0), "--", color=MUTED, label="model", linewidth=1.1)
-        axes.axhline(0, color=MUTED, linewidth=0.7)
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, -0.2), max(high, 0.2))
-        axes.set(xlabel="frames apart", ylabel="correlation")
-        axes.legend(loc="upper right")
-        axes.grid(True)
-        room_left(axes)
-        source = source_of(figure, 0)
+    curves = []
+    for camera, found in known.items():
+        values = np.array(found["autocorrelation"], float)
+        index = results.cameras.index(camera) if camera in results.cameras else 0
+        lags = np.arange(1.0, len(values) + 1)
+        curves.append(Curve(lags, values, camera_colour(index), camera, style={"marker": "o"}))
+    model = np.mean([np.array(found["expected"], float) for found in known.values()], 0)
+    curves.append(Curve(lags, model, MUTED, "model", style={"linestyle": "--"}))
+    settings: dict[str, Any] = {"xlabel": "frames apart", "ylabel": "correlation"}
+    with drawing(2.3, legend="above", grid=True, **settings) as sheet:
+        draw_curves(sheet, curves)
+        sheet.axes.axhline(0, color=MUTED, linewidth=0.7)
+        low, high = sheet.axes.get_ylim()
+        sheet.axes.set_ylim(min(low, -0.2), max(high, 0.2))
     return Picture(
         "Residuals some frames apart",
-        source,
+        sheet.source,
         "Both coordinates of the bubbles' pixels, outliers left out. The fit follows part of the "
         "noise, so that neighbours differ more than noise does; dashed: by how much, drawn from "
         "the model.",
@@ -408,37 +373,27 @@ def accelerometer_before_and_after(results: SmoothingResults, sensor: str) -> Pi
     found = known_parts(results, "accelerometer_spectra", "frequency_hz").get(sensor)
     if found is None:
         return None
-    frequency = np.array(found["frequency_hz"], float)
-    before, after = (np.array(found[key], float) for key in ("reading", "residual"))
-    noise: Any = found.get("noise")
-    with drawing(2.6) as (figure, axes):
-        axes.plot(frequency, before, color=NAIVE, label="readings", linewidth=1.1)
-        axes.plot(frequency, after, color=SMOOTHED, label="left by the model", linewidth=1.1)
-        if is_number(noise):
-            axes.axhline(noise, color=MUTED, linestyle=":", linewidth=0.9, label="stated noise")
-        axes.set(xlabel="frequency / Hz", ylabel="(m/s²)²/Hz", xscale="log", yscale="log")
-        axes.legend(loc="upper left", ncols=3)
-        low, high = axes.get_ylim()
-        axes.set_ylim(low, high * (high / low) ** 0.16)
-        axes.grid(True)
-        room_left(axes)
-        source = source_of(figure, 0)
-    return Picture(
-        f"Accelerometer {sensor}, before and after",
-        source,
-        _accelerometer_words(before, after, noise),
+    frequency, before, after = (
+        np.array(found[key], float) for key in ("frequency_hz", "reading", "residual")
     )
-
-
-def _accelerometer_words(before: Array, after: Array, noise: Any) -> str:
+    curves = [
+        Curve(frequency, before, NAIVE, "readings", style=_THICK),
+        Curve(frequency, after, SMOOTHED, "left by the model", style=_THICK),
+    ]
     share = float(after.sum() / before.sum()) if before.sum() > 0 else 0.0
-    text = f"The model leaves {number(100 * share, 2)} % of the readings' power"
+    caption = f"The model leaves {number(100 * share, 2)} % of the readings' power"
+    noise: Any = found.get("noise")
+    if is_number(noise):
+        flat = np.full(len(frequency), float(noise))
+        curves.append(Curve(frequency, flat, MUTED, "stated noise", style={"linestyle": ":"}))
     if is_number(noise) and noise > 0:
         times = float(np.median(after)) / noise
-        text += f", {number(times, 2)} times the stated noise (median)"
+        caption += f", {number(times, 2)} times the stated noise (median)"
         if times < _LITTLE:
-            text += "; where it is below, the priors have room for motion as fast as the noise"
-    return text + ". Welch's estimate, over the directions that the model moves the sensor in."
+            caption += "; where it is below, the priors have room for motion as fast as the noise"
+    caption += ". Welch's estimate, over the directions that the model moves the sensor in."
+    title = f"Accelerometer {sensor}, before and after"
+    return _spectra(title, "(m/s²)²/Hz", curves, caption)
 
 
 def accelerometer_names(results: SmoothingResults) -> list[str]:

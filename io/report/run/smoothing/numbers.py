@@ -98,16 +98,12 @@ def velocity_spectrum(results: SmoothingResults, kind: str = "") -> Spectrum | N
 
 def shake_spectrum(results: SmoothingResults, camera: str) -> Spectrum | None:
     """Density of a camera's shake per axis, µm²/Hz. None for a short run."""
-    values = _shake_um(results, camera)
+    values = 1e3 * np.stack([column(results.shake, f"{camera}_{axis}_mm") for axis in AXES], 1)
     if len(values) < LEAST_FRAMES:
         return None
     time = results.shake["t_s"].to_numpy(float)
     frequency, density = _welch(time, values, segment(len(values)))
     return Spectrum(frequency, density, float(frequency[1]))
-
-
-def _shake_um(results: SmoothingResults, camera: str) -> Array:
-    return 1e3 * np.stack([column(results.shake, f"{camera}_{axis}_mm") for axis in AXES], 1)
 
 
 def _welch(t_s: Array, values: Array, length: int) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array
 from telerig.io.report.page.figures import (
     KEPT,
     LEFT_OUT,
@@ -17,13 +17,17 @@ from telerig.io.report.page.figures import (
     drawing,
     image_axes,
     image_height_in,
-    png,
-    svg,
 )
 from telerig.io.report.page.number_format import number, share
-from telerig.io.report.run.tracking.numbers import learnt_sd_mm, median, per_frame, ray_miss_sd_mm
+from telerig.io.report.run.tracking.numbers import (
+    learnt_sd_mm,
+    median,
+    per_frame,
+    ray_miss_sd_mm,
+    rms,
+)
 from telerig.io.report.run.tracking.results import TrackResults
-from telerig.io.report.run.tracking.scene import MANY_POINTS, SHADES, draw_tracks, thinned
+from telerig.io.report.run.tracking.scene import draw_tracks, thinned
 
 _MOST_POINTS = 8_000
 _MOST_BINS = 400
@@ -34,21 +38,18 @@ def time_series(results: TrackResults, axis: int) -> Picture:
     """One rig coordinate of every track against time; up is up."""
     table = thinned(results.tracks, _MOST_POINTS)
     name, upwards = "xyz"[axis], float(results.up[axis])
-    with drawing(2.6) as (figure, axes):
+    with drawing(2.6, grid=True, xlabel="t / s", ylabel=f"{name} / mm") as sheet:
         place = table[f"{name}_mm"].to_numpy(float)
-        draw_tracks(axes, table["t_s"].to_numpy(float), place, table)
-        axes.set(xlabel="t / s", ylabel=f"{name} / mm")
+        draw_tracks(sheet, table["t_s"].to_numpy(float), place, table)
         if upwards < -0.5:
-            axes.invert_yaxis()
-        axes.grid(True)
-        source = png(figure, colours=SHADES) if len(table) > MANY_POINTS else svg(figure)
+            sheet.axes.invert_yaxis()
     span = 1e-9 + results.tracks["t_s"].max() - results.tracks["t_s"].min() if len(table) else 0
     caption = f"{number(float(span))} s, a colour per track; a line breaks where a bubble was lost."
     if upwards < -0.5:
         caption = f"The axis is turned round, so that up is up. {caption}"
     if len(table) < len(results.tracks):
         caption += f" {number(len(table))} of {number(len(results.tracks))} points are drawn."
-    return Picture(f"{name} against time", source, caption)
+    return Picture(f"{name} against time", sheet.source, caption)
 
 
 def bubbles_in_time(results: TrackResults) -> Picture:
@@ -57,18 +58,20 @@ def bubbles_in_time(results: TrackResults) -> Picture:
     frames = len(counts["both"])
     width = max(1, -(-frames // _MOST_BINS))
     edges = np.append(np.arange(0, frames, width), frames)
-    with drawing(2.6) as (figure, axes):
+    means = {
+        name: np.add.reduceat(c, edges[:-1]) / np.diff(edges)
+        if len(c)
+        else np.zeros(len(edges) - 1)
+        for name, c in counts.items()
+    }
+    settings: dict[str, Any] = {"xlabel": "frame", "ylabel": "bubbles", "xlim": (0, max(frames, 1))}
+    with drawing(2.6, legend="above", grid=True, **settings) as sheet:
         for i, camera in enumerate(results.cameras):
-            axes.stairs(_means(counts[camera], edges), edges, color=camera_colour(i),
-                        linewidth=1.0, label=camera, alpha=0.85)  # fmt: skip
-        axes.stairs(_means(counts["both"], edges), edges, color="black", linewidth=1.2,
-                    label="in space")  # fmt: skip
-        axes.set(xlabel="frame", ylabel="bubbles", xlim=(0, max(frames, 1)))
-        top = max((float(c.max()) for c in counts.values() if len(c)), default=1.0)
-        axes.set_ylim(0, 1.3 * max(top, 1.0))
-        axes.legend(loc="upper left", ncols=3, columnspacing=1.2, handlelength=1.4)
-        axes.grid(True)
-        source = svg(figure)
+            how = {"color": camera_colour(i), "linewidth": 1.0, "alpha": 0.85}
+            sheet.axes.stairs(means[camera], edges, label=camera, **how)
+        line = {"color": "black", "linewidth": 1.2, "label": "in space"}
+        sheet.axes.stairs(means["both"], edges, **line)
+        sheet.axes.set_ylim(0, None)
     empty = int(np.sum(counts["both"] == 0))
     caption = (
         "The black line should follow the lower of the cameras' lines: what lies above it has no "
@@ -76,92 +79,71 @@ def bubbles_in_time(results: TrackResults) -> Picture:
     )
     if width > 1:
         caption += f" Each step is the mean of {width} frames."
-    return Picture("Bubbles per frame", source, caption)
-
-
-def _means(counts: Ints, edges: Ints) -> Array:
-    if not len(counts):
-        return np.zeros(len(edges) - 1)
-    return np.asarray(np.add.reduceat(counts, edges[:-1]) / np.diff(edges))
+    return Picture("Bubbles per frame", sheet.source, caption)
 
 
 def sizes(results: TrackResults) -> Picture:
     """Histogram of the equivalent diameters, all points and one value per track."""
-    table = results.tracks[["particle", "d_eq_mm"]]
-    values = table["d_eq_mm"].to_numpy(float)
-    each = table.groupby("particle")["d_eq_mm"].median().to_numpy(float)
-    with drawing(2.6) as (figure, axes):
+    by_track = results.tracks.groupby("particle")["d_eq_mm"]
+    values = results.tracks["d_eq_mm"].to_numpy(float)
+    with drawing(2.6, xlabel="equivalent diameter / mm", ylabel="points") as sheet:
         edges = _edges(values)
-        _bars(axes, values, edges, MUTED, "points", fill=True)
-        axes.set(xlabel="equivalent diameter / mm", ylabel="points")
-        beside = axes.twinx()
-        beside.spines["top"].set_visible(False)
-        _bars(beside, each, edges, camera_colour(0), "tracks (median)", fill=False)
-        beside.set_ylabel("tracks", color=camera_colour(0))
-        beside.spines["right"].set(visible=True, color=camera_colour(0))
+        _bars(sheet.axes, values, edges, MUTED, "points", fill=True)
+        beside, colour = sheet.axes.twinx(), camera_colour(0)
+        _bars(beside, by_track.median().to_numpy(float), edges, colour, "tracks", fill=False)
+        beside.set_ylabel("tracks", color=colour)
+        beside.spines["right"].set(visible=True, color=colour)
         beside.yaxis.get_major_locator().set_params(integer=True)
-        box = axes.get_position()
-        for each_axes in (axes, beside):
-            each_axes.set_position((box.x0, box.y0, box.width - 0.09, box.height))
-        _room_above(axes, beside)
-        source = svg(figure)
-    scatter = _scatter_in_tracks(results)
+        box = sheet.axes.get_position()
+        for axes in (sheet.axes, beside):
+            axes.set_position((box.x0, box.y0, box.width - 0.09, box.height))
+            axes.set_ylim(0, 1.15 * max(axes.get_ylim()[1], 1.0))
+    relative = (by_track.std() / by_track.mean())[by_track.count() > 2]
+    scatter = median(100 * relative.to_numpy(float))
     caption = (
         "Diameter of the sphere of the bubble's volume. Grey: every point; blue: every track once. "
         f"Within a track it scatters by {number(scatter, 2)} % (1 sd, median of the tracks)."
     )
-    return Picture("Sizes", source, caption)
-
-
-def _scatter_in_tracks(results: TrackResults) -> float | None:
-    by_track = results.tracks.groupby("particle")["d_eq_mm"]
-    relative = (by_track.std() / by_track.mean())[by_track.count() > 2]
-    return median(100 * relative.to_numpy(float))
-
-
-def _room_above(*several: Any) -> None:
-    for axes in several:
-        axes.set_ylim(0, 1.15 * max(axes.get_ylim()[1], 1.0))
+    return Picture("Sizes", sheet.source, caption)
 
 
 def predicted_sd(results: TrackResults) -> Picture:
     """Histogram of the predicted standard deviations on the three axes."""
     sd = results.sd_um
-    with drawing(2.6) as (figure, axes):
-        edges = _edges(sd.ravel(), high=0.99)
+    edges = _edges(sd.ravel(), high=0.99)
+    settings: dict[str, Any] = {"xlabel": "sd of the position / µm", "ylabel": "points"}
+    with drawing(2.6, legend="above", **settings) as sheet:
         for i, name in enumerate("xyz"):
             label = f"{name}: {number(median(sd[:, i]), 2)} µm"
-            _bars(axes, sd[:, i], edges, camera_colour(i), label, fill=False)
-        axes.set(xlabel="sd of the position / µm", ylabel="points")
-        axes.set_ylim(0, 1.25 * max(axes.get_ylim()[1], 1.0))
-        axes.legend(loc="upper left", ncols=3, columnspacing=1.2, handlelength=1.4)
-        source = svg(figure)
+            _bars(sheet.axes, sd[:, i], edges, camera_colour(i), label, fill=False)
     beyond = int(np.sum((sd > edges[-1]).any(axis=1)))
     caption = (
         "Standard deviation of the position from the noise of the outlines and the unknown shape "
         "of the bubble, per rig axis; the legend gives the medians. The calibration's share is "
         f"common to all points and is not included. {number(beyond)} points lie beyond the plot."
     )
-    return Picture("Predicted standard deviation", source, caption)
+    return Picture("Predicted standard deviation", sheet.source, caption)
 
 
 def confidence(results: TrackResults) -> Picture:
     """Histogram of the probability that the two outlines are of one bubble."""
     values = results.tracks["confidence"].to_numpy(float)
-    with drawing(2.6) as (figure, axes):
-        edges = np.linspace(0, 1, 41)
-        _bars(axes, values, edges, KEPT, "", fill=True)
-        axes.axvline(0.9, color=MODEL, linewidth=0.8, linestyle="--")
-        axes.set(xlabel="confidence of the pair", ylabel="points", xlim=(0, 1))
-        axes.set_yscale("symlog", linthresh=1)
-        axes.set_ylim(0, 3 * max(float(axes.get_ylim()[1]), 1.0))
-        source = svg(figure)
+    settings: dict[str, Any] = {
+        "xlabel": "confidence of the pair",
+        "ylabel": "points",
+        "xlim": (0, 1),
+    }
+    with drawing(2.6, **settings) as sheet:
+        _bars(sheet.axes, values, np.linspace(0, 1, 41), KEPT, "", fill=True)
+        sheet.axes.axvline(0.9, color=MODEL, linewidth=0.8, linestyle="--")
+        sheet.axes.set_yscale("symlog", linthresh=1)
+        sheet.axes.set_ylim(0, 3 * max(float(sheet.axes.get_ylim()[1]), 1.0))
     low = int(np.sum(values < 0.9))
     caption = (
         "Probability that the two outlines are of one bubble; counts grow by powers of ten. "
         f"{number(low)} of {number(len(values))} points ({share(low, len(values))}) lie below 0.9."
     )
-    return Picture("Confidence of the pairs", source, caption)
+    return Picture("Confidence of the pairs", sheet.source, caption)
 
 
 def _edges(values: Array, high: float = 1.0) -> Array:
@@ -186,45 +168,33 @@ def marks_followed(results: TrackResults, camera: int) -> Picture:
     table = results.references[results.references["camera"] == name]
     along = max(("u_px", "v_px"), key=lambda c: float(np.ptp(table[c])))
     every = -(-len(table) // _MOST_POINTS)
-    lines = [group.iloc[::every] for _, group in table.groupby("mark", sort=True)]
-    with drawing(2.6) as (figure, axes):
-        for line in lines:
-            _draw_mark(axes, line, along, every, camera_colour(camera))
+    with drawing(2.6, grid=True, xlabel="frame", ylabel=f"{along[0]} / px") as sheet:
+        for _, group in table.groupby("mark", sort=True):
+            way = group.iloc[::every]
+            frame, place = way["frame"].to_numpy(float), way[along].to_numpy(float)
+            breaks = np.flatnonzero(np.diff(frame) > every + 1) + 1
+            gaps = (np.insert(values, breaks, np.nan) for values in (frame, place))
+            alone = "." if len(frame) == 1 else None
+            sheet.axes.plot(*gaps, color=camera_colour(camera), linewidth=0.8, marker=alone,
+                            markersize=2)  # fmt: skip
+            sheet.points += len(frame)
         size = results.image_size_px(name)
         if size is not None:
-            axes.set_ylim(-0.5, size[along == "v_px"] - 0.5)
+            sheet.axes.set_ylim(-0.5, size[along == "v_px"] - 0.5)
         if along == "v_px":
-            axes.invert_yaxis()
-        axes.set(xlabel="frame", ylabel=f"{along[0]} / px")
-        axes.grid(True)
-        many = sum(map(len, lines)) > MANY_POINTS
-        source = png(figure, colours=SHADES) if many else svg(figure)
-    return Picture(f"Marks fixed to the tank, {name}", source, _caption(table))
-
-
-def _draw_mark(axes: Any, line: Any, along: str, every: int, colour: str) -> None:
-    """One mark's way, broken where it was not seen."""
-    frame, place = line["frame"].to_numpy(float), line[along].to_numpy(float)
-    breaks = np.flatnonzero(np.diff(frame) > every + 1) + 1
-    axes.plot(
-        np.insert(frame, breaks, np.nan), np.insert(place, breaks, np.nan), color=colour,
-        linewidth=0.8, marker="." if len(frame) == 1 else None, markersize=2,
-    )  # fmt: skip
-
-
-def _caption(table: Any) -> str:
-    in_a_frame = table.groupby("frame").size().to_numpy()
-    stays = table.groupby("mark").size().to_numpy()
+            sheet.axes.invert_yaxis()
+    in_a_frame, stays = (table.groupby(key).size().to_numpy() for key in ("frame", "mark"))
     words = (
         f"{number(len(stays))} marks, {np.median(in_a_frame):.0f} in a frame and each in "
         f"{np.median(stays):.0f} frames (medians)"
     )
     if "sigma_px" in table and table["sigma_px"].notna().any():
-        words += f", measured to {number(median(table['sigma_px']))} px"
-    return (
+        words += f", measured to {number(median(table['sigma_px'].to_numpy(float)))} px"
+    caption = (
         f"{words}. The lines are as parallel as the stage and the shake move all marks alike; one "
         "that goes its own way is not fixed to the tank."
     )
+    return Picture(f"Marks fixed to the tank, {name}", sheet.source, caption)
 
 
 _MISS_BINS = 48
@@ -241,7 +211,10 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
     known = miss[np.isfinite(miss)]
     spread = _reach(known, sd)
     edges = np.linspace(-spread, spread, _MISS_BINS + 1)
-    with drawing(2.9) as (figure, axes):
+    settings: dict[str, Any] = {"xlim": (-spread, spread), "yticks": []}
+    settings |= {"xlabel": "ray miss / µm", "ylabel": "density"}
+    with drawing(2.9, legend="above", **settings) as sheet:
+        axes = sheet.axes
         count, _ = np.histogram(known, edges)
         share_of = count / max(len(known), 1) / np.diff(edges)
         axes.stairs(share_of, edges, color=camera_colour(0), fill=True, alpha=0.5, label="measured")
@@ -255,15 +228,9 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
                 axes.plot(*curve, color=MODEL, linewidth=1.2, label="with shake and scatter")
                 top = max(top, float(curve[1].max()))
         axes.axvline(0, color=MUTED, linewidth=0.8)
-        axes.set(xlabel="ray miss / µm", ylabel="density", xlim=(-spread, spread), yticks=[])
-        axes.set_ylim(0, 1.3 * max(top, 1e-9))
-        axes.legend(loc="upper left")
-        source = svg(figure)
-    beyond = int(np.sum(np.abs(known) > spread))
-    caption = (
-        f"Mean {number(float(np.mean(known)) if len(known) else None, 2)} µm, RMS "
-        f"{number(float(np.sqrt(np.mean(known**2))) if len(known) else None, 2)} µm. "
-    )
+        axes.set_ylim(0, 1.05 * max(top, 1e-9))
+    mean = float(np.mean(known)) if len(known) else None
+    caption = f"Mean {number(mean, 2)} µm, RMS {number(rms(known), 2)} µm. "
     if sd is None:
         caption += "There are too few points to say what the outlines' noise predicts."
     else:
@@ -271,8 +238,9 @@ def ray_miss_histogram(results: TrackResults) -> Picture:
             f"The outlines' noise predicts the black curve (sd {number(median(sd), 2)} µm): a "
             "shift against it is a biased calibration, more width is shake, shape or wrong pairs."
         )
+    beyond = int(np.sum(np.abs(known) > spread))
     caption += f" {number(beyond)} points lie beyond the plot." if beyond else ""
-    return Picture("Ray miss", source, caption)
+    return Picture("Ray miss", sheet.source, caption)
 
 
 def _predicted_um(results: TrackResults) -> Array | None:
@@ -305,42 +273,36 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
     miss = 1e3 * results.tracks["ray_miss_mm"].to_numpy(float)
     good = np.isfinite(place) & np.isfinite(miss)
     place, miss = place[good], miss[good]
-    step = len(miss) // _MOST_MARKS + 1
+    thin = len(miss) // _MOST_MARKS + 1
     reach = _reach(miss, _predicted_um(results))
-    middles, medians, error = _steps(place, miss)
-    with drawing(2.9) as (figure, axes):
-        axes.axhline(0, color=MUTED, linewidth=0.8)
-        axes.plot(place[::step], miss[::step], ".", color=camera_colour(0), alpha=0.5,
-                  markersize=2.5 if len(miss) > 1000 else 5, markeredgewidth=0)  # fmt: skip
-        axes.errorbar(middles, medians, error, color=MODEL, fmt="o-", markersize=3.5, linewidth=1.2,
-                      label="median of a step")  # fmt: skip
-        axes.set(xlabel=f"{name} / mm", ylabel="ray miss / µm", ylim=(-reach, 1.2 * reach))
-        axes.legend(loc="upper right")
-        source = png(figure, colours=SHADES) if len(miss) > 1000 else svg(figure)
+    # middle, median and its standard error of up to `_STEPS` steps of equal number
+    groups = int(min(_STEPS, len(place) // _LEAST_IN_STEP))
+    steps = np.array_split(np.argsort(place), groups) if groups else []
+    middles, medians = ([float(np.median(values[s])) for s in steps] for values in (place, miss))
+    error = [1.2533 * 1.4826 * float(np.median(np.abs(miss[s] - m))) / np.sqrt(len(s))
+             for s, m in zip(steps, medians)]  # fmt: skip
+    settings: dict[str, Any] = {
+        "xlabel": f"{name} / mm",
+        "ylabel": "ray miss / µm",
+        "ylim": (-reach, reach),
+    }
+    with drawing(2.9, legend="above", **settings) as sheet:
+        sheet.points = len(miss[::thin])
+        sheet.axes.axhline(0, color=MUTED, linewidth=0.8)
+        dots = {"alpha": 0.5, "markersize": 2.5 if len(miss) > 1000 else 5, "markeredgewidth": 0}
+        sheet.axes.plot(place[::thin], miss[::thin], ".", color=camera_colour(0), **dots)
+        line = {"fmt": "o-", "markersize": 3.5, "linewidth": 1.2, "label": "median of a step"}
+        sheet.axes.errorbar(middles, medians, error, color=MODEL, **line)
+    words = "There are too few points for it."
+    if steps:
+        most = int(np.argmax(np.abs(medians)))
+        strays = number(abs(medians[most]), 2)
+        words = f"It strays by up to {strays} ± {number(float(error[most]), 1)} µm."
     caption = (
         "The red line should lie on zero. A constant offset, a slope or a bow along it is the "
-        f"calibration error, not an effect of the bubbles. {_worst_step(medians, error)}"
+        f"calibration error, not an effect of the bubbles. {words}"
     )
-    return Picture(f"Ray miss against {name}", source, caption)
-
-
-def _steps(place: Array, miss: Array) -> tuple[Array, Array, Array]:
-    """Middle, median and its standard error of up to `_STEPS` steps of equal number."""
-    groups = int(min(_STEPS, len(place) // _LEAST_IN_STEP))
-    parts = np.array_split(np.argsort(place), groups) if groups else []
-    middles = np.array([np.median(place[p]) for p in parts])
-    medians = np.array([np.median(miss[p]) for p in parts])
-    error = [1.2533 * 1.4826 * np.median(np.abs(miss[p] - np.median(miss[p]))) / np.sqrt(len(p))
-             for p in parts]  # fmt: skip
-    return middles, medians, np.array(error)
-
-
-def _worst_step(medians: Array, error: Array) -> str:
-    if not len(medians):
-        return "There are too few points for it."
-    worst = int(np.argmax(np.abs(medians)))
-    most, sd = abs(float(medians[worst])), float(error[worst])
-    return f"It strays by up to {number(most, 2)} ± {number(sd, 1)} µm."
+    return Picture(f"Ray miss against {name}", sheet.source, caption)
 
 
 def seen_where(results: TrackResults, index: int) -> Picture:
@@ -349,48 +311,37 @@ def seen_where(results: TrackResults, index: int) -> Picture:
     table = results.detections[results.detections["camera"] == camera]
     uv = table[["u_px", "v_px"]].to_numpy(float)
     alone = uv[table["particle"].isna().to_numpy(bool)]
-    size, stated = _image_size(results, camera, uv)
+    size = stated = results.image_size_px(camera)
+    if size is None:
+        width, height = np.ceil(uv.max(axis=0)).astype(int) + 1 if len(uv) else (100, 100)
+        size = int(width), int(height)
     cells = [max(2, round(_CELLS * n / max(size))) for n in size]
     edges = [np.linspace(-0.5, n - 0.5, k + 1) for n, k in zip(size, cells)]
     count, _ = np.histogramdd(uv, bins=edges)
     below = 0.75
-    height = image_height_in(size) + below
-    with drawing(height) as (figure, axes):
-        box, room = axes.get_position(), below / height
-        axes.set_position((box.x0, box.y0 + room, box.width, box.height - room))
-        bar = figure.add_axes((box.x0, 0.42 / height, box.width, 0.1 / height))
-        image_axes(axes, size)
-        mesh = axes.pcolormesh(*edges, np.where(count.T > 0, count.T, np.nan), cmap="Blues",
-                               vmin=0, vmax=max(float(count.max()), 1.0))  # fmt: skip
-        step = len(alone) // _MOST_MARKS + 1
-        axes.plot(*alone[::step].T, ".", color=LEFT_OUT, markersize=4, markeredgewidth=0,
-                  alpha=0.7)  # fmt: skip
-        figure.colorbar(mesh, cax=bar, orientation="horizontal",
-                        label="bubbles in a cell, all frames")  # fmt: skip
-        source = png(figure, colours=SHADES) if len(alone) > 500 else svg(figure)
-    empty = int(np.sum(count == 0))
-    caption = _where_caption(len(uv), len(alone), empty, count.size, stated)
-    return Picture(f"Bubbles in the image, camera {camera}", source, caption)
-
-
-def _where_caption(found: int, alone: int, empty: int, cells: int, stated: bool) -> str:
-    if not found:
-        return "No bubble was found in this camera, or detections.csv is not in this folder."
-    caption = (
-        f"{number(found)} bubbles; red: {number(alone)} ({share(alone, found)}) in no track, which "
-        f"should not gather anywhere but at the border. {empty} of {cells} cells are empty."
-    )
-    return caption if stated else caption + " The image may be larger: its size is not known here."
-
-
-def _image_size(results: TrackResults, camera: str, uv: Array) -> tuple[tuple[int, int], bool]:
-    stated = results.image_size_px(camera)
-    if stated is not None:
-        return stated, True
-    if not len(uv):
-        return (100, 100), False
-    width, height = np.ceil(uv.max(axis=0)).astype(int) + 1
-    return (int(width), int(height)), False
+    height_in = image_height_in(size) + below
+    with drawing(height_in) as sheet:
+        box, room = sheet.axes.get_position(), below / height_in
+        sheet.axes.set_position((box.x0, box.y0 + room, box.width, box.height - room))
+        bar = sheet.figure.add_axes((box.x0, 0.42 / height_in, box.width, 0.1 / height_in))
+        image_axes(sheet.axes, size)
+        mesh = sheet.axes.pcolormesh(*edges, np.where(count.T > 0, count.T, np.nan), cmap="Blues",
+                                     vmin=0, vmax=max(float(count.max()), 1.0))  # fmt: skip
+        some = alone[:: len(alone) // _MOST_MARKS + 1]
+        sheet.points = len(some)
+        sheet.axes.plot(*some.T, ".", color=LEFT_OUT, markersize=4, markeredgewidth=0, alpha=0.7)
+        label = "bubbles in a cell, all frames"
+        sheet.figure.colorbar(mesh, cax=bar, orientation="horizontal", label=label)
+    caption = "No bubble was found in this camera, or detections.csv is not in this folder."
+    if len(uv):
+        caption = (
+            f"{number(len(uv))} bubbles; red: {number(len(alone))} ({share(len(alone), len(uv))}) "
+            "in no track, which should not gather anywhere but at the border. "
+            f"{int(np.sum(count == 0))} of {count.size} cells are empty."
+        )
+        if stated is None:
+            caption += " The image may be larger: its size is not known here."
+    return Picture(f"Bubbles in the image, camera {camera}", sheet.source, caption)
 
 
 def shared_pictures(results: TrackResults) -> list[Any]:

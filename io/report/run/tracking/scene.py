@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array
-from telerig.io.report.page.figures import Picture, drawing, png, svg
+from telerig.io.report.page.figures import Picture, Sheet, drawing
 from telerig.io.report.page.scene import Trace, lines, scene_text
 from telerig.io.report.run.tracking.results import TrackResults
 
@@ -17,10 +17,7 @@ TRACK_COLOURS = (
     "#d05fa0", "#4f6bd8",
 )  # fmt: skip
 MOST_POINTS = 8_000
-MANY_POINTS = 3_000
-"""More of them in a figure are stored as pixels."""
 
-SHADES = 64
 _NAMED = len(TRACK_COLOURS)
 _EYE = 1.5
 _WIDENING, _WIDEST, _FLATTEST = (1, 2, 5, 10, 20), 0.5, 0.02
@@ -125,16 +122,14 @@ def track_plans(results: TrackResults) -> list[Picture]:
 def _plan(results: TrackResults, across: int) -> Picture:
     table = thinned(results.tracks, MOST_POINTS)
     points = table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-    with drawing(4.2) as (figure, axes):
-        draw_tracks(axes, points[:, across], points @ results.up, table)
-        axes.set(xlabel=f"{'xyz'[across]} / mm", ylabel="height / mm")
-        axes.set_aspect("equal", adjustable="datalim")
-        source = png(figure, colours=SHADES) if len(points) > MANY_POINTS else svg(figure)
+    with drawing(4.2, xlabel=f"{'xyz'[across]} / mm", ylabel="height / mm") as sheet:
+        draw_tracks(sheet, points[:, across], points @ results.up, table)
+        sheet.axes.set_aspect("equal", adjustable="datalim")
     caption = "Every track has its colour; the scene in a browser can be turned."
-    return Picture(f"Tracks, height against {'xyz'[across]}", source, caption)
+    return Picture(f"Tracks, height against {'xyz'[across]}", sheet.source, caption)
 
 
-def draw_tracks(axes: Any, x: Array, y: Array, table: pd.DataFrame) -> None:
+def draw_tracks(sheet: Sheet, x: Array, y: Array, table: pd.DataFrame) -> None:
     """Lines in the tracks' colours, broken at gaps, a dot where a track begins.
 
     table : from `thinned`, row by row what x and y are of.
@@ -145,7 +140,8 @@ def draw_tracks(axes: Any, x: Array, y: Array, table: pd.DataFrame) -> None:
     particles = table["particle"].to_numpy()
     pieces = np.split(np.c_[x, y], starts[1:]) if len(table) else []
     colours = [track_colour(int(particles[s])) for s in starts]
-    axes.add_collection(LineCollection(pieces, colors=colours, linewidths=1.0))
+    sheet.axes.add_collection(LineCollection(pieces, colors=colours, linewidths=1.0))
     if len(table):
-        axes.scatter(x[starts], y[starts], s=5, c=colours, linewidths=0)
-    axes.autoscale_view()
+        sheet.axes.scatter(x[starts], y[starts], s=5, c=colours, linewidths=0)
+    sheet.axes.autoscale_view()
+    sheet.points += len(table)

@@ -16,8 +16,8 @@ from telerig.io.report.page.figures import (
     Picture,
     camera_colour,
     drawing,
-    svg,
 )
+from telerig.io.report.page.number_format import nice_below
 from telerig.io.report.run.tracking.cameras import pair_pixels, paired_rows
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.rig.camera import Camera
@@ -88,8 +88,8 @@ def two_rays(
     here = results.tracks.iloc[row]
     diameter = float(here["d_eq_mm"]) if np.isfinite(here["d_eq_mm"]) else 1.0
     names = [camera.name for camera in cameras]
-    with drawing(_HEIGHT_IN) as (figure, whole):
-        close = figure.add_axes((0, 0, 1, 1))
+    with drawing(_HEIGHT_IN) as sheet:
+        whole, close = sheet.axes, sheet.figure.add_axes((0, 0, 1, 1))
         _draw_whole(whole, pair, diameter, names, results.up)
         _draw_close(close, pair, names, results.up)
         width = 0.48
@@ -98,7 +98,6 @@ def two_rays(
         close.set_position((0.995 - width, 0.01, width, height))
         whole.set_title(f"bubble of {diameter:.3g} mm", fontsize=8.5)
         close.set_title("close-up, where they pass", fontsize=8.5)
-        source = svg(figure)
     caption = (
         f"Bubble {int(here['particle'])} in frame {int(here['frame'])}, a pair with the run's "
         f"median ray miss: the rays of the two outlines' centres pass each other at "
@@ -106,7 +105,7 @@ def two_rays(
         "the other, the cross half way between them is the triangulated point before shape and "
         "noise are weighed in. Arrows point away from the cameras."
     )
-    return Picture("Two rays of one bubble", source, caption)
+    return Picture("Two rays of one bubble", sheet.source, caption)
 
 
 def _view(pair: RayPair, up: Array, look_down_deg: float) -> Array:
@@ -167,8 +166,7 @@ def _draw_close(axes: Any, pair: RayPair, names: list[str], up: Array) -> None:
 
 
 def _length_bar(axes: Any, about_mm: float, reach_mm: float, unit: str, per_mm: float) -> None:
-    power = 10.0 ** np.floor(np.log10(about_mm * per_mm))
-    length = max(k * power for k in (1, 2, 5) if k * power <= about_mm * per_mm) / per_mm
+    length = nice_below(about_mm * per_mm) / per_mm
     y = -0.9 * reach_mm
     axes.plot([-length / 2, length / 2], [y, y], color="black", lw=1.6, solid_capstyle="butt")
     axes.annotate(f"{length * per_mm:.3g} {unit}", (0, y), xytext=(0, 3), ha="center",

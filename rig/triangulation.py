@@ -193,6 +193,15 @@ def triangulate_views(
     )
 
 
+def triangulate_any(
+    cameras: Sequence[Camera], uv_px: Sequence[ArrayLike], sigma_px: float
+) -> Triangulation:
+    """`triangulate` of two cameras, `triangulate_views` of more; uv_px : (..., 2) of each."""
+    if len(cameras) == 2:
+        return triangulate((cameras[0], cameras[1]), (uv_px[0], uv_px[1]), sigma_px)
+    return triangulate_views(cameras, uv_px, sigma_px)
+
+
 def nearest_to_rays(origins: Array, directions: Array) -> Array:
     """(..., 3) points of least summed squared distance from C rays each, (C, ..., 3) and unit.
 

@@ -21,7 +21,7 @@ from telerig.estimator.calibration.start.mirror_ambiguity import ENTOCENTRIC
 from telerig.io.rig_file.description import RigDescription
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX, standing_wall
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import triangulate_any
 from telerig.rig.windows import Wall
 
 Array = NDArray[np.float64]
@@ -77,8 +77,8 @@ def _with_windows_share(behind: Calibration, in_air: Calibration) -> dict[str, A
 
 def _space_variance_um2(calibration: Calibration, points_mm: Array) -> float:
     """Of the calibration's share, per axis; a common rigid motion of all points is set aside."""
-    pair = (calibration.cameras[0], calibration.cameras[1])
-    shared = aligned_covariance(pair, calibration.free, calibration.covariance, points_mm)
+    cameras, free = calibration.cameras, calibration.free
+    shared = aligned_covariance(cameras, free, calibration.covariance, points_mm)
     return float(1e6 * np.trace(shared) / len(shared))
 
 
@@ -110,8 +110,8 @@ def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
     """
     points = working_volume(tuple(used))
     pixels = [camera.project(points) for camera in true]
-    if len(used) == 2:
-        wrong = triangulate((used[0], used[1]), (pixels[0], pixels[1]), 1.0).points_mm - points
+    if len(used) > 1:
+        wrong = triangulate_any(used, pixels, 1.0).points_mm - points
     else:
         wrong = (pixels[0] - used[0].project(points)) / used[0]["scale_px_per_mm"]
     wrong = wrong - wrong.mean(0)
@@ -264,7 +264,7 @@ def window_warnings(rig: RigDescription | None, calibration: Calibration) -> lis
             f"the calibration has windows for {', '.join(gone)} that rig.toml does not state: if "
             f"they are gone, points are wrong by {much} over the working volume; calibrate again"
         ]
-    missing = [name for name, wall in stated.items() if not _same(have.get(name), wall)]
+    missing = [n for n, wall in stated.items() if n in have and not _same(have[n], wall)]
     if not missing or calibration.medium == "water":
         return []
     error = model_error_um(calibration.cameras, with_windows(calibration.cameras, stated))

@@ -25,7 +25,7 @@ from telerig.factors.projection import State
 from telerig.rig.lens_models import joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.projection import INDEX
-from telerig.rig.triangulation import triangulate, triangulate_views
+from telerig.rig.triangulation import triangulate_any
 
 Array = NDArray[np.float64]
 
@@ -282,10 +282,7 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
     if len(truth) == 0:
         return {}
     cameras, sigma = calibration.cameras, calibration.statistics["scatter_px"]
-    if len(cameras) == 2:
-        found = triangulate((cameras[0], cameras[1]), (pixels[0], pixels[1]), sigma)
-    else:
-        found = triangulate_views(cameras, list(pixels), sigma)
+    found = triangulate_any(cameras, list(pixels), sigma)
     some = found.points_mm[:: max(1, len(truth) // 200)]
     shared = aligned_covariance(cameras, calibration.free, calibration.covariance, some)
     measurement = np.trace(found.covariance_mm2, axis1=-2, axis2=-1).mean() / 3

@@ -31,6 +31,7 @@ from telerig.estimator.dots.dataset_dots import (
 )
 from telerig.estimator.dots.locate import REJECTED
 from telerig.io.dataset.dataset import Dataset, NoViewsError, View, load_dataset
+from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -94,7 +95,7 @@ class WatchedFolder:
             (view.name, camera)
             for view in dataset.views
             for camera in dataset.rig.cameras
-            if camera not in view.image_paths
+            if camera not in view.image_paths and len(view.image_paths) < _needed(dataset)
         ]
         self._waiting_s = {key: self._waiting_s.get(key, now_s) for key in waiting}
         late = [
@@ -146,13 +147,13 @@ class WatchedFolder:
         return [self._found[p][1] for v in self.dataset.views for p in v.image_paths.values()]
 
     def complete(self) -> list[str]:
-        """Names of the views in which every camera found the target."""
+        """Names of the views in which two cameras found the target, or the only one did."""
         if self.dataset is None:
             return []
         good: dict[str, int] = {}
         for image in self.images():
             good[image.view] = good.get(image.view, 0) + (not image.failure)
-        return [name for name, count in good.items() if count == len(self.dataset.rig.cameras)]
+        return [name for name, count in good.items() if count >= _needed(self.dataset)]
 
     def version(self) -> frozenset[tuple[Path, Stamp]]:
         """The images of complete views, as they are now."""
@@ -172,6 +173,11 @@ class WatchedFolder:
                 todo="put images of the target into calibration/<camera>/",
             )  # fmt: skip
         return detected_together(self.dataset, images)
+
+
+def _needed(dataset: Dataset) -> int:
+    """Cameras that must see a view for it to be complete."""
+    return min(2, len(dataset.rig.cameras))
 
 
 def _missing(views: list[str], camera: str) -> str:
@@ -264,9 +270,16 @@ def _generic(dataset: Dataset, count: int) -> str:
     names = list(dataset.rig.cameras)
     if len(names) < 2:
         return "tilt the target by 20 to 50 degrees, about another axis than before"
-    rotvec = dataset.rig.rotvec_from_first_deg.get(names[1])
-    angle = 90.0 if rotvec is None else float(np.linalg.norm(rotvec))
-    return first_views(names[0], names[1], angle)[min(count, RECOMMENDED_VIEWS - 1)]
+    rotvecs = {names[0]: (0.0, 0.0, 0.0), **dataset.rig.rotvec_from_first_deg}
+    at = count % (len(names) - 1)  # each camera and the next one in turn
+    first, second = names[at], names[at + 1]
+    angle = 90.0
+    if first in rotvecs and second in rotvecs:
+        turns = [rotation_from_rotvec(np.radians(rotvecs[name])) for name in (first, second)]
+        angle = float(np.degrees(np.linalg.norm(rotvec_from_rotation(turns[1] @ turns[0].T))))
+    return first_views(first, second, angle, alone=len(names) == 2)[
+        min(count, RECOMMENDED_VIEWS - 1)
+    ]
 
 
 def standing(

@@ -1,14 +1,15 @@
 """Two calibrations of one rig: what moved, by how much, and is that more than their uncertainty?
 
-Only what images can tell is compared (the gauge is set aside): the rotation between the cameras,
-their offset along the common perpendicular of the optical axes, the scales, and how far the same
-pair of pixels triangulates apart over the working volume after the best rigid motion.
+Only what images can tell is compared (the gauge is set aside): each camera's rotation against the
+first, its offset along the common perpendicular of their optical axes, the scales, and how far the
+same pixels triangulate apart over the working volume after the best rigid motion.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,7 +23,7 @@ from telerig.estimator.calibration.solver.covariance import aligned_shift
 from telerig.io.report.page.number_format import number, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import triangulate_any
 
 Array = NDArray[np.float64]
 
@@ -38,9 +39,9 @@ _LEAST_CHANCE = 1e-12
 
 @dataclass(frozen=True)
 class Rig:
-    """What is compared: two cameras, their free intrinsics, the covariance of the rig block."""
+    """What is compared: C cameras, their free intrinsics, the covariance of the rig block."""
 
-    cameras: tuple[Camera, Camera]
+    cameras: tuple[Camera, ...]
     free: tuple[tuple[str, ...], ...]
     covariance: Array
 
@@ -85,11 +86,13 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class RigComparison:
-    """changes : between the cameras, then scales.  p_moved : of the pose between the cameras.
+    """changes : four of each camera but the first (rotation, offset), then the C scales.
 
+    cameras : their names.  p_moved : of the poses between the cameras.
     exchanged : each camera now has the scale that the other had.  media : of first and second.
     """
 
+    cameras: tuple[str, ...]
     changes: tuple[Change, ...]
     field: FieldDifference
     p_moved: float
@@ -116,11 +119,7 @@ class RigComparison:
                 "both calibrations are the same to rounding, so they come from the same views. To "
                 "learn whether the rig moved, compare with a calibration from other views"
             )
-        shift, turn = self.changes[3], _norm(self.changes[:3])
-        size = (
-            f"{with_sd(abs(shift.change), shift.sd)} µm and {with_sd(turn.change, turn.sd)} µrad "
-            "between the cameras"
-        )
+        size = "; ".join(self._size(c) for c in range(1, len(self.cameras)))
         first = (
             f"the rig moved: {size}"
             if self.moved
@@ -137,6 +136,18 @@ class RigComparison:
             second += f", which is more than chance explains ({chance}); do not mix their runs"
         return "; ".join([first, *self._scale_words(), second, *self._medium_words()])
 
+    def _size(self, camera: int) -> str:
+        """How far a camera moved against the first."""
+        own = self.changes[4 * camera - 4 : 4 * camera]
+        shift, turn = own[3], _norm(own[:3])
+        between = "the cameras"
+        if len(self.cameras) > 2:
+            between = f"cameras {self.cameras[0]} and {self.cameras[camera]}"
+        return (
+            f"{with_sd(abs(shift.change), shift.sd)} µm and {with_sd(turn.change, turn.sd)} µrad "
+            f"between {between}"
+        )
+
     def _scale_words(self) -> list[str]:
         """Of scales that changed by more than chance."""
         if self.exchanged:
@@ -144,7 +155,8 @@ class RigComparison:
                 "each camera has the scale that the other one had, as if their images or cables "
                 "were exchanged"
             ]
-        changed = [c for c in self.changes[4:] if chdtrc(1, c.deviations**2) < UNLIKELY]
+        scales = self.changes[-len(self.cameras) :]
+        changed = [c for c in scales if chdtrc(1, c.deviations**2) < UNLIKELY]
         if not changed:
             return []
         said = (f"{with_sd(c.change, c.sd)} ppm ({c.quantity})" for c in changed)
@@ -214,7 +226,7 @@ def check_same_rig(first: Sequence[Named], second: Sequence[Named]) -> None:
 
 def _rig(calibration: Calibration) -> Rig:
     bare = calibration.in_air()
-    return Rig((bare.cameras[0], bare.cameras[1]), bare.free, bare.covariance)
+    return Rig(bare.cameras, bare.free, bare.covariance)
 
 
 def _named(cameras: list[tuple[str, tuple[int, ...]]]) -> str:
@@ -223,27 +235,37 @@ def _named(cameras: list[tuple[str, tuple[int, ...]]]) -> str:
 
 def compare_rigs(first: Rig, second: Rig) -> RigComparison:
     """The differences second minus first, with covariances added."""
+    cameras = tuple(camera.name for camera in first.cameras)
     pose, covariance = _pose_change(first, second)
     sd = np.sqrt(np.diag(covariance))
     names = [f"rotation about {a}" for a in "xyz"] + ["offset along the common perpendicular"]
-    units = ["urad", "urad", "urad", "um"]
-    factors = np.array([1e6, 1e6, 1e6, 1e3])
+    if len(cameras) > 2:
+        names = [f"{name} of camera {camera}" for camera in cameras[1:] for name in names]
+    others = len(cameras) - 1
+    units = others * ["urad", "urad", "urad", "um"]
+    factors = np.tile([1e6, 1e6, 1e6, 1e3], others)
     changes = [
         Change(n, u, float(f * c), float(f * s))
         for n, u, f, c, s in zip(names, units, factors, pose, sd)
     ]
-    changes += [_scale_change(first, second, i) for i in range(2)]
+    changes += [_scale_change(first, second, i) for i in range(len(cameras))]
     moved = _chance(pose, _root(covariance))
     field = field_difference(first, second)
-    return RigComparison(tuple(changes), field, moved, _exchanged(first, second, changes[4:]))
+    exchanged = _exchanged(first, second, changes[4 * others :])
+    return RigComparison(cameras, tuple(changes), field, moved, exchanged)
 
 
 def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
-    """Whether each scale left its camera by far and came to where the other's was."""
+    """Whether the scales of two cameras left them by far and came to where the other's was."""
     before, after = ([c["scale_px_per_mm"] for c in r.cameras] for r in (first, second))
-    left = min(abs(c.deviations) for c in scales) > _FAR
-    return left and all(
-        abs(1e6 * (after[i] / before[1 - i] - 1)) < _FAR * scales[i].sd for i in range(2)
+    left = [abs(c.deviations) > _FAR for c in scales]
+    came = [
+        [abs(1e6 * (a / b - 1)) < _FAR * scale.sd for b in before]
+        for a, scale in zip(after, scales)
+    ]
+    return any(
+        left[i] and left[j] and came[i][j] and came[j][i]
+        for i, j in combinations(range(len(scales)), 2)
     )
 
 
@@ -256,17 +278,21 @@ def _of(medium: str) -> str:
 
 
 def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:
-    """(4,) rotation (rad, rig axes) and offset along the common perpendicular (mm); (4, 4)."""
-    a, b = (r.cameras[1].camera_from_rig.inverse() for r in (first, second))
-    turn = a.rotation @ rotvec_from_rotation(a.rotation.T @ b.rotation)
-    across = np.cross([0.0, 0.0, 1.0], a.rotation[:, 2])
-    across /= np.linalg.norm(across)
-    shift = across @ (b.translation_mm - a.translation_mm)
-    rows = np.zeros((4, 6))
-    rows[:3, :3] = a.rotation
-    rows[3, 3:] = across @ a.rotation
-    blocks = sum(r.covariance[-6:, -6:] for r in (first, second))
-    return np.r_[turn, shift], rows @ blocks @ rows.T
+    """Of each camera but the first, (4,) rotation (rad, rig axes) and offset along the common
+    perpendicular (mm), one after the other; their covariance.
+    """
+    others = len(first.cameras) - 1
+    changes, rows = [], np.zeros((4 * others, 6 * others))
+    for c in range(others):
+        a, b = (r.cameras[c + 1].camera_from_rig.inverse() for r in (first, second))
+        turn = a.rotation @ rotvec_from_rotation(a.rotation.T @ b.rotation)
+        across = np.cross([0.0, 0.0, 1.0], a.rotation[:, 2])
+        across /= np.linalg.norm(across)
+        changes.append(np.r_[turn, across @ (b.translation_mm - a.translation_mm)])
+        rows[4 * c : 4 * c + 3, 6 * c : 6 * c + 3] = a.rotation
+        rows[4 * c + 3, 6 * c + 3 : 6 * c + 6] = across @ a.rotation
+    blocks = sum(r.covariance[-6 * others :, -6 * others :] for r in (first, second))
+    return np.concatenate(changes), rows @ blocks @ rows.T
 
 
 def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
@@ -293,7 +319,7 @@ def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference
     """Over the working volume: pixels by the first rig, points by the second."""
     points = working_volume(first.cameras, steps)
     pixels = [camera.project(points) for camera in first.cameras]
-    found = triangulate(second.cameras, (pixels[0], pixels[1]), 1.0, "ml").points_mm
+    found = triangulate_any(second.cameras, pixels, 1.0).points_mm
     shift = after_rigid_motion(found, points)
     root = np.concatenate(
         [

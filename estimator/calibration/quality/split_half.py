@@ -24,6 +24,8 @@ from telerig.estimator.calibration.quality.comparison import (
 from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.graph import solve
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
+from telerig.estimator.calibration.solver.robust import LEAST_DOTS
+from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.projection import State
 from telerig.io.report.page.number_format import number
 
@@ -40,9 +42,9 @@ def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
     The target's size is common to both halves and tells nothing about repeatability: the known
     distance, or without one that of two dots far apart, is taken as exact in both.
     """
-    if len(problem.cameras) != 2:
+    if len(problem.cameras) < 2:
         return {"words": "one camera: the split-half check compares points in space and needs two"}
-    used = np.unique(problem.view[problem.weight > 0])
+    used = _in_turn(problem)
     parts = [used[0::2], used[1::2]]
     if min(len(p) for p in parts) < LEAST_VIEWS:
         return {
@@ -87,6 +89,7 @@ def _size(
 def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
     half = problem.subset(np.isin(problem.view, views) & (problem.weight > 0))
     half = replace(half, solver="schur")
+    overlap_tree(half, _images(half))
     if half.scale is not None:
         pair, distance, _ = half.scale
         half = replace(half, scale=(pair, distance, _SCALE * distance))
@@ -97,7 +100,28 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
         raise CalibrationError(
             f"nothing determines {names[int(np.argmax(~np.isfinite(covariance)))]}"
         )
-    return Rig((cameras[0], cameras[1]), half.free, covariance)
+    return Rig(cameras, half.free, covariance)
+
+
+def _in_turn(problem: Problem) -> NDArray[np.int64]:
+    """The views that are used. Of three cameras or more, those that the same cameras see stand
+    together, so that each half has as many of a kind.
+    """
+    used = np.unique(problem.view[problem.weight > 0])
+    if len(problem.cameras) == 2:
+        return used
+    images = _images(problem)
+    kind = {int(v): tuple(c for w, c in sorted(images) if w == v) for v in used}
+    return np.array(sorted(kind, key=lambda v: (kind[v], v)), np.int64)
+
+
+def _images(problem: Problem) -> set[tuple[int, int]]:
+    """(view, camera) of every image with dots enough to place the target."""
+    kept = problem.weight > 0
+    images, counts = np.unique(
+        np.stack([problem.view[kept], problem.camera[kept]], 1), axis=0, return_counts=True
+    )
+    return {(int(v), int(c)) for v, c in images[counts >= LEAST_DOTS]}
 
 
 def _words(field: FieldDifference, views: list[int]) -> str:

@@ -19,6 +19,7 @@ from telerig.estimator.calibration.solver.covariance import aligned_covariance
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import intrinsics_from
+from telerig.rig.triangulation import triangulate_any
 
 Array = NDArray[np.float64]
 
@@ -70,10 +71,11 @@ def space_error(
     """
     calibration = calibration.in_air()
     pixels = [camera.project(points_mm) for camera in truth]
-    found = calibration.triangulate(*pixels, sigma_px=1.0, include_calibration=False).points_mm
+    found = triangulate_any(calibration.cameras, pixels, 1.0).points_mm
     errors = after_rigid_motion(found, points_mm)
-    pair = (calibration.cameras[0], calibration.cameras[1])
-    covariance = aligned_covariance(pair, calibration.free, calibration.covariance, found)
+    covariance = aligned_covariance(
+        calibration.cameras, calibration.free, calibration.covariance, found
+    )
     predicted = np.sqrt(np.trace(covariance) / errors.size)
     return SpaceError(
         float(1e3 * np.sqrt((errors**2).mean())), float(1e3 * predicted), errors, covariance
@@ -115,7 +117,10 @@ def _parameters(
                 unit = (estimate.rho_mm / truth.rho_mm) ** 2 if name == "k1" else 1.0
                 rows.append((f"{estimate.name} {name}", estimate[name], truth[name] * unit, sd))
     s = calibration.statistics
-    axis = cameras[1].camera_from_rig.rotation[2]
-    angle = float(np.degrees(np.arccos(axis[2])))
-    rows.append(("angle of the axes (deg)", s["axes_angle_deg"], angle, s["axes_angle_sd_deg"]))
+    others = {camera.name: camera.camera_from_rig.rotation[2] for camera in cameras[1:]}
+    for name, axis in others.items():
+        angle = float(np.degrees(np.arccos(axis[2])))
+        of, words = (s, "") if len(others) == 1 else (s["from_first"][name], f", camera {name}")
+        sd = of["axes_angle_sd_deg"]
+        rows.append((f"angle of the axes (deg){words}", of["axes_angle_deg"], angle, sd))
     return rows

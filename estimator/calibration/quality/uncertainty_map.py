@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.errors import CalibrationError
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.rig.camera import Camera
 
@@ -41,13 +42,23 @@ class UncertaintyMap:
 def uncertainty_map(
     calibration: Calibration, *, sigma_px: float | None = None, steps: int = STEPS
 ) -> UncertaintyMap:
-    """Of points triangulated from pixels good to ``sigma_px`` (None: the calibration's dots).
+    """Of points triangulated from all cameras' pixels, good to ``sigma_px`` (None: as the
+    calibration's dots are).
 
     Raises CalibrationError for a single camera.
     """
     sigma = float(calibration.statistics.get("scatter_px", 0.02)) if sigma_px is None else sigma_px
     points = working_volume(calibration.cameras, steps)
-    first, second = (calibration.project(c, points) for c in (0, 1))
-    found = calibration.triangulate(first, second, sigma_px=sigma)
+    if len(calibration.cameras) < 2:
+        raise CalibrationError(
+            "one camera cannot triangulate, so there is no map of its uncertainty in space",
+            todo="calibrate two cameras",
+        )
+    pixels = {c.name: calibration.project(c.name, points) for c in calibration.cameras}
+    if len(pixels) == 2:
+        first, second = pixels.values()
+        found = calibration.triangulate(first, second, sigma_px=sigma)
+    else:
+        found = calibration.triangulate(pixels, sigma_px=sigma)
     own = found.measurement_covariance_mm2
     return UncertaintyMap(points, found.covariance_mm2 - own, own, sigma)

@@ -15,7 +15,7 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.covariance import rig_jacobian
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, hat, nearest_rotation, rotation_from_rotvec
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import triangulate_any
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -187,21 +187,23 @@ def derivatives(
     return residual, by_point, np.concatenate([by_turn, by_move, by_slope], -1), by_rig
 
 
-def start(cameras: tuple[Camera, Camera], dots: Dots) -> State:
+def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
     """Closed form: dots triangulated view by view, median slopes, the target fitted to medians.
 
-    Raises CalibrationError when no dot is seen by both cameras at two positions.
+    Raises CalibrationError when no dot is seen by two cameras at two positions.
     """
     ids = np.unique(dots.place_mm, axis=0, return_inverse=True)[1].reshape(-1)
     keys = dots.view * (ids.max() + 1) + ids
-    left, right = (np.flatnonzero(dots.camera == c) for c in (0, 1))
-    _, i, j = np.intersect1d(keys[left], keys[right], return_indices=True)
-    left, right = left[i], right[j]
-    points = triangulate(cameras, (dots.uv_px[left], dots.uv_px[right]), 0.02).points_mm
-    reading = dots.reading_mm[dots.view[left]]
-    slope = _median_slope(reading, ids[left], points)
+    _, first, point = np.unique(keys, return_index=True, return_inverse=True)
+    pixels = np.full((len(cameras), len(first), 2), np.nan)
+    pixels[dots.camera, point] = dots.uv_px
+    several = np.isfinite(pixels[..., 0]).sum(0) > 1
+    one = first[several]
+    points = triangulate_any(cameras, list(pixels[:, several]), 0.02).points_mm
+    reading = dots.reading_mm[dots.view[one]]
+    slope = _median_slope(reading, ids[one], points)
     at_zero = points + slope * reading[:, None]
-    return State(_fitted_pose(ids[left], dots.place_mm[left], at_zero), slope)
+    return State(_fitted_pose(ids[one], dots.place_mm[one], at_zero), slope)
 
 
 def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
@@ -216,9 +218,9 @@ def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
     every = np.concatenate(slopes)
     if not len(every):
         raise CalibrationError(
-            "no dot is seen by both cameras at two positions",
+            "no dot is seen by two cameras at two positions",
             where="stage_axis",
-            todo="keep the target in both images while the stage travels",
+            todo="keep the target in the images of two cameras while the stage travels",
         )
     return np.asarray(np.median(every, axis=0))
 

@@ -176,7 +176,7 @@ def stage_axis_of(
     """
     dots, words = _dots(calibration, table, positions_mm)
     cameras = calibration.cameras
-    state = start((cameras[0], cameras[1]), dots)
+    state = start(cameras, dots)
     sigma = (position_sigma_mm, wander_sigma_mm)
     state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
     shown = _shown_sigma(state, weights, system, sigma)
@@ -252,7 +252,7 @@ def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
         raise CalibrationError(
             "one camera never sees travel along its own axis",
             where=FOLDER,
-            todo="show the target to both cameras",
+            todo="show the target to two cameras",
         )
     span = float(np.ptp(reading_mm))
     if span < LEAST_TRAVEL_MM:

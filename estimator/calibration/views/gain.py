@@ -23,7 +23,7 @@ class ViewGain:
 
     covariance : (P + 3 n, P + 3 n) of the rig block and of ``dots``, (n,) sorted, which alone can
     be asked for.  root : (P, R), root root^T weighs the rig block by the variance of points in
-    space.  whitener : (2,) 1 / px.
+    space.  whitener : (C,) 1 / px.
     """
 
     problem: Problem
@@ -38,10 +38,10 @@ class ViewGain:
     def of(problem: Problem, state: State, joint: JointCovariance, dots: Ints) -> ViewGain:
         cameras = cameras_from_state(problem, state)
         points = working_volume(cameras)
-        shift = aligned_shift((cameras[0], cameras[1]), problem.free, points)
+        shift = aligned_shift(cameras, problem.free, points)
         covariance, dots = joint.of_rig_and(np.unique(dots)), np.unique(dots)
         triangle = np.asarray(np.linalg.qr(shift, mode="r")).T
-        noise = [_noise_px(problem, c) for c in (0, 1)]
+        noise = [_noise_px(problem, c) for c in range(len(cameras))]
         return ViewGain(problem, state, covariance, dots, triangle, 1 / np.array(noise), points)
 
     @property
@@ -83,26 +83,30 @@ class ViewGain:
         return self._um(np.sum(by_points * np.linalg.solve(both, by_points), axis=(-1, -2)))
 
     def _rows(self, poses: Candidates, dots: Ints) -> tuple[Array, Array]:
-        """Whitened derivatives of K views: (K, 4 n, P + 3 n) by rig and dots, (K, 4 n, 6)."""
-        problem, rig = self.problem, len(self.root)
+        """Whitened derivatives of K views: (K, 2 C n, P + 3 n) by rig and dots, (K, 2 C n, 6)."""
+        count, problem, rig = len(self.problem.cameras), self.problem, len(self.root)
         stand_for = np.sqrt(len(problem.dot_ids) / len(dots))
         state, obs = predicted(problem, self.state, poses, dots, stand_for * self.whitener)
         visible, _ = dots_seen(problem, self.state, poses, dots)
         obs.whitener[~visible.ravel()] = 0.0
         found = whitened_residuals(state, obs, problem.rho_mm)
-        shape = (len(poses), 2, len(dots), 2)
+        shape = (len(poses), count, len(dots), 2)
         rows = np.zeros((*shape, rig + 3 * len(dots)))
         by_intrinsics = found.by_intrinsics.reshape(*shape, -1)
         at = 0
-        for c in (0, 1):
+        for c in range(count):
             free = problem.free_indices(c)
             rows[:, c, ..., at : at + len(free)] = by_intrinsics[:, c][..., free]
             at += len(free)
-        rows[:, 1, ..., at:rig] = found.by_camera.reshape(*shape, 6)[:, 1]
+        by_camera = found.by_camera.reshape(*shape, 6)
+        for c in range(1, count):
+            rows[:, c, ..., at : at + 6] = by_camera[:, c]
+            at += 6
         by_dot = found.by_dot.reshape(*shape, 3)
         for i, start in enumerate(range(rig, rows.shape[-1], 3)):
             rows[:, :, i, :, start : start + 3] = by_dot[:, :, i]
-        return rows.reshape(len(poses), 4 * len(dots), -1), found.by_view.reshape(len(poses), -1, 6)
+        by_view = found.by_view.reshape(len(poses), -1, 6)
+        return rows.reshape(len(poses), 2 * count * len(dots), -1), by_view
 
 
 def _noise_px(problem: Problem, camera: int) -> float:

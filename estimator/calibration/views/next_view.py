@@ -59,7 +59,7 @@ class NextView:
 
     before_um : standard deviation per axis of points over the working volume, the calibration's
     share, their common rigid motion set aside.  poses : best first; none when no pose of the table
-    is seen by both cameras.  size_um : what the stated uncertainty of the target's known
+    is seen by two cameras.  size_um : what the stated uncertainty of the target's known
     distance and print leaves, which no view can lower.  marks : ids of the target's marks.
     """
 
@@ -130,12 +130,13 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
     The candidates' noise is the median of the dots so far. Of many dots some stand for all, which
     promises slightly too little, as the dots' own uncertainty is averaged over fewer of them.
     """
-    if len(problem.cameras) != 2 or not np.isfinite(joint.rig_block()[1]).all():
+    if len(problem.cameras) < 2 or not np.isfinite(joint.rig_block()[1]).all():
         return None
     few, many = spread_dots(problem), spread_dots(problem, _MANY_DOTS)
     gain = ViewGain.of(problem, state, joint, np.union1d(few, many))
-    used = [np.unique(problem.view[(problem.weight > 0) & (problem.camera == c)]) for c in (0, 1)]
-    views = len(np.intersect1d(used[0], used[1]))
+    kept = problem.weight > 0
+    images = np.unique(np.stack([problem.view[kept], problem.camera[kept]], 1), axis=0)
+    views = int((np.bincount(images[:, 0]) > 1).sum())
     found = candidates(problem, state)
     if not len(found):
         return NextView(views, gain.before_um, (), gain.size_um)
@@ -145,7 +146,7 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
         HeldPose(
             chosen.rig_from_target[i],
             float(after_um),
-            hold_words(problem, state, chosen.rig_from_target[i], chosen.facing[i]),
+            hold_words(problem, state, chosen.some(slice(i, i + 1))),
             reason_words(problem, state, chosen.some(slice(i, i + 1))),
         )
         for i, after_um in enumerate(gain.after_um(chosen, many))

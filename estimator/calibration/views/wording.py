@@ -28,11 +28,12 @@ _MORE_TILT_DEG = 4.0
 _CORNER_CELLS = 2
 
 
-def hold_words(problem: Problem, state: State, rig_from_target: Array, facing: Array) -> str:
-    """Turn, lean, roll and place of one pose (4, 4); facing : (2,) the sides that are seen."""
-    axes = optical_axes(state)
+def hold_words(problem: Problem, state: State, one: Candidates) -> str:
+    """Turn, lean, roll and place of one pose, as its pair of cameras sees it."""
+    pair, rig_from_target = one.pair[0], one.rig_from_target[0]
+    axes, facing = optical_axes(state)[pair], one.facing[0][pair]
     alike, along, across = bases(axes, facing)
-    first, second = (camera.name for camera in problem.cameras)
+    first, second = (problem.cameras[c].name for c in pair)
     # the side that the first camera sees looks against its axis
     looks = -facing[0] * rig_from_target[:3, 2]
     middle = -facing[0] * alike
@@ -44,7 +45,7 @@ def hold_words(problem: Problem, state: State, rig_from_target: Array, facing: A
     upright = abs(across[1]) >= abs(across[0])
     across = across * np.sign(-across[1] if upright else across[0])
     lean = np.degrees(np.arcsin(np.clip(looks @ across, -1, 1)))
-    parts = [_start_words(problem, facing)]
+    parts = [_start_words(problem, facing, (first, second))]
     if abs(turn) >= _NEARLY_DEG:
         way = "towards" if facing[0] == facing[1] else "squarer to"
         parts.append(
@@ -58,16 +59,19 @@ def hold_words(problem: Problem, state: State, rig_from_target: Array, facing: A
     return ", ".join(parts)
 
 
-def _start_words(problem: Problem, facing: Array) -> str:
-    first, second = (camera.name for camera in problem.cameras)
+def _start_words(problem: Problem, facing: Array, pair: tuple[str, str]) -> str:
+    first, second = pair
     side = {1.0: "front", -1.0: "back"}
     if facing[0] != facing[1]:
         return (
             f"hold the plate with its {side[facing[0]]} towards camera {first} and its "
             f"{side[facing[1]]} towards camera {second}, at the same angle to both cameras"
         )
+    between = "the cameras"
+    if len(problem.cameras) > 2:
+        between = f"cameras {first} and {second}"
     which = f"'s {side[facing[0]]}" if problem.target.two_sided else ""
-    return f"face the plate{which} midway between the cameras"
+    return f"face the plate{which} midway between {between}"
 
 
 def _roll_words(problem: Problem, rig_from_target: Array) -> str:
@@ -107,7 +111,7 @@ def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, 
     for c, camera in enumerate(problem.cameras):
         most, tilt = (float(np.degrees(np.arccos(np.clip(v, 0, 1)))) for v in
                       (cosine[c].min(), then[c]))  # fmt: skip
-        if tilt > most + _MORE_TILT_DEG:
+        if one.sees[0, c] and tilt > most + _MORE_TILT_DEG:
             out.append(
                 f"a tilt of {tilt:.0f} degrees to camera {camera.name}, so far {most:.0f} at most"
             )
@@ -130,16 +134,20 @@ def _where(cells: Array) -> str:
     return "the empty " + " and ".join(names)
 
 
-def first_views(first: str, second: str, angle_deg: float) -> tuple[str, ...]:
+def first_views(
+    first: str, second: str, angle_deg: float, *, alone: bool = True
+) -> tuple[str, ...]:
     """Words for the first views, before any calibration can say more.
 
-    first, second : the cameras' names.  angle_deg : between their axes.
+    first, second : the cameras' names.  angle_deg : between their axes.  alone : whether the rig
+    has no other cameras.
     """
+    between = "the cameras" if alone else f"cameras {first} and {second}"
     turn = max(0, min(20, int(TILT_LIMIT_DEG - angle_deg / 2 - 5) // 5 * 5))
     aside = {
         c: f"turn it {turn} degrees towards camera {c}, " if turn else "" for c in (first, second)
     }
-    start = "face the plate midway between the cameras, "
+    start = f"face the plate midway between {between}, "
     return (
         start + "its middle in the middle of the field",
         start + "tilt its top 30 degrees back, hold it towards the upper left",

@@ -169,10 +169,18 @@ def test_an_empty_corner_is_filled(scene: Any) -> None:
     assert any("the empty upper left" in r and "camera left" in r for r in advice.poses[0].reasons)
     every = np.arange(len(problem.dot_ids))
     pose = advice.poses[0].rig_from_target[None]
-    best = Candidates(pose, np.ones((1, 2)), np.zeros(1, int))
+    best = _one(pose)
     visible, uv = dots_seen(problem, state, best, every)
     left = uv[0, 0][visible[0, 0]]
     assert np.any((left < 200).all(-1))
+
+
+def _one(pose: Any) -> Candidates:
+    """One pose (4, 4) of a plate whose front two cameras see."""
+    two = np.ones((1, 2))
+    return Candidates(
+        np.reshape(pose, (1, 4, 4)), two, np.zeros(1, int), two > 0, np.array([[0, 1]])
+    )
 
 
 def _held(problem: Any, state: State, rotvec_deg: Any, place: Any) -> str:
@@ -185,7 +193,7 @@ def _held(problem: Any, state: State, rotvec_deg: Any, place: Any) -> str:
     middle = (state.dots_mm.min(0) + state.dots_mm.max(0)) / 2
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, np.asarray(place) - rotation @ middle
-    return hold_words(problem, state, pose, np.ones(2))
+    return hold_words(problem, state, _one(pose))
 
 
 def test_words_say_how_the_plate_is_held(scene: Any) -> None:
@@ -212,7 +220,7 @@ def test_tilted_back_means_that_the_top_is_farther_from_both_cameras(scene: Any)
     found = candidates(problem, state)
     back = 0
     for k in range(0, len(found), 7):
-        words = hold_words(problem, state, found.rig_from_target[k], found.facing[k])
+        words = hold_words(problem, state, found.some(slice(k, k + 1)))
         if "tilt its top" not in words:
             continue
         # walk on the plate upwards, as the first camera sees it
@@ -247,7 +255,7 @@ def test_words_for_a_second_camera_anywhere_round_the_first(azimuth_deg: float) 
         pose = np.eye(4)
         pose[:3, :3] = np.stack([x, np.cross(normal, x), normal], 1)
         state = State(np.zeros((2, 20)), cameras, pose[None], np.zeros((1, 3)))
-        words = hold_words(problem, state, pose, np.ones(2))
+        words = hold_words(problem, state, _one(pose))
         assert "turn it" not in words
         edge, back = re.search(r"tilt its (.+) 30 degrees (back|forward)", words).groups()  # type: ignore[union-attr]
         along = [0.0, -1.0] if edge == "top" else [1.0, 0.0]

@@ -37,6 +37,7 @@ from telerig.estimator.bubbles.outline.split import (
     split_at_necks,
     split_blobs,
 )
+from telerig.estimator.images.noise import high_pass
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,7 +104,8 @@ def find_bubbles(
     if reason:
         return _bubbles({}, [], np.nan, reason)
     ratio, clipped = normalised(image, background)
-    sigma = max(noise_share(ratio), 1e-4)
+    response = high_pass(ratio)
+    sigma = max(noise_share(ratio, response), 1e-4)
     blobs, rejected = find_blobs(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
@@ -112,7 +114,7 @@ def find_bubbles(
     rejected += slender
     if not parts:
         return _bubbles({}, rejected, sigma, "no shadow dark and large enough")
-    dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
+    dark_sigma = max(dark_noise_share(ratio, response, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
     splits = split_at_necks(outlines, parts, blobs, image.shape, min_diameter_px)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Float32
 from telerig.estimator.images.noise import clipped_sigma
 
-_NOISE_ROWS, _NOISE_SAMPLES = 96, 40_000
+_NOISE_SAMPLES = 40_000
 _DARK_SHARE, _ENOUGH_DARK = 0.12, 120
 _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
@@ -43,51 +43,35 @@ class Rejected(NamedTuple):
     reason: str
 
 
-def noise_share(ratio: Float32) -> float:
+def noise_share(ratio: Float32, response: Float32) -> float:
     """Noise of the normalised image where the screen is free, as a share of the background.
 
-    From second differences along both axes (blind to any plane) on some rows.
+    response : the image's `high_pass`, which is blind to any plane.
     """
-    step = max(1, (ratio.shape[0] - 2) // _NOISE_ROWS)
-    middle = np.arange(1, ratio.shape[0] - 1, step)
-    above, here, below = ratio[middle - 1], ratio[middle], ratio[middle + 1]
-    response = _second_differences(above, here, below)
-    lit = np.minimum(np.minimum(above, here), below) > _LIT
-    far = lit.copy()
-    for shift in (1, 2, 3):
-        far[:, shift:] &= lit[:, :-shift]
-        far[:, :-shift] &= lit[:, shift:]
-    far = far[:, 1:-1]
-    values = response[far] if np.count_nonzero(far) > 200 else response.ravel()
+    import cv2
+
+    free = cv2.erode((ratio > _LIT).astype(np.uint8), np.ones((3, 7), np.uint8)) > 0
+    values = response[free] if np.count_nonzero(free) > 200 else response.ravel()
     return clipped_sigma(
         values[:: max(1, values.size // _NOISE_SAMPLES)].astype(np.float64), rounds=6
     )
 
 
-def _second_differences(above: Float32, here: Float32, below: Float32) -> Float32:
-    """Along both axes, scaled to the noise of one pixel."""
-    vertical = above - 2.0 * here + below
-    return (vertical[:, :-2] - 2.0 * vertical[:, 1:-1] + vertical[:, 2:]) / 6.0
-
-
-def dark_noise_share(ratio: Float32, blobs: list[Blob], sigma: float) -> float:
+def dark_noise_share(ratio: Float32, response: Float32, blobs: list[Blob], sigma: float) -> float:
     """Noise within the dark rims, at most ``sigma``, that of the screen: photons are fewer there.
 
-    From second differences along both axes where three by three pixels are dark alike. Structure
-    within the rims makes the estimate too large rather than too small.
+    From the `high_pass` where five by five pixels are dark alike. Structure within the rims makes
+    the estimate too large rather than too small.
     """
     import cv2
 
-    found = []
+    found = [np.empty(0, np.float32)]
     for blob in blobs:
         x, y, width, height = blob.box
-        crop = ratio[y : y + height, x : x + width]
-        if min(crop.shape) < 5:
-            continue
-        even = (crop < blob.inner + _DARK_SHARE * (1.0 - blob.inner)).astype(np.uint8)
-        even = cv2.erode(even, np.ones((5, 5), np.uint8), borderValue=0)[1:-1, 1:-1] > 0
-        found.append(_second_differences(crop[:-2], crop[1:-1], crop[2:])[even])
-    values = np.concatenate(found) if found else np.empty(0, np.float32)
+        crop = np.s_[y : y + height, x : x + width]
+        even = (ratio[crop] < blob.inner + _DARK_SHARE * (1.0 - blob.inner)).astype(np.uint8)
+        found.append(response[crop][cv2.erode(even, np.ones((5, 5), np.uint8), borderValue=0) > 0])
+    values = np.concatenate(found)
     if values.size < _ENOUGH_DARK:
         return sigma
     return min(sigma, clipped_sigma(values[: 10 * _NOISE_SAMPLES].astype(np.float64), rounds=6))

@@ -40,38 +40,23 @@ def contour_moments(contours: list[Array]) -> tuple[Array, Array, Array]:
 
     Points that are NaN (beyond the image) are passed over.
     """
-    clean = [contour[np.isfinite(contour[:, 0])] for contour in contours]
-    clean = [contour if len(contour) >= 3 else np.eye(3, 2) for contour in clean]
-    sizes = np.array([len(contour) for contour in clean])
-    first = np.cumsum(sizes) - sizes
-    owner = np.repeat(np.arange(sizes.size), sizes)
-    points = np.concatenate(clean)
-    origin = np.add.reduceat(points, first) / sizes[:, None]
-    x, y = (points - origin.take(owner, axis=0)).T
-    following = np.arange(owner.size) + 1
-    following[first + sizes - 1] = first
-    x1, y1 = x[following], y[following]
-    cross = x * y1 - x1 * y
-    terms = [
-        cross / 2.0,
-        cross * (x + x1) / 6.0,
-        cross * (y + y1) / 6.0,
-        cross * (x * x + x * x1 + x1 * x1) / 12.0,
-        cross * (y * y + y * y1 + y1 * y1) / 12.0,
-        cross * (x * (2.0 * y + y1) + x1 * (2.0 * y1 + y)) / 24.0,
-    ]
-    area, mx, my, mxx, myy, mxy = (np.add.reduceat(term, first) for term in terms)
-    area = np.where(np.abs(area) < 1e-9, 1e-9, area)
-    mx, my = mx / area, my / area
-    mxx, myy, mxy = mxx / area - mx * mx, myy / area - my * my, mxy / area - mx * my
-    middle, half = (mxx + myy) / 2.0, np.hypot((mxx - myy) / 2.0, mxy)
-    a = 2.0 * np.sqrt(np.maximum(middle + half, 0.1))
-    b = 2.0 * np.sqrt(np.maximum(middle - half, 0.1))
-    angle = 0.5 * np.arctan2(2.0 * mxy, mxx - myy)
-    ellipse = np.stack([origin[:, 0] + mx, origin[:, 1] + my, a, b, angle], axis=1)
-    gap = rough_distance(ellipse.take(owner, axis=0), points[:, 0], points[:, 1])
-    rms = np.sqrt(np.add.reduceat(gap**2, first) / sizes)
-    return ellipse, rms, np.maximum.reduceat(np.abs(gap), first)
+    import cv2
+
+    found = []
+    for contour in contours:
+        points = contour[np.isfinite(contour[:, 0])]
+        points = points if len(points) >= 3 else np.eye(3, 2)
+        m = cv2.moments(points.astype(np.float32)[:, None])
+        area = m["m00"] or 1e-9
+        uu, vv, uv = m["mu20"] / area, m["mu02"] / area, m["mu11"] / area
+        middle, half = (uu + vv) / 2.0, np.hypot((uu - vv) / 2.0, uv)
+        a, b = 2.0 * np.sqrt(np.maximum([middle + half, middle - half], 0.1))
+        angle = 0.5 * np.arctan2(2.0 * uv, uu - vv)
+        ellipse = np.array([m["m10"] / area, m["m01"] / area, a, b, angle])
+        gap = rough_distance(ellipse, points[:, 0], points[:, 1])
+        found.append((ellipse, np.sqrt(np.mean(gap**2)), np.max(np.abs(gap))))
+    ellipses, rms, largest = zip(*found)
+    return np.array(ellipses), np.array(rms), np.array(largest)
 
 
 def notch_arcs(contour: Array) -> list[Array]:

@@ -48,10 +48,17 @@ def batch(
     Exit code 0: all done. 1: a job failed or a calibration was rejected; batch.csv and report.html
     say which. 2: the input cannot be used. 130: interrupted; the same command continues.
     """
-    from telerig.estimator.batch.batch import dask_executor, local_executor, run_batch
+    from telerig.estimator.batch.batch import (
+        DONE,
+        Journal,
+        batch_words,
+        dask_executor,
+        local_executor,
+        run_batch,
+        summary_line,
+        write_batch,
+    )
     from telerig.estimator.batch.jobs import check_options, jobs_of, share_of
-    from telerig.estimator.batch.records import Journal, batch_words, write_batch
-    from telerig.estimator.batch.work import DONE, summary_line
 
     def tell(job: Job, record: dict[str, Any], done: int, of: int) -> None:
         say(f"[{done}/{of}] {summary_line(job, record, whole_path=same_names)}")

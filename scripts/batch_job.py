@@ -15,8 +15,8 @@ import threading
 import time
 
 from telerig.errors import TelerigError
+from telerig.estimator.batch.batch import FAILED, do_job, failure
 from telerig.estimator.batch.jobs import Job
-from telerig.estimator.batch.work import FAILED, do_job, failure
 from telerig.io.files.atomic import plain
 
 _END_WITHIN_S = 10.0

@@ -24,11 +24,11 @@ def doctor(
 
     Exit code 0: nothing prevents the work, though there may be warnings. 1: there is a failure.
     """
-    from telerig.estimator.doctor.installation import check_installation, check_ports
+    from telerig.estimator.doctor.checks import check_installation, check_ports
 
     checks = [*check_installation(), *check_ports()]
     if dataset is not None:
-        from telerig.estimator.doctor.dataset import check_dataset
+        from telerig.estimator.doctor.checks import check_dataset
 
         checks += check_dataset(dataset)
     if as_json:

@@ -42,9 +42,8 @@ def run(
     Exit code 0: all done. 1: a calibration was rejected or a run failed. 2: the dataset cannot be
     used. 130: interrupted; the same command continues.
     """
+    from telerig.estimator.batch.batch import DONE, FAILED, LEFT_OUT, batch_words, failure
     from telerig.estimator.batch.jobs import check_options, jobs_of
-    from telerig.estimator.batch.records import batch_words
-    from telerig.estimator.batch.work import DONE, FAILED, LEFT_OUT, failure
 
     check_options(calibration, model, medium)
     jobs = jobs_of([dataset], calibration=calibration, only=only or (), model=model,
@@ -65,7 +64,7 @@ def run(
 
 
 def _done(job: Job, quiet: bool) -> dict[str, Any]:
-    from telerig.estimator.batch.work import FAILED, do_job, failure
+    from telerig.estimator.batch.batch import FAILED, do_job, failure
 
     try:
         with progress(quiet) as stage:

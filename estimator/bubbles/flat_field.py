@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Float32
 from telerig.errors import InputError
-from telerig.estimator.images.checks import check_grey_image
+from telerig.estimator.images.noise import check_grey_image
 
 _UNIFORM_SHARE = 0.004
 _CLIPPED_SHARE = 0.5

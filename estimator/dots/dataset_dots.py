@@ -19,10 +19,59 @@ from telerig.estimator.dots.detect_target import (
     numbered,
     rejected_table,
 )
+from telerig.estimator.dots.fit.blurred_ellipse import (
+    PIXEL_VARIANCE_PX2,
+    coverage_on_grid,
+    shape_from_axes,
+)
 from telerig.estimator.dots.grid.numbering import check_handedness
 from telerig.estimator.dots.locate import measure_dots
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
+
+REACH = 1.7
+"""Half-width of the patch in semi-major axes, besides five pixels."""
+
+
+def dot_example(
+    image: NDArray[Any], u_px: float, v_px: float, a_px: float, *, polarity: Any
+) -> dict[str, Array] | None:
+    """The dot nearest to (u_px, v_px) with its luminance model; None when it is not found again.
+
+    Returns patch and model (h, w) in grey levels, u0 and v0 (pixel of the patch's corner), the
+    ellipse (u_px, v_px, a_px, b_px, angle_rad) and the grey noise.
+    """
+    half = int(np.ceil(REACH * a_px + 5))
+    v0, u0 = max(0, round(v_px) - half), max(0, round(u_px) - half)
+    patch = image[v0 : round(v_px) + half + 1, u0 : round(u_px) + half + 1].astype(float)
+    found = measure_dots(patch, polarity=polarity).dots
+    if not len(found):
+        return None
+    distance = np.hypot(found["u_px"] + u0 - u_px, found["v_px"] + v0 - v_px)
+    dot = found.iloc[int(np.argmin(distance))]
+    sigma = float(np.sqrt(dot["blur_px"] ** 2 + PIXEL_VARIANCE_PX2))
+    shape = shape_from_axes(dot["a_px"], dot["b_px"], dot["angle_rad"])
+    columns, rows = (np.arange(n, dtype=float) for n in patch.shape[::-1])
+    u, v = np.meshgrid(columns, rows)
+    centre = (dot["u_px"], dot["v_px"])
+    covered, _ = coverage_on_grid(columns, rows, centre, shape, sigma)
+    model = _with_levels(patch, covered, u - dot["u_px"], v - dot["v_px"])
+    numbers = {n: np.array(dot[n]) for n in ("a_px", "b_px", "angle_rad", "noise")}
+    place = {
+        "u0": np.array(float(u0)), "v0": np.array(float(v0)),
+        "u_px": np.array(dot["u_px"] + u0), "v_px": np.array(dot["v_px"] + v0),
+    }  # fmt: skip
+    return {"patch": patch, "model": model, **place, **numbers}
+
+
+def _with_levels(patch: Array, covered: Array, du: Array, dv: Array) -> Array:
+    """Least-squares grey levels and gradients, background and contrast, at a known coverage."""
+    one = np.ones_like(du)
+    terms = [one, du, dv, covered, covered * du, covered * dv]
+    design = np.stack([t.ravel() for t in terms], -1)
+    levels, *_ = np.linalg.lstsq(design, patch.ravel(), rcond=None)
+    return np.asarray((design @ levels).reshape(patch.shape))
+
 
 Progress = Callable[[int, int], None]
 
@@ -104,7 +153,7 @@ def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str
     if overlays:
         import cv2  # noqa: F401
 
-        import telerig.estimator.dots.example_dot
+        import telerig.estimator.dots.dataset_dots
         import telerig.io.report.overlays  # noqa: F401
 
 
@@ -149,7 +198,7 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
     """With the fit of a typical dot: the one whose chi-square is the median."""
-    from telerig.estimator.dots.example_dot import dot_example
+    from telerig.estimator.dots.dataset_dots import dot_example
 
     order = np.argsort(detected.dots["chi2_dof"].to_numpy())
     chosen = detected.dots.iloc[int(order[len(order) // 2])]

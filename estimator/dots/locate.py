@@ -37,10 +37,10 @@ from telerig.estimator.dots.fit.surroundings import (
     with_common_blur,
     without_neighbours,
 )
-from telerig.estimator.images.checks import check_grey_image
 from telerig.estimator.images.noise import (
     NoiseModel,
     agreed_factor,
+    check_grey_image,
     estimate_noise,
     grey_step,
     high_pass,

@@ -1,13 +1,18 @@
-"""Image noise measured from the image itself: variance = alpha + beta * grey level."""
+"""What an image is like: whether it is a grey image at all, and its noise, measured from itself.
+
+The noise model is variance = alpha + beta * grey level.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32
+from telerig.errors import InputError
 
 # Second differences along both axes: zero on any plane, unit gain for white noise (Immerkaer 1996).
 _SECOND_DIFFERENCES = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6.0
@@ -173,3 +178,29 @@ def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float
     if beta <= 4.0 * np.sqrt(covariance[1, 1]) or alpha + beta * levels.min() <= 0.0:
         return level_free
     return NoiseModel(float(alpha), float(beta), step, total, *seen)
+
+
+def check_grey_image(image: NDArray[Any], least_size_px: int, wanted: str) -> None:
+    """Raise InputError for anything but a finite 2-D image of at least ``least_size_px`` per side.
+
+    wanted : what is looked for in the image, in the plural, for the message.
+    """
+    if image.ndim != 2:
+        raise InputError(
+            f"a grey image has 2 dimensions, this array has {image.ndim}: {image.shape}",
+            where="image",
+            todo="convert colour images to grey first (cv2.cvtColor, or one channel of the array)",
+        )
+    if min(image.shape) < least_size_px or image.dtype.kind not in "uif":
+        raise InputError(
+            f"cannot look for {wanted} in an array of shape {image.shape} and type {image.dtype}",
+            where="image",
+            todo=f"give at least {least_size_px} x {least_size_px} pixels of an integer or float "
+            "type",
+        )
+    if image.dtype.kind == "f" and not np.all(np.isfinite(image.astype(np.float32))):
+        raise InputError(
+            "the image has pixels that are not finite",
+            where="image",
+            todo="replace NaN and infinity",
+        )

@@ -11,9 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
-from telerig.estimator.doctor import installation
-from telerig.estimator.doctor.dataset import check_dataset
-from telerig.estimator.doctor.installation import check_installation, check_ports
+from telerig.estimator.doctor import checks as doctor
+from telerig.estimator.doctor.checks import check_dataset, check_installation, check_ports
 from telerig.io.dataset.new_dataset import new_dataset
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.io.simulation.presets import run_preset
@@ -133,19 +132,19 @@ def test_two_distributions_of_opencv_are_told_apart(monkeypatch):
     class Rival:
         metadata = {"Name": "opencv-contrib-python"}  # noqa: RUF012
 
-    monkeypatch.setattr(installation, "distributions", lambda: [Rival()])
+    monkeypatch.setattr(doctor, "distributions", lambda: [Rival()])
     words = _of(check_installation(), "one OpenCV", "warning")
     assert "opencv-contrib-python" in words and "pip uninstall" in words
 
 
 def test_a_package_that_is_missing_or_broken_is_a_failure(monkeypatch):
-    monkeypatch.setattr(installation, "_required", lambda: ["no-such-package", "numpy"])
+    monkeypatch.setattr(doctor, "_required", lambda: ["no-such-package", "numpy"])
     assert "pip install no-such-package" in _of(check_installation(), "no-such-package", "failure")
 
     def broken(name: str) -> None:
         raise ImportError("libGL.so.1: cannot open shared object file")
 
-    monkeypatch.setattr(installation.importlib, "import_module", broken)
+    monkeypatch.setattr(doctor.importlib, "import_module", broken)
     assert "libGL.so.1" in _of(check_installation(), "numpy", "failure")
 
 

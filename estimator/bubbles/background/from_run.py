@@ -3,20 +3,507 @@
 log image = rig layer(u, v) + lab layer(u + shift_u, v + shift_v) + gain of the frame, with bubbles
 as dark outliers. The rig layer is all that is fixed in the image (lens dirt, flat field, a screen
 that moves with the rig), the lab layer all that stays behind (a fixed screen, dirt on the tank).
+
+Robust quantiles give a start; then the pixels under bubbles are marked frame by frame, and means
+over the rest, one layer after the other, sharpen both. A bubble that the rig follows hides the same
+pixels in most frames, so no quantile over frames can see behind it. It is far darker than any
+screen is uneven, and that is seen in single frames before any background is known. Dirt is as dark,
+but stays still: in the image, or in the lab.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.errors import DetectionError, InputError
-from telerig.estimator.bubbles.background.from_one_image import level_of_image
-from telerig.estimator.bubbles.background.layers import crop_of_lab, fit_layers
+from telerig.estimator.bubbles.background.from_one_image import (
+    DARK,
+    bright_surface,
+    compact_things,
+    fill_masked,
+    level_of_image,
+    log_cells,
+)
+
+_CELL_PX = 2
+
+DEEP = 0.2
+"""Depth (of log grey) from which on a dark thing is a bubble, or dirt."""
+
+OFTEN = 0.4
+"""Share of frames that hide a pixel from which on quantiles over frames are in danger."""
+
+_STILL, _GONE, _RING_SHARE = 0.9, 0.3, 0.7
+_CHANGES = 0.25
+_KNOWN_STILL, _FEW = 5, 10
+
+
+def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Array) -> Bools:
+    """(n, H, W) pixels of n images that a bubble probably hides, where that happens often.
+
+    Elsewhere quantiles over frames do better, as they need no threshold.
+
+    shifts_px : (n, 2) travel (u, v) of what is fixed in the lab; None when nothing moves.
+    gains : (n,) log brightness of the frames.
+    """
+    import cv2
+
+    height, width = stack.shape[1:]
+    log = np.stack([log_cells(image, _CELL_PX) - gain for image, gain in zip(stack, gains)])
+    surface = bright_surface(np.quantile(log, 0.8, axis=0).astype(np.float32), 4)
+    dark = np.stack([compact_things(surface - frame > DEEP) for frame in log])
+    keep = dark & ~_still(dark.mean(0), np.ones(dark.shape[1:], bool), 2)
+    places = _lab_places(shifts_px, dark.shape)
+    if places:
+        share, seen = _share_in_lab(dark, places)
+        still = _still(share, seen >= min(_KNOWN_STILL, len(dark)), 3)
+        keep &= ~np.stack([still[place] for place in places])
+    grow = np.ones((5, 5), np.uint8)
+    grown = np.stack([cv2.dilate(mask.astype(np.uint8), grow) for mask in keep])
+    often = np.broadcast_to(grown.mean(0) > OFTEN, grown.shape)
+    if places:
+        share, seen = _share_in_lab(grown, places)
+        hidden = (share > OFTEN) & (seen < _FEW)
+        often = often | np.stack([hidden[place] for place in places])
+    grown *= often
+    masks = np.stack([cv2.resize(m, (width, height), interpolation=0) for m in grown]) > 0
+    masks &= ~_fringe(stack, gains, masks)
+    return masks
+
+
+def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
+    """(H, W) pixels at the border of what is always hidden that hardly change: dirt beside it.
+
+    A bubble's own border moves, if only by a pixel, and parts its still inside from the outside.
+    """
+    import cv2
+
+    never = masks.mean(0) > 1 - 1.5 / len(masks)
+    values = np.log(np.maximum(stack[:, never].astype(np.float32), 0.5)) - gains[:, None]
+    low, high = np.quantile(values, (0.1, 0.9), axis=0)
+    steady = ~never
+    steady[never] = high - low < _CHANGES
+    _, labels = cv2.connectedComponents(steady.astype(np.uint8), connectivity=4)
+    outside = np.unique(labels[~never])
+    return np.asarray(never & np.isin(labels, outside[outside > 0]), bool)
+
+
+def _still(share: Array, known: Bools, margin: int) -> Bools:
+    """Things dark in nearly all frames, grown by ``margin`` cells, beyond which few are dark."""
+    import cv2
+
+    core = (share >= _STILL) & known
+    count, labels = cv2.connectedComponents(core.astype(np.uint8))
+    still = np.zeros(share.shape, np.uint8)
+    for k in range(1, count):
+        thing = (labels == k).astype(np.uint8)
+        near = cv2.dilate(thing, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8))
+        ring = (cv2.dilate(near, np.ones((3, 3), np.uint8)) > near) & known
+        if ring.any() and np.quantile(share[ring], _RING_SHARE) < _GONE:
+            still |= near
+    return still.astype(bool)
+
+
+def _lab_places(shifts_px: Array | None, shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    """Where each frame's cells lie on a canvas of the lab; empty when nothing moves."""
+    if shifts_px is None:
+        return []
+    shifts = np.rint(shifts_px / _CELL_PX).astype(int)
+    return [(slice(v, v + shape[1]), slice(u, u + shape[2])) for u, v in shifts - shifts.min(0)]
+
+
+def _share_in_lab(marks: Bools, places: list[tuple[slice, slice]]) -> tuple[Array, Array]:
+    """On the canvas: the share of the frames that see a cell which mark it, and their number."""
+    size = [max(place[axis].stop for place in places) for axis in (0, 1)]
+    total, seen = np.zeros(size), np.zeros(size)
+    for mask, place in zip(marks, places):
+        total[place] += mask
+        seen[place] += 1
+    return total / np.maximum(seen, 1), seen
+
+
+UPPER = 0.8
+"""Quantile over frames at the start: a bubble may darken a pixel in this share of them."""
+
+STEADY = 0.04
+"""A pixel whose brighter frames spread less than this shows the screen, or dirt on it."""
+
+_STARTS = 2
+_ROUNDS = 3
+_BLOCK_ROWS = 64
+_LEAST_SEEN = 3
+_LEAST_SEEN_LAB = 2
+"""In a single frame the lab and a bubble look alike."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Logarithms: rig (H, W), lab (Hl, Wl) or None, and gains (n,) of the frames.
+
+    The lab's pixel (0, 0) is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
+    """
+
+    rig: Float32
+    lab: Float32 | None
+    lab_origin_px: tuple[int, int]
+    gains: Array
+
+    def lab_in(self, shift_px: Array, rows: slice = slice(None)) -> Float32 | float:
+        """(H, W) of the lab layer as a frame sees it, or some rows of it."""
+        if self.lab is None:
+            return 0.0
+        first, last, _ = rows.indices(self.rig.shape[0])
+        shape, shift = (last - first, self.rig.shape[1]), (shift_px[0], shift_px[1] + first)
+        return crop_of_lab(self.lab, self.lab_origin_px, shift, shape, 0.0)
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """stack (n, H, W) grey values; shifts (n, 2) px (u, v); table of logarithms."""
+
+    stack: NDArray[np.generic]
+    shifts: Array
+    table: Float32 | None
+
+    def log(self, frame: int | slice, rows: slice = slice(None), step: int = 1) -> Float32:
+        values: NDArray[Any] = self.stack[frame, rows][..., ::step, ::step]
+        if self.table is None:
+            return np.log(np.maximum(values.astype(np.float32), 1e-6))
+        return np.take(self.table, values)
+
+
+def fit_layers(stack: NDArray[np.generic], shifts_px: Array | None) -> tuple[Layers, Bools, float]:
+    """Both layers of (n, H, W) images; shifts_px (n, 2), None for the rig layer alone.
+
+    Then (H, W) where a bubble hid the screen all the time, and the relative noise of a pixel.
+    """
+    shifts = np.zeros((len(stack), 2)) if shifts_px is None else shifts_px
+    sample = _Sample(stack, shifts, _log_table(stack.dtype))
+    gains = _first_gains(sample)
+    empty = np.zeros(stack.shape[1:], np.float32)
+    masks = first_masks(stack, shifts_px, gains)
+    layers, spread, never = _first_rig(sample, Layers(empty, None, (0, 0), gains), masks)
+    for _ in range(_STARTS if shifts_px is not None else 0):
+        layers = _first_lab(sample, layers, masks)
+        layers, spread, never = _first_rig(sample, layers, masks)
+    layers, marked, covered, usable = _uncovered(sample, *_marked(sample, layers), spread, never)
+    for turn in range(_ROUNDS):
+        if turn:
+            layers, marked = _marked(sample, layers)
+        layers, seen = _mean_rig(sample, layers, marked, covered)
+        if layers.lab is not None:
+            layers = _mean_lab(sample, layers, marked)
+    noise = float(np.median(_noise(sample, layers)[1]))
+    hidden = covered & (seen < _least_seen(len(stack)))
+    if hidden.any():
+        layers = _filled(sample, layers, hidden, usable)
+    return layers, hidden, noise
+
+
+def _log_table(kind: np.dtype[Any]) -> Float32 | None:
+    if kind not in (np.uint8, np.uint16):
+        return None
+    return np.log(np.maximum(np.arange(np.iinfo(kind).max + 1), 0.5)).astype(np.float32)
+
+
+def _step(sample: _Sample) -> int:
+    """Between the pixels that stand for the image where a median is all that is asked for."""
+    return max(1, int(np.sqrt(np.prod(sample.stack.shape[1:]) / 16_000)))
+
+
+def _first_gains(sample: _Sample) -> Array:
+    log = sample.log(slice(None), step=_step(sample)).reshape(len(sample.stack), -1)
+    gains = np.zeros(len(log))
+    for _ in range(3):
+        gains += np.median(log - gains[:, None] - np.median(log - gains[:, None], axis=0), axis=1)
+        gains -= np.median(gains)
+    return gains
+
+
+def _first_rig(sample: _Sample, layers: Layers, masks: Bools) -> tuple[Layers, Float32, Bools]:
+    """The layers with the frames' upper quantile, and how far the brighter frames spread.
+
+    masks : (n, H, W) what is left out. Then (H, W) the pixels that no two frames show, filled.
+    """
+    rig, spread = np.empty((2, *sample.stack.shape[1:]), np.float32)
+    for rows in _blocks(rig.shape[0]):
+        log = sample.log(slice(None), rows) - layers.gains[:, None, None].astype(np.float32)
+        for k, shift in enumerate(sample.shifts):
+            log[k] -= layers.lab_in(shift, rows)
+        log[masks[:, rows]] = np.nan
+        low, rig[rows], high = _quantiles(log, (UPPER - 0.1, UPPER, UPPER + 0.1))
+        spread[rows] = high - low
+    never = np.isnan(rig)
+    rig[never] = 0
+    layers = replace(layers, rig=rig)
+    if never.any():
+        layers = _filled(sample, layers, never, ~never)
+    return layers, np.nan_to_num(spread), never
+
+
+def _blocks(height: int) -> Iterator[slice]:
+    return (slice(r, min(r + _BLOCK_ROWS, height)) for r in range(0, height, _BLOCK_ROWS))
+
+
+def _quantiles(values: Float32, shares: tuple[float, ...]) -> Float32:
+    """(Q, H, W) quantiles over the first axis, NaN left out; NaN where fewer than two remain."""
+    count, height, width = values.shape
+    ordered = np.sort(np.ascontiguousarray(values.reshape(count, -1).T), axis=1)
+    known = count - np.sum(np.isnan(ordered), axis=1)
+    at = np.rint(np.outer(known - 1, shares)).astype(np.int64).clip(0)
+    found = np.take_along_axis(ordered, at, axis=1)
+    found[known < _LEAST_SEEN_LAB] = np.nan
+    return np.ascontiguousarray(found.T).reshape(len(shares), height, width)
+
+
+def _first_lab(sample: _Sample, layers: Layers, masks: Bools) -> Layers:
+    """The layers with the lab layer's quantiles over the frames that saw each place."""
+    height, width = layers.rig.shape
+    low, high = np.floor(sample.shifts.min(0)), np.ceil(sample.shifts.max(0))
+    origin = (int(low[0]), int(low[1]))
+    spread = (high - low).astype(int)
+    lab = np.zeros((height + spread[1] + 1, width + spread[0] + 1), np.float32)
+    for rows in _blocks(len(lab)):
+        seen = [
+            found
+            for k in range(len(sample.stack))
+            if (found := _lab_rows(sample, layers, k, masks[k], rows, origin, lab.shape[1]))
+            is not None
+        ]
+        if seen:
+            lab[rows] = np.nan_to_num(_quantiles(np.stack(seen), (UPPER,))[0], nan=0.0)
+    return _centred(replace(layers, lab=lab, lab_origin_px=origin))
+
+
+def _lab_rows(
+    sample: _Sample,
+    layers: Layers,
+    k: int,
+    mask: Bools,
+    rows: slice,
+    origin: tuple[int, int],
+    width: int,
+) -> Float32 | None:
+    """What frame k shows in these rows of the lab, NaN beside it; None when it shows nothing."""
+    left, top = sample.shifts[k] - origin
+    column, row = math.floor(left), math.floor(top)
+    height = layers.rig.shape[0]
+    first, last = max(rows.start - row, 0), min(rows.stop - row, height)
+    if first >= last:
+        return None
+    margin = slice(max(first - 2, 0), min(last + 2, height))
+    residual = sample.log(k, margin) - np.float32(layers.gains[k]) - layers.rig[margin]
+    residual[mask[margin]] = np.nan
+    moved = shifted(residual, (column - left, row - top))
+    out = np.full((rows.stop - rows.start, width), np.nan, np.float32)
+    place = slice(first + row - rows.start, last + row - rows.start)
+    part = moved[first - margin.start : last - margin.start]
+    out[place, column : column + part.shape[1]] = part
+    return out
+
+
+def _centred(layers: Layers) -> Layers:
+    """The same sum of layers with the lab's median at 0."""
+    assert layers.lab is not None
+    known = layers.lab[layers.lab != 0]
+    middle = np.float32(np.median(known)) if known.size else np.float32(0)
+    lab = np.where(layers.lab != 0, layers.lab - middle, 0).astype(np.float32)
+    return replace(layers, lab=lab, rig=layers.rig + middle)
+
+
+def _residual(sample: _Sample, layers: Layers, k: int) -> Float32:
+    out = sample.log(k) - layers.rig
+    out -= np.float32(layers.gains[k])
+    out -= layers.lab_in(sample.shifts[k])
+    return out
+
+
+def _noise(sample: _Sample, layers: Layers) -> tuple[Array, Array]:
+    """Log levels and the relative noise at each, from the bright half of the residuals."""
+    step = _step(sample)
+    every = range(0, len(sample.stack), max(1, len(sample.stack) // 8))
+    residual = np.concatenate([_residual(sample, layers, k)[::step, ::step].ravel() for k in every])
+    level = np.tile(layers.rig[::step, ::step].ravel(), len(every))
+    edges = np.quantile(level, np.linspace(0, 1, 7))
+    levels, sigmas = [], []
+    for low, high in pairwise(edges):
+        part = residual[(level >= low) & (level <= high)]
+        part = part - np.median(part)
+        sigmas.append(max(0.002, float(np.median(part[part >= 0])) / 0.6745))
+        levels.append(0.5 * (low + high))
+    return np.array(levels), np.array(sigmas)
+
+
+def _marked(sample: _Sample, layers: Layers) -> tuple[Layers, Bools]:
+    """The layers with new gains, and (n, H, W) the pixels under bubbles and other outliers."""
+    levels, sigmas = _noise(sample, layers)
+    sigma = np.interp(layers.rig, levels, sigmas).astype(np.float32)
+    marked = np.empty(sample.stack.shape, bool)
+    gains = layers.gains.copy()
+    step = _step(sample)
+    for k in range(len(sample.stack)):
+        residual = _residual(sample, layers, k)
+        thin = residual[::step, ::step]
+        change = float(np.median(thin))
+        near = np.abs(thin - change) < 3 * sigma[::step, ::step]
+        change = float(np.mean(thin[near])) if near.any() else change
+        residual -= np.float32(change)
+        gains[k] += change
+        marked[k] = _outliers(residual, sigma)
+    middle = float(np.median(gains))
+    return replace(layers, gains=gains - middle, rig=layers.rig + np.float32(middle)), marked
+
+
+def _outliers(residual: Float32, sigma: Float32) -> Bools:
+    """Dark things with their soft edges and bright centres, and bright specks."""
+    import cv2
+
+    soft = cv2.blur(residual, (5, 5))
+    thin = soft[::8, ::8] - np.median(soft[::8, ::8])
+    spread = float(np.median(thin[thin >= 0])) / 0.6745
+    dark = (residual < -4 * sigma) | (soft < -max(5 * spread, 0.01))
+    grown = cv2.dilate(dark.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+    outlines, _ = cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(grown, outlines, -1, 1, cv2.FILLED)
+    return np.asarray((grown > 0) | (residual > 5 * sigma), bool)
+
+
+def _uncovered(
+    sample: _Sample, layers: Layers, marked: Bools, spread: Float32, never: Bools
+) -> tuple[Layers, Bools, Bools, Bools]:
+    """The rig layer filled where a bubble kept it dark all the time, and the new marks.
+
+    Then (H, W) where it was filled, and what is clean enough to fill from.
+
+    spread, never : (H, W), as `_first_rig` gives them.
+
+    Dirt and a bubble that the rig follows both look dark in the layer, but a bubble's edge
+    moves: just outside it the frames differ.
+    """
+    import cv2
+
+    dark = (np.log(level_of_image(np.exp(layers.rig))[0]) - layers.rig > DARK).astype(np.uint8)
+    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    share = marked.mean(0, dtype=np.float32)
+    usual = float(np.median(share))
+    covered = never.astype(np.uint8)
+    for outline in outlines:
+        thing = cv2.drawContours(np.zeros_like(dark), [outline], -1, 1, cv2.FILLED)
+        around = cv2.dilate(thing, np.ones((7, 7), np.uint8)) > thing
+        if np.mean(share[around] > usual + 0.25) > 0.5:
+            covered |= thing
+    if not covered.any():
+        return layers, marked, covered.astype(bool), covered == 0
+    edge = cv2.dilate(covered, np.ones((13, 13), np.uint8)) > covered
+    hidden = covered.astype(bool) | (edge & (spread > STEADY))
+    usable = (cv2.dilate(dark | covered, np.ones((5, 5), np.uint8)) == 0) & ~edge
+    return *_marked(sample, _filled(sample, layers, hidden, usable)), hidden, usable
+
+
+def _filled(sample: _Sample, layers: Layers, hidden: Bools, usable: Bools) -> Layers:
+    """The rig layer interpolated where it is hidden, along the travel if that is an image axis.
+
+    A pattern that is constant along the travel looks the same in both layers, and what one has of
+    it the other lacks: such stripes must continue through a hole.
+    """
+    spread_u, spread_v = np.ptp(sample.shifts, axis=0)
+    across = (1.0, np.inf) if spread_v > spread_u else (np.inf, 1.0)
+    aslant = min(spread_u, spread_v) > 0.02 * max(spread_u, spread_v)
+    no_axis = layers.lab is None or aslant
+    return replace(layers, rig=fill_masked(layers.rig, hidden, usable, None if no_axis else across))
+
+
+def _least_seen(frames: int) -> int:
+    """Frames that must show a pixel that a bubble usually hides before they are believed."""
+    return max(_LEAST_SEEN, frames // 7)
+
+
+def _mean_rig(
+    sample: _Sample, layers: Layers, marked: Bools, covered: Bools
+) -> tuple[Layers, Float32]:
+    """The rig layer as the mean of the frames' unmarked pixels, and (H, W) their number."""
+    import cv2
+
+    total, seen = np.zeros(layers.rig.shape, np.float32), np.zeros(layers.rig.shape, np.float32)
+    for k in range(len(sample.stack)):
+        free = (~marked[k]).astype(np.uint8)
+        cv2.accumulate(_residual(sample, layers, k), total, free)
+        seen += free
+    needed = np.where(covered, _least_seen(len(sample.stack)), _LEAST_SEEN)
+    rig = np.where(seen >= needed, layers.rig + total / np.maximum(seen, 1), layers.rig)
+    return replace(layers, rig=rig.astype(np.float32)), seen
+
+
+def _mean_lab(sample: _Sample, layers: Layers, marked: Bools) -> Layers:
+    """The lab layer as the mean of the residuals that are free of marks."""
+    import cv2
+
+    assert layers.lab is not None
+    height, width = layers.rig.shape
+    total, seen = np.zeros_like(layers.lab), np.zeros_like(layers.lab)
+    for k, shift in enumerate(sample.shifts):
+        left, top = shift - layers.lab_origin_px
+        column, row = math.floor(left), math.floor(top)
+        fraction = (column - left, row - top)
+        residual = _residual(sample, layers, k)
+        residual[marked[k]] = 0
+        near = cv2.dilate(marked[k].astype(np.uint8), np.ones((3, 3), np.uint8))
+        free = (near == 0).astype(np.float32)
+        free[: int(fraction[1] < 0)] = 0
+        free[:, : int(fraction[0] < 0)] = 0
+        place = (slice(row, row + height), slice(column, column + width))
+        total[place] += free * shifted(residual, fraction)
+        seen[place] += free
+    change = np.where(seen >= _LEAST_SEEN_LAB, total / np.maximum(seen, 1), 0)
+    return _centred(replace(layers, lab=layers.lab + change.astype(np.float32)))
+
+
+def crop_of_lab(
+    lab: Float32,
+    origin_px: tuple[int, int],
+    shift_px: tuple[float, float],
+    shape: tuple[int, int],
+    outside: float,
+) -> Float32:
+    """(H, W) of the lab seen at a shift (u, v), by cubic interpolation; ``outside`` beyond it."""
+    left, top = shift_px[0] - origin_px[0], shift_px[1] - origin_px[1]
+    column, row = math.floor(left), math.floor(top)
+    window = np.full((shape[0] + 3, shape[1] + 3), outside, np.float32)
+    r0, r1 = max(row - 1, 0), min(row + shape[0] + 2, lab.shape[0])
+    c0, c1 = max(column - 1, 0), min(column + shape[1] + 2, lab.shape[1])
+    if r0 < r1 and c0 < c1:
+        part = lab[r0:r1, c0:c1]
+        window[r0 - row + 1 : r1 - row + 1, c0 - column + 1 : c1 - column + 1] = part
+    return shifted(window, (left - column, top - row))[1:-2, 1:-2]
+
+
+def shifted(image: Float32, shift_px: tuple[float, float]) -> Float32:
+    """image(p + shift) for shifts below 1 px, by Catmull-Rom splines; borders replicated."""
+    import cv2
+
+    along_u, along_v = (_spline(shift) for shift in shift_px)
+    out = cv2.sepFilter2D(image, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(out, np.float32)
+
+
+def _spline(shift: float) -> Float32:
+    """Five weights, of the pixels from -2 to +2."""
+    base = math.floor(shift)
+    x = np.abs(np.arange(-1, 3) - (shift - base))
+    near, far = 1 - 2.5 * x**2 + 1.5 * x**3, 2 - 4 * x + 2.5 * x**2 - 0.5 * x**3
+    weights = np.zeros(5, np.float32)
+    # the fourth weight of a non-negative shift falls on +2, that of a negative one on +1
+    weights[base + 1 : base + 5] = np.where(x <= 1, near, np.where(x < 2, far, 0.0))
+    return weights
+
 
 Shift = tuple[float, float]
 

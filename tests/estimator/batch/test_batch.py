@@ -13,10 +13,8 @@ from batch_dataset import make_dataset
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
-from telerig.estimator.batch.batch import local_executor, run_batch
+from telerig.estimator.batch.batch import Journal, local_executor, perform, run_batch, write_batch
 from telerig.estimator.batch.jobs import Job, fingerprint, jobs_of, share_of
-from telerig.estimator.batch.records import Journal, write_batch
-from telerig.estimator.batch.work import perform
 from telerig.scripts.main import app
 
 RESULTS = ["calibration/calibration.json", "rise/tracks.csv", "rise/trajectories.csv"]

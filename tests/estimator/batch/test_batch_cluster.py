@@ -11,9 +11,8 @@ import pytest
 
 from telerig.errors import InputError
 from telerig.estimator.batch import batch
-from telerig.estimator.batch.batch import dask_executor, local_executor, run_batch
+from telerig.estimator.batch.batch import Journal, dask_executor, local_executor, run_batch
 from telerig.estimator.batch.jobs import jobs_of
-from telerig.estimator.batch.records import Journal
 from telerig.io.simulation.simulate import simulate
 
 pytestmark = pytest.mark.slow

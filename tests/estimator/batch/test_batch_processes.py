@@ -11,11 +11,9 @@ from pathlib import Path
 import pytest
 from batch_dataset import make_dataset
 
-from telerig.estimator.batch import work
-from telerig.estimator.batch.batch import local_executor, run_batch
+from telerig.estimator.batch import batch as work
+from telerig.estimator.batch.batch import Journal, local_executor, perform, run_batch
 from telerig.estimator.batch.jobs import Job, jobs_of
-from telerig.estimator.batch.records import Journal
-from telerig.estimator.batch.work import perform
 
 
 def test_a_process_that_is_killed_fails_alone_and_is_done_the_next_time(tmp_path):
@@ -45,7 +43,7 @@ def test_a_job_ends_with_the_process_that_asked_for_it(tmp_path):
     data = make_dataset(tmp_path / "data", 4)
     (job, *_) = jobs_of([data])
     asker = (
-        "import sys; from telerig.estimator.batch.work import perform;"
+        "import sys; from telerig.estimator.batch.batch import perform;"
         "from telerig.estimator.batch.jobs import Job; print(perform(Job.from_json(sys.argv[1])))"
     )
     parent = subprocess.Popen([sys.executable, "-c", asker, job.as_json()])

@@ -27,9 +27,8 @@ from telerig.io.report.calibration.results import read_results
 from telerig.io.report.page.figures import Picture
 from telerig.io.report.run.smoothing import figures
 from telerig.io.report.run.smoothing.results import read_smoothing_results
-from telerig.io.report.run.tracking.cameras import run_cameras
 from telerig.io.report.run.tracking.figures import ray_miss_histogram
-from telerig.io.report.run.tracking.results import read_track_results
+from telerig.io.report.run.tracking.results import read_track_results, run_cameras
 from telerig.io.report.run.tracking.two_rays import two_rays
 
 DPI = 150

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from telerig.io.recording.replay import DeviceRecord, replay
 from telerig.io.recording.session import record
-from telerig.io.recording.simulated.devices import SimulatedPorts, Truth
-from telerig.io.recording.simulated.practice import practice_rig
+from telerig.io.recording.simulated.devices import SimulatedPorts, Truth, practice_rig
 from telerig.io.recording.simulated.signals import (
     Faults,
     SimulatedDevice,

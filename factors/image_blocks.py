@@ -18,7 +18,7 @@ from telerig.factors import lens_planes as planes
 from telerig.factors.image_rows import ImageRows
 from telerig.factors.lens_planes import Lens
 from telerig.factors.projection import State, apparent_shift_mm
-from telerig.io.machine.memory import keep_freed_memory
+from telerig.io.machine.parallel import keep_freed_memory
 from telerig.rig.pose import hat
 
 Array = NDArray[np.float64]

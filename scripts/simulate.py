@@ -147,8 +147,11 @@ def _simulate_devices(out: Path | None, seconds: float | None, rng: Generator) -
     them."""
     if sys.platform == "win32":
         raise InputError("Windows has no pseudo-terminals", todo="practise on Linux or macOS")
-    from telerig.io.recording.simulated.devices import SimulatedPorts
-    from telerig.io.recording.simulated.practice import practice_devices, practice_rig
+    from telerig.io.recording.simulated.devices import (
+        SimulatedPorts,
+        practice_devices,
+        practice_rig,
+    )
     from telerig.io.rig_file.rig_file import write_rig_toml
     from telerig.io.rig_file.writer import rig_toml
 

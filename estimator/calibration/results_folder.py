@@ -13,7 +13,7 @@ from telerig.estimator.calibration.calibrate import CalibrationRun
 from telerig.io.files.atomic import atomic_folder, plain, write_json_atomic
 from telerig.io.machine.parallel import Assistant, assistant
 from telerig.io.results.calibration import ComparisonFile
-from telerig.io.results.run_record import run_record
+from telerig.io.results.record import run_record
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.quality.comparison import RigComparison

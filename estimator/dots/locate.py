@@ -47,7 +47,7 @@ from telerig.estimator.images.noise import (
     rough_sigma,
     with_inner_level,
 )
-from telerig.io.machine.memory import keep_freed_memory
+from telerig.io.machine.parallel import keep_freed_memory
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,7 +16,7 @@ from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.tracking.detect_run import read_batch
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
-from telerig.io.results.run_record import RunFile, run_record
+from telerig.io.results.record import RunFile, run_record
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -122,7 +122,7 @@ def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list
     file = tracked / "references.csv"
     if run.references is not None or not file.is_file() or tracked.resolve() == run.path:
         return run, []
-    from telerig.io.dataset.run_tables import read_references_csv
+    from telerig.io.dataset.tables import read_references_csv
 
     sizes = dict(run.image_sizes_px)
     table = read_references_csv(file, list(run.cameras), sizes, run.frame_count)

@@ -28,7 +28,7 @@ from telerig.estimator.tracking.tracks import events_table
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.results.run_record import run_record
+from telerig.io.results.record import run_record
 from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:

@@ -1,8 +1,12 @@
-"""The tables of a dataset, checked against its rig."""
+"""The tables of a dataset and of a run, checked against rig, frames and cameras.
+
+Every error names the file, the row (header = 1), the column, and what to do.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,8 +14,9 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
+from telerig.arrays import Bools
 from telerig.errors import InputError, suggestion
-from telerig.io.files.csv_table import Column, read_table, rows_of
+from telerig.io.files.csv_table import Column, Rows, read_table, rows_of
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.rig.target import Target
@@ -199,3 +204,249 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
     )
     table["suu_px2"], table["suv_px2"], table["svv_px2"] = sigma**2, 0.0 * sigma, sigma**2
     return known
+
+
+Sizes = Mapping[str, tuple[int, int]]
+
+DETECTION_SIGMA_PX = 0.5
+"""Standard deviation of a bubble's centre where detections.csv does not state it."""
+
+REFERENCE_SIGMA_PX = 0.1
+"""Standard deviation of a reference mark where references.csv does not state it."""
+
+_RUN_KEYS = ["frame_rate_hz", "start_s"]
+
+
+def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> pd.DataFrame:
+    """`frames.csv`: frame, t_s (mid-exposure), and what else it has; one row per frame from 0.
+
+    frame_count : how many frames the images have; None where the table itself says it.
+    An optional column ``missing`` names the cameras that dropped the frame, joined by ``|``.
+    Raises InputError for times that do not increase and frames without a time or an image.
+    """
+    columns = [
+        Column("frame", "whole"),
+        Column("t_s"),
+        Column("missing", "text", required=False, blank=True),
+    ]
+    table = read_table(path, columns, extra=True)
+    rows = rows_of(table, path)
+    _check_frames(table, frame_count, rows)
+    frame, t = table["frame"].to_numpy(), table["t_s"].to_numpy()
+    rows.refuse(
+        np.diff(t, prepend=-np.inf) <= 0,
+        "t_s",
+        lambda i: f"is {t[i]:.9g} s at frame {frame[i]}, not later than {t[i - 1]:.9g} s before it",
+        "times must increase from frame to frame",
+    )
+    if "missing" in table:
+        named = [cell.split("|") if cell else [] for cell in table["missing"]]
+        unknown = [next((c for c in names if c not in cameras), None) for names in named]
+        rows.refuse(
+            np.array([name is not None for name in unknown], bool),
+            "missing",
+            lambda i: f"names {unknown[i]!r}, which is no camera of the rig",
+            f"join names of cameras by |; known: {', '.join(cameras)}",
+        )
+    return table.reset_index(drop=True)
+
+
+def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> None:
+    frame, expected = table["frame"].to_numpy(), np.arange(len(table))
+
+    def refuse(bad: Bools, what: Callable[[int], str], todo: str) -> None:
+        rows.refuse(bad, "frame", lambda i: f"is {frame[i]}{what(i)}", todo)
+
+    again = table.duplicated("frame").to_numpy()
+    rows.refuse(again, "frame", lambda i: f"{frame[i]} stands twice", "keep one of the rows")
+    refuse(frame < 0, lambda i: ", before 0", "frames count from 0")
+    if frame_count is not None:
+        end = f", but the images end with frame {frame_count - 1}"
+        refuse(frame >= frame_count, lambda i: end, "remove the row, or complete the images")
+    falls = np.diff(frame, prepend=frame[0]) < 0
+    refuse(falls, lambda i: f" after {frame[i - 1]}", "sort the rows by frame")
+    refuse(
+        frame != expected,
+        lambda i: f", and no row gives the time of frame {expected[i]}",
+        "add the missing row; frames count from 0",
+    )
+    if frame_count is not None and len(frame) < frame_count:
+        raise InputError(
+            f"has {len(frame)} rows, but there are images of {frame_count} frames: "
+            f"frame {len(frame)} has no time",
+            where=f"{rows.file} row {rows.numbers[-1]}",
+            todo="add the missing rows, or remove the images that do not belong to the run",
+        )
+
+
+def read_run_toml(path: Path) -> tuple[float, float]:
+    """(frame_rate_hz, start_s) of `run.toml`. Raises InputError for what cannot be."""
+    try:
+        raw = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(
+            f"is not valid TOML: {error}", where=str(path), todo="write frame_rate_hz = 500.0"
+        ) from error
+    for key in raw:
+        if key not in _RUN_KEYS:
+            raise InputError("unknown key", where=f"{path} {key}", todo=suggestion(key, _RUN_KEYS))
+    rate = _number(raw, "frame_rate_hz", path)
+    if rate is None or rate <= 0:
+        what = "is missing" if rate is None else f"is {rate:g}, not positive"
+        raise InputError(what, where=f"{path} frame_rate_hz", todo="write frame_rate_hz = 500.0")
+    return rate, _number(raw, "start_s", path) or 0.0
+
+
+def _number(raw: dict[str, Any], key: str, path: Path) -> float | None:
+    value = raw.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        what = f"is {value!r}, not a finite number"
+        raise InputError(what, where=f"{path} {key}", todo="write it as 500.0, without a unit")
+    return float(value)
+
+
+def read_stage_csv(path: Path) -> pd.DataFrame:
+    """`stage.csv`: t_s, position_mm, and what else it has, in the order of time.
+
+    Raises InputError for fewer than two rows and times that do not increase.
+    """
+    table = read_table(path, [Column("t_s"), Column("position_mm")], extra=True)
+    if len(table) < 2:
+        raise InputError(
+            "has a single row, between which nothing can be interpolated",
+            where=str(path),
+            todo="record the encoder during the run; a rig that stands needs no stage.csv",
+        )
+    _check_increasing(table, path)
+    return table.reset_index(drop=True)
+
+
+def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFrame:
+    """`accelerometer.csv`: t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2; each sensor in time's order.
+
+    sensors : the names in rig.toml; None where there is no rig file.
+    """
+    axes = [Column(f"a{axis}_m_s2") for axis in "xyz"]
+    table = read_table(path, [Column("t_s"), Column("sensor", "text"), *axes], extra=True)
+    if sensors is not None:
+        check_names(table, "sensor", "accelerometer", sensors, path)
+    for _, one in table.groupby("sensor"):
+        _check_increasing(one, path)
+    return table.reset_index(drop=True)
+
+
+def _check_increasing(table: pd.DataFrame, path: Path) -> None:
+    t = table["t_s"].to_numpy()
+    rows_of(table, path).refuse(
+        np.diff(t, prepend=-np.inf) <= 0,
+        "t_s",
+        lambda i: f"is {t[i]:.9g} s, not later than {t[i - 1]:.9g} s in the row before",
+        "sort the rows by time and keep one row for each time",
+    )
+
+
+def read_references_csv(
+    path: Path, cameras: list[str], sizes_px: Sizes, frame_count: int | None
+) -> pd.DataFrame:
+    """`references.csv`: frame, camera, mark (text), u_px, v_px and covariance; extras kept."""
+    table = _pixel_table(path, [Column("mark", "text")], cameras, sizes_px, frame_count)
+    _check_named_once(table, "mark", path)
+    known = fill_covariance(table, path, REFERENCE_SIGMA_PX, of="the mark's place")
+    return _finished(table, known)
+
+
+def read_detections_csv(
+    path: Path, cameras: list[str], sizes_px: Sizes, frame_count: int | None
+) -> pd.DataFrame:
+    """`detections.csv`: frame, camera, u_px, v_px, covariance, particle (text), extras kept.
+
+    Covariance from suu_px2, suv_px2, svv_px2, else sigma_px, else `DETECTION_SIGMA_PX`, and
+    ``attrs["sigma_known"]`` says whether the file stated it. particle is "" where blank: not
+    matched. a_px, b_px, angle_rad may be blank (NaN). sizes_px : (width, height) by camera.
+    frame_count : None where the table itself says it. Rows keep the file's order.
+    """
+    own = [
+        Column("particle", "text", required=False, blank=True),
+        *(Column(name, required=False, blank=True) for name in ("a_px", "b_px", "angle_rad")),
+        Column("flags", "text", required=False, blank=True),
+    ]
+    table = _pixel_table(path, own, cameras, sizes_px, frame_count)
+    if "particle" not in table:
+        table["particle"] = ""
+    _check_named_once(table, "particle", path)
+    _check_axes(table, path)
+    known = fill_covariance(table, path, DETECTION_SIGMA_PX, of="the bubble's centre")
+    return _finished(table, known)
+
+
+def _pixel_table(
+    path: Path, own: list[Column], cameras: list[str], sizes_px: Sizes, frame_count: int | None
+) -> pd.DataFrame:
+    columns = [
+        Column("frame", "whole"),
+        Column("camera", "text"),
+        Column("u_px"),
+        Column("v_px"),
+        Column("sigma_px", required=False),
+        *(Column(name, required=False) for name in COVARIANCE),
+        *own,
+    ]
+    table = read_table(path, columns, extra=True)
+    check_cameras(table, cameras, path)
+    if all(name in sizes_px for name in cameras):
+        check_pixels(table, sizes_px, path)
+    frame = table["frame"].to_numpy()
+    last = np.iinfo(np.int64).max if frame_count is None else frame_count - 1
+    rows_of(table, path).refuse(
+        (frame < 0) | (frame > last),
+        "frame",
+        lambda i: f"is {frame[i]}, " + ("before 0" if frame[i] < 0 else f"the last is {last}"),
+        "frames count from 0; correct the cell, or complete the times of the frames",
+    )
+    return table
+
+
+def _check_named_once(table: pd.DataFrame, name: str, path: Path) -> None:
+    again = table.duplicated(["frame", "camera", name]) & (table[name] != "")
+    frame, camera, label = (table[key].to_numpy() for key in ("frame", "camera", name))
+    rows_of(table, path).refuse(
+        again.to_numpy(),
+        name,
+        lambda i: f"{label[i]!r} stands twice in frame {frame[i]} of camera {camera[i]}",
+        "keep one of the rows, or leave the name blank where it is not known",
+    )
+
+
+def _check_axes(table: pd.DataFrame, path: Path) -> None:
+    given = [name for name in ("a_px", "b_px", "angle_rad") if name in table]
+    missing = [name for name in ("a_px", "b_px") if name not in given]
+    if given and missing:
+        raise InputError(
+            f"has {', '.join(given)} without {' and '.join(missing)}",
+            where=f"{path} row 1",
+            todo="give a_px, b_px and angle_rad, or none of them",
+        )
+    if not given:
+        return
+    rows = rows_of(table, path)
+    a, b = table["a_px"].to_numpy(), table["b_px"].to_numpy()
+    rows.refuse(
+        (a <= 0) | (b <= 0) | (np.isnan(a) != np.isnan(b)),
+        "a_px",
+        lambda i: f"{a[i]:g} with b_px {b[i]:g} is no pair of semi-axes",
+        "give both positive, a_px >= b_px, or leave both blank",
+    )
+    rows.refuse(
+        a < b,
+        "a_px",
+        lambda i: f"is {a[i]:g}, less than b_px = {b[i]:g}",
+        "the long semi-axis comes first: swap them and turn angle_rad by pi/2",
+    )
+
+
+def _finished(table: pd.DataFrame, sigma_known: bool) -> pd.DataFrame:
+    table = table.reset_index(drop=True)
+    table.attrs["sigma_known"] = sigma_known
+    return table

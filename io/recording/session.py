@@ -17,9 +17,8 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.recording.log import END, LOST, RECEIVED, Entry, LogHeader, RawLog
-from telerig.io.recording.ports import open_port
+from telerig.io.recording.ports import Reader, open_port
 from telerig.io.recording.protocols import Readings, parser
-from telerig.io.recording.reader import Reader
 from telerig.io.recording.replay import GAP_INTERVALS
 from telerig.io.rig_file.description import DeviceDescription
 

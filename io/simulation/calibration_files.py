@@ -24,8 +24,7 @@ from telerig.io.simulation.calibration.scene import (
     wholly_inside,
 )
 from telerig.io.simulation.config import SimulationConfig
-from telerig.io.simulation.images.plate_view import pixel_from_plate
-from telerig.io.simulation.images.plates import Light, render
+from telerig.io.simulation.images.plates import Light, pixel_from_plate, render
 from telerig.io.simulation.images.sensor import digitise
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -76,7 +76,7 @@ def merge_accelerations(table: pd.DataFrame, path: str | PathLike[str]) -> list[
     Returns the names of the sensors whose readings were replaced. Raises InputError when the file
     that is there cannot be read, or the new one not written.
     """
-    from telerig.io.dataset.run_tables import read_accelerometer_csv
+    from telerig.io.dataset.tables import read_accelerometer_csv
 
     file = Path(path)
     replaced: list[str] = []

@@ -17,9 +17,8 @@ from telerig.io.report.calibration.figures import (
     tilts,
     trust_pictures,
 )
-from telerig.io.report.calibration.next_view import next_pictures
 from telerig.io.report.calibration.results import CalibrationResults, read_results
-from telerig.io.report.calibration.rig import dots_are_drawn, rig_plan, scene_json
+from telerig.io.report.calibration.rig import dots_are_drawn, next_pictures, rig_plan, scene_json
 from telerig.io.report.calibration.target import target_pictures
 from telerig.io.report.page.contact_sheet import ContactSheet, picture_sheet
 from telerig.io.report.page.figures import Picture

@@ -23,7 +23,7 @@ from telerig.io.results.calibration import (
     read_joint_covariance,
     read_uncertainty,
 )
-from telerig.io.results.run_record import RunFile
+from telerig.io.results.record import RunFile
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -17,8 +17,7 @@ from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Picture, Progress, font, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
-from telerig.io.report.run.tracking.cameras import run_cameras
-from telerig.io.report.run.tracking.results import TrackResults, read_track_results
+from telerig.io.report.run.tracking.results import TrackResults, read_track_results, run_cameras
 from telerig.io.report.run.tracking.scene import thinned, track_colour
 from telerig.rig.camera import Camera
 

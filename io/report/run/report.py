@@ -16,7 +16,6 @@ from telerig.io.report.run.smoothing.figures import PLACES, smoothing_drawings
 from telerig.io.report.run.smoothing.results import SmoothingResults, read_smoothing_results
 from telerig.io.report.run.smoothing.tables import smoothing_words
 from telerig.io.report.run.tracking import tables as tables
-from telerig.io.report.run.tracking.cameras import run_cameras
 from telerig.io.report.run.tracking.figures import (
     bubbles_in_time,
     confidence,
@@ -29,7 +28,12 @@ from telerig.io.report.run.tracking.figures import (
     sizes,
     time_series,
 )
-from telerig.io.report.run.tracking.results import TrackResults, binary_column, read_track_results
+from telerig.io.report.run.tracking.results import (
+    TrackResults,
+    binary_column,
+    read_track_results,
+    run_cameras,
+)
 from telerig.io.report.run.tracking.scene import scene_widening, track_plans, track_scene_json
 from telerig.io.report.run.tracking.two_rays import two_rays
 from telerig.rig.camera import Camera

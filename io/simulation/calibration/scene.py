@@ -11,7 +11,7 @@ from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
-from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate
+from telerig.io.simulation.images.plates import Plate, pixel_from_plate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 

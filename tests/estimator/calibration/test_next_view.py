@@ -20,10 +20,10 @@ from telerig.estimator.calibration.views.next_view import NextView, next_view
 from telerig.estimator.calibration.views.poses import Candidates, candidates, dots_seen
 from telerig.estimator.calibration.views.wording import first_views, hold_words
 from telerig.factors.projection import State, pixels
-from telerig.io.report.calibration.next_view import next_pictures
 from telerig.io.report.calibration.report import write_calibration_report
 from telerig.io.report.calibration.results import read_results
-from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate
+from telerig.io.report.calibration.rig import next_pictures
+from telerig.io.simulation.images.plates import Plate, pixel_from_plate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
-from telerig.io.dataset.run_tables import read_accelerometer_csv
+from telerig.io.dataset.tables import read_accelerometer_csv
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.scripts.main import app

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.io import savemat, wavfile
 
 from telerig.errors import InputError
-from telerig.io.dataset.run_tables import read_accelerometer_csv
+from telerig.io.dataset.tables import read_accelerometer_csv
 from telerig.io.exchange.importing.accelerometer import (
     UNITS,
     Layout,

@@ -17,8 +17,7 @@ from telerig.errors import InputError
 from telerig.io.recording import ports as record_ports
 from telerig.io.recording.replay import replay
 from telerig.io.recording.session import FAILED_NAME, LOG_NAME, Status, record
-from telerig.io.recording.simulated.devices import SimulatedPorts
-from telerig.io.recording.simulated.practice import practice_devices
+from telerig.io.recording.simulated.devices import SimulatedPorts, practice_devices
 from telerig.io.recording.simulated.signals import (
     Faults,
     SimulatedDevice,

@@ -12,8 +12,7 @@ import pytest
 from simulated_log import simulated_log
 
 from telerig.errors import InputError
-from telerig.io.dataset.run_tables import read_accelerometer_csv, read_frames_csv, read_stage_csv
-from telerig.io.recording.frames import frame_numbers
+from telerig.io.dataset.tables import read_accelerometer_csv, read_frames_csv, read_stage_csv
 from telerig.io.recording.log import (
     FOUND,
     LOST,
@@ -25,15 +24,14 @@ from telerig.io.recording.log import (
     read_log,
 )
 from telerig.io.recording.replay import beside_gaps, replay
-from telerig.io.recording.simulated.devices import Truth
-from telerig.io.recording.simulated.practice import practice_devices
+from telerig.io.recording.simulated.devices import Truth, practice_devices
 from telerig.io.recording.simulated.signals import (
     Faults,
     SimulatedDevice,
     stage_position_mm,
     true_values,
 )
-from telerig.io.recording.tables import write_tables
+from telerig.io.recording.tables import frame_numbers, write_tables
 from telerig.io.rig_file.description import DeviceDescription
 
 SECONDS = 20.0

@@ -17,7 +17,7 @@ from telerig.io.report.page.figures import Picture
 from telerig.io.report.run import report
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.smoothing.figures import smoothing_drawings
-from telerig.io.report.run.smoothing.numbers import shake_spectrum, velocity_spectrum
+from telerig.io.report.run.smoothing.results import shake_spectrum, velocity_spectrum
 from telerig.io.report.run.smoothing.tables import smoothing_verdict
 from telerig.io.report.run.tracking.results import read_track_results
 

@@ -20,7 +20,7 @@ from smoothed_folder import (
     write_folder,
 )
 
-from telerig.io.report.run.smoothing.numbers import (
+from telerig.io.report.run.smoothing.results import (
     axis_sd,
     evenly,
     shake_rms_um,

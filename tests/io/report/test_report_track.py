@@ -26,13 +26,14 @@ from telerig.io.report.run.tracking.figures import (
     seen_where,
     time_series,
 )
-from telerig.io.report.run.tracking.numbers import (
+from telerig.io.report.run.tracking.results import (
+    TrackResults,
     learnt_sd_mm,
     per_frame,
     ray_miss_ratio,
     ray_miss_sd_mm,
+    read_track_results,
 )
-from telerig.io.report.run.tracking.results import TrackResults, read_track_results
 from telerig.io.report.run.tracking.scene import thinned, track_scene_json
 from telerig.io.report.run.tracking.tables import event_words, verdict
 

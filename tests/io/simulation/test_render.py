@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from telerig.errors import InputError
-from telerig.io.simulation.images.plate_view import Plate, pixel_from_plate, plate_from_pixel
 from telerig.io.simulation.images.plates import (
     Light,
+    Plate,
     _half_plane_share,
     disc_coverage,
+    pixel_from_plate,
+    plate_from_pixel,
     render,
 )
 from telerig.io.simulation.images.sensor import digitise

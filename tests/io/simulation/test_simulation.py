@@ -18,7 +18,7 @@ from telerig.io.simulation.calibration.scene import (
 )
 from telerig.io.simulation.calibration_files import exact_dots, view_image
 from telerig.io.simulation.config import CameraConfig
-from telerig.io.simulation.images.plate_view import pixel_from_plate
+from telerig.io.simulation.images.plates import pixel_from_plate
 from telerig.io.simulation.presets import PRESETS, preset
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera

@@ -17,8 +17,7 @@ from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.config import BubbleConfig, ImageConfig, RunConfig, SimulationConfig
 from telerig.io.simulation.images.bodies import volume_centre_mm
 from telerig.io.simulation.presets import RUN_PRESETS, any_preset, run_preset
-from telerig.io.simulation.run.population import lamb_frequency_hz
-from telerig.io.simulation.run.scene import AXIS_RIG, run_scene
+from telerig.io.simulation.run.scene import AXIS_RIG, lamb_frequency_hz, run_scene
 from telerig.io.simulation.run.views import camera_view
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera

@@ -24,7 +24,11 @@ from telerig.io.report.page.figures import (
     drawing,
 )
 from telerig.io.report.page.number_format import is_number, number
-from telerig.io.report.run.smoothing.numbers import (
+from telerig.io.report.run.smoothing.results import (
+    AXES,
+    PLACE,
+    SPEED,
+    SmoothingResults,
     Spectrum,
     column,
     known_parts,
@@ -32,8 +36,7 @@ from telerig.io.report.run.smoothing.numbers import (
     shake_spectrum,
     velocity_spectrum,
 )
-from telerig.io.report.run.smoothing.results import AXES, PLACE, SPEED, SmoothingResults
-from telerig.io.report.run.tracking.numbers import median, rms
+from telerig.io.report.run.tracking.results import median, rms
 from telerig.io.report.run.tracking.scene import track_colour
 
 PLACES = ("lab", "taken", "velocity", "shake", "spectra", "white")

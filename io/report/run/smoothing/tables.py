@@ -18,13 +18,15 @@ from telerig.io.report.page.number_format import (
     with_sd,
 )
 from telerig.io.report.page.page import Figure, Row
-from telerig.io.report.run.smoothing.numbers import (
+from telerig.io.report.run.smoothing.results import (
+    AXES,
+    SPEED,
+    SmoothingResults,
     axis_sd,
     known_parts,
     shake_rms_um,
     taken_away,
 )
-from telerig.io.report.run.smoothing.results import AXES, SPEED, SmoothingResults
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.report.run.tracking.tables import Headline
 from telerig.io.results.smoothing import VERDICT_WORDS, AttributedLine, Flag, Mode, Verdict

@@ -19,14 +19,14 @@ from telerig.io.report.page.figures import (
     image_height_in,
 )
 from telerig.io.report.page.number_format import number, share
-from telerig.io.report.run.tracking.numbers import (
+from telerig.io.report.run.tracking.results import (
+    TrackResults,
     learnt_sd_mm,
     median,
     per_frame,
     ray_miss_sd_mm,
     rms,
 )
-from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.report.run.tracking.scene import draw_tracks, thinned
 
 _MOST_POINTS = 8_000

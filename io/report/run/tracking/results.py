@@ -1,4 +1,7 @@
-"""What a tracked run's results folder holds, read and checked for its report."""
+"""What a tracked run's results folder holds, read and checked, and what its tables add up to.
+
+The cameras that the run was tracked with come from the calibration beside it.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +14,23 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import read_columns
-from telerig.io.results.run_record import RunFile
+from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.record import RunFile
 from telerig.io.results.tracking import (
     DETECTIONS,
     EVENTS,
     POINT,
     REFERENCES,
+    SILHOUETTES,
     Pairs,
     TrackingFile,
     tracks_columns,
 )
+from telerig.rig.camera import Camera
+from telerig.rig.triangulation import midpoint
 
 UP = (0.0, -1.0, 0.0)
 """In the rig frame, where tracking.json has no ``up``."""
@@ -166,3 +173,176 @@ def _pictures(folder: Path, cameras: Sequence[str]) -> dict[tuple[str, str], Pat
 def binary_column(camera: str) -> str:
     """Name of the contact sheet's column that holds a camera's binary pictures."""
     return f"{camera}, binary"
+
+
+_MOST_ROWS = 20_000
+_LEAST_SPREAD_MM = 0.1
+_LEAST_ROWS = 12
+NORMAL_MEDIAN = 0.6745
+"""Of the absolute value, in standard deviations."""
+
+
+def ray_miss_sd_mm(results: TrackResults) -> Array | None:
+    """(N,) sd of ``ray_miss_mm`` that the outlines' covariances predict; None if it is not known.
+
+    The cameras are not in the folder, but the points and their pixels are: an affine camera
+    fitted to them gives the rays' directions and what a pixel is worth along the common
+    perpendicular, to the lens's residual perspective. It takes points that fill some space.
+    """
+    worth = _mm_per_px(results)
+    if worth is None:
+        return None
+    variance = np.zeros(len(results.tracks))
+    for camera, per_px in zip(results.cameras, worth):
+        columns = [f"{camera}_{name}" for name in ("suu_px2", "suv_px2", "svv_px2")]
+        uu, uv, vv = results.tracks[columns].to_numpy(float).T
+        variance += per_px[0] ** 2 * uu + 2 * per_px[0] * per_px[1] * uv + per_px[1] ** 2 * vv
+    return np.sqrt(np.where(variance > 0, variance, np.nan))
+
+
+def learnt_sd_mm(results: TrackResults) -> float | None:
+    """What pairs were found to scatter besides: shake of the cameras against each other, shapes.
+
+    From ``frame_px`` and ``scatter_px`` of tracking.json; None where that is not known.
+    """
+    worth = _mm_per_px(results)
+    frame, scatter = results.pairs.frame_px, results.pairs.scatter_px
+    if worth is None or frame is None or scatter is None:
+        return None
+    apart_px = np.linalg.norm(np.array([frame, scatter], float))
+    return float(apart_px * np.linalg.norm(worth, axis=1).mean())
+
+
+def _mm_per_px(results: TrackResults) -> Array | None:
+    """(2, 2) by camera, what one px of u and of v moves a ray along the common perpendicular."""
+    maps = [_affine(results, camera) for camera in results.cameras]
+    known = [m for m in maps if m is not None]
+    if len(known) != 2:
+        return None
+    first, second = (np.cross(m[0], m[1]) for m in known)
+    across = np.cross(first, second)
+    length = np.linalg.norm(across)
+    if length < 1e-9:
+        return None
+    return np.array([np.linalg.lstsq(m.T, across / length, rcond=None)[0] for m in known])
+
+
+def _affine(results: TrackResults, camera: str) -> Array | None:
+    """(2, 3) px per mm, or None where the points do not tell."""
+    uv = results.tracks[[f"{camera}_u_px", f"{camera}_v_px"]].to_numpy(float)
+    both = np.c_[results.points_mm, uv]
+    both = both[np.isfinite(both).all(axis=1)]
+    both = both[:: len(both) // _MOST_ROWS + 1]
+    if len(both) < _LEAST_ROWS:
+        return None
+    points, pixels = both[:, :3] - both[:, :3].mean(axis=0), both[:, 3:] - both[:, 3:].mean(axis=0)
+    if np.linalg.svd(points, compute_uv=False)[2] < _LEAST_SPREAD_MM * np.sqrt(len(both)):
+        return None
+    return np.asarray(np.linalg.lstsq(points, pixels, rcond=None)[0].T)
+
+
+def ray_miss_ratio(
+    results: TrackResults, predicted_mm: Array | None, *, centred: bool = False
+) -> float | None:
+    """Typical ray miss over its predicted sd: 1 when the covariances tell the whole story.
+
+    From the medians, so that a few wrong pairs do not count. centred : about the median miss.
+    """
+    if predicted_mm is None:
+        return None
+    miss = results.tracks["ray_miss_mm"].to_numpy(float)
+    units = np.abs(miss - (median(miss) or 0.0 if centred else 0.0)) / predicted_mm
+    units = units[np.isfinite(units)]
+    return float(np.median(units)) / NORMAL_MEDIAN if len(units) else None
+
+
+def median(values: Array) -> float | None:
+    """None where no value is finite."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else None
+
+
+def rms(values: Array) -> float | None:
+    """None where no value is finite."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
+
+
+def frame_count(results: TrackResults) -> int:
+    """Of the run, else up to the last frame with a bubble."""
+    tables = (results.tracks, results.detections)
+    seen = max((int(t["frame"].max()) + 1 for t in tables if len(t)), default=0)
+    return max(results.file.frames or 0, seen)
+
+
+def per_frame(results: TrackResults) -> dict[str, Ints]:
+    """Bubbles in each frame (F,): by camera, and "both" for those with a place in space."""
+    frames = frame_count(results)
+    found = results.detections
+    counts = {
+        camera: np.bincount(found["frame"][found["camera"] == camera], minlength=frames)
+        for camera in results.cameras
+    }
+    return counts | {"both": np.bincount(results.tracks["frame"], minlength=frames)}
+
+
+def track_lengths(results: TrackResults) -> Ints:
+    """(K,) points of each track."""
+    return np.asarray(results.tracks["particle"].value_counts().to_numpy(np.int64))
+
+
+_AGREE_MM, _NEAR_MM = 1e-4, 0.02
+
+
+def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Camera] | None, str]:
+    """The two cameras, or None and the reason in words.
+
+    calibration.json is looked for in the run's results folder and in `calibration/` beside it.
+    It counts only if the rays of the pixels in tracks.csv meet where that table says, so another
+    calibration is not taken for the run's.
+    Raises InputError for a calibration.json that cannot be read.
+    """
+    places = (folder, folder.resolve().parent / "calibration")
+    file = next(
+        (p / "calibration.json" for p in places if (p / "calibration.json").is_file()), None
+    )
+    if file is None:
+        return None, "calibration.json is neither in this folder nor in calibration/ beside it"
+    stated = CalibrationFile.read(file)
+    known = {camera.name: camera for camera in stated.rig_cameras(behind_walls=True)}
+    if len(results.cameras) != 2 or not set(results.cameras) <= set(known):
+        return None, f"calibration.json beside it has cameras {', '.join(known)}, not the run's"
+    cameras = (known[results.cameras[0]], known[results.cameras[1]])
+    return (cameras, "") if _agree(results, cameras) else (
+        None, "calibration.json beside it is not the one that the run was tracked with"
+    )  # fmt: skip
+
+
+def pair_pixels(results: TrackResults, rows: Ints) -> list[Array]:
+    """Per camera (N, 2), the outlines' centres."""
+    return [results.tracks[[f"{c}_u_px", f"{c}_v_px"]].to_numpy(float)[rows]
+            for c in results.cameras]  # fmt: skip
+
+
+def paired_rows(results: TrackResults) -> Ints:
+    """Rows of tracks.csv that both cameras measured."""
+    every = np.arange(len(results.tracks))
+    good = np.isfinite(results.tracks["ray_miss_mm"].to_numpy(float))
+    for uv in pair_pixels(results, every):
+        good &= np.isfinite(uv).all(1)
+    return np.flatnonzero(good)
+
+
+def _agree(results: TrackResults, cameras: tuple[Camera, Camera]) -> bool:
+    """Whether the rays miss each other as tracks.csv says, and meet where it says."""
+    rows = paired_rows(results)
+    if not len(rows):
+        return True
+    rays = [camera.unproject(uv) for camera, uv in zip(cameras, pair_pixels(results, rows))]
+    middle, miss = midpoint(*rays[0], *rays[1])
+    stated = results.tracks["ray_miss_mm"].to_numpy(float)[rows]
+    names = SILHOUETTES if set(SILHOUETTES) <= set(results.tracks) else POINT
+    away = np.linalg.norm(middle - results.tracks[list(names)].to_numpy(float)[rows], axis=1)
+    if np.median(np.abs(miss - stated)) > _AGREE_MM:
+        return False
+    return bool(np.nanmedian(away) < _NEAR_MM + np.median(np.abs(stated)))

@@ -9,7 +9,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.io.report.page.figures import Picture, Sheet, drawing
-from telerig.io.report.page.scene import Trace, lines, scene_text
+from telerig.io.report.page.page import Trace, lines, scene_text
 from telerig.io.report.run.tracking.results import TrackResults
 
 TRACK_COLOURS = (

@@ -11,8 +11,9 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.io.report.page.number_format import ABSENT, number, sentence, share
 from telerig.io.report.page.page import Figure, Row
-from telerig.io.report.run.tracking.numbers import (
+from telerig.io.report.run.tracking.results import (
     NORMAL_MEDIAN,
+    TrackResults,
     frame_count,
     learnt_sd_mm,
     median,
@@ -21,7 +22,6 @@ from telerig.io.report.run.tracking.numbers import (
     rms,
     track_lengths,
 )
-from telerig.io.report.run.tracking.results import TrackResults
 
 MOST_EVENTS = 60
 _MISS_TOO_LARGE = 3.0

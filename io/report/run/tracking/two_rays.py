@@ -18,8 +18,7 @@ from telerig.io.report.page.figures import (
     drawing,
 )
 from telerig.io.report.page.number_format import nice_below
-from telerig.io.report.run.tracking.cameras import pair_pixels, paired_rows
-from telerig.io.report.run.tracking.results import TrackResults
+from telerig.io.report.run.tracking.results import TrackResults, pair_pixels, paired_rows
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
 

@@ -25,9 +25,9 @@ def telerig(settings: TrackerSettings | None = None, *, encoder: bool = True) ->
         for i, (t, points) in enumerate(zip(scene.t_s, scene.points_mm)):
             measured = FrameMeasurements.create(points, scene.covariance_mm2)
             read = float(scene.position_mm[i]) if encoder else None
-            settled += tracker.update(i, float(t), measured, read).settled
+            settled += tracker.update(i, float(t), measured, read).final
         last = tracker.finish()
-        settled += last.settled if last is not None else ()
+        settled += last.final if last is not None else ()
         return [ids.particle for ids in settled]
 
     return link

@@ -64,7 +64,7 @@ _PILOTS = 5
 _FEWEST_PIXELS = 25
 """A dot whose first fit left the image has no window for a second one."""
 _ROUNDS = 10
-_SETTLED_SD = 0.1
+_MOVED_SD = 0.1
 """A dot that moves by less of its standard deviation does not make its neighbours fitted again."""
 
 
@@ -286,4 +286,4 @@ def _start(fit: DotFit) -> Start:
 
 def _has_moved(before: DotFit, after: DotFit) -> bool:
     step = float(np.linalg.norm(after.centre_px - before.centre_px))
-    return bool(step > _SETTLED_SD * np.sqrt(np.trace(after.covariance_px2)))
+    return bool(step > _MOVED_SD * np.sqrt(np.trace(after.covariance_px2)))

@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
+from telerig.estimator.bubbles.outline.detection_table import flag_words
 from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.association.likelihoods import (
     gate2,
@@ -143,7 +144,7 @@ class Pairs:
 
     rows : (M, 2); confidence, ambiguous : (M,); given : (M,) ids given by the user, -1 where the
     pair was found here; points_mm (M, 3), covariance_mm2 (M, 3, 3), d_eq_mm (M,), NaN if unknown;
-    particle : (M,) of its track, -1 for none; known once the frame is settled.
+    particle : (M,) of its track, -1 for none; known once the frame is final.
     """
 
     rows: Ints
@@ -181,8 +182,8 @@ class Single:
 class Frame:
     """offset_px : (2, 2) per camera, shift of all that both cameras see; the cameras shake.
 
-    lonely : rows of the tables without a partner; alone : by index into these (first the first
-    camera's), tracks that one camera continued. singles : those in the end, after `settle`.
+    unpaired : rows of the tables without a partner; alone : by index into these (first the first
+    camera's), tracks that one camera continued. singles : those in the end, after `take_final`.
     """
 
     number: int
@@ -191,16 +192,16 @@ class Frame:
     pixels: tuple[Pixels, Pixels]
     offset_px: Array
     pairs: Pairs
-    lonely: tuple[Ints, Ints]
+    unpaired: tuple[Ints, Ints]
     alone: Mapping[int, SeenAlone]
     motion: Motion | None
     singles: list[Single] = field(default_factory=list)
 
-    def settle(self, ids: FrameIds) -> None:
+    def take_final(self, ids: FrameIds) -> None:
         """Take over the tracker's final ids."""
         self.pairs.particle[:] = ids.particle
-        cameras = np.repeat([0, 1], [len(rows) for rows in self.lonely])
-        rows = np.concatenate(self.lonely)
+        cameras = np.repeat([0, 1], [len(rows) for rows in self.unpaired])
+        rows = np.concatenate(self.unpaired)
         for index in np.flatnonzero(ids.single != NO_PARTICLE).tolist():
             seen = self.alone[index]
             camera, row = int(cameras[index]), int(rows[index])
@@ -229,10 +230,6 @@ class Frame:
     def hidden(self) -> list[Single]:
         """Particles that exactly one camera sees."""
         return [s for s in self.singles if len(self.of(s.particle)) == 1]
-
-    def release(self, particle: int) -> None:
-        """Its singles belong to no track again."""
-        self.singles = [s for s in self.singles if s.particle != particle]
 
     def claim(self, pair: Pairs) -> None:
         """Give the rows of one pair to its particle; pairs with only one of them are undone."""
@@ -282,9 +279,10 @@ _REACH_FRAMES = 4
 _VAGUE = 0.5
 """Largest sd of a predicted pixel, as a share of the bubble's diameter."""
 
-_REGULARISATION = 1e-6
 _CONFIDENCE = 0.95
-_DOUBTFUL = "overlap|merged|border"
+"""Share of points from smoothed tracks that were right in simulated swarms."""
+
+_DOUBTFUL = {"overlap", "merged", "border"}
 """Flags of outlines of which only a part was seen."""
 
 
@@ -296,14 +294,16 @@ def follow_back(
 ) -> None:
     """Give free detections of the ``changeable`` frames to the tracks that they continue.
 
-    frames : consecutive, all settled.
+    frames : consecutive, all with final ids.
     """
     motions = [f.motion for f in frames]
     sizes = _sizes(frames)
     for frame in frames:
         if frame.number in changeable:
-            _reconsider(frame, sizes)
-    _release_wrong(frames, changeable, sizes, cameras, settings)
+            # Two cameras that each saw a particle alone may be a pair, or one of them is wrong.
+            twice = {s.particle for s in frame.singles if len(frame.of(s.particle)) > 1}
+            wrong = twice & set(sizes)
+            frame.singles = [s for s in frame.singles if s.particle not in wrong]
     for _ in range(_PASSES):
         missing = _missing(frames, changeable, sorted(sizes))
         particles = sorted({p for found in missing for p in found})
@@ -317,17 +317,11 @@ def follow_back(
         for i, frame in enumerate(frames):
             at = [place[p] for p in missing[i]]
             if at:
-                predicted = _prediction(missing[i], points[i, at], covariances[i, at], sizes)
+                ids, d_eq = np.array(missing[i]), np.array([sizes[p] for p in missing[i]])
+                predicted = Prediction(ids, points[i, at], covariances[i, at], d_eq)
                 changed |= _claim(frame, predicted, cameras, settings)
         if not changed:
             break
-
-
-def _prediction(
-    particles: Sequence[int], points: Array, covariances: Array, sizes: dict[int, float]
-) -> Prediction:
-    d_eq = np.array([sizes[p] for p in particles])
-    return Prediction(np.array(particles, np.int64), points, covariances, d_eq)
 
 
 def _sizes(frames: Sequence[Frame]) -> dict[int, float]:
@@ -343,87 +337,21 @@ def _sizes(frames: Sequence[Frame]) -> dict[int, float]:
     return {p: float(np.median(d)) if len(d) else float("nan") for p, d in known.items()}
 
 
-def _reconsider(frame: Frame, sizes: dict[int, float]) -> None:
-    """Two cameras that each saw a particle alone may be a pair, or one of them is wrong."""
-    for particle in {s.particle for s in frame.singles if len(frame.of(s.particle)) > 1}:
-        if particle in sizes:
-            frame.release(particle)
-
-
-def _release_wrong(
-    frames: Sequence[Frame],
-    changeable: set[int],
-    sizes: dict[int, float],
-    cameras: tuple[Camera, Camera],
-    settings: TrackerSettings,
-) -> None:
-    """Undo pairs whose doubtful outline is where the bubble cannot be; the other view stays."""
-    doubtful = [_doubtful(f) if f.number in changeable else np.zeros((0, 2), bool) for f in frames]
-    ids = {int(p) for f, d in zip(frames, doubtful) for p in f.particle[: len(d)][d.any(1)]}
-    place = {p: k for k, p in enumerate(sorted(ids & set(sizes)))}
-    if not place:
-        return
-    motions = [f.motion for f in frames]
-    smoothed = smooth_points(readings_of(frames, list(place), cameras), motions, settings)
-    for i, (frame, doubt) in enumerate(zip(frames, doubtful)):
-        columns = [int(c) for c in np.flatnonzero(doubt.any(1)) if frame.particle[c] in place]
-        k = [place[int(frame.particle[c])] for c in columns]
-        found = _without_own(frame.pairs, columns, smoothed[0][i, k], smoothed[1][i, k])
-        for column, point, covariance in zip(columns, *found):
-            particle, rows = int(frame.particle[column]), frame.pairs.rows[column].tolist()
-            predicted = _prediction([particle], point[None], covariance[None], sizes)
-            agrees = [
-                _distance2(frame, [(c, rows[c])], predicted, 0, cameras) <= gate2(settings, 2)
-                for c in (0, 1)
-            ]
-            camera = int(agrees[1])
-            if agrees[0] != agrees[1] and doubt[column, 1 - camera]:
-                frame.particle[column] = NO_PARTICLE
-                _claim_single(frame, camera, rows[camera], predicted, 0)
-
-
-def _doubtful(frame: Frame) -> Bools:
-    """(M, 2) whether the outlines of each pair may be off: only a part of them was seen."""
-    return np.stack(
-        [
-            _flagged(table["flags"].iloc[frame.pairs.rows[:, c]])
-            for c, table in enumerate(frame.tables)
-        ],
-        -1,
-    )
-
-
-def _flagged(flags: pd.Series[str]) -> Bools:
-    return flags.fillna("").astype(str).str.contains(_DOUBTFUL).to_numpy(bool)
-
-
-def _without_own(
-    pairs: Pairs, columns: Sequence[int], points: Array, covariances: Array
-) -> tuple[Array, Array]:
-    """The smoothed points and covariances, the frame's own measurements removed from them."""
-    own, total = np.linalg.inv(pairs.covariance_mm2[columns]), np.linalg.inv(covariances)
-    pull = total @ points[..., None] - own @ pairs.points_mm[columns][..., None]
-    covariance = np.linalg.inv(total - own + _REGULARISATION * np.eye(3))
-    return np.asarray(covariance @ pull, float)[..., 0], np.asarray(covariance, np.float64)
-
-
 def _distance2(
     frame: Frame,
-    seen: Sequence[tuple[int, int]],
+    rows: tuple[int, int],
     predicted: Prediction,
     k: int,
     cameras: tuple[Camera, Camera],
 ) -> float:
-    """Squared Mahalanobis distance of rows (camera, row) from the k-th predicted particle."""
-    views = tuple(cameras[c] for c, _ in seen)
-    expected, by_point, _ = stacked_jacobian(views, predicted.points_mm[k : k + 1])
+    """Squared Mahalanobis distance of the two cameras' rows from the k-th predicted particle."""
+    expected, by_point, _ = stacked_jacobian(cameras, predicted.points_mm[k : k + 1])
     covariance = by_point[0] @ predicted.covariance_mm2[k] @ by_point[0].T
     left = -expected[0]
-    for i, (c, row) in enumerate(seen):
-        at = slice(2 * i, 2 * i + 2)
-        centre, noise = frame.pixels[c]
+    for c, ((centre, noise), row) in enumerate(zip(frame.pixels, rows)):
+        at = slice(2 * c, 2 * c + 2)
         covariance[at, at] += noise[row]
-        left[at] = centre[row] - expected[0, at] - frame.offset_px[c]
+        left[at] += centre[row] - frame.offset_px[c]
     return float(left @ np.linalg.solve(covariance, left))
 
 
@@ -500,7 +428,7 @@ def _claim_pair(
     Where both agree with it they become one point. Else the detection whose outline is whole is
     taken alone, if only one is. Returns whether anything was taken.
     """
-    if _distance2(frame, list(enumerate(rows)), predicted, k, cameras) <= gate2(settings, 4):
+    if _distance2(frame, rows, predicted, k, cameras) <= gate2(settings, 4):
         uv, noise = zip(*([a[r : r + 1] for a in p] for p, r in zip(frame.pixels, rows)))
         found = triangulate(cameras, uv, noise)
         frame.claim(
@@ -516,9 +444,8 @@ def _claim_pair(
             )
         )
         return True
-    first, second = (
-        bool(_flagged(t["flags"].iloc[r : r + 1])[0]) for t, r in zip(frame.tables, rows)
-    )
+    words = [set(flag_words(t.iloc[r : r + 1])[0]) for t, r in zip(frame.tables, rows)]
+    first, second = (bool(w & _DOUBTFUL) for w in words)
     if first == second:
         return False
     _claim_single(frame, int(first), rows[int(first)], predicted, k)
@@ -537,7 +464,6 @@ _APART = 0.5
 
 _BEHIND = 0.25
 """Standard deviation of a pixel "behind that outline", as a share of the outline's semi-axis."""
-"""Share of such points that were right in simulated swarms."""
 
 
 def shared_rows(
@@ -608,7 +534,7 @@ def _row(
         cameras[seen].name: mine[CENTRE_PX].tolist(),
         other.name: [*uv, behind[0, 0], behind[0, 1], behind[1, 1]],
     }
-    flags = sorted({FLAG, *filter(None, str(mine["flags"] or "").split("|"))})
+    flags = sorted({FLAG, *flag_words(frame.tables[seen].iloc[[single.row]])[0]})
     return {
         "frame": frame.number,
         "particle": single.particle,

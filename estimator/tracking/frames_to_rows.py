@@ -9,7 +9,8 @@ from itertools import chain
 import numpy as np
 import pandas as pd
 
-from telerig.arrays import Array, Bools, Ints
+from telerig.arrays import Array, Ints
+from telerig.estimator.bubbles.outline.detection_table import flag_words
 from telerig.estimator.bubbles.pairing.matching import PairModel, Prediction, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
 from telerig.estimator.tracking.association.likelihoods import px_per_mm
@@ -76,13 +77,13 @@ class Linker:
         pairs, offset_px = pair_frame(tables, pixels, self.cameras, self.model, predicted)
         everyone = (np.arange(len(table)) for table in tables)
         first, second = (np.setdiff1d(i, rows) for i, rows in zip(everyone, pairs.rows.T))
-        lonely = (first, second)
-        measured = _measured(pairs, lonely, pixels, offset_px)
+        unpaired = (first, second)
+        measured = _measured(pairs, unpaired, pixels, offset_px)
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
-            number, t_s, tables, pixels, offset_px, pairs, lonely, result.alone, result.motion
+            number, t_s, tables, pixels, offset_px, pairs, unpaired, result.alone, result.motion
         )
-        self._settle(result)
+        self._take_final(result)
         enough = self._waiting >= _PAIRS_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
         return self._flush(FRAMES_AFTER) if enough else None
 
@@ -96,14 +97,14 @@ class Linker:
         """The rows still open at the end of the run."""
         result = self.tracker.finish()
         if result is not None:
-            self._settle(result)
+            self._take_final(result)
         return self._flush(0) if self._closed else None
 
-    def _settle(self, result: FrameResult) -> None:
+    def _take_final(self, result: FrameResult) -> None:
         self.events.extend(result.events)
-        for ids in result.settled:
+        for ids in result.final:
             frame = self._open.pop(ids.frame)
-            frame.settle(ids)
+            frame.take_final(ids)
             self._closed.append(frame)
             self._waiting += 1 + len(frame.pairs)
 
@@ -157,7 +158,10 @@ class Linker:
         table["centre"] = bodies.used
         table[[f"silhouettes_{x}_mm" for x in "xyz"]] = bodies.silhouette_points_mm
         ambiguous = np.concatenate([f.pairs.ambiguous for f in frames])
-        table["flags"] = _joined_flags(first["flags"], second["flags"], ambiguous)
+        words = zip(flag_words(first), flag_words(second), ambiguous)
+        table["flags"] = [
+            "|".join(sorted({*a, *b, *(["ambiguous"] if unsure else [])})) for a, b, unsure in words
+        ]
         return table[table["particle"] != NO_PARTICLE].reset_index(drop=True)
 
 
@@ -233,12 +237,12 @@ def _pixels(table: pd.DataFrame, wander: float) -> Pixels:
 
 
 def _measured(
-    pairs: Pairs, lonely: tuple[Ints, Ints], pixels: tuple[Pixels, Pixels], offset_px: Array
+    pairs: Pairs, unpaired: tuple[Ints, Ints], pixels: tuple[Pixels, Pixels], offset_px: Array
 ) -> FrameMeasurements:
-    """The tracker's input; lonely : rows of the detections without a partner."""
-    (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, lonely))
+    """The tracker's input; unpaired : rows of the detections without a partner."""
+    (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, unpaired))
     singles = SingleMeasurements(
-        np.repeat([0, 1], [len(i) for i in lonely]).astype(np.int64),
+        np.repeat([0, 1], [len(i) for i in unpaired]).astype(np.int64),
         np.concatenate([uv_a - offset_px[0], uv_b - offset_px[1]]),
         np.concatenate([cov_a, cov_b]),
     )
@@ -264,11 +268,3 @@ def _detections(frames: Sequence[Frame]) -> pd.DataFrame:
     joined = pd.concat(tables, ignore_index=True)
     leading = ["frame", "camera", "particle"]
     return joined[leading + [name for name in joined if name not in leading]]
-
-
-def _joined_flags(first: pd.Series[str], second: pd.Series[str], ambiguous: Bools) -> list[str]:
-    """The flags of both views, each word once."""
-    return [
-        "|".join(sorted({*filter(None, (a or "").split("|") + (b or "").split("|"))} | extra))
-        for a, b, extra in zip(first, second, ({"ambiguous"} if x else set() for x in ambiguous))
-    ]

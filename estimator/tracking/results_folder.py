@@ -55,12 +55,12 @@ class _Worst:
         ).groupby("frame")[["doubt", "ambiguous"]]
         sums = unsure.sum()
         found = part.detections[np.isfinite(part.detections["u_px"].to_numpy(float))]
-        lonely = found["particle"].isna().groupby(found["frame"]).sum()
+        unpaired = found["particle"].isna().groupby(found["frame"]).sum()
         merged = found["flags"].str.contains("merged").groupby(found["frame"]).sum()
         for frame in sorted(set(part.detections["frame"])):
             doubt, ambiguous = sums.loc[frame] if frame in sums.index else (0.0, 0)
             parts = {
-                "without partner or track": float(lonely.get(frame, 0)),
+                "without partner or track": float(unpaired.get(frame, 0)),
                 "merged": float(merged.get(frame, 0)),
                 "ambiguous pairs": float(ambiguous),
             }

@@ -143,7 +143,7 @@ def extend(
         score = pairs.scores(common.shift_mm)
         chosen = best_assignment(len(tentative), pairs.row, pairs.column, score)
     score = pairs.scores(common.shift_mm)
-    safe = unrivalled(pairs.row, pairs.column, score, chosen, scan.settings.margin_nats)
+    safe = unrivalled(pairs.row, pairs.column, score, chosen, scan.settings.margin_log_ratio)
     picked = np.flatnonzero(chosen[pairs.row] == pairs.column)
     if mean_gain is None and len(picked):
         p = np.array([tentative[r].filter.P[:, POSITION] for r in pairs.row[picked]])
@@ -262,7 +262,7 @@ class Tracker:
     axis_rig : the stage's travel direction in the rig frame, also the bubbles' way up.
     first_id : of the first particle; larger than any id that is given with the measurements.
 
-    Write ids to tables from `FrameResult.settled` and `finish`: a frame stays open while a
+    Write ids to tables from `FrameResult.final` and `finish`: a frame stays open while a
     conflict or a birth in it is undecided, at most ``window_frames`` or ``confirm_frames``.
     Memory does not grow with the run.
     """
@@ -340,11 +340,11 @@ class Tracker:
         self._births(scan, np.setdiff1d(free, claimed), common, gain, events)
         self._deaths(scan, events)
         now = self.frames.now(frame)
-        settled, gaps = self._close(self._open_since(frame))
-        return FrameResult(frame, *now, (*events, *gaps), settled, alone, moved)
+        final, gaps = self._close(self._open_since(frame))
+        return FrameResult(frame, *now, (*events, *gaps), final, alone, moved)
 
     def finish(self) -> FrameResult | None:
-        """Settle the frames still open, conflicts as if their time were over; None if no frame.
+        """Decide the frames still open, conflicts as if their time were over; None if no frame.
 
         The result's own ids are empty: no measurements came with it.
         """
@@ -356,9 +356,9 @@ class Tracker:
         scan = Scan(frame, t_s, nothing, np.zeros(0, np.int64), self.settings)
         self._decide(self.clusters, scan, events, at_once=True)
         self.tentative = []
-        settled, gaps = self._close(frame + 1)
+        final, gaps = self._close(frame + 1)
         none = np.zeros(0, np.int64)
-        return FrameResult(frame, none, none, (*events, *gaps), settled)
+        return FrameResult(frame, none, none, (*events, *gaps), final)
 
     def _close(self, before_frame: int) -> tuple[tuple[FrameIds, ...], list[TrackEvent]]:
         return self.frames.close(before_frame, {t.particle for t in self._confirmed()})
@@ -494,7 +494,7 @@ class Tracker:
         new = [t for t in out if t is not None]
         reason = (
             f"continuation not safe: the log-likelihood ratio to the runner-up is "
-            f"{decision.runner_up_nats:.1f}, less than {self.settings.margin_nats:g}"
+            f"{decision.runner_up_log_ratio:.1f}, less than {self.settings.margin_log_ratio:g}"
         )
         self._event(events, "break", scan, (*old, *(t.particle for t in new)), reason)
         return new

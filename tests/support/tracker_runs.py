@@ -39,9 +39,9 @@ def run(
     last = tracker.finish()
     assert last is not None
     results.append(last)
-    settled = [s for r in results for s in r.settled]
-    assert [s.frame for s in settled] == list(range(len(frames)))
-    return [s.particle for s in settled], [e for r in results for e in r.events]
+    final = [s for r in results for s in r.final]
+    assert [s.frame for s in final] == list(range(len(frames)))
+    return [s.particle for s in final], [e for r in results for e in r.events]
 
 
 def kinds(events: list[TrackEvent]) -> list[str]:

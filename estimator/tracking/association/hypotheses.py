@@ -83,12 +83,12 @@ class Broken:
 @dataclass(frozen=True)
 class Decision:
     """still : the cluster that stays open, if any; free : tracks that leave it, with their
-    entries; broken : tracks that cannot be continued; runner_up_nats : how close it was."""
+    entries; broken : tracks that cannot be continued; runner_up_log_ratio : how close it was."""
 
     still: Cluster | None
     free: list[tuple[Track, list[tuple[int, int]]]]
     broken: list[Broken]
-    runner_up_nats: float
+    runner_up_log_ratio: float
 
 
 def recent(entries: Sequence[tuple[int, int]], depth: int) -> list[tuple[int, int]]:
@@ -114,7 +114,7 @@ def merged(
         out.append((float(total), members[top][1]))
     out.sort(key=lambda item: -item[0])
     best = out[0][0]
-    kept = [(w - best, i) for w, i in out if w >= best - settings.prune_nats]
+    kept = [(w - best, i) for w, i in out if w >= best - settings.prune_log_ratio]
     return kept[: settings.max_hypotheses]
 
 
@@ -151,7 +151,7 @@ def decide(
         open_ids = open_ids if still else set()
         free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in open_ids])
         return Decision(still, free, [], runner_up)
-    close = [b for b in branches if b.weight >= -settings.margin_nats]
+    close = [b for b in branches if b.weight >= -settings.margin_log_ratio]
     open_ids = disputed(close, 1)
     free = _leave(branches[0], [t for t in cluster.tracks if t.particle not in open_ids])
     broken = _break(close, [t for t in cluster.tracks if t.particle in open_ids])
@@ -216,7 +216,7 @@ def _agreed_links_from(paths: list[list[list[tuple[int, int]]]]) -> int:
     return start
 
 
-_SLACK_NATS = 6.0
+_SLACK_LOG_RATIO = 6.0
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ def children(found: Association, members: Sequence[int], edges: Sequence[int]) -
             [(int(pairs.column[e]), float(score[e])) for e in by_row.get(r, [])] for r in rows
         ]
         start = sum(b.weight for b in parents)
-        for taken, _ in alternatives(options, settings.prune_nats + _SLACK_NATS):
+        for taken, _ in alternatives(options, settings.prune_log_ratio + _SLACK_LOG_RATIO):
             chosen = tuple(
                 next((e for e in by_row.get(r, []) if pairs.column[e] == c), -1)
                 for r, c in zip(rows, taken)

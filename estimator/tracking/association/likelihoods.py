@@ -109,7 +109,7 @@ def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
 def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:
     """Log-likelihood ratio of sizes against a uniform density over 5 mm; 0 for an unknown size."""
     sigma = settings.size_scatter * expected_mm
-    off = np.minimum(((measured_mm - expected_mm) / sigma) ** 2 / 2, settings.size_cap_nats)
+    off = np.minimum(((measured_mm - expected_mm) / sigma) ** 2 / 2, settings.size_cap_log_ratio)
     score = np.log(_SIZE_SPAN_MM / sigma) - _LOG_2PI / 2 - off
     return np.where(np.isfinite(score), score, 0.0)
 
@@ -153,14 +153,16 @@ def assigned_with_shift(
     return now, chosen
 
 
-def unrivalled(row: Ints, column: Ints, score: Array, chosen: Ints, margin_nats: float) -> Ints:
+def unrivalled(
+    row: Ints, column: Ints, score: Array, chosen: Ints, margin_log_ratio: float
+) -> Ints:
     """(K,) chosen, and no other pairing of its track or its measurement is within the margin."""
     out = chosen >= 0
     for r in np.flatnonzero(out):
         mine = (row == r) & (column == chosen[r])
         rival = ((row == r) | (column == chosen[r])) & ~mine
         best_rival = np.max(score[rival], initial=-np.inf)
-        out[r] = best_rival < score[mine].max() - margin_nats
+        out[r] = best_rival < score[mine].max() - margin_log_ratio
     return np.asarray(out)
 
 
@@ -178,7 +180,7 @@ def joint_score(pairs: Pairs, edges: Ints, common: Common) -> float:
 
 
 def alternatives(
-    options: Sequence[Sequence[tuple[int, float]]], within_nats: float
+    options: Sequence[Sequence[tuple[int, float]]], within_log_ratio: float
 ) -> list[tuple[tuple[int, ...], float]]:
     """Every way to give each row one of its (column, score) options or none, near the best.
 
@@ -193,7 +195,7 @@ def alternatives(
         taken, score = stack.pop()
         nodes += 1
         depth = len(taken)
-        if score + bound[depth] < best - within_nats:
+        if score + bound[depth] < best - within_log_ratio:
             continue
         if depth == len(ordered):
             best = max(best, score)
@@ -202,7 +204,7 @@ def alternatives(
         stack.append(((*taken, -1), score))
         free = [(c, s) for c, s in ordered[depth] if c not in taken]
         stack.extend(((*taken, c), score + s) for c, s in reversed(free))
-    return [(taken, score) for taken, score in found if score >= best - within_nats]
+    return [(taken, score) for taken, score in found if score >= best - within_log_ratio]
 
 
 @dataclass(frozen=True)
@@ -249,7 +251,7 @@ def pair_pixels(
     ratio = base - np.log(np.linalg.det(covariance)) / 2 - distance2 / 2 + size_score
     score = ratio[row, column]
     chosen = best_assignment(len(between), row, column, score)
-    safe = unrivalled(row, column, score, chosen, settings.margin_nats)
+    safe = unrivalled(row, column, score, chosen, settings.margin_log_ratio)
     return [int(c) if ok else -1 for c, ok in zip(chosen, safe)]
 
 

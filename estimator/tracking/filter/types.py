@@ -27,15 +27,15 @@ class TrackerSettings:
     drift_sd_mm_s, drift_time_s : of the slow velocity across the axis about which it oscillates.
     shake_sd_mm, shake_time_s : offset common to all bubbles in a frame, sd and correlation time.
     stage_acceleration_mm_s2 : of the stage, where the encoder does not give its position.
-    size_scatter : relative sd of d_eq_mm from frame to frame; size_cap_nats : largest penalty
+    size_scatter : relative sd of d_eq_mm from frame to frame; size_cap_log_ratio : largest penalty
         (log-likelihood) of a wrong size.
     detection_probability, missed_again_probability : of a bubble in a frame; of one that was
         missed in the frame before to be missed again. end_probability : to leave for good in a
         frame; so a track that was missed for long hardly claims a measurement.
     new_per_mm3, new_per_px2 : density of clutter and new bubbles in space and in one image.
     gate_probability : that a true continuation lies inside its gate.
-    margin_nats : least log-likelihood ratio to the runner-up for a safe decision when the window
-        ends; prune_nats : hypotheses further behind the best are dropped at once.
+    margin_log_ratio : least log-likelihood ratio to the runner-up for a safe decision when the
+        window ends; prune_log_ratio : hypotheses further behind the best are dropped at once.
     window_frames : how long a conflict may stay open. max_hypotheses : per conflict.
     confirm_hits, confirm_frames : a new track needs so many measurements in its first frames.
     gap_s, gap_frames : a track unseen for longer than both ends.
@@ -56,15 +56,15 @@ class TrackerSettings:
     shake_time_s: float = 0.01
     stage_acceleration_mm_s2: float = 3000.0
     size_scatter: float = 0.05
-    size_cap_nats: float = 4.5
+    size_cap_log_ratio: float = 4.5
     detection_probability: float = 0.95
     missed_again_probability: float = 0.5
     end_probability: float = 0.002
     new_per_mm3: float = 1e-5
     new_per_px2: float = 1e-5
     gate_probability: float = 0.9999
-    margin_nats: float = 4.6
-    prune_nats: float = 9.0
+    margin_log_ratio: float = 4.6
+    prune_log_ratio: float = 9.0
     window_frames: int = 25
     max_hypotheses: int = 30
     confirm_hits: int = 3
@@ -213,7 +213,7 @@ class Motion:
 class FrameResult:
     """particle, single : ids as of now, the best guess where a conflict or a birth is still open.
 
-    settled : the earlier frames (and this one, if nothing is open) whose ids are final now, in
+    final : the earlier frames (and this one, if nothing is open) whose ids are final now, in
         order; write these to the tables. events : what became known in this frame.
     alone : by index of the single measurement, the tracks that one camera alone continued.
     motion : None in the first frame.
@@ -223,6 +223,6 @@ class FrameResult:
     particle: Ints
     single: Ints
     events: tuple[TrackEvent, ...]
-    settled: tuple[FrameIds, ...]
+    final: tuple[FrameIds, ...]
     alone: Mapping[int, SeenAlone] = field(default_factory=dict)
     motion: Motion | None = None

@@ -23,7 +23,7 @@ import numpy as np
 from calibration_scene import make_scene
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.solver import graph as product
+from telerig.estimator.calibration.solver import levenberg_marquardt as product
 from telerig.estimator.calibration.solver.problem import (
     GAUGE_SIGMA_MM,
     Problem,

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.calibration.lens.choice import model_start
 from telerig.estimator.calibration.self_calibration import choose_model
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import (
     Problem,
     cameras_from_state,

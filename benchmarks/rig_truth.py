@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import with_plate
-from telerig.estimator.calibration.solver.array_system import ArraySystem
 from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
 from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import linearisation, solve
 from telerig.estimator.calibration.solver.problem import held_at_nominal
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import SimulationConfig
@@ -193,7 +192,7 @@ def linear_deviations(scene: Scene, config: SimulationConfig, model: str) -> Arr
         known = replace(known, scale=(ends, true_mm, sigma))
     truth = solve(known, start).state
     measured = replace(problem, uv_px=problem.uv_px - discs)
-    equations = ArraySystem(measured, truth).linearised(truth)
+    equations = linearisation(measured)[1](truth)
     step, _ = equations.step(1e-12)
     count = sum(map(len, problem.free)) + 6
     sd = np.sqrt(np.diag(equations.posterior(whole=False).common))

@@ -1,23 +1,22 @@
-"""The calibration as a flat vector with a sparse Jacobian, and SciPy's least_squares on it.
+"""The calibration by SciPy's least_squares, with a sparse analytic Jacobian.
 
-Same variables, units, priors and gauge as the product; poses are tangent vectors at the start.
+Same variables, units, priors and gauge as the product; poses are tangent vectors at the start. The
+sparsity pattern is made once, values are written into one CSR array.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import csr_array
 
-from telerig.estimator.calibration.solver.array_system import ArraySystem
-from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem
-from telerig.factors.priors import depth_gauge_residual, distance_residual
-from telerig.factors.projection import State, whitened_residuals
-from telerig.rig.pose import hat
+from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.system import System
+from telerig.factors.projection import State
+from telerig.rig.pose import hat, rotation_from_rotvec
 
 Array = NDArray[np.float64]
 
@@ -33,121 +32,84 @@ def right_jacobian(w: Array) -> Array:
     return np.asarray(np.eye(3) - one * k + two * (k @ k))
 
 
-@dataclass
 class Flat:
-    """Residuals and Jacobian of a problem of two cameras."""
+    """Residuals and Jacobian of a problem of two cameras as functions of a flat vector."""
 
-    problem: Problem
-    start: State
-
-    def __post_init__(self) -> None:
-        problem = self.problem
-        self.system = ArraySystem(problem, self.start)
-        self.system.chunks = []
-        self.obs = problem.observations()
-        self.views_at = int(self.system.edges[-1])
-        self.dots_at = self.views_at + 6 * len(problem.views)
-        self.size = self.dots_at + problem.nominal_mm.size
-        self.rows = [np.flatnonzero(self.obs.camera == c) for c in range(2)]
-        self.columns = [self._columns(c, rows) for c, rows in enumerate(self.rows)]
-
-    def _columns(self, camera: int, rows: Any) -> Any:
-        """(m, k) variables that each measurement of a camera depends on."""
-        lens = np.arange(self.size)[self.system.intrinsics_of(camera)]
-        pose = np.arange(self.size)[self.system.pose_of(1)] if camera else lens[:0]
-        shared = np.broadcast_to(np.r_[lens, pose], (len(rows), len(lens) + len(pose)))
-        view = self.views_at + 6 * self.obs.view[rows, None] + np.arange(6)
-        dot = self.dots_at + 3 * self.obs.dot[rows, None] + np.arange(3)
-        return np.concatenate([shared, view, dot], 1)
+    def __init__(self, problem: Problem, start: State) -> None:
+        self.system, self.start = System(problem), start
+        system = self.system
+        index, width = [], []
+        for own, obs in zip(system.camera_places, system.images):
+            view = system.views_at + 6 * obs.view[:, None] + np.arange(6)
+            dot = system.dots_at + 3 * obs.dot[:, None] + np.arange(3)
+            shared = np.broadcast_to(own, (len(obs), len(own)))
+            index.append(np.repeat(np.concatenate([shared, view, dot], 1), 2, 0).ravel())
+            width.append(np.full(2 * len(obs), len(own) + 9))
+        priors = system.priors(start)
+        for own, (value, _) in zip(system.camera_places, priors.cameras):
+            index.append(np.tile(own, len(value)))
+            width.append(np.full(len(value), len(own)))
+        views = np.arange(system.views_at, system.dots_at).reshape(-1, 6)
+        dots = np.arange(system.dots_at, system.size)
+        index += [np.repeat(views, 3, 0).ravel(), dots]
+        width += [np.full(3 * len(views), 6), np.ones(len(dots), int)]
+        assert priors.distance is not None
+        pair = np.array(priors.distance[0])
+        index.append((system.dots_at + 3 * pair[:, None] + np.arange(3)).ravel())
+        width.append(np.array([6]))
+        self.index = np.concatenate(index)
+        self.edges = np.r_[0, np.cumsum(np.concatenate(width))]
 
     def state(self, x: Array) -> State:
         return self.system.moved(self.start, x)
 
     def residuals(self, x: Array) -> Array:
-        state = self.state(x)
-        from telerig.factors.projection import whitened_error
-
-        images = whitened_error(state, self.obs, self.problem.rho_mm)
-        parts = [images[rows].ravel() for rows in self.rows]
-        return np.concatenate([*parts, *self._priors(state)])
-
-    def _priors(self, state: State) -> list[Array]:
-        problem, system = self.problem, self.system
-        assert problem.scale is not None
-        return [
-            *(system.intrinsic_pull(state, c)[0] for c in range(2)),
-            depth_gauge_residual(state.rig_from_camera[1], GAUGE_SIGMA_MM)[0],
-            state.rig_from_target[:, :3, 3].ravel() / system.loose_mm,
-            ((state.dots_mm - problem.nominal_mm) / problem.dot_sigma_mm).ravel(),
-            distance_residual(state.dots_mm, *problem.scale)[0],
-        ]
+        state, system = self.state(x), self.system
+        images = [system.error(state, c).T.ravel() for c in range(2)]
+        priors = system.priors(state)
+        assert priors.distance is not None
+        own = [value for value, _ in priors.cameras]
+        far = np.array([priors.distance[1]])
+        return np.concatenate([*images, *own, priors.views[0].ravel(), priors.dots[0].ravel(), far])
 
     def jacobian(self, x: Array) -> Any:
-        """Sparse (R, D): by the perturbation at the state, then by the tangent at the start."""
-        problem, system, state = self.problem, self.system, self.state(x)
-        full = whitened_residuals(state, self.obs, problem.rho_mm)
-        blocks = []
-        for c, rows in enumerate(self.rows):
-            lens = full.by_intrinsics[rows][..., system.free[c]] * system.unit[c]
-            parts = [lens, full.by_view[rows], full.by_dot[rows]]
+        """By the perturbation at the state, times that per tangent at the start."""
+        state, system = self.state(x), self.system
+        camera = self._chain(x[system.camera_places[1][-6:]])
+        views = self._chain(x[system.views_at : system.dots_at].reshape(-1, 6))
+        parts = []
+        for c, obs in enumerate(system.images):
+            columns = system.columns(state, c)[:-1].transpose(2, 1, 0)
+            shared, by_view = columns[..., :-6], columns[..., -6:]
             if c:
-                parts.insert(1, full.by_camera[rows])
-            values = np.concatenate(parts, -1)
-            blocks.append((values.reshape(-1, values.shape[-1]), np.repeat(self.columns[c], 2, 0)))
-        data = np.concatenate([v.ravel() for v, _ in blocks])
-        index = np.concatenate([i.ravel() for _, i in blocks])
-        width = np.concatenate([np.full(len(v), v.shape[1]) for v, _ in blocks])
-        start = np.concatenate([[0], np.cumsum(width)])
-        images = csr_array((data, index, start), shape=(len(width), self.size))
-        return _stack([images, self._prior_jacobian(state)]) @ self._chain(x)
+                shared = np.concatenate([shared[..., :-6], shared[..., -6:] @ camera], -1)
+            parts.append(np.concatenate([shared, by_view @ views[obs.view], by_view[..., 3:]], -1))
+        priors = system.priors(state)
+        assert priors.distance is not None
+        for c, (_, jacobian) in enumerate(priors.cameras):
+            if c:
+                jacobian = np.concatenate([jacobian[:, :-6], jacobian[:, -6:] @ camera], -1)
+            parts.append(jacobian)
+        by_first = priors.distance[2]
+        parts += [priors.views[1] @ views, priors.dots[1], np.r_[by_first, -by_first]]
+        data = np.concatenate([part.ravel() for part in parts])
+        return csr_array((data, self.index, self.edges), shape=(len(self.edges) - 1, system.size))
 
-    def _prior_jacobian(self, state: State) -> Any:
-        problem, system = self.problem, self.system
-        assert problem.scale is not None
-        lens = [np.diag(system.intrinsic_pull(state, c)[1]) for c in range(2)]
-        gauge = depth_gauge_residual(state.rig_from_camera[1], GAUGE_SIGMA_MM)[1]
-        turn = state.rig_from_target[:, :3, :3] / system.loose_mm
-        views = block_diag([np.concatenate([np.zeros((3, 3)), r], 1) for r in turn])
-        dots = block_diag([np.diag(1 / problem.dot_sigma_mm.ravel())]) if False else None
-        del dots
-        weight = 1 / problem.dot_sigma_mm.ravel()
-        of_dots = csr_array(
-            (weight, (np.arange(len(weight)), np.arange(len(weight)))), shape=(len(weight),) * 2
-        )
-        far = csr_array(distance_residual(state.dots_mm, *problem.scale)[1])
-        common = block_diag([*lens, gauge, views, of_dots], format="csr")
-        pad = csr_array((1, self.dots_at))
-        from scipy.sparse import hstack
-
-        return _stack([csr_array(common), csr_array(hstack([pad, far]))])
-
-    def _chain(self, x: Array) -> Any:
-        """Block diagonal: right perturbation at the state per tangent at the start."""
-        from telerig.rig.pose import rotation_from_rotvec
-
-        first = self.views_at - 6
-        tangent = x[first : self.dots_at].reshape(-1, 6)
-        blocks = np.zeros((len(tangent), 6, 6))
-        blocks[:, :3, :3] = right_jacobian(tangent[:, :3])
-        blocks[:, 3:, 3:] = np.swapaxes(rotation_from_rotvec(tangent[:, :3]), -1, -2)
-        ones = [csr_array(np.eye(first))]
-        rest = self.size - self.dots_at
-        tail = csr_array((np.ones(rest), (np.arange(rest), np.arange(rest))), shape=(rest, rest))
-        return csr_array(block_diag([*ones, *blocks, tail], format="csr"))
+    @staticmethod
+    def _chain(tangent: Array) -> Array:
+        """(..., 6, 6) right perturbation at the state per tangent at the start."""
+        out = np.zeros((*tangent.shape, 6))
+        out[..., :3, :3] = right_jacobian(tangent[..., :3])
+        out[..., 3:, 3:] = np.swapaxes(rotation_from_rotvec(tangent[..., :3]), -1, -2)
+        return out
 
 
-def _stack(parts: list[Any]) -> Any:
-    from scipy.sparse import vstack
-
-    return csr_array(vstack(parts, format="csr"))
-
-
-def solve(problem: Problem, start: State, inner: float = 1e-12) -> tuple[State, int]:
+def solve(problem: Problem, start: State, inner: float = 1e-10) -> tuple[State, int]:
     """trf with lsmr, ended when nothing more is gained; the state and the Jacobians evaluated."""
     flat = Flat(problem, start)
     found: Any = least_squares(
-        flat.residuals, np.zeros(flat.size), flat.jacobian, method="trf", tr_solver="lsmr",
+        flat.residuals, np.zeros(flat.system.size), flat.jacobian, method="trf", tr_solver="lsmr",
         x_scale="jac", ftol=1e-11, xtol=1e-14, gtol=1e-14, max_nfev=100,
-        tr_options={"atol": inner, "btol": inner, "maxiter": 20 * flat.size},
+        tr_options={"atol": inner, "btol": inner, "maxiter": 20 * flat.system.size},
     )  # fmt: skip
-    return replace(flat.state(found.x)), int(found.njev)
+    return flat.state(found.x), int(found.njev)

@@ -8,6 +8,8 @@ OpenCV's definitions (Weng, Cohen and Herniou, PAMI 14:965, 1992), forward from 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,47 +21,91 @@ COEFFICIENTS = ("k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4")
 _NEWTON_STEPS = 40
 
 
+def components_first(batch: tuple[int, ...], *components: int) -> Array:
+    """Zeros of shape (*batch, *components) in which each component is contiguous in memory.
+
+    Arithmetic on one component of many points then runs along memory.
+    """
+    first, last = len(components), len(components) + len(batch)
+    return np.zeros((*components, *batch)).transpose(*range(first, last), *range(first))
+
+
+def _split(coefficients: Array) -> list[Array]:
+    return [coefficients[..., i] for i in range(len(COEFFICIENTS))]
+
+
 def distort(xy: Array, coefficients: Array) -> Array:
-    """(..., 2) ideal -> (..., 2) distorted; coefficients (..., 9) in the order `COEFFICIENTS`."""
+    """(..., 2) ideal -> (..., 2) distorted; coefficients (..., 9) in the order `COEFFICIENTS`.
+
+    A part of the model whose coefficients are all zero costs nothing.
+    """
     x, y = xy[..., 0], xy[..., 1]
-    k1, k2, k3, p1, p2, s1, s2, s3, s4 = np.moveaxis(coefficients, -1, 0)
+    k1, k2, k3, p1, p2, s1, s2, s3, s4 = _split(coefficients)
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + s2 * r2)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + s4 * r2)
-    return np.stack([xd, yd], -1)
+    xd, yd = x, y
+    if np.any(coefficients[..., :3]):
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd, yd = x * radial, y * radial
+    if np.any(coefficients[..., 3:5]):
+        cross = 2 * x * y
+        xd = xd + p1 * cross + p2 * (r2 + 2 * x * x)
+        yd = yd + p1 * (r2 + 2 * y * y) + p2 * cross
+    if np.any(coefficients[..., 5:]):
+        xd = xd + r2 * (s1 + s2 * r2)
+        yd = yd + r2 * (s3 + s4 * r2)
+    out = components_first(np.broadcast_shapes(xd.shape, yd.shape), 2)
+    out[..., 0], out[..., 1] = xd, yd
+    return out
 
 
 def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
     """(..., 2, 2) derivative of `distort` with respect to the ideal coordinates."""
     x, y = xy[..., 0], xy[..., 1]
-    k1, k2, k3, p1, p2, s1, s2, s3, s4 = np.moveaxis(coefficients, -1, 0)
+    k1, k2, k3, p1, p2, s1, s2, s3, s4 = _split(coefficients)
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-    prism_x, prism_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
-    out = np.empty((*radial.shape, 2, 2))
-    cross = slope * x * y
-    out[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x + prism_x * x
-    out[..., 0, 1] = cross + 2 * p1 * x + 2 * p2 * y + prism_x * y
-    out[..., 1, 0] = cross + 2 * p1 * x + 2 * p2 * y + prism_y * x
-    out[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x + prism_y * y
+    out = components_first(np.broadcast_shapes(x.shape, k1.shape), 2, 2)
+    out[..., 0, 0] = out[..., 1, 1] = 1
+    if np.any(coefficients[..., :3]):
+        radial = r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        cross = slope * x * y
+        out[..., 0, 0] += radial + slope * x * x
+        out[..., 0, 1] += cross
+        out[..., 1, 0] += cross
+        out[..., 1, 1] += radial + slope * y * y
+    if np.any(coefficients[..., 3:5]):
+        cross = 2 * (p1 * x + p2 * y)
+        out[..., 0, 0] += 2 * p1 * y + 6 * p2 * x
+        out[..., 0, 1] += cross
+        out[..., 1, 0] += cross
+        out[..., 1, 1] += 6 * p1 * y + 2 * p2 * x
+    if np.any(coefficients[..., 5:]):
+        prism_x, prism_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
+        out[..., 0, 0] += prism_x * x
+        out[..., 0, 1] += prism_x * y
+        out[..., 1, 0] += prism_y * x
+        out[..., 1, 1] += prism_y * y
     return out
 
 
-def coefficient_jacobian(xy: Array) -> Array:
-    """(..., 2, 9) derivative of `distort` by the coefficients, in which it is linear."""
+def coefficient_jacobian(xy: Array, which: Sequence[int] = range(9)) -> Array:
+    """(..., 2, k) derivative of `distort` by k of its coefficients, in which it is linear.
+
+    which : indices into `COEFFICIENTS`.
+    """
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    out = np.zeros((*r2.shape, 2, 9))
-    power = r2
-    for i in range(3):
-        out[..., 0, i], out[..., 1, i] = x * power, y * power
-        power = power * r2
-    out[..., 0, 3] = out[..., 1, 4] = 2 * x * y
-    out[..., 1, 3], out[..., 0, 4] = r2 + 2 * y * y, r2 + 2 * x * x
-    out[..., 0, 5] = out[..., 1, 7] = r2
-    out[..., 0, 6] = out[..., 1, 8] = r2 * r2
+    out = components_first(r2.shape, 2, len(which))
+    for column, i in enumerate(which):
+        if i < 3:
+            power = r2 ** (i + 1)
+            out[..., 0, column], out[..., 1, column] = x * power, y * power
+        elif i < 5:
+            square = x if i == 4 else y
+            out[..., i - 3, column] = 2 * x * y
+            out[..., 4 - i, column] = r2 + 2 * square * square
+        else:
+            out[..., (i - 5) // 2, column] = r2 if i % 2 else r2 * r2
     return out
 
 

@@ -15,12 +15,13 @@ the window's stated normal (`Wall.turned`) and have no effect without a window.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.rig import distortion, windows
+from telerig.rig.distortion import components_first
 from telerig.rig.windows import Wall
 
 Array = NDArray[np.float64]
@@ -77,10 +78,15 @@ def ideal_from_pixel(uv_px: Array, intrinsics: Array, rho_mm: float) -> Array:
 
 def sensor_from_distorted(xy_mm: Array, intrinsics: Array) -> Array:
     """(..., 2) -> (..., 2): the tilted sensor plane."""
-    q = intrinsics[_TX : _TY + 1]
-    qx = xy_mm @ q
-    stretched = xy_mm + (qx / (1 + np.sqrt(1 + q @ q)))[..., None] * q
-    return np.asarray(stretched / (1 - intrinsics[_W] * qx)[..., None])
+    q, w = intrinsics[_TX : _TY + 1], intrinsics[_W]
+    if not q.any():
+        return xy_mm
+    along = xy_mm[..., 0] * q[0] + xy_mm[..., 1] * q[1]
+    stretch = along / (1 + np.sqrt(1 + q @ q))
+    out = components_first(along.shape, 2)
+    for i in range(2):
+        out[..., i] = (xy_mm[..., i] + stretch * q[i]) / (1 - w * along)
+    return out
 
 
 def distorted_from_sensor(xy_mm: Array, intrinsics: Array) -> Array:
@@ -93,65 +99,101 @@ def distorted_from_sensor(xy_mm: Array, intrinsics: Array) -> Array:
 
 def _pixel_from_sensor(xy_mm: Array, intrinsics: Array) -> Array:
     scale = intrinsics[_SCALE]
-    u = scale * (xy_mm[..., 0] + intrinsics[_SKEW] * xy_mm[..., 1]) + intrinsics[_CU]
-    v = scale * intrinsics[_ASPECT] * xy_mm[..., 1] + intrinsics[_CV]
-    return np.stack([u, v], -1)
+    out = components_first(xy_mm.shape[:-1], 2)
+    out[..., 0] = scale * (xy_mm[..., 0] + intrinsics[_SKEW] * xy_mm[..., 1]) + intrinsics[_CU]
+    out[..., 1] = scale * intrinsics[_ASPECT] * xy_mm[..., 1] + intrinsics[_CV]
+    return out
 
 
 def pixel_jacobians(
-    points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall | None = None
+    points_mm: Array,
+    intrinsics: Array,
+    rho_mm: float,
+    wall: Wall | None = None,
+    free: Sequence[int] = range(len(PARAMETERS)),
 ) -> tuple[Array, Array, Array]:
     """Pixels with their derivatives.
 
-    Returns (..., 2) pixels, (..., 2, 3) with respect to the camera point and (..., 2, 20) with
-    respect to the intrinsics. wall : as in `pixel_from_camera`.
+    points_mm : (..., 3) camera coordinates.  free : indices into `PARAMETERS` of the F intrinsics
+    by which derivatives are wanted.  wall : as in `pixel_from_camera`.
+
+    Returns (..., 2) pixels, (..., 2, 3) with respect to the camera point and (..., 2, F) with
+    respect to the free intrinsics.
     """
-    if wall is not None:
-        return _behind_wall(points_mm, intrinsics, rho_mm, wall)
-    kappa = intrinsics[_KAPPA]
-    inverse_depth = 1 / (1 + kappa * points_mm[..., 2])
-    ideal = points_mm[..., :2] * inverse_depth[..., None]
-    uv, by_ideal, by_intrinsics = _lens_jacobians(ideal, intrinsics, rho_mm)
-    by_point = np.empty((*ideal.shape, 3))
-    by_point[..., :2] = by_ideal * inverse_depth[..., None, None]
-    towards_axis = np.einsum("...ij,...j->...i", by_ideal, ideal) * inverse_depth[..., None]
-    by_point[..., 2] = -kappa * towards_axis
-    by_intrinsics[..., _KAPPA] = -towards_axis * points_mm[..., 2:3]
-    return uv, by_point, by_intrinsics
+    kappa, batch = intrinsics[_KAPPA], points_mm.shape[:-1]
+    if wall is None:
+        nearness = 1 / (1 + kappa * points_mm[..., 2])
+        ideal = components_first(batch, 2)
+        for i in range(2):
+            ideal[..., i] = points_mm[..., i] * nearness
+        uv, by_ideal, by_free = _lens_jacobians(ideal, intrinsics, rho_mm, free)
+        towards_axis = by_ideal[..., 0] * ideal[..., :1] + by_ideal[..., 1] * ideal[..., 1:]
+        towards_axis *= nearness[..., None]
+        by_point = components_first(batch, 2, 3)
+        for i in range(2):
+            by_point[..., i] = by_ideal[..., i] * nearness[..., None]
+        by_point[..., 2] = -kappa * towards_axis
+        by_kappa, by_turn = -towards_axis * points_mm[..., 2:], np.zeros((*batch, 2, 2))
+    else:
+        seen = windows.ideal_jacobians(points_mm, float(kappa), standing_wall(intrinsics, wall))
+        uv, by_ideal, by_free = _lens_jacobians(seen.value, intrinsics, rho_mm, free)
+        by_point = by_ideal @ seen.by_point
+        by_kappa = np.einsum("...ij,...j->...i", by_ideal, seen.by_kappa)
+        by_turn = by_ideal @ (seen.by_wall[..., :2] @ wall.turn_jacobian(intrinsics[_WALL]))
+    for column, parameter in enumerate(free):
+        if parameter == _KAPPA:
+            by_free[..., column] = by_kappa
+        elif parameter >= _WALL.start:
+            by_free[..., column] = by_turn[..., parameter - _WALL.start]
+    return uv, by_point, by_free
 
 
-def _behind_wall(
-    points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall
+def _lens_jacobians(
+    ideal: Array, intrinsics: Array, rho_mm: float, free: Sequence[int]
 ) -> tuple[Array, Array, Array]:
-    turned = standing_wall(intrinsics, wall)
-    seen = windows.ideal_jacobians(points_mm, float(intrinsics[_KAPPA]), turned)
-    uv, by_ideal, by_intrinsics = _lens_jacobians(seen.value, intrinsics, rho_mm)
-    by_intrinsics[..., _KAPPA] = np.einsum("...ij,...j->...i", by_ideal, seen.by_kappa)
-    by_turn = seen.by_wall[..., :2] @ wall.turn_jacobian(intrinsics[_WALL])
-    by_intrinsics[..., _WALL] = by_ideal @ by_turn
-    return uv, by_ideal @ seen.by_point, by_intrinsics
-
-
-def _lens_jacobians(ideal: Array, intrinsics: Array, rho_mm: float) -> tuple[Array, Array, Array]:
-    """Pixels, (..., 2, 2) by telecentric coordinates, (..., 2, 20) by all but kappa and wall."""
-    normal = ideal / rho_mm
-    coefficients = intrinsics[_DISTORTION]
+    """Pixels, (..., 2, 2) by telecentric coordinates, (..., 2, F) by all but kappa and wall."""
+    normal, coefficients = ideal / rho_mm, intrinsics[_DISTORTION]
     distorted = distortion.distort(normal, coefficients) * rho_mm
-    sensor, sensor_jac, tilt_jac = tilt_jacobians(distorted, intrinsics)
-    affine = intrinsics[_SCALE] * np.array([[1, intrinsics[_SKEW]], [0, intrinsics[_ASPECT]]])
-    pixel_from_distorted = affine @ sensor_jac
-    by_ideal = pixel_from_distorted @ distortion.distortion_jacobian(normal, coefficients)
+    scale, aspect, skew = intrinsics[[_SCALE, _ASPECT, _SKEW]]
+    affine = scale * np.array([[1, skew], [0, aspect]])
+    sensor, by_distorted = distorted, affine
+    tilted, batch = [p for p in free if _TX <= p <= _W], ideal.shape[:-1]
+    by_tilt = np.zeros((*batch, 2, 3))
+    if tilted or intrinsics[_TX : _TY + 1].any():
+        sensor, by_xy, by_tilt = tilt_jacobians(distorted, intrinsics)
+        by_distorted, by_tilt = _product(affine, by_xy), _product(affine, by_tilt)
+    by_ideal = _product(by_distorted, distortion.distortion_jacobian(normal, coefficients))
 
-    by_intrinsics = np.zeros((*ideal.shape, len(PARAMETERS)))
-    by_intrinsics[..., 0, _SCALE] = sensor[..., 0] + intrinsics[_SKEW] * sensor[..., 1]
-    by_intrinsics[..., 1, _SCALE] = intrinsics[_ASPECT] * sensor[..., 1]
-    by_intrinsics[..., 1, _ASPECT] = intrinsics[_SCALE] * sensor[..., 1]
-    by_intrinsics[..., 0, _SKEW] = intrinsics[_SCALE] * sensor[..., 1]
-    by_intrinsics[..., 0, _CU] = by_intrinsics[..., 1, _CV] = 1
-    by_coefficients = distortion.coefficient_jacobian(normal) * rho_mm
-    by_intrinsics[..., _DISTORTION] = pixel_from_distorted @ by_coefficients
-    by_intrinsics[..., _TX : _W + 1] = affine @ tilt_jac
-    return _pixel_from_sensor(sensor, intrinsics), by_ideal, by_intrinsics
+    by_free = components_first(batch, 2, len(free))
+    wanted = [p - _DISTORTION.start for p in free if _DISTORTION.start <= p < _DISTORTION.stop]
+    by_coefficients = distortion.coefficient_jacobian(normal, wanted) if wanted else normal
+    for column, parameter in enumerate(free):
+        out = by_free[..., column]
+        if parameter == _SCALE:
+            out[..., 0] = sensor[..., 0] + skew * sensor[..., 1]
+            out[..., 1] = aspect * sensor[..., 1]
+        elif parameter == _ASPECT:
+            out[..., 1] = scale * sensor[..., 1]
+        elif parameter == _SKEW:
+            out[..., 0] = scale * sensor[..., 1]
+        elif parameter in (_CU, _CV):
+            out[..., parameter - _CU] = 1
+        elif parameter in tilted:
+            out[...] = by_tilt[..., parameter - _TX]
+        elif _DISTORTION.start <= parameter < _DISTORTION.stop:
+            step = by_coefficients[..., wanted.index(parameter - _DISTORTION.start)] * rho_mm
+            out[...] = by_distorted[..., 0] * step[..., :1] + by_distorted[..., 1] * step[..., 1:]
+    return _pixel_from_sensor(sensor, intrinsics), by_ideal, by_free
+
+
+def _product(left: Array, right: Array) -> Array:
+    """(..., 2, 2) times (..., 2, k), component by component."""
+    batch = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+    out = components_first(batch, *right.shape[-2:])
+    for i in range(2):
+        for j in range(right.shape[-1]):
+            out[..., i, j] = left[..., i, 0] * right[..., 0, j] + left[..., i, 1] * right[..., 1, j]
+    return out
 
 
 def tilt_jacobians(xy_mm: Array, intrinsics: Array) -> tuple[Array, Array, Array]:

@@ -21,7 +21,7 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
-from telerig.estimator.calibration.solver.graph import Progress, Solution, solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import Progress, Solution, solve
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import (
     OUTLIER_SD,

@@ -27,7 +27,7 @@ from telerig.estimator.calibration.lens.search import (
     search,
     steps_to,
 )
-from telerig.estimator.calibration.solver.graph import Solution, solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import Solution, solve
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
 from telerig.factors.projection import State, pixels
 from telerig.io.machine.parallel import ordered_map, quick_workers

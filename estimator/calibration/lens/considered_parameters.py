@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from telerig.estimator.calibration.solver.array_system import ArraySystem
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
-from telerig.estimator.calibration.solver.graph import Solution, slots
+from telerig.estimator.calibration.solver.levenberg_marquardt import Solution, linearisation
 from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.system import slots
 from telerig.rig.lens_models import GROUPS, groups_of, name_of, ordered
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def considered_covariance(
         return problem.free, joint
     names = [name_of({*groups_of(model), *more}) for model, more in zip(models, groups)]
     wide = problem.with_model(names)
-    equations = ArraySystem(wide, solution.state).linearised(solution.state)
+    equations = linearisation(wide)[1](solution.state)
     step, _ = equations.step(UNDAMPED)
     there = replace(solution, equations=equations, slots=slots(wide))
     # the residuals are those of the simpler fit

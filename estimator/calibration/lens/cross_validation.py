@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.solver.array_system import ArraySystem
+from telerig.estimator.calibration.solver.levenberg_marquardt import linearisation
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.factors.image_blocks import view_gram
-from telerig.factors.image_rows import in_chunks
+from telerig.estimator.calibration.solver.system import System, images_of, retracted
 from telerig.factors.projection import State, whitened_error
-from telerig.rig.pose import rotation_from_rotvec
 
 Array = NDArray[np.float64]
 
@@ -24,24 +22,23 @@ POSE_STEPS = 3
 
 def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
     """Refine every view's pose with cameras and dots held: Gauss-Newton on 6 unknowns a view."""
-    chunks = in_chunks(problem.observations(), len(problem.dot_ids))
-    views = state.rig_from_target.copy()
+    system = System(problem)
     for _ in range(steps):
-        normal = np.tile(1e-9 * np.eye(6), (len(views), 1, 1))
-        right = np.zeros((len(views), 6))
-        for rows in chunks:
-            gram = view_gram(replace(state, rig_from_target=views), rows, problem.rho_mm)
-            for _, images in rows.cameras:
-                normal[rows.view[images]] += gram[images, :6, :6]
-                right[rows.view[images]] -= gram[images, :6, 6]
+        normal = np.zeros((len(problem.views), 6, 6))
+        right = np.zeros((len(problem.views), 6))
+        for c, obs in enumerate(system.images):
+            columns = system.columns(state, c)[-7:]
+            for v, a, b in images_of(obs):
+                flat = columns[..., a:b].reshape(7, -1)
+                normal[v] += flat[:-1] @ flat[:-1].T
+                right[v] -= flat[:-1] @ flat[-1]
         # a view seen by one telecentric camera has a depth that nothing moves
-        normal += 1e-9 * np.trace(normal, axis1=-2, axis2=-1)[:, None, None] * np.eye(6)
-        step = np.linalg.solve(normal, right[..., None])[..., 0]
-        views[:, :3, 3] += np.einsum("vij,vj->vi", views[:, :3, :3], step[:, 3:])
-        views[:, :3, :3] = views[:, :3, :3] @ rotation_from_rotvec(step[:, :3])
+        normal += (1e-9 + 1e-9 * np.trace(normal, axis1=-2, axis2=-1))[:, None, None] * np.eye(6)
+        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
+        state = replace(state, rig_from_target=retracted(state.rig_from_target, step))
         if np.abs(step).max() < 1e-10:
             break
-    return replace(state, rig_from_target=views)
+    return state
 
 
 def held_out_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
@@ -57,8 +54,8 @@ def held_out_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
         if len(left_out) == 0 or len(views) - len(left_out) < 2:
             continue
         mine = np.isin(problem.view, left_out)
-        system = ArraySystem(problem.subset(~mine), state)
-        step, _ = system.linearised(state).step(DAMPING)
+        system, linearised = linearisation(problem.subset(~mine))
+        step, _ = linearised(state).step(DAMPING)
         trained = replace(system.moved(state, step), rig_from_target=state.rig_from_target)
         test = problem.subset(mine)
         fitted = pose_only(test, trained, steps=POSE_STEPS)

@@ -18,7 +18,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.solver.graph import Solution
+from telerig.estimator.calibration.solver.levenberg_marquardt import Solution
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit, prior_sigma
 from telerig.factors.projection import whitened_error
 from telerig.rig.lens_models import GROUPS, ordered

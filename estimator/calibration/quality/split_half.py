@@ -22,7 +22,7 @@ from telerig.estimator.calibration.quality.comparison import (
     field_difference,
 )
 from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.robust import LEAST_DOTS
 from telerig.estimator.calibration.start.known_target import overlap_tree

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.factors.projection import ImageKeys, Observations, State
+from telerig.factors.projection import Observations, State
 from telerig.rig.camera import Camera
 from telerig.rig.lens_models import parameters_of
 from telerig.rig.pose import Pose
@@ -137,20 +137,6 @@ class Problem:
     def free_indices(self, camera: int) -> Ints:
         """Indices into `PARAMETERS` of one camera's free intrinsics."""
         return np.array([INDEX[p] for p in self.free[camera]], int)
-
-    def keys(self) -> ImageKeys:
-        """The graph's keys: k intrinsics, c camera poses, v views, d dots."""
-        import gtsam
-
-        cameras, views = range(len(self.cameras)), range(len(self.views))
-        return ImageKeys(
-            intrinsics=tuple(gtsam.symbol("k", i) for i in cameras),
-            camera=tuple(gtsam.symbol("c", i) for i in cameras),
-            view=tuple(gtsam.symbol("v", i) for i in views),
-            dots=gtsam.symbol("d", 0),
-            free=tuple(self.free_indices(i) for i in cameras),
-            unit=tuple(parameter_unit(c)[self.free_indices(i)] for i, c in enumerate(self.cameras)),
-        )
 
 
 def whitening(covariance: Array) -> Array:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.calibration.solver.graph import Progress, Solution, solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import Progress, Solution, solve
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.factors.projection import State, pixels
 

@@ -1,17 +1,19 @@
-"""Symmetric positive systems of which one side is block diagonal, solved through the other side.
+"""The normal equations of a large calibration, solved through the Schur complement.
 
     [K  E ] [k]   [a]         D = W W^T, F = E W^-T, S = K - F F^T
     [E' D ] [d] = [b]
 
-`Reduced` holds W, F and the Cholesky factor of S, from which come solutions and what is asked for
-of the inverse: all of it, or one side and the diagonal blocks of the other.
+No view couples with a view and no dot with a dot: dots are eliminated (D), or views where that
+leaves less (Triggs et al., Bundle Adjustment, 1999, section 6). The two dots of a known distance
+couple and stay. The blocks are those that GTSAM gets (`telerig.factors.projection.image_columns`);
+they are summed up a few thousand dots at a time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,159 +21,21 @@ from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from telerig.errors import CalibrationError
+from telerig.estimator.calibration.solver.system import System, images_of
+from telerig.factors.projection import State, dot_columns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-
-class Whiten(Protocol):
-    """W^-1 or W^-T on vectors (..., E), or on the numbers of some of the blocks alone."""
-
-    def __call__(self, right: Array, some: Ints | slice = ...) -> Array: ...
+CHUNK = 4000
+"""Measured dots evaluated at once, about: fewer cost calls, more leave the cache."""
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """The block-diagonal side D = W W^T, its E numbers in any order.
-
-    forward : W^-1.  backward : W^-T.  places : (B, n) where the numbers of each block stand.
-    matrix : (B, n, n), D itself.
-    """
-
-    forward: Whiten
-    backward: Whiten
-    places: Ints
-    matrix: Array
-
-
-@dataclass(frozen=True)
-class Group:
-    """Some of the blocks, and the rows of E that are not zero there."""
-
-    blocks: Ints
-    rows: Ints
-
-
-@dataclass(frozen=True)
-class Piece:
-    """F where it is not zero: rows, columns, and the matrix there."""
-
-    rows: Ints | slice
-    columns: Ints | slice
-    matrix: Array
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """kept, eliminated : where the numbers of either side stand in the whole vector.
-
-    pieces : F.  factor : lower Cholesky factor of S, in Fortran's order.
-    """
-
-    kept: Ints
-    eliminated: Ints
-    pieces: list[Piece]
-    factor: Array
-    blocks: Blocks
-
-    @staticmethod
-    def of(
-        kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Blocks,
-        groups: Sequence[Group] = (),
-    ) -> Reduced:  # fmt: skip
-        """matrix : (K, K), which is overwritten.  coupling : (K, E); groups : where it is not zero.
-
-        Raises CalibrationError when the whole is not positive definite to working precision.
-        """
-        every = slice(None)
-        if groups:
-            pieces = [_piece(coupling, blocks, group) for group in groups]
-            for piece in pieces:
-                share = piece.matrix @ piece.matrix.T
-                matrix[np.ix_(np.asarray(piece.rows), np.asarray(piece.rows))] -= share
-            schur = matrix.T
-        else:
-            pieces = [Piece(every, every, blocks.forward(coupling))]
-            whitened = pieces[0].matrix.T
-            # a C-ordered array is its transpose in Fortran's order, here of a symmetric matrix
-            schur = dsyrk(-1.0, whitened, 1.0, matrix.T, trans=1, lower=1, overwrite_c=1)
-        factor, failed = dpotrf(schur, lower=1, overwrite_a=1, clean=0)
-        if failed:
-            raise CalibrationError(
-                "the measurements leave a direction of the calibration undetermined",
-                todo="add views with other tilts, or fix the model with --model",
-            )
-        return Reduced(kept, eliminated, pieces, factor, blocks)
-
-    def solve(self, right: Array) -> Array:
-        """right : (D,) or (D, k)."""
-        # few vectors, each along memory: a product of its own for each reads the matrix fastest
-        rows = right.reshape(len(right), -1).T.copy()
-        inner = self.blocks.forward(np.take(rows, self.eliminated, axis=1))
-        of_kept = np.take(rows, self.kept, axis=1)
-        for piece in self.pieces:
-            of_kept[:, piece.rows] -= _each(piece.matrix, inner[:, piece.columns])
-        solved, _ = dpotrs(self.factor, of_kept.T, lower=1, overwrite_b=1)
-        first = solved.T
-        for piece in self.pieces:
-            inner[:, piece.columns] -= _each(piece.matrix.T, first[:, piece.rows])
-        rows[:, self.kept] = first
-        rows[:, self.eliminated] = self.blocks.backward(inner)
-        return np.ascontiguousarray(rows.T).reshape(right.shape)
-
-    def inverse_kept(self) -> Array:
-        """(K, K) block of the inverse."""
-        inverse, _ = dpotri(self.factor, lower=1)
-        lower = np.tril(inverse)
-        return np.asarray(lower + np.tril(lower, -1).T)
-
-    def _through(self) -> Array:
-        """(K, E) chol(S)^-1 F W^-1: D^-1 plus its square is the eliminated side's inverse."""
-        whitened = np.zeros((len(self.kept), len(self.eliminated)))
-        for piece in self.pieces:
-            part = np.zeros((len(self.kept), piece.matrix.shape[1]))
-            part[piece.rows] = piece.matrix
-            whitened[:, piece.columns] = part
-        half = dtrsm(1.0, self.factor, whitened, lower=1)
-        return self.blocks.backward(np.ascontiguousarray(half))
-
-    def inverse_cross(self) -> Array:
-        """(K, E) block of the inverse."""
-        return np.asarray(-dtrsm(1.0, self.factor, self._through(), lower=1, trans_a=1))
-
-    def inverse_blocks(self) -> Array:
-        """(B, n, n) diagonal blocks of the inverse, of the eliminated side."""
-        out = np.linalg.inv(self.blocks.matrix)
-        places = self.blocks.places
-        through = self._through()
-        parts = [through[:, at] for at in places.T]
-        square = np.array([[np.einsum("kb,kb->b", a, b) for b in parts] for a in parts])
-        return np.asarray(out + np.moveaxis(square, -1, 0))
-
-    def inverse(self) -> Array:
-        """(D, D) all of the inverse."""
-        through = self._through()
-        across = -dtrsm(1.0, self.factor, through, lower=1, trans_a=1)
-        own = through.T @ through
-        places = self.blocks.places
-        own[places[:, :, None], places[:, None, :]] += np.linalg.inv(self.blocks.matrix)
-        out = np.empty((len(self.kept) + len(self.eliminated),) * 2)
-        out[np.ix_(self.kept, self.kept)] = self.inverse_kept()
-        out[np.ix_(self.kept, self.eliminated)] = across
-        out[np.ix_(self.eliminated, self.kept)] = across.T
-        out[np.ix_(self.eliminated, self.eliminated)] = own
-        return out
-
-
-def _each(matrix: Array, vectors: Array) -> Array:
-    """(k, rows) the matrix times each of (k, columns)."""
-    return np.asarray((matrix @ vectors[..., None])[..., 0])
-
-
-def _piece(coupling: Array, blocks: Blocks, group: Group) -> Piece:
-    columns = blocks.places[group.blocks].T.ravel()
-    matrix = blocks.forward(coupling[np.ix_(group.rows, columns)], group.blocks)
-    return Piece(group.rows, columns, matrix)
+def undetermined() -> CalibrationError:
+    return CalibrationError(
+        "the measurements leave a direction of the calibration undetermined",
+        todo="add views with other tilts, or fix the model with --model",
+    )
 
 
 @dataclass(frozen=True)
@@ -197,3 +61,275 @@ class Posterior:
         return Posterior(
             whole[:common, :common], cross, whole[at[:, :, None], at[:, None, :]], whole, untouched
         )
+
+
+class NormalEquations:
+    """J^T J and -J^T r in blocks, for C numbers of cameras and views, V views and N dots.
+
+    common : (C, C).  dots : (3, 3, N).  cross : (C, 3, N) of cameras and views with each dot.
+    right : (C + 3 N,).  cost : half the sum of squared residuals.
+    """
+
+    def __init__(self, system: System, state: State) -> None:
+        self.system = system
+        first, size = system.dots_at, system.size
+        count = (size - first) // 3
+        self.common, self.cross = np.zeros((first, first)), np.zeros((first, 3, count))
+        self.dots, self.right = np.zeros((3, 3, count)), np.zeros(size)
+        self.of_dots = self.right[first:].reshape(count, 3)
+        self.squared = 0.0
+        for camera in range(len(system.images)):
+            self._add_images(state, camera)
+        priors = system.priors(state)
+        self.cost = 0.5 * (self.squared + priors.squared)
+        for places, (value, jacobian) in zip(system.camera_places, priors.cameras):
+            self._add(places, jacobian, value)
+        for at, value, jacobian in zip(self._views(), *priors.views):
+            self._add(at, jacobian, value)
+        value, weight = priors.dots
+        self.dots[range(3), range(3)] += weight.T**2
+        self.of_dots -= weight * value
+        self.distance = priors.distance
+        if self.distance is not None:
+            pair, off, by_first = self.distance
+            self.of_dots[list(pair)] -= off * np.array([by_first, -by_first])
+        diagonals = np.diag(self.common), np.diagonal(self.dots).ravel()
+        self.untouched = np.concatenate(diagonals) <= 0
+
+    def _views(self) -> Ints:
+        """(V, 6) where the numbers of each view stand."""
+        return np.arange(self.system.views_at, self.system.dots_at).reshape(-1, 6)
+
+    def _add(self, at: Ints, jacobian: Array, value: Array) -> None:
+        self.common[np.ix_(at, at)] += jacobian.T @ jacobian
+        self.right[at] -= jacobian.T @ value
+
+    def _add_images(self, state: State, camera: int) -> None:
+        system = self.system
+        obs, own, views = system.images[camera], system.camera_places[camera], self._views()
+        size, width, first = len(own), len(own) + 7, system.views_at
+        gram, of_camera = (
+            np.zeros((len(views), width, width)),
+            np.zeros((size, *self.dots.shape[1:])),
+        )
+        by_view = self.cross[first:].reshape(len(views), 6, 3, -1)
+        for images in _in_chunks(images_of(obs)):
+            start = images[0][1]
+            columns = system.columns(state, camera, slice(start, images[-1][2]))
+            by_dot = np.empty((width, 3, columns.shape[-1]))
+            for j, dot_column in enumerate(dot_columns(columns)):
+                np.multiply(columns[:, 0], dot_column[0], out=by_dot[:, j])
+                by_dot[:, j] += columns[:, 1] * dot_column[1]
+            for view, a, b in images:
+                flat = columns[..., a - start : b - start].reshape(width, -1)
+                np.matmul(flat, flat.T, out=gram[view])
+                dot, block = obs.dot[a:b], by_dot[..., a - start : b - start]
+                # a slice is added in place, an index array by way of two copies
+                some = slice(dot[0], dot[-1] + 1) if dot[-1] - dot[0] + 1 == b - a else dot
+                by_view[view][..., some] += block[size:-1]
+                of_camera[..., some] += block[:size]
+                self.dots[..., some] += block[-4:-1]
+                self.of_dots[some] -= block[-1].T
+        self.cross[own] += of_camera
+        self.common[np.ix_(own, own)] += gram[:, :size, :size].sum(0)
+        self.common[views[:, :, None], views[:, None]] += gram[:, size:-1, size:-1]
+        across = gram[:, :size, size:-1].swapaxes(0, 1).reshape(size, -1)
+        self.common[own, first:] += across
+        self.common[first:, own] += across.T
+        self.right[own] -= gram[:, :size, -1].sum(0)
+        self.right[views] -= gram[:, size:-1, -1]
+        self.squared += float(gram[:, -1, -1].sum())
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """(C + 3 N,) step with Marquardt's damping, and the decrease of the cost that it promises.
+
+        Raises CalibrationError when a direction is undetermined.
+        """
+        step = self._reduced(damping).solve(self.right)
+        return step, float(0.5 * step @ self.right)
+
+    def posterior(self, whole: bool) -> Posterior:
+        """The inverse of J^T J from the factorisation that a step uses.
+
+        whole : all of it, dots with dots too.  Raises CalibrationError when it is singular.
+        """
+        reduced, size = self._reduced(0.0), len(self.common)
+        if whole:
+            return Posterior.of(reduced.inverse(), size, self.untouched)
+        common, cross, dots = reduced.inverse_blocks(size)
+        return Posterior(common, cross, dots, None, self.untouched)
+
+    def information(self) -> Array:
+        """(C + 3 N, C + 3 N) dense J^T J."""
+        kept, eliminated, matrix, coupling, blocks = self._sides(0.0)
+        out = np.zeros((len(self.right),) * 2)
+        out[np.ix_(kept, kept)] = matrix
+        flat = eliminated.ravel()
+        out[np.ix_(kept, flat)] = coupling.transpose(0, 2, 1).reshape(len(kept), -1)
+        out[np.ix_(flat, kept)] = out[np.ix_(kept, flat)].T
+        out[eliminated[:, :, None], eliminated[:, None]] = blocks
+        out[self.untouched, self.untouched] = 0.0
+        return out
+
+    def _reduced(self, damping: float) -> Reduced:
+        return Reduced.of(*self._sides(damping))
+
+    def _sides(self, damping: float) -> tuple[Ints, Ints, Array, Array, Array]:
+        """Kept, (B, n) eliminated, and the damped K (K, K), E (K, n, B) and D (B, n, n)."""
+        size, count = len(self.common), self.dots.shape[-1]
+        common = _damped(self.common, damping)
+        dots = _damped(self.dots.transpose(2, 0, 1), damping)
+        place = size + np.arange(3 * count).reshape(count, 3)
+        views = self._views()
+        if views.size <= 3 * count:
+            pair = [] if self.distance is None else list(self.distance[0])
+            rest = np.setdiff1d(np.arange(count), pair)
+            kept = np.concatenate([np.arange(size), place[pair].ravel()]).astype(int)
+            matrix = np.zeros((len(kept),) * 2)
+            matrix[:size, :size] = common
+            across = self.cross[..., pair].transpose(0, 2, 1).reshape(size, -1)
+            matrix[:size, size:], matrix[size:, :size] = across, across.T
+            matrix[size:, size:] = self._of_dots(dots, np.array(pair, int), damping)
+            coupling = np.zeros((len(kept), 3, len(rest)))
+            coupling[:size] = self.cross[..., rest]
+            return kept, place[rest], matrix, coupling, dots[rest]
+        shared = self.system.views_at
+        kept = np.concatenate([np.arange(shared), place.ravel()])
+        matrix = np.zeros((len(kept),) * 2)
+        matrix[:shared, :shared] = common[:shared, :shared]
+        across = self.cross[:shared].transpose(0, 2, 1).reshape(shared, -1)
+        matrix[:shared, shared:], matrix[shared:, :shared] = across, across.T
+        matrix[shared:, shared:] = self._of_dots(dots, np.arange(count), damping)
+        of_views = self.cross[shared:].reshape(len(views), 6, 3, count).transpose(3, 2, 1, 0)
+        coupling = np.concatenate(
+            [
+                self.common[:shared, shared:].reshape(shared, -1, 6).swapaxes(1, 2),
+                of_views.reshape(3 * count, 6, len(views)),
+            ]
+        )
+        return kept, views, matrix, coupling, common[views[:, :, None], views[:, None]]
+
+    def _of_dots(self, dots: Array, some: Ints, damping: float) -> Array:
+        """(3 n, 3 n) damped information of some dots, the known distance included."""
+        out = np.zeros((len(some), 3, len(some), 3))
+        each = np.arange(len(some))
+        out[each, :, each] = dots[some]
+        if self.distance is not None:
+            pair, _, by_first = self.distance
+            row = np.zeros((len(some), 3))
+            row[np.searchsorted(some, pair) if len(some) > 2 else [0, 1]] = by_first, -by_first
+            square = np.outer(row, row)
+            return out.reshape(square.shape) + square + damping * np.diag(np.diag(square))
+        return out.reshape(3 * len(some), 3 * len(some))
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """kept : (K,) and eliminated : (B, n), where the numbers of either side stand among all.
+
+    root : (B, n, n) inverse of W.  coupling : (K, n B) F, a component of all blocks side by side.
+    factor : lower Cholesky factor of S, in Fortran's order.
+    """
+
+    kept: Ints
+    eliminated: Ints
+    root: Array
+    coupling: Array
+    factor: Array
+
+    @staticmethod
+    def of(kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Array) -> Reduced:
+        """matrix : (K, K) K, overwritten.  coupling : (K, n, B) E.  blocks : (B, n, n) D."""
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(blocks))
+        except np.linalg.LinAlgError as error:
+            raise undetermined() from error
+        whitened = np.empty_like(coupling)
+        for i in range(root.shape[1]):
+            np.multiply(coupling[:, 0], root[:, i, 0], out=whitened[:, i])
+            for j in range(1, i + 1):
+                whitened[:, i] += coupling[:, j] * root[:, i, j]
+        flat = whitened.reshape(len(kept), -1)
+        # a C-ordered array is its transpose in Fortran's order, here of a symmetric matrix
+        schur = dsyrk(-1.0, flat.T, 1.0, matrix.T, trans=1, lower=1, overwrite_c=1)
+        factor, failed = dpotrf(schur, lower=1, overwrite_a=1, clean=0)
+        if failed:
+            raise undetermined()
+        return Reduced(kept, eliminated, root, flat, factor)
+
+    def solve(self, right: Array) -> Array:
+        """(D,) solution for a right side (D,)."""
+        inner = np.einsum("bij,bj->ib", self.root, right[self.eliminated])
+        of_kept = right[self.kept] - self.coupling @ inner.ravel()
+        first, _ = dpotrs(self.factor, of_kept, lower=1)
+        inner -= (first @ self.coupling).reshape(inner.shape)
+        out = np.empty_like(right)
+        out[self.kept] = first
+        out[self.eliminated] = np.einsum("bij,ib->bj", self.root, inner)
+        return out
+
+    def _inverse_kept(self) -> Array:
+        """(K, K) block of the inverse."""
+        lower = np.tril(dpotri(self.factor, lower=1)[0])
+        return np.asarray(lower + np.tril(lower, -1).T)
+
+    def _through(self) -> Array:
+        """(K, B, n) chol(S)^-1 F W^-1: D^-1 plus its square is the eliminated side's inverse."""
+        half = dtrsm(1.0, self.factor, self.coupling, lower=1).reshape(
+            len(self.kept), -1, len(self.root)
+        )
+        return np.asarray(np.einsum("kib,bij->kbj", half, self.root, optimize=True))
+
+    def inverse(self) -> Array:
+        """(D, D) all of the inverse."""
+        through = self._through().reshape(len(self.kept), -1)
+        flat, across = (
+            self.eliminated.ravel(),
+            -dtrsm(1.0, self.factor, through, lower=1, trans_a=1),
+        )
+        out = np.zeros((len(self.kept) + len(flat),) * 2)
+        out[np.ix_(self.kept, self.kept)] = self._inverse_kept()
+        out[np.ix_(self.kept, flat)] = across
+        out[np.ix_(flat, self.kept)] = across.T
+        out[np.ix_(flat, flat)] = through.T @ through
+        own = np.swapaxes(self.root, 1, 2) @ self.root
+        out[self.eliminated[:, :, None], self.eliminated[:, None]] += own
+        return out
+
+    def inverse_blocks(self, size: int) -> tuple[Array, Array, Array]:
+        """(C, C), (C, N, 3) and (N, 3, 3) of the inverse, C the first ``size`` numbers.
+
+        For when dots are eliminated; else from all of it.
+        """
+        if self.root.shape[1] != 3:
+            found = Posterior.of(self.inverse(), size, np.zeros(0, bool))
+            return found.common, found.cross, found.dots
+        through, inverse = self._through(), self._inverse_kept()
+        count = (len(self.kept) - size) // 3 + len(self.eliminated)
+        cross, dots = np.empty((size, count, 3)), np.empty((count, 3, 3))
+        flat = through.reshape(len(through), -1)
+        across = -dtrsm(1.0, self.factor, flat, lower=1, trans_a=1).reshape(through.shape)
+        mine, stay = (self.eliminated[:, 0] - size) // 3, (self.kept[size::3] - size) // 3
+        cross[:, mine], cross[:, stay] = across[:size], inverse[:size, size:].reshape(size, -1, 3)
+        dots[mine] = np.einsum("kbi,kbj->bij", through, through)
+        dots[mine] += np.swapaxes(self.root, 1, 2) @ self.root
+        at = size + np.arange(3 * len(stay)).reshape(-1, 3)
+        dots[stay] = inverse[at[:, :, None], at[:, None]]
+        return inverse[:size, :size], cross, dots
+
+
+def _in_chunks(images: Sequence[tuple[int, int, int]]) -> list[Sequence[tuple[int, int, int]]]:
+    """Consecutive images (view, first row, last row + 1) of about `CHUNK` measurements together."""
+    ends = [end for _, _, end in images]
+    parts = max(1, round(max(ends, default=0) / CHUNK))
+    cuts = np.unique(np.searchsorted(ends, np.linspace(0, max(ends, default=0), parts + 1)[1:]) + 1)
+    return [images[a:b] for a, b in pairwise([0, *cuts.tolist()])] if images else []
+
+
+def _damped(matrix: Array, damping: float) -> Array:
+    """Marquardt's damping; what nothing touches (a view left out) stays where it is."""
+    out = matrix.copy()
+    i = np.arange(matrix.shape[-1])
+    diagonal = matrix[..., i, i]
+    out[..., i, i] = np.where(diagonal > 0, diagonal * (1 + damping), 1.0)
+    return out

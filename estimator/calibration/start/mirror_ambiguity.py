@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.factors.projection import State
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.lens.cross_validation import pose_only
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust import robust_solve
 from telerig.factors.projection import State, whitened_error, whitened_residuals

@@ -18,7 +18,7 @@ from telerig.estimator.calibration.lens.considered_parameters import (
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver import covariance
 from telerig.estimator.calibration.solver.covariance import aligned_shift, joint_covariance
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.start.known_target import stereo_states
 from telerig.io.simulation.presets import preset

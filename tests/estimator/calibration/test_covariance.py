@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from telerig.estimator.calibration.self_calibration import with_plate
-from telerig.estimator.calibration.solver import graph
+from telerig.estimator.calibration.solver import levenberg_marquardt as graph
 from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.nonlinear_graph import nonlinear_graph
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal, parameter_unit
 from telerig.estimator.calibration.start import known_target
 from telerig.io.simulation.presets import preset
@@ -20,10 +21,10 @@ from telerig.io.simulation.presets import preset
 
 def by_marginals(problem: Problem, state: Any) -> Any:
     """Covariance of all variables, in the order and units of `JointCovariance`."""
-    factors, values, keys = graph.build(problem, state)
+    factors, values, keys = nonlinear_graph(problem, state)
     marginals = gtsam.Marginals(factors, values)
     ordered = [k for c, k in enumerate(keys.intrinsics) if problem.free[c]]
-    ordered += [*keys.camera[1:], *keys.view, keys.dots]
+    ordered += [*keys.camera[1:], *keys.view, *keys.dots]
     joint = marginals.jointMarginalCovariance(ordered)
     blocks = [[joint.at(a, b) for b in ordered] for a in ordered]
     unit = np.ones(sum(b.shape[1] for b in blocks[0]))

@@ -24,7 +24,7 @@ from telerig.estimator.calibration.lens.search import (
     steps_to,
 )
 from telerig.estimator.calibration.self_calibration import choose_model
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.factors.projection import whitened_error

@@ -14,7 +14,7 @@ import pytest
 
 from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
-from telerig.estimator.calibration.solver.graph import solve
+from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import cameras_from_state, held_at_nominal
 from telerig.estimator.calibration.views.next_view import NextView, next_view
 from telerig.estimator.calibration.views.poses import Candidates, candidates, dots_seen

@@ -116,9 +116,9 @@ def test_the_products_gauge_removes_exactly_what_is_unseen() -> None:
     _, of_pose = depth_gauge_residual(state.rig_from_camera[1], 1.0)
     gauge = np.zeros((2, rows.shape[1]))
     gauge[:, at : at + 6] = of_pose
-    _, of_dots = distance_residual(state.dots_mm, (0, 24), 33.0, 1.0)
+    _, by_first = distance_residual(state.dots_mm[0], state.dots_mm[24], 33.0, 1.0)
     scale = np.zeros((1, rows.shape[1]))
-    scale[:, -75:] = of_dots
+    scale[:, -75:-72], scale[:, -3:] = by_first, -by_first
     prior = np.eye(rows.shape[1])[-75:]
     assert unseen(np.r_[rows, gauge]) == 7
     assert unseen(np.r_[rows, gauge, scale]) == 6

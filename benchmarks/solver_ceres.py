@@ -1,26 +1,20 @@
-"""The calibration a measured dot at a time: pyceres and GTSAM with one Python residual per dot.
+"""The calibration by pyceres with one Python residual for each measured dot.
 
 The residual is written for its own sake, in plain Python numbers with a few small products, as
-somebody would who knows these solvers; the model is `solver_problem.MODEL`.
+somebody would who knows the solver; the model is `solver_problem.MODEL`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from solver_scipy import right_jacobian
 
-from telerig.estimator.calibration.solver.array_system import ArraySystem
 from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem
-from telerig.factors.priors import (
-    custom_factor,
-    depth_gauge_residual,
-    diagonal_prior,
-    distance_residual,
-)
+from telerig.estimator.calibration.solver.system import System
+from telerig.factors.priors import depth_gauge_residual, distance_residual
 from telerig.factors.projection import State
 from telerig.rig.pose import rotation_from_rotvec
 from telerig.rig.projection import INDEX
@@ -36,7 +30,7 @@ class Dotwise:
 
     def __init__(self, problem: Problem, start: State) -> None:
         self.problem, self.start = problem, start
-        self.system = ArraySystem(problem, start)
+        self.system = System(problem)
         for free in self.system.free:
             assert free.tolist() == _ORDER
         centre = [INDEX["centre_u_px"], INDEX["centre_v_px"]]
@@ -85,104 +79,10 @@ def _cross_and_one(point: Array, sign: float) -> Array:
     return np.array([[0, -c, b, -sign, 0, 0], [c, 0, -a, 0, -sign, 0], [-b, a, 0, 0, 0, -sign]])
 
 
-# --- GTSAM
-
-
-def gtsam_solve(problem: Problem, start: State) -> tuple[State, int]:
-    """One CustomFactor and one key per dot, GTSAM's Levenberg-Marquardt."""
-    model, keys = Dotwise(problem, start), problem.keys()
-    dot_keys = [gtsam.symbol("d", i) for i in range(len(problem.dot_ids))]
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for m, (v, c, d) in enumerate(zip(model.obs.view, model.obs.camera, model.obs.dot)):
-        graph.add(_dot_factor(model, m, int(c), [keys.view[v], dot_keys[d], *_of(keys, int(c))]))
-    for key, nominal, sigma in zip(dot_keys, problem.nominal_mm, problem.dot_sigma_mm):
-        graph.add(diagonal_prior(key, nominal, sigma))
-    _add_gtsam_priors(graph, model, keys, dot_keys)
-    for key, pose in zip(keys.view, start.rig_from_target):
-        values.insert(key, gtsam.Pose3(pose))
-    values.insert(keys.camera[1], gtsam.Pose3(start.rig_from_camera[1]))
-    for key in keys.intrinsics:
-        values.insert(key, np.zeros(len(LENS)))
-    for key, dot in zip(dot_keys, start.dots_mm):
-        values.insert(key, dot)
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-11)
-    params.setAbsoluteErrorTol(0.0)
-    params.setOrdering(_ordering(keys, dot_keys))
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
-    found = optimizer.optimize()
-    intrinsics = start.intrinsics.copy()
-    for c in range(2):
-        intrinsics[c, _ORDER] = model.lens(c, found.atVector(keys.intrinsics[c]))
-    cameras = np.array([np.eye(4), found.atPose3(keys.camera[1]).matrix()])
-    views = np.array([found.atPose3(k).matrix() for k in keys.view])
-    dots = np.array([found.atVector(k) for k in dot_keys])
-    return State(intrinsics, cameras, views, dots), int(optimizer.iterations())
-
-
-def _of(keys: Any, camera: int) -> list[int]:
-    return [keys.intrinsics[camera], *([keys.camera[1]] if camera else [])]
-
-
-def _ordering(keys: Any, dot_keys: list[int]) -> Any:
-    """Dots are eliminated first."""
-    out = gtsam.Ordering()
-    for key in (*dot_keys, *keys.view, *keys.intrinsics, keys.camera[1]):
-        out.push_back(key)
-    return out
-
-
-def _dot_factor(model: Dotwise, m: int, camera: int, keys: list[int]) -> Any:
-    def error(_this: Any, values: Any, jacobians: list[Array] | None) -> Array:
-        view = values.atPose3(keys[0]).matrix()
-        point = values.atVector(keys[1])
-        lens = model.lens(camera, values.atVector(keys[2]))
-        turn, place = view[:3, :3], view[:3, 3]
-        if camera:
-            pose = values.atPose3(keys[3]).matrix()
-            back = pose[:3, :3].T
-            turn, place = back @ turn, back @ (place - pose[:3, 3])
-        value, by_point, by_lens, in_camera = model.dot(m, camera, lens, turn, place, point)
-        if jacobians is not None:
-            by_dot = by_point @ turn
-            jacobians[0] = by_dot @ _cross_and_one(point, -1.0)
-            jacobians[1], jacobians[2] = by_dot, by_lens
-            if camera:
-                jacobians[3] = by_point @ _cross_and_one(in_camera, 1.0)
-        return value
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(2), keys, error)
-
-
-def _add_gtsam_priors(graph: Any, model: Dotwise, keys: Any, dot_keys: list[int]) -> None:
-    problem, start = model.problem, model.start
-    assert problem.scale is not None
-    (a, b), distance, sigma = problem.scale
-
-    def far(values: Any) -> tuple[Array, list[Array]]:
-        pair = np.array([values.atVector(dot_keys[a]), values.atVector(dot_keys[b])])
-        value, jacobian = distance_residual(pair, (0, 1), distance, sigma)
-        return value, [jacobian[:, :3], jacobian[:, 3:]]
-
-    def gauge(values: Any) -> tuple[Array, list[Array]]:
-        pose = values.atPose3(keys.camera[1]).matrix()
-        value, jacobian = depth_gauge_residual(pose, GAUGE_SIGMA_MM)
-        return value, [jacobian]
-
-    graph.add(custom_factor([dot_keys[a], dot_keys[b]], 1, [3, 3], far))
-    graph.add(custom_factor([keys.camera[1]], 2, [6], gauge))
-    for c in range(2):
-        pull, weight = model.system.intrinsic_pull(start, c)
-        graph.add(diagonal_prior(keys.intrinsics[c], -pull / weight, 1 / weight))
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, model.system.loose_mm)
-    for key in keys.view:
-        graph.add(gtsam.PoseTranslationPrior3D(key, gtsam.Pose3(), noise))
-
-
 # --- pyceres
 
 
-def ceres_solve(problem: Problem, start: State) -> tuple[State, int]:
+def solve(problem: Problem, start: State) -> tuple[State, int]:
     """One Python cost per measured dot, dots eliminated (DENSE_SCHUR); poses as tangents."""
     import pyceres
 
@@ -219,7 +119,9 @@ def ceres_solve(problem: Problem, start: State) -> tuple[State, int]:
     for view, function in zip(views, poses.loose(model)):
         add(3, [view], function)
     for c in range(2):
-        add(len(LENS), [lens[c]], _linear(*model.system.intrinsic_pull(start, c)))
+        value, jacobian = model.system.priors(start).cameras[c]
+        size = len(LENS)
+        add(size, [lens[c]], _linear(value[:size], np.diag(jacobian)[:size]))
     for dot, nominal, sigma in zip(dots, problem.nominal_mm, problem.dot_sigma_mm):
         add(3, [dot], _linear(-nominal / sigma, 1 / sigma))
     add(2, [second], poses.gauge)
@@ -244,8 +146,8 @@ def _linear(offset: Array, weight: Array) -> Any:
 
 def _far(distance: float, sigma: float) -> Any:
     def function(a: Array, b: Array) -> Any:
-        value, jacobian = distance_residual(np.array([a, b]), (0, 1), distance, sigma)
-        return value, lambda: [jacobian[:, :3], jacobian[:, 3:]]
+        value, by_first = distance_residual(a, b, distance, sigma)
+        return value[None], lambda: [by_first[None], -by_first[None]]
 
     return function
 
@@ -303,7 +205,7 @@ class Poses:
         """Each view's place, linear in its tangent."""
         out = []
         for pose in self.start.rig_from_target:
-            gain = np.concatenate([np.zeros((3, 3)), pose[:3, :3]], 1) / model.system.loose_mm
-            at = pose[:3, 3] / model.system.loose_mm
+            gain = np.concatenate([np.zeros((3, 3)), pose[:3, :3]], 1) / model.system.place_sigma_mm
+            at = pose[:3, 3] / model.system.place_sigma_mm
             out.append(lambda x, g=gain, a=at: (a + g @ x, lambda: [g]))
         return out

@@ -1,0 +1,274 @@
+"""The linear factors of a calibration, eliminated by GTSAM.
+
+Keys are cameras, views and groups of dots. Whitened blocks of all images are made as arrays and
+handed over as one `JacobianFactor` for each camera, view and group that it sees: with a group as
+one variable a factor holds some 30 rows, and what an object costs is spread over them. Columns
+are scaled to unit length: GTSAM's Cholesky refuses pivots of very different size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotri
+
+from telerig.estimator.calibration.solver.schur import Posterior, undetermined
+from telerig.estimator.calibration.solver.system import System
+from telerig.factors.linear_factors import add_linear_factors
+from telerig.factors.projection import State
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LEAST_PIVOT = 1e-10
+"""Of columns of unit length, what elimination has to leave of one."""
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Where one camera's M measurements stand in P factors of one view and one group of G dots.
+
+    view, group : (P,).  place : (M,) factor times G plus the dot's number in its group.
+    """
+
+    view: Ints
+    group: Ints
+    place: Ints
+
+
+class GraphLayout:
+    """The variables of a problem's graph: cameras, then views, then groups of dots.
+
+    Dots are filled up to whole groups; a dot that is none is a variable that nothing touches.
+    places : per variable where its numbers stand among the W of the graph.
+    families : keys of variables of one size.  order : of elimination.
+    """
+
+    def __init__(self, system: System) -> None:
+        problem, self.system = system.problem, system
+        count, cameras, views = len(problem.dot_ids), len(problem.cameras), len(problem.views)
+        self.per_group = 8 if count <= 30 else 16
+        groups = -(-count // self.per_group)
+        self.view_key = cameras + np.arange(views)
+        self.group_key = cameras + views + np.arange(groups)
+        self.size = system.dots_at + 3 * self.per_group * groups
+        self.of_views = np.arange(system.views_at, system.dots_at).reshape(views, 6)
+        self.of_groups = np.arange(system.dots_at, self.size).reshape(groups, -1)
+        self.places = [*system.camera_places, *self.of_views, *self.of_groups]
+        self.families = [np.array([c]) for c in range(cameras)]
+        self.families += [self.view_key, self.group_key]
+        first, second = self.view_key, self.group_key
+        if views <= count:
+            first, second = second, first
+        self.order = [*first.tolist(), *second.tolist(), *range(cameras)]
+        self.images = [self._images(obs.view, obs.dot) for obs in system.images]
+
+    def _images(self, view: Ints, dot: Ints) -> _Images:
+        group, slot = np.divmod(dot, self.per_group)
+        pairs, which = np.unique(view * len(self.group_key) + group, return_inverse=True)
+        return _Images(*np.divmod(pairs, len(self.group_key)), which * self.per_group + slot)
+
+    def gtsam_order(self) -> Any:
+        import gtsam
+
+        order = gtsam.Ordering()
+        for key in self.order:
+            order.push_back(key)
+        return order
+
+
+class GraphEquations:
+    """The Gaussian factor graph of a problem at one state.
+
+    cost : half the sum of squared residuals.  square, right : (W,) diagonal of J^T J, and -J^T r.
+    """
+
+    def __init__(self, layout: GraphLayout, state: State) -> None:
+        self.layout, system = layout, layout.system
+        self.square, self.right = np.zeros((2, layout.size))
+        self.priors = system.priors(state)
+        self.columns = [self._padded(state, c) for c in range(len(layout.images))]
+        images = (float(np.vdot(columns[-1], columns[-1])) for columns in self.columns)
+        self.cost = 0.5 * (sum(images) + self.priors.squared)
+        self._add_priors()
+        self.untouched = self.square <= 0
+        self.scale = 1 / np.sqrt(np.where(self.untouched, 1.0, self.square))
+
+    def _padded(self, state: State, camera: int) -> Array:
+        """(S + 7, 2, P, G) columns of a camera, summed up in ``square`` and ``right`` besides."""
+        layout, where = self.layout, self.layout.images[camera]
+        columns = layout.system.columns(state, camera)
+        shape = (*columns.shape[:2], len(where.view), layout.per_group)
+        padded = columns
+        if columns[0].size != np.prod(shape[1:]):
+            padded = np.zeros((*shape[:2], shape[2] * shape[3]))
+            padded[..., where.place] = columns
+        padded = padded.reshape(shape)
+        for out, products in (
+            (self.square, (padded * padded).sum(1)),
+            (self.right, -(padded * padded[-1]).sum(1)),
+        ):
+            own = layout.system.camera_places[camera]
+            out[own] += products[: len(own)].sum((1, 2))
+            np.add.at(out, layout.of_views[where.view], products[-7:-1].sum(2).T)
+            of_dots = products[-4:-1].transpose(1, 2, 0).reshape(len(where.group), -1)
+            np.add.at(out, layout.of_groups[where.group], of_dots)
+        return padded
+
+    def _add_priors(self) -> None:
+        layout, priors = self.layout, self.priors
+        for own, (value, jacobian) in zip(layout.system.camera_places, priors.cameras):
+            self.square[own] += (jacobian**2).sum(0)
+            self.right[own] -= value @ jacobian
+        value, jacobian = priors.views
+        self.square[layout.of_views] += (jacobian**2).sum(1)
+        self.right[layout.of_views] -= np.einsum("vr,vrk->vk", value, jacobian)
+        first, last = layout.system.dots_at, layout.system.size
+        self.square[first:last] += priors.dots[1].ravel() ** 2
+        self.right[first:last] -= (priors.dots[0] * priors.dots[1]).ravel()
+        if priors.distance is not None:
+            pair, off, by_first = priors.distance
+            rows = np.array([by_first, -by_first])
+            at = first + 3 * np.array(pair)[:, None] + np.arange(3)
+            self.square[at] += rows**2
+            self.right[at] -= off * rows
+
+    @cached_property
+    def _undamped(self) -> Any:
+        """The graph of all factors, each column in units of its length."""
+        import gtsam
+
+        graph = gtsam.GaussianFactorGraph()
+        for camera in range(len(self.columns)):
+            self._add_images(graph, camera)
+        self._add_prior_factors(graph)
+        return graph
+
+    def _add_images(self, graph: Any, camera: int) -> None:
+        """One factor for each view and group of dots that the camera sees."""
+        layout, where, padded = self.layout, self.layout.images[camera], self.columns[camera]
+        own, per = layout.system.camera_places[camera], layout.per_group
+        of_camera = padded[: len(own)] * self.scale[own][:, None, None, None]
+        of_view = padded[-7:-1] * self.scale[layout.of_views[where.view]].T[:, None, :, None]
+        scale = self.scale[layout.of_groups[where.group]].reshape(-1, per, 3)
+        each = np.arange(per)
+        of_dots = np.zeros((len(where.group), per, 3, 2, per))
+        of_dots[:, each, :, :, each] = (
+            padded[-4:-1] * scale.transpose(2, 0, 1)[:, None]
+        ).transpose(3, 2, 0, 1)
+        blocks = [
+            *(part.transpose(2, 0, 1, 3) for part in (of_camera, of_view)),
+            of_dots.reshape(len(where.group), 3 * per, 2, per),
+        ]
+        add_linear_factors(
+            graph,
+            (camera, layout.view_key[where.view], layout.group_key[where.group]),
+            [b.reshape(*b.shape[:2], 2 * per).swapaxes(1, 2) for b in blocks],
+            -padded[-1].swapaxes(0, 1).reshape(len(where.view), 2 * per),
+        )
+
+    def _add_prior_factors(self, graph: Any) -> None:
+        layout, priors, scale = self.layout, self.priors, self.scale
+        for camera, (value, jacobian) in enumerate(priors.cameras):
+            block = jacobian * scale[layout.system.camera_places[camera]]
+            add_linear_factors(graph, (camera,), (block,), -value[None])
+        value, jacobian = priors.views
+        add_linear_factors(
+            graph, (layout.view_key,), (jacobian * scale[layout.of_views][:, None],), -value
+        )
+        value, weight = np.zeros((2, *layout.of_groups.shape))
+        value.flat[: priors.dots[0].size] = priors.dots[0].flat
+        weight.flat[: priors.dots[1].size] = priors.dots[1].flat
+        blocks = (weight * scale[layout.of_groups])[:, None] * np.eye(weight.shape[1])
+        add_linear_factors(graph, (layout.group_key,), (blocks,), -value)
+        if priors.distance is not None:
+            pair, off, by_first = priors.distance
+            groups, slots = np.divmod(np.array(pair), layout.per_group)
+            rows = np.zeros((2, layout.per_group, 3))
+            rows[[0, 1], slots] = by_first, -by_first
+            rows = rows.reshape(2, 1, -1) * scale[layout.of_groups[groups]][:, None]
+            keys = layout.group_key[groups]
+            if groups[0] == groups[1]:
+                rows, keys = rows.sum(0, keepdims=True), keys[:1]
+            add_linear_factors(graph, [*keys], [*rows[:, None]], np.array([[-off]]))
+
+    def _graph(self, damping: float) -> Any:
+        """The damped graph; what nothing touches stays."""
+        import gtsam
+
+        graph = gtsam.GaussianFactorGraph()
+        graph.push_back(self._undamped)
+        weight = np.sqrt(np.where(self.untouched, 1.0, damping))
+        if weight.any():
+            for keys in self.layout.families:
+                diagonal = weight[[self.layout.places[key] for key in keys.tolist()]]
+                blocks = diagonal[:, None] * np.eye(diagonal.shape[1])
+                add_linear_factors(graph, (keys,), (blocks,), np.zeros_like(diagonal))
+        return graph
+
+    def _net(self, damping: float) -> Any:
+        """The Bayes net: by Cholesky, or by QR where a pivot is too small for it.
+
+        That is so where a view is seen by one camera alone: along its axis the loose prior is all.
+        """
+        import gtsam
+
+        graph, order = self._graph(damping), self.layout.gtsam_order()
+        try:
+            return graph.eliminateSequential(order)
+        except RuntimeError:
+            return graph.eliminateSequential(order, gtsam.EliminateQR)
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """(D,) step with Marquardt's damping, and the decrease of the cost that it promises."""
+        step = np.empty(self.layout.size)
+        step[np.concatenate(self.layout.places)] = self._net(damping).optimize().vector()
+        step *= self.scale
+        return step[: self.layout.system.size], float(0.5 * step @ self.right)
+
+    def posterior(self, whole: bool) -> Posterior:
+        """The inverse of J^T J from the Bayes net of the undamped graph; all of it in any case.
+
+        Raises CalibrationError when it is singular to working precision.
+        """
+        del whole
+        root, place = self._square_root()
+        inverse, failed = dpotri(root, lower=0, overwrite_c=1)
+        if failed:
+            raise undetermined()
+        inverse = np.triu(inverse) + np.triu(inverse, 1).T
+        matrix, scale = np.empty_like(inverse), self.scale[place]
+        matrix[np.ix_(place, place)] = inverse * scale[:, None] * scale
+        size = self.layout.system.size
+        return Posterior.of(matrix[:size, :size], self.layout.system.dots_at, self.untouched[:size])
+
+    def information(self) -> Array:
+        """(D, D) dense J^T J."""
+        root, place = self._square_root()
+        scaled = root / self.scale[place]
+        out = np.empty_like(root)
+        out[np.ix_(place, place)] = scaled.T @ scaled
+        out[self.untouched, self.untouched] = 0.0
+        return out[: self.layout.system.size, : self.layout.system.size]
+
+    def _square_root(self) -> tuple[Array, Ints]:
+        """(W, W) upper triangle R of the Bayes net, and where each of its columns stands."""
+        net = self._net(0.0)
+        place = np.concatenate([self.layout.places[key] for key in self.layout.order])
+        row_of = np.empty_like(place)
+        row_of[place] = np.arange(len(place))
+        root = np.zeros((len(place), len(place)), order="F")
+        for i in range(net.size()):
+            conditional = net.at(i)
+            keys = list(conditional.keys())
+            own, *parents = (row_of[self.layout.places[key]] for key in keys)
+            root[np.ix_(own, own)] = conditional.R()
+            if parents:
+                root[np.ix_(own, np.concatenate(parents))] = conditional.S()
+        if np.abs(np.diag(root)).min() < LEAST_PIVOT:
+            raise undetermined()
+        return root, place

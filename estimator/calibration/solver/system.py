@@ -1,0 +1,175 @@
+"""The whitened residuals of a problem, and their derivatives, at any state.
+
+Every solver reads the same arrays: those of the images from
+`telerig.factors.projection.image_columns`, those of everything else from `Priors`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.estimator.calibration.solver.problem import (
+    GAUGE_SIGMA_MM,
+    Problem,
+    parameter_unit,
+    prior_sigma,
+)
+from telerig.factors.priors import depth_gauge_residual, distance_residual, place_residual
+from telerig.factors.projection import Observations, State, image_columns, whitened_image_error
+from telerig.io.machine.memory import keep_freed_memory
+from telerig.rig.pose import rotation_from_rotvec
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Whitened residuals and derivatives of everything that is no image.
+
+    cameras : per camera (r,) and (r, S) by its free intrinsics and, for all but the first, its
+    pose: weak priors and the depth gauge.  views : (V, 3) and (V, 3, 6), loose places.
+    dots : (N, 3) and (N, 3), the diagonal: nominal places.
+    distance : the two dots, a number and (3,) by the first of them, or None.
+    """
+
+    cameras: list[tuple[Array, Array]]
+    views: tuple[Array, Array]
+    dots: tuple[Array, Array]
+    distance: tuple[tuple[int, int], float, Array] | None
+
+    @property
+    def squared(self) -> float:
+        parts = [*(value for value, _ in self.cameras), self.views[0], self.dots[0]]
+        far = self.distance[1] ** 2 if self.distance is not None else 0.0
+        return float(sum(np.vdot(part, part) for part in parts)) + far
+
+
+class System:
+    """A problem's residuals as functions of the state.
+
+    images : per camera its measurements in the order view, dot.
+    camera_places : per camera where its S numbers stand among all: free intrinsics, then pose.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        keep_freed_memory()
+        self.problem = problem
+        self.place_sigma_mm = 10 * max(problem.rho_mm)
+        cameras = range(len(problem.cameras))
+        self.free = [problem.free_indices(c) for c in cameras]
+        self.unit = [parameter_unit(k)[f] for k, f in zip(problem.cameras, self.free)]
+        self.sigma = [prior_sigma(k)[f] for k, f in zip(problem.cameras, self.free)]
+        place = slots(problem)
+        every = np.arange(place["dots"][0].stop)
+        self.camera_places = [
+            np.r_[every[place["intrinsics"][c]], every[place["camera"][c]]] for c in cameras
+        ]
+        self.views_at = place["view"][0].start if problem.views else place["dots"][0].start
+        self.dots_at, self.size = place["dots"][0].start, place["dots"][0].stop
+        observations = problem.observations()
+        self.images = [_of_camera(observations, c) for c in cameras]
+
+    def columns(self, state: State, camera: int, rows: slice = slice(None)) -> Array:
+        """(S + 7, 2, M) `image_columns` of some of a camera's measurements, in units of a step."""
+        obs = self.images[camera].subset(rows)
+        out = image_columns(
+            state, obs, camera, self.problem.rho_mm[camera], self.free[camera].tolist()
+        )
+        out[: len(self.free[camera])] *= self.unit[camera][:, None, None]
+        return out
+
+    def cost(self, state: State) -> float:
+        """Half the sum of all squared residuals."""
+        errors = [self.error(state, c) for c in range(len(self.images))]
+        return 0.5 * (sum(float(np.vdot(e, e)) for e in errors) + self.priors(state).squared)
+
+    def error(self, state: State, camera: int) -> Array:
+        """(2, M) whitened residuals of one camera's measurements, without derivatives."""
+        rho_mm = self.problem.rho_mm[camera]
+        return whitened_image_error(state, self.images[camera], camera, rho_mm)
+
+    def priors(self, state: State) -> Priors:
+        problem, cameras = self.problem, []
+        for c, nominal in enumerate(problem.cameras):
+            free, unit, sigma = self.free[c], self.unit[c], self.sigma[c]
+            value = (state.intrinsics[c] - nominal.intrinsics)[free] / sigma
+            jacobian = np.diag(unit / sigma)
+            if c:
+                # only the second camera fixes where the origin lies along the first one's axis
+                gauge, by_pose = depth_gauge_residual(state.rig_from_camera[c], GAUGE_SIGMA_MM)
+                first = 0 if c == 1 else 1
+                value = np.concatenate([value, gauge[first:]])
+                whole = np.zeros((len(value), len(free) + 6))
+                whole[: len(free), : len(free)] = jacobian
+                whole[len(free) :, len(free) :] = by_pose[first:]
+                jacobian = whole
+            cameras.append((value, jacobian))
+        views = place_residual(state.rig_from_target, self.place_sigma_mm)
+        sigma = np.broadcast_to(problem.dot_sigma_mm, state.dots_mm.shape)
+        dots = (state.dots_mm - problem.nominal_mm) / sigma, 1 / sigma
+        distance = None
+        if problem.scale is not None:
+            (a, b), length, sd = problem.scale
+            off, by_first = distance_residual(state.dots_mm[a], state.dots_mm[b], length, sd)
+            distance = (a, b), float(off), by_first
+        return Priors(cameras, views, dots, distance)
+
+    def moved(self, state: State, step: Array) -> State:
+        """The state after a step: poses R exp(w), t + R v."""
+        intrinsics, cameras = state.intrinsics.copy(), state.rig_from_camera.copy()
+        for c, (free, unit, places) in enumerate(zip(self.free, self.unit, self.camera_places)):
+            intrinsics[c, free] += step[places[: len(free)]] * unit
+            if c:
+                cameras[c] = retracted(cameras[c], step[places[len(free) :]])
+        of_views = step[self.views_at : self.dots_at].reshape(-1, 6)
+        return replace(
+            state,
+            intrinsics=intrinsics,
+            rig_from_camera=cameras,
+            rig_from_target=retracted(state.rig_from_target, of_views),
+            dots_mm=state.dots_mm + step[self.dots_at :].reshape(-1, 3),
+        )
+
+
+def slots(problem: Problem) -> dict[str, list[slice]]:
+    """Where each variable's components stand in the information matrix."""
+    out: dict[str, list[slice]] = {"intrinsics": [], "camera": [], "view": [], "dots": []}
+    at = 0
+    sizes = [("intrinsics", len(f)) for f in problem.free]
+    sizes += [("camera", 0 if c == 0 else 6) for c in range(len(problem.cameras))]
+    sizes += [("view", 6)] * len(problem.views) + [("dots", problem.nominal_mm.size)]
+    for name, size in sizes:
+        out[name].append(slice(at, at + size))
+        at += size
+    return out
+
+
+def images_of(obs: Observations) -> list[tuple[int, int, int]]:
+    """(view, first row, last row + 1) of every image of one camera."""
+    edges = np.flatnonzero(np.diff(obs.view, prepend=-1, append=-1)).tolist()
+    return [(int(obs.view[a]), a, b) for a, b in pairwise(edges)]
+
+
+def _of_camera(obs: Observations, camera: int) -> Observations:
+    """One camera's measurements in the order view, dot; components contiguous in memory."""
+    mine = np.flatnonzero(obs.camera == camera)
+    mine = mine[np.lexsort((obs.dot[mine], obs.view[mine]))]
+    part = obs.subset(mine)
+    uv, whitener = (
+        np.ascontiguousarray(np.moveaxis(a, 0, -1)) for a in (part.uv_px, part.whitener)
+    )
+    return replace(part, uv_px=uv.T, whitener=np.moveaxis(whitener, -1, 0))
+
+
+def retracted(pose: Array, tangent: Array) -> Array:
+    """(..., 4, 4) poses moved by (..., 6) tangents (rotation, translation)."""
+    out = pose.copy()
+    turn = pose[..., :3, :3]
+    out[..., :3, :3] = turn @ rotation_from_rotvec(tangent[..., :3])
+    out[..., :3, 3] += (turn @ tangent[..., 3:, None])[..., 0]
+    return out

@@ -1,0 +1,135 @@
+"""The factors of a self-calibration as `gtsam.CustomFactor`, for graphs of one's own.
+
+Each wraps the NumPy function that states it; the solvers of telerig do not go through them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.factors.priors import depth_gauge_residual, distance_residual, place_residual
+from telerig.factors.projection import Observations, State, dot_columns, image_columns
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Residual = Callable[[Any], tuple[Array, list[Array]]]
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Keys of a calibration's variables.
+
+    intrinsics : per camera, a vector of F_c free intrinsics, as differences from the start in
+    units of ``unit``.  camera : per camera, its Pose3 rig_from_camera; the first is not used.
+    view : per view, its Pose3 rig_from_target.  dots : per dot, its place (3,).
+    free : per camera, indices into `PARAMETERS`.  unit : per camera (F_c,).
+    """
+
+    intrinsics: tuple[int, ...]
+    camera: tuple[int, ...]
+    view: tuple[int, ...]
+    dots: tuple[int, ...]
+    free: tuple[Ints, ...]
+    unit: tuple[Array, ...]
+
+
+def custom_factor(keys: Sequence[int], columns: Sequence[int], rows: int, f: Residual) -> Any:
+    """A `gtsam.CustomFactor` of unit noise round ``f(values) -> (rows,), [(rows, columns[k])]``.
+
+    A Jacobian with the wrong number of rows is a segmentation fault in GTSAM and a wrong number
+    of columns goes unseen, so shapes are checked: AssertionError.
+    """
+    import gtsam
+
+    shapes = [(rows, n) for n in columns]
+
+    def error(_this: Any, values: Any, jacobians: list[Array] | None) -> Array:
+        value, blocks = f(values)
+        if value.shape != (rows,):
+            raise AssertionError(f"factor of {rows} rows returned {value.shape}")
+        if [b.shape for b in blocks] != shapes or len(shapes) != len(keys):
+            raise AssertionError(f"factor of Jacobians {shapes} gave {[b.shape for b in blocks]}")
+        if jacobians is not None:
+            for i, block in enumerate(blocks):
+                jacobians[i] = np.asfortranarray(block)
+        return value
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), list(keys), error)
+
+
+def image_factor(keys: Keys, start: State, image: Observations, camera: int, rho_mm: float) -> Any:
+    """The factor of one image's M dots; ``image`` holds the measurements of one view and camera."""
+    view, free, unit = int(image.view[0]), keys.free[camera], keys.unit[camera]
+    variables = [*([keys.intrinsics[camera]] if len(free) else []), keys.view[view]]
+    variables += [keys.camera[camera]] if camera else []
+    columns = [*([len(free)] if len(free) else []), 6, *([6] if camera else [])]
+    variables += [keys.dots[dot] for dot in image.dot.tolist()]
+    rows = 2 * len(image)
+
+    def residual(values: Any) -> tuple[Array, list[Array]]:
+        state = _image_state(values, keys, start, image, camera)
+        found = image_columns(state, image, camera, rho_mm, free.tolist())
+        found[: len(free)] *= unit[:, None, None]
+        flat = found.transpose(2, 1, 0).reshape(rows, -1)
+        own, pose = flat[:, : len(free)], flat[:, len(free) : -7]
+        blocks = [*([own] if len(free) else []), flat[:, -7:-1], *([pose] if camera else [])]
+        for m, by_dot in enumerate(dot_columns(found).transpose(2, 1, 0)):
+            blocks.append(np.zeros((rows, 3)))
+            blocks[-1][2 * m : 2 * m + 2] = by_dot
+        return flat[:, -1], blocks
+
+    return custom_factor(variables, columns + [3] * len(image), rows, residual)
+
+
+def _image_state(values: Any, keys: Keys, start: State, image: Observations, camera: int) -> State:
+    """The start with the variables of one image replaced by those of a `gtsam.Values`."""
+    intrinsics, cameras = start.intrinsics.copy(), start.rig_from_camera.copy()
+    views, dots = start.rig_from_target.copy(), start.dots_mm.copy()
+    free, view = keys.free[camera], int(image.view[0])
+    if len(free):
+        intrinsics[camera, free] += values.atVector(keys.intrinsics[camera]) * keys.unit[camera]
+    if camera:
+        cameras[camera] = values.atPose3(keys.camera[camera]).matrix()
+    views[view] = values.atPose3(keys.view[view]).matrix()
+    for dot in image.dot.tolist():
+        dots[dot] = values.atVector(keys.dots[dot])
+    return replace(
+        start, intrinsics=intrinsics, rig_from_camera=cameras, rig_from_target=views, dots_mm=dots
+    )
+
+
+def distance_factor(first: int, second: int, distance_mm: float, sigma_mm: float) -> Any:
+    """The known distance of two dots, whose keys are given."""
+
+    def residual(values: Any) -> tuple[Array, list[Array]]:
+        ends = values.atVector(first), values.atVector(second)
+        value, by_first = distance_residual(*ends, distance_mm, sigma_mm)
+        return value.reshape(1), [by_first[None], -by_first[None]]
+
+    return custom_factor([first, second], [3, 3], 1, residual)
+
+
+def depth_gauge_factor(key: int, sigma_mm: float, *, second: bool) -> Any:
+    """The depth gauge of a camera's pose; both rows for the second camera, else its own axis."""
+    first = 0 if second else 1
+
+    def residual(values: Any) -> tuple[Array, list[Array]]:
+        value, jacobian = depth_gauge_residual(values.atPose3(key).matrix(), sigma_mm)
+        return value[first:], [jacobian[first:]]
+
+    return custom_factor([key], [6], 2 - first, residual)
+
+
+def place_factor(key: int, sigma_mm: float) -> Any:
+    """The loose prior on a view's place."""
+
+    def residual(values: Any) -> tuple[Array, list[Array]]:
+        value, jacobian = place_residual(values.atPose3(key).matrix(), sigma_mm)
+        return value, [jacobian]
+
+    return custom_factor([key], [6], 3, residual)

@@ -1,0 +1,392 @@
+"""The linear problem at a state, by GTSAM and by arrays, against the multiplied-out Jacobian.
+
+The reference multiplies out `whitened_residuals`, which test_factors.py proves by itself, and adds
+priors that are written down here once more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from telerig.errors import CalibrationError
+from telerig.estimator.calibration.solver import covariance, schur
+from telerig.estimator.calibration.solver import levenberg_marquardt as lm
+from telerig.estimator.calibration.solver.covariance import joint_covariance
+from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.problem import (
+    GAUGE_SIGMA_MM,
+    Problem,
+    nominal_state,
+    parameter_unit,
+    prior_sigma,
+    whitening,
+)
+from telerig.estimator.calibration.solver.system import System, images_of, slots
+from telerig.estimator.calibration.start import known_target
+from telerig.factors.projection import State, whitened_error, whitened_residuals
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.target import Target
+from telerig.rig.windows import Wall
+
+SOLVERS = ("gtsam", "schur")
+
+MODELS = {
+    "scale": {"scale_px_per_mm": 20.4},
+    "radial": {"k1": 0.02, "k2": -0.01, "k3": 0.004},
+    "one power": {"k1": 0.02},
+    "tangential": {"p1": 0.003, "p2": -0.002},
+    "prism": {"s1": 0.004, "s2": 0.002, "s3": -0.003, "s4": 0.005},
+    "affine": {"aspect": 1.01, "skew": -0.004, "k1": 0.01},
+    "kappa": {"kappa_per_mm": 2e-3, "k1": 0.01, "centre_u_px": 520.0, "centre_v_px": 380.0},
+    "tilt": {"tilt_x": 0.05, "tilt_y": -0.03, "image_convergence_per_mm": 1e-3, "p1": 0.002},
+}
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+def problem_of(
+    free: tuple[str, ...],
+    rng: Any,
+    seen: float = 0.9,
+    walls: tuple[Any, ...] = (None, None),
+    cameras: int = 2,
+) -> Problem:
+    """Five views, twelve dots of which a share is seen; random measurements."""
+    views, dots = 5, 12
+    turns = [Pose.from_rotvec((0.1 * c, np.deg2rad(60 * c), 0.0), (c, -2.0 * c, 3.0 * c))
+             for c in range(cameras)]  # fmt: skip
+    made = [
+        Camera.create("abcd"[c], (1024, 768), 20.0 + c, camera_from_rig=turns[c])
+        for c in range(cameras)
+    ]
+    made = [replace(c, wall=w) for c, w in zip(made, (*walls, None, None))]
+    view, camera, dot = np.nonzero(rng.random((views, cameras, dots)) < seen)
+    factor = rng.normal(size=(len(view), 2, 2)) + 3 * np.eye(2)
+    target = Target(rows=3, columns=4, pitch_mm=(5.0, 5.0))
+    columns, rows = np.meshgrid(np.arange(4), np.arange(3))
+    nominal = np.stack([5.0 * columns.ravel(), 5.0 * rows.ravel(), 0 * rows.ravel()], -1)
+    of_camera = (("scale_px_per_mm", *free), ("scale_px_per_mm", *free[: 1 + len(free) // 2]))
+    return Problem(
+        tuple(made), target, tuple(f"{v:02}" for v in range(views)), np.arange(dots),
+        nominal, np.full((dots, 3), 0.02), view, camera, dot, rng.uniform(0, 900, (len(view), 2)),
+        0.01 * factor @ np.swapaxes(factor, -1, -2), rng.uniform(0.1, 1, len(view)),
+        (*of_camera, *of_camera)[:cameras], ((0, 11), 18.0, 0.001), np.zeros((views, cameras)),
+    )  # fmt: skip
+
+
+def state_of(problem: Problem, values: dict[str, float], rng: Any) -> State:
+    state = nominal_state(problem)
+    cameras = [c.with_parameters(**values) for c in problem.cameras]
+    intrinsics = np.array([c.intrinsics for c in cameras])
+    intrinsics[1] *= 1.01
+    views = np.tile(np.eye(4), (len(problem.views), 1, 1))
+    views[:, :3, :3] = rotation_from_rotvec(0.4 * rng.normal(size=(len(views), 3)))
+    views[:, :3, 3] = rng.uniform(-6, 6, (len(views), 3)) + [0, 0, 60]
+    dots = problem.nominal_mm + 0.1 * rng.normal(size=problem.nominal_mm.shape)
+    return replace(state, intrinsics=intrinsics, rig_from_target=views, dots_mm=dots)
+
+
+def of_images(problem: Problem, state: State) -> tuple[Any, Any]:
+    """(R, D) whole Jacobian of the images, and (R,) their residual."""
+    obs, place = problem.observations(), slots(problem)
+    full = whitened_residuals(state, obs, problem.rho_mm)
+    out = np.zeros((len(obs), 2, place["dots"][0].stop))
+    for m, (v, c, d) in enumerate(zip(obs.view, obs.camera, obs.dot)):
+        free = problem.free_indices(c)
+        unit = parameter_unit(problem.cameras[c])[free]
+        out[m][:, place["intrinsics"][c]] = full.by_intrinsics[m][:, free] * unit
+        if c:
+            out[m][:, place["camera"][c]] = full.by_camera[m]
+        out[m][:, place["view"][v]] = full.by_view[m]
+        dot = place["dots"][0].start + 3 * d
+        out[m][:, dot : dot + 3] = full.by_dot[m]
+    return out.reshape(-1, out.shape[-1]), full.value.ravel()
+
+
+def of_priors(problem: Problem, state: State) -> tuple[Any, Any]:
+    """(R, D) and (R,) of everything else, by central differences of what is written down here."""
+    system = System(problem)
+
+    def residual(at: State) -> Any:
+        parts = []
+        for c, camera in enumerate(problem.cameras):
+            free = problem.free_indices(c)
+            gap = (at.intrinsics[c] - camera.intrinsics) / prior_sigma(camera)
+            parts.append(gap[free])
+            pose = at.rig_from_camera[c]
+            if c == 1:
+                parts.append([pose[2, 3] / GAUGE_SIGMA_MM])
+            if c:
+                parts.append([pose[:3, 3] @ pose[:3, 2] / GAUGE_SIGMA_MM])
+        parts.append(at.rig_from_target[:, :3, 3].ravel() / (10 * max(problem.rho_mm)))
+        parts.append(((at.dots_mm - problem.nominal_mm) / problem.dot_sigma_mm).ravel())
+        if problem.scale is not None:
+            (a, b), distance, sigma = problem.scale
+            length = np.linalg.norm(at.dots_mm[a] - at.dots_mm[b])
+            parts.append([(length - distance) / sigma])
+        return np.concatenate(parts)
+
+    columns = []
+    for k in range(system.size):
+        step = np.zeros(system.size)
+        step[k] = 1e-4
+        ends = residual(system.moved(state, step)), residual(system.moved(state, -step))
+        columns.append((ends[0] - ends[1]) / 2e-4)
+    return np.stack(columns, -1), residual(state)
+
+
+def check(problem: Problem, state: State) -> None:
+    """Cost, information, right side, damped step and inverse, by either solver."""
+    parts = zip(of_images(problem, state), of_priors(problem, state))
+    jacobian, value = (np.concatenate(pair) for pair in parts)
+    information, right = jacobian.T @ jacobian, -jacobian.T @ value
+    length = np.sqrt(np.maximum(np.diag(information), 1e-30))
+    unit = np.outer(length, length)
+    correlation = np.linalg.inv(information / unit)
+    sd = np.sqrt(np.diag(correlation))
+    for solver in SOLVERS:
+        _, linearised = lm.linearisation(replace(problem, solver=solver))
+        ours = linearised(state)
+        assert ours.cost == pytest.approx(0.5 * value @ value, rel=1e-12)
+        assert System(problem).cost(state) == pytest.approx(ours.cost, rel=1e-12)
+        assert np.abs((ours.information() - information) / unit).max() < 1e-7
+        given = ours.right[: len(right)]
+        np.testing.assert_allclose(given / length, right / length, rtol=1e-5, atol=1e-6)
+        for damping in (1e-6, 1e-3, 1.0):
+            damped = ours.information() + damping * np.diag(np.diag(information))
+            step, promised = ours.step(damping)
+            expected = np.linalg.solve(damped / unit, given / length)
+            off = np.abs(step * length - expected).max()
+            assert off < 1e-6 * np.abs(expected).max()
+            assert promised == pytest.approx(0.5 * step @ given)
+        for whole in (True, False):
+            found = ours.posterior(whole)
+            size = len(found.common)
+            inverse = correlation / unit
+            near = np.outer(sd, sd) / unit
+            wanted, bound = inverse[:size, :size], near[:size, :size]
+            assert np.abs((found.common - wanted) / bound).max() < 2e-5
+            wanted, bound = inverse[:size, size:], near[:size, size:]
+            assert np.abs((found.cross.reshape(size, -1) - wanted) / bound).max() < 2e-5
+            for d, block in enumerate(found.dots):
+                at = size + 3 * d + np.arange(3)
+                assert np.abs((block - inverse[np.ix_(at, at)]) / near[np.ix_(at, at)]).max() < 2e-5
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("seen", [1.0, 0.6])
+def test_every_lens(model: str, seen: float, rng: Any) -> None:
+    free = tuple(n for n in MODELS[model] if n != "scale_px_per_mm")
+    problem = problem_of(free, rng, seen)
+    check(problem, state_of(problem, MODELS[model], rng))
+
+
+@pytest.mark.parametrize("model", ["scale", "tilt", "kappa"])
+def test_free_but_zero(model: str, rng: Any) -> None:
+    """Steps that do nothing yet are left out of the value, not of the derivatives."""
+    free = tuple(n for n in MODELS[model] if n != "scale_px_per_mm")
+    problem = problem_of(free, rng)
+    check(problem, state_of(problem, {}, rng))
+
+
+@pytest.mark.parametrize("both", [False, True])
+@pytest.mark.parametrize("kappa", [0.0, 2e-3])
+def test_behind_walls(kappa: float, both: bool, rng: Any) -> None:
+    normal = np.array([0.05, -0.02, 1.0])
+    wall = Wall(normal / np.linalg.norm(normal), 20.0, 8.0, (1.0, 1.5, 1.33), 0.01)
+    walls = (wall if both else None, wall)
+    problem = problem_of(("wall_x_rad", "wall_y_rad", "kappa_per_mm"), rng, walls=walls)
+    values = {"kappa_per_mm": kappa, "wall_x_rad": 0.01, "wall_y_rad": -0.02, "k1": 0.01}
+    check(problem, state_of(problem, values, rng))
+
+
+def test_through_a_plate(rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    target = replace(problem.target, plate_thickness_mm=3.0, plate_index=1.5)
+    shift = rng.choice([-1.0, 0.0, 1.0], (5, 2))
+    problem = replace(problem, target=target, plate_shift=shift)
+    check(problem, state_of(problem, {"k1": 0.02}, rng))
+
+
+@pytest.mark.parametrize("cameras", [3, 4])
+def test_more_cameras(cameras: int, rng: Any) -> None:
+    problem = problem_of(("k1", "p1"), rng, cameras=cameras)
+    check(problem, state_of(problem, {"k1": 0.02}, rng))
+
+
+def test_without_a_known_distance_and_with_one_inside_a_group(rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    check(replace(problem, scale=None), state)
+    check(replace(problem, scale=((0, 3), 15.0, 0.001)), state)
+
+
+def test_views_are_eliminated_where_dots_are_fewer(rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    problem = problem.subset(problem.dot < 6)
+    problem = replace(
+        problem, dot_ids=np.arange(6), nominal_mm=problem.nominal_mm[:6],
+        dot_sigma_mm=problem.dot_sigma_mm[:6], scale=((0, 5), 7.0, 0.001),
+    )  # fmt: skip
+    assert 6 * len(problem.views) > 3 * 6
+    check(problem, state_of(problem, {"k1": 0.02}, rng))
+
+
+def test_a_view_that_is_left_out_stays_and_is_infinitely_uncertain(rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    problem = replace(problem, weight=np.where(problem.view == 2, 0.0, problem.weight))
+    state = state_of(problem, {"k1": 0.02}, rng)
+    place = slots(problem)["view"][2]
+    for solver in SOLVERS:
+        made = replace(problem, solver=solver)
+        equations = lm.linearisation(made)[1](state)
+        step, _ = equations.step(1e-3)
+        assert not step[place][:3].any()
+        found = joint_covariance(made, lm.Solution(state, 0.0, 0, equations, slots(made)))
+        assert np.isinf(np.diag(found.matrix)[place][:3]).all()
+
+
+def test_chunks_of_any_size(rng: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = problem_of(("k1",), rng, 0.6)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    system = System(problem)
+    for size in (1, 15, 40, 10_000):
+        monkeypatch.setattr(schur, "CHUNK", size)
+        for obs in system.images:
+            chunks = schur._in_chunks(images_of(obs))
+            assert [i for chunk in chunks for i in chunk] == images_of(obs)
+        assert len(chunks) > 1 or size > 15
+        check(problem, state)
+
+
+def test_whitening_is_the_inverse_cholesky_factor(rng: Any) -> None:
+    factor = rng.normal(size=(20, 2, 2))
+    covariance = factor @ np.swapaxes(factor, -1, -2) + 0.1 * np.eye(2)
+    expected = np.linalg.inv(np.linalg.cholesky(covariance))
+    np.testing.assert_allclose(whitening(covariance), expected, rtol=1e-12, atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        whitening(np.array([[[1.0, 2.0], [2.0, 1.0]]]))
+
+
+def solved(problem: Problem, state: State) -> lm.Solution:
+    equations = lm.linearisation(problem)[1](state)
+    return lm.Solution(state, equations.cost, 0, equations, slots(problem))
+
+
+def test_degrees_of_freedom_are_the_trace_of_the_residuals(rng: Any) -> None:
+    problem = problem_of(("k1",), rng)
+    state = state_of(problem, {"k1": 0.02}, rng)
+    jacobian, _ = of_images(problem, state)
+    solution = solved(problem, state)
+    found = joint_covariance(problem, solution).effective_dof
+    inverse = np.linalg.inv(solution.information)
+    absorbed = np.trace(inverse @ jacobian.T @ jacobian)
+    assert found == pytest.approx(2 * len(problem.view) - absorbed, rel=1e-6)
+
+
+def test_a_large_calibration_keeps_cameras_and_views(
+    rng: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = replace(problem_of(("k1",), rng), solver="schur")
+    solution = solved(problem, state_of(problem, {"k1": 0.02}, rng))
+    whole = joint_covariance(problem, solution)
+    monkeypatch.setattr(covariance, "WHOLE", 10)
+    parts = joint_covariance(problem, solution)
+    n = len(parts.names)
+    assert parts.names == whole.names[:n]
+    assert n == slots(problem)["dots"][0].start
+    sd = np.sqrt(np.diag(whole.matrix)[:n])
+    difference = (parts.matrix - whole.matrix[:n, :n]) / np.outer(sd, sd)
+    assert np.abs(difference).max() < 1e-7
+    np.testing.assert_allclose(parts.dots, whole.dots, rtol=1e-6, atol=1e-12)
+    assert parts.effective_dof == pytest.approx(whole.effective_dof, rel=1e-9)
+
+
+def test_a_direction_that_nothing_determines_is_an_error(rng: Any) -> None:
+    """Dots without a prior and no known distance: the target's own frame is free."""
+    problem = replace(problem_of((), rng), scale=None)
+    problem = replace(problem, dot_sigma_mm=np.full((12, 3), 1e12))
+    state = state_of(problem, {}, rng)
+    for solver in SOLVERS:
+        equations = lm.linearisation(replace(problem, solver=solver))[1](state)
+        with pytest.raises(CalibrationError, match="undetermined"):
+            equations.posterior(True)
+
+
+def test_moves_are_gtsams_retraction_to_first_order(rng: Any) -> None:
+    problem = problem_of(("k1",), rng, cameras=3)
+    start, system = state_of(problem, {"k1": 0.02}, rng), System(problem)
+    step = 1e-5 * rng.standard_normal(system.size)
+    mine, place = system.moved(start, step), slots(problem)
+    poses: list[tuple[Any, Any, slice]] = []
+    poses += zip(start.rig_from_camera[1:], mine.rig_from_camera[1:], place["camera"][1:])
+    poses += zip(start.rig_from_target, mine.rig_from_target, place["view"])
+    for before, after, at in poses:
+        theirs = gtsam.Pose3(before).retract(step[at]).matrix()
+        np.testing.assert_allclose(after, theirs, atol=1e-8)
+
+
+def case(made: Any, model: str) -> tuple[Problem, State]:
+    problem = problem_from_dots(made.dots, made.cameras, made.target).with_model(model)
+    return problem, known_target.stereo_states(problem, problem.nominal_mm)[0]
+
+
+@pytest.mark.parametrize("model", ["radial", "kappa+brown"])
+def test_same_minimum(model: str, scene: Callable[..., Any]) -> None:
+    problem, start = case(scene("near_telecentric", 5), model)
+    one, other = (lm.solve(replace(problem, solver=s), start) for s in SOLVERS)
+    assert one.cost == pytest.approx(other.cost, rel=1e-9)
+    sd = np.sqrt(np.diag(np.linalg.inv(one.information)))
+    place = slots(problem)["dots"][0]
+    moved = (other.state.dots_mm - one.state.dots_mm).ravel() / sd[place]
+    assert np.abs(moved).max() < 1e-3
+    length = np.sqrt(np.diag(one.information))
+    same = (one.information - other.information) / np.outer(length, length)
+    assert np.abs(same).max() < 1e-6
+
+
+def test_arrays_are_taken_for_many_dots(scene: Callable[..., Any]) -> None:
+    small, start = case(scene("paper", 1), "radial")
+    assert isinstance(lm.linearisation(small)[1](start), lm.GraphEquations)
+    large, start = case(scene("dense", 1, views=8), "radial")
+    assert len(large.view) > lm.MANY_DOTS
+    assert isinstance(lm.linearisation(large)[1](start), lm.NormalEquations)
+
+
+def test_the_whole_calibration_with_either_solver(scene: Callable[..., Any]) -> None:
+    made = scene("paper", 2, outlier_share=0.05)
+    one, other = (made.calibrate("radial", solver=s) for s in SOLVERS)
+    assert one.statistics["cost"] == pytest.approx(other.statistics["cost"], rel=1e-8)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-4, atol=1e-16)
+    with pytest.raises(CalibrationError, match="unknown solver"):
+        made.calibrate("radial", solver="ceres")
+
+
+def test_all_of_a_dense_target(scene: Callable[..., Any]) -> None:
+    """400 dots in 6 views: 52 s with GTSAM's dense Hessian."""
+    made = scene("dense", 2, views=6)
+    calibration = made.calibrate("tangential")
+    assert calibration.verdict["status"] == "GOOD"
+    assert made.space_rms_um(calibration) < 0.6
+    assert 0.9 < calibration.statistics["chi2_dof"] < 1.1
+
+
+def test_a_camera_that_cannot_see_a_dot_stops_the_start_alone(rng: Any) -> None:
+    """A window seen edge on: no finite cost at the start."""
+    wall = Wall(np.array([1.0, 0.0, 0.0]), 20.0, 8.0, (1.0, 1.5, 1.33), 0.01)
+    problem = problem_of(("kappa_per_mm",), rng, walls=(None, wall))
+    state = state_of(problem, {"kappa_per_mm": 1e-3}, rng)
+    with pytest.raises(CalibrationError, match="no finite cost"):
+        lm.solve(problem, state)
+    assert np.isfinite(whitened_error(state, problem.subset(problem.camera == 0).observations(),
+                                      problem.rho_mm)).all()  # fmt: skip

@@ -141,7 +141,10 @@ def cell(run: dict[str, Any] | None, least: float) -> str:
 
 def ratios(runs: dict[str, dict[str, Any]]) -> list[str]:
     """How many times faster the product is."""
-    lines = ["| views x dots | scipy / gtsam | scipy / schur | ceres / gtsam |", "|---|---|---|---|"]
+    lines = [
+        "| views x dots | scipy / gtsam | scipy / schur | ceres / gtsam |",
+        "|---|---|---|---|",
+    ]
     for size, found in runs.items():
         cells = []
         for ours, other in (("gtsam", "scipy"), ("schur", "scipy"), ("gtsam", "ceres")):

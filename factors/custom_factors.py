@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.factors.priors import depth_gauge_residual, distance_residual, place_residual
 from telerig.factors.projection import Observations, State, dot_columns, image_columns
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Residual = Callable[[Any], tuple[Array, list[Array]]]
 
 

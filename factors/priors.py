@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.rig.pose import hat
-
-Array = NDArray[np.float64]
 
 
 def distance_residual(

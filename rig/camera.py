@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.rig import projection, windows
 from telerig.rig.pose import Pose
 from telerig.rig.projection import INDEX, PARAMETERS
 from telerig.rig.windows import Wall
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

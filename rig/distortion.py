@@ -11,11 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import GeometryError
-
-Array = NDArray[np.float64]
 
 COEFFICIENTS = ("k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4")
 _NEWTON_STEPS = 40

@@ -18,13 +18,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.rig import distortion, windows
 from telerig.rig.distortion import components_first
 from telerig.rig.windows import Wall
-
-Array = NDArray[np.float64]
 
 PARAMETERS = (
     "scale_px_per_mm", "aspect", "skew", "centre_u_px", "centre_v_px", "kappa_per_mm",

@@ -17,9 +17,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from telerig.arrays import Array
 
 TRACE_VARIANCE = {
     (3, 1): 21 / 8,

@@ -11,8 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from telerig.arrays import Array, Ints
 
 Layout = Literal["grid", "points"]
 Polarity = Literal["white_on_black", "black_on_white"]

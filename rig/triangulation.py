@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from telerig.arrays import Array
 from telerig.errors import GeometryError, InputError
 from telerig.rig import distortion, projection
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX
 from telerig.rig.windows import affine_map
-
-Array = NDArray[np.float64]
 
 _STEPS = 20
 _BLOCK = 4096

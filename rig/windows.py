@@ -21,11 +21,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import GeometryError
-
-Array = NDArray[np.float64]
 
 _STEPS = 60
 _WEAK = 1e-3

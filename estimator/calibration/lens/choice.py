@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.lens.cross_validation import held_out_chi2
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
@@ -33,8 +33,6 @@ from telerig.factors.projection import State, pixels
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.rig.lens_models import AUTO, GROUPS, joint_name, name_of, ordered
 from telerig.rig.projection import INDEX
-
-Array = NDArray[np.float64]
 
 DOTS_FOR_WORKERS = 500
 """With fewer measured dots, four fits take 0.1 s, and starting processes for them 0.05 s."""

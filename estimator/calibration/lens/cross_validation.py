@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.solver.levenberg_marquardt import linearisation
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.system import System, images_of, retracted
 from telerig.factors.projection import State, whitened_error
-
-Array = NDArray[np.float64]
 
 FOLDS = 4
 DAMPING = 1e-6

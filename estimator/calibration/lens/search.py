@@ -16,15 +16,14 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.solver.levenberg_marquardt import Solution
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit, prior_sigma
 from telerig.factors.projection import whitened_error
 from telerig.rig.lens_models import GROUPS, ordered
 from telerig.rig.projection import INDEX
 
-Array = NDArray[np.float64]
 Lens = frozenset[str]
 """The groups of one camera."""
 Lenses = tuple[Lens, ...]

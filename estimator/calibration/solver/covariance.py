@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.levenberg_marquardt import Solution
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.schur import Posterior
@@ -15,9 +15,6 @@ from telerig.rig.camera import Camera
 from telerig.rig.pose import hat
 from telerig.rig.projection import INDEX
 from telerig.rig.triangulation import stacked_jacobian
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 WHOLE = 4000

@@ -9,12 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.factors.projection import State, pixels
-
-Array = NDArray[np.float64]
 
 
 def eccentricity_px(problem: Problem, state: State, rings: int = 2, spokes: int = 8) -> Array:

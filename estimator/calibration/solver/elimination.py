@@ -13,16 +13,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotri
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.schur import Posterior, undetermined
 from telerig.estimator.calibration.solver.system import System
 from telerig.factors.linear_factors import add_linear_factors
 from telerig.factors.projection import State
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LEAST_PIVOT = 1e-10
 """Of columns of unit length, what elimination has to leave of one."""

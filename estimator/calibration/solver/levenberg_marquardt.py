@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.elimination import GraphEquations, GraphLayout
 from telerig.estimator.calibration.solver.problem import Problem
@@ -20,7 +20,6 @@ from telerig.estimator.calibration.solver.schur import NormalEquations
 from telerig.estimator.calibration.solver.system import System, slots
 from telerig.factors.projection import State
 
-Array = NDArray[np.float64]
 MANY_DOTS = 5000
 """Measured dots above which arrays solve the problem; see docs/decisions/020."""
 MANY_NUMBERS = 4000

@@ -13,8 +13,6 @@ from telerig.estimator.calibration.solver.problem import Problem
 from telerig.rig.camera import Camera
 from telerig.rig.target import Target
 
-Array = NDArray[np.float64]
-
 IMPOSSIBLE_SD = 20.0
 
 

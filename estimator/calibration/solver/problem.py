@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.factors.projection import Observations, State
 from telerig.rig.camera import Camera
@@ -19,9 +20,6 @@ from telerig.rig.lens_models import parameters_of
 from telerig.rig.pose import Pose
 from telerig.rig.projection import INDEX, PARAMETERS
 from telerig.rig.target import Target
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 GAUGE_SIGMA_MM = 1e-4
 """Holds the rig origin where the optical axes come closest; see docs/decisions/003."""

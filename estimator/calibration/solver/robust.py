@@ -11,14 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.levenberg_marquardt import Progress, Solution, solve
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.factors.projection import State, pixels
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LEAST_DOTS = 4
 """Sound dots below which a view is left out: they would not fix the target's pose."""

@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
+from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.system import System, images_of
 from telerig.factors.projection import State, dot_columns
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CHUNK = 4000
 """Measured dots evaluated at once, about: fewer cost calls, more leave the cache."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.solver.problem import (
     GAUGE_SIGMA_MM,
     Problem,
@@ -22,9 +22,6 @@ from telerig.factors.priors import depth_gauge_residual, distance_residual, plac
 from telerig.factors.projection import Observations, State, image_columns, whitened_image_error
 from telerig.io.machine.memory import keep_freed_memory
 from telerig.rig.pose import rotation_from_rotvec
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

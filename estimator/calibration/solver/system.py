@@ -20,7 +20,7 @@ from telerig.estimator.calibration.solver.problem import (
 )
 from telerig.factors.priors import depth_gauge_residual, distance_residual, place_residual
 from telerig.factors.projection import Observations, State, image_columns, whitened_image_error
-from telerig.io.machine.memory import keep_freed_memory
+from telerig.io.machine.parallel import keep_freed_memory
 from telerig.rig.pose import rotation_from_rotvec
 
 

@@ -204,7 +204,7 @@ def _rig_above(folder: Path) -> RigDescription | None:
 
 def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSource:
     has: dict[RunSource, bool] = {
-        "images": bool(_recordings(folder)),
+        "images": bool(recordings(folder)),
         "detections": (folder / "detections.csv").is_file(),
     }
     chosen = choose_source(has, source, folder)
@@ -218,7 +218,7 @@ def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSou
     return chosen
 
 
-def _recordings(folder: Path) -> dict[str, Path]:
+def recordings(folder: Path) -> dict[str, Path]:
     """Whatever in the folder looks like a camera's frames, by its name without extension."""
     found = {}
     for entry in sorted(folder.iterdir()):
@@ -230,7 +230,7 @@ def _recordings(folder: Path) -> dict[str, Path]:
 
 def _open_sources(folder: Path, names: list[str]) -> dict[str, FrameSource]:
     """Raises InputError for a camera without frames, and for frames of no known camera."""
-    strangers = {name: p for name, p in _recordings(folder).items() if name not in names}
+    strangers = {name: p for name, p in recordings(folder).items() if name not in names}
     for name, entry in strangers.items():
         raise InputError(
             f"there is no camera {name!r} in the rig",

@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from telerig.errors import InputError
+
 if TYPE_CHECKING:
     from telerig.io.exchange.export.run_results import RunResults
     from telerig.io.exchange.export.volume import Volume
@@ -96,6 +98,43 @@ SENSOR_IMPORTERS = {
 def described(formats: dict[str, Format]) -> str:
     """The names of formats, each with its description, for a help text."""
     return ", ".join(f"{name} ({known.description})" for name, known in formats.items())
+
+
+def export_results(
+    source: Path,
+    to: str,
+    *,
+    run: str | None = None,
+    calibration: Path | None = None,
+    out: Path | None = None,
+    **options: Any,
+) -> list[str]:
+    """Write cameras or a run in the format ``to``; returns lines on what was written and where.
+
+    source : a dataset, one of its results folders, or a calibration.json. run : name of a run,
+    where there are several. calibration : instead of the dataset's own. out : a file or folder;
+    None writes into the dataset's results/export. options : as for `export_cameras`.
+    Raises InputError for an unknown format, and for results that are missing or cannot be used.
+    """
+    from telerig.io.exchange.export.run_results import (
+        cameras_of,
+        read_results,
+        results_root,
+        run_folder,
+    )
+
+    known = CAMERA_EXPORTS | RUN_EXPORTS
+    if to not in known:
+        raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
+    cameras = cameras_of(source, calibration, required=to in CAMERA_EXPORTS)
+    results = None if to in CAMERA_EXPORTS else read_results(run_folder(source, run))
+    name = to if results is None else results.name
+    place = out or results_root(source) / "export" / f"{name}{known[to].suffix}"
+    if results is None:
+        lines = export_cameras(cameras, to, place, **options)
+    else:
+        lines = export_run(results, to, place, cameras)
+    return [*lines, f"written: {place}"]
 
 
 def export_cameras(

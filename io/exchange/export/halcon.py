@@ -33,7 +33,13 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import GeometryError
-from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
+from telerig.io.exchange.export.volume import (
+    Misfit,
+    Volume,
+    refuse_unknown_parameters,
+    seen_points,
+    working_volume,
+)
 from telerig.io.files.atomic import atomic_folder
 from telerig.rig import projection
 from telerig.rig.camera import Camera
@@ -95,8 +101,9 @@ def halcon_cameras(
 
     A camera is exported as telecentric unless that moves points of the volume by more than
     `PERSPECTIVE_PX`. volume : None takes `working_volume`.
-    Raises InputError when the cameras do not see the volume.
+    Raises InputError when the cameras do not see the volume, and for an unknown lens parameter.
     """
+    refuse_unknown_parameters(cameras, "HALCON")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
     return tuple(_halcon_camera(camera, points) for camera in cameras)
 

@@ -16,7 +16,13 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.io.exchange.export.volume import Misfit, Volume, seen_points, working_volume
+from telerig.io.exchange.export.volume import (
+    Misfit,
+    Volume,
+    refuse_unknown_parameters,
+    seen_points,
+    working_volume,
+)
 from telerig.io.files.atomic import atomic_path
 from telerig.rig.camera import Camera
 from telerig.rig.distortion import COEFFICIENTS
@@ -114,8 +120,10 @@ def camera_matrices(
 ) -> tuple[Matrices, ...]:
     """The matrices of every camera; misfits over what all of them see of the volume.
 
-    volume : None takes `working_volume`. Raises InputError when the cameras do not see it.
+    volume : None takes `working_volume`. Raises InputError when the cameras do not see it,
+    and for an unknown lens parameter.
     """
+    refuse_unknown_parameters(cameras, "OpenCV")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
     return tuple(_matrices(camera, points) for camera in cameras)
 

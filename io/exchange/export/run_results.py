@@ -1,8 +1,9 @@
-"""What a run's results folder holds, as every export of trajectories takes it."""
+"""What a run's results folder holds, as every export of trajectories takes it; and where it is."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
@@ -14,7 +15,12 @@ import pandas as pd
 from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_table
+from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.smoothing import SmoothingFile
+from telerig.rig.camera import Camera
+
+_TRAJECTORIES = ("trajectories.csv", "tracks.csv")
+_RESULTS = (*_TRAJECTORIES, "calibration.json")
 
 LAB = (
     "lab: axes of the rig frame, origin where the rig frame's origin is at stage position 0 and "
@@ -50,7 +56,7 @@ def read_results(folder: str | PathLike[str]) -> RunResults:
     Raises InputError when the folder has neither, or a table that cannot be read.
     """
     place = Path(folder)
-    names = [n for n in ("trajectories.csv", "tracks.csv") if (place / n).is_file()]
+    names = [n for n in _TRAJECTORIES if (place / n).is_file()]
     if not names:
         raise InputError(
             "has neither trajectories.csv nor tracks.csv",
@@ -123,3 +129,75 @@ def identifier(name: str) -> str:
     """A name that MATLAB takes for a field: letters, digits, underscores, a letter first."""
     plain = re.sub(r"\W", "_", name, flags=re.ASCII)
     return (plain if plain[:1].isalpha() else f"n_{plain}")[:63]
+
+
+def results_root(source: Path) -> Path:
+    """DATASET/results for a dataset, one of its results folders, or a file in one of them.
+
+    Raises InputError when there is nothing at ``source``, or a folder of something else.
+    """
+    if not source.exists():
+        raise InputError("there is no such dataset", where=str(source), todo="check the path")
+    place = source.resolve()
+    if place.is_file():
+        place = place.parent
+    if (place / "rig.toml").is_file() or (place / "results").is_dir():
+        return place / "results"
+    if place.name == "results":
+        return place
+    if source.is_dir() and not any((place / name).is_file() for name in _RESULTS):
+        raise InputError(
+            "is neither a dataset nor a folder of results",
+            where=str(source),
+            todo="give DATASET, or DATASET/results/NAME after `telerig track`",
+        )
+    return place.parent
+
+
+def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Sequence[Camera]:
+    """The cameras of ``calibration``, of ``source`` or of its dataset; () where there are none.
+
+    Raises InputError when there are none and they are required.
+    """
+    trials = [results_root(source) / "calibration" / "calibration.json"]
+    if source.suffix == ".json":
+        trials.insert(0, source)
+    elif (source / "calibration.json").is_file():
+        trials.insert(0, source / "calibration.json")
+    place = calibration or next((p for p in trials if p.is_file()), None)
+    if place is not None:
+        file = place / "calibration.json" if place.is_dir() else place
+        return CalibrationFile.read(file).rig_cameras(behind_walls=True)
+    if required:
+        raise InputError(
+            "there is no calibration",
+            where=str(trials[0]),
+            todo="run `telerig calibrate` first, or give one with --calibration",
+        )
+    return ()
+
+
+def run_folder(source: Path, run: str | None) -> Path:
+    """The results folder of a run.
+
+    Raises InputError when it is not there, or when none of several was named.
+    """
+
+    def holds(folder: Path) -> bool:
+        files = (folder / name for name in _TRAJECTORIES)
+        return not folder.name.startswith(".") and any(file.is_file() for file in files)
+
+    if run is None and holds(source):
+        return source
+    root = results_root(source)
+    if run is not None:
+        return root / run
+    found = sorted(p for p in root.iterdir() if holds(p)) if root.is_dir() else []
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(p.name for p in found)
+    raise InputError(
+        f"{len(found)} runs have results",
+        where=str(root),
+        todo=f"name one with --run: {names}" if found else "run `telerig track` first",
+    )

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.rig.camera import Camera
+from telerig.rig.projection import PARAMETERS
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,27 @@ class Misfit:
     def words(self) -> str:
         """The two figures and the number of points."""
         return f"RMS {self.rms_px:.3g} px, largest {self.max_px:.3g} px, at {self.points} points"
+
+
+EXPORTED = (
+    "scale_px_per_mm", "aspect", "skew", "centre_u_px", "centre_v_px", "kappa_per_mm",
+    "k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4",
+    "tilt_x", "tilt_y", "image_convergence_per_mm", "wall_x_rad", "wall_y_rad",
+)  # fmt: skip
+"""The lens parameters that the exports to HALCON and OpenCV express, or name in a note."""
+
+
+def refuse_unknown_parameters(cameras: Sequence[Camera], program: str) -> None:
+    """Raise InputError for a camera with a lens parameter that is not 0 and not in `EXPORTED`."""
+    for camera in cameras:
+        for name, value in zip(PARAMETERS, camera.intrinsics):
+            if name not in EXPORTED and value != 0:
+                raise InputError(
+                    f"camera {camera.name} has the lens parameter {name} = {value:.6g}, which the "
+                    f"export to {program} does not know",
+                    todo="export to soloff, which is fitted to any lens, or calibrate with a "
+                    f"--model without {name}",
+                )
 
 
 def volume_of(bounds_mm: ArrayLike) -> Volume:

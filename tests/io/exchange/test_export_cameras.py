@@ -11,6 +11,8 @@ import pytest
 from camera_pairs import DISTORTED, PRISM, SQUARE_ON, Array, pair, random_points
 
 from telerig.errors import InputError
+from telerig.io.exchange.export import volume
+from telerig.io.exchange.export.halcon import halcon_cameras
 from telerig.io.exchange.export.opencv import camera_matrices, write_opencv
 from telerig.io.exchange.export.soloff import POWERS, fit_soloff, write_soloff
 from telerig.io.exchange.export.volume import seen_points, volume_of, working_volume
@@ -178,3 +180,15 @@ def test_volume_is_the_cube_both_cameras_see() -> None:
         seen_points(cameras, volume_of([(90, 100), (0, 1), (0, 1)]), 13)
     with pytest.raises(InputError, match="no box"):
         volume_of([(1, 0), (0, 1), (0, 1)])
+
+
+def test_a_lens_parameter_that_an_export_does_not_know_is_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cameras = [camera.with_parameters(s4=2e-3) for camera in pair(SQUARE_ON)]
+    monkeypatch.setattr(volume, "EXPORTED", tuple(n for n in volume.EXPORTED if n != "s4"))
+    for program, export in (("HALCON", halcon_cameras), ("OpenCV", camera_matrices)):
+        with pytest.raises(InputError, match=f"s4 = 0.002, which the export to {program}") as found:
+            export(cameras)
+        assert "without s4" in str(found.value)
+    halcon_cameras([camera.with_parameters(s4=0.0) for camera in cameras])

@@ -19,13 +19,13 @@ from telerig.io.exchange.export.run_results import (
     RunResults,
     identifier,
     read_results,
+    run_folder,
     unit_of,
 )
 from telerig.io.exchange.export.tables import write_hdf5, write_mat, write_trackpy
 from telerig.io.files.csv_table import write_table
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
-from telerig.scripts.export import run_folder
 
 CAMERAS = (
     Camera.create("left", (512, 500), 10.0, k1=0.01),

@@ -1,0 +1,68 @@
+"""The films of a run: its path in space, and the images of both cameras where they are at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from telerig.errors import InputError
+from telerig.io.dataset.run import load_run, recordings
+from telerig.io.report.film.files import Progress
+from telerig.io.report.film.path import write_path_film
+from telerig.io.report.film.views import write_views_film
+from telerig.io.report.run.tracking.results import read_track_results
+
+
+def write_films(
+    results_folder: Path,
+    place: Path,
+    endings: Sequence[str],
+    recording: Path | None,
+    stage: Progress,
+) -> Iterator[str]:
+    """Write path.* and views.* into the folder ``place``; a line for each file, and for each note.
+
+    endings : "mp4", "gif" or both. recording : the run's folder; None looks in the dataset that
+    holds the results, and leaves out the film of the views where it is not there.
+    Raises InputError for results or a recording that cannot be used.
+    """
+    files = [place / f"path.{ending}" for ending in endings]
+    yield from _lines(files, write_path_film(results_folder, files, stage=stage))
+    if recording is None:
+        folder = results_folder.resolve()
+        recording = folder.parent.parent / "runs" / folder.name
+        why = f"{recording} is not there (name the recording with --run)"
+        if recording.is_dir():
+            why = "" if recordings(recording) else f"{recording} holds no images"
+        if why:
+            yield f"the film of both views is left out: {why}"
+            return
+    tracked = read_track_results(results_folder)
+    sizes = {c: s for c in tracked.cameras if (s := tracked.image_size_px(c)) is not None}
+    data = load_run(recording, source="images", cameras=tracked.cameras, image_sizes_px=sizes)
+    frames = tracked.file.frames or data.frame_count
+    if frames > data.frame_count:
+        raise InputError(
+            f"has {data.frame_count} frames, but {frames} were tracked",
+            where=str(recording),
+            todo="name the recording that these results are of (--run DATASET/runs/NAME)",
+        )
+    images = replace(data, stage=None, accelerometers=None, references=None, skip_unreadable=True)
+    files = [place / f"views.{ending}" for ending in endings]
+    notes = write_views_film(
+        results_folder,
+        files,
+        images=images.image,
+        image_sizes_px=data.image_sizes_px,
+        frame_count=frames,
+        t_s=data.t_s,
+        stage=stage,
+    )
+    yield from _lines(files, notes)
+
+
+def _lines(files: Sequence[Path], notes: Sequence[str]) -> Iterator[str]:
+    for file in files:
+        yield f"written: {file} ({file.stat().st_size / 1e6:.1f} MB)"
+    yield from (f"  {note}" for note in notes)

@@ -72,7 +72,7 @@ def cameras_without_rig(run: Path, calibration: Calibration) -> dict[str, Any]:
     if (run.resolve().parent.parent / "rig.toml").is_file():
         return {}
     return {
-        "cameras": [c.name for c in calibration.cameras],
+        "cameras": [c.name for c in calibration.cameras[:2]],
         "image_sizes_px": {c.name: c.image_size_px for c in calibration.cameras},
     }
 

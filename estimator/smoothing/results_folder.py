@@ -13,6 +13,7 @@ from telerig.errors import InputError
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.smooth import smooth
+from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.estimator.tracking.detect_run import read_batch
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
@@ -50,6 +51,7 @@ def smooth_run(
     begun = time.perf_counter()
     followed, source = read_tracks(tracks, run.path)
     _check_cameras(followed, calibration)
+    calibration = pair_of_run(calibration, run.cameras)
     run, marks = with_followed_references(run, source.parent)
     warnings = [
         *window_warnings(run.rig, calibration),

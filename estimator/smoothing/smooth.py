@@ -44,6 +44,7 @@ from telerig.estimator.smoothing.result import Smoothing, summary_of
 from telerig.estimator.smoothing.tables import shake as shake_table
 from telerig.estimator.smoothing.tables import trajectories
 from telerig.estimator.smoothing.verdict.judge import judge
+from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 if TYPE_CHECKING:
@@ -92,7 +93,9 @@ def smooth(
 
     Raises InputError for tables that cannot be used together.
     """
-    refinement = refinement_of(getattr(tracks, "table", tracks), calibration, refine_rig)
+    table = getattr(tracks, "table", tracks)
+    calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
+    refinement = refinement_of(table, calibration, refine_rig)
     problem, tracked, encoder_sigma = problem_of(
         tracks, calibration, stage=stage, accelerometers=accelerometers,
         references=references, rig=rig, t_s=t_s,
@@ -121,6 +124,15 @@ def smooth(
         chosen,
         solution,
     )
+
+
+def _cameras_of(table: Any, calibration: Calibration, stage: Any, rig: Any) -> list[str]:
+    """Names of the cameras whose pixels a table of tracks has; without one, those of the run."""
+    known = [camera.name for camera in calibration.cameras]
+    if table is not None:
+        return [name for name in known if f"{name}_u_px" in table]
+    of_rig = getattr(rig or getattr(stage, "rig", None), "tracking_cameras", known[:2])
+    return list(getattr(stage, "cameras", of_rig))
 
 
 def _chosen(

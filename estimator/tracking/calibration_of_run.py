@@ -9,6 +9,18 @@ from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration, load_calibration
 
 
+def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
+    """Of a calibration of more than two cameras, the two by which a run is tracked.
+
+    names : of the run's cameras. Others than two that it has are left to `check_calibration`.
+    """
+    known = [camera.name for camera in calibration.cameras]
+    if len(known) < 3 or len(names) != 2 or not set(names) <= set(known):
+        return calibration
+    first, second = sorted(names, key=known.index)
+    return calibration.pair(first, second)
+
+
 def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:
     """The calibration and the files it came from.
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import find_bubbles, outline_points
+from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.estimator.tracking.detect_run import Progress, Scene, make_scene
 from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.track import (
@@ -106,7 +107,7 @@ def write_tracking(
             write_table(table, staged / "references.csv")
         write_json_atomic(staged / "run.json", _record(run, options, record))
         if run.detections is None:
-            cameras = check_calibration(run, calibration)
+            cameras = check_calibration(run, pair_of_run(calibration, run.cameras))
             axis = stage_axis(run, calibration)
             strips = stream.marks.strips if stream.marks is not None else None
             scene = stream.scene or make_scene(

@@ -23,6 +23,7 @@ from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.from_pairs import PairCollector, with_change
 from telerig.estimator.tracking.backtracking import Tables
+from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     Progress,
@@ -173,6 +174,7 @@ def tracking_stream(
 ) -> TrackingStream:
     """Detect (detections are kept in ``work``), learn the pair model, then link lazily."""
     chosen = options or TrackOptions()
+    calibration = pair_of_run(calibration, run.cameras)
     cameras = check_calibration(run, calibration)
     axis = stage_axis(run, calibration)
     first_id, labels, scene, marks = 0, None, None, None

@@ -123,7 +123,8 @@ def load_run(
     path : `DATASET/runs/NAME`, or any folder that holds the same files.
     rig : None looks for `rig.toml` two folders up.
     source : "images" or "detections" where the folder has both.
-    cameras, image_sizes_px : from a calibration, where there is no rig.toml.
+    cameras, image_sizes_px : from a calibration, where there is no rig.toml. With one, the run is
+    that of the two cameras that `[tracking]` names; what it has of others is left out.
     pair_by : how images of several cameras come together, see `pair_frames`.
     skip_unreadable : True leaves out every frame that cannot be read, False none; by default only
     the last of a recording, which is cut short when the disk is full or the power fails.
@@ -133,16 +134,19 @@ def load_run(
     folder = _run_folder(Path(path))
     rig = rig or _rig_above(folder)
     names = list(cameras) if cameras else _cameras_of(rig, folder)
+    every = list(rig.cameras) if rig and not set(names) - set(rig.cameras) else names
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()} if rig else {}
     sizes |= dict(image_sizes_px or {})
     notes: list[str] = []
     images = _choose_source(folder, names, source) == "images"
-    sources = _open_sources(folder, names) if images else {}
-    positions = _paired(folder, sources, pair_by, notes) if images else {}
+    if len(every) > len(names):
+        notes.append(f"of {', '.join(every)}, the run is that of cameras {', '.join(names)}")
+    sources = _open_sources(folder, names, every) if images else {}
+    positions = _paired(folder, sources, every, pair_by, notes) if images else {}
     sizes |= {n: _size(s) for n, s in sources.items() if n not in sizes}
     count = len(positions[names[0]]) if images else None
-    detections = None if images else _detections(folder, names, sizes, notes)
-    t_s = _times(folder, names, count, detections, notes)
+    detections = None if images else _detections(folder, names, every, sizes, notes)
+    t_s = _times(folder, every, count, detections, notes)
     stage = _table(folder / "stage.csv", read_stage_csv)
     sensors = list(rig.accelerometers) if rig else None
     run = RunData(
@@ -161,7 +165,7 @@ def load_run(
         ),
         references=_table(
             folder / "references.csv",
-            lambda file: read_references_csv(file, names, sizes, len(t_s)),
+            lambda file: _of(names, read_references_csv(file, every, sizes, len(t_s))),
         ),
         detections=detections,
         notes=notes,
@@ -179,7 +183,13 @@ def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
             where=str(folder),
             todo="put the run into DATASET/runs/, or give a calibration (--calibration FILE)",
         )
-    return list(rig.cameras)
+    return list(rig.tracking_cameras)
+
+
+def _of(names: list[str], table: pd.DataFrame) -> pd.DataFrame:
+    """The rows of some cameras."""
+    mine = table["camera"].isin(names)
+    return table if mine.all() else table[mine].reset_index(drop=True)
 
 
 def _run_folder(path: Path) -> Path:
@@ -228,14 +238,17 @@ def recordings(folder: Path) -> dict[str, Path]:
     return found
 
 
-def _open_sources(folder: Path, names: list[str]) -> dict[str, FrameSource]:
-    """Raises InputError for a camera without frames, and for frames of no known camera."""
-    strangers = {name: p for name, p in recordings(folder).items() if name not in names}
+def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str, FrameSource]:
+    """The frames of the cameras ``names``; ``every`` : all of the rig.
+
+    Raises InputError for a camera without frames, and for frames of no known camera.
+    """
+    strangers = {name: p for name, p in recordings(folder).items() if name not in every}
     for name, entry in strangers.items():
         raise InputError(
             f"there is no camera {name!r} in the rig",
             where=str(entry),
-            todo=suggestion(name, names) + " Else move it out of the run's folder.",
+            todo=suggestion(name, every) + " Else move it out of the run's folder.",
         )
     sources = {name: open_frames(folder, name) for name in names}
     for name, source in sources.items():
@@ -249,11 +262,15 @@ def _open_sources(folder: Path, names: list[str]) -> dict[str, FrameSource]:
 
 
 def _paired(
-    folder: Path, sources: Mapping[str, FrameSource], pair_by: Pairing, notes: list[str]
+    folder: Path,
+    sources: Mapping[str, FrameSource],
+    every: list[str],
+    pair_by: Pairing,
+    notes: list[str],
 ) -> dict[str, Ints]:
     file, missing = folder / "frames.csv", None
     if file.is_file():
-        table = read_frames_csv(file, None, list(sources))
+        table = read_frames_csv(file, None, every)
         if "missing" in table:
             dropped = table["missing"].str.split("|")
             missing = {n: np.array([n in names for names in dropped], bool) for n in sources}
@@ -268,11 +285,21 @@ def _size(source: FrameSource) -> tuple[int, int]:
 
 
 def _detections(
-    folder: Path, names: list[str], sizes: Mapping[str, tuple[int, int]], notes: list[str]
+    folder: Path,
+    names: list[str],
+    every: list[str],
+    sizes: Mapping[str, tuple[int, int]],
+    notes: list[str],
 ) -> pd.DataFrame:
     file = folder / "frames.csv"
-    count = len(read_frames_csv(file, None, names)) if file.is_file() else None
-    table = read_detections_csv(folder / "detections.csv", names, sizes, count)
+    count = len(read_frames_csv(file, None, every)) if file.is_file() else None
+    table = _of(names, read_detections_csv(folder / "detections.csv", every, sizes, count))
+    if not len(table):
+        raise InputError(
+            f"has no row of the cameras {', '.join(names)}",
+            where=str(folder / "detections.csv"),
+            todo="name the cameras that saw bubbles: [tracking] cameras in rig.toml",
+        )
     if not all(name in sizes for name in names):
         notes.append("the images' sizes are not known: detections outside them are not noticed")
     absent = [name for name in names if name not in set(table["camera"])]

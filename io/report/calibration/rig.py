@@ -226,7 +226,7 @@ _MARGIN = 1 / 12
 def next_pictures(results: CalibrationResults) -> list[Picture]:
     """Two pictures of the best pose; none in folders of before, or when no pose was found."""
     advice = results.file.diagnostics.next_view
-    if not advice.get("poses") or len(results.cameras) != 2:
+    if not advice.get("poses") or len(results.cameras) < 2:
         return []
     pose = np.array(advice["poses"][0]["rig_from_target"], float).reshape(4, 4)
     return [_images(results, pose, advice), _plan(results, pose)]
@@ -240,13 +240,14 @@ def _images(results: CalibrationResults, pose: Array, advice: Mapping[str, Any])
     corners = _moved(pose, plate_corners(results.points_mm, _MARGIN))
     dots = _moved(pose, results.points_mm)
     marked = np.isin(results.dot_ids, advice.get("marks") or [])
-    share = (1 - 3 * _GAP) / 2
+    count = len(results.cameras)
+    share = (1 - (count + 1) * _GAP) / count
     ratio = max(c.image_size_px[1] / c.image_size_px[0] for c in results.cameras)
     height_in = WIDTH_IN * share * ratio + 0.45
     table = results.residuals
     with drawing(height_in) as sheet:
-        both = (sheet.axes, sheet.figure.add_axes((0, 0, 1, 1)))
-        for i, (camera, axes) in enumerate(zip(results.cameras, both)):
+        more = [sheet.figure.add_axes((0, 0, 1, 1), label=c.name) for c in results.cameras[1:]]
+        for i, (camera, axes) in enumerate(zip(results.cameras, [sheet.axes, *more])):
             axes.set_position((_GAP + i * (share + _GAP), 0.03, share, 1 - 0.45 / height_in))
             image_axes(axes, camera.image_size_px)
             axes.set(xlabel="", ylabel="", xticks=[], yticks=[])
@@ -262,7 +263,8 @@ def _images(results: CalibrationResults, pose: Array, advice: Mapping[str, Any])
                 axes.plot(*seen[which].T, "o", color=camera_colour(i), markersize=size, **dot)
             axes.plot(*outline[:2].T, color=MODEL, linewidth=2.2, solid_capstyle="butt")
     caption = (
-        "The target as both cameras would see it (large: marks; red: the edge beside row 0, or of "
+        f"The target as {'both' if count == 2 else 'the'} cameras would see it (large: marks; "
+        "red: the edge beside row 0, or of "
         "smallest y); grey: where dots were so far. Some degrees and millimetres more or less do "
         "not matter."
     )

@@ -15,7 +15,6 @@ from telerig.io.report.page.page import Figure, Row
 from telerig.io.results.calibration import CameraRecord, LadderStep
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
 
 WORST = 15
@@ -130,25 +129,32 @@ def _largest_distortion(camera: Camera) -> str:
 
 
 def pose_rows(results: CalibrationResults) -> list[Row]:
-    """The second camera against the first; empty for one camera."""
-    if len(results.cameras) < 2:
-        return []
-    second = results.cameras[1]
-    pose = second.camera_from_rig
-    nominal = results.file.twin.nominal_rotvec_deg
-    turn, place = _tangent_sd(results, "r", "_rad"), _tangent_sd(results, "t", "_mm")
-    statistics = results.statistics
+    """Every camera against the first; empty for one camera."""
+    return [row for camera in results.cameras[1:] for row in _pose_rows(results, camera)]
+
+
+def _pose_rows(results: CalibrationResults, camera: Camera) -> list[Row]:
+    pose, name, first = camera.camera_from_rig, camera.name, results.cameras[0].name
+    nominal: Any = results.file.twin.nominal_rotvec_deg
+    statistics, which = results.statistics, ""
+    if len(results.cameras) > 2:
+        nominal = (nominal or {}).get(name)
+        statistics, which = (
+            statistics.get("from_first", {}).get(name, {}),
+            f" of {first} and {name}",
+        )
+    turn = _tangent_sd(results, name, "r", "_rad")
+    place = _tangent_sd(results, name, "t", "_mm")
+    angle = with_sd(statistics.get("axes_angle_deg"), statistics.get("axes_angle_sd_deg"))
     return [
-        Row(("angle between the axes (°)", with_sd(statistics.get("axes_angle_deg"),
-                                                  statistics.get("axes_angle_sd_deg"))), True),
-        Row(("distance between the axes (mm)", _gap(results, pose))),
-        Row((f"{second.name}_from_{results.cameras[0].name} as rotation vector (°)",
+        Row((f"angle between the axes{which} (°)", angle), True),
+        Row((f"distance between the axes{which} (mm)", _gap(results, camera))),
+        Row((f"{name}_from_{first} as rotation vector (°)",
              _fixed(np.degrees(pose.rotvec_rad), 5))),
         Row(("the same, nominal (rig.toml)", _fixed(nominal, 1))),
-        Row((f"sd of turns about {second.name}'s x, y, z (°)", _fixed(_degrees(turn), 5))),
-        Row((f"{second.name}_from_{results.cameras[0].name} translation (mm)",
-             _fixed(pose.translation_mm, 5))),
-        Row((f"sd of shifts along {second.name}'s x, y, z (mm)", _fixed(place, 5))),
+        Row((f"sd of turns about {name}'s x, y, z (°)", _fixed(_degrees(turn), 5))),
+        Row((f"{name}_from_{first} translation (mm)", _fixed(pose.translation_mm, 5))),
+        Row((f"sd of shifts along {name}'s x, y, z (mm)", _fixed(place, 5))),
     ]  # fmt: skip
 
 
@@ -182,23 +188,22 @@ def _rig_block(results: CalibrationResults, names: list[str]) -> Array | None:
     return np.asarray(block.matrix[np.ix_(index, index)])
 
 
-def _tangent_names(results: CalibrationResults, kind: str, unit: str) -> list[str]:
-    return [f"{results.cameras[1].name}.{kind}{axis}{unit}" for axis in "xyz"]
-
-
-def _tangent_sd(results: CalibrationResults, kind: str, unit: str) -> list[float] | None:
-    block = _rig_block(results, _tangent_names(results, kind, unit))
+def _tangent_sd(
+    results: CalibrationResults, camera: str, kind: str, unit: str
+) -> list[float] | None:
+    block = _rig_block(results, [f"{camera}.{kind}{axis}{unit}" for axis in "xyz"])
     return None if block is None else [float(s) for s in np.sqrt(np.diag(block))]
 
 
-def _gap(results: CalibrationResults, camera_from_rig: Pose) -> str:
-    """Length of the common perpendicular; the tangent is of rig_from_second, in its own axes."""
+def _gap(results: CalibrationResults, camera: Camera) -> str:
+    """Length of the common perpendicular; the tangent is of rig_from_camera, in its own axes."""
+    camera_from_rig = camera.camera_from_rig
     across = np.cross([0.0, 0.0, 1.0], camera_from_rig.rotation[2])
     if np.linalg.norm(across) < 1e-6:
         return "the axes are parallel"
     across /= np.linalg.norm(across)
     gap = abs(float(across @ camera_from_rig.inverse().translation_mm))
-    block = _rig_block(results, _tangent_names(results, "t", "_mm"))
+    block = _rig_block(results, [f"{camera.name}.t{axis}_mm" for axis in "xyz"])
     if block is None:
         return number(gap, 5)
     inside = camera_from_rig.rotation @ across

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from telerig.errors import InputError
 
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
+Rejected = tuple[float, float, float, str]
 
 GREEN, RED, PAPER, INK = (40, 200, 70), (235, 45, 45), (255, 255, 255), (30, 30, 30)
 _ELLIPSE = ["u_px", "v_px", "a_px", "b_px", "angle_rad"]
@@ -23,6 +25,15 @@ _FRACTION_BITS = 4
 _SCALE, _LINE_PX, _JPEG_QUALITY = 0.36, 14, 80
 _ENOUGH_PIXELS = 50_000
 """For the brightness of the picture."""
+
+_LEAST_CONTRAST = 0.6
+_LABEL_PX = 9
+"""An outline wider than twice this has its label inside."""
+
+_FINEST_PX = 2.0
+"""What is drawn round something is at least so large, to be seen."""
+
+_TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 
 
 def draw_overlay(
@@ -41,40 +52,25 @@ def draw_overlay(
 
     Raises InputError for what is no grey image or a table without these columns.
     """
-    _check_grey(image)
-    _check_columns(accepted, ["dot", "row", "column"], "accepted")
-    _check_columns(rejected, ["reason"], "rejected")
-    factor = min(1.0, max_width_px / image.shape[1])
-    picture = grey_picture(image, factor)
-    counts = Counter(rejected["reason"]).most_common()
-    numbers = {reason: i + 1 for i, (reason, _) in enumerate(counts)}
-    taken = np.zeros(picture.shape[:2], bool)
-    _ellipses(picture, rejected, factor, RED)
-    _ellipses(picture, accepted, factor, GREEN)
-    _write_indices(picture, accepted, _labels(accepted), factor, GREEN, taken)
-    _write_indices(
-        picture, rejected, [str(numbers[r]) for r in rejected["reason"]], factor, RED, taken
-    )
-    lines = [f"{len(accepted)} dots accepted, {len(rejected)} rejected"]
-    lines += [f"{numbers[reason]}: {reason} ({count})" for reason, count in counts]
-    return np.concatenate([picture, legend(lines, picture.shape[1])])
-
-
-def _check_grey(image: NDArray[Any]) -> None:
-    if image.ndim != 2 or min(image.shape) < 1:
-        raise InputError(
-            f"an overlay is drawn on a grey image, this one has shape {image.shape}",
-            todo="pass one channel, (height, width)",
-        )
-
-
-def _check_columns(table: pd.DataFrame, extra: list[str], name: str) -> None:
-    missing = [column for column in _ELLIPSE + extra if column not in table]
-    if missing:
-        raise InputError(
-            f"the table of {name} dots lacks {', '.join(missing)}",
-            todo=f"it needs {', '.join(_ELLIPSE + extra)}",
-        )
+    for table, extra, name in (
+        (accepted, ["dot", "row", "column"], "accepted"),
+        (rejected, ["reason"], "rejected"),
+    ):
+        missing = [column for column in _ELLIPSE + extra if column not in table]
+        if missing:
+            raise InputError(
+                f"the table of {name} dots lacks {', '.join(missing)}",
+                todo=f"it needs {', '.join(_ELLIPSE + extra)}",
+            )
+    labels = [str(dot) for dot in accepted["dot"]]
+    if len(accepted) and accepted["dot"].max() > _LARGEST_ID:
+        labels = [f"{r},{c}" for r, c in zip(accepted["row"], accepted["column"])]
+    least_px = _FINEST_PX / min(1.0, max_width_px / image.shape[1])
+    dots, strange = (_ellipses(table, least_px) for table in (accepted, rejected))
+    return _overlay(
+        image, dots, labels, [GREEN] * len(dots), strange, list(rejected["reason"]),
+        f"{len(dots)} dots accepted", max_width_px,
+    )  # fmt: skip
 
 
 def overlay_jpeg(
@@ -87,124 +83,6 @@ def overlay_jpeg(
     quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     _, encoded = cv2.imencode(".jpg", picture[..., ::-1], quality)
     return encoded.tobytes()
-
-
-def grey_picture(image: NDArray[Any], factor: float, least_contrast: float = 0.0) -> Picture:
-    """8-bit RGB; the darkest and brightest thousandth of the pixels become black and white.
-
-    What is brighter than 1 - least_contrast of the brightest never becomes black, so that an
-    empty image does not look like snow.
-    """
-    import cv2
-
-    height, width = image.shape
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    grey = np.nan_to_num(image.astype(np.float32))
-    if factor < 1:
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    stride = 1 + int(np.sqrt(grey.size / _ENOUGH_PIXELS))
-    low, high = np.percentile(grey[::stride, ::stride], [0.1, 99.9]).tolist()
-    low = min(low, (1 - least_contrast) * high) if least_contrast > 0 else low
-    stretched = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255)
-    return np.asarray(cv2.cvtColor(stretched.astype(np.uint8), cv2.COLOR_GRAY2RGB), np.uint8)
-
-
-def _labels(accepted: pd.DataFrame) -> list[str]:
-    if len(accepted) and accepted["dot"].max() > _LARGEST_ID:
-        return [f"{r},{c}" for r, c in zip(accepted["row"], accepted["column"])]
-    return [str(dot) for dot in accepted["dot"]]
-
-
-def _ellipses(picture: Picture, table: pd.DataFrame, factor: float, colour: Colour) -> None:
-    import cv2
-
-    ellipses = table[_ELLIPSE].to_numpy(float)
-    for u, v, a, b, angle in ellipses[np.isfinite(ellipses).all(axis=1)]:
-        centre = (np.array([u, v]) + 0.5) * factor - 0.5
-        axes = np.maximum(np.array([a, b]) * factor, 1.5)
-        cv2.ellipse(
-            picture, fixed(centre), fixed(axes), float(np.degrees(angle)), 0, 360, colour, 1,
-            cv2.LINE_AA, _FRACTION_BITS,
-        )  # fmt: skip
-
-
-def _write_indices(
-    picture: Picture,
-    table: pd.DataFrame,
-    labels: Iterable[str],
-    factor: float,
-    colour: Colour,
-    taken: Bools,
-) -> None:
-    """Each label in the middle of its ellipse, else at an end of the long axis, if there is room.
-
-    ``taken`` marks the pixels under labels that are already there.
-    """
-    for (u, v, a, _, angle), label in zip(table[_ELLIPSE].to_numpy(float), labels):
-        if not np.isfinite([u, v, a, angle]).all():
-            continue
-        along = a * np.array([np.cos(angle), np.sin(angle)])
-        places = [(np.array([u, v]) + step * along + 0.5) * factor for step in (0, 1, -1)]
-        any(write_label(picture, label, place, colour, taken) for place in places)
-
-
-def fixed(point: Array) -> tuple[int, int]:
-    x, y = np.rint(point * 2**_FRACTION_BITS).astype(int)
-    return int(x), int(y)
-
-
-def write_label(
-    picture: Picture,
-    label: str,
-    centre: Array,
-    colour: Colour,
-    taken: Bools,
-) -> bool:
-    """Write text round a point, with a dark rim, unless other text is there; whether it was."""
-    import cv2
-
-    (width, height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, 1)
-    x = int(np.clip(round(centre[0] - width / 2), 0, max(picture.shape[1] - width, 0)))
-    y = int(np.clip(round(centre[1] + height / 2), height, max(picture.shape[0] - 1, height)))
-    place = (slice(max(y - height - 1, 0), y + 2), slice(max(x - 1, 0), x + width + 2))
-    if taken[place].any():
-        return False
-    taken[place] = True
-    for shade, thickness in ((INK, 2), (colour, 1)):
-        cv2.putText(
-            picture, label, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _SCALE, shade, thickness, cv2.LINE_AA
-        )
-    return True
-
-
-def legend(lines: list[str], width_px: int) -> Picture:
-    """The lines in dark ink on white, wrapped to the width."""
-    import textwrap
-
-    import cv2
-
-    letters = max(8, int((width_px - 8) / (18.5 * _SCALE)))
-    wrapped = [part for line in lines for part in textwrap.wrap(_ascii(line), letters)]
-    strip = np.full((_LINE_PX * len(wrapped) + 6, width_px, 3), PAPER, np.uint8)
-    for i, line in enumerate(wrapped):
-        at = (4, _LINE_PX * (i + 1))
-        cv2.putText(strip, line, at, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, INK, 1, cv2.LINE_AA)
-    return strip
-
-
-def _ascii(text: str) -> str:
-    """OpenCV's letters are ASCII only."""
-    return text.replace("µ", "u").encode("ascii", "replace").decode("ascii")
-
-
-Rejected = tuple[float, float, float, str]
-
-_LEAST_CONTRAST = 0.6
-_LABEL_PX = 9
-"""An outline wider than twice this has its label inside."""
-
-_FINEST_PX = 2.0
-"""A circle round what was rejected is at least so large, to be seen."""
 
 
 def draw_bubble_overlay(
@@ -226,59 +104,6 @@ def draw_bubble_overlay(
 
     Raises InputError for what is no grey image, and for labels or colours that do not fit.
     """
-    shades = _checked(image, outlines, labels, colours)
-    factor = min(1.0, max_width_px / image.shape[1])
-    picture = grey_picture(image, factor, _LEAST_CONTRAST)
-    reasons = Counter(reason for *_, reason in rejected)
-    numbers = {reason: i + 1 for i, (reason, _) in enumerate(reasons.most_common())}
-    circles = [_circle(u, v, radius, factor) for u, v, radius, _ in rejected]
-    for circle in circles:
-        _draw(picture, circle, factor, RED)
-    for outline, shade in zip(outlines, shades):
-        _draw(picture, outline, factor, shade)
-    taken = np.zeros(picture.shape[:2], bool)
-    for outline, label, shade in zip(outlines, labels, shades):
-        _write_beside(picture, outline, label, factor, shade, taken)
-    for circle, (*_, reason) in zip(circles, rejected):
-        _write_beside(picture, circle, str(numbers[reason]), factor, RED, taken)
-    lines = [f"{len(outlines)} bubbles, {len(rejected)} rejected"]
-    lines += [f"{n}: {reason} ({reasons[reason]})" for reason, n in numbers.items()]
-    return np.concatenate([picture, legend(lines, picture.shape[1])])
-
-
-def draw_binary(
-    shape: tuple[int, int], outlines: Sequence[Array], max_width_px: int = 900
-) -> NDArray[np.uint8]:
-    """(h, w), 255 where at least half of the pixel lies inside an outline, else 0.
-
-    shape : (H, W) of the image, whose pixels the outlines (N, 2) are in.
-    """
-    from telerig.io.images.outline_raster import cell_coverage
-
-    factor = min(1.0, max_width_px / shape[1])
-    picture = np.zeros([max(1, round(n * factor)) for n in shape[:2]], np.uint8)
-    for outline in outlines:
-        corners = (_finite(outline) + 0.5) * factor
-        if len(corners) < 3:
-            continue
-        low = np.floor(corners.min(axis=0)).astype(int)
-        columns, rows = np.ceil(corners.max(axis=0)).astype(int) - low + 1
-        inside = cell_coverage(corners - low, (int(rows), int(columns))) >= 0.5
-        row, column = np.nonzero(inside)
-        row, column = row + low[1], column + low[0]
-        seen = (row >= 0) & (row < picture.shape[0]) & (column >= 0) & (column < picture.shape[1])
-        picture[row[seen], column[seen]] = 255
-    return picture
-
-
-def _checked(
-    image: NDArray[Any],
-    outlines: Sequence[Array],
-    labels: Sequence[str],
-    colours: Sequence[Colour] | Colour,
-) -> list[Colour]:
-    """One colour per outline."""
-    _check_grey(image)
     alike = len(colours) == 3 and all(np.ndim(part) == 0 for part in colours)
     shades: list[Any] = [colours] * len(outlines) if alike else list(colours)
     if not len(outlines) == len(labels) == len(shades):
@@ -286,38 +111,138 @@ def _checked(
             f"{len(outlines)} outlines, {len(labels)} labels and {len(shades)} colours",
             todo="pass one label and one colour for each outline",
         )
-    return [tuple(int(part) for part in shade) for shade in shades]  # type: ignore[misc]
+    finest_px = _FINEST_PX / min(1.0, max_width_px / image.shape[1])
+    circles = []
+    for u, v, radius, _ in rejected:
+        size = max(radius, finest_px) if np.isfinite(radius) else 4 * finest_px
+        circles.append(np.stack([u + size * np.cos(_TURN), v + size * np.sin(_TURN)], -1))
+    reasons = [reason for *_, reason in rejected]
+    return _overlay(image, outlines, labels, shades, circles, reasons, f"{len(outlines)} bubbles",
+                    max_width_px, _LEAST_CONTRAST)  # fmt: skip
 
 
-def _finite(outline: Array) -> Array:
-    points = np.asarray(outline, float).reshape(-1, 2)
-    return np.asarray(points[np.isfinite(points).all(axis=1)])
+def draw_binary(
+    shape: tuple[int, int], outlines: Sequence[Array], max_width_px: int = 900
+) -> Picture:
+    """(h, w), 255 where the middle of a pixel lies inside an outline, else 0.
+
+    shape : (H, W) of the image, whose pixels the outlines (N, 2) are in.
+    """
+    from skimage.draw import polygon
+
+    factor = min(1.0, max_width_px / shape[1])
+    height, width = (max(1, round(n * factor)) for n in shape[:2])
+    picture = np.zeros((height, width), np.uint8)
+    for outline in outlines:
+        points = _scaled(outline, factor)
+        if len(points) > 2:
+            picture[polygon(points[:, 1], points[:, 0], (height, width))] = 255
+    return picture
 
 
-def _circle(u: float, v: float, radius: float, factor: float) -> Array:
-    size = max(radius, _FINEST_PX / factor) if np.isfinite(radius) else 4 * _FINEST_PX / factor
-    turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    return np.stack([u + size * np.cos(turn), v + size * np.sin(turn)], -1)
+def _overlay(
+    image: NDArray[Any],
+    outlines: Sequence[Array],
+    labels: Sequence[str],
+    colours: Sequence[Colour],
+    rejected: Sequence[Array],
+    reasons: Sequence[str],
+    found: str,
+    max_width_px: int,
+    least_contrast: float = 0.0,
+) -> Picture:
+    """The image with closed outlines, each (N, 2) px, their labels, and a legend underneath.
+
+    rejected : outlines in red with the numbers of their ``reasons``.
+    """
+    if image.ndim != 2 or min(image.shape) < 1:
+        raise InputError(
+            f"an overlay is drawn on a grey image, this one has shape {image.shape}",
+            todo="pass one channel, (height, width)",
+        )
+    factor = min(1.0, max_width_px / image.shape[1])
+    picture = _grey_picture(image, factor, least_contrast)
+    counts = Counter(reasons).most_common()
+    numbers = {reason: str(i + 1) for i, (reason, _) in enumerate(counts)}
+    every = [*((outline, numbers[reason], RED) for outline, reason in zip(rejected, reasons)),
+             *zip(outlines, labels, colours)]  # fmt: skip
+    for outline, _, colour in every:
+        draw_line(picture, _scaled(outline, factor), colour, closed=True)
+    taken = np.zeros(picture.shape[:2], bool)
+    for outline, label, colour in every[len(rejected) :] + every[: len(rejected)]:
+        _write_beside(picture, _scaled(outline, factor), label, colour, taken)
+    lines = [f"{found}, {len(rejected)} rejected"]
+    lines += [f"{numbers[reason]}: {reason} ({count})" for reason, count in counts]
+    return np.concatenate([picture, _legend(lines, picture.shape[1])])
 
 
-def _draw(picture: Picture, outline: Array, factor: float, colour: Colour) -> None:
+def _grey_picture(image: NDArray[Any], factor: float, least_contrast: float = 0.0) -> Picture:
+    """8-bit RGB; the darkest and brightest thousandth of the pixels become black and white.
+
+    What is brighter than 1 - least_contrast of the brightest never becomes black, so that an
+    empty image does not look like snow.
+    """
+    stride = 1 + int(np.sqrt(factor**2 * image.size / _ENOUGH_PIXELS))
+    grey = shrunk(image, factor)
+    low, high = np.percentile(grey[::stride, ::stride], [0.1, 99.9]).tolist()
+    low = min(low, (1 - least_contrast) * high) if least_contrast > 0 else low
+    return in_grey(grey, low, high)
+
+
+def shrunk(image: NDArray[Any], factor: float) -> NDArray[np.float32]:
+    """(h, w) the image by a factor of at most 1; what is not finite becomes 0."""
     import cv2
 
-    points = (_finite(outline) + 0.5) * factor - 0.5
+    grey = np.nan_to_num(image.astype(np.float32))
+    if factor >= 1:
+        return grey
+    size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def in_grey(grey: NDArray[np.float32], low: float, high: float) -> Picture:
+    """(h, w, 3) 8-bit RGB, black at ``low`` and white at ``high``."""
+    stretched = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255)
+    return np.repeat(stretched.astype(np.uint8)[..., None], 3, axis=2)
+
+
+def draw_line(picture: Picture, points: Array, colour: Colour, *, closed: bool) -> None:
+    """A line through (N, 2) pixels of the picture, pixel (0, 0) the centre of the first one."""
+    import cv2
+
     if len(points) > 1:
-        corners = np.array([fixed(p) for p in points], np.int32).reshape(-1, 1, 2)
-        cv2.polylines(picture, [corners], True, colour, 1, cv2.LINE_AA, _FRACTION_BITS)
+        corners = np.rint(points * 2**_FRACTION_BITS).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(picture, [corners], closed, colour, 1, cv2.LINE_AA, _FRACTION_BITS)
+
+
+def write_label(
+    picture: Picture, label: str, centre: Array, colour: Colour, taken: Bools | None = None
+) -> bool:
+    """Write text round a point, with a dark rim; whether it was, as other text may be there.
+
+    taken : (h, w) the pixels under labels that are already there; None writes over them.
+    """
+    import cv2
+
+    (width, height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, 1)
+    x = int(np.clip(round(centre[0] - width / 2), 0, max(picture.shape[1] - width, 0)))
+    y = int(np.clip(round(centre[1] + height / 2), height, max(picture.shape[0] - 1, height)))
+    place = (slice(max(y - height - 1, 0), y + 2), slice(max(x - 1, 0), x + width + 2))
+    if taken is not None:
+        if taken[place].any():
+            return False
+        taken[place] = True
+    for shade, thickness in ((INK, 2), (colour, 1)):
+        cv2.putText(
+            picture, label, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _SCALE, shade, thickness, cv2.LINE_AA
+        )
+    return True
 
 
 def _write_beside(
-    picture: Picture,
-    outline: Array,
-    label: str,
-    factor: float,
-    colour: Colour,
-    taken: Bools,
+    picture: Picture, points: Array, label: str, colour: Colour, taken: Bools
 ) -> None:
-    points = (_finite(outline) + 0.5) * factor
+    """In the middle of a large outline, else at one of its four sides, if there is room."""
     if not label or not len(points):
         return
     low, high = points.min(axis=0), points.max(axis=0)
@@ -327,3 +252,33 @@ def _write_beside(
         steps = [(0, 0), *steps]
     places = [middle + (reach + _LABEL_PX) * step for step in steps]
     any(write_label(picture, label, place, colour, taken) for place in places)
+
+
+def _legend(lines: list[str], width_px: int) -> Picture:
+    """The lines in dark ink on white, wrapped to the width. OpenCV's letters are ASCII only."""
+    import cv2
+
+    letters = max(8, int((width_px - 8) / (18.5 * _SCALE)))
+    plain = [line.replace("µ", "u").encode("ascii", "replace").decode("ascii") for line in lines]
+    wrapped = [part for line in plain for part in textwrap.wrap(line, letters)]
+    strip = np.full((_LINE_PX * len(wrapped) + 6, width_px, 3), PAPER, np.uint8)
+    for i, line in enumerate(wrapped):
+        at = (4, _LINE_PX * (i + 1))
+        cv2.putText(strip, line, at, cv2.FONT_HERSHEY_SIMPLEX, _SCALE, INK, 1, cv2.LINE_AA)
+    return strip
+
+
+def _ellipses(table: pd.DataFrame, least_px: float) -> list[Array]:
+    """The outline (N, 2) px of each row's ellipse; no points where it is not finite."""
+    outlines = []
+    for u, v, a, b, angle in table[_ELLIPSE].to_numpy(float):
+        x, y = max(a, least_px) * np.cos(_TURN), max(b, least_px) * np.sin(_TURN)
+        cos, sin = np.cos(angle), np.sin(angle)
+        outlines.append(np.stack([u + cos * x - sin * y, v + sin * x + cos * y], -1))
+    return outlines
+
+
+def _scaled(outline: Array, factor: float) -> Array:
+    """The finite points of an outline (N, 2) in pixels of the picture, smaller by ``factor``."""
+    points = np.asarray(outline, float).reshape(-1, 2)
+    return np.asarray((points[np.isfinite(points).all(axis=1)] + 0.5) * factor - 0.5)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -155,12 +154,3 @@ class _Gif:
 
     def close(self) -> None:
         self._pages = []
-
-
-@cache
-def font(size_px: float) -> Any:
-    """Matplotlib's own typeface, for Pillow."""
-    from matplotlib import get_data_path
-    from PIL import ImageFont
-
-    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", size_px)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.report.film.files import Picture, Progress, font, write_film
+from telerig.io.report.film.files import Picture, Progress, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.results import TrackResults, read_track_results, run_cameras
 from telerig.io.report.run.tracking.scene import thinned, track_colour
@@ -426,8 +426,17 @@ class _Page:
         pen = ImageDraw.Draw(image)
         for words, (u, v), anchor, colour, size in self._texts:
             place = u * DPI / 100, v * DPI / 100
-            pen.text(place, words, colour, font(size * DPI / 100), anchor)
+            pen.text(place, words, colour, _font(size * DPI / 100), anchor)
         return np.array(image)
+
+
+@cache
+def _font(size_px: float) -> Any:
+    """Matplotlib's own typeface, for Pillow."""
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/DejaVuSans.ttf", size_px)
 
 
 def _band_words(panel: Panel) -> str:

@@ -16,7 +16,8 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.io.report.film.files import Progress, font, write_film
+from telerig.io.report.film.files import Progress, write_film
+from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
 
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
@@ -28,7 +29,6 @@ WIDTH_PX = 640
 _GIF_WIDTH_PX = 800
 _RATE_HZ = 25.0
 _STRIP_PX, _GAP_PX = 30, 4
-_BITS = 4
 _ALONE: Colour = (250, 190, 20)
 _COLOURS: tuple[Colour, ...] = (
     (20, 110, 255), (235, 70, 0), (15, 165, 60), (205, 40, 200), (225, 25, 60), (0, 165, 175),
@@ -173,12 +173,12 @@ def draw_views(
     width = sum(part.shape[1] for part in parts) + _GAP_PX * (len(parts) - 1)
     page = np.full((height + height % 2, width + width % 2, 3), 255, np.uint8)
     left = 0
-    for i, part in enumerate(parts):
+    for part in parts:
         page[: part.shape[0], left : left + part.shape[1]] = part
-        if i + 1 == len(parts):
-            time = "" if frame.t_s is None else f", {frame.t_s:.3f} s"
-            _words(page, f"frame {frame.frame}{time}", (left + part.shape[1] - 10, 15), "rm")
         left += part.shape[1] + _GAP_PX
+    time = "" if frame.t_s is None else f", {frame.t_s:.3f} s"
+    place = np.array([left - _GAP_PX - 90.0, _STRIP_PX / 2])
+    write_label(page, f"frame {frame.frame}{time}", place, INK)
     return page
 
 
@@ -189,51 +189,31 @@ def _view(
     found: Sequence[Found],
     camera: str,
 ) -> Picture:
+    """(h, w, 3) one camera's image with its bubbles, below a strip with the camera's name."""
     import cv2
 
     factor = min(1.0, WIDTH_PX / size_px[0])
     width, height = round(size_px[0] * factor), round(size_px[1] * factor)
-    page = np.full((height + _STRIP_PX, width, 3), 255, np.uint8)
-    picture = page[_STRIP_PX:]
+    picture = np.full((height, width, 3), 128, np.uint8)
     if image is None:
-        picture[:] = 128
-        _words(page, "no image", (width / 2, _STRIP_PX + height / 2), "mm")
+        write_label(picture, "no image", np.array([width / 2, height / 2]), PAPER)
     else:
-        low, high = shades
-        grey = np.clip((image.astype(np.float32) - low) * (255 / max(high - low, 1e-9)), 0, 255)
-        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-        picture[:] = np.round(small).astype(np.uint8)[..., None]
-    labels = []
-    drawing = np.ascontiguousarray(picture)
+        picture = in_grey(shrunk(image, factor), *shades)
     for bubble in found:
-        colour = _ALONE if bubble.particle is None else _bright(bubble.particle)
-        # Where the bubble came from; each place is a small dot on the line.
-        points = (bubble.tail_px + 0.5) * factor - 0.5
-        import cv2
-
-        if len(points) > 1:
-            cv2.polylines(drawing, [_fixed(points)], False, colour, 1, cv2.LINE_AA, _BITS)
-        for point in _fixed(points):
-            cv2.circle(drawing, (int(point[0]), int(point[1])), 24, colour, -1, cv2.LINE_AA, _BITS)
-        ring = (bubble.outline_px + 0.5) * factor - 0.5
-        cv2.polylines(drawing, [_fixed(ring)], True, colour, 1, cv2.LINE_AA, _BITS)
+        colour = _ALONE
         if bubble.particle is not None:
-            place = float(ring[:, 0].max()) + 5, float(ring[:, 1].mean()) + _STRIP_PX
-            labels.append((str(bubble.particle), place, colour))
-    picture[:] = drawing
-    _words(page, camera, (10, 15), "lm")
-    for words, place, colour in labels:
-        _words(page, words, place, "lm", colour)
-    return page
-
-
-def _fixed(points: Array) -> NDArray[np.int32]:
-    return np.round(points * (1 << _BITS)).astype(np.int32).reshape(-1, 2)
-
-
-def _bright(particle: int) -> Colour:
-    """One to a track, to be seen on a dark bubble and on a light background."""
-    return _COLOURS[particle % len(_COLOURS)]
+            colour = _COLOURS[bubble.particle % len(_COLOURS)]
+        tail, ring = ((p + 0.5) * factor - 0.5 for p in (bubble.tail_px, bubble.outline_px))
+        draw_line(picture, tail, colour, closed=False)
+        for u, v in np.rint(16 * tail).astype(int):
+            cv2.circle(picture, (int(u), int(v)), 24, colour, -1, cv2.LINE_AA, 4)
+        draw_line(picture, ring, colour, closed=True)
+        if bubble.particle is not None:
+            beside = np.array([ring[:, 0].max() + 10, ring[:, 1].mean()])
+            write_label(picture, str(bubble.particle), beside, colour)
+    strip = np.full((_STRIP_PX, width, 3), 255, np.uint8)
+    write_label(strip, camera, np.array([30.0, _STRIP_PX / 2]), INK)
+    return np.concatenate([strip, picture])
 
 
 def _palette() -> list[Colour]:
@@ -255,20 +235,3 @@ def _shades(images: Images, camera: str, frame_count: int) -> tuple[float, float
         return 0.0, 255.0
     ends = np.array([np.percentile(image, [0.1, 99.9]) for image in seen])
     return float(ends[:, 0].min()), float(ends[:, 1].max())
-
-
-def _words(
-    page: Picture,
-    words: str,
-    place: tuple[float, float],
-    anchor: str,
-    colour: Colour = (28, 31, 36),
-) -> None:
-    from PIL import Image, ImageDraw
-
-    canvas = Image.fromarray(page)
-    ImageDraw.Draw(canvas).text(
-        place, words, fill=colour, font=font(14), anchor=anchor, stroke_width=2,
-        stroke_fill=(255, 255, 255),
-    )  # fmt: skip
-    page[:] = np.asarray(canvas)

@@ -1,7 +1,7 @@
 """The smoothing graph in GTSAM: its factors, the order of elimination, its marginals.
 
-The marginal covariances of all variables come from one backward sweep. A conditional
-R x = d - S s gives, from the separator's covariance P, the variable's own R^-1 R^-T + G P G^T and
+The marginal covariances of all variables come from one backward sweep over the cliques. A clique
+R x = d - S s gives, from the separator's covariance P, its own R^-1 R^-T + G P G^T and
 its cross covariance G P, G = -R^-1 S (Rauch-Tung-Striebel in square root form; Takahashi's
 selected inverse). The separator lies within the clique of its first variable, so that no other
 blocks than those of the elimination are needed. Sums of squares only: unlike GTSAM's marginals it
@@ -10,8 +10,9 @@ works on graphs whose posterior is far from round.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -19,47 +20,65 @@ from scipy.linalg.lapack import dtrtri
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph.blocks import Blocks
 from telerig.estimator.smoothing.graph.state import GraphLayout
 from telerig.factors.linear_factors import Linear, add_linear_factors
+
+LEAST_PIVOT = 1e-9
+"""Of the information's diagonal, what Cholesky's elimination has to leave of it; covariances are
+then good to 1e-5."""
 
 _NOTHING = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
+class Blocks:
+    """Covariances of increments, in their bases.
+
+    own : of each family of keys, (n, d, d); the shake's at the frames.
+    cross : (rows, Ds, Db) of the shake with each bubble at the same frame.
+    """
+
+    own: list[Array]
+    cross: Array
+
+
+@dataclass(frozen=True)
 class EliminatedGraph:
-    """net : `gtsam.GaussianBayesNet`, one key a conditional.  vector : the solution."""
+    """cliques : the square root of the information.  vector : the solution, keys in their order."""
 
     graph: GraphLayout
-    net: Any
+    cliques: list[Clique]
     vector: Array
 
     def log_det(self) -> float:
         """log |R|; QR leaves signs on the diagonal."""
-        diagonals = (np.diagonal(self.net.at(i).R()) for i in range(self.net.size()))
-        return float(sum(np.log(np.abs(d)).sum() for d in diagonals))
+        return float(np.log(np.abs(_diagonal(self.cliques))).sum())
 
     def blocks(self) -> Blocks:
         """Marginal covariances of all increments, and of shake with bubbles at the same frame."""
         graph = self.graph
         base, counts = graph.base(), graph.counts()
-        families = [range(base[i], base[i] + n * (d > 0)) for i, (n, d) in enumerate(counts)]
-        at_frames = graph.nodes.of_frame.tolist() if counts.shake.size else []
-        rows = base.bubbles + np.arange(graph.rows)
-        pairs = list(zip(graph.node_of_row.tolist(), rows.tolist())) if counts.shake.size else []
-        sizes = [d for n, d in counts for _ in range(n)]
-        wanted = set(at_frames).union(*families[1:])
-        found, found_cross = marginal_covariances(self.net, sizes, wanted, pairs)
-        own = []
-        for keys, (number, size) in zip([at_frames, *families[1:]], counts):
-            number = number if keys is not at_frames else len(graph.nodes.of_frame)
-            own.append(np.array([found[k] for k in keys]).reshape(number, size, size))
-        cross = np.array([found_cross[pair] for pair in pairs])
-        return Blocks(own, cross.reshape(graph.rows, counts.shake.size, counts.bubbles.size))
+        nodes, of_frame = np.unique(graph.nodes.of_frame, return_inverse=True)
+        own = [np.zeros((n, d, d)) for n, d in counts]
+        own[0] = np.zeros((len(nodes), *own[0].shape[1:]))
+        keys = [nodes, *(base[i] + np.arange(n) for i, (n, _) in enumerate(counts) if i)]
+        wanted = {
+            key: block
+            for some, blocks in zip(keys, own)
+            if blocks.size
+            for key, block in zip(some.tolist(), blocks)
+        }
+        cross = np.zeros((graph.rows, counts.shake.size, counts.bubbles.size))
+        pairs: dict[int, list[tuple[int, Array]]] = {}
+        for node, row, block in zip(graph.node_of_row.tolist(), keys[1].tolist(), cross):
+            if cross.size:
+                pairs.setdefault(node, []).append((row, block))
+        fill_covariances(self.cliques, _sizes(graph), wanted, pairs)
+        return Blocks([own[0][of_frame], *own[1:]], cross)
 
 
 def eliminate(graph: GraphLayout, factors: list[Linear], *, cholesky: bool) -> EliminatedGraph:
-    """The graph of all factors, solved: by QR, or by Cholesky where that does not refuse.
+    """The graph of all factors, solved: by QR, or by Cholesky where that keeps enough digits.
 
     Raises CalibrationError where it is undetermined.
     """
@@ -69,8 +88,50 @@ def eliminate(graph: GraphLayout, factors: list[Linear], *, cholesky: bool) -> E
     for linear in factors:
         add_linear_factors(factor_graph, linear.keys, linear.blocks, linear.rhs)
     _add_bonds(factor_graph, graph)
-    net, solution = _eliminated(factor_graph, _ordering(graph), cholesky)
-    return EliminatedGraph(graph, net, solution.vector())
+    (ordering, when), sizes = _ordering(graph), _sizes(graph)
+    if cholesky:
+        try:
+            net = factor_graph.eliminateSequential(ordering)
+            cliques = cliques_of(net, sizes, when)
+            if _least_pivot(cliques, factors, sizes) > LEAST_PIVOT:
+                return EliminatedGraph(graph, cliques, net.optimize().vector())
+        except RuntimeError:
+            pass
+    try:
+        net = factor_graph.eliminateSequential(ordering, gtsam.EliminateQR)
+        return EliminatedGraph(graph, cliques_of(net, sizes, when), net.optimize().vector())
+    except RuntimeError as error:
+        raise CalibrationError(
+            f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
+            todo="check the priors: every component needs a positive intensity",
+        ) from error
+
+
+def _sizes(graph: GraphLayout) -> list[int]:
+    """Dimension of each key."""
+    return [d for n, d in graph.counts() for _ in range(n)]
+
+
+def _diagonal(cliques: Sequence[Clique]) -> Array:
+    """(D,) diagonals of the roots, in order of elimination."""
+    return np.concatenate([np.zeros(0), *(np.diagonal(c.root) for c in cliques)])
+
+
+def _least_pivot(
+    cliques: Sequence[Clique], factors: Sequence[Linear], sizes: Sequence[int]
+) -> float:
+    """What elimination leaves of the information's diagonal, the least share."""
+    starts = np.r_[0, np.cumsum(sizes)]
+    before = np.zeros(starts[-1])
+    for linear in factors:
+        for key, block in zip(linear.keys, linear.blocks):
+            own = starts[np.asarray(key)][..., None] + np.arange(block.shape[-1])
+            square = np.broadcast_to((block**2).sum(-2), (len(linear.rhs), block.shape[-1]))
+            before += np.bincount(
+                np.broadcast_to(own, square.shape).ravel(), square.ravel(), len(before)
+            )
+    order = [np.arange(starts[k], starts[k + 1]) for c in cliques for k in c.fronts]
+    return float(np.min(_diagonal(cliques) ** 2 / before[np.concatenate(order)], initial=1.0))
 
 
 def _add_bonds(factor_graph: Any, graph: GraphLayout) -> None:
@@ -89,28 +150,11 @@ def _add_bonds(factor_graph: Any, graph: GraphLayout) -> None:
     add_linear_factors(factor_graph, keys, blocks, np.zeros((len(alone), 1)))
 
 
-def _eliminated(factor_graph: Any, ordering: Any, cholesky: bool) -> tuple[Any, Any]:
-    """Bayes net and solution."""
-    import gtsam
+def _ordering(graph: GraphLayout) -> tuple[Any, Ints]:
+    """Keys in time order, with their times.
 
-    try:
-        if cholesky:
-            try:
-                net = factor_graph.eliminateSequential(ordering)
-                return net, net.optimize()
-            except RuntimeError:
-                pass
-        net = factor_graph.eliminateSequential(ordering, gtsam.EliminateQR)
-        return net, net.optimize()
-    except RuntimeError as error:
-        raise CalibrationError(
-            f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
-            todo="check the priors: every component needs a positive intensity",
-        ) from error
-
-
-def _ordering(graph: GraphLayout) -> Any:
-    """Time order; what ends (a bubble's mean, a mark) right after it was last seen; rest last."""
+    What ends (a bubble's mean, a mark) follows right after it was last seen; the rest is last.
+    """
     import gtsam
 
     base, problem = graph.base(), graph.problem
@@ -126,59 +170,113 @@ def _ordering(graph: GraphLayout) -> Any:
     when.append(last_mark)
     rank = np.repeat(np.arange(4), [len(k) for k in keys])
     joined = np.concatenate(keys).astype(np.int64)
-    order = np.lexsort((joined, rank, np.concatenate(when)))
-    out = gtsam.Ordering()
-    for key in joined[order].tolist():
-        out.push_back(key)
+    times = np.concatenate(when)
+    order = np.lexsort((joined, rank, times))
     counts = graph.counts()
-    for family in (3, 4, 6):
-        number, size = counts[family]
-        for key in range(base[family], base[family] + number * (size > 0)):
-            out.push_back(key)
-    return out
+    rest = [base[i] + np.arange(counts[i].number * (counts[i].size > 0)) for i in (3, 4, 6)]
+    out = gtsam.Ordering()
+    for key in np.concatenate([joined[order], *rest]).tolist():
+        out.push_back(key)
+    return out, np.append(times[order], np.full(sum(map(len, rest)), len(graph.nodes.t_s)))
 
 
-def marginal_covariances(
-    net: Any, sizes: Sequence[int], wanted: set[int], pairs: Sequence[tuple[int, int]]
-) -> tuple[dict[int, Array], dict[tuple[int, int], Array]]:
-    """Covariances (d, d) of the wanted keys and (d, e) of the pairs, from a `GaussianBayesNet`.
+@dataclass(frozen=True)
+class Clique:
+    """Conditionals that are eliminated one after the other and end in the same separator.
 
-    net : one key a conditional.  sizes : dimension of each key, keys counting from 0.
-    pairs : (key, later key) of one clique.
+    fronts : their own keys, in the order of elimination.  separator : keys.
+    root : (n, n) upper triangular R.  right : (n, m) S, columns as in the separator.
+    """
+
+    fronts: list[int]
+    separator: list[int]
+    root: Array
+    right: Array
+
+    @property
+    def keys(self) -> list[int]:
+        return self.fronts + self.separator
+
+
+def cliques_of(net: Any, sizes: Sequence[int], when: Ints) -> list[Clique]:
+    """The cliques of a `gtsam.GaussianBayesNet` of one key a conditional, in order of elimination.
+
+    A conditional is joined to the next one where that is its parent and of the same time.
+    sizes : dimension of each key, keys counting from 0.  when : (C,) times of the conditionals.
     """
     conditionals = [net.at(i) for i in range(int(net.size()))]
     keys = [list(c.keys()) for c in conditionals]
-    when = {clique[0]: i for i, clique in enumerate(keys)}
-    parents = [min(c[1:], key=when.__getitem__, default=-1) for c in keys]
-    children = [0] * len(sizes)
+    ends = np.append(np.diff(when) != 0, True).tolist()
+    last = [i for i, end in enumerate(ends) if end or keys[i + 1][0] not in keys[i][1:]]
+    out, first = [], 0
+    for end in last:
+        mine = range(first, end + 1)
+        first = end + 1
+        if len(mine) == 1:
+            # copies, since what GTSAM returns are views of memory that ends with the net
+            root, right = conditionals[end].R().copy(), conditionals[end].S().copy()
+            out.append(Clique(keys[end][:1], keys[end][1:], root, right))
+            continue
+        fronts, separator = [keys[i][0] for i in mine], keys[end][1:]
+        every = fronts + separator
+        starts, width = _starts(every, sizes)
+        wide = sum([sizes[k] for k in fronts])
+        both = np.zeros((wide, width))
+        for i in mine:
+            row = starts[keys[i][0]]
+            below = row + sizes[keys[i][0]]
+            both[row:below, row:below] = conditionals[i].R()
+            right, column = conditionals[i].S(), 0
+            for key in keys[i][1:]:
+                end = column + sizes[key]
+                both[row:below, starts[key] : starts[key] + sizes[key]] = right[:, column:end]
+                column = end
+        out.append(Clique(fronts, separator, both[:, :wide], both[:, wide:]))
+    return out
+
+
+def fill_covariances(
+    cliques: Sequence[Clique],
+    sizes: Sequence[int],
+    wanted: Mapping[int, Array],
+    pairs: Mapping[int, Sequence[tuple[int, Array]]],
+) -> None:
+    """Write marginal covariances into the arrays that are given.
+
+    sizes : dimension of each key, keys counting from 0.  wanted : (d, d) of keys.
+    pairs : (d, e) of keys with others of their clique.
+    """
+    where = {key: i for i, clique in enumerate(cliques) for key in clique.fronts}
+    parents = [min(map(where.__getitem__, c.separator), default=-1) for c in cliques]
+    children = [0] * len(cliques)
     for parent in parents:
         children[parent] += parent >= 0
-    seconds: dict[int, list[int]] = {}
-    for first, second in pairs:
-        seconds.setdefault(first, []).append(second)
-    joint: dict[int, tuple[list[int], Array]] = {}
-    patterns: dict[tuple[Any, ...], Ints] = {}
-    own_of: dict[int, Array] = {}
-    cross_of: dict[tuple[int, int], Array] = {}
-    for conditional, clique, parent in zip(conditionals[::-1], keys[::-1], parents[::-1]):
-        own, size = clique[0], sizes[clique[0]]
-        inverse, _ = dtrtri(conditional.R())
+    joint: dict[int, Array] = {}
+    for i in range(len(cliques) - 1, -1, -1):
+        clique, parent = cliques[i], parents[i]
+        inverse, _ = dtrtri(clique.root)
         block = inverse @ inverse.T
         if parent >= 0:
-            block = _joined(
-                block, inverse @ conditional.S(), _within(clique, joint[parent], sizes, patterns)
-            )
+            above, known = joint[parent], cliques[parent].keys
+            if clique.separator != known:
+                place = _starts(known, sizes)[0]
+                at = np.concatenate(
+                    [np.arange(place[k], place[k] + sizes[k]) for k in clique.separator]
+                )
+                above = above.take(at[:, None] * len(above) + at)
+            block = _joined(block, inverse @ clique.right, above)
             children[parent] -= 1
             if not children[parent]:
                 del joint[parent]
-        if own in wanted:
-            own_of[own] = block[:size, :size].copy()
-        for other in seconds.get(own, ()):
-            at = sum([sizes[k] for k in clique[: clique.index(other)]])
-            cross_of[own, other] = block[:size, at : at + sizes[other]].copy()
-        if children[own]:
-            joint[own] = (clique, block)
-    return own_of, cross_of
+        starts, _ = _starts(clique.keys, sizes)
+        for key in clique.fronts:
+            mine = slice(starts[key], starts[key] + sizes[key])
+            if key in wanted:
+                wanted[key][...] = block[mine, mine]
+            for other, out in pairs.get(key, ()):
+                out[...] = block[mine, starts[other] : starts[other] + sizes[other]]
+        if children[i]:
+            joint[i] = block
 
 
 def _joined(own: Array, gain: Array, above: Array) -> Array:
@@ -194,23 +292,7 @@ def _joined(own: Array, gain: Array, above: Array) -> Array:
     return block
 
 
-def _within(
-    clique: list[int],
-    parent: tuple[list[int], Array],
-    sizes: Sequence[int],
-    patterns: dict[tuple[Any, ...], Ints],
-) -> Array:
-    """Covariance of a clique's separator, out of its parent's clique."""
-    keys, block = parent
-    separator = clique[1:]
-    if separator == keys:
-        return block
-    shape = (*[keys.index(k) for k in separator], -1, *[sizes[k] for k in keys])
-    flat = patterns.get(shape)
-    if flat is None:
-        starts = np.r_[0, np.cumsum([sizes[k] for k in keys])]
-        places = [keys.index(k) for k in separator]
-        index = np.concatenate([np.arange(starts[p], starts[p + 1]) for p in places])
-        flat = index[:, None] * len(block) + index
-        patterns[shape] = flat
-    return block.take(flat)
+def _starts(keys: list[int], sizes: Sequence[int]) -> tuple[dict[int, int], int]:
+    """The first column of each of the keys side by side, and the number of columns."""
+    ends = list(accumulate([sizes[k] for k in keys], initial=0))
+    return dict(zip(keys, ends)), ends[-1]

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph import chain, elimination
-from telerig.estimator.smoothing.graph.blocks import Blocks
+from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph, eliminate
 from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
 from telerig.estimator.smoothing.graph.state import (
     GraphLayout,
@@ -180,44 +179,28 @@ def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
     return flat and not any(held) and model.bubble.speed_sigma_mm_s is None and not model.pitches
 
 
-Eliminated = elimination.EliminatedGraph | chain.EliminatedChain
-"""The factors of one pass, solved, by GTSAM or by arrays."""
-
-
 @dataclass(frozen=True)
 class _Pass:
-    done: Eliminated
+    done: EliminatedGraph
     largest_px: float
     log_norm: float
     squared: float
 
 
 def _linear_solve(graph: GraphLayout, state: State, weights: tuple[Array, Array]) -> _Pass:
+    """One Gauss-Newton pass, by Cholesky or by QR, which is four times slower.
+
+    The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
+    good to 3e-6), and more than double precision has with steps as short as a sensor's.
+    """
     factors = all_factors(graph, state, weights)
-    done = _eliminated(graph, factors)
+    only_frames = len(graph.nodes.t_s) == len(graph.problem.t_s)
+    done = eliminate(graph, factors, cholesky=only_frames and not graph.model.broad_bands)
     if not np.all(np.isfinite(done.vector)):
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
     largest = _largest_shift_px(graph, done.vector)
     squared = _squared(graph, factors, done.vector)
     return _Pass(done, largest, _log_norm(graph, factors), squared)
-
-
-def _eliminated(graph: GraphLayout, factors: list[Linear]) -> Eliminated:
-    """By normal equations, or by QR, four times slower, where digits are short.
-
-    The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
-    good to 3e-6), and more than double precision has with steps as short as a sensor's. Else QR
-    is for what Cholesky refuses.
-    """
-    only_frames = len(graph.nodes.t_s) == len(graph.problem.t_s)
-    cholesky = only_frames and not graph.model.broad_bands
-    if cholesky and chain.is_chain_of_frames(graph):
-        places = chain.places_of(graph)
-        try:
-            return chain.eliminate(places, chain.normal_equations(places, factors))
-        except np.linalg.LinAlgError:
-            cholesky = False
-    return elimination.eliminate(graph, factors, cholesky=cholesky)
 
 
 def _squared(graph: GraphLayout, factors: list[Linear], vector: Array) -> float:

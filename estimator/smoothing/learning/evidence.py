@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
+from telerig.estimator.smoothing.learning.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.processes import (
     moving_processes,

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from shake_learning_data import run, true_model
 
-from telerig.estimator.smoothing.graph.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.attribution import moved_to_bubble
+from telerig.estimator.smoothing.learning.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.evidence import signal_evidence, signal_gradient
 from telerig.estimator.smoothing.learning.likelihood import (
     evidence,

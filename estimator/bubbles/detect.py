@@ -32,9 +32,7 @@ from telerig.estimator.bubbles.outline.regions import (
 from telerig.estimator.bubbles.outline.rim_model import close_pairs
 from telerig.estimator.bubbles.outline.split import (
     Part,
-    confirmed_splits,
     implausible_parts,
-    split_at_necks,
     split_blobs,
 )
 from telerig.estimator.images.noise import high_pass
@@ -117,16 +115,6 @@ def find_bubbles(
     dark_sigma = max(dark_noise_share(ratio, response, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
-    splits = split_at_necks(outlines, parts, blobs, image.shape, min_diameter_px)
-    for _ in range(2 if splits else 0):
-        split = [new for k, part in enumerate(parts) for new in splits.get(k, [part])]
-        start = _start(split, blobs, sigma, dark_sigma)
-        refitted = fit_outlines(ratio, start)
-        confirmed = confirmed_splits(splits, outlines, split, refitted)
-        if len(confirmed) == len(splits):
-            parts, outlines = split, refitted
-            break
-        splits = confirmed
     columns = _columns(outlines, parts, image.shape, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])

@@ -16,7 +16,6 @@ from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.association.hypotheses import (
-    Broken,
     Cluster,
     Decision,
     Scan,
@@ -292,6 +291,7 @@ class Tracker:
         self.stage = StageMotion()
         self.frames = OpenFrames()
         self.last: tuple[int, float] | None = None
+        self.events: list[TrackEvent] = []
 
     def predict(self, t_s: float, position_mm: float | None = None) -> Prediction:
         """Expected positions of the confirmed tracks in the rig frame; the tracker is not changed.
@@ -329,19 +329,18 @@ class Tracker:
         motion = self._predict_all(t_s, position_mm)
         self.last = (frame, t_s)
         self.frames.begin(frame, t_s, len(measured), len(measured.singles))
-        events: list[TrackEvent] = []
-        gains = self._follow_labelled(frame, t_s, measured, events)
-        free = np.flatnonzero(measured.particle == NO_PARTICLE)
-        scan = Scan(frame, t_s, measured, free, self.settings)
+        self.events = []
+        gains = self._follow_labelled(Scan(frame, t_s, measured, measured.labelled, self.settings))
+        scan = Scan(frame, t_s, measured, measured.free, self.settings)
         grown, common, gain = advance(self.clusters, scan, self.common, gains)
-        claimed = self._decide(grown, scan, events)
+        claimed = self._decide(grown, scan)
         moved = None if motion is None else motion.shifted(common.shift, common.covariance_mm2)
         alone = self._single(scan, common)
-        self._births(scan, np.setdiff1d(free, claimed), common, gain, events)
-        self._deaths(scan, events)
+        self._births(replace(scan, columns=np.setdiff1d(scan.columns, claimed)), common, gain)
+        self._deaths(scan)
         now = self.frames.now(frame)
-        final, gaps = self._close(self._open_since(frame))
-        return FrameResult(frame, *now, (*events, *gaps), final, alone, moved)
+        final = self._close(self._open_since(frame))
+        return FrameResult(frame, *now, tuple(self.events), final, alone, moved)
 
     def finish(self) -> FrameResult | None:
         """Decide the frames still open, conflicts as if their time were over; None if no frame.
@@ -350,18 +349,19 @@ class Tracker:
         """
         if self.last is None:
             return None
-        events: list[TrackEvent] = []
+        self.events = []
         nothing = FrameMeasurements.create(np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        frame, t_s = self.last
-        scan = Scan(frame, t_s, nothing, np.zeros(0, np.int64), self.settings)
-        self._decide(self.clusters, scan, events, at_once=True)
+        none = nothing.particle
+        scan = Scan(*self.last, nothing, none, self.settings)
+        self._decide(self.clusters, scan, at_once=True)
         self.tentative = []
-        final, gaps = self._close(frame + 1)
-        none = np.zeros(0, np.int64)
-        return FrameResult(frame, none, none, (*events, *gaps), final)
+        final = self._close(scan.frame + 1)
+        return FrameResult(scan.frame, none, none, tuple(self.events), final)
 
-    def _close(self, before_frame: int) -> tuple[tuple[FrameIds, ...], list[TrackEvent]]:
-        return self.frames.close(before_frame, {t.particle for t in self._confirmed()})
+    def _close(self, before_frame: int) -> tuple[FrameIds, ...]:
+        final, gaps = self.frames.close(before_frame, {t.particle for t in self._confirmed()})
+        self.events += gaps
+        return final
 
     def _confirmed(self) -> list[Track]:
         return [*self.given, *(t for c in self.clusters for t in c.tracks)]
@@ -418,20 +418,18 @@ class Tracker:
             track.predict(step, control)
         return Motion(step.matrix, step.noise, step.matrix[:, VELOCITY] @ found + control)
 
-    def _follow_labelled(
-        self, frame: int, t_s: float, measured: FrameMeasurements, events: list[TrackEvent]
-    ) -> list[Array]:
-        columns = np.flatnonzero(measured.particle != NO_PARTICLE)
-        scan = Scan(frame, t_s, measured, columns, self.settings)
+    def _follow_labelled(self, scan: Scan) -> list[Array]:
+        """Follow the tracks whose ids came with the measurements; returns their gains."""
+        ids = scan.measured.particle
         self.common, gains, fresh = follow_labelled(self.given, scan, self.common)
-        for column in columns.tolist():
-            self.frames.write([(frame, column)], int(measured.particle[column]))
+        for column in scan.columns.tolist():
+            self.frames.write([(scan.frame, column)], int(ids[column]))
         for column in fresh:
             track = self._new(scan, column)
-            track.particle = int(measured.particle[column])
+            track.particle = int(ids[column])
             self.given.append(track)
-            self._event(events, "birth", scan, (track.particle,), "id given with the data")
-        self.next_id = max([self.next_id, *(measured.particle + 1).tolist()])
+            self._event("birth", scan, (track.particle,), "id given with the data")
+        self.next_id = max([self.next_id, *(ids + 1).tolist()])
         return gains
 
     def _new(self, scan: Scan, column: int) -> Track:
@@ -439,28 +437,14 @@ class Tracker:
         velocity = np.array(self.axis) * (self.settings.rise_mm_s if self.stage.in_lab else 0.0)
         return born(scan, column, velocity, self.stage.in_lab, self._confirmed())
 
-    def _event(
-        self,
-        events: list[TrackEvent],
-        kind: str,
-        scan: Scan,
-        particles: tuple[int, ...],
-        reason: str,
-    ) -> None:
-        events.append(TrackEvent(kind, scan.frame, scan.t_s, particles, reason))
+    def _event(self, kind: str, scan: Scan, particles: tuple[int, ...], reason: str) -> None:
+        self.events.append(TrackEvent(kind, scan.frame, scan.t_s, particles, reason))
 
     def _take_id(self) -> int:
         self.next_id += 1
         return self.next_id - 1
 
-    def _decide(
-        self,
-        grown: Sequence[Cluster],
-        scan: Scan,
-        events: list[TrackEvent],
-        *,
-        at_once: bool = False,
-    ) -> Ints:
+    def _decide(self, grown: Sequence[Cluster], scan: Scan, *, at_once: bool = False) -> Ints:
         """Decide the conflicts that can be decided; the columns that some track claims."""
         claimed, out = [], []
         for cluster in grown:
@@ -470,9 +454,12 @@ class Tracker:
             for track, entries in decision.free:
                 self.frames.write(entries, track.particle)
                 out.append(Cluster.of(track))
-            self._resolved(decision, scan, events)
+            waited = {t.particle: len(h) for t, h in decision.free if len(h) > 1}
+            if waited:
+                reason = f"conflict of {max(waited.values())} frames decided"
+                self._event("resolved", scan, tuple(waited), reason)
             if decision.broken:
-                out += [Cluster.of(t) for t in self._broken(decision, scan, events)]
+                out += [Cluster.of(t) for t in self._broken(decision, scan)]
             if decision.still is not None:
                 out.append(decision.still)
                 for particle, entries in decision.still.branches[0].history.items():
@@ -480,32 +467,23 @@ class Tracker:
         self.clusters = out
         return np.unique(np.array(claimed, np.int64))
 
-    def _resolved(self, decision: Decision, scan: Scan, events: list[TrackEvent]) -> None:
-        waited = [(t.particle, len(entries)) for t, entries in decision.free if len(entries) > 1]
-        if waited:
-            reason = f"conflict of {max(n for _, n in waited)} frames decided"
-            self._event(events, "resolved", scan, tuple(p for p, _ in waited), reason)
-
-    def _broken(self, decision: Decision, scan: Scan, events: list[TrackEvent]) -> list[Track]:
+    def _broken(self, decision: Decision, scan: Scan) -> list[Track]:
         """New ids for the tracks that go on behind a conflict."""
         self.frames.write((e for b in decision.broken for e in b.entries), NO_PARTICLE)
-        old = tuple(b.track.particle for b in decision.broken)
-        out = [self._renamed(b) for b in decision.broken]
-        new = [t for t in out if t is not None]
+        old = [b.track.particle for b in decision.broken]
+        going_on = []
+        for broken in decision.broken:
+            self.frames.write(broken.kept, broken.track.particle)
+            if broken.new:
+                broken.track.particle = self._take_id()
+                self.frames.write(broken.new, broken.track.particle)
+                going_on.append(broken.track)
         reason = (
             f"continuation not safe: the log-likelihood ratio to the runner-up is "
             f"{decision.runner_up_log_ratio:.1f}, less than {self.settings.margin_log_ratio:g}"
         )
-        self._event(events, "break", scan, (*old, *(t.particle for t in new)), reason)
-        return new
-
-    def _renamed(self, broken: Broken) -> Track | None:
-        self.frames.write(broken.kept, broken.track.particle)
-        if not broken.new:
-            return None
-        broken.track.particle = self._take_id()
-        self.frames.write(broken.new, broken.track.particle)
-        return broken.track
+        self._event("break", scan, (*old, *(t.particle for t in going_on)), reason)
+        return going_on
 
     def _single(self, scan: Scan, common: Common) -> dict[int, SeenAlone]:
         """Continue confirmed tracks that were missed in this frame by one camera alone."""
@@ -516,45 +494,31 @@ class Tracker:
             self.frames.write_single(scan.frame, single, track.particle)
         return {single: alone for _, single, alone in found}
 
-    def _births(
-        self,
-        scan: Scan,
-        free: Ints,
-        common: Common,
-        gain: Array | None,
-        events: list[TrackEvent],
-    ) -> None:
+    def _births(self, scan: Scan, common: Common, gain: Array | None) -> None:
         """Tentative tracks go on, are confirmed or given up; what is left starts new ones."""
-        rest = Scan(scan.frame, scan.t_s, scan.measured, free, scan.settings)
-        going, common, gain = extend(self.tentative, rest, common, gain)
+        going, common, gain = extend(self.tentative, scan, common, gain)
         self.common = common.applied(np.zeros((STATES, 3)) if gain is None else gain)
         used = [c for t in going for f, c in t.history[-1:] if f == scan.frame]
+        fresh = np.setdiff1d(scan.columns, np.array(used, np.int64)).tolist()
         self.tentative = []
-        for track in going:
+        for track in [*going, *(self._new(scan, column) for column in fresh)]:
             if len(track.history) >= self.settings.confirm_hits:
-                self._confirm(track, scan, events)
+                self._confirm(track, scan)
             elif not hopeless(track, scan.frame, self.settings):
                 self.tentative.append(track)
-        fresh = np.setdiff1d(free, np.array(used, np.int64)).tolist()
-        self.tentative += [self._new(scan, column) for column in fresh]
-        if self.settings.confirm_hits == 1:
-            for track in self.tentative:
-                self._confirm(track, scan, events)
-            self.tentative = []
 
-    def _confirm(self, track: Track, scan: Scan, events: list[TrackEvent]) -> None:
+    def _confirm(self, track: Track, scan: Scan) -> None:
         track.particle = self._take_id()
         self.frames.write(track.history, track.particle)
-        reason = f"first seen in frame {track.history[0][0]}"
-        self._event(events, "birth", scan, (track.particle,), reason)
-        events += split_off(track, self._confirmed(), scan)
+        self._event("birth", scan, (track.particle,), f"first seen in frame {track.history[0][0]}")
+        self.events += split_off(track, self._confirmed(), scan)
         track.history, track.parent = [], None
         self.clusters.append(Cluster.of(track))
 
-    def _deaths(self, scan: Scan, events: list[TrackEvent]) -> None:
+    def _deaths(self, scan: Scan) -> None:
         closed = [c.tracks[0] for c in self.clusters if not c.open] + self.given
         dead, found = ended(closed, self._confirmed(), scan)
-        events += found
+        self.events += found
         if dead:
             self.clusters = [c for c in self.clusters if c.tracks[0].particle not in dead]
             self.given = [t for t in self.given if t.particle not in dead]

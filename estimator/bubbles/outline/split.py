@@ -15,14 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
     ELLIPSE_PARAMETERS,
     deepest_concavity,
     ellipse_basis,
     foot_points,
     moved,
-    outline_curvature,
     rough_distance,
 )
 from telerig.estimator.bubbles.outline.outline_fit import Outlines
@@ -137,15 +136,6 @@ def _cut_closed(contour: Array, sense: float) -> list[Array]:
     return _trimmed(points, bounds)
 
 
-def arcs_between(contour: Array, cuts: Array) -> list[Array]:
-    """A closed outline (n, 2) cut at its points nearest to ``cuts`` (m, 2)."""
-    points = _spaced(contour, closed=True)
-    gap = np.hypot(*(points[:, None] - cuts[None]).transpose(2, 0, 1))
-    bounds = np.sort(np.argmin(gap, axis=0)).tolist()
-    points = np.roll(points, -bounds[0], axis=0)
-    return _trimmed(points, [k - bounds[0] for k in bounds] + [len(points)])
-
-
 def _cut_open(contour: Array, sense: float) -> list[Array]:
     if len(contour) < _SHORTEST_ARC:
         return []
@@ -229,7 +219,7 @@ _FIT_PX, _FIT_SHARE = 0.3, 0.03
 _MIN_ARC_RAD = 1.0
 _MIN_EXPLAINED, _MIN_COVERED = 0.75, 0.88
 _MAX_ARCS = 24
-_SPIRAL, _LEAST_IN_IMAGE = 200, 0.08
+_LEAST_IN_IMAGE = 0.08
 _CANVAS_MARGIN_PX = 2
 """Outline points on the image's edge are left out, which narrows the blob by this much."""
 
@@ -239,8 +229,6 @@ concavities too, but then the outline's harmonics describe them."""
 _MISFIT_PX, _MISFIT_SHARE = 0.15, 0.005
 _LARGEST_GROWTH, _LONG = 1.6, 2.3
 _SHARPEST_ORDER, _WHOLE = 35.0, 0.9
-_FLAT = 0.35
-_BETTER = 0.6
 
 
 @dataclass(frozen=True)
@@ -287,16 +275,7 @@ def _split(
         fitted, rms = fit_ellipses(arcs)
         sound = rms[0] < 2.5 * _tolerance(fitted[0]) and _dark(fitted[0], contour, shape)
         return [Part(fitted[0], index)] if sound else unsplit
-    return parts_of_arcs(_grouped(arcs, blob), blob, index, shape, min_diameter_px) or unsplit
-
-
-def parts_of_arcs(
-    groups: list[Array], blob: Blob, index: int, shape: tuple[int, ...], min_diameter_px: float
-) -> list[Part]:
-    """The sound bubbles along groups of arcs of blob ``index``; none if they do not explain it."""
-    if not groups:
-        return []
-    contour = blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
+    groups = _grouped(arcs, contour)
     fitted, rms = fit_ellipses(groups)
     good = [
         ellipse
@@ -305,7 +284,7 @@ def parts_of_arcs(
         and _dark(ellipse, contour, shape)
     ]
     if not _explains(good, contour):
-        return []
+        return unsplit
     return [Part(ellipse, index, shared=len(good) > 1) for ellipse in good]
 
 
@@ -332,9 +311,8 @@ def _seen_rad(ellipse: Array, points: Array) -> float:
     return float(np.unique(slot).size * (2.0 * np.pi / 48))
 
 
-def _grouped(arcs: list[Array], blob: Blob) -> list[Array]:
+def _grouped(arcs: list[Array], contour: Array) -> list[Array]:
     """Arcs joined, best pair first, as long as one ellipse fits both."""
-    contour = blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
     groups = list(arcs)
     rejected: set[tuple[int, int]] = set()
     ids = list(range(len(groups)))
@@ -378,40 +356,34 @@ def _explains(ellipses: list[Array], contour: Array) -> bool:
     return _covered(stack, contour) > _MIN_COVERED
 
 
-def _filled(contour: Array) -> tuple[NDArray[np.uint8], NDArray[np.int_]]:
-    """The outline filled on a canvas, and the canvas's first pixel (u, v)."""
+def _filled(contour: Array, low: Ints, high: Ints) -> NDArray[np.uint8]:
+    """The outline filled, in the window of pixels (u, v) from ``low`` to before ``high``."""
     import cv2
 
-    low = np.floor(np.min(contour, axis=0)).astype(int)
-    size = np.ceil(np.max(contour, axis=0)).astype(int) - low + 1
-    canvas = np.zeros((size[1], size[0]), np.uint8)
-    cv2.fillPoly(canvas, [np.round(contour - low).astype(np.int32).reshape(-1, 1, 2)], 1)
-    return canvas, low
+    canvas = np.zeros((high - low)[::-1], np.uint8)
+    cv2.fillPoly(canvas, [np.round(contour - low).astype(np.int32)[:, None]], 1)
+    return canvas
 
 
 def _dark(ellipse: Array, contour: Array, shape: tuple[int, ...]) -> bool:
     """Whether what the image shows of the ellipse's disc lies within the blob."""
-    share = (np.arange(_SPIRAL) + 0.5) / _SPIRAL
-    turn = np.arange(_SPIRAL) * np.pi * (3.0 - np.sqrt(5.0))
-    x = ellipse[2] * np.sqrt(share) * np.cos(turn)
-    y = ellipse[3] * np.sqrt(share) * np.sin(turn)
-    cos, sin = np.cos(ellipse[4]), np.sin(ellipse[4])
-    u = np.round(ellipse[0] + cos * x - sin * y).astype(int)
-    v = np.round(ellipse[1] + sin * x + cos * y).astype(int)
-    seen = (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
-    if np.mean(seen) < _LEAST_IN_IMAGE:
+    import cv2
+
+    low = np.maximum(np.floor(ellipse[:2] - ellipse[2]), 0).astype(np.int64)
+    high = np.minimum(np.ceil(ellipse[:2] + ellipse[2]) + 1, shape[::-1]).astype(np.int64)
+    if np.any(high <= low):
         return False
-    canvas, low = _filled(contour)
-    u, v = u[seen] - low[0], v[seen] - low[1]
-    near_u, near_v = np.clip(u, 0, canvas.shape[1] - 1), np.clip(v, 0, canvas.shape[0] - 1)
-    inside = np.maximum(np.abs(near_u - u), np.abs(near_v - v)) <= _CANVAS_MARGIN_PX
-    dark = inside & (canvas[near_v, near_u] > 0)
-    return bool(np.mean(dark) > _MIN_COVERED)
+    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
+    disc = rough_distance(ellipse, u, v) < 0.0
+    blob = cv2.dilate(_filled(contour, low, high), np.ones((2 * _CANVAS_MARGIN_PX + 1,) * 2))
+    seen = np.count_nonzero(disc) / (np.pi * ellipse[2] * ellipse[3])
+    return bool(seen > _LEAST_IN_IMAGE and np.mean(blob[disc]) > _MIN_COVERED)
 
 
 def _covered(ellipses: Array, contour: Array) -> float:
-    canvas, low = _filled(contour)
-    v, u = np.nonzero(canvas)
+    low = np.floor(np.min(contour, axis=0)).astype(np.int64)
+    high = np.ceil(np.max(contour, axis=0)).astype(np.int64) + 1
+    v, u = np.nonzero(_filled(contour, low, high))
     gap = rough_distance(ellipses[:, None, :], (u + low[0])[None, :], (v + low[1])[None, :])
     return float(np.mean(np.any(gap < 0.7, axis=0)))
 
@@ -441,54 +413,3 @@ def implausible_parts(outlines: Outlines, parts: list[Part]) -> Bools:
     moved |= (jump > 0.3 * began[:, 3] + 1.0) | (ended[:, 2] > _LONG * ended[:, 3])
     moved &= np.array([part.shared for part in parts])
     return implausible_outlines(outlines) | moved
-
-
-def split_at_necks(
-    outlines: Outlines,
-    parts: list[Part],
-    blobs: list[Blob],
-    shape: tuple[int, ...],
-    min_diameter_px: float,
-) -> dict[int, list[Part]]:
-    """For each part that is a whole blob with a neck, the two parts that a cut there gives.
-
-    The fitted outline shows a neck where blur hides the notch in the blob's raw outline.
-    """
-    alone = np.bincount([part.blob for part in parts]) == 1
-    necked = implausible_outlines(outlines) & (outlines.coverage > _WHOLE)
-    splits = {}
-    for index in np.flatnonzero(necked).tolist():
-        part = parts[index]
-        blob = blobs[part.blob]
-        if not alone[part.blob] or blob.touches_border:
-            continue
-        notches = _flattest(outlines.ellipse[index], outlines.harmonics[index])
-        if len(notches) != 2:
-            continue
-        arcs = arcs_between(blob.contour_px, notches)
-        found = parts_of_arcs(arcs, blob, part.blob, shape, min_diameter_px)
-        if len(found) == 2:
-            splits[index] = found
-    return splits
-
-
-def _flattest(ellipse: Array, harmonics: Array) -> Array:
-    """Places (n, 2) where the outline's curvature has a minimum far below that of a circle."""
-    points, curvature = outline_curvature(ellipse[None], harmonics[None])
-    turn = curvature[0] * np.sqrt(ellipse[2] * ellipse[3])
-    low = (turn < _FLAT) & (turn <= np.roll(turn, 1)) & (turn < np.roll(turn, -1))
-    return np.asarray(points[0][low])
-
-
-def confirmed_splits(
-    splits: dict[int, list[Part]], before: Outlines, parts: list[Part], after: Outlines
-) -> dict[int, list[Part]]:
-    """The splits of which both parts fit far better than the whole did."""
-    sound = ~implausible_parts(after, parts)
-    better = {}
-    for index, found in splits.items():
-        own = [k for k, part in enumerate(parts) if part.blob == found[0].blob]
-        limit = _BETTER * before.chi2_dof[index]
-        if all(sound[k] and after.chi2_dof[k] < limit for k in own):
-            better[index] = found
-    return better

@@ -159,6 +159,16 @@ class FrameMeasurements:
     def __len__(self) -> int:
         return len(self.points_mm)
 
+    @property
+    def labelled(self) -> Ints:
+        """Positions of the bubbles with given ids."""
+        return np.flatnonzero(self.particle != NO_PARTICLE)
+
+    @property
+    def free(self) -> Ints:
+        """Positions of the others."""
+        return np.flatnonzero(self.particle == NO_PARTICLE)
+
 
 @dataclass(frozen=True)
 class TrackEvent:

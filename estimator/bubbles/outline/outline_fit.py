@@ -39,120 +39,42 @@ from telerig.estimator.bubbles.outline.rim_model import (
 )
 
 _LEVEL_SPREAD = 0.3
-_FREE_HARMONIC, _FREE_FLATTENING = 0.25, 1e3
-_UNLEARNT_HARMONIC, _LEAST_HARMONIC, _LEAST_FLATTENING = 0.02, 0.002, 0.01
-_UNLEARNT_FLATTENING = 0.08
+_FREE, _UNLEARNT, _LEAST, _HELD = 0.25, 0.02, 0.002, 1e-7
+"""Spread of the harmonics' coefficients, as a share of the radius: too wide to affect whole
+outlines; without whole outlines to learn from; the least that is learnt; tied to their start."""
+
 _WIDENED = 1.5
 _ENOUGH_WHOLE = 4
-_HELD = 1e-7
 
 
-@dataclass(frozen=True)
-class ShapePrior:
-    """Spread of the harmonics' coefficients ``harmonic_share`` (B,) as a share of the radius;
-    mean ``flattening`` (B, 2) and its spread (B,): (a - b) / (a + b) times the cosine and sine
-    of twice the angle."""
-
-    harmonic_share: Array
-    flattening: Array
-    flattening_spread: Array
-
-    def __getitem__(self, index: Index) -> ShapePrior:
-        return ShapePrior(
-            self.harmonic_share[index], self.flattening[index], self.flattening_spread[index]
-        )
-
-    def held_where(self, held: Bools) -> ShapePrior:
-        """The same prior with the harmonics of the bubbles ``held`` (B,) tied to zero."""
-        return replace(self, harmonic_share=np.where(held, _HELD, self.harmonic_share))
-
-
-def weak_prior(count: int, *, held: bool = False) -> ShapePrior:
-    """A prior too weak to affect whole outlines; ``held`` fixes the harmonics at their start."""
-    return ShapePrior(
-        np.full(count, _HELD if held else _FREE_HARMONIC),
-        np.zeros((count, 2)),
-        np.full(count, _FREE_FLATTENING),
-    )
-
-
-def learnt_prior(ellipse: Array, harmonics: Array, whole: Bools, partial: Bools) -> ShapePrior:
-    """For outlines that are ``partial`` (B,) the shapes of the ``whole`` ones, for others none.
-
-    With too few whole ones, partial outlines are taken to be round to 8 %.
-    """
-    count = len(ellipse)
-    prior = weak_prior(count)
-    share = _UNLEARNT_HARMONIC
+def learnt_spread(outlines: Outlines, partial: Bools) -> Array:
+    """(B,) spread of the harmonics: of ``partial`` (B,) outlines that of the whole ones."""
+    whole = outlines.resolved & ~partial
+    share = _UNLEARNT
     if np.count_nonzero(whole) >= _ENOUGH_WHOLE:
-        radius = np.sqrt(ellipse[whole, 2] * ellipse[whole, 3])
-        typical = np.median(np.mean((harmonics[whole] / radius[:, None]) ** 2, axis=1))
-        share = max(_WIDENED * float(np.sqrt(typical)), _LEAST_HARMONIC)
-        own = flattening(ellipse[whole])
-        middle = np.median(own, axis=0)
-        scatter = 1.4826 * float(np.median(np.abs(own - middle)))
-        prior.flattening[partial] = middle
-        prior.flattening_spread[partial] = max(_WIDENED * scatter, _LEAST_FLATTENING)
-    else:
-        prior.flattening_spread[partial] = _UNLEARNT_FLATTENING
-    prior.harmonic_share[partial] = share
-    return prior
-
-
-def flattening(ellipse: Array) -> Array:
-    """(B, 2): (a - b) / (a + b) times cosine and sine of twice the angle."""
-    ratio = (ellipse[:, 2] - ellipse[:, 3]) / (ellipse[:, 2] + ellipse[:, 3])
-    angle = 2.0 * ellipse[:, 4]
-    return np.stack([ratio * np.cos(angle), ratio * np.sin(angle)], axis=1)
+        radius = np.sqrt(outlines.ellipse[whole, 2] * outlines.ellipse[whole, 3])
+        typical = np.median(np.mean((outlines.harmonics[whole] / radius[:, None]) ** 2, axis=1))
+        share = max(_WIDENED * float(np.sqrt(typical)), _LEAST)
+    return np.where(partial, share, _FREE)
 
 
 def prior_equations(
-    information: Array,
-    pull: Array,
-    state: RimState,
-    shifts: Array,
-    inner: Array,
-    prior: ShapePrior,
+    information: Array, pull: Array, state: RimState, shifts: Array, inner: Array, spread: Array
 ) -> None:
-    """Add the prior at outlines ``shifts`` (B, 13) away from the state's ellipses."""
+    """Add the prior at outlines ``shifts`` (B, 13) away from the state's ellipses.
+
+    inner : (B,) expected level; spread : (B,) of the harmonics as a share of the radius.
+    """
     level = 1.0 / _LEVEL_SPREAD**2
     information[:, OUTER, OUTER] += level
     information[:, INNER, INNER] += level
     pull[:, OUTER] -= level * (state.outer - 1.0)
     pull[:, INNER] -= level * (state.inner - inner)
-    ellipse = state.ellipse
-    radius = np.sqrt(ellipse[:, 2] * ellipse[:, 3])
-    weight = 1.0 / (prior.harmonic_share * radius) ** 2
+    weight = 1.0 / (spread**2 * state.ellipse[:, 2] * state.ellipse[:, 3])
     places = np.arange(FIRST_HARMONIC, information.shape[1])
     information[:, places, places] += weight[:, None]
-    held = (prior.harmonic_share <= _HELD)[:, None]
-    gap = np.where(held, 0.0, shifts[:, ELLIPSE_PARAMETERS:])
+    gap = np.where((spread <= _HELD)[:, None], 0.0, shifts[:, ELLIPSE_PARAMETERS:])
     pull[:, FIRST_HARMONIC:] -= weight[:, None] * gap
-    _add_flattening(information, pull, ellipse, shifts, radius, prior)
-
-
-def _add_flattening(
-    information: Array,
-    pull: Array,
-    ellipse: Array,
-    shifts: Array,
-    radius: Array,
-    prior: ShapePrior,
-) -> None:
-    weight = 1.0 / (prior.flattening_spread * radius) ** 2
-    cos, sin = np.cos(2.0 * ellipse[:, 4]), np.sin(2.0 * ellipse[:, 4])
-    along = prior.flattening[:, 0] * cos + prior.flattening[:, 1] * sin
-    across = prior.flattening[:, 1] * cos - prior.flattening[:, 0] * sin
-    half_gap = (ellipse[:, 2] + shifts[:, 2] - ellipse[:, 3] - shifts[:, 3]) / 2.0
-    information[:, 2, 2] += weight / 4.0
-    information[:, 3, 3] += weight / 4.0
-    information[:, 2, 3] -= weight / 4.0
-    information[:, 3, 2] -= weight / 4.0
-    information[:, 4, 4] += weight
-    miss = weight * (half_gap - radius * along) / 2.0
-    pull[:, 2] -= miss
-    pull[:, 3] += miss
-    pull[:, 4] -= weight * (shifts[:, 4] - radius * across)
 
 
 _PIXEL_VARIANCE_PX2 = 1.0 / 12.0
@@ -245,13 +167,13 @@ def fit_outlines(ratio: Float32, start: Start) -> Outlines:
         start.inner,
     )
     state = _first_look(ratio, state, start)
-    fit = _refined(ratio, state, start, state, everyone, weak_prior(len(start)))
+    fit = _refined(ratio, state, start, state, everyone, np.full(len(start), _FREE))
     partial = fit.coverage < _WHOLE
     again = np.flatnonzero(partial | (fit.shift_px > _FAR_SHIFT_PX))
     for _ in range(2):
         if again.size == 0:
             break
-        prior = learnt_prior(fit.ellipse, fit.harmonics, fit.resolved & ~partial, partial)
+        prior = learnt_spread(fit, partial)
         near = _refined(
             ratio, fit.state(again), start[again], fit.state(everyone), again, prior[again]
         )
@@ -270,7 +192,7 @@ def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
     everyone = np.arange(len(start))
     used &= ~pixels.hidden(state.ellipse, state.ellipse, _HIDING_SIGMA * state.sigma, everyone)
     weight = spread(1.0 / start.sigma_outer**2, pixels.counts) * used.astype(np.float32)
-    prior = weak_prior(len(start), held=True)
+    prior = np.full(len(start), _HELD)
     descent = _descend(state, pixels, linear, weight, start, prior, steps=2)
     return _moved(descent.state, descent.shifts)
 
@@ -306,14 +228,14 @@ def _refined(
     start: Start,
     everyone: RimState,
     own: Index,
-    prior: ShapePrior,
+    prior: Array,
 ) -> Outlines:
     """One linearisation: pixels, window, steps, results of the bubbles ``own`` of everyone."""
     pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state))
     linear = linearised(state, pixels)
     hidden = pixels.hidden(state.ellipse, everyone.ellipse, _HIDING_SIGMA * everyone.sigma, own)
     weight = _window(state, pixels, linear, start, hidden)
-    prior = prior.held_where(~linear.resolved)
+    prior = np.where(linear.resolved, prior, _HELD)
     descent = _descend(state, pixels, linear, weight, start, prior, steps=_STEPS)
     return _result(descent, pixels, linear, weight, hidden, start)
 
@@ -351,7 +273,7 @@ def _descend(
     linear: Linear,
     weight: Float32,
     start: Start,
-    prior: ShapePrior,
+    prior: Array,
     *,
     steps: int,
 ) -> _Descent:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.statistics import robust_sd
 
 _SIGMAS = 10.0
 _COUNTS = 4.0
@@ -113,17 +114,12 @@ def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]
     excess = np.where(known, _excess_speed(speed) * dt, 0.0)
     residual = np.where(known, _prediction_residual(speed) * dt, 0.0)
     least = _least_fault(step)
-    odd = np.abs(residual) > max(_SIGMAS * _sd(residual), least)
+    odd = np.abs(residual) > max(_SIGMAS * robust_sd(residual), least)
     odd &= (excess * residual > 0) & (np.abs(excess) > _SHARE * np.abs(residual))
     bend = (speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * dt[1:-1]
-    clear = np.abs(excess) > max(_SIGMAS * _sd(bend - np.median(bend)), least)
+    clear = np.abs(excess) > max(_SIGMAS * robust_sd(bend - np.median(bend)), least)
     excess = np.where(odd & ~clear, residual, excess)
     return _classified(np.flatnonzero(odd | clear), excess, t, position)
-
-
-def _sd(values: Array) -> float:
-    """Robust standard deviation about 0."""
-    return 1.4826 * float(np.median(np.abs(values)))
 
 
 def _excess_speed(speed: Array) -> Array:
@@ -149,7 +145,7 @@ def _prediction_residual(speed: Array) -> Array:
     for _ in range(4):
         weights = np.linalg.lstsq(near[kept], speed[kept], rcond=None)[0]
         residual = speed - near @ weights
-        clean = np.abs(residual) <= 5 * _sd(residual)
+        clean = np.abs(residual) <= 5 * robust_sd(residual)
         kept = np.convolve(~clean, np.ones(width), "same") < 0.5
         if kept.sum() < _LEAST_TO_LEARN // 2:
             return np.zeros(len(speed))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32
+from telerig.statistics import robust_sd
 
 _CELL_PX = 4
 DARK = 0.05
@@ -126,7 +127,7 @@ def _dark_things(log: Float32, surface: Float32) -> Bools:
     import cv2
 
     depth = surface - log
-    noise = 1.4826 * float(np.median(np.abs(depth - np.median(depth))))
+    noise = float(robust_sd(depth - np.median(depth)))
     dark = compact_things(depth > max(DARK, 5 * noise))
     grown = cv2.dilate(dark.astype(np.uint8), np.ones((5, 5), np.uint8))
     return np.asarray(grown, bool)

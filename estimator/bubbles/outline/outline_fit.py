@@ -37,6 +37,7 @@ from telerig.estimator.bubbles.outline.rim_model import (
     rim_pixels,
     unlike_rim,
 )
+from telerig.statistics import robust_sd
 
 _LEVEL_SPREAD = 0.3
 _FREE, _UNLEARNT, _LEAST, _HELD = 0.25, 0.02, 0.002, 1e-7
@@ -263,7 +264,7 @@ def _typical_residual(residual: Float32, pixels: Pixels, kept: Bools) -> Array:
     for index, part in enumerate(pixels.parts()):
         own = np.abs(residual[part][kept[part]])
         if own.size > 8:
-            typical[index] = 1.4826 * np.partition(own, own.size // 2)[own.size // 2]
+            typical[index] = robust_sd(own)
     return typical
 
 

@@ -33,6 +33,7 @@ from telerig.estimator.bubbles.pairing.matching import (
     marginals,
 )
 from telerig.rig.camera import Camera
+from telerig.statistics import robust_sd
 
 MOST_FRAMES = 60
 MOST_BIAS_PX = 20.0
@@ -274,7 +275,7 @@ def _populations(model: PairModel, views: list[tuple[View, View]]) -> PairModel:
             values = values[np.isfinite(values).all(-1)]
             middle = np.median(values, axis=0) if len(values) else np.zeros(len(usual))
             off = values - middle
-            limit = 3 * 1.4826 * np.median(np.abs(off), axis=0) if len(values) else 0.0
+            limit = 3 * robust_sd(off, axis=0) if len(values) else 0.0
             off = np.clip(off, -limit, limit)
             means.append(middle)
             squares, count = squares + off.T @ off, count + len(off)

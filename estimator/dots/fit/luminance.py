@@ -32,6 +32,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     semi_axes,
 )
 from telerig.estimator.images.noise import NoiseModel
+from telerig.statistics import NORMAL_FROM_MEDIAN
 
 PARAMETERS = 10
 """Free parameters of a fit; the two of the contrast gradient are held by their prior."""
@@ -500,7 +501,7 @@ def _outliers(pixels: Pixels, residual: Array, variance: Array, dots: Ints) -> B
     for k, count in enumerate(np.maximum(pixels.counts[dots], 1)):
         places = [count // 2, int(0.95 * (count - 1))]
         middle, high = np.partition(whitened[k, :count], places)[places]
-        limit[k] = _OUTLIER_SIGMA * max(1.0, 1.4826 * middle, 0.51 * high)
+        limit[k] = _OUTLIER_SIGMA * max(1.0, NORMAL_FROM_MEDIAN * middle, 0.51 * high)
     bad: Bools = (whitened > limit) & pixels.there[dots]
     return bad
 

@@ -21,6 +21,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
 )
 from telerig.estimator.dots.fit.candidates import Candidate, fill
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window
+from telerig.statistics import robust_sd
 
 CLEAR_SIGMA = 3.5
 _MAX_MARGIN_PX = 12.0
@@ -190,7 +191,7 @@ def with_common_blur(priors: list[Prior], fits: list[DotFit]) -> list[Prior]:
         return priors
     sigmas = np.array([fit.sigma_px for fit in fits])
     usual = float(np.median(sigmas))
-    spread = max(_BLUR_SPREAD * usual, 1.4826 * float(np.median(np.abs(sigmas - usual))))
+    spread = max(_BLUR_SPREAD * usual, float(robust_sd(sigmas - usual)))
     return [replace(prior, edge_px=usual, edge_spread_px=spread) for prior in priors]
 
 

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import DetectionError
+from telerig.statistics import robust_sd
 
 NEIGHBOURS: Ints = np.array(
     [(i, j) for i in range(-2, 3) for j in range(-2, 3) if (i, j) != (0, 0)], np.int64
@@ -318,7 +319,7 @@ def _drop_false_dots(growth: _Growth, image_from_flat: Array, floor_px: float) -
         residual = np.zeros_like(growth.flat)
         residual[dots] = (growth.flat[dots] - smooth) @ image_from_flat.T
         miss = leave_one_out(growth.at, residual, places)
-        limit = max(8 * 1.4826 * float(np.median(miss)), floor_px)
+        limit = max(8 * float(robust_sd(miss)), floor_px)
         worst = np.full(growth.at.shape, 0.0)
         worst[tuple(places.T)] = miss
         around = [worst[tuple((places + step).T)] for step in NEIGHBOURS]

@@ -21,6 +21,7 @@ from telerig.errors import DetectionError, InputError
 from telerig.estimator.dots.grid.lattice import MIN_DOTS, Lattice, grow_lattice, shape_matrix
 from telerig.estimator.dots.grid.point_layout import match_points
 from telerig.rig.target import QUARTER_TURNS, Target
+from telerig.statistics import robust_sd
 
 LOG_MISSED_MARK = -4.0
 """A mark that is seen as a plain dot."""
@@ -76,7 +77,7 @@ def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
     step = np.log(
         (target.mark_diameter_mm or 1.5 * target.dot_diameter_mm) / target.dot_diameter_mm
     )
-    spread = 1.5 * 1.4826 * float(np.median(np.abs(size)))
+    spread = 1.5 * float(robust_sd(size))
     sigma = float(np.clip(spread, 0.05, max(abs(step) / 4, 0.05)))
     odds = (size - step / 2) * step / sigma**2
     return np.asarray(1 / (1 + np.exp(-np.clip(odds, -30, 30))))
@@ -199,7 +200,7 @@ def _aspect_score(lattice: Lattice, target: Target) -> tuple[float, float]:
     """Log-likelihoods, from the dots' shapes, that the lattice's first axis is x and is y."""
     logs = 0.5 * np.log(lattice.shape[:, 1, 1] / lattice.shape[:, 0, 0])
     middle = float(np.median(logs))
-    spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+    spread = float(robust_sd(logs - middle))
     sigma = max(_MIN_ASPECT_SIGMA, 1.25 * spread / np.sqrt(len(logs)))
     nominal = float(np.log(target.pitch_mm[0] / target.pitch_mm[1]))
     along = [max(-0.5 * ((middle - s * nominal) / sigma) ** 2, -100.0) for s in (1, -1)]

@@ -21,18 +21,16 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from telerig.errors import InputError
 from telerig.estimator.batch.jobs import Job, check_run_name, fingerprint
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Stage = Callable[[str, int, int], None]
 
@@ -276,8 +274,6 @@ class Journal:
 
 def table_of(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Columns `COLUMNS`, `FIGURES` and the reason of a failure; a row per job, in their order."""
-    import pandas as pd
-
     rows = []
     for record in records:
         figures = record.get("figures") or {}

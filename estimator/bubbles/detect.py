@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Bools
@@ -36,10 +37,6 @@ from telerig.estimator.bubbles.outline.split import (
     split_blobs,
 )
 from telerig.estimator.images.noise import high_pass
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 __all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
 
@@ -144,8 +141,6 @@ def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:
 def _bubbles(
     columns: dict[str, Any], rejected: list[Rejected], noise: float, reason: str
 ) -> Bubbles:
-    import pandas as pd
-
     empty = {name: np.empty(0, object if name == "flags" else float) for name in DETECTION_COLUMNS}
     accepted = pd.DataFrame(columns or empty, columns=DETECTION_COLUMNS, copy=False)
     accepted.attrs["reason"] = reason

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,8 +54,6 @@ def _full_scale(image: NDArray[Any]) -> float:
 
 def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Float32, bool]:
     """Grey over background, and whether the screen is clipped at the sensor's white."""
-    import cv2
-
     grey = image.astype(np.float32, copy=False)
     if background is None:
         screen = screen_level(grey)
@@ -90,8 +89,6 @@ def screen_level(image: Float32) -> Float32:
     Bright closing over a quarter of the image at an eighth of its size, then a broad mean over
     what is not darker than that; robust while the screen shows within a quarter of the image.
     """
-    import cv2
-
     rows, columns = image.shape
     small_size = (max(columns // _SHRINK, 4), max(rows // _SHRINK, 4))
     small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)

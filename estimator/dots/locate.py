@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Float32
@@ -48,10 +49,6 @@ from telerig.estimator.images.noise import (
     with_inner_level,
 )
 from telerig.io.machine.parallel import keep_freed_memory
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 COLUMNS = [
     *("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2", "a_px", "b_px", "angle_rad", "chi2_dof"),
@@ -171,8 +168,6 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
             rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
         else:
             accepted.append(_row(blob, fit, noise))
-    import pandas as pd
-
     return DotMeasurement(
         pd.DataFrame(accepted, columns=COLUMNS),
         pd.DataFrame(rejected, columns=REJECTED),

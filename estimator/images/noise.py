@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -112,8 +113,6 @@ def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
 
 def high_pass(image: Float32) -> Float32:
     """The image without its locally plane part, scaled to keep the variance of white noise."""
-    import cv2
-
     kernel = _SECOND_DIFFERENCES.astype(np.float32)
     return np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT))
 
@@ -142,8 +141,6 @@ def estimate_noise(
     Pixels are grouped by the grey level of their surroundings, as their own level holds the noise.
     A line is fitted through the clipped variances of the groups if they differ significantly.
     """
-    import cv2
-
     level = cv2.blur(image, (5, 5))
     if np.count_nonzero(flat) >= 64:
         response, level = response[flat], level[flat]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -39,10 +39,6 @@ from telerig.estimator.tracking.filter.types import (
 )
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian, triangulate
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 _ANYWHERE_MM = 100.0
 

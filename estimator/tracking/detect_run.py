@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
@@ -27,9 +28,6 @@ from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
 from telerig.rig.camera import Camera
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Progress = Callable[[str, int, int], None]
 Batch = tuple[int, int]
@@ -169,8 +167,6 @@ def _write(
 
 def read_batch(path: Path) -> pd.DataFrame:
     """A table that `write_table` wrote; empty texts are ""."""
-    import pandas as pd
-
     kinds = {"camera": str, "flags": str, "reason": str}
     table = pd.read_csv(path, dtype=kinds)
     texts = [name for name in kinds if name in table]
@@ -199,8 +195,6 @@ def detect_missing(scene: Scene, store: DetectionStore, progress: Progress | Non
 
 
 def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:
-    import pandas as pd
-
     tables = [
         _detect(scene, camera, frame) for frame in range(*batch) for camera in scene.run.cameras
     ]
@@ -209,8 +203,6 @@ def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:
 
 def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
     """One image's bubbles; an image without any gives one row with the reason."""
-    import pandas as pd
-
     image, strip = scene.image(camera, frame), scene.strips.get(camera)
     if image is None:
         found, reason = pd.DataFrame(columns=DETECTION_COLUMNS), "no image"

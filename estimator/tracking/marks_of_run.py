@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.marks.following import Follower, Mark, StripInImages, TankView
@@ -22,8 +23,6 @@ from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from telerig.io.dataset.run import RunData
     from telerig.io.rig_file.description import ReferencesDescription
 
@@ -122,8 +121,6 @@ def _look(
 
 def _find_dots(run: RunData, looks: Looks, batch: Batch) -> pd.DataFrame:
     """Every dot in the images of some frames, `DOT_COLUMNS`."""
-    import pandas as pd
-
     rows: list[tuple[Any, ...]] = []
     for frame in range(*batch):
         for name, look in looks.items():
@@ -138,8 +135,6 @@ def _sightings(
     run: RunData, followers: Mapping[str, Follower], store: DetectionStore
 ) -> pd.DataFrame:
     """Every dot that a camera's follower gives a number, `REFERENCE_COLUMNS`."""
-    import pandas as pd
-
     parts = [pd.DataFrame(columns=REFERENCE_COLUMNS)]
     for batch in store.batches if followers else ():
         dots = read_batch(store.path(batch, "dots"))

@@ -10,7 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
+import pandas as pd
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import find_bubbles, outline_points
@@ -33,8 +35,6 @@ from telerig.io.results.record import run_record
 from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.io.dataset.run import RunData
 
@@ -172,8 +172,6 @@ def _write_pictures(scene: Scene, summary: Mapping[str, Any], staged: Path) -> N
 
 
 def _labels(staged: Path, camera: str, frame: int) -> pd.DataFrame:
-    import pandas as pd
-
     chunks = pd.read_csv(
         staged / "detections.csv", usecols=["frame", "camera", "particle", "u_px", "v_px"],
         dtype={"camera": str}, chunksize=20_000,
@@ -215,8 +213,6 @@ def _particle(labels: pd.DataFrame, row: pd.Series[Any]) -> str:
 
 
 def _write_image(path: Path, picture: Any) -> None:
-    import cv2
-
     path.parent.mkdir(parents=True, exist_ok=True)
     written, encoded = cv2.imencode(path.suffix, picture)
     if not written:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
+
 from telerig.errors import InputError
 from telerig.estimator.tracking.detect_run import read_batch
 from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from telerig.estimator.tracking.filter.types import TrackEvent
 
 EVENT_COLUMNS = ["frame", "t_s", "kind", "particles", "reason"]
@@ -57,8 +57,6 @@ class Tracks:
 
 def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
     """In the order of time."""
-    import pandas as pd
-
     rows = [
         (e.frame, e.t_s, e.kind, " ".join(str(p) for p in e.particles), e.reason)
         for e in sorted(events, key=lambda e: e.frame)

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from telerig.arrays import Array, Bools
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from telerig.estimator.tracking.tracks import Tracks
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,8 +26,6 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Float32, Bools]:
     image itself where that is not dark. A dark band along more than a third of the border is the
     screen's edge, not a bubble.
     """
-    import cv2
-
     height, width = image.shape
     log = log_cells(image, _CELL_PX)
     surface = bright_surface(log, 4)
@@ -41,8 +40,6 @@ def level_of_image(image: NDArray[np.generic]) -> tuple[Float32, Bools]:
 
 def log_cells(image: NDArray[np.generic], cell_px: int) -> Float32:
     """Logarithm of the image, averaged over square cells first."""
-    import cv2
-
     size = [max(4, extent // cell_px) for extent in reversed(image.shape)]
     cells = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.asarray(np.log(np.maximum(cells, 0.5)))
@@ -81,8 +78,6 @@ def _holes(mask: Bools) -> Iterator[tuple[tuple[slice, slice], Bools]]:
 
 def _carried(residual: Float32, known: Bools, across: tuple[float, float] | None = None) -> Float32:
     """Weighted means of what is known nearby, the finest scale that reaches a pixel first."""
-    import cv2
-
     weight, value = known.astype(np.float32), np.where(known, residual, 0).astype(np.float32)
     result, left = np.zeros_like(value), np.ones_like(value)
     scale = 2.0
@@ -124,8 +119,6 @@ def _terms(shape: tuple[int, ...], degree: int) -> Array:
 
 def _dark_things(log: Float32, surface: Float32) -> Bools:
     """Dark against the surface, grown by two cells."""
-    import cv2
-
     depth = surface - log
     noise = float(robust_sd(depth - np.median(depth)))
     dark = compact_things(depth > max(DARK, 5 * noise))

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,8 +55,6 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
     shifts_px : (n, 2) travel (u, v) of what is fixed in the lab; None when nothing moves.
     gains : (n,) log brightness of the frames.
     """
-    import cv2
-
     height, width = stack.shape[1:]
     log = np.stack([log_cells(image, _CELL_PX) - gain for image, gain in zip(stack, gains)])
     surface = bright_surface(np.quantile(log, 0.8, axis=0).astype(np.float32), 4)
@@ -84,8 +83,6 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
 
     A bubble's own border moves, if only by a pixel, and parts its still inside from the outside.
     """
-    import cv2
-
     never = masks.mean(0) > 1 - 1.5 / len(masks)
     values = np.log(np.maximum(stack[:, never].astype(np.float32), 0.5)) - gains[:, None]
     low, high = np.quantile(values, (0.1, 0.9), axis=0)
@@ -98,8 +95,6 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
 
 def _still(share: Array, known: Bools, margin: int) -> Bools:
     """Things dark in nearly all frames, grown by ``margin`` cells, beyond which few are dark."""
-    import cv2
-
     core = (share >= _STILL) & known
     count, labels = cv2.connectedComponents(core.astype(np.uint8))
     still = np.zeros(share.shape, np.uint8)
@@ -364,8 +359,6 @@ def _marked(sample: _Sample, layers: Layers) -> tuple[Layers, Bools]:
 
 def _outliers(residual: Float32, sigma: Float32) -> Bools:
     """Dark things with their soft edges and bright centres, and bright specks."""
-    import cv2
-
     soft = cv2.blur(residual, (5, 5))
     thin = soft[::8, ::8] - np.median(soft[::8, ::8])
     spread = float(np.median(thin[thin >= 0])) / 0.6745
@@ -388,8 +381,6 @@ def _uncovered(
     Dirt and a bubble that the rig follows both look dark in the layer, but a bubble's edge
     moves: just outside it the frames differ.
     """
-    import cv2
-
     dark = (np.log(level_of_image(np.exp(layers.rig))[0]) - layers.rig > DARK).astype(np.uint8)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     share = marked.mean(0, dtype=np.float32)
@@ -430,8 +421,6 @@ def _mean_rig(
     sample: _Sample, layers: Layers, marked: Bools, covered: Bools
 ) -> tuple[Layers, Float32]:
     """The rig layer as the mean of the frames' unmarked pixels, and (H, W) their number."""
-    import cv2
-
     total, seen = np.zeros(layers.rig.shape, np.float32), np.zeros(layers.rig.shape, np.float32)
     for k in range(len(sample.stack)):
         free = (~marked[k]).astype(np.uint8)
@@ -444,8 +433,6 @@ def _mean_rig(
 
 def _mean_lab(sample: _Sample, layers: Layers, marked: Bools) -> Layers:
     """The lab layer as the mean of the residuals that are free of marks."""
-    import cv2
-
     assert layers.lab is not None
     height, width = layers.rig.shape
     total, seen = np.zeros_like(layers.lab), np.zeros_like(layers.lab)
@@ -487,8 +474,6 @@ def crop_of_lab(
 
 def shifted(image: Float32, shift_px: tuple[float, float]) -> Float32:
     """image(p + shift) for shifts below 1 px, by Catmull-Rom splines; borders replicated."""
-    import cv2
-
     along_u, along_v = (_spline(shift) for shift in shift_px)
     out = cv2.sepFilter2D(image, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(out, np.float32)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from telerig.arrays import Array
 from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS, outline_moments, points_on
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 CENTRE_COLUMNS = ["u_px", "v_px"]
 COVARIANCE_COLUMNS = ["suu_px2", "suv_px2", "svv_px2"]
@@ -57,8 +54,6 @@ def outline_centroid(table: pd.DataFrame) -> Array:
 
 def columns(table: pd.DataFrame, names: list[str]) -> Array:
     """(N, K) columns as numbers; NaN where there is none, or no number."""
-    import pandas as pd
-
     out = np.full((len(table), len(names)), np.nan)
     for k, name in enumerate(names):
         if name in table:

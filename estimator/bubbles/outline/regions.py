@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,8 +49,6 @@ def noise_share(ratio: Float32, response: Float32) -> float:
 
     response : the image's `high_pass`, which is blind to any plane.
     """
-    import cv2
-
     free = cv2.erode((ratio > _LIT).astype(np.uint8), np.ones((3, 7), np.uint8)) > 0
     values = response[free] if np.count_nonzero(free) > 200 else response.ravel()
     return clipped_sigma(
@@ -63,8 +62,6 @@ def dark_noise_share(ratio: Float32, response: Float32, blobs: list[Blob], sigma
     From the `high_pass` where five by five pixels are dark alike. Structure within the rims makes
     the estimate too large rather than too small.
     """
-    import cv2
-
     found = [np.empty(0, np.float32)]
     for blob in blobs:
         x, y, width, height = blob.box
@@ -85,8 +82,6 @@ def find_blobs(
     Hysteresis: a region is what is darker than a faint shadow, and counts when it holds pixels
     darker than ``1 - min_contrast``. Its outline is traced at half of its own depth.
     """
-    import cv2
-
     low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
     mask = cv2.compare(ratio, low, cv2.CMP_LT)
     regions, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -118,8 +113,6 @@ def _trace(
     min_diameter_px: float,
 ) -> tuple[list[Blob], str]:
     """Outlines at half depth within one region, or the reason why there is none."""
-    import cv2
-
     x, y, width, height = box
     rows, columns = ratio.shape
     left, top = max(x - 1, 0), max(y - 1, 0)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,8 +40,6 @@ def contour_moments(contours: list[Array]) -> tuple[Array, Array, Array]:
 
     Points that are NaN (beyond the image) are passed over.
     """
-    import cv2
-
     found = []
     for contour in contours:
         points = contour[np.isfinite(contour[:, 0])]
@@ -358,8 +357,6 @@ def _explains(ellipses: list[Array], contour: Array) -> bool:
 
 def _filled(contour: Array, low: Ints, high: Ints) -> NDArray[np.uint8]:
     """The outline filled, in the window of pixels (u, v) from ``low`` to before ``high``."""
-    import cv2
-
     canvas = np.zeros((high - low)[::-1], np.uint8)
     cv2.fillPoly(canvas, [np.round(contour - low).astype(np.int32)[:, None]], 1)
     return canvas
@@ -367,8 +364,6 @@ def _filled(contour: Array, low: Ints, high: Ints) -> NDArray[np.uint8]:
 
 def _dark(ellipse: Array, contour: Array, shape: tuple[int, ...]) -> bool:
     """Whether what the image shows of the ellipse's disc lies within the blob."""
-    import cv2
-
     low = np.maximum(np.floor(ellipse[:2] - ellipse[2]), 0).astype(np.int64)
     high = np.minimum(np.ceil(ellipse[:2] + ellipse[2]) + 1, shape[::-1]).astype(np.int64)
     if np.any(high <= low):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,8 +89,6 @@ class EdgeMap:
 
 def edge_map(image: Float32, sigma: float) -> EdgeMap:
     """Threshold surface of ``image`` (rows, columns) whose noise is about ``sigma`` grey levels."""
-    import cv2
-
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     rows, columns = image.shape
     missing = (-rows % _BLOCK, -columns % _BLOCK)
@@ -116,8 +115,6 @@ def _away_from(bright: Bools) -> Bools:
 
     They are chosen by place alone: choosing quiet pixels would bias the noise measured in them.
     """
-    import cv2
-
     grey = bright.astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     crossing = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, cross)
@@ -133,8 +130,6 @@ def _away_from(bright: Bools) -> Bools:
 
 def _spread(values: Float32, weight: Float32) -> Float32:
     """Values weighted and interpolated to where there is no weight, from coarser scales."""
-    import cv2
-
     rows, columns = values.shape
     if min(rows, columns) <= 2:
         total = float(np.sum(weight))
@@ -204,8 +199,6 @@ def _with_pieces(shown: list[_Look], above: Float32, min_diameter_px: float) -> 
 
 def fill(canvas: NDArray[np.generic], value: int, *outlines: NDArray[np.int32]) -> None:
     """Fill the inside of the first outline, without that of the others, which are its holes."""
-    import cv2
-
     cv2.drawContours(canvas, [o.reshape(-1, 1, 2) for o in outlines], -1, value, cv2.FILLED)
 
 
@@ -213,8 +206,6 @@ def _outlines(
     inside: Bools,
 ) -> list[tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]]:
     """Outer outline (N, 2) of each connected region, with the outlines of its holes."""
-    import cv2
-
     found, tree = cv2.findContours(inside.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if not found:
         return []
@@ -232,8 +223,6 @@ def _pieces(above: Float32, outline: NDArray[np.int32]) -> list[NDArray[np.int32
     Only blobs that are nowhere thicker than the blur are separated: larger dots that touch in the
     image touch in the world.
     """
-    import cv2
-
     low, high = outline.min(axis=0), outline.max(axis=0) + 1
     filled = np.zeros((high - low)[::-1] + 2, np.uint8)
     fill(filled, 1, outline - low + 1)
@@ -289,8 +278,6 @@ def _first_look(
 
 def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
     """Area, centre (2,) and ellipse of equal second moments (3,) of a filled outline's pixels."""
-    import cv2
-
     low, size = outline.min(axis=0), np.ptp(outline, axis=0) + 1
     filled = np.zeros((int(size[1]), int(size[0])), np.uint8)
     fill(filled, 1, outline - low)
@@ -310,8 +297,6 @@ def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
 def _reason_against_outline(
     outline: NDArray[np.int32], centre: Array, shape: Array
 ) -> Reason | None:
-    import cv2
-
     offset = outline - centre
     distance = approximate_distance_px(shape, offset[:, 0], offset[:, 1]) + 0.5
     _, b, _ = axes_from_shape(shape)
@@ -342,8 +327,6 @@ def reference_radius_px(found: Candidates) -> float:
 
 def is_ring(blob: Candidate) -> bool:
     """Whether holes make up a notable part of the blob, rather than specks of dust in it."""
-    import cv2
-
     holes = sum(float(cv2.contourArea(hole.reshape(-1, 1, 2))) for hole in blob.holes)
     return holes > _MIN_HOLE_SHARE * blob.area_px2
 

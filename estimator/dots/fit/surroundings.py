@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -81,8 +82,6 @@ def dot_window(
 
 
 def _distance_to(marked: Bools) -> Array:
-    import cv2
-
     distance: Array = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, 5) - 0.5
     return distance
 

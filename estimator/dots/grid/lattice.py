@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
@@ -67,8 +68,6 @@ def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
 
 def fit_homography(source: ArrayLike, target: ArrayLike) -> Array:
     """(3, 3) homography, target ~ H source, of (N, 2) pairs; affine where that is all they tell."""
-    import cv2
-
     homography, _ = cv2.findHomography(np.asarray(source, float), np.asarray(target, float))
     return fit_affine(source, target) if homography is None else np.asarray(homography)
 

@@ -44,7 +44,7 @@ class BubbleModel:
     velocity_sigma_mm_s, velocity_tau_s : Ornstein-Uhlenbeck velocity about a constant mean.
     start_sigma_mm, mean_sigma_mm_s : of the first position and the mean velocity, each axis.
     zigzags : oscillations besides.  wander_px, wander_tau_s : of the centroid in each image,
-        0 for none.  speed_sigma_mm_s : how constant the speed is, None to leave it free.
+        0 for none.
     """
 
     velocity_sigma_mm_s: float = 10.0
@@ -54,7 +54,6 @@ class BubbleModel:
     zigzags: tuple[Zigzag, ...] = ()
     wander_px: float = 0.0
     wander_tau_s: float = 0.1
-    speed_sigma_mm_s: float | None = None
 
 
 @dataclass(frozen=True)

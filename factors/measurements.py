@@ -21,14 +21,13 @@ class ImagePrediction:
     """uv_px : (..., 2) and its derivatives.
 
     by_point, by_offset : (..., 2, 3) by the lab point and the camera's offset.
-    by_position : (..., 2) by the stage's position.  by_pitch : (..., 2) by the arm's pitch.
+    by_position : (..., 2) by the stage's position.
     """
 
     uv_px: Array
     by_point: Array
     by_offset: Array
     by_position: Array
-    by_pitch: Array
 
 
 def image_of_point(
@@ -37,28 +36,20 @@ def image_of_point(
     position_mm: ArrayLike,
     axis: Array,
     offset_mm: ArrayLike,
-    pitch_rad: ArrayLike = 0.0,
 ) -> ImagePrediction:
     """The image of a bubble, or of a mark fixed to the tank, and its derivatives.
 
     point_lab_mm, offset_mm : (..., 3).  position_mm : (...) of the carriage along ``axis`` (3,).
-    pitch_rad : (...) of the camera about its own x axis; a point at depth Z looks higher by
-        pitch * Z.
     """
-    pose, pitch = camera.camera_from_rig, np.asarray(pitch_rad, float)
+    pose = camera.camera_from_rig
     position = np.asarray(position_mm, float)[..., None]
     point = np.asarray(point_lab_mm, float) - axis * position - np.asarray(offset_mm, float)
-    depth = np.asarray(point @ pose.rotation[2] + pose.translation_mm[2])
-    point = point - (pitch * depth)[..., None] * pose.rotation[1]
     in_camera = point @ pose.rotation.T + pose.translation_mm
     uv, by_camera, _ = camera.pixel_jacobians(in_camera.reshape(-1, 3))
     by_camera = by_camera.reshape(*in_camera.shape[:-1], 2, 3)
-    by_pitch = -by_camera[..., 1] * depth[..., None]
-    # depth along the optical axis moves with the point, and with it the lift
-    tilted = pitch[..., None, None] * by_camera[..., 1:2]
-    by_point = by_camera @ pose.rotation - tilted * pose.rotation[2]
+    by_point = by_camera @ pose.rotation
     return ImagePrediction(
-        uv.reshape(*in_camera.shape[:-1], 2), by_point, -by_point, -by_point @ axis, by_pitch
+        uv.reshape(*in_camera.shape[:-1], 2), by_point, -by_point, -by_point @ axis
     )
 
 
@@ -94,25 +85,6 @@ def accelerometer_reading(
     reading = force @ axes.T + np.asarray(bias_mm_s2, float)
     by_acceleration = np.broadcast_to(gain[..., None] * axes, (*reading.shape, 3))
     return AccelerometerPrediction(reading, by_acceleration, acceleration @ axes.T)
-
-
-def speed_residual(
-    velocity_mm_s: ArrayLike, speed_mm_s: ArrayLike, up: Array
-) -> tuple[Array, Array, Array]:
-    """A zigzagging bubble keeps its speed V: v_up + |v_across|^2 / (2 V) - V, near zero.
-
-    (..., 3) velocity, (...) V -> residual (...), derivatives (..., 3) and (...).
-    """
-    velocity, speed = np.asarray(velocity_mm_s, float), np.asarray(speed_mm_s, float)
-    rise = velocity @ up
-    across = velocity - rise[..., None] * up
-    square = (across**2).sum(-1)
-    by_velocity = up + across / speed[..., None]
-    return (
-        np.asarray(rise + square / (2 * speed) - speed),
-        np.asarray(by_velocity),
-        np.asarray(-square / (2 * speed**2) - 1),
-    )
 
 
 def whitener_of(covariance: Array) -> Array:

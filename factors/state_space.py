@@ -112,22 +112,6 @@ def ou_velocity(sigma_mm_s: float, tau_s: float, *, start_sigma_mm: float = 100.
     )
 
 
-def white_jerk(
-    jerk_density: float,
-    *,
-    start_sigma_mm: float = 100.0,
-    start_sigma_mm_s: float = 300.0,
-    start_sigma_mm_s2: float = 1000.0,
-) -> Component:
-    """States (position, velocity, acceleration); jerk white, density in mm s^-3 / sqrt Hz."""
-    _positive(jerk_density=jerk_density)
-    start = np.diag(np.square([start_sigma_mm, start_sigma_mm_s, start_sigma_mm_s2]))
-    drift = np.diag([1.0, 1.0], 1)
-    return _component(
-        "white_jerk", drift, [0, 0, jerk_density], start, acceleration=[0.0, 0.0, 1.0]
-    )
-
-
 def forced_mass(
     acceleration_rms_mm_s2: float,
     *,
@@ -137,8 +121,8 @@ def forced_mass(
 ) -> Component:
     """A carriage under a smooth force: its acceleration is white noise through three equal poles.
 
-    States (position, velocity, acceleration and two more of the force). Smoother than white jerk
-    on purpose: a prior's power above a sensor's sampling rate is aliased into the sensor's band and
+    States (position, velocity, acceleration and two more of the force). Smooth on
+    purpose: a prior's power above a sensor's sampling rate is aliased into the sensor's band and
     makes an accelerometer worthless.
     """
     _positive(acceleration_rms_mm_s2=acceleration_rms_mm_s2, corner_hz=corner_hz)

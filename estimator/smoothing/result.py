@@ -152,7 +152,7 @@ def _sensors(solution: Solution) -> dict[str, Any]:
 
 
 def _means(solution: Solution) -> dict[str, Any]:
-    names = ["x_mm_s", "y_mm_s", "z_mm_s", "speed_mm_s"][: solution.graph.mean_size]
+    names = ["x_mm_s", "y_mm_s", "z_mm_s"]
     block = _block(solution, "means")
     return {
         str(b.particle): _with_sd(

@@ -47,42 +47,29 @@ def slope(function: Callable[[Any], Any], at: Any, step: float) -> Any:
 def test_image_derivatives(camera: Camera, shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(3)
     point, offset = rng.uniform(-15, 15, (*shape, 3)), rng.uniform(-1, 1, (*shape, 3))
-    position, pitch = rng.uniform(-5, 5, shape), rng.uniform(-0.01, 0.01, shape)
+    position = rng.uniform(-5, 5, shape)
 
-    def image(p: Any, s: Any, o: Any, q: Any) -> Any:
-        return measurements.image_of_point(camera, p, s, UP, o, q).uv_px
+    def image(p: Any, s: Any, o: Any) -> Any:
+        return measurements.image_of_point(camera, p, s, UP, o).uv_px
 
-    found = measurements.image_of_point(camera, point, position, UP, offset, pitch)
+    found = measurements.image_of_point(camera, point, position, UP, offset)
     assert found.uv_px.shape == (*shape, 2)
     tolerance = {"rtol": 1e-6, "atol": 1e-6}
     np.testing.assert_allclose(
-        found.by_point, slope(lambda p: image(p, position, offset, pitch), point, 1e-4), **tolerance
+        found.by_point, slope(lambda p: image(p, position, offset), point, 1e-4), **tolerance
     )
     np.testing.assert_allclose(
-        found.by_offset, slope(lambda o: image(point, position, o, pitch), offset, 1e-4),
+        found.by_offset, slope(lambda o: image(point, position, o), offset, 1e-4),
         **tolerance,
     )  # fmt: skip
-    by_position = slope(lambda s: image(point, s[..., 0], offset, pitch), position[..., None], 1e-4)
+    by_position = slope(lambda s: image(point, s[..., 0], offset), position[..., None], 1e-4)
     np.testing.assert_allclose(found.by_position, by_position[..., 0], **tolerance)
-    by_pitch = slope(lambda q: image(point, position, offset, q[..., 0]), pitch[..., None], 1e-6)
-    np.testing.assert_allclose(found.by_pitch, by_pitch[..., 0], rtol=1e-5, atol=1e-4)
 
 
 def test_image_is_the_rigs_view_of_the_moved_point() -> None:
     camera = cameras()[1]
     seen = measurements.image_of_point(camera, [1.0, 2.0, 3.0], 7.0, UP, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(seen.uv_px, camera.project([0.9, 8.8, 2.7]), atol=1e-9)
-
-
-def test_pitch_shifts_with_depth() -> None:
-    camera = cameras()[0]
-    near, far = (
-        measurements.image_of_point(camera, [0.0, 0.0, z], 0.0, UP, np.zeros(3), 0.01).uv_px
-        - measurements.image_of_point(camera, [0.0, 0.0, z], 0.0, UP, np.zeros(3)).uv_px
-        for z in (0.0, 20.0)
-    )
-    np.testing.assert_allclose(near, 0, atol=1e-9)
-    np.testing.assert_allclose(far, [0, -0.01 * 20 * 10], atol=1e-9)
 
 
 def test_accelerometer_at_rest_shows_gravity_upwards() -> None:
@@ -104,23 +91,6 @@ def test_accelerometer_derivatives() -> None:
     np.testing.assert_allclose(found.by_acceleration, slope(reading, a, 1.0), atol=1e-9)
     by_scale = (reading(a, 0.03) - reading(a, 0.01)) / 0.02
     np.testing.assert_allclose(found.by_scale, by_scale, rtol=1e-9)
-
-
-def test_speed_residual_is_second_order_zero_on_a_zigzag() -> None:
-    """Constant speed V at a small angle: v_up + v_across^2 / (2 V) - V is of fourth order."""
-    angle = np.array([0.0, 0.1, 0.2])
-    velocity = 280 * (
-        np.cos(angle)[:, None] * UP + np.sin(angle)[:, None] * np.array([0.6, 0, 0.8])
-    )
-    value, by_velocity, by_speed = measurements.speed_residual(velocity, np.full(3, 280.0), UP)
-    assert np.all(np.abs(value) <= 280 * angle**4 / 6 + 1e-9)
-
-    def residual(v: Any) -> Any:
-        return measurements.speed_residual(v, np.full(3, 280.0), UP)[0]
-
-    np.testing.assert_allclose(by_velocity, slope(residual, velocity, 1e-3), atol=1e-7)
-    more, less = (measurements.speed_residual(velocity, np.full(3, s), UP)[0] for s in (281, 279))
-    np.testing.assert_allclose(by_speed, (more - less) / 2, atol=1e-5)
 
 
 def test_motion_residual_is_whitened() -> None:

@@ -25,7 +25,6 @@ from telerig.factors.state_space import (
     independent,
     resonance,
     slow_ou,
-    white_jerk,
 )
 from telerig.rig.camera import Camera
 
@@ -44,7 +43,7 @@ class ShakeLayout:
     position, velocity, acceleration, jerk : (D,) of the carriage along the axis.
     offset, offset_velocity, offset_acceleration, offset_jerk : (C + 1, 3, D) of each camera in
         rig axes; the last is what all share, measured by a sensor on the carriage.
-    pitch : (C, D).  seen : per camera (k, 3), the directions in which its own arm is modelled.
+    seen : per camera (k, 3), the directions in which its own arm is modelled.
     unseen_variance_mm2 : (C, 3, 3) of the arm's own shake along the camera's depth.
     """
 
@@ -58,7 +57,6 @@ class ShakeLayout:
     offset_velocity: Array
     offset_acceleration: Array
     offset_jerk: Array
-    pitch: Array
     seen: tuple[Array, ...]
     unseen_variance_mm2: Array
 
@@ -128,15 +126,13 @@ def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
     parts = [p.component for p in placed]
     size, cameras = sum(c.size for c in parts), len(problem.cameras)
     carriage = np.zeros((4, size))
-    offset, pitch = np.zeros((4, cameras + 1, 3, size)), np.zeros((cameras, size))
+    offset = np.zeros((4, cameras + 1, 3, size))
     at = 0
     for p in placed:
         c, columns = p.component, slice(at, at + p.component.size)
         rows = (c.position, c.velocity, c.acceleration, c.jerk)
         if p.kind == "carriage":
             carriage[:, columns] = rows
-        elif p.kind == "pitch":
-            pitch[p.camera, columns] = c.position
         else:
             block = np.einsum("rn,i->rin", np.array(rows), p.direction)
             if p.camera == CARRIAGE:
@@ -147,7 +143,7 @@ def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
     return ShakeLayout(
         tuple(parts), tuple(p.label for p in placed),
         carriage[0], carriage[1], carriage[2], carriage[3],
-        offset[0], offset[1], offset[2], offset[3], pitch,
+        offset[0], offset[1], offset[2], offset[3],
         tuple(seen_directions(c) for c in problem.cameras), _unseen(problem.cameras, model),
     )  # fmt: skip
 
@@ -155,11 +151,7 @@ def shake_layout(problem: SmoothingProblem, model: ShakeModel) -> ShakeLayout:
 def _carriage(problem: SmoothingProblem, model: ShakeModel) -> list[_Placed]:
     if problem.stage is None:
         return []
-    if model.carriage.kind == "jerk":
-        part = white_jerk(
-            model.carriage.jerk_density, start_sigma_mm_s=1000.0, start_sigma_mm_s2=5000.0
-        )
-    elif model.carriage.kind == "force":
+    if model.carriage.kind == "force":
         part = forced_mass(
             model.carriage.acceleration_rms_mm_s2, corner_hz=model.carriage.corner_hz
         )
@@ -189,9 +181,6 @@ def _offsets(cameras: Sequence[Camera], model: ShakeModel) -> list[_Placed]:
             if band.slow_rms_mm > 0:
                 slow = slow_ou(band.slow_rms_mm, band.slow_tau_s)
                 placed.append(_Placed(slow, "slow", direction, band.camera))
-    for p in model.pitches:
-        part = driven_mode(p.rms_rad, p.frequency_hz, p.damping, force_hz=p.force_hz)
-        placed.append(_Placed(part, "pitch", np.zeros(3), p.camera, "pitch"))
     return placed
 
 

@@ -68,11 +68,11 @@ def _bubble_motion(graph: GraphLayout, state: State) -> list[Linear]:
     covariance, by_input = start(layout.components)
     whitener = whitener_of(covariance)
     places = np.array([b.start_mm for b in problem.bubbles])
-    means = state.mean_velocity
+    means = state.means
     off = state.bubbles[firsts] - means @ by_input.T
     off[:, layout.path_position] -= places
     numbers = np.arange(len(firsts))
-    wide = _with_columns(-whitener @ by_input, graph.mean_size)
+    wide = -whitener @ by_input
     begin = Linear(
         (base.bubbles + firsts, base.means + numbers),
         (whitener @ graph.bubble_basis(firsts), np.broadcast_to(wide, (len(firsts), *wide.shape))),
@@ -86,7 +86,7 @@ def _bubble_motion(graph: GraphLayout, state: State) -> list[Linear]:
     i = steps.index
     blocks = (
         *steps.in_basis(graph.row_basis[rows + 1]),
-        _with_columns(steps.by_input, graph.mean_size)[i],
+        steps.by_input[i],
     )
     keys = (base.bubbles + rows, base.bubbles + rows + 1, base.means + owner)
     return [begin, Linear(keys, blocks, -residual, steps.log_det[i])]
@@ -186,12 +186,10 @@ def _seen(
         shake = at_frames[obs.frame[mine]]
         seen = measurements.image_of_point(
             camera, points[mine], position[obs.frame[mine]], problem.axis,
-            shake @ layout.offset[c].T, shake @ layout.pitch[c],
+            shake @ layout.offset[c].T,
         )  # fmt: skip
-        by_shake = (
-            seen.by_offset @ layout.offset[c]
-            + seen.by_position[..., None] * (gain * layout.position)
-            + seen.by_pitch[..., None] * layout.pitch[c]
+        by_shake = seen.by_offset @ layout.offset[c] + seen.by_position[..., None] * (
+            gain * layout.position
         )
         if graph.to_frames is not None:
             by_shake = by_shake @ graph.to_frames[obs.frame[mine]]
@@ -335,31 +333,11 @@ def sensed_directions(graph: GraphLayout, index: int) -> tuple[Array, float]:
     return np.asarray(whitener @ rows), float(log_det_of(whitener))
 
 
-def speeds(graph: GraphLayout, state: State) -> list[Linear]:
-    """How constant the bubbles' speed is, if that is part of the model."""
-    sigma = graph.model.bubble.speed_sigma_mm_s
-    if sigma is None or not graph.rows:
-        return []
-    layout, base = graph.bubble, graph.base()
-    owner = graph.bubble_of_row
-    velocity = state.bubbles @ layout.velocity.T
-    value, by_velocity, by_speed = measurements.speed_residual(
-        velocity, state.means[owner, 3], graph.problem.up
-    )
-    by_mean = np.zeros((len(owner), 1, 4))
-    by_mean[:, 0, 3] = by_speed / sigma
-    every = graph.bubble_basis(np.arange(graph.rows))
-    by_state = (by_velocity @ layout.velocity)[:, None] @ every / sigma
-    keys = (base.bubbles + np.arange(graph.rows), base.means + owner)
-    log_det = np.full(len(owner), -np.log(sigma))
-    return [Linear(keys, (by_state, by_mean), -value[:, None] / sigma, log_det)]
-
-
 def all_factors(graph: GraphLayout, state: State, weights: tuple[Array, Array]) -> list[Linear]:
     """Every factor of the graph; weights of the bubbles' and of the marks' pixels."""
     out = priors_and_motion(graph, state)
     out += images(graph, state, weights[0]).linear + references(graph, state, weights[1]).linear
-    return out + encoder(graph, state) + accelerometers(graph, state) + speeds(graph, state)
+    return out + encoder(graph, state) + accelerometers(graph, state)
 
 
 def pixel_residuals(graph: GraphLayout, state: State) -> tuple[Array, Array]:
@@ -367,9 +345,3 @@ def pixel_residuals(graph: GraphLayout, state: State) -> tuple[Array, Array]:
     problem = graph.problem
     ones = np.ones(len(problem.observations)), np.ones(len(problem.references))
     return images(graph, state, ones[0]).residual, references(graph, state, ones[1]).residual
-
-
-def _with_columns(block: Array, columns: int) -> Array:
-    """Zero columns added on the right."""
-    missing = columns - block.shape[-1]
-    return np.concatenate([block, np.zeros((*block.shape[:-1], missing))], -1)

@@ -176,7 +176,7 @@ def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
         model.accelerometer_scale_sigma,
         model.accelerometer_delay_sigma_s,
     )
-    return flat and not any(held) and model.bubble.speed_sigma_mm_s is None and not model.pitches
+    return flat and not any(held)
 
 
 @dataclass(frozen=True)

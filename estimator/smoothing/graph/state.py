@@ -52,7 +52,7 @@ class State:
     """shake : (N, Ds), the carriage in units of the encoder's reading.
 
     bubbles : (sum of lengths, Db), one bubble after the other.
-    means : (K, 3), or (K, 4) with the constant speed.  sensors : (A, 3 or 4) bias, scale.
+    means : (K, 3) velocities over the run.  sensors : (A, 3 or 4) bias, scale.
     encoder : (0..2,) scale, delay.  calibration : (r,).  marks : (Q, 3).  clocks : (G, 0 or 1)
     delay of the accelerometers' clocks beyond that at which the nodes are placed.
     """
@@ -65,11 +65,6 @@ class State:
     calibration: Array
     marks: Array
     clocks: Array
-
-    @property
-    def mean_velocity(self) -> Array:
-        """(K, 3) mean velocities of the K bubbles over the run, mm/s in the lab frame."""
-        return self.means[:, :3]
 
     def encoder_scale(self, graph: GraphLayout) -> float:
         """0 where it is held."""
@@ -146,10 +141,6 @@ class GraphLayout:
         return np.asarray(self.first_row[bubble] + graph - first[bubble])
 
     @property
-    def mean_size(self) -> int:
-        return 3 if self.model.bubble.speed_sigma_mm_s is None else 4
-
-    @property
     def sensor_flags(self) -> tuple[bool, bool]:
         model = self.model
         return model.accelerometer_scale_sigma > 0, model.accelerometer_delay_sigma_s > 0
@@ -180,7 +171,7 @@ class GraphLayout:
         return Families(
             Family(len(self.nodes.t_s), self.shake.size),
             Family(self.rows, self.bubble.size),
-            Family(len(problem.bubbles), self.mean_size),
+            Family(len(problem.bubbles), 3),
             Family(len(problem.accelerometers), 3 + self.sensor_flags[0]),
             Family(1, self.encoder_size + self.share_size),
             Family(len(problem.marks), 3),
@@ -248,8 +239,7 @@ def first_guess(graph: GraphLayout) -> State:
             slope = np.polyfit(t - t.mean(), bubble.guess_mm, 1)[0]
         bubbles[rows, graph.bubble.path_position] = bubble.guess_mm
         bubbles[rows, graph.bubble.path_velocity] = slope
-        means[k, :3] = slope
-        means[k, 3:] = max(float(np.linalg.norm(slope)), 1.0)
+        means[k] = slope
     if len(problem.marks):
         marks[:] = [m.guess_mm for m in problem.marks]
     encoder, calibration = np.split(constants[0], [graph.encoder_size])

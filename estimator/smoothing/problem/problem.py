@@ -53,30 +53,18 @@ class BroadBand:
 
 
 @dataclass(frozen=True)
-class PitchMode:
-    """Rotation of a camera about its own x axis, which shifts its image with depth."""
-
-    frequency_hz: float
-    damping: float
-    rms_rad: float
-    camera: int
-    force_hz: float = 60.0
-
-
-@dataclass(frozen=True)
 class CarriageModel:
     """How the carriage moves along the axis.
 
     kind : "readings", no dynamics: its position at a frame is what the encoder reads there;
         "force", an acceleration of the given RMS, low-pass filtered by three poles at corner_hz,
-        which accelerometers and slow encoders need; "jerk", white jerk of the given density.
+        which accelerometers and slow encoders need.
     servo : (RMS mm, Hz, damping) of a following error besides.
     """
 
-    kind: Literal["readings", "force", "jerk"] = "readings"
+    kind: Literal["readings", "force"] = "readings"
     acceleration_rms_mm_s2: float = 1000.0
     corner_hz: float = 60.0
-    jerk_density: float = 1e4
     servo: tuple[float, float, float] | None = None
 
 
@@ -93,7 +81,6 @@ class ShakeModel:
     bubble: BubbleModel = field(default_factory=BubbleModel)
     modes: tuple[RigMode, ...] = ()
     broad_bands: tuple[BroadBand, ...] = ()
-    pitches: tuple[PitchMode, ...] = ()
     carriage: CarriageModel = CarriageModel()
     encoder_sigma_mm: float = 0.005
     encoder_scale_sigma: float = 0.0
@@ -112,7 +99,7 @@ class ShakeModel:
 
     def without_shake(self) -> ShakeModel:
         """The oracle's model: the cameras stand still on the carriage."""
-        return replace(self, modes=(), broad_bands=(), pitches=())
+        return replace(self, modes=(), broad_bands=())
 
 
 @dataclass(frozen=True)

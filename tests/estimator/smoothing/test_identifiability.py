@@ -165,7 +165,7 @@ def test_modes_are_read_from_estimated_shake_and_encoder_when_the_model_has_none
     solution = solve(problem, BANDS, QUIET)
     moving = replace(
         solution,
-        frame=replace(solution.graph, problem=replace(problem, stage=Stage(t, 50 * t + servo))),
+        graph=replace(solution.graph, problem=replace(problem, stage=Stage(t, 50 * t + servo))),
     )
     rows = {r.where: r for r in reversed(shake_modes(moving))}
     assert rows["common"].frequency_hz == pytest.approx(COMMON_HZ, abs=0.8)

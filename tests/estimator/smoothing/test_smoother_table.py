@@ -79,7 +79,7 @@ def scenario(bubbles: int, *, sensors: bool = False, marks: bool = False) -> Smo
     )
 
 
-SERVO = CarriageModel("jerk", jerk_density=100.0, servo=(0.1, 15.0, 0.3))
+SERVO = CarriageModel("force", acceleration_rms_mm_s2=1e-2, servo=(0.1, 15.0, 0.3))
 
 
 @pytest.mark.parametrize(

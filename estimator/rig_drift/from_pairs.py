@@ -23,7 +23,7 @@ from telerig.estimator.rig_drift.drift import (
     with_drift,
 )
 from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, information, learned_noise
-from telerig.rig.robust import robust_sd
+from telerig.statistics import robust_sd
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -139,7 +139,7 @@ def _without_outliers(table: pd.DataFrame) -> pd.DataFrame:
     if not len(miss):
         return table
     middle = np.median(miss)
-    spread = robust_sd(miss - middle)
+    spread = float(robust_sd(miss - middle))
     near = np.abs(miss - middle) <= _FAR_SIGMAS * max(spread, 1e-6)
     bubble = np.unique(table["particle"], return_inverse=True)[1].astype(np.int64)
     kept: pd.DataFrame = table.assign(particle=bubble).loc[near]

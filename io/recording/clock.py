@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.rig.robust import robust_sd
+from telerig.statistics import robust_sd
 
 RESTART_S = 0.5
 """A stamp that differs by more from the expected one belongs to another count."""
@@ -313,5 +313,5 @@ def _too_early(x: Array, late: Array, edge: Ints, least: Array) -> Bools:
     slope = float(np.median((least[j] - least[i]) / (x[edge[j]] - x[edge[i]])))
     level = least - slope * x[edge]
     middle = float(np.median(level))
-    spread = robust_sd(level - middle)
+    spread = float(robust_sd(level - middle))
     return np.asarray(late - slope * x < middle - max(8 * spread, 2e-4))

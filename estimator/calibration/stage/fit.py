@@ -15,8 +15,8 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.covariance import rig_jacobian
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, hat, nearest_rotation, rotation_from_rotvec
-from telerig.rig.robust import robust_sd
 from telerig.rig.triangulation import triangulate_any
+from telerig.statistics import robust_sd
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -122,7 +122,7 @@ def _scores(system: Linear, state: State, sigma_mm: float) -> tuple[Array, Array
     axis = state.slope / np.linalg.norm(state.slope)
     own = np.einsum("i,vij,j->v", axis, system.shift_covariance, axis)
     off = system.shift_mm @ axis
-    spread = robust_sd(off)
+    spread = float(robust_sd(off))
     stated = float(np.sqrt(np.median(own) + sigma_mm**2))
     variance = own + sigma_mm**2 if spread < 2 * stated else own + spread**2
     return system.dot_score, off**2 / variance

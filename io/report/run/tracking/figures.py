@@ -28,7 +28,7 @@ from telerig.io.report.run.tracking.results import (
     rms,
 )
 from telerig.io.report.run.tracking.scene import draw_tracks, thinned
-from telerig.rig.robust import robust_sd
+from telerig.statistics import robust_sd
 
 _MOST_POINTS = 8_000
 _MOST_BINS = 400
@@ -280,7 +280,7 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
     groups = int(min(_STEPS, len(place) // _LEAST_IN_STEP))
     steps = np.array_split(np.argsort(place), groups) if groups else []
     middles, medians = ([float(np.median(values[s])) for s in steps] for values in (place, miss))
-    error = [1.2533 * robust_sd(miss[s] - m) / np.sqrt(len(s))
+    error = [1.2533 * float(robust_sd(miss[s] - m) / np.sqrt(len(s)))
              for s, m in zip(steps, medians)]  # fmt: skip
     settings: dict[str, Any] = {
         "xlabel": f"{name} / mm",

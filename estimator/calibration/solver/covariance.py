@@ -10,7 +10,7 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.levenberg_marquardt import Solution
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.schur import Posterior
-from telerig.factors.projection import whitened_residuals
+from telerig.estimator.calibration.solver.system import System, images_of
 from telerig.rig.camera import Camera
 from telerig.rig.pose import hat
 from telerig.rig.projection import INDEX
@@ -133,25 +133,19 @@ def _names(problem: Problem) -> tuple[str, ...]:
 
 def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior) -> Array:
     """(M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs."""
-    obs = problem.observations()
-    slots, out = solution.slots, np.empty((len(obs), 2, 2))
-    every = np.arange(len(posterior.common))
-    image = obs.view * len(problem.cameras) + obs.camera
-    order = np.argsort(image, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(image[order])) + 1):
-        v, c, dot = int(obs.view[rows[0]]), int(obs.camera[rows[0]]), obs.dot[rows]
-        jac = whitened_residuals(solution.state, obs.subset(rows), problem.rho_mm)
-        free = problem.free_indices(c)
-        lens = jac.by_intrinsics[..., free] * parameter_unit(problem.cameras[c])[free]
-        pose = [jac.by_camera] if c else []
-        common, own = np.concatenate([lens, *pose, jac.by_view], -1), jac.by_dot
-        places = (slots["intrinsics"][c], slots["camera"][c], slots["view"][v])
-        index = np.concatenate([every[place] for place in places])
-        across = posterior.cross[index][:, dot].swapaxes(0, 1)
-        mixed = common @ across @ np.swapaxes(own, -1, -2)
-        alone = common @ posterior.common[np.ix_(index, index)] @ np.swapaxes(common, -1, -2)
-        of_dots = own @ posterior.dots[dot] @ np.swapaxes(own, -1, -2)
-        out[rows] = alone + mixed + np.swapaxes(mixed, -1, -2) + of_dots
+    system, out = System(problem), np.empty((int(np.sum(problem.weight > 0)), 2, 2))
+    for c, obs in enumerate(system.images):
+        columns = system.columns(solution.state, c)[:-1].transpose(2, 1, 0)
+        for view, first, last in images_of(obs):
+            image, dot = columns[first:last], obs.dot[first:last]
+            own, place = image[..., -3:], system.views_at + 6 * view
+            index = np.r_[system.camera_places[c], place : place + 6]
+            across = posterior.cross[index][:, dot].swapaxes(0, 1)
+            mixed = image @ across @ np.swapaxes(own, -1, -2)
+            alone = image @ posterior.common[np.ix_(index, index)] @ np.swapaxes(image, -1, -2)
+            of_dots = own @ posterior.dots[dot] @ np.swapaxes(own, -1, -2)
+            rows = system.rows[c][first:last]
+            out[rows] = alone + mixed + np.swapaxes(mixed, -1, -2) + of_dots
     return out
 
 

@@ -49,7 +49,8 @@ class Priors:
 class System:
     """A problem's residuals as functions of the state.
 
-    images : per camera its measurements in the order view, dot.
+    images : per camera its measurements in the order view, dot.  rows : per camera where these
+    stand in `Problem.observations`.
     camera_places : per camera where its S numbers stand among all: free intrinsics, then pose.
     """
 
@@ -69,7 +70,12 @@ class System:
         self.views_at = place["view"][0].start if problem.views else place["dots"][0].start
         self.dots_at, self.size = place["dots"][0].start, place["dots"][0].stop
         observations = problem.observations()
-        self.images = [_of_camera(observations, c) for c in cameras]
+        self.rows = [np.flatnonzero(observations.camera == c) for c in cameras]
+        self.rows = [
+            rows[np.lexsort((observations.dot[rows], observations.view[rows]))]
+            for rows in self.rows
+        ]
+        self.images = [_components_first(observations.subset(rows)) for rows in self.rows]
 
     def columns(self, state: State, camera: int, rows: slice = slice(None)) -> Array:
         """(S + 7, 2, M) `image_columns` of some of a camera's measurements, in units of a step."""
@@ -152,15 +158,11 @@ def images_of(obs: Observations) -> list[tuple[int, int, int]]:
     return [(int(obs.view[a]), a, b) for a, b in pairwise(edges)]
 
 
-def _of_camera(obs: Observations, camera: int) -> Observations:
-    """One camera's measurements in the order view, dot; components contiguous in memory."""
-    mine = np.flatnonzero(obs.camera == camera)
-    mine = mine[np.lexsort((obs.dot[mine], obs.view[mine]))]
-    part = obs.subset(mine)
-    uv, whitener = (
-        np.ascontiguousarray(np.moveaxis(a, 0, -1)) for a in (part.uv_px, part.whitener)
-    )
-    return replace(part, uv_px=uv.T, whitener=np.moveaxis(whitener, -1, 0))
+def _components_first(obs: Observations) -> Observations:
+    """The same measurements, each component contiguous in memory."""
+    uv = np.ascontiguousarray(obs.uv_px.T)
+    whitener = np.ascontiguousarray(obs.whitener.transpose(1, 2, 0))
+    return replace(obs, uv_px=uv.T, whitener=whitener.transpose(2, 0, 1))
 
 
 def retracted(pose: Array, tangent: Array) -> Array:

@@ -9,22 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.covariance import rig_jacobian
+from telerig.factors.linear_factors import add_linear_factors
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, hat, nearest_rotation, rotation_from_rotvec
 from telerig.rig.triangulation import triangulate_any
 from telerig.statistics import robust_sd
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 LEAST_TRAVEL_MM = 1.0
 _STEPS = 60
 _REWEIGHTED = 25
 _SUSPECT = 3.5
+_STATE, _RIG, _FIRST_ERROR = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -142,28 +141,47 @@ def linearised(
     sigma_mm: tuple[float, float],
     weights: Weights,
 ) -> Linear:
-    """Linear system at a state; the errors e of each view are marginalised in closed form."""
+    """Linear system at a state; GTSAM eliminates the carriage's error e of each view."""
+    import gtsam
+
     residual, by_point, by_state, by_rig = derivatives(cameras, free, dots, state)
     information = dots.information * weights.dots[:, None, None]
-    axis = state.slope / np.linalg.norm(state.slope)
-    along = np.outer(axis, axis)
-    every = np.concatenate([by_state, by_rig, residual[:, :, None]], -1)
+    whitener = np.swapaxes(np.linalg.cholesky(dots.information), -1, -2)
+    whitener = whitener * np.sqrt(weights.dots)[:, None, None]
+    across = _across(state.slope)
     count = len(dots.views)
-    total = np.zeros((9, every.shape[-1]))
     shift, spread = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    graph, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
     for v in range(count):
         mine = dots.view == v
-        prior = sigma_mm[0] ** 2 / weights.views[v] * along + sigma_mm[1] ** 2 * (np.eye(3) - along)
-        white = information[mine] @ every[mine]
-        total += np.einsum("mki,mkj->ij", by_state[mine], white)
-        felt = np.einsum("mki,mkj->ij", by_point[mine], white)
+        along, beside = sigma_mm[0] / np.sqrt(weights.views[v]), sigma_mm[1]
+        # the carriage's error in units of its sd, which may be zero
+        by_error = by_point[mine] @ (across * [along, beside, beside])
+        white = [whitener[mine] @ part for part in (by_error, by_state[mine], by_rig[mine])]
+        rows = 2 * int(mine.sum())
+        value = (whitener[mine] @ residual[mine][:, :, None]).reshape(1, rows)
+        blocks = [part.reshape(1, rows, part.shape[-1]) for part in white]
+        add_linear_factors(graph, (_FIRST_ERROR + v, _STATE, _RIG), blocks, value)
+        add_linear_factors(graph, (_FIRST_ERROR + v,), (np.eye(3)[None],), np.zeros((1, 3)))
+        order.push_back(_FIRST_ERROR + v)
         seen = np.einsum("mki,mkl,mlj->ij", by_point[mine], information[mine], by_point[mine])
-        total -= felt[:, :9].T @ np.linalg.solve(np.eye(3) + prior @ seen, prior @ felt)
+        felt = np.einsum("mki,mkl,ml->i", by_point[mine], information[mine], residual[mine])
         spread[v] = np.linalg.pinv(seen, rcond=1e-9)
-        shift[v] = spread[v] @ felt[:, -1]
+        shift[v] = spread[v] @ felt
+    _, left = graph.eliminatePartialSequential(order)
+    kept = gtsam.Ordering()
+    for key in (_STATE, _RIG) if by_rig.shape[-1] else (_STATE,):
+        kept.push_back(key)
+    normal, right = left.hessian(kept)
     off = residual - np.einsum("mki,mi->mk", by_point, shift[dots.view])
     score = np.einsum("mi,mij,mj->m", off, dots.information, off)
-    return Linear(total[:, :9], total[:, -1], total[:, 9:-1], shift, spread, score)
+    return Linear(normal[:9, :9], right[:9], normal[:9, 9:], shift, spread, score)
+
+
+def _across(slope: Array) -> Array:
+    """(3, 3) unit vectors as columns: the travel's direction and two across it."""
+    basis, _ = np.linalg.qr(np.column_stack([slope, np.eye(3)]))
+    return np.asarray(basis)
 
 
 def derivatives(

@@ -17,6 +17,7 @@ import pandas as pd
 from telerig.arrays import Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.files.csv_table import Column, Rows, read_table, rows_of
+from telerig.io.files.text import read_text
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.rig.target import Target
@@ -282,8 +283,8 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
 def read_run_toml(path: Path) -> tuple[float, float]:
     """(frame_rate_hz, start_s) of `run.toml`. Raises InputError for what cannot be."""
     try:
-        raw = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raw = tomllib.loads(read_text(path, "write frame_rate_hz = 500.0"))
+    except tomllib.TOMLDecodeError as error:
         raise InputError(
             f"is not valid TOML: {error}", where=str(path), todo="write frame_rate_hz = 500.0"
         ) from error

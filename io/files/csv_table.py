@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import atomic_path
+from telerig.io.files.text import read_text
 
 _EVERY_DIGIT: dict[str, Any] = (
     {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
@@ -179,7 +180,7 @@ def _sound_table(
 
 def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
     """Header, the cells column by column, and each row's number; blank lines are passed over."""
-    lines = _decoded(file).split("\n")
+    lines = read_text(file, _EXPORT).split("\n")
     numbers = [i for i, line in enumerate(lines, 1) if line.strip(", \r")]
     if not numbers:
         raise InputError("is empty", where=str(file), todo=_EXPORT)
@@ -199,21 +200,10 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
     return [name.strip() for name in header], content, numbers[1:]
 
 
-def _decoded(file: Path) -> str:
-    try:
-        return file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
-    except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror}",
-            where=str(file),
-            todo="check the path and its permissions",
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"is not UTF-8 text: {error.reason} at byte {error.start}",
-            where=str(file),
-            todo=_EXPORT,
-        ) from error
+def header_of(file: Path, todo: str) -> list[str]:
+    """The names in the first line of a table; none in an empty file. Raises as `read_text` does."""
+    first, _, _ = read_text(file, todo).partition("\n")
+    return [name.strip() for name in first.split(",")]
 
 
 def _check_header(header: list[str], columns: Sequence[Column], extra: bool, file: Path) -> None:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.io.exchange.importing.text import read_text
 from telerig.io.files.csv_table import write_table
+from telerig.io.files.text import read_text
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "g": STANDARD_GRAVITY_M_S2,

@@ -19,7 +19,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
-from telerig.io.exchange.importing.text import read_text
+from telerig.io.files.text import read_text
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.distortion import distort

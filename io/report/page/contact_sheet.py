@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-
-import numpy as np
 
 from telerig.errors import InputError
 from telerig.io.report.page.figures import data_uri
@@ -75,21 +74,18 @@ def picture_sheet(
 
 
 def _smaller(picture: bytes, file: Path, width_px: int) -> bytes:
-    import cv2
+    from PIL import Image, UnidentifiedImageError
 
-    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_ANYCOLOR)
-    if image is None:
+    small = BytesIO()
+    try:
+        with Image.open(BytesIO(picture)) as image:
+            image.thumbnail((width_px, image.height))
+            image.save(small, image.format, quality=_SMALL_QUALITY)
+    except (UnidentifiedImageError, OSError) as error:
         raise InputError(
             "is no JPEG or PNG picture", where=str(file), todo="remove this file, or make it again"
-        )
-    factor = width_px / image.shape[1]
-    if factor < 1:
-        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    if picture.startswith(_PNG):
-        _, small = cv2.imencode(".png", image)
-    else:
-        _, small = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY])
-    return min(small.tobytes(), picture, key=len)
+        ) from error
+    return min(small.getvalue(), picture, key=len)
 
 
 def read_picture(file: Path) -> bytes:

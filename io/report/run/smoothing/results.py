@@ -15,7 +15,7 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.io.files.csv_table import read_columns
+from telerig.io.files.csv_table import header_of, read_columns
 from telerig.io.report.run.tracking.results import median, rms
 from telerig.io.results.smoothing import (
     AXES,
@@ -104,7 +104,9 @@ def read_smoothing_results(folder: Path, up: Array) -> SmoothingResults | None:
 
 
 def _shake(file: Path, smoothing: SmoothingFile) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    found = [n.removesuffix("_x_mm") for n in _header(file) if n.endswith("_x_mm")]
+    found = [
+        n.removesuffix("_x_mm") for n in header_of(file, SmoothingFile.AGAIN) if n.endswith("_x_mm")
+    ]
     cameras = tuple(n for n in found if not (n[:1] == "s" and n[1:] in found))
     known = list(smoothing.cameras or cameras)
     if not cameras or sorted(known) != sorted(cameras):
@@ -117,7 +119,6 @@ def _shake(file: Path, smoothing: SmoothingFile) -> tuple[pd.DataFrame, tuple[st
 
 def _trajectories(file: Path) -> pd.DataFrame:
     """Rows by bubble and frame. Columns that a run without bubbles leaves out are there, empty."""
-    _header(file)
     table = read_columns(file, TRAJECTORIES)
     missing = [name for name in STATE if name not in table]
     if len(table) and missing:
@@ -129,16 +130,6 @@ def _trajectories(file: Path) -> pd.DataFrame:
     for particle, mine in table.groupby("particle", sort=False):
         _check_times(mine, file, f" of bubble {particle}")
     return table
-
-
-def _header(file: Path) -> list[str]:
-    try:
-        with file.open(encoding="utf-8-sig") as stream:
-            return [name.strip() for name in stream.readline().split(",")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read: {error}", where=str(file), todo=SmoothingFile.AGAIN
-        ) from error
 
 
 def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:

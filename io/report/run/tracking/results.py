@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import read_columns
+from telerig.io.files.csv_table import header_of, read_columns
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.record import RunFile
 from telerig.io.results.tracking import (
@@ -129,13 +129,7 @@ def unit_vector(vector: ArrayLike) -> Array:
 
 def _cameras(tracking: TrackingFile, file: Path) -> tuple[str, ...]:
     """The two cameras that the header of tracks.csv names."""
-    try:
-        with file.open(encoding="utf-8-sig") as stream:
-            header = [name.strip() for name in stream.readline().split(",")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read: {error}", where=str(file), todo=TrackingFile.AGAIN
-        ) from error
+    header = header_of(file, TrackingFile.AGAIN)
     found = tuple(name.removesuffix("_u_px") for name in header if name.endswith("_u_px"))
     known = list(tracking.frames_without_bubbles or found)
     if not found or sorted(known) != sorted(found):

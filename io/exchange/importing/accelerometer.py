@@ -63,7 +63,26 @@ def read_accelerations(
     names = _channels(recording, layout.channels)
     raw = np.stack([_values(recording, name) for name in names], -1)
     t_s = _times(recording, layout, len(raw)) + layout.start_s
-    _check_readings(recording, names, raw, t_s)
+    if len(raw) != len(t_s) or not len(raw):
+        raise recording.error(
+            f"has {len(raw)} readings and {len(t_s)} times",
+            "give as many times as readings, at least one",
+        )
+    bad = np.argwhere(~np.isfinite(np.c_[raw, t_s]))
+    if len(bad):
+        row, column = bad[0]
+        name = [*names, "time"][column]
+        raise recording.error(
+            f"reading {row} of {name!r} is no finite number ({len(bad)} such)",
+            "cut it out, or export the recording again",
+        )
+    late = np.flatnonzero(np.diff(t_s) <= 0)
+    if len(late):
+        i = int(late[0])
+        raise recording.error(
+            f"time {t_s[i + 1]:.9g} s follows {t_s[i]:.9g} s (reading {i + 1})",
+            "times must increase; give rate_hz instead if they are rounded",
+        )
     readings = raw * _scale(recording, names, layout)
     table = pd.DataFrame({"t_s": t_s, "sensor": sensor})
     table[COLUMNS[2:]] = readings
@@ -164,29 +183,6 @@ def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
             f"give unit ({', '.join(UNITS)}), or scale_m_s2, the m/s^2 of a reading of 1",
         )
     return np.array([UNITS[unit] for unit in units])
-
-
-def _check_readings(recording: Recording, names: Sequence[str], raw: Array, t_s: Array) -> None:
-    if len(raw) != len(t_s) or not len(raw):
-        raise recording.error(
-            f"has {len(raw)} readings and {len(t_s)} times",
-            "give as many times as readings, at least one",
-        )
-    bad = np.argwhere(~np.isfinite(np.c_[raw, t_s]))
-    if len(bad):
-        row, column = bad[0]
-        name = [*names, "time"][column]
-        raise recording.error(
-            f"reading {row} of {name!r} is no finite number ({len(bad)} such)",
-            "cut it out, or export the recording again",
-        )
-    late = np.flatnonzero(np.diff(t_s) <= 0)
-    if len(late):
-        i = int(late[0])
-        raise recording.error(
-            f"time {t_s[i + 1]:.9g} s follows {t_s[i]:.9g} s (reading {i + 1})",
-            "times must increase; give rate_hz instead if they are rounded",
-        )
 
 
 def layout_from(options: dict[str, Any]) -> Layout:

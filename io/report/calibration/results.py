@@ -12,7 +12,7 @@ import pandas as pd
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import read_table
+from telerig.io.files.csv_table import read_table, rows_of
 from telerig.io.results.calibration import (
     DOT_COVARIANCE,
     DOTS,
@@ -140,13 +140,11 @@ def _residuals(
         )
     table = read_table(place, RESIDUALS, extra=True)
     for column, known in (("camera", [c.name for c in cameras]), ("view", list(views))):
-        strange = table[column][~table[column].isin(known)]
-        if len(strange):
-            raise InputError(
-                f"calibration.json has no {column} {strange.iloc[0]!r}",
-                where=f"{place} row {strange.index[0]}",
-                todo="the files are of two calibrations; " + CalibrationFile.AGAIN,
-            )
+        strange = ~table[column].isin(known).to_numpy()
+        name = table[column][strange].iloc[0] if strange.any() else ""
+        what = f"calibration.json has no {column} {name!r}"
+        todo = "the files are of two calibrations; " + CalibrationFile.AGAIN
+        rows_of(table, place).refuse(strange, column, what, todo)
     table = table.reset_index(drop=True)
     table["kept"] = table["weight"] > KEPT_WEIGHT
     table["length_px"] = np.hypot(table["du_px"], table["dv_px"])

@@ -146,7 +146,9 @@ def test_bad_files_are_named_and_the_old_report_stays(
 def test_files_that_do_not_fit_together_are_refused(folder: Path) -> None:
     file = folder / "residuals.csv"
     file.write_text(file.read_text().replace("view05,right,14,", "view05,middle,14,"))
-    with pytest.raises(InputError, match=r"row 181: calibration.json has no camera 'middle'"):
+    with pytest.raises(
+        InputError, match=r"row 181, column camera: calibration.json has no camera 'middle'"
+    ):
         read_results(folder)
     with pytest.raises(InputError, match="garbles 'views'"):
         content = json.loads((folder / "calibration.json").read_text())

@@ -93,43 +93,33 @@ class SmoothingResults:
 def read_smoothing_results(folder: Path, up: Array) -> SmoothingResults | None:
     """Read smoothing.json, trajectories.csv and shake.csv; None where there is no smoothing.json.
 
-    Raises InputError for what is missing, cannot be read or does not fit together.
+    Trajectories are by bubble and frame; columns that a run without bubbles leaves out are there,
+    empty. Raises InputError for what is missing, cannot be read or does not fit together.
     """
-    file = folder / "smoothing.json"
-    if not file.is_file():
+    if not (folder / "smoothing.json").is_file():
         return None
-    found = SmoothingFile.read(file)
-    shake, cameras = _shake(folder / "shake.csv", found)
-    return SmoothingResults(found, cameras, _trajectories(folder / "trajectories.csv"), shake, up)
-
-
-def _shake(file: Path, smoothing: SmoothingFile) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    found = [
-        n.removesuffix("_x_mm") for n in header_of(file, SmoothingFile.AGAIN) if n.endswith("_x_mm")
-    ]
+    stated = SmoothingFile.read(folder / "smoothing.json")
+    file = folder / "shake.csv"
+    header = header_of(file, SmoothingFile.AGAIN)
+    found = [name.removesuffix("_x_mm") for name in header if name.endswith("_x_mm")]
     cameras = tuple(n for n in found if not (n[:1] == "s" and n[1:] in found))
-    known = list(smoothing.cameras or cameras)
+    known = stated.cameras or cameras
     if not cameras or sorted(known) != sorted(cameras):
-        what = f"its columns are of cameras {list(cameras)}, smoothing.json's are {known}"
+        what = f"its columns are of cameras {list(cameras)}, smoothing.json's are {list(known)}"
         raise InputError(what, where=f"{file} row 1", todo=SmoothingFile.AGAIN)
-    table = read_columns(file, shake_columns(known))
-    _check_times(table, file, "")
-    return table, tuple(known)
-
-
-def _trajectories(file: Path) -> pd.DataFrame:
-    """Rows by bubble and frame. Columns that a run without bubbles leaves out are there, empty."""
+    shake = read_columns(file, shake_columns(known))
+    _check_times(shake, file, "")
+    file = folder / "trajectories.csv"
     table = read_columns(file, TRAJECTORIES)
     missing = [name for name in STATE if name not in table]
     if len(table) and missing:
-        raise InputError(
-            f"has no column {missing[0]}", where=f"{file} row 1", todo=SmoothingFile.AGAIN
-        )
+        what = f"has no column {missing[0]}"
+        raise InputError(what, where=f"{file} row 1", todo=SmoothingFile.AGAIN)
     table = table.assign(**{name: np.zeros(0) for name in missing})
     table = table.sort_values(["particle", "frame"], kind="stable", ignore_index=True)
     for particle, mine in table.groupby("particle", sort=False):
         _check_times(mine, file, f" of bubble {particle}")
-    return table
+    return SmoothingResults(stated, tuple(known), table, shake, up)
 
 
 def _check_times(table: pd.DataFrame, file: Path, whose: str) -> None:

@@ -5,7 +5,7 @@ The cameras that the run was tracked with come from the calibration beside it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
-from telerig.io.files.csv_table import header_of, read_columns
+from telerig.io.files.csv_table import Rows, header_of, read_columns
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.results.record import RunFile
 from telerig.io.results.tracking import (
@@ -100,14 +100,36 @@ def read_track_results(folder: Path) -> TrackResults:
     overlays/<camera>/<frame>.jpg and binary/<camera>/<frame>.png are used when they are there.
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
-    file = TrackingFile.read(folder / "tracking.json")
-    cameras = _cameras(file, folder / "tracks.csv")
-    tracks = read_columns(folder / "tracks.csv", tracks_columns(cameras))
-    detections = _detections(folder / "detections.csv", cameras)
-    events = read_columns(folder / "events.csv", EVENTS, optional=True)
-    references = read_columns(folder / "references.csv", REFERENCES, optional=True)
+    stated = TrackingFile.read(folder / "tracking.json")
+    file = folder / "tracks.csv"
+    header = header_of(file, TrackingFile.AGAIN)
+    cameras = tuple(name.removesuffix("_u_px") for name in header if name.endswith("_u_px"))
+    known = list(stated.frames_without_bubbles or cameras)
+    if not cameras or sorted(known) != sorted(cameras):
+        what = f"its columns are of cameras {list(cameras)}, tracking.json's are {known}"
+        raise InputError(what, where=f"{file} row 1", todo=TrackingFile.AGAIN)
+    tables = {
+        name: read_columns(folder / f"{name}.csv", columns, optional=True)
+        for name, columns in (
+            ("detections", DETECTIONS), ("events", EVENTS), ("references", REFERENCES)
+        )
+    }  # fmt: skip
+    found = tables["detections"]
+    camera = found["camera"].to_numpy()
+    Rows(folder / "detections.csv", np.arange(len(found)) + 2).refuse(
+        ~np.isin(camera, cameras),
+        "camera",
+        lambda i: f"tracks.csv has no camera {camera[i]!r}",
+        "the files are of two runs; " + TrackingFile.AGAIN,
+    )
     run = RunFile.read_if_there(folder / "run.json").content()
-    pictures = _pictures(folder, cameras)
+    pictures = {
+        (column, picture.stem): picture
+        for camera in cameras
+        for column, kind in ((camera, "overlays"), (binary_column(camera), "binary"))
+        for picture in sorted((folder / kind / camera).glob("*.*"))
+        if picture.suffix in (".jpg", ".png")
+    }
     absent = {
         "detections.csv (no numbers on single images)": (folder / "detections.csv").is_file(),
         "events.csv (no history of births, gaps and ends)": (folder / "events.csv").is_file(),
@@ -115,53 +137,22 @@ def read_track_results(folder: Path) -> TrackResults:
         "overlays/ and binary/ (no pictures of the bubbles that were found)": bool(pictures),
     }
     return TrackResults(
-        file, cameras, tracks, detections, events, references, run,
-        unit_vector(UP if file.up is None else file.up),
-        pictures,
-        tuple(text for text, present in absent.items() if not present),
-    )  # fmt: skip
+        file=stated,
+        cameras=cameras,
+        tracks=read_columns(file, tracks_columns(cameras)),
+        detections=found[np.isfinite(found["u_px"])].reset_index(drop=True),
+        events=tables["events"],
+        references=tables["references"],
+        run=run,
+        up=unit_vector(UP if stated.up is None else stated.up),
+        pictures=pictures,
+        absent=tuple(text for text, present in absent.items() if not present),
+    )
 
 
 def unit_vector(vector: ArrayLike) -> Array:
     found = np.asarray(vector, float)
     return np.asarray(found / np.linalg.norm(found))
-
-
-def _cameras(tracking: TrackingFile, file: Path) -> tuple[str, ...]:
-    """The two cameras that the header of tracks.csv names."""
-    header = header_of(file, TrackingFile.AGAIN)
-    found = tuple(name.removesuffix("_u_px") for name in header if name.endswith("_u_px"))
-    known = list(tracking.frames_without_bubbles or found)
-    if not found or sorted(known) != sorted(found):
-        what = f"its columns are of cameras {list(found)}, tracking.json's are {known}"
-        raise InputError(what, where=f"{file} row 1", todo=TrackingFile.AGAIN)
-    return found
-
-
-def _detections(file: Path, cameras: Sequence[str]) -> pd.DataFrame:
-    table = read_columns(file, DETECTIONS, optional=True)
-    strange = ~table["camera"].isin(cameras).to_numpy(bool)
-    if strange.any():
-        row = int(np.flatnonzero(strange)[0])
-        raise InputError(
-            f"tracks.csv has no camera {table['camera'].iloc[row]!r}",
-            where=f"{file} row {row + 2}",
-            todo="the files are of two runs; " + TrackingFile.AGAIN,
-        )
-    found: pd.DataFrame = table.loc[np.isfinite(table["u_px"].to_numpy(float))]
-    return found.reset_index(drop=True)
-
-
-def _pictures(folder: Path, cameras: Sequence[str]) -> dict[tuple[str, str], Path]:
-    found = {}
-    for camera in cameras:
-        for column, kind, suffix in (
-            (camera, "overlays", ".jpg"),
-            (binary_column(camera), "binary", ".png"),
-        ):
-            for file in sorted((folder / kind / camera).glob(f"*{suffix}")):
-                found[column, file.stem] = file
-    return found
 
 
 def binary_column(camera: str) -> str:

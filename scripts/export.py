@@ -43,7 +43,7 @@ def export(
     volume: Annotated[
         str | None,
         typer.Option(
-            help="Working volume in mm in the rig frame, 'x,x,y,y,z,z' [what both cameras see]."
+            help="Working volume in mm in the rig frame, 'x,x,y,y,z,z' [what all cameras see]."
         ),
     ] = None,
     full_cubic: Annotated[

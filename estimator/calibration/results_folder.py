@@ -110,7 +110,7 @@ def write_results(
             compared = {"earlier": options.get("compare"), **change.as_dict()}
             file = staged / "comparison.json"
             ComparisonFile.of(plain(compared), file).write(file)
-        if len(run.calibration.cameras) == 2:
+        if len(run.calibration.cameras) > 1:
             write_uncertainty(run.calibration, staged / "uncertainty.npz")
         if run.detected is not None:
             write_detections(run.detected, staged)

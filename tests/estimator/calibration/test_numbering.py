@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from turned_images import settled, turned
 
 from telerig.estimator.calibration.start.symmetric_target import turns
 from telerig.rig.target import Target
@@ -14,27 +15,6 @@ from telerig.rig.target import Target
 SQUARE = Target(
     rows=5, columns=5, pitch_mm=(5.0, 5.0), dot_diameter_mm=2.0, scale_dots=(0, 24)
 )  # fmt: skip
-
-
-def turned(scene: Any, seed: int = 0, *, images: bool = True) -> tuple[Any, Any]:
-    """Every image (or every view) numbered after a random turn; and (M,) the turns."""
-    rng = np.random.default_rng(seed)
-    labels, dots = turns(scene.target), scene.dots.copy()
-    by = ["view", "camera"] if images else ["view"]
-    turn = np.zeros(len(dots), int)
-    for _, group in dots.groupby(by):
-        turn[group.index] = rng.integers(len(labels))
-    dots["dot"] = np.array(labels)[turn, dots["dot"].to_numpy()]
-    return scene.with_dots(dots), turn
-
-
-def settled(calibration: Any, scene: Any, true_ids: Any) -> list[int]:
-    """The one turn that the final numbering differs from the truth by; empty if there is none."""
-    columns = ["view", "camera", "u_px", "v_px"]
-    final = calibration.dots.sort_values(columns)["dot"].to_numpy()
-    order = scene.dots.sort_values(columns).index.to_numpy()
-    truth = np.asarray(true_ids)[order]
-    return [k for k, label in enumerate(turns(scene.target)) if np.array_equal(label[truth], final)]
 
 
 def test_turns_are_turns() -> None:

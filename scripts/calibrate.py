@@ -87,8 +87,8 @@ def calibrate(
 ) -> None:
     """Calibrate the rig from views of the target.
 
-    Finds and numbers the dots, estimates one to four cameras, their relative poses, every pose of the
-    target and the positions of the dots together, and writes calibration.json, covariance.npz,
+    Finds and numbers the dots, estimates one to four cameras, their relative poses, every pose of
+    the target and the positions of the dots together, and writes calibration.json, covariance.npz,
     dots.csv, residuals.csv, run.json and report.html.
 
     With --watch it waits for new images in calibration/CAMERA/ until another view would improve the

@@ -59,6 +59,26 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
 
+UNITS = {
+    "_mm_s2": "mm/s²", "_mm_s": "mm/s", "_mm": "mm", "_um": "µm", "_m_s2": "m/s²", "_hz": "Hz",
+    "_s": "s", "_px": "px", "_rad": "rad", "_nats": "log-likelihood ratio (nats)",
+}  # fmt: skip
+"""What stands for the end of a name in the files. Longer ends come first."""
+
+
+def name_with_unit(
+    name: str, shown: Mapping[str, tuple[str, float]] | None = None
+) -> tuple[str, float]:
+    """A name of the files in words, with its unit; and the factor to that unit.
+
+    shown : unit -> (the unit that a reader gets instead, the factor to it).
+    """
+    end = next((end for end in UNITS if name.endswith(end) and name != end), "")
+    unit, factor = (shown or {}).get(UNITS.get(end, ""), (UNITS.get(end, ""), 1.0))
+    words = name.removesuffix(end).replace("_", " ").replace(".", ": ")
+    return (f"{words}, {unit}" if unit else words), factor
+
+
 def nice_below(value: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not above ``value`` (1 for 0)."""
     if not is_number(value) or value <= 0:

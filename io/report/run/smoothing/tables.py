@@ -12,6 +12,7 @@ from telerig.io.report.page.number_format import (
     ABSENT,
     flat_rows,
     is_number,
+    name_with_unit,
     number,
     sentence,
     share,
@@ -83,9 +84,12 @@ _FLAGS: dict[str, str] = {
     ),
 }
 _HARMLESS = {Flag.SHAKE_BELOW_NOISE}
-_NAMES = {
+_HEADS = {
     "eta": "η", "sigma_mm": "sd, µm", "sigma_shake_known_mm": "sd if the shake were known, µm",
 }  # fmt: skip
+_IN_UM = {"mm": ("µm", 1e3)}
+
+
 _SURE_LOG_LIKELIHOOD_RATIO = 5.0
 _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 
@@ -177,11 +181,11 @@ def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:
             else _scaled(shake_rms_um(results, camera, axis))
             for axis in AXES
         ]  # fmt: skip
-    rows = [
-        Row((_head(key), *(_cell(key, judged.get(axis, {}).get(key)) for axis in AXES)),
-            strong=key == "verdict")
-        for key in keys
-    ]  # fmt: skip
+    rows = []
+    for key in keys:
+        head = _HEADS.get(key) or name_with_unit(key, _IN_UM)[0]
+        cells = (_cell(key, judged.get(axis, {}).get(key)) for axis in AXES)
+        rows.append(Row((head, *cells), strong=key == "verdict"))
     rows += [Row((name, *cells)) for name, cells in columns.items()]
     return ["", *(_axis_name(results, axis) for axis in range(3))], rows
 
@@ -190,16 +194,6 @@ def _axis_name(results: SmoothingResults, axis: int) -> str:
     along = float(results.up[axis])
     vertical = {True: " (up)", False: " (down)"}[along > 0] if abs(along) > 0.9 else ""
     return AXES[axis] + vertical
-
-
-def _head(key: str) -> str:
-    if key in _NAMES:
-        return _NAMES[key]
-    for unit, shown in (("_mm_s", ", mm/s"), ("_mm", ", µm"), ("_um", ", µm"), ("_hz", ", Hz"),
-                        ("_nats", ", log-likelihood ratio (nats)")):  # fmt: skip
-        if key.endswith(unit):
-            return key.removesuffix(unit).replace("_", " ") + shown
-    return key.replace("_", " ")
 
 
 def _cell(key: str, value: Any) -> str:
@@ -211,7 +205,7 @@ def _cell(key: str, value: Any) -> str:
         return "yes" if value else "no"
     if key == "eta" and is_number(value):
         return f"{value:.4f}"
-    return _scaled(value, 1e3 if key.endswith("_mm") else 1.0)
+    return _scaled(value, name_with_unit(key, _IN_UM)[1])
 
 
 def _scaled(value: Any, factor: float = 1.0) -> str:
@@ -359,11 +353,6 @@ def _pitch(mode: Mapping[str, Any], cameras: Sequence[str]) -> Row:
                 number(mode.get("damping")), angle, _PITCH))  # fmt: skip
 
 
-_CONSTANTS = (
-    ("_mm_s2", ", mm/s²", 1.0), ("_mm_s", ", mm/s", 1.0), ("_s", ", ms", 1e3),
-)  # fmt: skip
-
-
 def constant_rows(results: SmoothingResults) -> list[Row]:
     """Constants of encoder and accelerometers: sensor, what, value with its sd."""
     parts = {"encoder": results.part("encoder")} | dict(results.part("accelerometers"))
@@ -390,22 +379,12 @@ def _constants(values: Mapping[str, Any]) -> list[tuple[str, str]]:
     for name, value in values.items():
         if name[:1] == "s" and name[1:] in values:
             continue
-        shown, factor = name.replace("_", " "), 1.0
-        for ending, unit, times in _CONSTANTS:
-            if name.endswith(ending) and name != ending:
-                shown, factor = name.removesuffix(ending).replace("_", " ") + unit, times
-                break
+        shown, factor = name_with_unit(name, {"s": ("ms", 1e3)})
         sd: Any = values.get("s" + name)
         text = with_sd(value * factor, sd * factor) if is_number(value) and is_number(sd) else (
             number(value * factor, 4) if is_number(value) else ABSENT)  # fmt: skip
         out.append((shown, text))
     return out
-
-
-_UNITS = (
-    ("_mm_s2", "mm/s²"), ("_mm_s", "mm/s"), ("_mm", "mm"), ("_hz", "Hz"), ("_s", "s"),
-    ("_px", "px"), ("_rad", "rad"),
-)  # fmt: skip
 
 
 _SOURCES = {
@@ -419,21 +398,13 @@ def model_rows(results: SmoothingResults) -> list[tuple[str, str]]:
     """Every hyper-parameter by its name in `smoothing.json`."""
     model = {k: v for k, v in results.part("model").items() if k != "name"}
     rows = [(name, value) for name, value in flat_rows(model) if value]
-    return [(_readable(name), _owner(name, value, results.cameras)) for name, value in rows]
+    return [(name_with_unit(name)[0], _owner(name, value, results.cameras)) for name, value in rows]
 
 
 def model_words(results: SmoothingResults) -> str:
     """Where the hyper-parameters come from."""
     source = str(results.part("model").get("name") or ABSENT)
     return f"{source}: {_SOURCES[source]}" if source in _SOURCES else source
-
-
-def _readable(name: str) -> str:
-    for ending, unit in _UNITS:
-        if name.endswith(ending):
-            name = f"{name.removesuffix(ending)}, {unit}"
-            break
-    return name.replace("_", " ").replace(".", ": ")
 
 
 def _owner(name: str, value: str, cameras: Sequence[str]) -> str:

@@ -21,7 +21,7 @@ Prior = tuple[Array, Array]
 
 _PEAKS = 3
 _MOST_MODES = 2
-_BETTER_NATS = 3.0
+_LEAST_LOG_RATIO = 3.0
 _WANDER_S = 0.1
 _CYCLES = 5.0
 _FACTOR_3, _FACTOR_10 = np.log(3.0), np.log(10.0)
@@ -131,7 +131,7 @@ class _Spectrum:
 def learned_noise(parts: list[Series]) -> Noise:
     """Maximum a-posteriori noise of stretches of a run, from the spectra of their residuals.
 
-    Oscillations are added while each raises the log posterior by `_BETTER_NATS`, at most two (one
+    Oscillations are added while each raises the log posterior by `_LEAST_LOG_RATIO`, at most two (one
     per camera's arm).
     """
     spread = max(float(np.concatenate([p.residuals() for p in parts]).std()), 1e-7)
@@ -151,7 +151,7 @@ def learned_noise(parts: list[Series]) -> Noise:
             )
             trials.append((*_fitted(spectra, np.concatenate([best, mode]), richer), richer))
         found = min(trials, key=lambda t: t[1], default=None)
-        if found is None or found[1] > score - _BETTER_NATS:
+        if found is None or found[1] > score - _LEAST_LOG_RATIO:
             break
         best, score, prior = found
     return _noise(best)

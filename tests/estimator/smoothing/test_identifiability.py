@@ -47,7 +47,7 @@ def test_one_bubble_cannot_be_told_from_the_rig() -> None:
     json.dumps(found)
 
 
-def test_several_bubbles_settle_the_label_but_not_the_amplitude() -> None:
+def test_several_bubbles_decide_the_label_but_not_the_amplitude() -> None:
     problem, _, _ = run(np.random.default_rng(1), bubbles=5)
     y = verdicts(solve(problem, true_model(), QUIET))["y"]
     assert "LABEL_AMBIGUOUS" not in y.flags

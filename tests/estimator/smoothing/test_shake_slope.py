@@ -65,7 +65,7 @@ def test_slope_equals_differences_of_the_evidence(kind: str, kept: float, marks:
         for part in (signal, *pooled(signal)):
             value, slope = signal_gradient(part, model, names)
             assert value == pytest.approx(signal_evidence(part, model), abs=1e-9)
-            # the evidence of broad bands, stiff in double precision, has noise of 1e-5 nats
+            # the evidence of broad bands, stiff in double precision, has noise of 1e-5
             np.testing.assert_allclose(slope, differences(part, model, names), atol=0.03, rtol=1e-4)
 
 

@@ -266,7 +266,7 @@ def _add_sensors(given: Any, model: Any, whole: Dense, graph: Any, of_shake: Any
 
 
 def compare(given: SmoothingProblem, model: ShakeModel) -> None:
-    """Means to 1e-6 mm, covariances to 1e-6 relative, the evidence to 1e-5 nats."""
+    """Means to 1e-6 mm, covariances to 1e-6 relative, the log evidence to 1e-5."""
     whole, (graph, shake, sizes), (_bubbles, _means, of_bubble), log_dets = dense(given, model)
     mean, covariance, starts, evidence = whole.posterior()
     solution = solve(given, model, QUIET)

@@ -47,6 +47,17 @@ class Linear:
         return float((share * each).sum())
 
 
+def prior_factors(keys: ArrayLike, deviation: Array, sigma: ArrayLike) -> Linear:
+    """Priors of M vectors with independent components.
+
+    keys : (M,).  deviation : (M, n) of the values from the prior's mean.  sigma : to (M, n).
+    """
+    count, width = deviation.shape
+    scale = np.broadcast_to(1 / np.asarray(sigma, float), (count, width))
+    block = scale[:, :, None] * np.eye(width)
+    return Linear((keys,), (block,), -deviation * scale, np.log(scale).sum(-1))
+
+
 @lru_cache(maxsize=64)
 def _unit_noise(rows: int) -> Any:
     import gtsam

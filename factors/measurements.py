@@ -85,8 +85,3 @@ def accelerometer_reading(
     reading = force @ axes.T + np.asarray(bias_mm_s2, float)
     by_acceleration = np.broadcast_to(gain[..., None] * axes, (*reading.shape, 3))
     return AccelerometerPrediction(reading, by_acceleration, acceleration @ axes.T)
-
-
-def whitener_of(covariance: Array) -> Array:
-    """(..., n, n) lower W with W covariance W^T = 1. Raises LinAlgError for a singular one."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

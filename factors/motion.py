@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
-from telerig.factors.state_space import Component, block_diagonal, discretise, distinct_steps
+from telerig.factors.linear_factors import Linear
+from telerig.factors.state_space import (
+    Component,
+    block_diagonal,
+    discretise,
+    distinct_steps,
+    log_det_of,
+    whitener_of,
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,22 @@ class Motion:
         constant = np.broadcast_to(np.asarray(inputs, float), (len(i), self.by_input.shape[-1]))
         terms = ((self.by_next, following), (self.by_last, last), (self.by_input, constant))
         return np.asarray(sum(np.einsum("mij,mj->mi", a[i], x) for a, x in terms))
+
+    def factors(
+        self,
+        keys: Sequence[ArrayLike],
+        states: tuple[Array, Array],
+        inputs: Array,
+        following: Ints,
+    ) -> Linear:
+        """The steps as M factors on increments of both states in their bases, and on the inputs.
+
+        keys : of the states before and after, (M,) each, and of the inputs where there are any.
+        states : before and after, (M, n) each.  inputs : (M, K).  following : see `in_basis`.
+        """
+        residual = self.residual(*states, inputs)
+        blocks = (*self.in_basis(following), self.by_input[self.index])
+        return Linear(tuple(keys), blocks[: len(keys)], -residual, self.log_det[self.index])
 
     def in_basis(self, following: Ints) -> tuple[Array, Array]:
         """(M, n, n) by_last and by_next for increments in the bases of the two states.
@@ -79,3 +103,24 @@ def start(components: Sequence[Component]) -> tuple[Array, Array]:
     """(n, n) covariance of the states at the start, and (n, K) their mean for given inputs."""
     covariance = block_diagonal([c.start_covariance for c in components])
     return covariance, block_diagonal([c.start_from_input for c in components])
+
+
+def start_factors(
+    components: Sequence[Component],
+    keys: Sequence[ArrayLike],
+    deviation: Array,
+    basis: Array,
+    inputs: Array,
+) -> Linear:
+    """The priors of M first states, as factors on increments in their basis and on the inputs.
+
+    keys : of the states, (M,), and of the inputs where there are any.  deviation : (M, n) from the
+    mean without inputs.  basis : (M, n, n).  inputs : (M, K).
+    """
+    covariance, by_input = start(components)
+    whitener = whitener_of(covariance)
+    count = len(deviation)
+    by_inputs = np.broadcast_to(-whitener @ by_input, (count, *by_input.shape))
+    rhs = -(deviation - inputs @ by_input.T) @ whitener.T
+    log_det = np.full(count, log_det_of(whitener))
+    return Linear(tuple(keys), (whitener @ basis, by_inputs)[: len(keys)], rhs, log_det)

@@ -411,6 +411,11 @@ def _inverse_root(covariance: Array) -> Array:
     return np.asarray(np.tril(np.linalg.solve(root, unit)) / sigma[..., None, :])
 
 
+def whitener_of(covariance: Array) -> Array:
+    """(..., n, n) lower W with W covariance W^T = 1. Raises LinAlgError for a singular one."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
 def log_det_of(whitener: Array) -> Array:
     """(...) log of the determinant of triangular whiteners (..., n, n)."""
     return np.asarray(np.log(np.abs(np.diagonal(whitener, axis1=-2, axis2=-1))).sum(-1))

@@ -131,8 +131,8 @@ class _Spectrum:
 def learned_noise(parts: list[Series]) -> Noise:
     """Maximum a-posteriori noise of stretches of a run, from the spectra of their residuals.
 
-    Oscillations are added while each raises the log posterior by `_LEAST_LOG_RATIO`, at most two (one
-    per camera's arm).
+    Oscillations are added while each raises the log posterior by `_LEAST_LOG_RATIO`, at most two
+    (one for each arm of a camera).
     """
     spread = max(float(np.concatenate([p.residuals() for p in parts]).std()), 1e-7)
     start = np.log([spread / 2, spread / 4, _WANDER_S])

@@ -16,10 +16,9 @@ from telerig.estimator.calibration.solver.covariance import rig_jacobian
 from telerig.estimator.smoothing.graph.state import GraphLayout, State
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
 from telerig.factors import measurements
-from telerig.factors.linear_factors import Linear
-from telerig.factors.measurements import whitener_of
-from telerig.factors.motion import start
-from telerig.factors.state_space import log_det_of
+from telerig.factors.linear_factors import Linear, prior_factors
+from telerig.factors.motion import start_factors
+from telerig.factors.state_space import log_det_of, whitener_of
 
 _SLOPE_S = 2e-3
 """Width of the filter that takes the readings' rate of change for the delay."""
@@ -45,18 +44,14 @@ def _shake_motion(graph: GraphLayout, state: State) -> list[Linear]:
         elif i == 0 and graph.problem.stage is not None:
             deviation[:, at] -= graph.nominal_mm[0]
         at += component.size
-    residual = steps.residual(deviation[:-1], deviation[1:], np.zeros(0))
-    blocks = steps.in_basis(np.append(steps.index[1:], -1))
-    between = Linear((keys[:-1], keys[1:]), blocks, -residual, steps.log_det[steps.index])
-    covariance, _ = start(layout.components)
-    whitener = whitener_of(covariance)
-    first = Linear(
-        (keys[:1],),
-        ((whitener @ graph.shake_basis(0))[None],),
-        -(whitener @ deviation[0])[None],
-        log_det_of(whitener)[None],
-    )
-    return [first, between]
+    still = np.zeros((len(keys), 0))
+    after = np.append(steps.index[1:], -1)
+    return [
+        start_factors(
+            layout.components, (keys[:1],), deviation[:1], graph.shake_basis(keys[:1]), still[:1]
+        ),
+        steps.factors((keys[:-1], keys[1:]), (deviation[:-1], deviation[1:]), still[1:], after),
+    ]
 
 
 def _bubble_motion(graph: GraphLayout, state: State) -> list[Linear]:
@@ -65,64 +60,55 @@ def _bubble_motion(graph: GraphLayout, state: State) -> list[Linear]:
         return []
     base = graph.base()
     firsts, rows = graph.first_row[:-1], graph.moving_rows
-    covariance, by_input = start(layout.components)
-    whitener = whitener_of(covariance)
     places = np.array([b.start_mm for b in problem.bubbles])
-    means = state.means
-    off = state.bubbles[firsts] - means @ by_input.T
-    off[:, layout.path_position] -= places
-    numbers = np.arange(len(firsts))
-    wide = -whitener @ by_input
-    begin = Linear(
-        (base.bubbles + firsts, base.means + numbers),
-        (whitener @ graph.bubble_basis(firsts), np.broadcast_to(wide, (len(firsts), *wide.shape))),
-        -off @ whitener.T,
-        np.full(len(firsts), log_det_of(whitener)),
+    deviation = state.bubbles[firsts]
+    deviation[:, layout.path_position] -= places
+    begin = start_factors(
+        layout.components,
+        (base.bubbles + firsts, base.means + np.arange(len(firsts))),
+        deviation,
+        graph.bubble_basis(firsts),
+        state.means,
     )
     if not len(rows):
         return [begin]
-    steps, owner = graph.bubble_motion, graph.bubble_of_row[rows]
-    residual = steps.residual(state.bubbles[rows], state.bubbles[rows + 1], means[owner])
-    i = steps.index
-    blocks = (
-        *steps.in_basis(graph.row_basis[rows + 1]),
-        steps.by_input[i],
+    owner = graph.bubble_of_row[rows]
+    between = graph.bubble_motion.factors(
+        (base.bubbles + rows, base.bubbles + rows + 1, base.means + owner),
+        (state.bubbles[rows], state.bubbles[rows + 1]),
+        state.means[owner],
+        graph.row_basis[rows + 1],
     )
-    keys = (base.bubbles + rows, base.bubbles + rows + 1, base.means + owner)
-    return [begin, Linear(keys, blocks, -residual, steps.log_det[i])]
+    return [begin, between]
 
 
 def _constant_priors(graph: GraphLayout, state: State) -> list[Linear]:
     model, problem, base = graph.model, graph.problem, graph.base()
     scale, delay = graph.sensor_flags
-    out = [_prior(base.means, state.means, model.bubble.mean_sigma_mm_s)]
+    out = [_priors(base.means, state.means, model.bubble.mean_sigma_mm_s)]
     if problem.accelerometers:
         extra = [model.accelerometer_scale_sigma] * scale
         sigma = np.array([[a.bias_sigma_mm_s2] * 3 + extra for a in problem.accelerometers])
-        out.append(_prior(base.sensors, state.sensors, sigma))
+        out.append(_priors(base.sensors, state.sensors, sigma))
         if delay:
             given = np.array([a.delay_s for a in problem.accelerometers])
             _, first = np.unique(graph.clock_of, return_index=True)
             value = state.clocks + (graph.delays_s - given)[first, None]
-            out.append(_prior(base.clocks, value, model.accelerometer_delay_sigma_s))
+            out.append(_priors(base.clocks, value, model.accelerometer_delay_sigma_s))
     sigmas = np.array([model.encoder_scale_sigma, model.encoder_delay_sigma_s])
     sigmas = np.concatenate([sigmas[np.array(graph.encoder_flags)], np.ones(graph.share_size)])
     out.append(
-        _prior(base.constants, np.concatenate([state.encoder, state.calibration])[None], sigmas)
+        _priors(base.constants, np.concatenate([state.encoder, state.calibration])[None], sigmas)
     )
     if problem.marks:
         guess = np.array([m.guess_mm for m in problem.marks])
         sigma = np.array([[m.sigma_mm] for m in problem.marks])
-        out.append(_prior(base.marks, state.marks - guess, sigma))
+        out.append(_priors(base.marks, state.marks - guess, sigma))
     return [p for p in out if p.rhs.size]
 
 
-def _prior(base: int, value: Array, sigma: ArrayLike) -> Linear:
-    count, width = value.shape
-    scale = np.broadcast_to(1 / np.asarray(sigma, float), (count, width))
-    block = scale[:, :, None] * np.eye(width)
-    keys = base + np.arange(count)
-    return Linear((keys,), (block,), -value * scale, np.log(scale).sum(-1))
+def _priors(base: int, deviation: Array, sigma: ArrayLike) -> Linear:
+    return prior_factors(base + np.arange(len(deviation)), deviation, sigma)
 
 
 @dataclass(frozen=True)

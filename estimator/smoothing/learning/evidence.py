@@ -29,7 +29,6 @@ from telerig.estimator.smoothing.learning.processes import (
 )
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
 from telerig.factors.bubble_motion import Process
-from telerig.factors.measurements import whitener_of
 from telerig.factors.motion import Motion, motion, start
 from telerig.factors.state_space import (
     Component,
@@ -37,6 +36,7 @@ from telerig.factors.state_space import (
     discretise,
     distinct_steps,
     slow_ou,
+    whitener_of,
 )
 
 _STILL_MM = 1e-6

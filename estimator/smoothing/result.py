@@ -1,4 +1,4 @@
-"""The result of a smoothing: tables, verdict, numbers, and how they are written."""
+"""The result of a smoothing: its tables, verdict and numbers, and how they are written."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import (
+    carriage,
+    carriage_sigma,
     considered_variance,
     scale_sigma,
     total_scale,
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
+from telerig.factors.bubble_motion import BubbleModel, bubble_processes
+from telerig.factors.state_space import discretise, distinct_steps
 from telerig.io.results.smoothing import SmoothingFile
 
 if TYPE_CHECKING:
@@ -202,3 +206,155 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
             states.create_dataset(name, data=array, compression="gzip")
         file.attrs["schema"] = SmoothingFile.SCHEMA
         file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"
+
+
+AXES = ("x", "y", "z")
+LONGEST_RTS = 5000
+"""Tracks with more frames get no RTS baseline: filterpy takes longer than the whole graph."""
+
+
+def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFrame:
+    """One row for every frame between a bubble's first and last detection; lab frame.
+
+    The standard deviations hold what is not known of the encoder's scale and the travel axis.
+    """
+    import pandas as pd
+
+    graph, problem = solution.graph, solution.graph.problem
+    if not problem.bubbles:
+        return pd.DataFrame({name: [] for name in ("frame", "particle", "t_s")})
+    layout, covariances = graph.bubble, solution.covariances
+    states = solution.state.bubbles
+    columns: dict[str, Any] = {
+        "frame": graph.frame_of_row,
+        "particle": np.array([b.particle for b in problem.bubbles])[graph.bubble_of_row],
+        "t_s": problem.t_s[graph.frame_of_row],
+    }
+    columns |= _named(states @ layout.position.T, "{}_mm")
+    columns |= _named(states @ layout.velocity.T, "v{}_mm_s")
+    if covariances is not None:
+        place, speed = considered_variance(solution)
+        sigma = _sigma(layout.position, covariances.bubbles)
+        columns |= _named(np.sqrt(sigma**2 + place), "s{}_mm")
+        sigma = _sigma(layout.velocity, covariances.bubbles)
+        columns |= _named(np.sqrt(sigma**2 + speed), "sv{}_mm_s")
+    columns["observed"] = _observed(solution)
+    if tracks is not None:
+        columns |= _baselines(solution, tracks)
+    return pd.DataFrame(columns)
+
+
+def _named(values: Array, pattern: str) -> dict[str, Array]:
+    return {pattern.format(axis): values[:, i] for i, axis in enumerate(AXES)}
+
+
+def _sigma(rows: Array, covariance: Array) -> Array:
+    """(n, 3) standard deviations of rows (3, d) or (n, 3, d) of states with (n, d, d)."""
+    return np.asarray(np.sqrt(((rows @ covariance) * rows).sum(-1).clip(0)))
+
+
+def _observed(solution: Solution) -> Ints:
+    """1 where a camera saw the bubble and the pixel was not an outlier."""
+    graph, obs = solution.graph, solution.graph.problem.observations
+    out = np.zeros(graph.rows, np.int64)
+    kept = solution.weights[0] > 0.5
+    out[graph.row(obs.item[kept], obs.frame[kept])] = 1
+    return out
+
+
+def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
+    """Naive and RTS positions and velocities; the diameter that the tracker found."""
+    graph, problem = solution.graph, solution.graph.problem
+    number = {b.particle: i for i, b in enumerate(problem.bubbles)}
+    item = tracks["particle"].map(number).to_numpy(np.int64)
+    seen = tracks["frame"].to_numpy(np.int64)
+    rows = graph.row(np.asarray(item), np.asarray(seen))
+    naive = np.full((graph.rows, 3), np.nan)
+    naive[rows] = tracks[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    naive[rows] += problem.encoder_mm[seen, None] * problem.axis
+    covariance = np.tile(1e-4 * np.eye(3), (graph.rows, 1, 1))
+    names = [["sxx", "sxy", "sxz"], ["sxy", "syy", "syz"], ["sxz", "syz", "szz"]]
+    if f"{names[0][0]}_mm2" in tracks:
+        for i, line in enumerate(names):
+            for j, name in enumerate(line):
+                covariance[rows, i, j] = tracks[f"{name}_mm2"].to_numpy(float)
+    velocity, plain = np.full_like(naive, np.nan), np.full((2, *naive.shape), np.nan)
+    for k in range(len(problem.bubbles)):
+        mine = slice(graph.first_row[k], graph.first_row[k + 1])
+        t = problem.t_s[graph.frame_of_row[mine]]
+        velocity[mine] = _central_velocity(t, naive[mine])
+        if 1 < len(t) <= LONGEST_RTS:
+            plain[:, mine] = _rts(t, naive[mine], covariance[mine], graph.model.bubble)
+    out = _named(naive, "naive_{}_mm") | _named(velocity, "naive_v{}_mm_s")
+    out |= _named(plain[0], "rts_{}_mm") | _named(plain[1], "rts_v{}_mm_s")
+    if "d_eq_mm" in tracks:
+        diameter = np.full(graph.rows, np.nan)
+        diameter[rows] = tracks["d_eq_mm"].to_numpy(float)
+        out["d_eq_mm"] = diameter
+    return out
+
+
+def _central_velocity(t_s: Array, position_mm: Array) -> Array:
+    """(n, 3) differences over two frames, one at the ends; NaN beside a missing position."""
+    if len(t_s) < 2:
+        return np.full_like(position_mm, np.nan)
+    before, after = (np.clip(np.arange(len(t_s)) + i, 0, len(t_s) - 1) for i in (-1, 1))
+    difference = position_mm[after] - position_mm[before]
+    return np.asarray(difference / (t_s[after] - t_s[before])[:, None])
+
+
+def _rts(
+    t_s: Array, position_mm: Array, covariance_mm2: Array, model: BubbleModel
+) -> tuple[Array, Array]:
+    """filterpy's Kalman filter and RTS smoother on lab positions, no shake in the model.
+
+    t_s (n,), position_mm (n, 3) with NaN where there is none, covariance_mm2 (n, 3, 3).
+    Returns positions and velocities (n, 3).
+    """
+    from filterpy.kalman import KalmanFilter
+
+    seen = np.asarray(np.isfinite(position_mm).all(1))
+    lengths, index = distinct_steps(np.diff(t_s))
+    path = bubble_processes(model, np.zeros(3))[0]
+    steps = discretise([path.component], lengths)[0]
+    # of one axis: position, velocity, mean velocity
+    transition, noise = np.tile(np.eye(3), (len(t_s), 1, 1)), np.zeros((len(t_s), 3, 3))
+    transition[1:, :2, :2] = steps.transition[0, index]
+    transition[1:, :2, 2] = steps.input[0, index, :, 0]
+    noise[1:, :2, :2] = steps.covariance[0, index]
+    start = np.diag([model.start_sigma_mm**2, 0.0, 0.0])
+    start[1:, 1:] = model.mean_sigma_mm_s**2
+    start[1, 1] += model.velocity_sigma_mm_s**2
+    filter_: Any = KalmanFilter(dim_x=9, dim_z=3)
+    filter_.x = np.r_[position_mm[np.argmax(seen)], np.zeros(6)][:, None]
+    filter_.P = np.kron(start, np.eye(3))
+    filter_.H = np.eye(3, 9)
+    matrices = [np.kron(a, np.eye(3)) for a in (transition, noise)]
+    readings = [p[:, None] if s else None for p, s in zip(position_mm, seen)]
+    means, covariances, _, _ = filter_.batch_filter(readings, *matrices, Rs=covariance_mm2)
+    smooth, *_ = filter_.rts_smoother(means, covariances, *matrices)
+    return smooth[:, :3, 0], smooth[:, 3:6, 0]
+
+
+def shake(solution: Solution) -> pd.DataFrame:
+    """One row a frame: carriage and each camera's offset from it, rig axes.
+
+    Along its depth a camera's own shake is unseen: the estimate is 0 and its sd the prior's.
+    """
+    import pandas as pd
+
+    graph, problem, layout = solution.graph, solution.graph.problem, solution.graph.shake
+    states, covariances = graph.shake_at_frames(solution.state.shake), solution.covariances
+    columns: dict[str, Any] = {"frame": np.arange(len(states)), "t_s": problem.t_s}
+    for c, camera in enumerate(problem.cameras):
+        columns |= _named(states @ layout.offset[c].T, f"{camera.name}_{{}}_mm")
+        if covariances is not None:
+            sigma = _sigma(layout.offset[c], covariances.shake)
+            unseen = np.diagonal(layout.unseen_variance_mm2[c])
+            columns |= _named(np.sqrt(sigma**2 + unseen), f"s{camera.name}_{{}}_mm")
+    if problem.stage is not None:
+        columns["position_mm"], _ = carriage(solution)
+        if covariances is not None:
+            sigma = _sigma(layout.position[None], covariances.shake)[:, 0]
+            columns["sposition_mm"] = carriage_sigma(solution, sigma)
+    return pd.DataFrame(columns)

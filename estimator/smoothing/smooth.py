@@ -13,8 +13,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
-from telerig.estimator.smoothing.learning.adapted_priors import adapted
-from telerig.estimator.smoothing.learning.default_priors import default_model
+from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
 from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import (
     with_hyperparameter_uncertainty,
 )
@@ -40,9 +39,8 @@ from telerig.estimator.smoothing.refined_pose import (
     refinement_of,
     with_wander,
 )
-from telerig.estimator.smoothing.result import Smoothing, summary_of
-from telerig.estimator.smoothing.tables import shake as shake_table
-from telerig.estimator.smoothing.tables import trajectories
+from telerig.estimator.smoothing.result import Smoothing, summary_of, trajectories
+from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.verdict.judge import judge
 from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.rig.units import STANDARD_GRAVITY_M_S2

@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dtrtri
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph.state import GraphLayout
+from telerig.estimator.smoothing.graph.layout import GraphLayout
 from telerig.factors.linear_factors import Linear, add_linear_factors
 
 LEAST_PIVOT = 1e-9

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.covariance import rig_jacobian
-from telerig.estimator.smoothing.graph.state import GraphLayout, State
+from telerig.estimator.smoothing.graph.layout import GraphLayout, State
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
 from telerig.factors import measurements
 from telerig.factors.linear_factors import Linear, prior_factors

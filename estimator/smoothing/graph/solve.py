@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph, eliminate
-from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
-from telerig.estimator.smoothing.graph.state import (
+from telerig.estimator.smoothing.graph.layout import (
     GraphLayout,
     State,
     first_guess,
@@ -23,6 +22,7 @@ from telerig.estimator.smoothing.graph.state import (
     moved,
     times,
 )
+from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.factors.linear_factors import Linear
 from telerig.rig.projection import INDEX

@@ -1,4 +1,4 @@
-"""Priors for users who have given none, from what was measured."""
+"""Priors for users who have given none: from what was measured, and from a first solution."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from telerig.arrays import Array
-from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma
+from telerig.arrays import Array, Ints
+from telerig.estimator.smoothing.graph.linear import images
+from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.stage_travel import default_scale_sigma, wider_scale_sigma
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     BroadBand,
@@ -19,6 +21,7 @@ from telerig.estimator.smoothing.problem.problem import (
     Stage,
 )
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
+from telerig.factors.state_space import broad_band_density
 
 SHAKE_RMS_MM = 0.2
 DELAY_SIGMA_S = 0.002
@@ -173,3 +176,169 @@ def acceleration_rms(stage: Stage) -> float:
     parabola = np.linalg.pinv(np.stack([np.ones(window), x, x**2], -1))[2] * 2
     bend = np.convolve(stage.position_mm, parabola[::-1], mode="valid")
     return float(np.sqrt(np.mean(bend**2)))
+
+
+_INFLATE_BEYOND = 0.05
+_RESCALE_BEYOND = 0.2
+_SAMPLED = 1000
+_LEAST_SPARE = 0.2
+_LEAST_PIXELS = 60
+_MEDIAN_OF_CHI_SQUARE, _SD_OF_MEDIAN = 0.4549, 1.16
+_FLOORS = np.geomspace(0.03, 0.4, 40)
+_FLOOR_SPREAD = np.log(2.0)
+_LOW_BAND = 0.4
+_FEWEST_BINS = 3
+_UNSEEN_MM = 1e-6
+_INDEPENDENT = 0.5
+"""Share of independent bins: a tapered spectrum's neighbours, and cameras, are correlated."""
+
+
+def adapted(solution: Solution) -> ShakeModel | None:
+    """The model with noise, broad band's RMS and prior of the encoder's scale that the data show.
+
+    None if that is it.
+    """
+    model = solution.graph.model
+    inflation = _noise_factor(solution)
+    better = model
+    wide = wider_scale_sigma(solution)
+    if wide is not None:
+        better = replace(better, encoder_scale_sigma=wide)
+    if inflation > 1:
+        better = replace(better, pixel_inflation=model.pixel_inflation * inflation)
+    if model.broad_bands:
+        fresh = rescaled(better, _offset_rms(solution), _dominant_hz(solution))
+        ratio = [
+            np.divide(a.rms_mm, b.rms_mm) for a, b in zip(fresh.broad_bands, model.broad_bands)
+        ]
+        floor = fitted_floor(solution.graph.problem.t_s, _offsets(solution), fresh.broad_bands)
+        moved = abs(np.log(floor / model.broad_bands[0].floor)) if floor else 0.0
+        if max(np.max(np.abs(np.log(ratio))), moved) > _RESCALE_BEYOND:
+            better = _with_floor(fresh, floor)
+    return None if better is model else better
+
+
+def _with_floor(model: ShakeModel, floor: float | None) -> ShakeModel:
+    if floor is None:
+        return model
+    return replace(model, broad_bands=tuple(replace(b, floor=floor) for b in model.broad_bands))
+
+
+def fitted_floor(t_s: Array, offsets_mm: Array, bands: tuple[BroadBand, ...]) -> float | None:
+    """The bands' floor that offsets show below the frequencies of the shake itself.
+
+    t_s (F,) times; offsets_mm (F, C, 3) of the cameras, 0 where unseen; a band for each camera.
+
+    How far a mode yields to slow forces, its damping, decides how well the slow motion of a bubble
+    is known. Whittle's likelihood of the low end of the spectra (Whittle, Arkiv foer Matematik 2,
+    1953), with a prior of a factor of two about `DEFAULT_FLOOR`. None where the run is too short
+    to see it, where a band is common to the cameras, so that the offsets are not its own, and where
+    the shake is so strong that the first solution's offsets are the prior's as much as the data's.
+    """
+    t = np.asarray(t_s, float)
+    if any(b.camera == CARRIAGE or b.tail > 2 for b in bands) or not bands[0].floor or len(t) < 2:
+        return None
+    step = float(np.median(np.diff(t)))
+    even = np.arange(t[0], t[-1] + step / 2, step)
+    frequency = np.asarray(np.fft.rfftfreq(len(even), step), np.float64)
+    low = (frequency * len(even) * step > 1.5) & (frequency <= _LOW_BAND * bands[0].low_hz)
+    if np.count_nonzero(low) < _FEWEST_BINS:
+        return None
+    score = -0.5 * (np.log(_FLOORS / DEFAULT_FLOOR) / _FLOOR_SPREAD) ** 2
+    for band in bands:
+        for axis in range(3):
+            series = np.interp(even, t, offsets_mm[:, band.camera, axis])
+            if series.std() < _UNSEEN_MM:
+                continue
+            seen = _periodogram(series, step)[low]
+            for i, floor in enumerate(_FLOORS):
+                density = broad_band_density(
+                    frequency[low], band.rms_mm[axis], low_hz=band.low_hz, high_hz=band.high_hz,
+                    floor=float(floor), tail=band.tail,
+                )  # fmt: skip
+                score[i] -= _INDEPENDENT * float(np.sum(np.log(density) + seen / density))
+    return float(_FLOORS[np.argmax(score)])
+
+
+def _periodogram(series: Array, step_s: float) -> Array:
+    """One-sided density (per Hz) of a series, its line removed, tapered by Hann's window."""
+    from scipy.signal import detrend, periodogram
+
+    taper: Any = np.hanning(len(series))
+    return np.asarray(periodogram(series, 1 / step_s, window=taper, detrend=detrend)[1])
+
+
+def _offsets(solution: Solution) -> Array:
+    """(F, C, 3) of each camera, mm."""
+    states = solution.graph.shake_at_frames(solution.state.shake)
+    return np.asarray(np.einsum("cid,fd->fci", solution.graph.shake.offset[:-1], states))
+
+
+def _offset_rms(solution: Solution) -> Array:
+    """(C, 3) RMS of each camera's offset, its uncertainty included; the mean where it is unseen."""
+    rows, found = solution.graph.shake.offset[:-1], solution.covariances
+    square = _offsets(solution) ** 2
+    if found is not None:
+        square = square + np.einsum("cid,fde,cie->fci", rows, found.shake, rows, optimize=True)
+    mean = square.mean(0)
+    unseen = mean < 1e-12
+    each = np.where(unseen, np.nan, mean)
+    return np.asarray(np.sqrt(np.where(unseen, np.nanmean(each, 1, keepdims=True), mean)))
+
+
+def _dominant_hz(solution: Solution) -> float:
+    """RMS of the offsets' velocity over that of the offsets."""
+    graph, place = solution.graph, _offsets(solution)
+    states = graph.shake_at_frames(solution.state.shake)
+    speed = np.einsum("cid,fd->fci", graph.shake.offset_velocity[:-1], states)
+    return float(np.sqrt((speed**2).mean() / max((place**2).mean(), 1e-12)) / (2 * np.pi))
+
+
+def _noise_factor(solution: Solution) -> float:
+    """By how much the pixels' stated noise is too small, 1 at least.
+
+    From the median square of single coordinates, which outliers do not move; what the fit takes up
+    is given back to each by its leverage. Those that it follows closely are left out. The noise is
+    never taken for smaller than stated: the error of a bubble's outline changes slowly
+    with its shape, and the fit takes that for motion.
+    """
+    square, spare = [], []
+    for which, leverage in leverages(solution):
+        kept = solution.weights[0][which] > 0.5
+        square.append(solution.residuals[0][which[kept]].ravel() ** 2)
+        spare.append(1 - leverage[kept].ravel())
+    if not square:
+        return 1.0
+    squares, spares = np.concatenate(square), np.concatenate(spare)
+    informative = spares > _LEAST_SPARE
+    if np.count_nonzero(informative) < _LEAST_PIXELS:
+        return 1.0
+    median = float(np.median(squares[informative] / spares[informative]))
+    found = float(np.sqrt(median / _MEDIAN_OF_CHI_SQUARE))
+    sure = 1 + max(_INFLATE_BEYOND, 2 * _SD_OF_MEDIAN / np.sqrt(np.count_nonzero(informative)))
+    return found if found > sure else 1.0
+
+
+def leverages(solution: Solution) -> list[tuple[Ints, Array]]:
+    """By camera: some of the bubbles' pixels (m,), var(prediction) / var(noise) of each (m, 2)."""
+    graph, found = solution.graph, solution.covariances
+    if found is None or not graph.rows:
+        return []
+    observed = graph.problem.observations
+    out = []
+    linear = images(graph, solution.state, np.ones(len(observed))).linear
+    for camera, part in zip(np.unique(observed.camera), linear, strict=True):
+        row, node = np.asarray(part.keys[0]) - graph.base().bubbles, np.asarray(part.keys[1])
+        some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
+        row, node = row[some], node[some]
+        at = graph.frame_of_row[row]
+        by_bubble = part.blocks[0][some] @ np.linalg.inv(graph.bubble_basis(row))
+        by_shake = part.blocks[1][some] @ np.linalg.inv(graph.shake_basis(node))
+        if graph.to_frames is not None:
+            by_shake = by_shake @ np.linalg.inv(graph.to_frames[at])
+        both = by_shake @ found.cross[row]
+        leverage = (by_bubble @ found.bubbles[row] * by_bubble).sum(-1)
+        leverage += (by_shake @ found.shake[at] * by_shake).sum(-1)
+        leverage += 2 * (both * by_bubble).sum(-1)
+        out.append((np.flatnonzero(observed.camera == camera)[some], leverage))
+    return out

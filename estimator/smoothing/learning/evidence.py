@@ -22,7 +22,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.learning.block_tridiagonal import eliminated
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
-from telerig.estimator.smoothing.learning.processes import (
+from telerig.estimator.smoothing.learning.parameters import (
     moving_processes,
     names_of_process,
     shake_processes,

@@ -20,8 +20,7 @@ from telerig.estimator.smoothing.learning.lines_of_sight import (
     pooled,
     signals_of,
 )
-from telerig.estimator.smoothing.learning.parameters import value_of, with_values
-from telerig.estimator.smoothing.learning.processes import processes
+from telerig.estimator.smoothing.learning.parameters import processes, value_of, with_values
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 
 _FARTHEST = 0.5

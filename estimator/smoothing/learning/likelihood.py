@@ -12,12 +12,12 @@ from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.evidence import signal_evidence, signal_gradient
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.learning.parameters import (
+    depends_on,
     log_prior,
     prior_of,
     value_of,
     with_values,
 )
-from telerig.estimator.smoothing.learning.processes import depends_on
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 
 _IMPOSSIBLE = -1e12

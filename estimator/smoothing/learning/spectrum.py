@@ -9,7 +9,7 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
-from telerig.estimator.smoothing.learning.processes import moving_processes, shake_processes
+from telerig.estimator.smoothing.learning.parameters import moving_processes, shake_processes
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
 from telerig.factors.state_space import Component
 

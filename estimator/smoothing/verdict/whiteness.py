@@ -16,13 +16,13 @@ from numpy.random import Generator
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from telerig.arrays import Array, Ints
+from telerig.estimator.smoothing.graph.layout import GraphLayout
 from telerig.estimator.smoothing.graph.linear import (
     accelerometers,
     all_factors,
     sensed_directions,
 )
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.state import GraphLayout
 from telerig.factors.linear_factors import Linear
 
 LAGS = 10

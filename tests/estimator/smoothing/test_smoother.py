@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from telerig.estimator.smoothing.graph.layout import graph_layout
 from telerig.estimator.smoothing.graph.solve import Options, solve
-from telerig.estimator.smoothing.graph.state import graph_layout
 from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
     BroadBand,

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from telerig.estimator.smoothing.learning.adapted_priors import fitted_floor
-from telerig.estimator.smoothing.learning.default_priors import DEFAULT_FLOOR, rescaled
+from telerig.estimator.smoothing.learning.default_priors import (
+    DEFAULT_FLOOR,
+    fitted_floor,
+    rescaled,
+)
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel
 from telerig.factors.state_space import broad_band, broad_band_density, discretise
 

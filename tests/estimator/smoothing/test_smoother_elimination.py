@@ -12,8 +12,8 @@ from shake_problem import problem, true_model
 from telerig.arrays import Array
 from telerig.estimator.smoothing.graph import elimination
 from telerig.estimator.smoothing.graph.elimination import EliminatedGraph, eliminate
+from telerig.estimator.smoothing.graph.layout import GraphLayout, first_guess, graph_layout
 from telerig.estimator.smoothing.graph.linear import all_factors
-from telerig.estimator.smoothing.graph.state import GraphLayout, first_guess, graph_layout
 from telerig.estimator.smoothing.problem.problem import Bubble, SmoothingProblem
 from telerig.factors.linear_factors import Linear
 

@@ -32,8 +32,8 @@ from telerig.estimator.smoothing.problem.problem import (
     Stage,
     Travel,
 )
+from telerig.estimator.smoothing.result import shake, trajectories
 from telerig.estimator.smoothing.smooth import problem_of
-from telerig.estimator.smoothing.tables import shake, trajectories
 from telerig.estimator.smoothing.verdict.modes import shake_modes
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra
 from telerig.io.rig_file.description import StageDescription

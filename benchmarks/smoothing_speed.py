@@ -22,9 +22,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
 from shake_cases import SCENARIOS
+from shake_learning_data import run as crowded
 from shake_scene import Case, Run, simulate
 
 from telerig.estimator.smoothing.graph.solve import solve
+from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.smooth import problem_of, smooth
 
 
@@ -81,7 +83,8 @@ def main() -> None:
     def row(name: str, frames: int, what: str, repeats: int, call: Callable[[], Any]) -> Any:
         cpu, wall, result = timed(call, repeats)
         solution = getattr(result, "solution", result)
-        states = solution.graph.shake.size + solution.graph.bubble.size
+        graph = solution.graph
+        states = graph.shake.size + len(graph.problem.bubbles) * graph.bubble.size
         peer = rts_seconds(states, min(frames, 2000)) * frames / min(frames, 2000)
         lines.append(
             f"| {name} | {frames:,} | {what} | {cpu:.2f} | {wall:.2f} | {states} | {peer:.2f} "
@@ -103,6 +106,14 @@ def main() -> None:
         problem, *_ = problem_of(inputs.pop("tracks"), inputs.pop("calibration"), **inputs)
         row(name, frames, "one solution with all covariances", repeats,
             lambda p=problem, m=found.model: solve(p, m))  # fmt: skip
+    for frames, bubbles, rate_hz in ((59, 5, 100.0), (400, 5, 500.0), (1000, 5, 500.0),
+                                     (400, 20, 500.0)):  # fmt: skip
+        crowd, _, _ = crowded(
+            np.random.default_rng(1), bubbles=bubbles, seconds=frames / rate_hz, rate_hz=rate_hz
+        )
+        prior = default_model(crowd)
+        row(f"{bubbles} bubbles, images alone", frames, "one solution with all covariances",
+            1 if bubbles > 5 else 3, lambda p=crowd, m=prior: solve(p, m))  # fmt: skip
     if args.long:
         longest, s1 = run_of(100_000), simulate(Case(SCENARIOS["S1"]), np.random.default_rng(0))
         row("images alone", 100_000, "`telerig.smooth`, all of it", 1,

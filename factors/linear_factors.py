@@ -18,7 +18,7 @@ from telerig.arrays import Array
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearFactors:
     """M factors of one shape.
 
     keys : one (M,) each.  blocks : (M, rows, columns) each.  rhs : (M, rows).
@@ -47,7 +47,7 @@ class Linear:
         return float((share * each).sum())
 
 
-def prior_factors(keys: ArrayLike, deviation: Array, sigma: ArrayLike) -> Linear:
+def prior_factors(keys: ArrayLike, deviation: Array, sigma: ArrayLike) -> LinearFactors:
     """Priors of M vectors with independent components.
 
     keys : (M,).  deviation : (M, n) of the values from the prior's mean.  sigma : to (M, n).
@@ -55,7 +55,7 @@ def prior_factors(keys: ArrayLike, deviation: Array, sigma: ArrayLike) -> Linear
     count, width = deviation.shape
     scale = np.broadcast_to(1 / np.asarray(sigma, float), (count, width))
     block = scale[:, :, None] * np.eye(width)
-    return Linear((keys,), (block,), -deviation * scale, np.log(scale).sum(-1))
+    return LinearFactors((keys,), (block,), -deviation * scale, np.log(scale).sum(-1))
 
 
 @lru_cache(maxsize=64)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
-from telerig.factors.linear_factors import Linear
+from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.state_space import (
     Component,
     block_diagonal,
@@ -49,7 +49,7 @@ class Motion:
         states: tuple[Array, Array],
         inputs: Array,
         following: Ints,
-    ) -> Linear:
+    ) -> LinearFactors:
         """The steps as M factors on increments of both states in their bases, and on the inputs.
 
         keys : of the states before and after, (M,) each, and of the inputs where there are any.
@@ -57,7 +57,7 @@ class Motion:
         """
         residual = self.residual(*states, inputs)
         blocks = (*self.in_basis(following), self.by_input[self.index])
-        return Linear(tuple(keys), blocks[: len(keys)], -residual, self.log_det[self.index])
+        return LinearFactors(tuple(keys), blocks[: len(keys)], -residual, self.log_det[self.index])
 
     def in_basis(self, following: Ints) -> tuple[Array, Array]:
         """(M, n, n) by_last and by_next for increments in the bases of the two states.
@@ -111,7 +111,7 @@ def start_factors(
     deviation: Array,
     basis: Array,
     inputs: Array,
-) -> Linear:
+) -> LinearFactors:
     """The priors of M first states, as factors on increments in their basis and on the inputs.
 
     keys : of the states, (M,), and of the inputs where there are any.  deviation : (M, n) from the
@@ -123,4 +123,4 @@ def start_factors(
     by_inputs = np.broadcast_to(-whitener @ by_input, (count, *by_input.shape))
     rhs = -(deviation - inputs @ by_input.T) @ whitener.T
     log_det = np.full(count, log_det_of(whitener))
-    return Linear(tuple(keys), (whitener @ basis, by_inputs)[: len(keys)], rhs, log_det)
+    return LinearFactors(tuple(keys), (whitener @ basis, by_inputs)[: len(keys)], rhs, log_det)

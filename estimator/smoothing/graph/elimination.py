@@ -21,7 +21,7 @@ from scipy.linalg.lapack import dtrtri
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.layout import GraphLayout
-from telerig.factors.linear_factors import Linear, add_linear_factors
+from telerig.factors.linear_factors import LinearFactors, add_linear_factors
 
 LEAST_PIVOT = 1e-9
 """Of the information's diagonal, what Cholesky's elimination has to leave of it; covariances are
@@ -77,7 +77,9 @@ class EliminatedGraph:
         return Blocks([own[0][of_frame], *own[1:]], cross)
 
 
-def eliminate(graph: GraphLayout, factors: list[Linear], *, cholesky: bool) -> EliminatedGraph:
+def eliminate(
+    graph: GraphLayout, factors: list[LinearFactors], *, cholesky: bool
+) -> EliminatedGraph:
     """The graph of all factors, solved: by QR, or by Cholesky where that keeps enough digits.
 
     Raises CalibrationError where it is undetermined.
@@ -118,7 +120,7 @@ def _diagonal(cliques: Sequence[Clique]) -> Array:
 
 
 def _least_pivot(
-    cliques: Sequence[Clique], factors: Sequence[Linear], sizes: Sequence[int]
+    cliques: Sequence[Clique], factors: Sequence[LinearFactors], sizes: Sequence[int]
 ) -> float:
     """What elimination leaves of the information's diagonal, the least share."""
     starts = np.r_[0, np.cumsum(sizes)]

@@ -16,7 +16,7 @@ from telerig.estimator.calibration.solver.covariance import rig_jacobian
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
 from telerig.factors import measurements
-from telerig.factors.linear_factors import Linear, prior_factors
+from telerig.factors.linear_factors import LinearFactors, prior_factors
 from telerig.factors.motion import start_factors
 from telerig.factors.state_space import log_det_of, whitener_of
 
@@ -24,13 +24,13 @@ _SLOPE_S = 2e-3
 """Width of the filter that takes the readings' rate of change for the delay."""
 
 
-def priors_and_motion(graph: GraphLayout, state: State) -> list[Linear]:
+def priors_and_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
     """Everything but the measurements."""
     out = _shake_motion(graph, state) + _bubble_motion(graph, state)
     return out + _constant_priors(graph, state)
 
 
-def _shake_motion(graph: GraphLayout, state: State) -> list[Linear]:
+def _shake_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
     layout = graph.shake
     if not layout.size:
         return []
@@ -54,7 +54,7 @@ def _shake_motion(graph: GraphLayout, state: State) -> list[Linear]:
     ]
 
 
-def _bubble_motion(graph: GraphLayout, state: State) -> list[Linear]:
+def _bubble_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
     problem, layout = graph.problem, graph.bubble
     if not problem.bubbles:
         return []
@@ -82,7 +82,7 @@ def _bubble_motion(graph: GraphLayout, state: State) -> list[Linear]:
     return [begin, between]
 
 
-def _constant_priors(graph: GraphLayout, state: State) -> list[Linear]:
+def _constant_priors(graph: GraphLayout, state: State) -> list[LinearFactors]:
     model, problem, base = graph.model, graph.problem, graph.base()
     scale, delay = graph.sensor_flags
     out = [_priors(base.means, state.means, model.bubble.mean_sigma_mm_s)]
@@ -107,7 +107,7 @@ def _constant_priors(graph: GraphLayout, state: State) -> list[Linear]:
     return [p for p in out if p.rhs.size]
 
 
-def _priors(base: int, deviation: Array, sigma: ArrayLike) -> Linear:
+def _priors(base: int, deviation: Array, sigma: ArrayLike) -> LinearFactors:
     return prior_factors(base + np.arange(len(deviation)), deviation, sigma)
 
 
@@ -115,7 +115,7 @@ def _priors(base: int, deviation: Array, sigma: ArrayLike) -> Linear:
 class Seen:
     """Predictions of images: whitened residuals (M, 2), for the robust weights."""
 
-    linear: list[Linear]
+    linear: list[LinearFactors]
     residual: Array
 
 
@@ -196,7 +196,9 @@ def _seen(
         )
         rhs = -residual[mine] * root[:, None]
         log_det = log_det_of(whitener[mine])
-        linear = Linear((keys[mine], node, base.constants), blocks, rhs, log_det, weight[mine])
+        linear = LinearFactors(
+            (keys[mine], node, base.constants), blocks, rhs, log_det, weight[mine]
+        )
         out.append(linear)
     return Seen(out, residual)
 
@@ -212,7 +214,7 @@ def _by_calibration(
     return np.asarray(rows @ share.root)
 
 
-def encoder(graph: GraphLayout, state: State) -> list[Linear]:
+def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
     """Readings of the stage's position: at their own times, or interpolated at the frames.
 
     The carriage's states are in units of the reading, so that its scale is not a factor of what
@@ -247,13 +249,13 @@ def encoder(graph: GraphLayout, state: State) -> list[Linear]:
     blocks = (by_shake / sigma, np.concatenate(constants, -1)[:, None] / sigma)
     log_det = np.full(len(node), -np.log(sigma))
     return [
-        Linear(
+        LinearFactors(
             (node, graph.base().constants), blocks, (reading - position)[:, None] / sigma, log_det
         )
     ]
 
 
-def accelerometers(graph: GraphLayout, state: State) -> list[Linear]:
+def accelerometers(graph: GraphLayout, state: State) -> list[LinearFactors]:
     """Samples of all sensors, along the directions in which their mount's motion is modelled.
 
     Their information on the encoder's scale, by the carriage's own acceleration, is not used.
@@ -261,7 +263,7 @@ def accelerometers(graph: GraphLayout, state: State) -> list[Linear]:
     return [_accelerometer(graph, state, i) for i in range(len(graph.problem.accelerometers))]
 
 
-def _accelerometer(graph: GraphLayout, state: State, index: int) -> Linear:
+def _accelerometer(graph: GraphLayout, state: State, index: int) -> LinearFactors:
     problem, layout = graph.problem, graph.shake
     sensor = problem.accelerometers[index]
     node, late = graph.nodes.of_accelerometers[index], graph.nodes.accelerometer_late_s[index]
@@ -292,7 +294,7 @@ def _accelerometer(graph: GraphLayout, state: State, index: int) -> Linear:
     rhs = (sensor.reading_mm_s2 - read.reading_mm_s2 + delay * slope) @ project.T
     log_det = np.full(len(node), white)
     keys = (node, graph.base().sensors + index, graph.base().clocks + clock)
-    return Linear(keys, blocks, rhs, log_det)
+    return LinearFactors(keys, blocks, rhs, log_det)
 
 
 def _slope(sensor: Accelerometer) -> Array:
@@ -319,7 +321,9 @@ def sensed_directions(graph: GraphLayout, index: int) -> tuple[Array, float]:
     return np.asarray(whitener @ rows), float(log_det_of(whitener))
 
 
-def all_factors(graph: GraphLayout, state: State, weights: tuple[Array, Array]) -> list[Linear]:
+def all_factors(
+    graph: GraphLayout, state: State, weights: tuple[Array, Array]
+) -> list[LinearFactors]:
     """Every factor of the graph; weights of the bubbles' and of the marks' pixels."""
     out = priors_and_motion(graph, state)
     out += images(graph, state, weights[0]).linear + references(graph, state, weights[1]).linear

@@ -24,7 +24,7 @@ from telerig.estimator.smoothing.graph.layout import (
 )
 from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
-from telerig.factors.linear_factors import Linear
+from telerig.factors.linear_factors import LinearFactors
 from telerig.rig.projection import INDEX
 
 Progress = Callable[[str, float], None]
@@ -203,7 +203,7 @@ def _linear_solve(graph: GraphLayout, state: State, weights: tuple[Array, Array]
     return _Pass(done, largest, _log_norm(graph, factors), squared)
 
 
-def _squared(graph: GraphLayout, factors: list[Linear], vector: Array) -> float:
+def _squared(graph: GraphLayout, factors: list[LinearFactors], vector: Array) -> float:
     """Sum of squares of all factors after the step."""
     base, counts = np.array(graph.base()), graph.counts()
     sizes = [n * d for n, d in counts]
@@ -218,7 +218,7 @@ def _squared(graph: GraphLayout, factors: list[Linear], vector: Array) -> float:
     return sum(f.squared(of_keys) for f in factors)
 
 
-def _log_norm(graph: GraphLayout, factors: list[Linear]) -> float:
+def _log_norm(graph: GraphLayout, factors: list[LinearFactors]) -> float:
     """log of the joint density's normalisation, the change to whitening bases included."""
     shake, bubble = graph.shake_motion, graph.bubble_motion
     of_nodes = np.linalg.slogdet(shake.basis)[1][np.append(shake.index, -1)]

@@ -23,7 +23,7 @@ from telerig.estimator.smoothing.graph.linear import (
     sensed_directions,
 )
 from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.factors.linear_factors import Linear
+from telerig.factors.linear_factors import LinearFactors
 
 LAGS = 10
 _LEAST_PAIRS = 25
@@ -158,7 +158,7 @@ class Stretch:
     size: int
     inner: tuple[int, int]
 
-    def columns(self, linear: Linear) -> Ints:
+    def columns(self, linear: LinearFactors) -> Ints:
         """(M, keys) first column of each block of the factors, -1 where it is held."""
         count = len(linear.rhs)
         moving = len(self.column)
@@ -235,7 +235,7 @@ class _Part:
     of_bubbles: bool
 
     @classmethod
-    def of(cls, stretch: Stretch, linear: Linear) -> _Part:
+    def of(cls, stretch: Stretch, linear: LinearFactors) -> _Part:
         base, key = stretch.graph.base(), int(np.min(linear.keys[0]))
         of_bubbles = linear.weight is not None and base.bubbles <= key < base.means
         first = stretch.columns(linear)

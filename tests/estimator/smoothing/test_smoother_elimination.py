@@ -15,7 +15,7 @@ from telerig.estimator.smoothing.graph.elimination import EliminatedGraph, elimi
 from telerig.estimator.smoothing.graph.layout import GraphLayout, first_guess, graph_layout
 from telerig.estimator.smoothing.graph.linear import all_factors
 from telerig.estimator.smoothing.problem.problem import Bubble, SmoothingProblem
-from telerig.factors.linear_factors import Linear
+from telerig.factors.linear_factors import LinearFactors
 
 FRAMES = 60
 LIVES = ((0, 59), (0, 20), (21, 40), (35, 59), (44, 44))
@@ -35,7 +35,7 @@ def cut(given: SmoothingProblem) -> SmoothingProblem:
     return replace(given, bubbles=bubbles, observations=obs.of(keep))
 
 
-def linearised(information: str, *, shake: bool = True) -> tuple[GraphLayout, list[Linear]]:
+def linearised(information: str, *, shake: bool = True) -> tuple[GraphLayout, list[LinearFactors]]:
     scenario = replace(SCENARIOS["S2"], frames=FRAMES)
     given = problem(scenario, information, generate(scenario, 1, np.random.default_rng(4)))
     model = true_model(scenario, information)
@@ -50,7 +50,7 @@ def linearised(information: str, *, shake: bool = True) -> tuple[GraphLayout, li
     return graph, all_factors(graph, first_guess(graph), weights)
 
 
-def dense(graph: GraphLayout, factors: list[Linear]) -> tuple[Array, Array, float, Array]:
+def dense(graph: GraphLayout, factors: list[LinearFactors]) -> tuple[Array, Array, float, Array]:
     """Solution, covariance, log |R| and first columns of the keys, from one dense matrix."""
     starts = np.r_[0, np.cumsum([d for n, d in graph.counts() for _ in range(n)])]
     rows, right = [np.zeros((0, starts[-1]))], [np.zeros(0)]

@@ -307,26 +307,26 @@ def _write_truth(
     population, config = scene.population, plain(scene.config)
     if config["strip"] is None:
         del config["strip"]
-        write_json_atomic(
-            folder / "truth.json",
-            {
-                "schema": RUN_TRUTH_SCHEMA,
-                "pixel_origin": "centre",
-                "seed": seed,
-                "axis_rig": AXIS_RIG,
-                "modes": MODES,
-                "particles": {
-                    "d_eq_mm": population.d_eq_mm,
-                    "semi_axes_proportions": population.semi_axes_mm,
-                    "modes_static": population.modes_static,
-                    "modes_swing": population.modes_swing,
-                    "swing_hz": population.swing_hz,
-                    "spin_hz": population.spin_hz,
-                },
-                "pairs_closest_s": scene.closest_s,
-                "config": config,
+    write_json_atomic(
+        folder / "truth.json",
+        {
+            "schema": RUN_TRUTH_SCHEMA,
+            "pixel_origin": "centre",
+            "seed": seed,
+            "axis_rig": AXIS_RIG,
+            "modes": MODES,
+            "particles": {
+                "d_eq_mm": population.d_eq_mm,
+                "semi_axes_proportions": population.semi_axes_mm,
+                "modes_static": population.modes_static,
+                "modes_swing": population.modes_swing,
+                "swing_hz": population.swing_hz,
+                "spin_hz": population.spin_hz,
             },
-        )
+            "pairs_closest_s": scene.closest_s,
+            "config": config,
+        },
+    )
 
 
 _LEAST_VIEWS = 3

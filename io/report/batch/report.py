@@ -84,12 +84,12 @@ def render(jobs: Sequence[Job], folder: Path) -> str:
             lines.setdefault((job["dataset"], job["run"]), {})[job["kind"]] = job
     context = {
         "name": Path(folder).resolve().name,
-        "headline": (f"{words}, {datasets} dataset" + ("s" if datasets != 1 else "")),
+        "headline": f"{words}, {datasets} dataset" + ("s" if datasets != 1 else ""),
         "colour": "good" if not failed else ("rejected" if len(failed) == len(jobs) else "usable"),
         "figures": _key_numbers(jobs),
         "failures": [_failure(j) for j in failed],
         "calibrations": [_calibration(j, folder) for j in jobs if j["kind"] == "calibrate"],
-        "runs": ([_run(dataset, run, kinds, folder) for (dataset, run), kinds in lines.items()]),
+        "runs": [_run(dataset, run, kinds, folder) for (dataset, run), kinds in lines.items()],
         "pictures": [p for p in drawn_over_cores(_drawings(jobs)) if p is not None],
     }
     return render_page("template_batch.html", context, "")

@@ -84,7 +84,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "weak": file.diagnostics.weak,
         "notes": file.notes,
         "absent": results.absent,
-        "trust_words": ([words[0].upper() + words[1:] + "." for words in found if words]),
+        "trust_words": [words[0].upper() + words[1:] + "." for words in found if words],
         "comparison": results.comparison.content(),
         "advice": file.diagnostics.next_view,
         "dots_drawn": dots_are_drawn(results),

@@ -14,7 +14,13 @@ from typer.testing import CliRunner
 from telerig.errors import InputError
 from telerig.io.dataset.run import load_run
 from telerig.io.simulation.calibration.scene import true_cameras
-from telerig.io.simulation.config import BubbleConfig, ImageConfig, RunConfig, SimulationConfig
+from telerig.io.simulation.config import (
+    BubbleConfig,
+    ImageConfig,
+    RunConfig,
+    SimulationConfig,
+    StripConfig,
+)
 from telerig.io.simulation.images.bodies import volume_centre_mm
 from telerig.io.simulation.presets import RUN_PRESETS, any_preset, run_preset
 from telerig.io.simulation.run.scene import AXIS_RIG, lamb_frequency_hz, run_scene
@@ -322,3 +328,11 @@ def test_the_command_takes_frames_and_bubbles(tmp_path):
     paper = ["simulate", "paper", "--out", str(tmp_path / "no"), "--frames", "5", "--no-images"]
     refused = runner.invoke(app, paper)
     assert refused.exit_code == 2 and "without a run" in refused.output
+
+
+def test_a_run_with_a_strip_of_marks_has_its_whole_truth():
+    data = dataset("rise", frames=2, strip=StripConfig(dots=4))
+    _, _, known = truth_of(data, "rise")
+    assert known["config"]["strip"]["dots"] == 4
+    marks = pd.read_csv(data.path / "truth" / "runs" / "rise" / "references.csv")
+    assert set(marks["camera"]) == {"left", "right"}

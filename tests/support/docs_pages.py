@@ -13,13 +13,14 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from string import Template
 
 from places import ROOT
 
+from telerig.io.dataset.new_dataset import new_dataset
 from telerig.io.rig_file.rig_file import description_from_toml
 
 LANGUAGES = ("sh", "python", "toml", "text", "{toctree}", "{eval-rst}")
@@ -151,11 +152,10 @@ def check_toml(block: Block) -> None:
     if "schema" in content:
         description_from_toml(block.code, where=block.where)
     elif all(isinstance(value, dict) for value in content.values()):
-        template = (ROOT / "io" / "dataset" / "rig_template.toml").read_text(encoding="utf-8")
-        known = {"name": "rig", "first": "left", "second": "right", "angle": "90.0"}
-        known |= {"width": "512", "height": "512", "scale": "10.0"}
+        with tempfile.TemporaryDirectory() as folder:
+            template = new_dataset(Path(folder) / "rig")[0].read_text(encoding="utf-8")
         sensors = "" if "accelerometers" in content else SENSOR
-        whole = Template(template).substitute(known) + sensors + block.code
+        whole = template + sensors + block.code
         description_from_toml(whole, where=block.where)
 
 

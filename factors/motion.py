@@ -64,11 +64,15 @@ class Motion:
 
         following : (M,) index into ``basis`` of each step's second state.
         """
+        last, ahead, place = self.distinct_in_basis(following)
+        return last[place], ahead[place]
+
+    def distinct_in_basis(self, following: Ints) -> tuple[Array, Array, Ints]:
+        """As `in_basis`, but only those that differ, and (M,) which of them each step has."""
         count = len(self.basis)
         own, place = np.unique(self.index * count + following % count, return_inverse=True)
         step, after = np.divmod(own, count)
-        last = self.by_last[step] @ self.basis[step]
-        return last[place], (self.by_next[step] @ self.basis[after])[place]
+        return self.by_last[step] @ self.basis[step], self.by_next[step] @ self.basis[after], place
 
 
 def motion(components: Sequence[Component], dt_s: ArrayLike, *, batched: bool = False) -> Motion:

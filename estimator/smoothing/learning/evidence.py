@@ -263,11 +263,8 @@ def _chain(system: _System, steps: Motion) -> tuple[Array, Array, float]:
 
     The determinant is of the states' precision in the whitening bases.
     """
-    count = len(steps.basis)
-    which = np.append(steps.index, count - 1)
-    kind, place = np.unique(steps.index * count + which[1:], return_inverse=True)
-    step, after = np.divmod(kind, count)
-    last, ahead = steps.by_last[step] @ steps.basis[step], steps.by_next[step] @ steps.basis[after]
+    which = np.append(steps.index, len(steps.basis) - 1)
+    last, ahead, place = steps.distinct_in_basis(which[1:])
     backward, forward = (np.swapaxes(a, -1, -2) for a in (last, ahead))
     frames, size = len(which), system.rows.shape[1]
     diagonal = np.zeros((frames, size, size))

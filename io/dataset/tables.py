@@ -72,7 +72,7 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
     if rig.target.bounded:
         _check_dots(table, rig.target, file)
     else:
-        # The ids of `Target` in place of the file's opaque ones, from row and column.
+        # Row and column give the ids of `Target`, in place of the file's opaque ones.
         todo = f"rows and columns count from the origin mark, within +-{FARTHEST}"
         for column in ("row", "column"):
             far = table[column].abs().to_numpy() > FARTHEST

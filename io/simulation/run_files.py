@@ -68,7 +68,7 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     calibration_rng, scene_rng, sensor_rng, image_rng, table_rng, stage_rng = rng.spawn(6)
 
     def complete(rig: RigDescription) -> RigDescription:
-        # The rig file of a rig with a stage, and the sensors and marks that the run has.
+        # The rig file also states the stage, and the sensors and marks that the run has.
         x, y, z = (float(a) for a in AXIS_RIG)
         stage = StageDescription(
             (x, y, z),
@@ -100,11 +100,9 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     scene = run_scene(config, cameras, scene_rng)
     strips = random_strips(scene, rng.spawn(1)[0]) if config.strip and images else []
     run = folder / "runs" / config.name
-    # (C, F) frames that a camera drops; each camera keeps its first one.
+    # lost (cameras, frames): what a camera drops; each camera keeps its first frame.
     lost = image_rng.random((len(scene.cameras), scene.config.frames)) < scene.config.image.dropped
     lost[:, 0] = False
-    lost = np.asarray(lost)
-    # marks : False where the marks are in the images, to be found there.
     encoder_rng, accelerometer_rng, mark_rng = sensor_rng.spawn(3)
     run.mkdir(parents=True, exist_ok=True)
     frames = pd.DataFrame({"frame": np.arange(scene.config.frames), "t_s": scene.t_s})
@@ -115,7 +113,8 @@ def write_run_dataset(config: RunConfig, folder: Path, rng: Generator, *, images
     write_table(stage_table(scene, encoder_rng), run / "stage.csv")
     if scene.config.stage.accelerometers:
         write_table(accelerometer_table(scene, accelerometer_rng), run / "accelerometer.csv")
-    if (not strips) and scene.config.table.references:
+    # Marks that are drawn into the images are found there, and have no table.
+    if not strips and scene.config.table.references:
         write_table(references_table(scene, mark_rng), run / "references.csv")
     truth: list[dict[str, Any]] = []
     detections: list[dict[str, Any]] = []

@@ -67,7 +67,7 @@ def render(results: CalibrationResults, dot: list[Picture] | None = None) -> str
 def _words(results: CalibrationResults) -> dict[str, Any]:
     file = results.file
     costs = (file.twin.cost, file.twin.other_cost)
-    # What halves and residuals say; nothing for folders of before.
+    # Folders of before have no split-half check and no residual tests.
     halves, structure = results.file.diagnostics.halves, results.file.diagnostics.structure
     found = [str(halves["words"])] if "words" in halves else []
     found += [str(words) for words in structure.get("words") or []]

@@ -91,7 +91,7 @@ def _camera_outline(camera: Camera, points_mm: Array) -> CameraOutline:
     middle = float(depth.mean())
     half_field = 0.5 * min(camera.image_size_px) / camera["scale_px_per_mm"]
     reach = max(float(np.abs(depth - middle).max()), half_field)
-    # ``wanted_mm``, but well in front of the centre of perspective if there is one.
+    # The near end stays well in front of the centre of perspective, if there is one.
     wanted_mm = middle - _BEFORE * reach
     kappa = camera["kappa_per_mm"]
     near = max(wanted_mm, -0.95 / kappa) if kappa > 0 else wanted_mm

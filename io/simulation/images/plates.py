@@ -91,7 +91,7 @@ def disc_coverage(
     near = _near_image(camera, rig_from_target, plate, centres_mm, diameter_mm, blur_px)
     centres, diameter, hole = centres_mm[near], diameter_mm[near], hole_mm[near]
     first, count = _windows(camera, rig_from_target, plate, centres, diameter)
-    # (N, 2, nodes, nodes) x, y from each disc's centre, at Chebyshev nodes of its window.
+    # nodes (N, 2, n, n): x, y from each disc's centre at the n x n Chebyshev nodes of its window.
     along = (first[:, None, :] - 0.5) + count[:, None, :] * (1 + _chebyshev(_NODES)[:, None]) / 2
     uv = np.empty((len(centres), _NODES, _NODES, 2))
     uv[..., 0], uv[..., 1] = along[:, None, :, 0], along[:, :, None, 1]
@@ -142,7 +142,7 @@ def _cell_coverage(nodes: Array, size: Ints, radius_mm: float) -> Array:
     x, y = rows @ nodes @ columns.T
     square = x * x + y * y
     coverage = (square < radius_mm**2).astype(float)
-    # (2, 2) mean change of plate coordinates (mm) per cell, as d(x, y) / d(u, v).
+    # jacobian (2, 2): mean change of plate coordinates (mm) per cell, d(x, y) / d(u, v).
     by_u = [np.mean(a[:, -1] - a[:, 0]) / (a.shape[1] - 1) for a in (x, y)]
     by_v = [np.mean(a[-1] - a[0]) / (a.shape[0] - 1) for a in (x, y)]
     jacobian = np.array([by_u, by_v]).T

@@ -102,7 +102,7 @@ class RunScene:
         swing = np.cos(2 * np.pi * population.swing_hz[chosen] * t + population.swing_rad[chosen])
         modes = population.modes_static[chosen] + population.modes_swing[chosen] * swing
         spin = 2 * np.pi * population.spin_hz[chosen] * t + population.spin_rad[chosen]
-        # (M, 3, 3) lab_from_body with z along the velocity, turned about it.
+        # lab_from_body (bubbles, 3, 3) has z along the velocity and is turned about it.
         z = _unit(self.lab_mm_s[chosen, frame])
         start = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
         x = _unit(start - z * np.sum(start * z, -1, keepdims=True))
@@ -124,7 +124,7 @@ def run_scene(config: RunConfig, cameras: Mapping[str, Camera], rng: Generator) 
     speed = config.stage.follow * _mean_rise(config.motion)
     carriage = _carriage(config, len(cameras), speed, stage_rng)
     position = carriage.position_mm[carriage.frames]
-    # (2,) nominal width and height of the first camera's view.
+    # size_mm (2,): nominal width and height of the first camera's view.
     first = config.calibration.cameras[0]
     size_mm = np.array(first.image_size_px) / first.nominal_scale_px_per_mm
     count = _bubble_count(config, position, size_mm)

@@ -276,7 +276,7 @@ def ray_miss_in_space(results: TrackResults, direction: Array, name: str) -> Pic
     place, miss = place[good], miss[good]
     thin = len(miss) // _MOST_MARKS + 1
     reach = _reach(miss, _predicted_um(results))
-    # middle, median and its standard error of up to `_STEPS` steps of equal number
+    # Each of up to `_STEPS` steps of equal number has a middle, a median and its standard error.
     groups = int(min(_STEPS, len(place) // _LEAST_IN_STEP))
     steps = np.array_split(np.argsort(place), groups) if groups else []
     middles, medians = ([float(np.median(values[s])) for s in steps] for values in (place, miss))

@@ -1,1 +1,4 @@
-"""Pure geometry: cameras, targets, rotations, triangulation. No images, no files, no solver."""
+"""Pure geometry: cameras, lens models, poses, the target, windows and triangulation.
+
+Nothing here reads an image or a file or knows a solver. Read ``camera`` first.
+"""

@@ -1,4 +1,4 @@
-"""A camera whose lens is telecentric, nearly telecentric or, as the limit, perspective."""
+"""The camera model. A lens is telecentric, nearly telecentric or, in the limit, perspective."""
 
 from __future__ import annotations
 
@@ -17,12 +17,16 @@ from telerig.rig.windows import Wall
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera of the rig.
+    """One camera of the rig.
 
-    intrinsics : (20,) in the order of `telerig.rig.projection.PARAMETERS`.
-    rho_mm : half the image diagonal in object space at nominal scale; normalises the distortion.
-    camera_from_rig : pose; the identity for the first camera, whose frame is the rig frame.
-    wall : the window that the camera looks through; all points are then in the water behind it.
+    intrinsics : (20,) parameters of the lens and the sensor, in the order of
+        `telerig.rig.projection.PARAMETERS`.
+    rho_mm : half the diagonal of the image, measured in object space at the nominal scale.
+        Coordinates are divided by this length before the distortion is computed.
+    camera_from_rig : pose that maps rig coordinates to camera coordinates. It is the identity for
+        the first camera, because that camera's frame is the rig frame.
+    wall : the window through which the camera looks, or None. With a window, all points are in the
+        water behind it.
     """
 
     name: str
@@ -42,8 +46,11 @@ class Camera:
         rho_mm: float | None = None,
         **parameters: float,
     ) -> Camera:
-        """A camera from named parameters. Parameters that are not given are those of an ideal lens
-        centred on the image.
+        """Return a camera with the given parameters; all others are those of an ideal centred lens.
+
+        parameters : intrinsics by name, see `telerig.rig.projection.PARAMETERS`. A parameter that
+            is not given is 0, the aspect ratio is 1, and the centre is the middle of the image.
+        rho_mm : see `Camera`; by default it follows from the image size and the scale.
 
         Raises GeometryError for an unknown parameter.
         """
@@ -70,7 +77,10 @@ class Camera:
         return float(self.intrinsics[INDEX[parameter]])
 
     def with_parameters(self, **parameters: float) -> Camera:
-        """A copy with some intrinsics changed. Raises KeyError for an unknown parameter."""
+        """Return a copy of the camera with some intrinsics changed.
+
+        Raises KeyError for an unknown parameter.
+        """
         intrinsics = self.intrinsics.copy()
         for name, value in parameters.items():
             intrinsics[INDEX[name]] = value
@@ -81,7 +91,7 @@ class Camera:
         return self.camera_from_rig.inverse()
 
     def project(self, points_rig_mm: ArrayLike) -> Array:
-        """(..., 3) rig points -> (..., 2) pixels.
+        """Return the pixels (..., 2) at which the camera sees the points (..., 3) of the rig frame.
 
         Raises GeometryError for points behind the perspective centre (1 + kappa Z <= 0) and for
         points that no ray reaches through the window.
@@ -97,14 +107,16 @@ class Camera:
         return uv.reshape(*np.shape(points_rig_mm)[:-1], 2)
 
     def pixel_jacobians(self, points_camera_mm: Array) -> tuple[Array, Array, Array]:
-        """`projection.pixel_jacobians` at points (..., 3) in the camera's own frame."""
+        """Return `projection.pixel_jacobians` of this camera, for points (..., 3) in its frame."""
         return projection.pixel_jacobians(points_camera_mm, self.intrinsics, self.rho_mm, self.wall)
 
     def unproject(self, uv_px: ArrayLike) -> tuple[Array, Array]:
-        """(..., 2) pixels -> rays in the rig frame: (..., 3) origins and (..., 3) unit directions.
+        """Return the rays in the rig frame that the camera sees at the pixels (..., 2).
 
-        Origins lie in the camera's plane Z = 0; rays in water are extended straight back to it.
-        Raises GeometryError for pixels where the lens model cannot be inverted.
+        Returns the origins (..., 3) in mm and the unit directions (..., 3). An origin lies in the
+        camera's plane Z = 0; a ray in water is extended backwards to this plane in a straight line.
+
+        Raises GeometryError for pixels at which the lens model cannot be inverted.
         """
         ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), self.intrinsics, self.rho_mm)
         if self.wall is not None:

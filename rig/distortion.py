@@ -1,9 +1,10 @@
-"""Lens distortion in normalised coordinates: radial, tangential, thin prism.
+"""Lens distortion in normalised coordinates: radial, tangential and thin-prism terms.
 
-OpenCV's definitions (Weng, Cohen and Herniou, PAMI 14:965, 1992), forward from ideal to distorted:
+The definitions are those of OpenCV (Weng, Cohen and Herniou, PAMI 14:965, 1992). They map ideal
+coordinates (x, y) to distorted ones (x', y'), with r2 = x^2 + y^2, r4 = r2^2 and r6 = r2^3:
 
-    x' = x (1 + k1 r2 + k2 r4 + k3 r6) + 2 p1 x y + p2 (r2 + 2 x2) + s1 r2 + s2 r4
-    y' = y (1 + k1 r2 + k2 r4 + k3 r6) + p1 (r2 + 2 y2) + 2 p2 x y + s3 r2 + s4 r4
+    x' = x (1 + k1 r2 + k2 r4 + k3 r6) + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r4
+    y' = y (1 + k1 r2 + k2 r4 + k3 r6) + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r4
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ _NEWTON_STEPS = 40
 
 
 def components_first(batch: tuple[int, ...], *components: int) -> Array:
-    """Zeros of shape (*batch, *components) in which each component is contiguous in memory.
+    """Return zeros of shape (*batch, *components) in which each component is contiguous in memory.
 
-    Arithmetic on one component of many points then runs along memory.
+    Arithmetic on one component of many points is then faster, because it reads memory in order.
     """
     first, last = len(components), len(components) + len(batch)
     return np.zeros((*components, *batch)).transpose(*range(first, last), *range(first))
@@ -33,9 +34,10 @@ def _split(coefficients: Array) -> list[Array]:
 
 
 def distort(xy: Array, coefficients: Array) -> Array:
-    """(..., 2) ideal -> (..., 2) distorted; coefficients (..., 9) in the order `COEFFICIENTS`.
+    """Return the distorted coordinates (..., 2) of ideal coordinates (..., 2), both normalised.
 
-    A part of the model whose coefficients are all zero costs nothing.
+    coefficients : (..., 9) in the order of `COEFFICIENTS`. Terms whose coefficients are all zero
+        are skipped.
     """
     x, y = xy[..., 0], xy[..., 1]
     k1, k2, k3, p1, p2, s1, s2, s3, s4 = _split(coefficients)
@@ -57,7 +59,7 @@ def distort(xy: Array, coefficients: Array) -> Array:
 
 
 def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
-    """(..., 2, 2) derivative of `distort` with respect to the ideal coordinates."""
+    """Return the derivative (..., 2, 2) of `distort` with respect to the ideal coordinates."""
     x, y = xy[..., 0], xy[..., 1]
     k1, k2, k3, p1, p2, s1, s2, s3, s4 = _split(coefficients)
     r2 = x * x + y * y
@@ -87,9 +89,12 @@ def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
 
 
 def coefficient_jacobian(xy: Array, which: Sequence[int] = range(9)) -> Array:
-    """(..., 2, k) derivative of `distort` by k of its coefficients, in which it is linear.
+    """Return the derivative (..., 2, k) of `distort` with respect to k of its coefficients.
 
-    which : indices into `COEFFICIENTS`.
+    `distort` is linear in its coefficients, so the derivative does not depend on their values.
+
+    xy : (..., 2) ideal coordinates.
+    which : the k indices into `COEFFICIENTS`.
     """
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -108,12 +113,10 @@ def coefficient_jacobian(xy: Array, which: Sequence[int] = range(9)) -> Array:
 
 
 def undistort(xy_distorted: Array, coefficients: Array) -> Array:
-    """(..., 2) distorted -> (..., 2) ideal, by Newton's method to machine precision.
+    """Return the ideal coordinates (..., 2) of distorted ones (..., 2), to machine precision.
 
-    Raises
-    ------
-    GeometryError
-        Where the distortion cannot be inverted: beyond the radius at which the map folds over.
+    `distort` is inverted by Newton's method. Raises GeometryError where it cannot be inverted,
+    which is beyond the radius at which the map folds over.
     """
     target = np.asarray(xy_distorted, float)
     if not np.any(coefficients):

@@ -1,7 +1,8 @@
-"""Lens models by name: which intrinsics besides the scale are free, camera by camera.
+"""Names of lens models. A lens model says which intrinsics of a camera are free besides the scale.
 
-A model is a set of groups, its name their names joined by "+": ``kappa+brown``, ``tilt+radial``,
-``k1+k2``. A rig's model is one name for all cameras, or ``left=brown,right=radial``.
+A model is a set of parameter groups. Its name joins their names by "+": ``kappa+brown``,
+``tilt+radial``, ``k1+k2``. The model of a rig is one name for all cameras, or one for each:
+``left=brown,right=radial``.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "s": ("s1", "s3"),
     "centre": ("centre_u_px", "centre_v_px"),
 }
-"""Parameters that are freed together, in the order in which every file lists them.
+"""The parameters of each group, which are freed together. Every file lists them in this order.
 
-Without kappa the image centre acts only through the distortion, where it equals the tangential
-terms to first order and is otherwise a gauge freedom. It is therefore held at the middle of the
-image, and p1 and p2 describe a decentred lens (docs/decisions/003). s2 and s4 are never free: they
-act like s1 and s3, but nearer to the image's corners (docs/decisions/014).
+If kappa is 0, the image centre acts only through the distortion. To first order its effect is that
+of the tangential terms, and otherwise it is a gauge freedom. It is therefore held at the middle of
+the image, and p1 and p2 describe a decentred lens (docs/decisions/003). s2 and s4 are never free:
+they act like s1 and s3, but closer to the corners of the image (docs/decisions/014).
 """
 DISTORTIONS: dict[str, tuple[str, ...]] = {
     "none": (),
@@ -35,18 +36,19 @@ DISTORTIONS: dict[str, tuple[str, ...]] = {
     "brown": ("k1", "k2", "p"),
     "prism": ("k1", "k2", "p", "s"),
 }
-"""Named sets of distortion groups; each contains the one before it."""
+"""Named sets of distortion groups. Each set contains the one before it."""
 KNOWN = f"auto, {', '.join([*DISTORTIONS, *GROUPS])}, joined by +, or LEFT=NAME,RIGHT=NAME"
 
 Model = str | Mapping[str, str] | Sequence[str]
-"""One name for all cameras, "left=NAME,right=NAME", a mapping, or one name per camera."""
+"""A lens model of a rig: one name for all cameras, "left=NAME,right=NAME", a mapping from camera to
+name, or a sequence with one name for each camera."""
 
 
 def groups_of(name: str) -> tuple[str, ...]:
-    """The groups of a model, in the order of `GROUPS`.
+    """Return the groups of the model with this name, in the order of `GROUPS`.
 
-    Raises CalibrationError for an unknown name, and for affine together with tilt, whose effects
-    are the same.
+    Raises CalibrationError for an unknown name, and for affine together with tilt, because both
+    have the same effect on the image.
     """
     found: set[str] = set()
     for part in name.split("+"):
@@ -62,12 +64,12 @@ def groups_of(name: str) -> tuple[str, ...]:
 
 
 def ordered(groups: Iterable[str]) -> tuple[str, ...]:
-    """The groups in the order of `GROUPS`."""
+    """Return the given groups in the order of `GROUPS`."""
     return tuple(g for g in GROUPS if g in set(groups))
 
 
 def name_of(groups: Iterable[str]) -> str:
-    """The shortest name of a set of groups."""
+    """Return the shortest name of a set of groups."""
     wanted = set(groups)
     lens = [g for g in ("kappa", "affine", "tilt") if g in wanted]
     distortion = wanted & {"k1", "k2", "p", "s"}
@@ -78,14 +80,14 @@ def name_of(groups: Iterable[str]) -> str:
 
 
 def parameters_of(name: str) -> tuple[str, ...]:
-    """Names of the free intrinsics besides the scale."""
+    """Return the names of the intrinsics that are free in this model besides the scale."""
     return tuple(p for g in groups_of(name) for p in GROUPS[g])
 
 
 def models_by_camera(model: Model, cameras: Sequence[str]) -> tuple[str, ...]:
-    """One name per camera; "auto" for a camera that the model does not name.
+    """Return the model's name for each camera, "auto" for a camera that ``model`` does not mention.
 
-    Raises CalibrationError for unknown models and cameras, and for a sequence whose length is not
+    Raises CalibrationError for an unknown model or camera, and for a sequence whose length is not
     the number of cameras.
     """
     if isinstance(model, str) and "=" in model:
@@ -112,14 +114,15 @@ def models_by_camera(model: Model, cameras: Sequence[str]) -> tuple[str, ...]:
 
 
 def joint_name(names: Sequence[str], cameras: Sequence[str]) -> str:
-    """One name where all cameras have the same, else ``left=NAME,right=NAME``."""
+    """Return the common name if all cameras have the same model, else ``left=NAME,right=NAME``."""
     if len(set(names)) == 1:
         return names[0]
     return ",".join(f"{camera}={name}" for camera, name in zip(cameras, names))
 
 
 def checked_model(model: str) -> str:
-    """The model itself, checked before the cameras are known.
+    """Return ``model`` unchanged after a check of its names. The cameras need not be known for
+    this.
 
     Raises CalibrationError for an unknown name.
     """

@@ -1,4 +1,5 @@
-"""Rigid transformations as (rotation, translation), with GTSAM's Pose3 tangent order."""
+"""Rigid transformations as a rotation and a translation. Tangent vectors have the order of GTSAM's
+Pose3: rotation first."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from telerig.arrays import Array
 
 
 def hat(v: ArrayLike) -> Array:
-    """(..., 3) -> (..., 3, 3) cross-product matrix."""
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3): hat(v) w = v x w."""
     v = np.asarray(v, float)
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
@@ -21,12 +22,16 @@ def hat(v: ArrayLike) -> Array:
 
 
 def across(direction: ArrayLike) -> Array:
-    """(3,) -> (3, 2) orthonormal vectors perpendicular to it."""
+    """Return two orthonormal vectors, the columns of (3, 2), that are perpendicular to a direction
+    (3,)."""
     return np.asarray(np.linalg.svd(np.asarray(direction, float)[None])[2][1:].T)
 
 
 def rotation_from_rotvec(rotvec_rad: ArrayLike) -> Array:
-    """(..., 3) rotation vectors -> (..., 3, 3); Rodrigues' formula, exact near zero."""
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad.
+
+    This is Rodrigues' formula in a form that is also exact near zero.
+    """
     w = np.asarray(rotvec_rad, float)
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     k = hat(w)
@@ -35,10 +40,11 @@ def rotation_from_rotvec(rotvec_rad: ArrayLike) -> Array:
 
 
 def rotvec_from_rotation(rotation: ArrayLike) -> Array:
-    """(..., 3, 3) -> (..., 3) rotation vectors, angles in [0, pi].
+    """Return the rotation vectors (..., 3) of rotation matrices (..., 3, 3), with angles in [0,
+    pi].
 
-    By the unit quaternion (Shepperd, J. Guidance and Control 1, 1978): every column of 4 q q^T is
-    a multiple of q, and the longest one is taken.
+    The unit quaternion q is computed first (Shepperd, J. Guidance and Control 1, 1978): every
+    column of 4 q q^T is a multiple of q, and the longest column is used.
     """
     r = np.asarray(rotation, float)
     trace = np.trace(r, axis1=-2, axis2=-1)[..., None]
@@ -58,7 +64,10 @@ def rotvec_from_rotation(rotation: ArrayLike) -> Array:
 
 
 def nearest_rotation(matrix: ArrayLike) -> Array:
-    """(..., 3, 3) -> the nearest proper rotation in the Frobenius norm (SVD)."""
+    """Return the proper rotation (..., 3, 3) that is nearest to each matrix (..., 3, 3).
+
+    Distance is measured by the Frobenius norm; the solution uses the singular value decomposition.
+    """
     u, _, vt = np.linalg.svd(np.asarray(matrix, float))
     u[..., :, 2] *= np.linalg.det(u @ vt)[..., None]
     return np.asarray(u @ vt)
@@ -66,9 +75,10 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """``target_from_source``: x_target = rotation @ x_source + translation.
+    """A rigid transformation ``target_from_source``: x_target = rotation @ x_source + translation.
 
-    rotation : (..., 3, 3); translation_mm : (..., 3).
+    rotation : (..., 3, 3).
+    translation_mm : (..., 3).
     """
 
     rotation: Array
@@ -87,7 +97,8 @@ class Pose:
         return rotvec_from_rotation(self.rotation)
 
     def apply(self, points_mm: ArrayLike) -> Array:
-        """(..., N, 3) -> (..., N, 3)."""
+        """Return the points (..., N, 3) in target coordinates, for N points (..., N, 3) in source
+        coordinates."""
         rotated = np.asarray(points_mm, float) @ self.rotation.mT
         return np.asarray(rotated + self.translation_mm[..., None, :])
 
@@ -96,7 +107,10 @@ class Pose:
         return Pose(back, -np.einsum("...ij,...j->...i", back, self.translation_mm))
 
     def adjoint(self) -> Array:
-        """(..., 6, 6): T Exp(x) T^-1 = Exp(adjoint x) for tangents x (rotation, translation)."""
+        """Return the adjoint matrices (..., 6, 6): T Exp(x) T^-1 = Exp(adjoint x).
+
+        T is this pose, and x is a tangent vector (rotation, translation).
+        """
         out = np.zeros((*self.rotation.shape[:-2], 6, 6))
         out[..., :3, :3] = out[..., 3:, 3:] = self.rotation
         out[..., 3:, :3] = hat(self.translation_mm) @ self.rotation

@@ -1,16 +1,18 @@
-"""The camera model as pure functions: from camera coordinates to pixels, and its derivatives.
+"""The camera model as pure functions: pixels of points in camera coordinates, and derivatives.
 
-Steps (all about one centre): residual perspective kappa, distortion, sensor tilt, affine map.
-Sensor tilt after Steger (IJCV 123:121, 2017), in one formula for both kinds of lens. With q the
-tangent vector of the tilt and w = 1 / image distance (object-space mm):
+The steps are residual perspective (kappa), distortion, sensor tilt and an affine map, all about
+one centre. The tilt follows Steger (IJCV 123:121, 2017), in one formula for both kinds of
+telecentric lens. Let x be the distorted coordinates, y the coordinates on the tilted sensor, q the
+tangent vector of the tilt and w = 1 / image distance (1/mm, in object space):
 
     y = S(q) x / (1 - w q.x),    S(q) = I + q q^T / (1 + sqrt(1 + q.q))
 
-w = 0 is the bilateral telecentric lens (an affine stretch, even in q: the sign of the tilt is
-unobservable); w > 0 the object-side telecentric one (a homography).
+A lens that is telecentric on both sides has w = 0. The map is then an affine stretch that is even
+in q, so the sign of the tilt cannot be observed. A lens that is telecentric on the object side only
+has w > 0, and the map is a homography.
 
-For points behind a window the first step is `telerig.rig.windows`; wall_x_rad and wall_y_rad turn
-the window's stated normal (`Wall.turned`) and have no effect without a window.
+For points behind a window the first step is `telerig.rig.windows`. The parameters wall_x_rad and
+wall_y_rad turn the window's stated normal (`Wall.turned`). They have no effect without a window.
 """
 
 from __future__ import annotations
@@ -37,25 +39,29 @@ _WALL = slice(18, 20)
 
 
 def intrinsics_from(parameters: Mapping[str, float]) -> Array:
-    """(20,) in the order of `PARAMETERS`; wall_x_rad and wall_y_rad are 0 where they are missing.
+    """Return the intrinsics (20,) in the order of `PARAMETERS`, from a mapping from name to value.
 
-    Raises KeyError for any other parameter that is missing.
+    wall_x_rad and wall_y_rad are 0 if they are missing. Raises KeyError if another one is missing.
     """
     wall = dict.fromkeys(PARAMETERS[_WALL], 0.0)
     return np.array([(wall | dict(parameters))[name] for name in PARAMETERS], float)
 
 
 def standing_wall(intrinsics: Array, wall: Wall) -> Wall:
-    """The window with its normal turned by wall_x_rad and wall_y_rad of the intrinsics."""
+    """Return the window after its normal has been turned by wall_x_rad and wall_y_rad of the
+    intrinsics."""
     return wall.turned(intrinsics[_WALL])
 
 
 def pixel_from_camera(
     points_mm: Array, intrinsics: Array, rho_mm: float, wall: Wall | None = None
 ) -> Array:
-    """(..., 3) camera coordinates -> (..., 2) pixels; intrinsics (20,) ordered as `PARAMETERS`.
+    """Return the pixels (..., 2) of points (..., 3) in camera coordinates.
 
-    wall : the points are in the water behind it; raises what `windows.ideal_from_water` raises.
+    intrinsics : (20,) in the order of `PARAMETERS`.
+    wall : the window between the camera and the points, which are then in the water; or None.
+
+    Raises the errors of `windows.ideal_from_water`.
     """
     if wall is None:
         telecentric = points_mm[..., :2] / (1 + intrinsics[_KAPPA] * points_mm[..., 2:3])
@@ -67,7 +73,10 @@ def pixel_from_camera(
 
 
 def ideal_from_pixel(uv_px: Array, intrinsics: Array, rho_mm: float) -> Array:
-    """(..., 2) pixels -> (..., 2) telecentric coordinates (mm) at depth 0: the ray's origin."""
+    """Return the telecentric coordinates (..., 2) in mm of pixels (..., 2).
+
+    The telecentric coordinates of a pixel are the point at which its ray in air crosses depth 0.
+    """
     v = (uv_px[..., 1] - intrinsics[_CV]) / (intrinsics[_SCALE] * intrinsics[_ASPECT])
     u = (uv_px[..., 0] - intrinsics[_CU]) / intrinsics[_SCALE] - intrinsics[_SKEW] * v
     distorted = distorted_from_sensor(np.stack([u, v], -1), intrinsics)
@@ -75,7 +84,9 @@ def ideal_from_pixel(uv_px: Array, intrinsics: Array, rho_mm: float) -> Array:
 
 
 def sensor_from_distorted(xy_mm: Array, intrinsics: Array) -> Array:
-    """(..., 2) -> (..., 2): the tilted sensor plane."""
+    """Return the coordinates (..., 2) on the tilted sensor of distorted coordinates (..., 2), in
+    mm.
+    """
     q, w = intrinsics[_TX : _TY + 1], intrinsics[_W]
     if not q.any():
         return xy_mm
@@ -88,7 +99,7 @@ def sensor_from_distorted(xy_mm: Array, intrinsics: Array) -> Array:
 
 
 def distorted_from_sensor(xy_mm: Array, intrinsics: Array) -> Array:
-    """(..., 2) -> (..., 2): inverse of `sensor_from_distorted`, in closed form."""
+    """Return the inverse of `sensor_from_distorted`, in closed form."""
     q = intrinsics[_TX : _TY + 1]
     root = np.sqrt(1 + q @ q)
     unstretched = xy_mm - ((xy_mm @ q) / (root * (1 + root)))[..., None] * q
@@ -110,13 +121,14 @@ def pixel_jacobians(
     wall: Wall | None = None,
     free: Sequence[int] = range(len(PARAMETERS)),
 ) -> tuple[Array, Array, Array]:
-    """Pixels with their derivatives.
+    """Return the pixels of points and their derivatives.
 
-    points_mm : (..., 3) camera coordinates.  free : indices into `PARAMETERS` of the F intrinsics
-    by which derivatives are wanted.  wall : as in `pixel_from_camera`.
+    points_mm : (..., 3) in camera coordinates.
+    free : indices into `PARAMETERS` of the F intrinsics for which derivatives are wanted.
+    wall : as in `pixel_from_camera`.
 
-    Returns (..., 2) pixels, (..., 2, 3) with respect to the camera point and (..., 2, F) with
-    respect to the free intrinsics.
+    Returns the pixels (..., 2), their derivative (..., 2, 3) with respect to the point, and their
+    derivative (..., 2, F) with respect to the free intrinsics.
     """
     kappa, batch = intrinsics[_KAPPA], points_mm.shape[:-1]
     if wall is None:
@@ -149,7 +161,11 @@ def pixel_jacobians(
 def _lens_jacobians(
     ideal: Array, intrinsics: Array, rho_mm: float, free: Sequence[int]
 ) -> tuple[Array, Array, Array]:
-    """Pixels, (..., 2, 2) by telecentric coordinates, (..., 2, F) by all but kappa and wall."""
+    """Return pixels (..., 2) and their derivatives, starting from telecentric coordinates (..., 2).
+
+    The derivatives are (..., 2, 2) with respect to these coordinates and (..., 2, F) with respect
+    to the F free intrinsics; the columns of kappa and of the window stay 0 for the caller to fill.
+    """
     normal, coefficients = ideal / rho_mm, intrinsics[_DISTORTION]
     distorted = distortion.distort(normal, coefficients) * rho_mm
     scale, aspect, skew = intrinsics[[_SCALE, _ASPECT, _SKEW]]
@@ -185,7 +201,7 @@ def _lens_jacobians(
 
 
 def _product(left: Array, right: Array) -> Array:
-    """(..., 2, 2) times (..., 2, k), component by component."""
+    """Return the product of matrices (..., 2, 2) and (..., 2, k), one component at a time."""
     batch = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])
     out = components_first(batch, *right.shape[-2:])
     for i in range(2):
@@ -195,7 +211,12 @@ def _product(left: Array, right: Array) -> Array:
 
 
 def tilt_jacobians(xy_mm: Array, intrinsics: Array) -> tuple[Array, Array, Array]:
-    """Sensor coordinates, (..., 2, 2) by the coordinates, (..., 2, 3) by tilt_x, tilt_y, w."""
+    """Return the coordinates on the tilted sensor and their derivatives, from distorted
+    coordinates.
+
+    Returns the coordinates (..., 2), their derivative (..., 2, 2) with respect to the distorted
+    coordinates, and (..., 2, 3) with respect to tilt_x, tilt_y and w.
+    """
     q, w = intrinsics[_TX : _TY + 1], intrinsics[_W]
     root = np.sqrt(1 + q @ q)
     f = 1 / (1 + root)

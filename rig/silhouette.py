@@ -1,15 +1,17 @@
 """The shape of a nearly ellipsoidal body from its silhouettes in two cameras.
 
-The body is x(s) = centre + A s (1 + h(s)), s on the unit sphere, A symmetric (an ellipsoid), h a
-sum of spherical harmonics of degree 3 and more. An affine camera maps the body's silhouette as it
-maps the body, so everything is computed in the space of s. There the body is a perturbed unit
-sphere. To first order its rim is the great circle perpendicular to the viewing direction, and the
-outline's radial displacement is h along that circle (the trace of h). A point of the circle is
-W (cos phi, sin phi).
+The body is x(s) = centre + A s (1 + h(s)). Here s lies on the unit sphere, A is a symmetric matrix
+(an ellipsoid), and h is a sum of spherical harmonics of degree 3 and higher. An affine camera maps
+the silhouette of the body in the same way as the body itself, so everything is computed in the
+space of s. There the body is a perturbed unit sphere. To first order its rim is the great circle
+perpendicular to the viewing direction, and the radial displacement of the outline equals h along
+this circle, which is called the trace of h. A point on the circle is W (cos phi, sin phi), where
+the columns of W (3, 2) are orthonormal.
 
-An isotropic Gaussian h of degree l with variance sigma^2 per (unit mean square) coefficient has the
-covariance sigma^2 (2 l + 1) P_l(cos) along the circle (addition theorem), so the variance of its
-harmonic k is (2 l + 1) times the coefficient of cos k phi in P_l(cos phi).
+Let h be isotropic and Gaussian, of degree l, with variance sigma^2 for each coefficient (harmonics
+of unit mean square). Its covariance along the circle is sigma^2 (2 l + 1) P_l(cos) by the addition
+theorem, so the variance of harmonic k of the trace is (2 l + 1) times the coefficient of cos k phi
+in P_l(cos phi).
 """
 
 from __future__ import annotations
@@ -27,14 +29,17 @@ TRACE_VARIANCE = {
     (4, 2): 45 / 16,
     (4, 4): 315 / 64,
 }
-"""(degree, k) -> variance of cos k phi's (and sin k phi's) coefficient for sigma = 1."""
+"""Variance of the coefficient of cos k phi (and of sin k phi) for sigma = 1, by (degree, k)."""
 
 _SAMPLES = 8
 _FLATTEST = 0.9
 
 
 def third_degree(directions: Array) -> Array:
-    """(..., 3) unit vectors -> (..., 7) real harmonics of degree 3, each of unit mean square."""
+    """Return the 7 real spherical harmonics of degree 3 (..., 7) at unit vectors (..., 3).
+
+    Each harmonic has unit mean square over the sphere.
+    """
     x, y, z = np.moveaxis(directions, -1, 0)
     zonal = [np.sqrt(7) / 2 * c * (5 * c * c - 3) for c in (x, y, z)]
     planar = [p * (q * q - r * r) for p, q, r in ((x, y, z), (y, z, x), (z, x, y))]
@@ -43,10 +48,12 @@ def third_degree(directions: Array) -> Array:
 
 
 def third_degree_traces(frames: Array) -> tuple[Array, Array]:
-    """Traces of `third_degree` on the circle W (cos phi, sin phi).
+    """Return the traces of `third_degree` on the circle W (cos phi, sin phi).
 
-    frames : (..., 3, 2) orthonormal columns.  Returns two (..., 2, 7): the coefficients of
-    (cos phi, sin phi) and of (cos 3 phi, sin 3 phi); the trace has no other harmonics.
+    frames : (..., 3, 2) W, with orthonormal columns.
+
+    Returns two arrays (..., 2, 7): the coefficients of (cos phi, sin phi) and those of (cos 3 phi,
+    sin 3 phi). A trace of degree 3 has no other harmonics.
     """
     phi = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
     circle = np.stack([np.cos(phi), np.sin(phi)])
@@ -58,10 +65,12 @@ def third_degree_traces(frames: Array) -> tuple[Array, Array]:
 
 
 def zonal_traces(projection: Array) -> tuple[Array, Array]:
-    """Traces of h(s) = P_3(s . n), axisymmetric about n.
+    """Return the traces of h(s) = P_3(s . n), which is axisymmetric about the unit vector n.
 
-    projection : (..., 2) q = W^T n, where the pole appears in the unit circle.  Returns two
-    (..., 2) as `third_degree_traces`: (15/8 |q|^2 - 3/2) q, and 5/8 q^3, q taken as complex.
+    projection : (..., 2) q = W^T n, the position of the pole n in the unit circle.
+
+    Returns two arrays (..., 2), the coefficients of the first and of the third harmonic as in
+    `third_degree_traces`: (15/8 |q|^2 - 3/2) q, and 5/8 q^3 with q taken as a complex number.
     """
     x, y = projection[..., 0], projection[..., 1]
     first = (1.875 * (x * x + y * y) - 1.5)[..., None] * projection
@@ -71,14 +80,16 @@ def zonal_traces(projection: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class EllipsePair:
-    """The silhouettes' ellipses of one ellipsoid in two affine cameras, in mm.
+    """The elliptic silhouettes of one ellipsoid in two affine cameras, in mm.
 
-    shared : (..., 3) unit vector perpendicular to both viewing directions.
-    sides : two (..., 3) unit vectors, each perpendicular to it and to one viewing direction.
-    moments_mm2 : two (..., 2, 2), the ellipse's A A^T in (shared, side).
-    rims : two (..., 2, 2), in (cos phi, sin phi): column 0 is where the rim on the unit sphere
-        reaches farthest along the shared coordinate, column 1 a quarter turn from it, on the
-        positive side.
+    shared : (..., 3) unit vector perpendicular to both viewing directions. Both cameras measure the
+        coordinate along it.
+    sides : two arrays (..., 3) of unit vectors, each perpendicular to ``shared`` and to the viewing
+        direction of its camera.
+    moments_mm2 : two arrays (..., 2, 2), A A^T of the ellipse in the axes (shared, side).
+    rims : two arrays (..., 2, 2) in the components (cos phi, sin phi). Column 0 is the point of the
+        rim on the unit sphere that reaches farthest along the shared coordinate. Column 1 lies a
+        quarter turn from it, on the positive side.
     """
 
     shared: Array
@@ -87,11 +98,13 @@ class EllipsePair:
     rims: tuple[Array, Array]
 
     def frames(self, coupling: Array) -> tuple[Array, Array]:
-        """Two (..., 3, 2) W: a rim is W (cos phi, sin phi).
+        """Return W (..., 3, 2) of both cameras; the rim in a camera is W (cos phi, sin phi).
 
-        Both rims contain the direction of the shared coordinate, the first unit vector here. The
-        other direction is (0, 1, 0) for the first rim and (0, r, sqrt(1 - r^2)) for the second.
-        Silhouettes do not determine the coupling r (...), see `coupling_of`.
+        Both rims contain the direction of the shared coordinate, which is the first unit vector
+        here. The other direction is (0, 1, 0) for the first rim and (0, r, sqrt(1 - r^2)) for the
+        second.
+
+        coupling : (...) the number r. Silhouettes do not determine it; see `coupling_of`.
         """
         zero, one = np.zeros_like(coupling), np.ones_like(coupling)
         second = np.stack([zero, coupling, np.sqrt(1 - coupling**2)], -1)
@@ -101,16 +114,21 @@ class EllipsePair:
         return left, right
 
     def coupling_of(self, moments_mm2: Array) -> Array:
-        """(...): partial correlation of the two sides, given the shared coordinate, of A A^T."""
+        """Return the coupling (...) of ellipsoids A A^T (..., 3, 3).
+
+        The coupling is the partial correlation of the two side coordinates, given the shared
+        coordinate.
+        """
         basis = np.stack([self.shared, *self.sides], -2)
         return _coupling(basis @ moments_mm2 @ basis.mT)
 
 
 def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -> EllipsePair:
-    """The pair of silhouettes of one ellipsoid.
+    """Return the pair of silhouettes that one ellipsoid has in two cameras.
 
-    jacobians : two (..., 2, 3), px per mm.  axes_px : two (..., 2, 2) whose columns are the
-    ellipse's semi-axes.
+    jacobians : two arrays (..., 2, 3), the derivative of the pixels with respect to the point
+        (px/mm).
+    axes_px : two arrays (..., 2, 2) whose columns are the semi-axes of the ellipse in the image.
     """
     across = [np.cross(j[..., 0, :], j[..., 1, :]) for j in jacobians]
     view = [d / np.linalg.norm(d, axis=-1, keepdims=True) for d in across]
@@ -127,11 +145,11 @@ def ellipse_pair(jacobians: tuple[Array, Array], axes_px: tuple[Array, Array]) -
 
 
 def most_spherical(pair: EllipsePair) -> Array:
-    """(..., 3, 3) A A^T in mm^2 of the most spherical ellipsoid with these silhouettes.
+    """Return A A^T (..., 3, 3) in mm^2 of the most spherical ellipsoid that has these silhouettes.
 
-    They determine five of its six parameters; both give the extent along the shared coordinate, of
-    which the geometric mean is taken. The sixth parameter is the one with the largest
-    det / trace^3.
+    Two silhouettes determine five of the six parameters of an ellipsoid. Both give the extent along
+    the shared coordinate; their geometric mean is used. The sixth parameter is chosen such that det
+    / trace^3 of A A^T is largest.
     """
     inverse = np.linalg.inv(np.stack([pair.shared, *pair.sides], -2))
     moments = _joined(pair.moments_mm2)
@@ -141,10 +159,13 @@ def most_spherical(pair: EllipsePair) -> Array:
 
 
 def oblate_spheroid(pair: EllipsePair) -> tuple[Array, Array]:
-    """The oblate spheroid nearest to these silhouettes: its pole (..., 3) from its centre, A A^T.
+    """Return the pole and A A^T of the oblate spheroid that is nearest to these silhouettes.
 
-    The long semi-axis of every silhouette is the equator's radius; the short one gives the pole's
-    inclination in that view up to a sign, which follows from the shared coordinate. Units mm.
+    The long semi-axis of every silhouette is the radius of the equator. The short one gives the
+    inclination of the pole in that view except for its sign, which follows from the shared
+    coordinate.
+
+    Returns the pole (..., 3) in mm relative to the centre, and A A^T (..., 3, 3) in mm^2.
     """
     equator2, leaning = [], []
     for moments in pair.moments_mm2:
@@ -173,7 +194,10 @@ def _coupling(moments: Array) -> Array:
 
 
 def _rim(extents: Array) -> Array:
-    """(..., 2, 2) rows: extents along the shared coordinate and across -> `EllipsePair.rims`."""
+    """Return `EllipsePair.rims` (..., 2, 2) from the extents of an ellipse (..., 2, 2).
+
+    extents : row 0 along the shared coordinate, row 1 along the side.
+    """
     shared = extents[..., 0, :] / np.linalg.norm(extents[..., 0, :], axis=-1, keepdims=True)
     across = np.stack([-shared[..., 1], shared[..., 0]], -1)
     sign = np.sign((across * extents[..., 1, :]).sum(-1, keepdims=True))
@@ -181,7 +205,10 @@ def _rim(extents: Array) -> Array:
 
 
 def _joined(flat: tuple[Array, Array]) -> Array:
-    """(..., 3, 3) second moments in the basis (shared, first's side, second's side)."""
+    """Return second moments (..., 3, 3) in the axes (shared, first side, second side).
+
+    The moment between the two sides is left at 0, because silhouettes do not determine it.
+    """
     shared2 = np.sqrt(flat[0][..., 0, 0] * flat[1][..., 0, 0])
     moments = np.zeros((*shared2.shape, 3, 3))
     moments[..., 0, 0] = shared2
@@ -193,7 +220,14 @@ def _joined(flat: tuple[Array, Array]) -> Array:
 
 
 def _most_spherical(moments: Array, gram: Array) -> Array:
-    """The entry (1, 2) that makes det(moments) / trace(gram moments)^3 stationary, det > 0."""
+    """Return the moment between both sides that makes the ellipsoid most spherical.
+
+    It makes det(moments) / trace(gram moments)^3 stationary, with a positive determinant.
+
+    moments : (..., 3, 3) in the axes (shared, first side, second side).
+    gram : (..., 3, 3) the matrix with which the trace is taken, because these axes are not
+        orthogonal.
+    """
     p, b, c = moments[..., 0, 0], moments[..., 0, 1], moments[..., 0, 2]
     d, e = moments[..., 1, 1], moments[..., 2, 2]
     det0, det1, det2 = p * d * e - b * b * e - c * c * d, 2 * b * c, -p

@@ -1,6 +1,7 @@
-"""The flat target of dots: its nominal geometry and the numbering of its dots.
+"""The flat target: the nominal positions of its dots, and the numbers (ids) by which dots are
+known.
 
-Dot (row r, column c) is nominally at (c * pitch_x, r * pitch_y, 0); z = x cross y.
+The dot in row r and column c is nominally at (c * pitch_x, r * pitch_y, 0); z = x cross y.
 """
 
 from __future__ import annotations
@@ -19,28 +20,29 @@ MarkStyle = Literal["large", "ring", "missing"]
 Extent = Literal["bounded", "unbounded"]
 
 _HALF = 4096
-"""Rows and columns of an unbounded grid lie within +-4095 of the origin mark."""
+"""The rows and columns of an unbounded grid lie within +-4095 of the origin mark."""
 QUARTER_TURNS: tuple[Ints, ...] = tuple(
     np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), k) for k in range(4)
 )
-"""Rotations of (column, row) by multiples of 90 degrees."""
+"""The rotations of (column, row) by 0, 90, 180 and 270 degrees."""
 
 
 @dataclass(frozen=True)
 class Target:
     """Nominal geometry of the target, as `[target]` in `rig.toml` states it.
 
-    layout : "grid" or "points".
-    rows, columns : of the grid; on an unbounded grid the block in which ``scale_dots`` counts.
-    pitch_mm : (pitch_x, pitch_y).
-    points_mm : (N, 2) of the layout "points", else (0, 2).
-    marks : (row, column) of each mark; of the layout "points", (0, dot).
-    print_sigma_mm, flatness_sigma_mm : how far a dot may be from its nominal place, in the plane
-        and out of it.
-    scale_dots : two dot ids whose distance ``scale_distance_mm`` +- ``scale_sigma_mm`` is known;
-        None when the nominal pitch itself sets the scale.
-    two_sided : the plate is transparent and may be seen from behind, through
-        ``plate_thickness_mm`` of material with refractive index ``plate_index``.
+    layout : "grid", or "points" for dots at listed positions.
+    rows, columns : size of the grid. On an unbounded grid, size of the block in which the ids in
+        ``scale_dots`` are counted.
+    pitch_mm : (pitch_x, pitch_y), the distances between neighbouring columns and rows.
+    points_mm : (N, 2) positions of the N dots for the layout "points"; None for a grid.
+    marks : (row, column) of each mark; (0, dot) for the layout "points".
+    print_sigma_mm, flatness_sigma_mm : standard deviations of a dot's true position from the
+        nominal one, in the plane and perpendicular to it.
+    scale_dots : ids of two dots whose distance ``scale_distance_mm`` +- ``scale_sigma_mm`` is
+        known; None if the nominal pitch sets the scale.
+    two_sided : whether the plate is transparent and may be seen from behind, through
+        ``plate_thickness_mm`` of a material with refractive index ``plate_index``.
     """
 
     layout: Layout = "grid"
@@ -65,11 +67,13 @@ class Target:
 
     @property
     def bounded(self) -> bool:
-        """True when every dot of the target is known by its id beforehand."""
+        """Whether the ids of all dots are known in advance."""
         return self.layout == "points" or self.extent == "bounded"
 
     def ids(self) -> Ints:
-        """(N,) ids of all dots of a bounded target, missing marks left out."""
+        """Return the ids (N,) of all N dots of a bounded target, without marks that are missing
+        dots.
+        """
         if self.layout == "points":
             return np.arange(len(self._points()))
         every = np.arange(self.rows * self.columns)
@@ -78,7 +82,10 @@ class Target:
         return every
 
     def id_from_row_column(self, row: ArrayLike, column: ArrayLike) -> Ints:
-        """(...,) ids; any integer rows and columns on an unbounded grid."""
+        """Return the ids (...) of the dots in the given rows and columns (...).
+
+        On an unbounded grid rows and columns may be negative.
+        """
         r, c = np.asarray(row, np.int64), np.asarray(column, np.int64)
         if self.layout == "points":
             return c.copy()
@@ -87,7 +94,8 @@ class Target:
         return np.asarray((r + _HALF) * (2 * _HALF) + (c + _HALF))
 
     def row_column_from_id(self, dot: ArrayLike) -> tuple[Ints, Ints]:
-        """The inverse of `id_from_row_column`; (0, dot) for the layout "points"."""
+        """Return the rows (...) and columns (...) of dot ids; for the layout "points" they are (0,
+        dot)."""
         d = np.asarray(dot, np.int64)
         if self.layout == "points":
             return np.zeros_like(d), d.copy()
@@ -96,14 +104,14 @@ class Target:
         return d // (2 * _HALF) - _HALF, d % (2 * _HALF) - _HALF
 
     def known_id(self, dot: ArrayLike) -> NDArray[np.bool_]:
-        """(...,) whether the target can have a dot of this id."""
+        """Return (...) whether the target can have a dot with each id."""
         d = np.asarray(dot, np.int64)
         if self.bounded:
             return np.isin(d, self.ids())
         return (d >= 0) & (d < (2 * _HALF) ** 2)
 
     def nominal_mm(self, dot: ArrayLike) -> Array:
-        """(..., 3) nominal place of each dot id, in the target's frame."""
+        """Return the nominal positions (..., 3) of the dots with these ids, in the target frame."""
         row, column = self.row_column_from_id(dot)
         if self.layout == "points":
             xy = self._points()[column]
@@ -112,20 +120,21 @@ class Target:
         return np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], -1).astype(float)
 
     def is_mark(self, dot: ArrayLike) -> NDArray[np.bool_]:
-        """(...,) whether each dot id is a mark."""
+        """Return (...) whether each dot id belongs to a mark."""
         if not self.marks:
             return np.zeros(np.shape(dot), bool)
         return np.isin(np.asarray(dot), self.id_from_row_column(*np.transpose(self.marks)))
 
     def diameter_mm(self, dot: ArrayLike) -> Array:
-        """(...,) nominal outer diameter of each dot."""
+        """Return the nominal outer diameter (...) of each dot."""
         mark = self.mark_diameter_mm if self.mark_diameter_mm else self.dot_diameter_mm
         return np.where(self.is_mark(dot), mark, self.dot_diameter_mm).astype(float)
 
     def symmetry_order(self) -> int:
-        """How many rotations by multiples of 90 degrees leave the nominal target unchanged.
+        """Return how many of the four rotations by multiples of 90 degrees leave the target
+        unchanged.
 
-        On an unbounded grid a rotation may be combined with a shift. It is 1 for the layout
+        On an unbounded grid a rotation may be combined with a shift. The result is 1 for the layout
         "points".
         """
         if self.layout == "points":
@@ -133,16 +142,17 @@ class Target:
         return sum(self._unchanged_by(turn) for turn in QUARTER_TURNS)
 
     def mirror_images_differ(self) -> bool:
-        """Whether the marks of a grid tell it from its mirror image."""
+        """Return whether the marks of a grid distinguish it from its mirror image."""
         mirrored = (turn * np.array([[-1], [1]]) for turn in QUARTER_TURNS)
         return bool(self.marks) and not any(self._unchanged_by(turn) for turn in mirrored)
 
     def marks_column_row(self) -> Ints:
-        """(M, 2) column and row of each mark."""
+        """Return the column and row (K, 2) of each of the K marks."""
         return np.array(self.marks, np.int64).reshape(-1, 2)[:, ::-1]
 
     def _unchanged_by(self, turn: Ints) -> bool:
-        """turn : (2, 2) rotation of (column, row), with or without a reflection."""
+        """Return whether ``turn`` (2, 2), a rotation or reflection of (column, row), keeps the
+        marks in place."""
         marks, swapped = self.marks_column_row(), turn[0, 0] == 0
         if swapped and not np.isclose(*self.pitch_mm):
             return False

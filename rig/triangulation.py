@@ -1,7 +1,8 @@
-"""Points in space from their pixels: mid-point of the rays, maximum likelihood.
+"""Triangulation: points in space from their pixels, by the mid-point of rays or maximum likelihood.
 
-`triangulate` takes two cameras that see every point, `triangulate_views` any number of cameras of
-which each point is seen by some."""
+`triangulate` takes two cameras that both see every point. `triangulate_views` takes any number of
+cameras, and each point may be seen by only some of them.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +27,18 @@ _ROWS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @dataclass(frozen=True)
 class Triangulation:
-    """points_mm : (..., 3) in the rig frame.
+    """Triangulated points with their covariance.
 
-    covariance_mm2 : (..., 3, 3) of the measurement; where a calibration triangulates, the
-        calibration's own uncertainty is added, which measurement_covariance_mm2 leaves out.
-    ray_miss_mm : (...,) signed distance of the two rays, along their common perpendicular
-        (first direction x second direction), from the first ray to the second. Of
-        `triangulate_views` (..., C): the distance of each of the C cameras' rays from the point,
-        NaN where the camera does not see it.
-    seen_by : (...,) how many cameras saw each point; None: two saw all. A point that fewer than
-        two saw has no place: its numbers are NaN.
+    points_mm : (..., 3) in the rig frame.
+    covariance_mm2 : (..., 3, 3) covariance of the points. If a calibration triangulates, it
+        contains the calibration's own uncertainty.
+    measurement_covariance_mm2 : (..., 3, 3) the part of it that comes from the noise of the pixels.
+    ray_miss_mm : (...) signed distance from the first ray to the second, along their common
+        perpendicular (first direction x second direction). `triangulate_views` gives (..., C)
+        instead, the distance of the point from the ray of each of the C cameras, NaN for a camera
+        that does not see it.
+    seen_by : (...) number of cameras that saw each point; None if two cameras saw all points. A
+        point that fewer than two cameras saw has NaN in all other arrays.
     """
 
     points_mm: Array
@@ -46,16 +49,20 @@ class Triangulation:
 
     @property
     def unplaced(self) -> int:
-        """The number of points that fewer than two cameras saw."""
+        """The number of points that fewer than two cameras saw, so that they have no position."""
         return 0 if self.seen_by is None else int((self.seen_by < 2).sum())
 
 
 def midpoint(
     origin_a: Array, direction_a: Array, origin_b: Array, direction_b: Array
 ) -> tuple[Array, Array]:
-    """(..., 3) middle of the shortest segment between two rays, and its signed (...,) length.
+    """Return the middle (..., 3) of the shortest segment between two rays, and its signed length
+    (...).
 
-    Raises GeometryError when rays are parallel.
+    origin_a, origin_b : (..., 3) a point on each ray.
+    direction_a, direction_b : (..., 3) unit direction of each ray.
+
+    Raises GeometryError if two rays are parallel.
     """
     cross = np.cross(direction_a, direction_b)
     sine2 = (cross**2).sum(-1)
@@ -73,9 +80,13 @@ def midpoint(
 
 
 def pixel_covariance(sigma_px: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Standard deviations (scalar or (...,)) or covariances (..., 2, 2) -> (..., 2, 2).
+    """Return covariances (..., 2, 2) in px^2 from standard deviations or from covariances.
 
-    An array of the points' own shape is taken for standard deviations, even when that is (2, 2).
+    sigma_px : one standard deviation, an array of them (...), or covariances (..., 2, 2). An array
+        whose shape equals ``shape`` is read as standard deviations, even if that shape is (2, 2).
+    shape : the shape (...) of the array of points.
+
+    Raises InputError for a standard deviation that is not positive.
     """
     sigma = np.asarray(sigma_px, float)
     if sigma.shape != shape and sigma.ndim >= 2 and sigma.shape[-2:] == (2, 2):
@@ -91,14 +102,15 @@ def triangulate(
     sigma_px: ArrayLike | tuple[ArrayLike, ArrayLike],
     method: str = "ml",
 ) -> Triangulation:
-    """Points from pixels in two cameras.
+    """Return the points that two cameras see at the given pixels.
 
-    uv_px : two arrays (..., 2).
-    sigma_px : scalar, (...,) or covariances (..., 2, 2); a tuple of two for the two cameras.
-    method : "ml" (minimum of the whitened reprojection error, Gauss-Newton from the mid-point) or
-        "midpoint" (the method of 2004, which weights both rays equally).
+    uv_px : two arrays (..., 2), one for each camera.
+    sigma_px : noise of the pixels as in `pixel_covariance`; a tuple of two gives each camera its
+        own.
+    method : "ml" minimises the whitened reprojection error by Gauss-Newton steps from the
+        mid-point; "midpoint" takes the middle of the shortest segment between both rays.
 
-    Raises InputError for unequal shapes, pixels that are not finite or an unknown method,
+    Raises InputError for unequal shapes, pixels that are not finite or an unknown method, and
     GeometryError for parallel rays.
     """
     first, second = (np.asarray(uv, float) for uv in uv_px)
@@ -133,15 +145,15 @@ def triangulate_views(
     sigma_px: ArrayLike | tuple[ArrayLike, ...],
     method: str = "ml",
 ) -> Triangulation:
-    """Points from their pixels in those of C cameras that see them.
+    """Return the points that C cameras see at the given pixels; each needs at least two of them.
 
-    uv_px : C arrays (..., 2), NaN where a camera does not see a point.
-    sigma_px : scalar, (...,) or covariances (..., 2, 2); a tuple of C for each camera's.
-    method : "ml" as in `triangulate`, started at the point nearest to all rays, or "midpoint",
-        that point.
+    uv_px : C arrays (..., 2), with NaN where a camera does not see a point.
+    sigma_px : noise of the pixels as in `pixel_covariance`; a tuple of C gives each camera its own.
+    method : "ml" as in `triangulate`, but started at the point nearest to all rays; "midpoint"
+        returns that point.
 
-    A point that fewer than two cameras see has NaN for its numbers; ``seen_by`` counts them.
-    Raises InputError for unequal shapes or an unknown method, GeometryError where all rays of a
+    A point that fewer than two cameras see gets NaN; ``seen_by`` of the result counts the cameras.
+    Raises InputError for unequal shapes or an unknown method, and GeometryError if all rays of a
     point are parallel.
     """
     pixels = [np.asarray(uv, float) for uv in uv_px]
@@ -195,16 +207,21 @@ def triangulate_views(
 def triangulate_any(
     cameras: Sequence[Camera], uv_px: Sequence[ArrayLike], sigma_px: float
 ) -> Triangulation:
-    """`triangulate` of two cameras, `triangulate_views` of more; uv_px : (..., 2) of each."""
+    """Return `triangulate` for two cameras and `triangulate_views` for more.
+
+    uv_px : for each camera an array (..., 2).
+    """
     if len(cameras) == 2:
         return triangulate((cameras[0], cameras[1]), (uv_px[0], uv_px[1]), sigma_px)
     return triangulate_views(cameras, uv_px, sigma_px)
 
 
 def nearest_to_rays(origins: Array, directions: Array) -> Array:
-    """(..., 3) points of least summed squared distance from C rays each, (C, ..., 3) and unit.
+    """Return the points (..., 3) with the least sum of squared distances from C rays each.
 
-    Raises GeometryError where all rays of a point are parallel.
+    origins, directions : (C, ..., 3) a point on each ray and its unit direction.
+
+    Raises GeometryError if all rays of a point are parallel.
     """
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     total = across.sum(0)
@@ -218,12 +235,16 @@ def nearest_to_rays(origins: Array, directions: Array) -> Array:
 
 
 def _distance(points: Array, origin: Array, direction: Array) -> Array:
-    """(N,) distance of points from rays of unit directions."""
+    """Return the distance (N,) of N points (N, 3) from rays with unit directions (N, 3)."""
     return np.asarray(np.linalg.norm(np.cross(points - origin, direction), axis=-1))
 
 
 def seen_covariance(sigma_px: ArrayLike, seen: NDArray[np.bool_]) -> Array:
-    """`pixel_covariance` (..., 2, 2) of pixels that are ``seen`` (...,); elsewhere 1 px^2."""
+    """Return `pixel_covariance` (..., 2, 2) of the pixels that are seen, and 1 px^2 for the other
+    pixels.
+
+    seen : (...) whether each pixel was seen.
+    """
     sigma = np.asarray(sigma_px, float)
     if sigma.shape == seen.shape:
         sigma = np.where(seen, sigma, 1.0)
@@ -232,7 +253,11 @@ def seen_covariance(sigma_px: ArrayLike, seen: NDArray[np.bool_]) -> Array:
 
 
 def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Array, Array, Array]:
-    """(..., 2C) pixels, (..., 2C, 3) by the rig point, (C, ..., 2, 20) by the intrinsics."""
+    """Return the pixels of rig points in C cameras, and their derivatives.
+
+    Returns the pixels (..., 2C), their derivative (..., 2C, 3) with respect to the rig point, and
+    (C, ..., 2, 20) with respect to the intrinsics of each camera.
+    """
     pixels, jacobians, by_intrinsics = [], [], []
     for camera in cameras:
         in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
@@ -249,7 +274,10 @@ def _maximum_likelihood(
     covariances: list[Array],
     points: Array,
 ) -> tuple[Array, Array]:
-    """Gauss-Newton in blocks that fit the processor's cache; (..., 3), (..., 3, 3)."""
+    """Return points (..., 3) and covariances (..., 3, 3) by Gauss-Newton steps from ``points``.
+
+    The points are processed in blocks that fit into the processor's cache.
+    """
     flat = points.reshape(-1, 3).T
     measured = np.concatenate([uv.reshape(-1, 2) for uv in uv_px], -1).T
     weights = np.array([_weights(covariance) for covariance in covariances])
@@ -264,7 +292,7 @@ def _maximum_likelihood(
 
 
 def _weights(covariance: Array) -> Array:
-    """(..., 2, 2) -> (3, N) inverse covariances: uu, uv, vv."""
+    """Return the entries uu, uv and vv (3, N) of the inverses of N covariances (..., 2, 2)."""
     a, b, c = (covariance[..., i, j].ravel() for i, j in ((0, 0), (0, 1), (1, 1)))
     determinant = a * c - b * b
     return np.array([c / determinant, -b / determinant, a / determinant])
@@ -273,7 +301,12 @@ def _weights(covariance: Array) -> Array:
 def _gauss_newton(
     cameras: tuple[Camera, ...], measured: Array, weights: Array, points: Array
 ) -> tuple[Array, Array]:
-    """C cameras: measured (2C, N), weights (C, 3, N), points (3, N) -> (3, N), (N, 3, 3)."""
+    """Return N points (3, N) and their covariances (N, 3, 3).
+
+    measured : (2C, N) pixels in C cameras.
+    weights : (C, 3, N) as `_weights` gives them.
+    points : (3, N) where the iteration starts.
+    """
     points = np.ascontiguousarray(points)
     inverse = np.empty((6, points.shape[1]))
     for _ in range(_STEPS):
@@ -295,7 +328,10 @@ def _gauss_newton(
 
 
 def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
-    """(3, N) rig points -> (2, N) pixels, (2, 3, N) by the rig point; fast for untilted lenses."""
+    """Return the pixels (2, N) of N rig points (3, N), and the derivative (2, 3, N) by the point.
+
+    Lenses without a sensor tilt are evaluated by shorter formulas, because speed matters here.
+    """
     pose = camera.camera_from_rig
     x, y, z = pose.rotation @ points + pose.translation_mm[:, None]
     kappa = camera["kappa_per_mm"]
@@ -326,7 +362,8 @@ def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
 
 
 def _symmetric_inverse(matrix: Array) -> Array:
-    """(6, N) -> (6, N): inverses of symmetric 3x3 matrices, entries in the order of `_UPPER`."""
+    """Return the inverses of N symmetric 3x3 matrices, both as entries (6, N) in the order of
+    `_UPPER`."""
     a, b, c, d, e, f = matrix
     cofactors = np.array(
         [d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b]
@@ -337,7 +374,10 @@ def _symmetric_inverse(matrix: Array) -> Array:
 def _midpoint_covariance(
     cameras: tuple[Camera, ...], points: Array, covariances: list[Array]
 ) -> Array:
-    """First order: the mid-point is the least-squares point of object-space ray distances."""
+    """Return the covariance (N, 3, 3) of mid-points to first order in the noise.
+
+    The mid-point is the least-squares point of the distances from the rays in object space.
+    """
     projectors, gains = [], []
     for camera in cameras:
         _, direction = camera.unproject(camera.project(points))

@@ -1,10 +1,10 @@
-"""Units that are defined by a number: one constant of each, used by all that convert."""
+"""Units that are defined by a number. Every conversion uses the constant from here."""
 
 from __future__ import annotations
 
 STANDARD_GRAVITY_M_S2 = 9.80665
-"""The unit g in m/s^2, exact (3rd General Conference on Weights and Measures, 1901).
+"""The unit g in m/s^2, exact by definition (3rd General Conference on Weights and Measures, 1901).
 
-It is what a sensor's g means, everywhere. A laboratory's own gravity differs from it by up to
-0.03 m/s^2 and stands in rig.toml, `[stage] gravity_m_s2`.
+A sensor that reads in g uses this value everywhere on Earth. The local gravity of a laboratory
+differs from it by up to 0.03 m/s^2 and is given in rig.toml, `[stage] gravity_m_s2`.
 """

@@ -1,17 +1,19 @@
 """Refraction at a plane window (a glass wall) between a camera and the water.
 
 The window is given in the camera's frame: its near face meets the camera's axis at
-``distance_mm``. Let d be the unit direction of a ray in air, n the normal, c = n.d, and T = d - c n
-the part of d along the window. By Snell's law this part keeps its direction and is multiplied by
-the ratio of the indices: per mm of travel along n the ray moves sideways by
-T m / sqrt(1 - m^2 T.T), m = n_air / n_medium (Born and Wolf, Principles of Optics, 1.5). A point X
-in water, h = n.X - far face, lies on the ray that enters the glass at H when
+``distance_mm``. Let d be the unit direction of a ray in air, n the normal of the window and
+T = d - (n.d) n the part of d along the window. By Snell's law this part keeps its direction and is
+multiplied by the ratio of the refractive indices. Per mm of travel along n the ray therefore moves
+sideways by T m / sqrt(1 - m^2 T.T), where m is n_air / n_glass in the glass (m_g) and
+n_air / n_water in the water (m_w); see Born and Wolf, Principles of Optics, 1.5. A point X in the
+water, at the height h = n.X - (n.X of the far face) above the window, lies on the ray that enters
+the glass at H when
 
     X = H + (thickness + h) n + A T,   A = thickness m_g / sqrt(...) + h m_w / sqrt(...).
 
-For kappa = 0 all rays have the same T and this is an affine map in closed form; otherwise it is
-solved for the ray by Newton's method. Points in front of the window are treated as if the water
-extended to them.
+For kappa = 0 all rays have the same T, and this is an affine map in closed form. Otherwise the ray
+is found by Newton's method. Points in front of the window are treated as if the water extended to
+them.
 """
 
 from __future__ import annotations
@@ -27,17 +29,19 @@ from telerig.errors import GeometryError
 
 _STEPS = 60
 _WEAK = 1e-3
-"""kappa times distance below which the affine map is a sufficient start of Newton's method."""
+"""If kappa times the distance is below this value, the affine map is a good enough start for
+Newton's method."""
 
 
 @dataclass(frozen=True)
 class Wall:
     """A plane window in the camera's frame.
 
-    normal : (3,) unit vector, away from the camera (z > 0).
-    distance_mm : where the camera's axis meets the near face; negative behind the camera's origin.
-    indices : refractive indices on the camera's side, of the glass, and behind it.
-    normal_sigma_rad : prior standard deviation of the normal, 0 where it is exact.
+    normal : (3,) unit vector that points away from the camera (z > 0).
+    distance_mm : where the camera's axis meets the near face, measured from the camera's origin;
+        negative if that is behind the origin.
+    indices : refractive indices on the camera's side, of the glass, and behind the glass.
+    normal_sigma_rad : prior standard deviation of the normal; 0 if the normal is exact.
     """
 
     normal: Array
@@ -48,29 +52,36 @@ class Wall:
 
     @property
     def ratios(self) -> tuple[float, float]:
-        """Index of the camera's side over that of the glass, and over that behind it."""
+        """The refractive index on the camera's side divided by that of the glass, and by that
+        behind the glass."""
         return self.indices[0] / self.indices[1], self.indices[0] / self.indices[2]
 
     @property
     def near_mm(self) -> float:
-        """n.X of the near face."""
+        """The value of n.X for all points X of the near face."""
         return float(self.normal[2] * self.distance_mm)
 
     def turned(self, tangent: Array) -> Wall:
-        """The window whose normal is moved by ``tangent_basis(normal) @ tangent`` (rad) and
-        normalised again."""
+        """Return the window after a small rotation of its normal.
+
+        tangent : (2,) rad. The new normal is normal + ``tangent_basis(normal) @ tangent``,
+            normalised.
+        """
         if not np.any(tangent):
             return self
         normal = self.normal + tangent_basis(self.normal) @ np.asarray(tangent, float)
         return replace(self, normal=normal / np.linalg.norm(normal))
 
     def turn_jacobian(self, tangent: Array) -> Array:
-        """(2, 2) derivative of the turned normal, in its own tangents, by ``tangent``."""
+        """Return the derivative (2, 2) of the turned normal with respect to ``tangent`` (2,).
+
+        The change of the turned normal is expressed in its own `tangent_basis`.
+        """
         turned, length = self.turned(tangent), float(np.sqrt(1 + np.sum(np.square(tangent))))
         return np.asarray(tangent_basis(turned.normal).T @ tangent_basis(self.normal) / length)
 
     def as_dict(self) -> dict[str, Any]:
-        """The window as it stands in calibration.json."""
+        """Return the window in the form in which it is written to calibration.json."""
         return {
             "normal": [float(v) for v in self.normal],
             "distance_mm": self.distance_mm,
@@ -81,7 +92,10 @@ class Wall:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Wall:
-        """The inverse of `as_dict`. Raises KeyError, TypeError or ValueError for other contents."""
+        """Return the window that `as_dict` has described.
+
+        Raises KeyError, TypeError or ValueError for other contents.
+        """
         normal = np.array(data["normal"], float).reshape(3)
         air, glass, behind = (float(n) for n in data["indices"])
         return Wall(
@@ -93,10 +107,12 @@ class Wall:
 
 @dataclass(frozen=True)
 class IdealPrediction:
-    """value : (..., 2) telecentric coordinates at depth 0 (mm) of the air ray, and derivatives.
+    """Telecentric coordinates of points in water, and their derivatives.
 
-    by_point : (..., 2, 3).  by_kappa : (..., 2).  by_wall : (..., 2, 3) by the two tangents of
-    `Wall.turned` and by the distance.
+    value : (..., 2) mm, where the ray in air crosses depth 0.
+    by_point : (..., 2, 3) with respect to the point.
+    by_kappa : (..., 2) with respect to kappa.
+    by_wall : (..., 2, 3) with respect to the two tangents of `Wall.turned` and to the distance.
     """
 
     value: Array
@@ -107,10 +123,15 @@ class IdealPrediction:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays in air, (..., 3) unless said: entry on the near face, unnormalised direction, T.
+    """Rays in air and in the water, with the symbols of the module's docstring.
 
-    along : (...,) n . unit direction.  spread, slope : A of the module's text, and dA / d(T.T).
-    water : m_w / sqrt(1 - m_w^2 T.T).
+    entry : (..., 3) H, the point on the near face.
+    direction : (..., 3) direction in air, not normalised.
+    along : (...) n.d.
+    tangential : (..., 3) T.
+    spread, slope : (...) A, and its derivative dA / d(T.T).
+    water : (...) m_w / sqrt(1 - m_w^2 T.T).
+    reached : (..., 3) the point that the ray reaches in the water.
     """
 
     entry: Array
@@ -124,14 +145,20 @@ class _Rays:
 
 
 def tangent_basis(normal: Array) -> Array:
-    """(3, 2) orthonormal vectors along the window; the camera's x and y if the normal is z."""
+    """Return two orthonormal vectors along the window, the columns of (3, 2).
+
+    They are the camera's x and y axes if the normal is its z axis.
+    """
     x, y, z = normal
     f = 1 / (1 + z)
     return np.array([[1 - f * x * x, -f * x * y], [-f * x * y, 1 - f * y * y], [-x, -y]])
 
 
 def affine_map(wall: Wall) -> tuple[Array, Array]:
-    """(2, 3) matrix and (2,) offset: telecentric coordinates (kappa = 0) of a point in water."""
+    """Return the map from a point in water to telecentric coordinates for kappa = 0.
+
+    Returns the matrix (2, 3) and the offset (2,) in mm.
+    """
     tangential = _tangential_of_axis(wall)
     glass, water = (_sideways(m, 1 - wall.normal[2] ** 2) for m in wall.ratios)
     by_height = (wall.normal + water * tangential)[:2]
@@ -142,9 +169,11 @@ def affine_map(wall: Wall) -> tuple[Array, Array]:
 
 
 def ideal_from_water(points_mm: Array, kappa: float, wall: Wall) -> Array:
-    """(..., 3) points in water, camera frame -> (..., 2) where their air rays cross depth 0.
+    """Return the telecentric coordinates (..., 2) of points (..., 3) in water, in the camera's
+    frame.
 
-    Raises GeometryError for points that no ray of the camera reaches.
+    These coordinates are where the point's ray in air crosses depth 0. Raises GeometryError for
+    points that no ray of the camera reaches.
     """
     matrix, offset = affine_map(wall)
     ideal = points_mm @ matrix.T + offset
@@ -167,7 +196,9 @@ def ideal_from_water(points_mm: Array, kappa: float, wall: Wall) -> Array:
 
 
 def ideal_jacobians(points_mm: Array, kappa: float, wall: Wall) -> IdealPrediction:
-    """`ideal_from_water` with its derivatives, by the implicit function theorem."""
+    """Return `ideal_from_water` with its derivatives, which follow from the implicit function
+    theorem.
+    """
     ideal = ideal_from_water(points_mm, kappa, wall)
     rays = _refract(ideal, points_mm, kappa, wall)
     by_ideal, by_kappa = _ray_jacobians(ideal, rays, kappa, wall)
@@ -180,10 +211,11 @@ def ideal_jacobians(points_mm: Array, kappa: float, wall: Wall) -> IdealPredicti
 
 
 def water_from_ideal(ideal_mm: Array, kappa: float, wall: Wall) -> tuple[Array, Array]:
-    """(..., 2) telecentric coordinates at depth 0 -> rays in water, camera frame.
+    """Return the rays in water, in the camera's frame, of telecentric coordinates (..., 2).
 
-    (..., 3) origins, where the ray drawn on backwards crosses depth 0, and (..., 3) unit
-    directions. Raises GeometryError for total reflection and rays that never meet the wall.
+    Returns the origins (..., 3), where the ray in water, extended backwards in a straight line,
+    crosses depth 0, and the unit directions (..., 3). Raises GeometryError for total reflection and
+    for rays that never meet the window.
     """
     entry, direction, along = _enter(ideal_mm, kappa, wall)
     tangential = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -198,7 +230,13 @@ def water_from_ideal(ideal_mm: Array, kappa: float, wall: Wall) -> tuple[Array, 
 
 
 def _sideways(ratio: float, tau: Array) -> Array:
-    """m / sqrt(1 - m^2 T.T). Raises GeometryError for total reflection."""
+    """Return m / sqrt(1 - m^2 T.T): how far a ray moves sideways along T per mm of travel along n.
+
+    ratio : m.
+    tau : (...) T.T.
+
+    Raises GeometryError for total reflection.
+    """
     inside = 1 - ratio**2 * np.asarray(tau)
     if not np.all(inside > 0):
         raise GeometryError(
@@ -214,15 +252,20 @@ def _tangential_of_axis(wall: Wall) -> Array:
 
 
 def air_rays(ideal_mm: Array, kappa: float) -> tuple[Array, Array]:
-    """(..., 2) telecentric coordinates -> rays in air, camera frame: (..., 3) origins at depth 0
-    and (..., 3) directions (kappa x, kappa y, 1)."""
+    """Return the rays in air, in the camera's frame, of telecentric coordinates (..., 2).
+
+    Returns the origins (..., 3) at depth 0 and the directions (..., 3) (kappa x, kappa y, 1).
+    """
     shape = (*ideal_mm.shape[:-1], 1)
     origin = np.concatenate([ideal_mm, np.zeros(shape)], -1)
     return origin, np.concatenate([kappa * ideal_mm, np.ones(shape)], -1)
 
 
 def _enter(ideal: Array, kappa: float, wall: Wall) -> tuple[Array, Array, Array]:
-    """Entry points on the near face, directions (kappa x, kappa y, 1), n . unit direction."""
+    """Return where rays meet the near face (..., 3), their directions (..., 3), and n.d (...).
+
+    The directions are (kappa x, kappa y, 1), not normalised.
+    """
     origin, direction = air_rays(ideal, kappa)
     normal_part = direction @ wall.normal
     if not np.all(normal_part > 0):
@@ -233,7 +276,7 @@ def _enter(ideal: Array, kappa: float, wall: Wall) -> tuple[Array, Array, Array]
 
 
 def _refract(ideal: Array, points: Array, kappa: float, wall: Wall) -> _Rays:
-    """The rays, and the points that they reach at the given points' distance from the window."""
+    """Return the rays, and where they reach the height of the given points (..., 3)."""
     entry, direction, along = _enter(ideal, kappa, wall)
     unit = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     tangential = unit - along[..., None] * wall.normal
@@ -248,7 +291,11 @@ def _refract(ideal: Array, points: Array, kappa: float, wall: Wall) -> _Rays:
 
 
 def _ray_jacobians(ideal: Array, rays: _Rays, kappa: float, wall: Wall) -> tuple[Array, Array]:
-    """(..., 3, 2) and (..., 3): the reached point by the telecentric coordinates and by kappa."""
+    """Return the derivatives of the reached points with respect to the telecentric coordinates and
+    kappa.
+
+    The first is (..., 3, 2), the second (..., 3).
+    """
     normal, length = wall.normal, np.linalg.norm(rays.direction, axis=-1)
     unit = rays.direction / length[..., None]
     along_ray = np.eye(3) - unit[..., None] * normal / rays.along[..., None, None]
@@ -265,7 +312,10 @@ def _ray_jacobians(ideal: Array, rays: _Rays, kappa: float, wall: Wall) -> tuple
 
 
 def _wall_jacobian(rays: _Rays, points: Array, wall: Wall) -> Array:
-    """(..., 3, 3): reached point minus point, by the normal's two tangents and the distance."""
+    """Return the derivative (..., 3, 3) of (reached point minus point) with respect to the window.
+
+    The columns are the two tangents of the normal and the distance.
+    """
     normal, basis = wall.normal, tangent_basis(wall.normal)
     unit = rays.direction / np.linalg.norm(rays.direction, axis=-1, keepdims=True)
     near = wall.distance_mm * basis[2]
@@ -287,11 +337,13 @@ def _wall_jacobian(rays: _Rays, points: Array, wall: Wall) -> Array:
 
 
 def _start(points: Array, kappa: float, wall: Wall) -> Array:
-    """Rays by Newton in the plane through the perspective centre, the point and the normal.
+    """Return telecentric coordinates from which Newton's method of `ideal_from_water` converges.
 
-    With q the tangent of incidence, kappa times the point's distance from the normal through the
-    centre is D q + kappa (thickness tan(glass) + h tan(water)), D = n_z + kappa near: increasing,
-    and concave (kappa > 0) or convex (kappa < 0), so that Newton from q = 0 cannot fail.
+    The rays are found in the plane through the perspective centre, the point and the normal. Let q
+    be the tangent of the angle of incidence. Then kappa times the point's distance from the normal
+    through the perspective centre is D q + kappa (thickness tan(angle in glass) + h tan(angle in
+    water)), with D = n_z + kappa near. This function of q increases, and it is concave (kappa > 0)
+    or convex (kappa < 0), so Newton's method from q = 0 always converges.
     """
     normal = wall.normal
     depth = normal[2] + kappa * wall.near_mm

@@ -1,6 +1,8 @@
-"""telerig: telecentric stereo self-calibration and shake-free 3-D bubble trajectories.
+"""telerig calibrates a rig of telecentric cameras from images of a dot target and gives 3-D
+trajectories of bubbles without the rig's shake.
 
-The public names; each is loaded when it is first used.
+This module holds the public names. Each one is imported when it is first used, so that `import
+telerig` is fast.
 """
 
 from __future__ import annotations

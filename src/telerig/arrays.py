@@ -1,4 +1,5 @@
-"""Types of arrays by what they hold. The docstring of whoever takes or gives one says its shape."""
+"""These types name arrays by what they hold. The docstring of each function that takes or returns
+an array states its shape."""
 
 from __future__ import annotations
 

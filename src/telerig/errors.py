@@ -1,4 +1,4 @@
-"""Errors that say what is wrong, where, and what to do next."""
+"""The errors that telerig raises. Each one says what is wrong, where, and what to do next."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from difflib import get_close_matches
 
 
 class TelerigError(Exception):
-    """Base of every error that telerig raises on purpose.
+    """This is the base class of every error that telerig raises on purpose.
 
-    ``what`` is the fault, ``where`` the file, row, view, camera or dot, ``todo`` the remedy.
+    what : the fault.
+    where : the file, row, camera, view, frame or dot in which it is.
+    todo : what the user can do about it.
     """
 
     def __init__(self, what: str, *, where: str = "", todo: str = "") -> None:
@@ -27,30 +29,35 @@ def _rebuild(kind: type[TelerigError], what: str, where: str, todo: str) -> Tele
 
 
 class InputError(TelerigError):
-    """A file, table, image or argument that cannot be used as it is."""
+    """A file, table, image or argument cannot be used as it is."""
 
 
 class DetectionError(TelerigError):
-    """An image in which the target or a bubble cannot be found or numbered."""
+    """The target or a bubble cannot be found in an image, or the dots cannot be numbered."""
 
 
 class CalibrationError(TelerigError):
-    """Measurements that cannot give a calibration, or an estimate that failed its checks."""
+    """The measurements cannot give a calibration, or an estimate failed its checks."""
 
 
 class GeometryError(TelerigError):
-    """A point outside the region where a camera model can be evaluated or inverted."""
+    """A point lies outside the region in which a camera model can be evaluated or inverted."""
 
 
 def nearest(word: str, known: list[str]) -> str | None:
-    """The known word that is spelled most like ``word``, in any case; None if none is like it."""
+    """Return the name in ``known`` that is spelled most like ``word``, or None if no name is
+    similar.
+
+    Upper and lower case are treated as equal.
+    """
     lowered = {name.lower(): name for name in known}
     near = get_close_matches(word.lower(), lowered, n=1, cutoff=0.55)
     return lowered[near[0]] if near else None
 
 
 def suggestion(word: str, known: list[str]) -> str:
-    """What to do about an unknown word: the nearest known one, or all of them."""
+    """Return the advice for an unknown word: the most similar known name, or a list of all known
+    names."""
     near = nearest(word, known)
     if near:
         return f"did you mean {near}?"

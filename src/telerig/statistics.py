@@ -8,13 +8,17 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 
 NORMAL_FROM_MEDIAN = 1.4826
-"""Standard deviation of a normal distribution over the median of its absolute deviations."""
+"""Ratio of a normal distribution's standard deviation to the median of its absolute deviations."""
 
 
 def robust_sd(deviations: ArrayLike, axis: int | None = None) -> Array:
-    """Standard deviation of normal ``deviations`` from a known centre, whatever outliers do.
+    """Return the standard deviation of ``deviations`` in a way that outliers hardly change.
 
-    Returns 1.4826 times their median absolute value along ``axis``, or of all of them. Subtract
-    the median first where the centre is not known.
+    The result is 1.4826 times the median of the absolute values, which equals the standard
+    deviation if the values are normally distributed about 0. Subtract the median first if their
+    centre is not known.
+
+    deviations : array of any shape.
+    axis : the axis along which the median is taken; None takes all values together.
     """
     return np.asarray(NORMAL_FROM_MEDIAN * np.median(np.abs(deviations), axis=axis))

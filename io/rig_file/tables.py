@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import reprlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -110,7 +110,8 @@ def subtables(raw: dict[str, Any], table: str, problems: Problems) -> dict[str, 
 @cache
 def field_types(kind: Any) -> dict[str, Any]:
     """The type of each field of a table, with its annotations."""
-    return get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hints[name] for name in (field.name for field in fields(kind))}
 
 
 def _words(hint: Any) -> str:

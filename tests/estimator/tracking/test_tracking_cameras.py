@@ -11,15 +11,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import telerig
 from telerig.errors import InputError
+from telerig.estimator.calibration.calibrate import calibrate
 from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
 from telerig.estimator.smoothing.results_folder import smooth_run
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions
+from telerig.io.dataset.dataset import load_dataset
 from telerig.io.dataset.run import load_run
-from telerig.io.simulation.presets import run_preset
+from telerig.io.simulation.presets import preset, run_preset
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -89,3 +92,27 @@ def test_detections_of_none_of_the_two_are_refused(rise: Path, tmp_path: Path) -
     table[table["camera"] == "right"].to_csv(run / "detections.csv", index=False)
     with pytest.raises(InputError, match="no row of the cameras left, middle"):
         load_run(run)
+
+
+def test_a_pair_without_the_first_camera(tmp_path: Path) -> None:
+    """Calibrated from dots with a stage axis, tracked and smoothed in the first camera's frame."""
+    config = run_preset("rise", frames=20)
+    stage = replace(config.stage, axis_views=5)
+    config = replace(config, calibration=preset("three"), stage=stage)
+    data = simulate(config, rng=np.random.default_rng(3), out=tmp_path / "rig", images=False)
+    with (data.path / "rig.toml").open("a") as file:
+        file.write('[tracking]\ncameras = ["middle", "right"]\n')
+    calibration = calibrate(load_dataset(data.path), model="radial")
+    assert calibration.verdict["status"] == "GOOD"
+    assert calibration.stage["chi2_dof"] == pytest.approx(1, abs=0.4)
+    run = load_run(next((data.path / "runs").iterdir()))
+    assert run.cameras == ("middle", "right")
+    tracks = telerig.track(run, calibration)
+    assert len(tracks.table) == 20
+    pair = calibration.pair("middle", "right")
+    uv = [tracks.table[[f"{c}_u_px", f"{c}_v_px"]].to_numpy(float) for c in run.cameras]
+    found = pair.triangulate(*uv, sigma_px=0.1)
+    assert np.abs(found.points_mm - tracks.table[["x_mm", "y_mm", "z_mm"]]).to_numpy().max() < 0.5
+    smoothed = telerig.smooth(tracks, calibration, stage=run)
+    assert len(smoothed.trajectories) == 20
+    assert {"middle_y_mm", "right_y_mm"} <= set(smoothed.shake)

@@ -142,6 +142,8 @@ def test_a_third_camera_under_a_wrong_key() -> None:
     message = error_of(text.replace("[target]", "top_from_right_rotvec_deg = [0, 1, 2]\n[target]"))
     assert "top_from_right_rotvec_deg" in message
     assert "did you mean top_from_left_rotvec_deg" in message
+    message = error_of(text.replace("[target]", "angle = [0, 1, 2]\n[target]"))
+    assert "known: right_from_left_rotvec_deg, top_from_left_rotvec_deg" in message
     message = error_of(text.replace("[target]", "top_from_left_rotvec_deg = [0, 1]\n[target]"))
     assert "top_from_left_rotvec_deg" in message and "three numbers in degrees" in message
 

@@ -49,7 +49,10 @@ _ENOUGH_WHOLE = 4
 
 
 def learnt_spread(outlines: Outlines, partial: Bools) -> Array:
-    """(B,) spread of the harmonics: of ``partial`` (B,) outlines that of the whole ones."""
+    """(B,) standard deviation of each outline's harmonics, as a share of its radius.
+
+    ``partial`` (B,) outlines, which are hidden in part, get that of the frame's whole outlines.
+    """
     whole = outlines.resolved & ~partial
     share = _UNLEARNT
     if np.count_nonzero(whole) >= _ENOUGH_WHOLE:

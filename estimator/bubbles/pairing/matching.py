@@ -36,7 +36,6 @@ NEGLIGIBLE = -9.0
 """Log odds below which a pair is never considered: its probability stays under exp(-9)."""
 
 _EXACT_SIDE = 11
-_PASSES = 500
 
 
 def best_assignment(log_odds: Array) -> tuple[Ints, Ints]:
@@ -49,22 +48,22 @@ def best_assignment(log_odds: Array) -> tuple[Ints, Ints]:
     return rows[kept].astype(np.int64), columns[kept].astype(np.int64)
 
 
-def marginals(log_odds: Array) -> Array:
+def marginals(log_odds: Array, negligible: float = NEGLIGIBLE) -> Array:
     """(N1, N2) log odds -> (N1, N2) posterior probability of each pair.
 
     Exact per connected component with up to 11 detections on its smaller side (sum over all
-    assignments by dynamic programming over subsets); above that loopy belief propagation
-    (Williams and Lau, IEEE Trans. AES 50:2942, 2014), which always converges.
+    assignments by dynamic programming over subsets). Of a larger component the least likely pairs
+    are left out, one unit of log odds after the other, until it falls apart.
     """
     out = np.zeros(log_odds.shape)
-    possible = log_odds > NEGLIGIBLE
+    possible = log_odds > negligible
     lone = possible & (possible.sum(1) == 1)[:, None] & (possible.sum(0) == 1)
     out[lone] = 1 / (1 + np.exp(-log_odds[lone]))
     for i, j in _components(possible & ~lone):
         block = np.ix_(i, j)
         part = np.where(possible[block], log_odds[block], -np.inf)
         if min(len(i), len(j)) > _EXACT_SIDE:
-            out[block] = _belief_propagation(part)
+            out[block] = marginals(log_odds[block], negligible + 1.0)
         elif len(j) <= len(i):
             out[block] = _exact(part)
         else:
@@ -117,26 +116,6 @@ def _exact(log_odds: Array) -> Array:
         for j in np.flatnonzero(weight[i]):
             out[i, j] = weight[i, j] * (forward[i, free[j]] @ backward[i + 1, free[j] | (1 << j)])
     return np.asarray(out / backward[0, 0])
-
-
-def _belief_propagation(log_odds: Array) -> Array:
-    weight = np.exp(np.minimum(log_odds, 50.0))
-    back = np.ones_like(weight)
-    for _ in range(_PASSES):
-        incoming = weight * back
-        forth = weight / (1 + _others(incoming, 1))
-        new = 1 / (1 + _others(forth, 0))
-        change = np.abs(new - back).max()
-        back = new
-        if change < 1e-9:
-            break
-    incoming = weight * back
-    return np.asarray(incoming / (1 + incoming.sum(1, keepdims=True)))
-
-
-def _others(values: Array, axis: int) -> Array:
-    """Sums along the axis less each element, never below 0 by rounding."""
-    return np.asarray(np.maximum(values.sum(axis, keepdims=True) - values, 0.0))
 
 
 @dataclass(frozen=True)

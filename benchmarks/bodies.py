@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
-from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS
+from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS, HARMONICS
 from telerig.estimator.bubbles.shape.volume_centroid import Bodies, fit_bodies
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

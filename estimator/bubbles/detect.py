@@ -11,31 +11,26 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Bools
 from telerig.estimator.bubbles.flat_field import checked_image, normalised, nothing_to_see
-from telerig.estimator.bubbles.outline.detection_table import (
-    DETECTION_COLUMNS,
-    HARMONIC_COLUMNS,
-    outline_centroid,
-    outline_points,
-)
-from telerig.estimator.bubbles.outline.ellipse_geometry import (
-    outline_moments,
-    points_on,
-    rough_distance,
-)
-from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, fit_outlines
-from telerig.estimator.bubbles.outline.regions import (
+from telerig.estimator.bubbles.outline.blobs import (
     Blob,
+    Part,
     Rejected,
     dark_noise_share,
     find_blobs,
-    noise_share,
-)
-from telerig.estimator.bubbles.outline.rim_model import close_pairs
-from telerig.estimator.bubbles.outline.split import (
-    Part,
     implausible_parts,
+    noise_share,
     split_blobs,
 )
+from telerig.estimator.bubbles.outline.ellipse_geometry import (
+    DETECTION_COLUMNS,
+    HARMONIC_COLUMNS,
+    outline_centroid,
+    outline_moments,
+    outline_points,
+    points_on,
+    rough_distance,
+)
+from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, close_pairs, fit_outlines
 from telerig.estimator.images.noise import high_pass
 
 __all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]

@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.estimator.bubbles.outline.detection_table import flag_words
+from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
 from telerig.estimator.bubbles.pairing.matching import Prediction
 from telerig.estimator.tracking.association.likelihoods import (
     gate2,

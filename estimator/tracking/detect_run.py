@@ -21,7 +21,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.bubbles.background.from_run import Background, estimate_background
 from telerig.estimator.bubbles.detect import detect_bubbles
-from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
+from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.marks.following import StripInImages
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import write_json_atomic

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
+from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma

@@ -1,5 +1,5 @@
 """Sub-pixel outlines of bubbles: ellipses with harmonics, fitted to the pixels at the rim.
 
-In: an image divided by its background. Out: outlines with covariance. Read ``regions`` (dark
-blobs), ``split`` (overlapping bubbles), then ``outline_fit``.
+In: an image divided by its background. Out: outlines with covariance. Read ``blobs`` (dark
+regions, overlapping bubbles), then ``outline_fit``.
 """

@@ -15,16 +15,16 @@ import pandas as pd
 
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
-from telerig.estimator.bubbles.outline.detection_table import (
+from telerig.estimator.bubbles.outline.ellipse_geometry import (
     AXES_COLUMNS,
     CENTRE_COLUMNS,
     COVARIANCE_COLUMNS,
     HARMONIC_COLUMNS,
+    HARMONICS,
     centre_covariances,
     columns,
     flag_words,
 )
-from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint

@@ -21,15 +21,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
-from telerig.estimator.bubbles.outline.detection_table import (
+from telerig.estimator.bubbles.outline.ellipse_geometry import (
     AXES_COLUMNS,
     CENTRE_COLUMNS,
     HARMONIC_COLUMNS,
+    HARMONICS,
     centre_covariances,
     columns,
     flag_words,
 )
-from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS
 from telerig.rig import silhouette
 from telerig.rig.camera import Camera
 from telerig.rig.silhouette import EllipsePair

@@ -16,7 +16,7 @@ from telerig.estimator.bubbles.detect import (
     outline_centroid,
     outline_points,
 )
-from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS, HARMONIC_COLUMNS
+from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS, HARMONIC_COLUMNS
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from bubble_outline_renderer import Drawn, centre_bound_px, draw

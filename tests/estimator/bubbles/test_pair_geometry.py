@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from matching_scenes import Array, geometry, rig, table
 
-from telerig.estimator.bubbles.outline.detection_table import HARMONIC_COLUMNS
-from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONICS
+from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONIC_COLUMNS, HARMONICS
 from telerig.estimator.bubbles.pairing.geometry import outline_extent
 from telerig.estimator.bubbles.pairing.matching import marginals
 from telerig.rig.pose import Pose

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.outline.detection_table import DETECTION_COLUMNS
+from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.tracking.frames_to_rows import Linker
 from telerig.estimator.tracking.tracker import Tracker

@@ -26,19 +26,17 @@ from telerig.estimator.tracking.backtracking import Tables
 from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
+    FollowedMarks,
     Progress,
     Scene,
+    described_strip,
     detect_missing,
     fingerprint,
+    follow_references,
     make_scene,
 )
 from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracking.frames_to_rows import Linked, Linker
-from telerig.estimator.tracking.marks_of_run import (
-    FollowedMarks,
-    described_strip,
-    follow_references,
-)
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData

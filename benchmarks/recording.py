@@ -30,10 +30,12 @@ from numpy.typing import NDArray
 
 from telerig.io.recording.replay import DeviceRecord, replay
 from telerig.io.recording.session import record
-from telerig.io.recording.simulated.devices import SimulatedPorts, Truth, practice_rig
-from telerig.io.recording.simulated.signals import (
+from telerig.io.recording.simulated.devices import (
     Faults,
     SimulatedDevice,
+    SimulatedPorts,
+    Truth,
+    practice_rig,
     stage_position_mm,
     true_values,
 )

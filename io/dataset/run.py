@@ -25,9 +25,8 @@ from telerig.io.dataset.tables import (
     read_run_toml,
     read_stage_csv,
 )
-from telerig.io.images.frames import PAGE_EXTENSIONS, FrameSource, open_frames
+from telerig.io.images.frames import PAGE_EXTENSIONS, VIDEO_EXTENSIONS, FrameSource, open_frames
 from telerig.io.images.read import Image, check_size, list_images
-from telerig.io.images.video import VIDEO_EXTENSIONS
 from telerig.io.rig_file.description import RigDescription, camera_named
 from telerig.io.rig_file.rig_file import read_rig_toml
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.random import Generator
 
 from telerig.io.recording.log import END, RECEIVED, Entry, LogHeader, RawLog
-from telerig.io.recording.simulated.devices import Truth, made_since_last
-from telerig.io.recording.simulated.signals import SimulatedDevice
+from telerig.io.recording.simulated.devices import SimulatedDevice, Truth, made_since_last
 
 
 def simulated_log(

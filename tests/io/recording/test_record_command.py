@@ -18,8 +18,12 @@ from simulated_log import simulated_log
 from typer.testing import CliRunner
 
 from telerig.errors import InputError
-from telerig.io.recording.simulated.devices import SimulatedPorts, practice_devices, practice_rig
-from telerig.io.recording.simulated.signals import SimulatedDevice
+from telerig.io.recording.simulated.devices import (
+    SimulatedDevice,
+    SimulatedPorts,
+    practice_devices,
+    practice_rig,
+)
 from telerig.io.rig_file.rig_file import description_from_toml, read_rig_toml, write_rig_toml
 from telerig.scripts.main import app
 from telerig.scripts.record import _device_words

@@ -17,10 +17,11 @@ from telerig.errors import InputError
 from telerig.io.recording import ports as record_ports
 from telerig.io.recording.replay import replay
 from telerig.io.recording.session import FAILED_NAME, LOG_NAME, Status, record
-from telerig.io.recording.simulated.devices import SimulatedPorts, practice_devices
-from telerig.io.recording.simulated.signals import (
+from telerig.io.recording.simulated.devices import (
     Faults,
     SimulatedDevice,
+    SimulatedPorts,
+    practice_devices,
     stage_position_mm,
     true_values,
 )

@@ -24,10 +24,11 @@ from telerig.io.recording.log import (
     read_log,
 )
 from telerig.io.recording.replay import beside_gaps, replay
-from telerig.io.recording.simulated.devices import Truth, practice_devices
-from telerig.io.recording.simulated.signals import (
+from telerig.io.recording.simulated.devices import (
     Faults,
     SimulatedDevice,
+    Truth,
+    practice_devices,
     stage_position_mm,
     true_values,
 )

@@ -14,23 +14,25 @@ from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
-from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import (
+from telerig.estimator.smoothing.learning.learn import learn
+from telerig.estimator.smoothing.learning.likelihood import (
     with_hyperparameter_uncertainty,
 )
-from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.problem.problem import (
     Observations,
     ShakeModel,
     SmoothingProblem,
 )
-from telerig.estimator.smoothing.problem.sensors import (
+from telerig.estimator.smoothing.problem.tables import (
+    Tracked,
     accelerometers_of,
+    bubbles_of,
     calibration_share,
+    read_tracks,
     references_of,
     stage_of,
     thinned,
 )
-from telerig.estimator.smoothing.problem.tracks import Tracked, bubbles_of, read_tracks
 from telerig.estimator.smoothing.refined_pose import (
     Refinement,
     change_words,

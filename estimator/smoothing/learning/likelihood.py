@@ -1,20 +1,37 @@
-"""The climb to the most probable hyper-parameters, and how sharp the top is."""
+"""The evidence of several signals: its maximum, its curvature there, and the spread by that.
+
+Covariances contain the uncertainty of learned hyper-parameters (Laplace's approximation): every
+learned parameter is moved by one standard deviation up and down; by how much the smoothed
+positions, velocities and offsets move with it is added to their covariances. The parameters count
+as independent, which errs on the wide side where they are not.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.smoothing.learning.evidence import signal_evidence, signal_gradient
-from telerig.estimator.smoothing.learning.lines_of_sight import Signal
+from telerig.estimator.smoothing.graph.solve import Covariances, Solution
+from telerig.estimator.smoothing.learning.evidence import (
+    signal_evidence,
+    signal_gradient,
+    signal_posterior,
+)
+from telerig.estimator.smoothing.learning.lines_of_sight import (
+    Signal,
+    contrasts,
+    pooled,
+    signals_of,
+)
 from telerig.estimator.smoothing.learning.parameters import (
     depends_on,
     log_prior,
     prior_of,
+    processes,
     value_of,
     with_values,
 )
@@ -124,3 +141,105 @@ def laplace_covariance(signals: Sequence[Signal], model: ShakeModel, names: Sequ
     values_, vectors = np.linalg.eigh(curvature / roots[:, None] / roots)
     inner = (vectors / np.maximum(values_, 1.0)) @ vectors.T
     return np.asarray(inner / roots[:, None] / roots * scale[:, None] * scale)
+
+
+_FARTHEST = 0.5
+_Triple = tuple[Array, Array, Array]
+"""Of positions, velocities and offsets."""
+
+
+def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
+    """The solution with the spread by its model's ``learned`` parameters in its covariances.
+
+    Bubbles beyond those that learning looks at get the mean spread of those. Unchanged without
+    covariances or learned parameters.
+    """
+    found, model, problem = solution.covariances, solution.graph.model, solution.graph.problem
+    if found is None or not model.learned or not problem.bubbles:
+        return solution
+    signals = [c for c in signals_of(problem, solution.weights) if c.samples]
+    directions = np.array([c.direction for c in signals])
+    spreads = [_spread(c, model) for c in signals]
+    # coordinates along the signals, which need not be at right angles, back into the lab
+    lab = np.linalg.pinv(directions)
+    bubbles = found.bubbles.copy()
+    for kind, rows in ((0, solution.graph.bubble.position), (1, solution.graph.bubble.velocity)):
+        along = np.stack([_rows(solution, c, s[kind]) for c, s in zip(signals, spreads)], -1)
+        into = np.linalg.pinv(rows) @ lab
+        bubbles += np.einsum("ik,nk,jk->nij", into, along, into, optimize=True)
+    shake = _shaken(solution, signals, [s[2] for s in spreads], found)
+    return replace(solution, covariances=replace(found, bubbles=bubbles, shake=shake))
+
+
+def _spread(signal: Signal, model: ShakeModel) -> _Triple:
+    """Variances (B, F) of positions and velocities, (J, F) of offsets, by the parameters."""
+    parts = pooled(signal)
+    total = [np.zeros((1, len(signal.t_s)))] * 3
+    for name, sigma in model.learned.items():
+        at, step = value_of(model, name), min(sigma, _FARTHEST)
+        up, down = (with_values(model, [name], [at * np.exp(s * step)]) for s in (1, -1))
+        same = [name != "pixel_inflation" and _same(part, up, model) for part in parts]
+        if all(same):
+            continue
+        moved = [_still(p) if s else _moved(p, up, down) for p, s in zip(parts, same)]
+        for i, change in enumerate(_of_bubbles(moved, int(signal.moving.sum()))):
+            total[i] = total[i] + (change / 2 * (sigma / step)) ** 2
+    return total[0], total[1], total[2]
+
+
+def _same(signal: Signal, one: ShakeModel, two: ShakeModel) -> bool:
+    """Whether both models are the same for this signal."""
+    return all(a is b for a, b in zip(processes(signal, one), processes(signal, two)))
+
+
+def _moved(signal: Signal, up: ShakeModel, down: ShakeModel) -> _Triple:
+    """Posterior means under one model less those under the other."""
+    one, two = signal_posterior(signal, up), signal_posterior(signal, down)
+    return (
+        one.position_mm - two.position_mm,
+        one.velocity_mm_s - two.velocity_mm_s,
+        one.offset_mm - two.offset_mm,
+    )
+
+
+def _still(signal: Signal) -> _Triple:
+    nothing = np.zeros((1, len(signal.t_s)))
+    return nothing, nothing, nothing
+
+
+def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
+    """Of each bubble, where the signal is split into their mean and their differences."""
+    if len(moved) == 1:
+        return moved[0]
+    (position, velocity, offset), apart = moved
+    place, speed = (
+        contrasts(count).T @ np.broadcast_to(a, (count - 1, a.shape[-1])) for a in apart[:2]
+    )
+    return position + place, velocity + speed, offset
+
+
+def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
+    """(rows,) of the bubbles' states, from (B, F) of the signal's bubbles."""
+    graph = solution.graph
+    number = np.full(len(graph.problem.bubbles), -1)
+    movers = signal.bubble[signal.moving]
+    number[movers] = np.arange(len(movers))
+    mine = number[graph.bubble_of_row]
+    variance = np.broadcast_to(variance, (len(movers), variance.shape[-1]))
+    each = variance[mine, graph.frame_of_row]
+    return np.asarray(np.where(mine >= 0, each, variance.mean(0)[graph.frame_of_row]))
+
+
+def _shaken(
+    solution: Solution, signals: list[Signal], spreads: list[Array], found: Covariances
+) -> Array:
+    """(F, D, D) covariance of the shake's states, offsets widened along what the cameras see."""
+    layout, out = solution.graph.shake, found.shake.copy()
+    for signal, variance in zip(signals, spreads):
+        rows = np.einsum("i,cid->cd", signal.direction, layout.offset[list(signal.cameras)])
+        if not np.any(rows):
+            continue
+        into = np.linalg.pinv(rows)
+        variance = np.broadcast_to(variance, (len(rows), len(out)))
+        out += np.einsum("dk,kf,ek->fde", into, variance, into, optimize=True)
+    return out

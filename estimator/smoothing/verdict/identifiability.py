@@ -15,7 +15,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
 from telerig.estimator.smoothing.learning.attribution import Attribution, attributions
-from telerig.estimator.smoothing.learning.groups import Learning, groups_of
+from telerig.estimator.smoothing.learning.learn import Learning, groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.problem.problem import (
     Bubble,

@@ -9,8 +9,7 @@ import pytest
 from shake_learning_data import SWING_HZ, run, true_model
 
 from telerig.estimator.smoothing.learning.default_priors import default_model
-from telerig.estimator.smoothing.learning.groups import groups_of
-from telerig.estimator.smoothing.learning.learn import Learning, learn, posterior_rms
+from telerig.estimator.smoothing.learning.learn import Learning, groups_of, learn, posterior_rms
 from telerig.estimator.smoothing.learning.likelihood import evidence
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.learning.parameters import with_values

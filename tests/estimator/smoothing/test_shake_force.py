@@ -17,10 +17,11 @@ from telerig.estimator.smoothing.learning.attribution import (
     with_split_lines,
 )
 from telerig.estimator.smoothing.learning.default_priors import default_model
-from telerig.estimator.smoothing.learning.groups import free_names, groups_of
 from telerig.estimator.smoothing.learning.learn import (
     Learning,
     Step,
+    free_names,
+    groups_of,
     learn,
     try_low_pass_force,
     try_white_force,

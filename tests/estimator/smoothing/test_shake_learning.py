@@ -22,12 +22,13 @@ from telerig.estimator.smoothing.learning.evidence import (
     signal_evidence,
     signal_posterior,
 )
-from telerig.estimator.smoothing.learning.groups import groups_of
-from telerig.estimator.smoothing.learning.hyperparameter_uncertainty import (
+from telerig.estimator.smoothing.learning.learn import Learning, groups_of, learn
+from telerig.estimator.smoothing.learning.likelihood import (
+    evidence,
+    laplace_covariance,
+    maximise,
     with_hyperparameter_uncertainty,
 )
-from telerig.estimator.smoothing.learning.learn import Learning, learn
-from telerig.estimator.smoothing.learning.likelihood import evidence, laplace_covariance, maximise
 from telerig.estimator.smoothing.learning.lines_of_sight import pooled, sight_directions, signals_of
 from telerig.estimator.smoothing.learning.parameters import (
     log_prior,

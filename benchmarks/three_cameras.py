@@ -252,7 +252,7 @@ def pixel_errors(calibration: Calibration, truth: Truth) -> tuple[Array, Array]:
     """
     points = volume()
     exact = [truth.cameras[c.name].project(points) for c in calibration.cameras]
-    found, by_point, _ = stacked_jacobian(calibration.cameras, points)
+    found, by_point = stacked_jacobian(calibration.cameras, points)
     error = (found - np.concatenate(exact, -1)).ravel()
     centred = points - points.mean(0)
     turns = np.cross(np.eye(3)[:, None], centred)

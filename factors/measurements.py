@@ -45,7 +45,7 @@ def image_of_point(
     position = np.asarray(position_mm, float)[..., None]
     point = np.asarray(point_lab_mm, float) - axis * position - np.asarray(offset_mm, float)
     in_camera = point @ pose.rotation.T + pose.translation_mm
-    uv, by_camera, _ = camera.pixel_jacobians(in_camera.reshape(-1, 3))
+    uv, by_camera, _ = camera.pixel_jacobians(in_camera.reshape(-1, 3), ())
     by_camera = by_camera.reshape(*in_camera.shape[:-1], 2, 3)
     by_point = by_camera @ pose.rotation
     return ImagePrediction(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,9 +107,13 @@ class Camera:
         uv = projection.pixel_from_camera(points, self.intrinsics, self.rho_mm, self.wall)
         return uv.reshape(*np.shape(points_rig_mm)[:-1], 2)
 
-    def pixel_jacobians(self, points_camera_mm: Array) -> tuple[Array, Array, Array]:
+    def pixel_jacobians(
+        self, points_camera_mm: Array, free: Sequence[int] = range(len(PARAMETERS))
+    ) -> tuple[Array, Array, Array]:
         """Return `projection.pixel_jacobians` of this camera, for points (..., 3) in its frame."""
-        return projection.pixel_jacobians(points_camera_mm, self.intrinsics, self.rho_mm, self.wall)
+        return projection.pixel_jacobians(
+            points_camera_mm, self.intrinsics, self.rho_mm, self.wall, free
+        )
 
     def unproject(self, uv_px: ArrayLike) -> tuple[Array, Array]:
         """Return the rays in the rig frame that the camera sees at the pixels (..., 2).

@@ -252,20 +252,18 @@ def seen_covariance(sigma_px: ArrayLike, seen: NDArray[np.bool_]) -> Array:
     return np.where(seen[..., None, None], covariance, np.eye(2))
 
 
-def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Array, Array, Array]:
-    """Return the pixels of rig points in C cameras, and their derivatives.
+def stacked_jacobian(cameras: tuple[Camera, ...], points_mm: Array) -> tuple[Array, Array]:
+    """Return the pixels of rig points (..., 3) in C cameras, and their derivatives.
 
-    Returns the pixels (..., 2C), their derivative (..., 2C, 3) with respect to the rig point, and
-    (C, ..., 2, 20) with respect to the intrinsics of each camera.
+    Returns the pixels (..., 2C) and their derivative (..., 2C, 3) with respect to the rig point.
     """
-    pixels, jacobians, by_intrinsics = [], [], []
+    pixels, jacobians = [], []
     for camera in cameras:
         in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
-        uv, by_point, by_k = camera.pixel_jacobians(in_camera)
+        uv, by_point, _ = camera.pixel_jacobians(in_camera, ())
         pixels.append(uv)
         jacobians.append(by_point @ camera.camera_from_rig.rotation)
-        by_intrinsics.append(by_k)
-    return np.concatenate(pixels, -1), np.concatenate(jacobians, -2), np.array(by_intrinsics)
+    return np.concatenate(pixels, -1), np.concatenate(jacobians, -2)
 
 
 def _maximum_likelihood(
@@ -336,7 +334,7 @@ def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
     x, y, z = pose.rotation @ points + pose.translation_mm[:, None]
     kappa = camera["kappa_per_mm"]
     if np.any(camera.intrinsics[INDEX["tilt_x"] : INDEX["wall_x_rad"]]) or (kappa and camera.wall):
-        uv, by_tilted, _ = camera.pixel_jacobians(np.stack([x, y, z], -1))
+        uv, by_tilted, _ = camera.pixel_jacobians(np.stack([x, y, z], -1), ())
         return uv.T, np.moveaxis(by_tilted @ pose.rotation, 0, -1)
     if camera.wall is not None:
         matrix, offset = affine_map(projection.standing_wall(camera.intrinsics, camera.wall))
@@ -382,7 +380,7 @@ def _midpoint_covariance(
     for camera in cameras:
         _, direction = camera.unproject(camera.project(points))
         projectors.append(np.eye(3) - direction[..., :, None] * direction[..., None, :])
-        _, jacobian, _ = stacked_jacobian((camera,), points)
+        _, jacobian = stacked_jacobian((camera,), points)
         gains.append(projectors[-1] @ np.linalg.pinv(jacobian))
     total = np.linalg.inv(sum(projectors[1:], projectors[0]))
     spread = sum(g @ c @ g.mT for g, c in zip(gains, covariances))

@@ -173,7 +173,7 @@ def ray_misses(
     covariance_px2 : (M, 2, 2, 2). Without pixels or covariances the results are 0.
     """
     n, _ = common_perpendicular(cameras)
-    predicted, by_point, _ = stacked_jacobian(cameras, points_mm)
+    predicted, by_point = stacked_jacobian(cameras, points_mm)
     null = np.linalg.svd(by_point)[0][..., :, 3]
     scale = -np.einsum("mi,mij,j->m", null[:, 2:], by_point[:, 2:], n)
     null = null / scale[:, None]

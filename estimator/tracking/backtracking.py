@@ -257,7 +257,7 @@ def readings_of(
         for single in frame.singles:
             if single.particle not in place:
                 continue
-            uv, by_point, _ = stacked_jacobian((cameras[single.camera],), single.point_mm[None])
+            uv, by_point = stacked_jacobian((cameras[single.camera],), single.point_mm[None])
             measured, covariance = frame.pixels[single.camera]
             left = measured[single.row] - frame.offset_px[single.camera] - uv[0]
             value = left + by_point[0] @ single.point_mm
@@ -341,7 +341,7 @@ def _distance2(
     cameras: tuple[Camera, Camera],
 ) -> float:
     """Squared Mahalanobis distance of the two cameras' rows from the k-th predicted particle."""
-    expected, by_point, _ = stacked_jacobian(cameras, predicted.points_mm[k : k + 1])
+    expected, by_point = stacked_jacobian(cameras, predicted.points_mm[k : k + 1])
     covariance = by_point[0] @ predicted.covariance_mm2[k] @ by_point[0].T
     left = -expected[0]
     for c, ((centre, noise), row) in enumerate(zip(frame.pixels, rows)):

@@ -172,7 +172,7 @@ def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
     share = (bodies.covariance_mm2 - bodies.silhouette_covariance_mm2)[known]
     values, vectors = np.linalg.eigh(share)
     share = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2)
-    _, jacobian, _ = stacked_jacobian(cameras, bodies.points_mm[known])
+    _, jacobian = stacked_jacobian(cameras, bodies.points_mm[known])
     for c in range(2):
         view = jacobian[:, 2 * c : 2 * c + 2]
         out[known, c] = view @ share @ np.swapaxes(view, -1, -2)
@@ -206,7 +206,7 @@ def pair_frame(
         given = np.concatenate([given, np.full(len(found), NO_PARTICLE)])
     (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))
     points = triangulate(cameras, (uv_a, uv_b), (cov_a, cov_b))
-    expected, by_point, _ = stacked_jacobian(cameras, points.points_mm)
+    expected, by_point = stacked_jacobian(cameras, points.points_mm)
     left = np.hstack([uv_a, uv_b]) - expected
     offset = np.zeros((2, 2))
     if len(left) >= _LEAST_FOR_OFFSET:

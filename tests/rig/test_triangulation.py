@@ -214,7 +214,7 @@ def test_blocks_give_what_dense_normal_equations_give(kind: str) -> None:
     weight[:2, :2], weight[2:, 2:] = np.linalg.inv(SIGMA)
     at = found.points_mm
     for _ in range(3):
-        predicted, jacobian, _ = stacked_jacobian(cameras, at)
+        predicted, jacobian = stacked_jacobian(cameras, at)
         weighted = np.swapaxes(jacobian, 1, 2) @ weight
         off = (np.concatenate(pixels, 1) - predicted)[..., None]
         at = at + np.linalg.solve(weighted @ jacobian, weighted @ off)[..., 0]

@@ -209,7 +209,7 @@ def _peak(profile: Array) -> Array:
 def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
     ideal = projection.ideal_from_pixel(uv_px, camera.intrinsics, camera.rho_mm)
     points = np.concatenate([ideal, np.zeros((len(ideal), 1))], -1)
-    _, by_point, _ = projection.pixel_jacobians(points, camera.intrinsics, camera.rho_mm)
+    _, by_point, _ = projection.pixel_jacobians(points, camera.intrinsics, camera.rho_mm, free=())
     return np.asarray(np.linalg.inv(by_point[..., :2]))
 
 

@@ -474,7 +474,7 @@ def _unmatched_density(
     """(N, K) expected density of detections whose track only this camera sees, over the usual."""
     view = geometry.views[c]
     cameras = (geometry.views[0].camera, geometry.views[1].camera)
-    pixels, jacobian, _ = stacked_jacobian(cameras, np.asarray(predicted.points_mm, float))
+    pixels, jacobian = stacked_jacobian(cameras, np.asarray(predicted.points_mm, float))
     rows = jacobian[:, 2 * c : 2 * c + 2]
     spread = rows @ predicted.covariance_mm2 @ np.swapaxes(rows, 1, 2)
     common = model.scatter_px**2 + model.frame_px**2 + model.bias_px[0] ** 2 / 4

@@ -438,7 +438,7 @@ def _inside_both(
     rows: Bools,
 ) -> Bools:
     """(M,) whether the triangulated point appears inside both outlines, as of one body."""
-    pixels, _, _ = stacked_jacobian(cameras, points_mm)
+    pixels, _ = stacked_jacobian(cameras, points_mm)
     pair = [o.rows(rows) for o in outlines]
     gap = np.concatenate([o.uv_px for o in pair], -1) - pixels
     extent = np.minimum(*(np.linalg.norm(o.axes_px, axis=1).max(-1) for o in pair))
@@ -456,7 +456,7 @@ def _fill_shapes(
     correct: bool,
 ) -> None:
     """Sizes; the centres of volume, or else what the shape adds to the outlines' centres' error."""
-    pixels, jacobian, _ = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
+    pixels, jacobian = stacked_jacobian(cameras, bodies.silhouette_points_mm[rows])
     axes_px = (pair[0].axes_px, pair[1].axes_px)
     shapes = _ellipsoids((jacobian[:, :2], jacobian[:, 2:]), axes_px)
     squares = np.linalg.eigvalsh(shapes.moments_mm2)

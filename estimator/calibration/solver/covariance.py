@@ -153,21 +153,16 @@ def rig_jacobian(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
     """(..., 2C, P) derivative of the pixels of rig points by the rig block's parameters."""
-    _, by_point, by_intrinsics = stacked_jacobian(cameras, points_mm)
-    columns = sum(len(f) for f in free) + 6 * (len(cameras) - 1)
-    out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), columns))
-    at = 0
-    for c, names in enumerate(free):
-        index = [INDEX[n] for n in names]
-        out[..., 2 * c : 2 * c + 2, at : at + len(index)] = by_intrinsics[c][..., index]
-        at += len(index)
-    for c, camera in enumerate(cameras[1:], 1):
-        pose = camera.camera_from_rig
-        in_camera = pose.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
-        by_camera_point = by_point[..., 2 * c : 2 * c + 2, :] @ pose.rotation.T
-        block = np.concatenate([by_camera_point @ hat(in_camera), -by_camera_point], -1)
-        out[..., 2 * c : 2 * c + 2, at : at + 6] = block
-        at += 6
+    lens = np.cumsum([0, *map(len, free)])
+    out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), lens[-1] + 6 * (len(cameras) - 1)))
+    for c, camera in enumerate(cameras):
+        rows = out[..., 2 * c : 2 * c + 2, :]
+        in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
+        names = [INDEX[name] for name in free[c]]
+        _, by_point, rows[..., lens[c] : lens[c + 1]] = camera.pixel_jacobians(in_camera, names)
+        if c:
+            at = lens[-1] + 6 * (c - 1)
+            rows[..., at : at + 6] = np.concatenate([by_point @ hat(in_camera), -by_point], -1)
     return out
 
 
@@ -207,7 +202,7 @@ def point_shift_jacobian(
     information_px: Array,
 ) -> Array:
     """(..., 3, P): how a triangulated point moves when the rig block's parameters move."""
-    _, by_point, _ = stacked_jacobian(cameras, points_mm)
+    _, by_point = stacked_jacobian(cameras, points_mm)
     weighted = np.swapaxes(by_point, -1, -2) @ information_px
     by_rig = rig_jacobian(cameras, free, points_mm)
     return np.asarray(-np.linalg.solve(weighted @ by_point, weighted @ by_rig), np.float64)

@@ -196,7 +196,7 @@ def derivatives(
     for c, camera in enumerate(cameras):
         mine = dots.camera == c
         in_camera = camera.camera_from_rig.apply(points[mine])
-        uv, by_camera_point, _ = camera.pixel_jacobians(in_camera)
+        uv, by_camera_point, _ = camera.pixel_jacobians(in_camera, ())
         residual[mine] = dots.uv_px[mine] - uv
         by_point[mine] = by_camera_point @ camera.camera_from_rig.rotation
         by_rig[mine] = whole[mine, 2 * c : 2 * c + 2]

@@ -219,7 +219,7 @@ class Projected:
 
 def projected(camera: Camera, points_mm: Array, covariance_mm2: Array) -> Projected:
     """Of rig points (K, 3) with covariances (K, 3, 3)."""
-    uv, by_point, _ = stacked_jacobian((camera,), points_mm)
+    uv, by_point = stacked_jacobian((camera,), points_mm)
     return Projected(uv, by_point, by_point @ covariance_mm2 @ np.swapaxes(by_point, -1, -2))
 
 

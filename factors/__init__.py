@@ -1,1 +1,5 @@
-"""Residuals with analytic Jacobians and their thin GTSAM wrappers."""
+"""Residuals with analytic Jacobians, stochastic motion processes, and thin wrappers for GTSAM.
+
+A residual is a pure NumPy function. Read ``projection`` for the calibration, ``state_space`` for
+the smoothing.
+"""

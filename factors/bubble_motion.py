@@ -1,13 +1,13 @@
-"""How a bubble moves: the one statement that tracking, learning and smoothing use.
+"""How a bubble moves. Tracking, learning and smoothing all use the models of this module.
 
-Over a run, along each axis: position = path + zigzags. The path's velocity is a constant mean U and
-an Ornstein-Uhlenbeck process; a zigzag is a stochastic oscillator. Smoothing and learning lay these
-processes out as states (`bubble_processes`).
+Over a run, the position along each axis is a path plus zigzags. The velocity of the path is a
+constant mean U plus an Ornstein-Uhlenbeck process; a zigzag is a stochastic oscillator. Smoothing
+and learning represent these processes by states (`bubble_processes`).
 
-From one frame to the next a tracker needs an acceleration to gate with, and has no run from which
-a mean could be known. Along the rise its acceleration is an Ornstein-Uhlenbeck process (Singer,
-IEEE Trans. Aerosp. Electron. Syst. 6:473, 1970); across it the velocity oscillates about a slow
-drift (`rise_motion`, `lateral_motion`).
+A tracker works from one frame to the next. It needs an acceleration to set its gates, and it has no
+run from which a mean velocity could be known. Along the direction of rise the acceleration is
+therefore an Ornstein-Uhlenbeck process (Singer, IEEE Trans. Aerosp. Electron. Syst. 6:473, 1970).
+Across the rise the velocity oscillates about a slow drift (`rise_motion`, `lateral_motion`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,12 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Zigzag:
-    """A stochastic oscillation of the bubbles' paths; RMS along the rig's x, y, z, 0 for none.
+    """A stochastic oscillation of the bubbles' paths.
 
-    force_hz : low-pass cut-off of the force (two poles); None: white.
+    rms_mm : RMS displacement along the rig's x, y and z axes; 0 for no oscillation along an axis.
+    damping : damping ratio.
+    force_hz : cut-off frequency of the two-pole low-pass filter of the driving force; None if the
+        force is white noise.
     """
 
     frequency_hz: float
@@ -39,12 +42,15 @@ class Zigzag:
 
 @dataclass(frozen=True)
 class BubbleModel:
-    """Priors of every bubble.
+    """The prior distribution of the motion of every bubble.
 
-    velocity_sigma_mm_s, velocity_tau_s : Ornstein-Uhlenbeck velocity about a constant mean.
-    start_sigma_mm, mean_sigma_mm_s : of the first position and the mean velocity, each axis.
-    zigzags : oscillations besides.  wander_px, wander_tau_s : of the centroid in each image,
-        0 for none.
+    velocity_sigma_mm_s, velocity_tau_s : standard deviation and correlation time of the velocity
+        about its constant mean (Ornstein-Uhlenbeck process).
+    start_sigma_mm, mean_sigma_mm_s : standard deviations of the first position and of the mean
+        velocity, along each axis.
+    zigzags : oscillations that are added to the path.
+    wander_px, wander_tau_s : RMS and correlation time of the centroid's error in each image; 0 px
+        for none.
     """
 
     velocity_sigma_mm_s: float = 10.0
@@ -58,10 +64,14 @@ class BubbleModel:
 
 @dataclass(frozen=True)
 class Process:
-    """One process along one direction, and the hyper-parameters that it is made from.
+    """One stochastic process along one direction, with the hyper-parameters that define it.
 
-    stem : of the hyper-parameters' names, "bubble.zigzags.0".  learned : their last parts, with the
-    arguments of ``make`` and values here.  camera : index of the arm that it moves, None: a bubble.
+    stem : common first part of the hyper-parameters' names, for instance "bubble.zigzags.0".
+    make : function that returns the process as a `Component`.
+    learned : for each learned hyper-parameter the last part of its name, mapped to the argument of
+        ``make`` and its value.
+    fixed : the other arguments of ``make``.
+    camera : index of the camera whose arm the process moves; None if it moves a bubble.
     """
 
     stem: str
@@ -72,11 +82,15 @@ class Process:
 
     @property
     def component(self) -> Component:
-        """The same object for the same numbers, where ``make`` remembers what it has made."""
+        """The process as a `Component`; equal hyper-parameters give the same object if ``make`` is
+        cached."""
         return self.make(**dict(self.learned.values()), **self.fixed)
 
     def moved(self, name: str, factor: float) -> Component:
-        """With one hyper-parameter (its last part) times a factor."""
+        """Return the process after one hyper-parameter has been multiplied by a factor.
+
+        name : the last part of the hyper-parameter's name.
+        """
         values = {n: (a, factor * v if n == name else v) for n, (a, v) in self.learned.items()}
         return self.make(**dict(values.values()), **self.fixed)
 
@@ -93,10 +107,13 @@ def _path_about_its_mean(**values: float) -> Component:
 def bubble_processes(
     model: BubbleModel, direction: Array, *, bubbles: int = 1, mean_known: bool = False
 ) -> list[Process]:
-    """The path, then the zigzags that move along a direction (3,), a unit vector in rig axes.
+    """Return the processes that move a bubble along a direction: the path, then the zigzags.
 
-    bubbles : the mean of so many bubbles' positions is meant, whose deviations are independent.
-    mean_known : the path is that about its mean velocity; else the mean is its input.
+    direction : (3,) unit vector in rig axes.
+    bubbles : number of bubbles whose mean position is described. Their deviations are independent,
+        so the RMS values are divided by its square root.
+    mean_known : if True, the path is taken about its mean velocity; otherwise the mean velocity is
+        an input of the process.
     """
     share = 1 / np.sqrt(bubbles)
     learned = {
@@ -122,7 +139,11 @@ def line_process(
     force_hz: float | None,
     camera: int | None = None,
 ) -> Process:
-    """A spectral line: a resonance of the rig, or a zigzag of bubbles."""
+    """Return the process of a spectral line, which is a resonance of the rig or a zigzag of
+    bubbles.
+
+    Arguments are as in `Process` and `state_space.resonance`.
+    """
     values = {"rms_mm": rms_mm, "frequency_hz": frequency_hz, "damping": damping}
     if force_hz is not None:
         values["force_hz"] = force_hz
@@ -130,10 +151,14 @@ def line_process(
 
 
 def rise_motion(acceleration_mm_s2: float, acceleration_time_s: float) -> tuple[Array, Array]:
-    """(4, 4) drift F and (4, 1) noise L along the rise: Singer's model; the last state is constant.
+    """Return the drift F (4, 4) and the noise L (4, 1) of a bubble's motion along the direction of
+    rise.
 
-    States here and in `lateral_motion`: position, velocity, acceleration, drift velocity.
-    acceleration_mm_s2 : RMS.
+    This is Singer's model. The states here and in `lateral_motion` are position, velocity,
+    acceleration and drift velocity; the last one stays constant here.
+
+    acceleration_mm_s2 : RMS acceleration.
+    acceleration_time_s : correlation time of the acceleration.
     """
     drift, noise = np.zeros((4, 4)), np.zeros((4, 1))
     drift[0, 1] = drift[1, 2] = 1.0
@@ -149,10 +174,13 @@ def lateral_motion(
     drift_mm_s: float,
     drift_time_s: float,
 ) -> tuple[Array, Array]:
-    """(4, 4) drift F and (4, 2) noise L across the rise.
+    """Return the drift F (4, 4) and the noise L (4, 2) of a bubble's motion across the rise.
 
-    The velocity oscillates about a drift velocity of RMS drift_mm_s that forgets within
-    drift_time_s.  acceleration_mm_s2 : RMS that the oscillation's noise alone would keep up.
+    The velocity oscillates about a drift velocity, whose RMS is ``drift_mm_s`` and whose
+    correlation time is ``drift_time_s``.
+
+    acceleration_mm_s2 : RMS acceleration that the oscillation's noise alone would maintain.
+    damping : damping ratio of the oscillation.
     """
     omega = 2 * np.pi * frequency_hz
     rate = 2 * damping * omega

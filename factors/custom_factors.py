@@ -1,6 +1,7 @@
-"""The factors of a self-calibration as `gtsam.CustomFactor`, for graphs of one's own.
+"""The factors of a self-calibration as `gtsam.CustomFactor`, for users who build their own graphs.
 
-Each wraps the NumPy function that states it; the solvers of telerig do not go through them.
+Each one wraps the NumPy function that defines its residual. The solvers of telerig do not use these
+wrappers.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ Residual = Callable[[Any], tuple[Array, list[Array]]]
 
 @dataclass(frozen=True)
 class Keys:
-    """Keys of a calibration's variables.
+    """The GTSAM keys of a calibration's variables, and how intrinsics are scaled.
 
-    intrinsics : per camera, a vector of F_c free intrinsics, as differences from the start in
-    units of ``unit``.  camera : per camera, its Pose3 rig_from_camera; the first is not used.
-    view : per view, its Pose3 rig_from_target.  dots : per dot, its place (3,).
-    free : per camera, indices into `PARAMETERS`.  unit : per camera (F_c,).
+    intrinsics : for each camera the key of a vector of its F_c free intrinsics, given as
+        differences from the start and in multiples of ``unit``.
+    camera : for each camera the key of its Pose3 rig_from_camera; the first one is not used.
+    view : for each view the key of its Pose3 rig_from_target.
+    dots : for each dot the key of its position (3,) in the target frame.
+    free : for each camera the indices of its free intrinsics in `PARAMETERS`.
+    unit : for each camera the units (F_c,) of its free intrinsics.
     """
 
     intrinsics: tuple[int, ...]
@@ -37,10 +41,15 @@ class Keys:
 
 
 def custom_factor(keys: Sequence[int], columns: Sequence[int], rows: int, f: Residual) -> Any:
-    """A `gtsam.CustomFactor` of unit noise round ``f(values) -> (rows,), [(rows, columns[k])]``.
+    """Return a `gtsam.CustomFactor` with unit noise for the residual function ``f``.
 
-    A Jacobian with the wrong number of rows is a segmentation fault in GTSAM and a wrong number
-    of columns goes unseen, so shapes are checked: AssertionError.
+    keys, columns : the variables and the number of columns of each one's Jacobian.
+    rows : number of rows of the residual.
+    f : takes a `gtsam.Values` and returns the residual (rows,) and a list of Jacobians (rows,
+        columns[k]).
+
+    Raises AssertionError if the shapes are wrong: a Jacobian with a wrong number of rows crashes
+    GTSAM, and a wrong number of columns goes unnoticed.
     """
     import gtsam
 
@@ -61,7 +70,11 @@ def custom_factor(keys: Sequence[int], columns: Sequence[int], rows: int, f: Res
 
 
 def image_factor(keys: Keys, start: State, image: Observations, camera: int, rho_mm: float) -> Any:
-    """The factor of one image's M dots; ``image`` holds the measurements of one view and camera."""
+    """Return the factor of the M dots that one camera measured in one view.
+
+    start : the state to which the increments of the intrinsics refer.
+    image : the measurements of one view and one camera.
+    """
     view, free, unit = int(image.view[0]), keys.free[camera], keys.unit[camera]
     variables = [*([keys.intrinsics[camera]] if len(free) else []), keys.view[view]]
     variables += [keys.camera[camera]] if camera else []
@@ -85,7 +98,7 @@ def image_factor(keys: Keys, start: State, image: Observations, camera: int, rho
 
 
 def _image_state(values: Any, keys: Keys, start: State, image: Observations, camera: int) -> State:
-    """The start with the variables of one image replaced by those of a `gtsam.Values`."""
+    """Return ``start`` with the variables of one image replaced by those of a `gtsam.Values`."""
     intrinsics, cameras = start.intrinsics.copy(), start.rig_from_camera.copy()
     views, dots = start.rig_from_target.copy(), start.dots_mm.copy()
     free, view = keys.free[camera], int(image.view[0])
@@ -102,7 +115,8 @@ def _image_state(values: Any, keys: Keys, start: State, image: Observations, cam
 
 
 def distance_factor(first: int, second: int, distance_mm: float, sigma_mm: float) -> Any:
-    """The known distance of two dots, whose keys are given."""
+    """Return the factor of the known distance between two dots, whose keys are ``first`` and
+    ``second``."""
 
     def residual(values: Any) -> tuple[Array, list[Array]]:
         ends = values.atVector(first), values.atVector(second)
@@ -113,7 +127,11 @@ def distance_factor(first: int, second: int, distance_mm: float, sigma_mm: float
 
 
 def depth_gauge_factor(key: int, sigma_mm: float, *, second: bool) -> Any:
-    """The depth gauge of a camera's pose; both rows for the second camera, else its own axis."""
+    """Return the factor that fixes the origin of the rig frame; see `depth_gauge_residual`.
+
+    second : True for the second camera, which takes both rows. A further camera takes only the row
+        along its own axis.
+    """
     first = 0 if second else 1
 
     def residual(values: Any) -> tuple[Array, list[Array]]:
@@ -124,7 +142,7 @@ def depth_gauge_factor(key: int, sigma_mm: float, *, second: bool) -> Any:
 
 
 def place_factor(key: int, sigma_mm: float) -> Any:
-    """The loose prior on a view's place."""
+    """Return the factor of the weak prior on a view's position; see `place_residual`."""
 
     def residual(values: Any) -> tuple[Array, list[Array]]:
         value, jacobian = place_residual(values.atPose3(key).matrix(), sigma_mm)

@@ -1,7 +1,7 @@
-"""Whitened linear factors: arrays of one shape, and their way into GTSAM.
+"""Whitened linear factors as arrays, and the conversion to GTSAM.
 
-A factor is |sum_k A_k x_k - b|^2 with unit noise. Arrays of factors of one shape are made in NumPy
-and handed over one by one: GTSAM's `JacobianFactor` takes up to three keys.
+A factor is |sum_k A_k x_k - b|^2 with unit noise. Many factors of equal shape are computed together
+in NumPy and then given to GTSAM one by one. GTSAM's `JacobianFactor` takes up to three keys.
 """
 
 from __future__ import annotations
@@ -48,9 +48,11 @@ class LinearFactors:
 
 
 def prior_factors(keys: ArrayLike, deviation: Array, sigma: ArrayLike) -> LinearFactors:
-    """Priors of M vectors with independent components.
+    """Return the factors of M Gaussian priors on vectors of n independent components.
 
-    keys : (M,).  deviation : (M, n) of the values from the prior's mean.  sigma : to (M, n).
+    keys : (M,).
+    deviation : (M, n) current values minus the mean of the prior.
+    sigma : standard deviations, of any shape that broadcasts to (M, n).
     """
     count, width = deviation.shape
     scale = np.broadcast_to(1 / np.asarray(sigma, float), (count, width))
@@ -68,10 +70,12 @@ def _unit_noise(rows: int) -> Any:
 def add_linear_factors(
     graph: Any, keys: Sequence[ArrayLike], blocks: Sequence[Array], rhs: Array
 ) -> None:
-    """Add M factors |sum_k blocks[k] x_keys[k] - rhs|^2 of unit noise to a GaussianFactorGraph.
+    """Add M factors |sum_k blocks[k] x_keys[k] - rhs|^2 with unit noise to a GaussianFactorGraph.
 
-    keys : up to three of (M,) or one number.  blocks : (M, rows, columns) or (rows, columns) each.
-    rhs : (M, rows). Blocks without columns are left out.
+    keys : for each of up to three variables the keys (M,), or one key for all factors.
+    blocks : for each variable (M, rows, columns), or (rows, columns) for all factors. A block
+        without columns is left out.
+    rhs : (M, rows).
     """
     import gtsam
 

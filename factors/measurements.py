@@ -1,7 +1,8 @@
-"""What cameras and accelerometers read of bubbles, carriage and camera offsets.
+"""Predicted measurements of cameras and accelerometers, with derivatives.
 
-Each function predicts a reading and gives its derivatives; leading axes are batch axes. Lengths
-mm, times s, angles rad, accelerations mm/s^2, pixels px. A camera j with offset o_j sees the lab
+A measurement depends on the positions of the bubble and of the carriage and on the offset of the
+camera. Leading axes (...) are batch axes. Lengths are in mm, times in s, angles in rad,
+accelerations in mm/s^2 and image coordinates in px. A camera j with the offset o_j sees the lab
 point P at the rig point P - axis * position - o_j.
 """
 
@@ -18,10 +19,11 @@ from telerig.rig.camera import Camera
 
 @dataclass(frozen=True)
 class ImagePrediction:
-    """uv_px : (..., 2) and its derivatives.
+    """Predicted pixels of points, and their derivatives.
 
-    by_point, by_offset : (..., 2, 3) by the lab point and the camera's offset.
-    by_position : (..., 2) by the stage's position.
+    uv_px : (..., 2).
+    by_point, by_offset : (..., 2, 3) with respect to the lab point and to the camera's offset.
+    by_position : (..., 2) with respect to the stage's position.
     """
 
     uv_px: Array
@@ -37,9 +39,10 @@ def image_of_point(
     axis: Array,
     offset_mm: ArrayLike,
 ) -> ImagePrediction:
-    """The image of a bubble, or of a mark fixed to the tank, and its derivatives.
+    """Return the pixel of a bubble, or of a mark that is fixed to the tank, with its derivatives.
 
-    point_lab_mm, offset_mm : (..., 3).  position_mm : (...) of the carriage along ``axis`` (3,).
+    point_lab_mm, offset_mm : (..., 3) position in the laboratory, and offset of the camera.
+    position_mm : (...) position of the carriage along ``axis`` (3,).
     """
     pose = camera.camera_from_rig
     position = np.asarray(position_mm, float)[..., None]
@@ -55,10 +58,14 @@ def image_of_point(
 
 @dataclass(frozen=True)
 class AccelerometerPrediction:
-    """reading_mm_s2 : (..., 3) along the sensor's axes.
+    """Predicted readings of an accelerometer, and their derivatives.
 
-    by_acceleration : (..., 3, 3) by the mount's acceleration in rig axes.  by_scale : (..., 3).
-    The derivative by the bias is the identity.
+    reading_mm_s2 : (..., 3) along the sensor's axes.
+    by_acceleration : (..., 3, 3) with respect to the acceleration of the sensor's mount, in rig
+        axes.
+    by_scale : (..., 3) with respect to the scale error.
+
+    The derivative with respect to the bias is the identity.
     """
 
     reading_mm_s2: Array
@@ -73,11 +80,16 @@ def accelerometer_reading(
     bias_mm_s2: ArrayLike = 0.0,
     scale: ArrayLike = 0.0,
 ) -> AccelerometerPrediction:
-    """axes . ((1 + scale) acceleration - g) + bias; specific force as the sensor gives it.
+    """Return the predicted readings: axes ((1 + scale) acceleration - g) + bias.
 
-    acceleration_mm_s2 : (..., 3) of the mount, in rig axes, at the stamp minus the delay.
-    gravity_mm_s2 : (3,) g of the laboratory, downwards, in rig axes.
-    axes : (3, 3), rows are the sensor's axes in rig coordinates.
+    An accelerometer measures specific force, which is acceleration minus gravity.
+
+    acceleration_mm_s2 : (..., 3) acceleration of the mount in rig axes, at the time of the sample
+        minus the sensor's delay.
+    gravity_mm_s2 : (3,) g in the laboratory, pointing down, in rig axes.
+    axes : (3, 3) whose rows are the sensor's axes in rig coordinates.
+    bias_mm_s2 : constant error of the reading, broadcast to (..., 3).
+    scale : relative error of the scale, broadcast to (...).
     """
     acceleration = np.asarray(acceleration_mm_s2, float)
     gain = 1 + np.asarray(scale, float)[..., None]

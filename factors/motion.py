@@ -1,4 +1,4 @@
-"""Motion priors as whitened linear factors: the steps of several processes side by side."""
+"""Motion priors as whitened linear factors. Several processes are put side by side in one state."""
 
 from __future__ import annotations
 
@@ -22,11 +22,17 @@ from telerig.factors.state_space import (
 
 @dataclass(frozen=True)
 class Motion:
-    """Steps of several components side by side, whitened: W (x' - Phi x - G c) has unit noise.
+    """Whitened steps of several processes: W (x' - Phi x - G c) has unit noise.
 
-    by_next, by_last : (U, n, n) W and -W Phi.  by_input : (U, n, K) -W G.  log_det : (U,) of W.
-    basis : (U + 1, n, n), see `Steps.bases`.
-    index : (M,) which of the U distinct steps each step is.
+    Here x (n,) and x' (n,) are the states before and after a step, Phi (n, n) the transition, c
+    (K,) the constant inputs, G (n, K) their effect, and W (n, n) the whitening matrix. There are M
+    steps, of U different lengths.
+
+    by_next, by_last : (U, n, n) W and -W Phi.
+    by_input : (U, n, K) -W G.
+    log_det : (U,) logarithm of the determinant of W.
+    basis : (U + 1, n, n) bases of the states, see `Steps.bases`.
+    index : (M,) which of the U lengths each step has.
     """
 
     by_last: Array
@@ -37,7 +43,11 @@ class Motion:
     index: Ints
 
     def residual(self, last: Array, following: Array, inputs: ArrayLike) -> Array:
-        """(M, n) whitened residuals of states (M, n), (M, n) and inputs (M, K) or (K,)."""
+        """Return the whitened residuals (M, n) of M steps.
+
+        last, following : (M, n) states before and after each step.
+        inputs : (M, K), or (K,) for all steps.
+        """
         i = self.index
         constant = np.broadcast_to(np.asarray(inputs, float), (len(i), self.by_input.shape[-1]))
         terms = ((self.by_next, following), (self.by_last, last), (self.by_input, constant))
@@ -50,19 +60,24 @@ class Motion:
         inputs: Array,
         following: Ints,
     ) -> LinearFactors:
-        """The steps as M factors on increments of both states in their bases, and on the inputs.
+        """Return the M steps as linear factors on increments of the states, in their bases, and on
+        the inputs.
 
-        keys : of the states before and after, (M,) each, and of the inputs where there are any.
-        states : before and after, (M, n) each.  inputs : (M, K).  following : see `in_basis`.
+        keys : (M,) of the states before, (M,) of the states after and, if there are inputs, (M,) of
+            these.
+        states : (M, n) before and (M, n) after.
+        inputs : (M, K).
+        following : (M,) as in `in_basis`.
         """
         residual = self.residual(*states, inputs)
         blocks = (*self.in_basis(following), self.by_input[self.index])
         return LinearFactors(tuple(keys), blocks[: len(keys)], -residual, self.log_det[self.index])
 
     def in_basis(self, following: Ints) -> tuple[Array, Array]:
-        """(M, n, n) by_last and by_next for increments in the bases of the two states.
+        """Return by_last and by_next (M, n, n) for increments that are expressed in the states'
+        bases.
 
-        following : (M,) index into ``basis`` of each step's second state.
+        following : (M,) index into ``basis`` of the state after each step.
         """
         last, ahead, place = self.distinct_in_basis(following)
         return last[place], ahead[place]
@@ -76,10 +91,11 @@ class Motion:
 
 
 def motion(components: Sequence[Component], dt_s: ArrayLike, *, batched: bool = False) -> Motion:
-    """The steps dt_s (M,) of independent components, states and inputs one after the other.
+    """Return the whitened steps of independent processes, with states and inputs side by side.
 
-    batched : components of one kind in one batch of arrays, which pays where few steps are worked
-    out a thousand times.
+    dt_s : (M,) lengths of the steps.
+    batched : whether processes of equal kind are computed together. This is faster if a few steps
+        are computed thousands of times.
     """
     lengths, index = distinct_steps(dt_s)
     sizes, inputs = (np.array([c.input.shape[i] for c in components], int) for i in (0, 1))
@@ -104,7 +120,10 @@ def motion(components: Sequence[Component], dt_s: ArrayLike, *, batched: bool = 
 
 
 def start(components: Sequence[Component]) -> tuple[Array, Array]:
-    """(n, n) covariance of the states at the start, and (n, K) their mean for given inputs."""
+    """Return the prior of the first state of several processes.
+
+    Returns its covariance (n, n), and the matrix (n, K) that maps the inputs to its mean.
+    """
     covariance = block_diagonal([c.start_covariance for c in components])
     return covariance, block_diagonal([c.start_from_input for c in components])
 
@@ -116,10 +135,12 @@ def start_factors(
     basis: Array,
     inputs: Array,
 ) -> LinearFactors:
-    """The priors of M first states, as factors on increments in their basis and on the inputs.
+    """Return the priors of M first states as factors on increments of the state and on the inputs.
 
-    keys : of the states, (M,), and of the inputs where there are any.  deviation : (M, n) from the
-    mean without inputs.  basis : (M, n, n).  inputs : (M, K).
+    keys : (M,) of the states and, if there are inputs, (M,) of these.
+    deviation : (M, n) state minus its mean without inputs.
+    basis : (M, n, n) in which the increments of the states are expressed.
+    inputs : (M, K).
     """
     covariance, by_input = start(components)
     whitener = whitener_of(covariance)

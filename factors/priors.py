@@ -1,4 +1,7 @@
-"""Priors, known distance and depth gauge of the self-calibration, each a pure whitened residual."""
+"""Residuals of the self-calibration that are not images: known distance, depth gauge, weak priors.
+
+Each is a pure function that returns whitened residuals and their derivatives.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,12 @@ from telerig.rig.pose import hat
 def distance_residual(
     first_mm: Array, second_mm: Array, distance_mm: float, sigma_mm: float
 ) -> tuple[Array, Array]:
-    """The known distance of two dots (..., 3), which sets the scale.
+    """Return the residual of the known distance between two dots, which sets the scale.
 
-    Returns (...,) residuals and (..., 3) derivatives by the first dot; those by the second are
-    their negative.
+    first_mm, second_mm : (..., 3) positions of the two dots.
+
+    Returns the residuals (...) and their derivatives (..., 3) with respect to the first dot. The
+    derivatives with respect to the second dot are the negative of these.
     """
     difference = first_mm - second_mm
     length = np.linalg.norm(difference, axis=-1)
@@ -25,11 +30,15 @@ def distance_residual(
 
 
 def depth_gauge_residual(rig_from_camera: Array, sigma_mm: float) -> tuple[Array, Array]:
-    """The rig origin lies where two optical axes come closest.
+    """Return the residuals that put the rig origin where two optical axes come closest.
 
-    (..., 4, 4) poses -> (..., 2) their translations along the first camera's axis and along their
-    own, and (..., 2, 6) by GTSAM's Pose3 tangent. Neither is observable of the second camera, only
-    that along its own axis of a further one; see `docs/theory.md`.
+    rig_from_camera : (..., 4, 4) poses of the second camera or a further one.
+
+    Returns the residuals (..., 2), which are the translation along the axis of the first camera and
+    along the camera's own axis, both over ``sigma_mm``, and their derivatives (..., 2, 6) with
+    respect to GTSAM's Pose3 tangent. Images do not determine either translation for the second
+    camera. For a further camera they leave only the translation along its own axis undetermined;
+    see `docs/theory.md`.
     """
     rotation, translation = rig_from_camera[..., :3, :3], rig_from_camera[..., :3, 3]
     axis = rotation[..., 2]
@@ -43,9 +52,14 @@ def depth_gauge_residual(rig_from_camera: Array, sigma_mm: float) -> tuple[Array
 
 
 def place_residual(rig_from_target: Array, sigma_mm: float) -> tuple[Array, Array]:
-    """A loose prior on the target's place: bounds a depth that a single camera cannot see.
+    """Return the residuals of a weak prior on the target's position in a view.
 
-    (..., 4, 4) poses -> (..., 3) residuals and (..., 3, 6) by GTSAM's Pose3 tangent.
+    It bounds the depth of a view that only one telecentric camera sees.
+
+    rig_from_target : (..., 4, 4).
+
+    Returns the residuals (..., 3) and their derivatives (..., 3, 6) with respect to GTSAM's Pose3
+    tangent.
     """
     rotation, translation = rig_from_target[..., :3, :3], rig_from_target[..., :3, 3]
     jacobian = np.concatenate([np.zeros_like(rotation), rotation], -1) / sigma_mm

@@ -1,7 +1,7 @@
-"""The telecentric projection factor: dots of a target seen by the cameras of the rig.
+"""The projection factor: dots of a target as the cameras of the rig see them.
 
-`image_columns` is the one place where its residual and derivatives stand; they are of all dots of
-a camera at once. Everything else here, and every solver, reads them from it.
+`image_columns` defines the residual and its derivatives, for all dots of one camera at once. All
+solvers, and all other functions in this module that need derivatives, use it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from telerig.rig.windows import Wall
 
 @dataclass(frozen=True)
 class State:
-    """Everything that is estimated, as arrays.
+    """All quantities that a calibration estimates, for C cameras, V views and N dots.
 
-    intrinsics : (C, 20), order `telerig.rig.projection.PARAMETERS`.
+    intrinsics : (C, 20) in the order of `telerig.rig.projection.PARAMETERS`.
     rig_from_camera : (C, 4, 4); the first is the identity.
     rig_from_target : (V, 4, 4).
-    dots_mm : (N, 3) in the target's frame.
+    dots_mm : (N, 3) in the target frame.
     """
 
     intrinsics: Array
@@ -35,13 +35,17 @@ class State:
 
 @dataclass(frozen=True)
 class Observations:
-    """Dots measured in images, sorted by image (view, camera).
+    """M dots measured in images by C cameras in V views, sorted by image (view, camera).
 
-    view, camera, dot : (M,) indices.  uv_px : (M, 2).
-    whitener : (M, 2, 2), W with W^T W = inverse covariance; a weight multiplies its square.
-    plate_shift : (V, C) +1 or -1 where the camera sees the dots through the plate, else 0.
-    plate : (thickness_mm, index).
-    walls : per camera, the glass that it sees the dots through; () where they are in air.
+    view, camera, dot : (M,) indices of each measurement.
+    uv_px : (M, 2).
+    whitener : (M, 2, 2) matrices W with W^T W = inverse covariance, multiplied by the square root
+        of the measurement's weight.
+    plate_shift : (V, C) +1 or -1 if the camera sees the dots through the plate of the target, and 0
+        otherwise.
+    plate : thickness (mm) and refractive index of the plate.
+    walls : for each camera the window through which it sees the dots, or None; () if all dots are
+        in air.
     """
 
     view: Ints
@@ -54,7 +58,7 @@ class Observations:
     walls: tuple[Wall | None, ...] = ()
 
     def subset(self, rows: Ints | NDArray[np.bool_] | slice) -> Observations:
-        """Only some of the measurements."""
+        """Return only the measurements in ``rows``."""
         parts = {n: getattr(self, n)[rows] for n in ("view", "camera", "dot", "uv_px", "whitener")}
         return replace(self, **parts)
 
@@ -66,10 +70,15 @@ class Observations:
 
 
 def apparent_shift_mm(cosine: Array, thickness_mm: float, index: float) -> tuple[Array, Array]:
-    """How much nearer a dot looks, along the plate's normal, through a parallel plate.
+    """Return how much nearer a dot appears through a parallel plate, along the plate's normal.
 
-    Snell's law for the parallel rays of a telecentric lens at angle acos(cosine) to the normal:
-    d (1 - tan(refracted) / tan(incident)). Returns the shift and its slope d(shift)/d(cosine).
+    By Snell's law, a telecentric camera whose rays make an angle with the normal sees the shift d
+    (1 - tan(angle in the plate) / tan(angle in air)), with d the thickness.
+
+    cosine : cosine of the angle in air.
+
+    Returns the shift in mm and its derivative with respect to ``cosine``, both of the shape of
+    ``cosine``.
     """
     root2 = index**2 - 1 + cosine**2
     shift = thickness_mm * (1 - cosine / np.sqrt(root2))
@@ -78,10 +87,12 @@ def apparent_shift_mm(cosine: Array, thickness_mm: float, index: float) -> tuple
 
 @dataclass(frozen=True)
 class _Placed:
-    """M dots of one camera; components come first, so that each is contiguous in memory.
+    """Positions of M dots that one camera sees. Components come first, so that each is contiguous.
 
-    rotation : (3, 3, M) camera from target.  target, camera : (3, M) coordinates of the dots in
-    the target's frame, with the shift of the plate that they are seen through, and the camera's.
+    rotation : (3, 3, M) camera from target.
+    target : (3, M) coordinates in the target frame, with the shift of the plate through which the
+        dots are seen.
+    camera : (3, M) coordinates in the camera frame.
     """
 
     rotation: Array
@@ -107,13 +118,16 @@ def _placed(state: State, obs: Observations, camera: int) -> _Placed:
 
 
 def whitened_error(state: State, obs: Observations, rho_mm: Sequence[float]) -> Array:
-    """(M, 2) whitened residuals, predicted minus measured, without derivatives."""
+    """Return the whitened residuals (M, 2), predicted minus measured, without derivatives."""
     residual = pixels(state, obs, rho_mm) - obs.uv_px
     return np.asarray(np.einsum("mij,mj->mi", obs.whitener, residual))
 
 
 def pixels(state: State, obs: Observations, rho_mm: Sequence[float]) -> Array:
-    """(M, 2) predicted pixels."""
+    """Return the predicted pixels (M, 2).
+
+    rho_mm : for each camera the length that normalises the distortion, see `Camera`.
+    """
     out = np.empty((len(obs), 2))
     for c, rho in enumerate(rho_mm):
         mine = obs.camera == c
@@ -127,7 +141,7 @@ def _pixels(state: State, obs: Observations, camera: int, rho_mm: float) -> Arra
 
 
 def whitened_image_error(state: State, obs: Observations, camera: int, rho_mm: float) -> Array:
-    """(2, M) whitened residuals of one camera's dots, component by component."""
+    """Return the whitened residuals (2, M) of one camera's dots, one row per component."""
     u, v = (_pixels(state, obs, camera, rho_mm) - obs.uv_px).T
     white = obs.whitener.transpose(1, 2, 0)
     return np.asarray(white[:, 0] * u + white[:, 1] * v)
@@ -136,15 +150,18 @@ def whitened_image_error(state: State, obs: Observations, camera: int, rho_mm: f
 def image_columns(
     state: State, obs: Observations, camera: int, rho_mm: float, free: Sequence[int]
 ) -> Array:
-    """Whitened residuals of one camera's M dots, and their derivatives: the image factor.
+    """Return the whitened residuals of one camera's M dots, and their derivatives: the image
+    factor.
 
-    obs : measurements of this camera alone.  free : indices into `PARAMETERS` of F intrinsics.
+    obs : measurements of this camera only.
+    free : indices into `PARAMETERS` of the F intrinsics for which derivatives are wanted.
 
-    Returns (F + 13, 2, M), component by component: derivatives by the F intrinsics, by
-    rig_from_camera (6; not of the first camera, whose frame is the rig's) and by rig_from_target
-    (6), both GTSAM's Pose3 tangent (rotation, translation; right perturbation), and the residual,
-    predicted minus measured. The derivative by the dot is that by the target's translation,
-    `dot_columns`.
+    Returns columns (F + 13, 2, M), or (F + 7, 2, M) for the first camera, because its frame is the
+    rig frame and its pose is fixed. The columns are the derivatives with respect to the F
+    intrinsics, to rig_from_camera (6, left out for the first camera) and to rig_from_target (6),
+    and then the residual, predicted minus measured. Poses use GTSAM's Pose3 tangent (rotation,
+    translation; right perturbation). The derivative with respect to a dot equals that with respect
+    to the target's translation; see `dot_columns`.
     """
     at, count = _placed(state, obs, camera), len(free)
     uv, by_point, by_free = projection.pixel_jacobians(
@@ -178,12 +195,13 @@ def image_columns(
 
 
 def dot_columns(columns: Array) -> Array:
-    """(3, 2, M) of `image_columns`: the derivatives by each dot's own place."""
+    """Return the derivatives (3, 2, M) with respect to each dot's position, from
+    `image_columns`."""
     return columns[-4:-1]
 
 
 def _cross(first: Array, second: Array, out: Array) -> None:
-    """first x second, component by component: (3, M) or (3, 2, M) each, out (3, 2, M)."""
+    """Write first x second to ``out`` (3, 2, M). Both factors are (3, M) or (3, 2, M)."""
     a, b = (p[:, None] if p.ndim < out.ndim else p for p in (first, second))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=out[i])
@@ -205,10 +223,13 @@ def _add_plate_slopes(
 
 @dataclass(frozen=True)
 class Residuals:
-    """Whitened residuals (M, 2) and their derivatives (M, 2, k).
+    """Whitened residuals of M dots and their derivatives.
 
-    by_dot : 3 columns; by_view, by_camera : 6, as in `image_columns`, zero for the first camera;
-    by_intrinsics : all 20.
+    value : (M, 2) residuals.
+    by_dot : (M, 2, 3) with respect to the dot.
+    by_view, by_camera : (M, 2, 6) with respect to the poses, as in `image_columns`; by_camera is
+        zero for the first camera.
+    by_intrinsics : (M, 2, 20) with respect to all intrinsics.
     """
 
     value: Array
@@ -219,7 +240,9 @@ class Residuals:
 
 
 def whitened_residuals(state: State, obs: Observations, rho_mm: Sequence[float]) -> Residuals:
-    """`image_columns` of all cameras, in the order of the measurements, with all derivatives."""
+    """Return `image_columns` of all cameras, in the order of the measurements, with all
+    derivatives.
+    """
     every = range(len(projection.PARAMETERS))
     first = len(every)
     columns = np.zeros((first + 13, 2, len(obs)))

@@ -1,9 +1,11 @@
 """Linear stochastic processes of bubbles and rig, and their exact discretisation.
 
-Every process is x' = F x + B c + L w, with w white noise of unit two-sided density and c constants
-(a bubble's mean velocity). A step of any length is exact: Van Loan's matrix exponential (IEEE
-Trans. Autom. Control 23:395, 1978) over a short step, doubled as often as the step needs, so that
-neither a long gap nor the tiny variance of an often integrated noise loses digits.
+Every process is x' = F x + B c + L w. Here x (n,) is the state, w (m,) is white noise of unit
+two-sided density, and c (k,) are constant inputs, for instance a bubble's mean velocity. A step of
+any length is exact: Van Loan's matrix exponential (IEEE Trans. Autom. Control 23:395, 1978) is
+computed over a short step, which is then doubled until it has the wanted length. In this way a long
+gap loses no digits, and neither does the very small variance of a noise that is integrated several
+times.
 """
 
 from __future__ import annotations
@@ -20,20 +22,25 @@ from telerig.errors import InputError
 
 _SERIES_TERMS = 26
 _SHORT_STEP = 0.5
-"""Largest eigenvalue times step over which the exponential's series is summed."""
+"""Largest product of eigenvalue and step for which the series of the exponential is summed."""
 _STEPS_PER_S = 1e11
-"""Clocks printed to a nanosecond jitter in the last digit; that makes no new length of step."""
+"""Lengths of steps that agree after rounding to 1e-11 s count as equal. Clocks that are printed to
+a nanosecond vary in the last digit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """One process. Lengths in mm (or px, rad: the caller's), time in s.
+    """One stochastic process. Lengths are in mm (or px or rad, as the caller chooses), times in s.
 
-    drift : (n, n) F.  noise : (n, m) L.  start_covariance : (n, n) at the first node.
-    position, velocity, acceleration : (n,) rows that read these from the state; an acceleration
-        that does not exist (white noise drives the velocity) is 0.
-    input : (n, k) B.  start_from_input : (n, k), the state's mean at the start for constants c.
-    memoryless : the state is drawn anew at every node, from start_covariance.
+    drift : (n, n) F.
+    noise : (n, m) L.
+    start_covariance : (n, n) covariance of the state at the first time.
+    position, velocity, acceleration : (n,) rows that give these quantities from the state. The row
+        of an acceleration that does not exist (white noise drives the velocity) is 0.
+    input : (n, k) B.
+    start_from_input : (n, k) matrix that gives the mean of the first state from the inputs c.
+    memoryless : whether the state at every time is independent of the others, with
+        start_covariance.
     """
 
     name: str
@@ -53,11 +60,12 @@ class Component:
 
     @property
     def jerk(self) -> Array:
-        """(n,) the acceleration's rate of change, its white part (if any) left out."""
+        """The row (n,) that gives the rate of change of the acceleration, without its white-noise
+        part."""
         return np.asarray(self.acceleration @ self.drift)
 
     def without_input(self) -> Component:
-        """The same process about a mean that is known."""
+        """Return the same process about a known mean, so that it has no inputs."""
         nothing = np.zeros((self.size, 0))
         return replace(self, input=nothing, start_from_input=nothing)
 
@@ -70,7 +78,11 @@ def _component(
     *,
     acceleration: ArrayLike | None = None,
 ) -> Component:
-    """States (displacement, velocity, ...); start None: stationary."""
+    """Return a process whose first states are displacement and velocity.
+
+    start : (n, n) covariance at the start; None takes the stationary covariance.
+    acceleration : (n,) row that gives the acceleration; None if it does not exist.
+    """
     f = np.atleast_2d(np.asarray(drift, float))
     n = len(f)
     gain = np.asarray(noise, float).reshape(n, -1)
@@ -82,7 +94,10 @@ def _component(
 
 
 def stationary_covariance(drift: Array, noise: Array) -> Array:
-    """(n, n) P with F P + P F^T + L L^T = 0. Raises InputError for an unstable process."""
+    """Return the covariance P (n, n) of the stationary state: F P + P F^T + L L^T = 0.
+
+    Raises InputError for a process that is not stable.
+    """
     from scipy.linalg import solve_continuous_lyapunov
 
     if np.max(np.linalg.eigvals(drift).real) >= 0:
@@ -98,10 +113,11 @@ def _positive(**values: float) -> None:
 
 
 def ou_velocity(sigma_mm_s: float, tau_s: float, *, start_sigma_mm: float = 100.0) -> Component:
-    """States (position, velocity): a velocity about a constant mean that forgets within tau.
+    """Return a process whose velocity is an Ornstein-Uhlenbeck process about a constant mean U.
 
-    v' = (U - v) / tau + noise, v - U of RMS sigma; U is the input. Starts at position 0 within
-    start_sigma, its velocity stationary about U.
+    The velocity v obeys v' = (U - v) / tau + noise, and v - U has the RMS sigma. The states are
+    position and velocity, and U is the input. The first position is 0 +- start_sigma_mm, and the
+    first velocity has its stationary distribution about U.
     """
     _positive(sigma_mm_s=sigma_mm_s, tau_s=tau_s, start_sigma_mm=start_sigma_mm)
     drift = np.array([[0.0, 1.0], [0.0, -1 / tau_s]])
@@ -119,11 +135,12 @@ def forced_mass(
     start_sigma_mm: float = 100.0,
     start_sigma_mm_s: float = 1000.0,
 ) -> Component:
-    """A carriage under a smooth force: its acceleration is white noise through three equal poles.
+    """Return the process of a carriage under a smooth force.
 
-    States (position, velocity, acceleration and two more of the force). Smooth on
-    purpose: a prior's power above a sensor's sampling rate is aliased into the sensor's band and
-    makes an accelerometer worthless.
+    The acceleration is white noise through three equal poles at ``corner_hz``. The states are
+    position, velocity, acceleration and two more of the force. The force has to be smooth: if a
+    prior had power above the sampling rate of an accelerometer, this power would be aliased into
+    the sensor's band, and the readings would then carry almost no information.
     """
     _positive(acceleration_rms_mm_s2=acceleration_rms_mm_s2, corner_hz=corner_hz)
     cutoff = 2 * np.pi * corner_hz
@@ -137,7 +154,11 @@ def forced_mass(
 
 
 def oscillator(rms_mm: float, frequency_hz: float, damping: float) -> Component:
-    """States (displacement, velocity) of a resonator driven by white noise: zigzag, rough mode."""
+    """Return a resonator driven by white noise, for a zigzag or a mode. Its states are displacement
+    and velocity.
+
+    damping : damping ratio.
+    """
     _positive(rms_mm=rms_mm, frequency_hz=frequency_hz, damping=damping)
     w = 2 * np.pi * frequency_hz
     drift = np.array([[0.0, 1.0], [-(w**2), -2 * damping * w]])
@@ -148,9 +169,10 @@ def oscillator(rms_mm: float, frequency_hz: float, damping: float) -> Component:
 def driven_mode(
     rms_mm: float, frequency_hz: float, damping: float, *, force_hz: float = 60.0
 ) -> Component:
-    """States (displacement, velocity, force, force's slope) of one degree of freedom.
+    """Return a vibration mode driven by a low-pass filtered force.
 
-    The force is white noise through two critically damped poles at force_hz.
+    The states are displacement, velocity, force and the rate of change of the force. The force is
+    white noise through two equal poles (critical damping) at ``force_hz``.
     """
     _positive(rms_mm=rms_mm, frequency_hz=frequency_hz, damping=damping, force_hz=force_hz)
     w, f = 2 * np.pi * frequency_hz, 2 * np.pi * force_hz
@@ -164,7 +186,8 @@ def driven_mode(
 def resonance(
     rms_mm: float, frequency_hz: float, damping: float, force_hz: float | None = None
 ) -> Component:
-    """An `oscillator`, or with a low-pass filtered force a `driven_mode`."""
+    """Return an `oscillator`, or a `driven_mode` if the cut-off ``force_hz`` of the force is
+    given."""
     if force_hz is None:
         return oscillator(rms_mm, frequency_hz, damping)
     return driven_mode(rms_mm, frequency_hz, damping, force_hz=force_hz)
@@ -178,12 +201,16 @@ def broad_band(
     floor: float = 0.0,
     tail: int = 2,
 ) -> Component:
-    """Shake of unknown modes: (s + floor a) / ((s + a)^3 (s + b)^tail) of white noise, given RMS.
+    """Return shake whose modes are unknown, with a broad spectrum and the given RMS.
 
-    A density that falls from low_hz (a) on and steeply from high_hz (b) on: accelerations as
-    smooth as a force through two poles makes them, without which accelerometers are of no use.
-    Below low_hz it falls too, to floor^2 of about the peak: to nothing at floor 0, while a mode of
-    little damping keeps a compliance there. Three states and ``tail``, one for each pole.
+    White noise passes the filter (s + floor a) / ((s + a)^3 (s + b)^tail), with a = 2 pi low_hz and
+    b = 2 pi high_hz. The spectral density falls above low_hz, and steeply above high_hz. The
+    accelerations are then as smooth as those under a force with two poles; otherwise accelerometers
+    would carry almost no information. Below low_hz the density falls as well, to about floor^2
+    times its peak. With floor = 0 it falls to zero, whereas a mode of little damping keeps its
+    static compliance there.
+
+    tail : number of poles at high_hz. There are 3 + tail states.
     """
     _positive(rms_mm=rms_mm, low_hz=low_hz, high_hz=high_hz)
     a, b = 2 * np.pi * low_hz, 2 * np.pi * high_hz
@@ -201,7 +228,7 @@ def broad_band_density(
     floor: float,
     tail: int = 2,
 ) -> Array:
-    """(N,) one-sided density (mm^2 / Hz) of `broad_band` at the frequencies (N,)."""
+    """Return the one-sided spectral density (N,) of `broad_band` in mm^2/Hz at frequencies (N,)."""
     a, b = low_hz, high_hz
 
     def shape(f: Array) -> Array:
@@ -214,7 +241,11 @@ def broad_band_density(
 
 
 def _scaled(name: str, drift: Array, position: Array, rms: float) -> Component:
-    """A process driven at its last state, its displacement ``position`` scaled to the RMS."""
+    """Return a process that is driven at its last state, scaled such that its displacement has the
+    RMS.
+
+    position : (n,) row that gives the displacement from the state.
+    """
     unit = np.zeros((len(drift), 1))
     unit[-1] = 1.0
     shape = stationary_covariance(drift, unit)
@@ -225,16 +256,21 @@ def _scaled(name: str, drift: Array, position: Array, rms: float) -> Component:
 
 
 def slow_ou(rms: float, tau_s: float) -> Component:
-    """One state that forgets within tau: slow drift of an arm, wander of a centroid (in px).
+    """Return an Ornstein-Uhlenbeck process with one state, for the slow drift of an arm (mm) or the
+    wander of a centroid (px).
 
-    Too rough to have a velocity: accelerometers do not measure it.
+    It has no velocity, so accelerometers do not measure it.
     """
     _positive(rms=rms, tau_s=tau_s)
     return _component("slow_ou", [[-1 / tau_s]], [rms * np.sqrt(2 / tau_s)])
 
 
 def independent(sigma: float) -> Component:
-    """One state, drawn anew at every node: a position known from its own reading alone."""
+    """Return a process with one state that is independent at every time, with standard deviation
+    sigma.
+
+    It describes a position that is known only from its own reading.
+    """
     _positive(sigma=sigma)
     plain = _component("independent", [[0.0]], [[0.0]], np.array([[sigma**2]]))
     return replace(plain, memoryless=True)
@@ -242,12 +278,15 @@ def independent(sigma: float) -> Component:
 
 @dataclass(frozen=True)
 class Steps:
-    """Exact steps of N processes alike in kind, of n states and k inputs, over U lengths.
+    """Exact steps of N processes of equal kind, with n states and k inputs, over U lengths.
 
-    which : (N,) their places in the list of processes.
-    transition, covariance : (N, U, n, n).  input : (N, U, n, k).
-    whitener : (N, U, n, n) W with W covariance W^T = 1.  log_det : (N, U) of W.
-    start : (N, n, n) whitener of the state at the first node.  start_log_det : (N,).
+    which : (N,) indices of the processes in the caller's list.
+    transition, covariance : (N, U, n, n) of each step.
+    input : (N, U, n, k) effect of the inputs.
+    whitener : (N, U, n, n) W with W covariance W^T = identity.
+    log_det : (N, U) logarithm of the determinant of W.
+    start : (N, n, n) whitening matrix of the first state.
+    start_log_det : (N,) logarithm of its determinant.
     """
 
     which: Ints
@@ -260,11 +299,13 @@ class Steps:
     start_log_det: Array
 
     def bases(self) -> Array:
-        """(N, U + 1, n, n) bases T, x = T y, of a state before each step, last one: before none.
+        """Return bases T (N, U + 1, n, n) for the state x = T y before a step of each length.
 
-        Integrated noise has variances many powers of the step apart. In this basis the information
-        of the next state and of the prior on a state, Phi^T Q^-1 Phi + P^-1, is the identity: the
-        pivots of a forward elimination are of order one, as Cholesky in double precision needs.
+        The last basis is for a state after which there is no step. Integrated noise has variances
+        that differ by many powers of the step. In this basis the information from the next state
+        together with that of the state's prior, Phi^T Q^-1 Phi + P^-1, is the identity. The pivots
+        of a forward elimination are then of order one, as a Cholesky factorisation in double
+        precision needs.
         """
         count, lengths, size, _ = self.whitener.shape
         ahead = np.zeros((count, lengths + 1, size, size))
@@ -275,7 +316,8 @@ class Steps:
 
 
 def distinct_steps(dt_s: ArrayLike) -> tuple[Array, Ints]:
-    """Distinct lengths (U,) of steps dt_s (M,), and (M,) which of them each is.
+    """Return the different lengths (U,) among the steps dt_s (M,), and the index (M,) of each
+    step's length.
 
     Raises InputError for a length that is not positive.
     """
@@ -295,7 +337,10 @@ def _distinct(dt_s: bytes) -> tuple[Array, Ints]:
 def discretise(
     components: Sequence[Component], lengths_s: Array, *, batched: bool = True
 ) -> list[Steps]:
-    """Exact steps of lengths_s (U,), of components of one kind in one batch or each by itself."""
+    """Return the exact steps of processes for the lengths lengths_s (U,).
+
+    batched : whether all processes of equal kind are computed in one batch, or each by itself.
+    """
     kinds: dict[object, list[int]] = {}
     for i, component in enumerate(components):
         kinds.setdefault(_kind(component) if batched else i, []).append(i)
@@ -303,7 +348,7 @@ def discretise(
 
 
 def _kind(component: Component) -> object:
-    """Alike for processes that one batch can hold."""
+    """Return a value that is equal for processes that one batch can hold."""
     drift, noise = (a.astype(bool).tobytes() for a in (component.drift, component.noise))
     inputs = component.input.astype(bool).tobytes()
     return component.memoryless, inputs, _cached_orders(drift, noise, component.size)
@@ -341,9 +386,12 @@ def _steps(components: Sequence[Component], which: Sequence[int], lengths_s: Arr
 
 
 def exact_step(drift: Array, noise: Array, dt_s: float) -> tuple[Array, Array]:
-    """(n, n) transition and covariance of x' = F x + L w over one step.
+    """Return the transition and the covariance, both (n, n), of x' = F x + L w over one step.
 
-    drift : (n, n) F.  noise : (n, m) L.  The covariance may be singular.
+    drift : (n, n) F.
+    noise : (n, m) L.
+
+    The covariance may be singular.
     """
     transition, covariance = _exact_steps(
         drift[None], noise[None], np.array([dt_s]), _integrations(drift, noise)
@@ -352,9 +400,12 @@ def exact_step(drift: Array, noise: Array, dt_s: float) -> tuple[Array, Array]:
 
 
 def _exact_steps(drift: Array, noise: Array, dt_s: Array, orders: Array) -> tuple[Array, Array]:
-    """Transitions and covariances (M, n, n) of steps dt_s (M,); drift (M, n, n), noise (M, n, m).
+    """Return the transitions and covariances, both (M, n, n), of M steps.
 
-    orders : (n,) see `_integrations`, the same for all.
+    drift : (M, n, n).
+    noise : (M, n, m).
+    dt_s : (M,).
+    orders : (n,) as `_integrations` gives them, the same for all steps.
     """
     rate = np.abs(np.linalg.eigvals(drift)).max(-1, initial=0.0)
     doublings = np.ceil(np.log2(np.maximum(rate * dt_s / _SHORT_STEP, 1.0))).astype(int)
@@ -368,7 +419,10 @@ def _exact_steps(drift: Array, noise: Array, dt_s: Array, orders: Array) -> tupl
 
 
 def _short_step(drift: Array, noise: Array, h: Array, orders: Array) -> tuple[Array, Array]:
-    """Van Loan's exponential by its series, states scaled by the powers of h they grow with."""
+    """Return transitions and covariances by the series of Van Loan's matrix exponential.
+
+    Each state is scaled by the power of the step h (M,) with which it grows.
+    """
     n = drift.shape[-1]
     scale = h[:, None] ** orders
     ratio = scale[:, None, :] / scale[:, :, None]
@@ -393,7 +447,8 @@ def _short_step(drift: Array, noise: Array, h: Array, orders: Array) -> tuple[Ar
 
 
 def _integrations(drift: Array, noise: Array) -> Array:
-    """(n,) how many integrations lie between the white noise and each state."""
+    """Return for each state (n,) how many integrations lie between the white noise and the
+    state."""
     orders = np.full(len(drift), np.nan)
     reached = np.abs(noise).sum(1)
     for order in range(len(orders)):
@@ -403,7 +458,10 @@ def _integrations(drift: Array, noise: Array) -> Array:
 
 
 def _inverse_root(covariance: Array) -> Array:
-    """(..., n, n) lower W with W C W^T = 1, scaled so that small variances keep their digits."""
+    """Return lower triangular matrices W (..., n, n) with W C W^T = identity, for covariances C.
+
+    The covariances are scaled first, so that small variances keep their digits.
+    """
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     scaled = covariance / sigma[..., :, None] / sigma[..., None, :]
     root = np.linalg.cholesky(scaled)
@@ -412,17 +470,21 @@ def _inverse_root(covariance: Array) -> Array:
 
 
 def whitener_of(covariance: Array) -> Array:
-    """(..., n, n) lower W with W covariance W^T = 1. Raises LinAlgError for a singular one."""
+    """Return lower triangular matrices W (..., n, n) with W covariance W^T = identity.
+
+    Raises LinAlgError if a covariance is singular.
+    """
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def log_det_of(whitener: Array) -> Array:
-    """(...) log of the determinant of triangular whiteners (..., n, n)."""
+    """Return the logarithm (...) of the determinant of triangular matrices (..., n, n)."""
     return np.asarray(np.log(np.abs(np.diagonal(whitener, axis1=-2, axis2=-1))).sum(-1))
 
 
 def block_diagonal(blocks: Sequence[Array]) -> Array:
-    """Blocks (..., a, b), batch axes alike, into one (..., sum a, sum b)."""
+    """Return matrices (..., sum of a, sum of b) with the given blocks (..., a, b) on the
+    diagonal."""
     rows, columns = (sum(b.shape[axis] for b in blocks) for axis in (-2, -1))
     batch = np.broadcast_shapes(*(b.shape[:-2] for b in blocks)) if blocks else ()
     out = np.zeros((*batch, rows, columns))

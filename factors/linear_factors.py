@@ -19,10 +19,14 @@ from telerig.arrays import Array
 
 @dataclass(frozen=True)
 class LinearFactors:
-    """M factors of one shape.
+    """M whitened linear factors of equal shape.
 
-    keys : one (M,) each.  blocks : (M, rows, columns) each.  rhs : (M, rows).
-    log_det : (M,) of the whiteners.  weight : (M,) 0..1 of a robust fit, already in the rest.
+    keys : for each variable of the factors an array of keys (M,).
+    blocks : for each variable its Jacobians A_k (M, rows, columns).
+    rhs : (M, rows) the right-hand sides b.
+    log_det : (M,) logarithm of the determinant of each factor's whitening matrix.
+    weight : (M,) weights from 0 to 1 of a robust fit, with which blocks and rhs are already
+        multiplied; None for no weights.
     """
 
     keys: tuple[ArrayLike, ...]
@@ -32,7 +36,11 @@ class LinearFactors:
     weight: Array | None = None
 
     def squared(self, increments: Callable[[ArrayLike, int], Array]) -> float:
-        """Sum of squares at increments, which are given for keys (M,) of some size."""
+        """Return the sum of all squared residuals.
+
+        increments : function that returns the increments (M, size) of the variables for given keys
+            (M,) and a size.
+        """
         error = -self.rhs
         for key, block in zip(self.keys, self.blocks):
             if block.shape[-1]:
@@ -41,7 +49,7 @@ class LinearFactors:
         return float((error**2).sum())
 
     def log_norm(self) -> float:
-        """log of the factors' normalisation, residuals apart."""
+        """Return the sum of the logarithms of the factors' normalisation constants."""
         share = np.ones(len(self.rhs)) if self.weight is None else self.weight
         each = self.log_det - self.rhs.shape[1] * 0.5 * np.log(2 * np.pi)
         return float((share * each).sum())

@@ -83,7 +83,11 @@ class Motion:
         return last[place], ahead[place]
 
     def distinct_in_basis(self, following: Ints) -> tuple[Array, Array, Ints]:
-        """As `in_basis`, but only those that differ, and (M,) which of them each step has."""
+        """Return the same as `in_basis`, but every different pair of matrices only once.
+
+        Returns by_last and by_next (Q, n, n) of the Q different pairs, and the index (M,) of each
+        step's pair.
+        """
         count = len(self.basis)
         own, place = np.unique(self.index * count + following % count, return_inverse=True)
         step, after = np.divmod(own, count)

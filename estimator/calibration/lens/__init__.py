@@ -1,5 +1,5 @@
-"""The choice of each camera's lens model.
+"""The choice of the lens model of each camera.
 
-In: a ``Problem`` and a start. Out: the lens model that the data support, and which parameters the
-covariance considers besides. Read ``choice`` first.
+In: a ``Problem`` and a start. Out: the lens model that the data support, and the parameters that
+the covariance considers in addition. Read ``choice`` first.
 """

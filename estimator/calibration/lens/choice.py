@@ -1,8 +1,9 @@
-"""Which lens model the data support, camera by camera.
+"""The choice of each camera's lens model by what the data support.
 
-A rich model is fitted once; the criterion of `search` names the best model that it contains. The
-models between the simplest one and that one are then fitted, one more group of parameters at each
-step, and each step has to predict views that were left out no worse than the one before.
+A rich model is fitted once, and the information criterion of `search` selects the best model that
+it contains. The models between the simplest one and the selected one are then fitted, with one more
+group of parameters at each step. Each step is kept only if it predicts left-out views at least as
+well as the step before (cross-validation).
 """
 
 from __future__ import annotations
@@ -35,12 +36,15 @@ from telerig.rig.lens_models import AUTO, GROUPS, joint_name, name_of, ordered
 from telerig.rig.projection import INDEX
 
 DOTS_FOR_WORKERS = 500
-"""With fewer measured dots, four fits take 0.1 s, and starting processes for them 0.05 s."""
+"""Number of measured dots below which no worker processes are used: four fits then take 0.1 s, and
+starting processes for them 0.05 s."""
 TOO_COSTLY = 10.0
-"""Times the rich model's cost beyond which a model is not asked to predict."""
+"""A model is not cross-validated if its cost is more than this many times that of the rich
+model."""
 ROUNDS = 3
 AGREEMENT = 2.0
-"""Chi-square by which a fit may differ from the quadratic's prediction before that is redone."""
+"""If the chi-square of a fit differs by more than this from its quadratic prediction, the quadratic
+is recomputed at the fit."""
 
 _TILT = [INDEX["tilt_x"], INDEX["tilt_y"]]
 _SHAPE = [INDEX["aspect"], INDEX["skew"]]
@@ -49,10 +53,17 @@ _SCALE = INDEX["scale_px_per_mm"]
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A fitted model: groups of every camera, free intrinsics of all, what is left.
+    """A fitted lens model of all cameras.
 
-    per_view : (V,) mean squared whitened residual of each view, predicted by a fit without it;
-        NaN where too few views are left, infinite where it was not asked for.
+    lenses : parameter groups of each camera.
+    parameters : number of free intrinsics of all cameras together.
+    cost : half the sum of squared whitened residuals and priors.
+    rows : number of measured coordinates.
+    rms_px : RMS of the residuals.
+    per_view : (V,) mean squared whitened residual of each of the V views, predicted by a fit
+        without that view. It is NaN if too few views would remain, and infinite if the model was
+        not cross-validated.
+    state : the estimate.
     """
 
     lenses: Lenses
@@ -69,21 +80,22 @@ class FittedModel:
 
     @property
     def held_out(self) -> float:
-        """Mean over the views; infinite when no view could be left out."""
+        """The mean of ``per_view``; infinite if no view could be left out."""
         seen = self.per_view[~np.isnan(self.per_view)]
         return float(seen.mean()) if len(seen) else float("inf")
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step from the simplest model on, taken or not.
+    """One step of the model choice. It adds a group of parameters to one camera's model and is kept
+    or not.
 
-    camera, added : index of the camera whose model has these parameters more than the step before;
-        -1 and () for the first.
-    gain : chi-square that it takes away, in units of the noise.
-    bic_gain : the gain less the criterion's penalty.
-    fit : None where the gain alone decides.
-    undetermined : these views do not determine the parameters.
+    camera, added : index of the camera and names of the added parameters; -1 and () for the first
+        step, which is the simplest model.
+    gain : decrease of chi-square, in units of the residuals' variance.
+    bic_gain : the gain minus the penalty of the information criterion.
+    fit : the fitted model; None if the gain was predicted without a fit.
+    undetermined : whether the views do not determine the added parameters.
     """
 
     camera: int
@@ -98,13 +110,19 @@ class Step:
 
     @property
     def p_value(self) -> float:
-        """Chance of such a gain without any reason for it; NaN for the first step."""
+        """The probability of such a gain if the added parameters are truly zero; NaN for the first
+        step."""
         return float(chdtrc(len(self.added), self.gain)) if self.added else float("nan")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The steps up to the chosen model, then those that were not taken; the choice in words."""
+    """The chosen lens model.
+
+    steps : the steps up to the chosen model, then those that were not taken.
+    chosen : the fitted model.
+    words : the choice in sentences for the user.
+    """
 
     steps: tuple[Step, ...]
     chosen: FittedModel
@@ -112,11 +130,13 @@ class Choice:
 
 
 def rich_lens(*, mono: bool, strong: bool) -> Lens:
-    """What is tried of a camera.
+    """Return the parameter groups that are tried for a camera.
 
-    strong : perspective; kappa and the centre are then free in any case. With the centre free the
-        image on a tilted sensor is that of a turned camera, so that s or a tilt cannot be told
-        from a turn, and aspect+skew hardly from the target's own stretch (docs/decisions/014).
+    mono : whether the rig has this camera only; kappa is then not tried.
+    strong : whether the lens has strong perspective. Then kappa and the image centre are always
+        free. A free centre makes the image on a tilted sensor equal to that of a rotated camera, so
+        s or a tilt cannot be distinguished from a rotation, and aspect and skew hardly from a
+        stretch of the target (docs/decisions/014).
     """
     if strong:
         return Lens({"kappa", "k1", "k2", "p", "centre"})
@@ -124,10 +144,10 @@ def rich_lens(*, mono: bool, strong: bool) -> Lens:
 
 
 def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:
-    """Choose among what the problem has free.
+    """Return the choice among the models that the problem's free parameters contain.
 
-    problem, rich : with the richest model, at its minimum.
-    models : per camera, "auto" or a model that stays.
+    problem, rich : the problem with the richest model, and its solution.
+    models : for each camera "auto", or the name of a model that is kept.
     """
     whole = tuple(_lens_of(free) for free in problem.free)
     allowed = [possible(lens) if m == AUTO else [lens] for lens, m in zip(whole, models)]
@@ -155,7 +175,7 @@ def _lens_of(free: Sequence[str]) -> Lens:
 
 
 def _determined(quadratic: QuadraticCost, allowed: list[list[Lens]]) -> Lenses:
-    """The best model of which the views determine every parameter."""
+    """Return the best model among those whose parameters the views all determine."""
     allowed = list(allowed)
     while True:
         found = search(quadratic, allowed)
@@ -173,7 +193,8 @@ def _determined(quadratic: QuadraticCost, allowed: list[list[Lens]]) -> Lenses:
 def _alternatives(
     quadratic: QuadraticCost, wanted: Lenses, allowed: list[list[Lens]]
 ) -> list[Lenses]:
-    """What else is fitted: the best model without a tilt, and the richest without kappa."""
+    """Return further models to fit: the best one without a tilt, and the richest one without
+    kappa."""
     out = []
     if any("tilt" in lens for lens in wanted):
         flat = [[lens for lens in options if "tilt" not in lens] or options for options in allowed]
@@ -213,10 +234,10 @@ def _fit(problem: Problem, rich: Solution, task: tuple[Lenses, bool]) -> FittedM
 
 
 def model_start(problem: Problem, state: State) -> State:
-    """A start for the problem's own model from a state fitted with another.
+    """Return a start for the problem's own model, from a state that was fitted with another model.
 
-    A tilt acts in the second order: at zero its derivative vanishes and no solver leaves it. Its
-    start is the tilt that stretches the image as the best aspect ratio and skew do.
+    A tilt acts in second order: its derivative vanishes at zero, so a solver cannot leave zero. It
+    starts at the tilt that stretches the image in the same way as the best aspect ratio and skew.
     """
     start = held_at_nominal(problem, state)
     if not any("tilt_x" in free for free in problem.free):
@@ -233,8 +254,12 @@ def model_start(problem: Problem, state: State) -> State:
 
 
 def tilted(state: State, cameras: Sequence[int]) -> State:
-    """The state with aspect and skew of some cameras turned into a bilateral tilt; see
-    `telerig.rig.projection`: S(q) stretches by sqrt(1 + q^2) along q. The sign of q is free.
+    """Return the state after aspect and skew of some cameras were replaced by an equivalent tilt.
+
+    The tilt is that of a lens that is telecentric on both sides: by `telerig.rig.projection` it
+    stretches the image by sqrt(1 + q^2) along q. The sign of q is arbitrary.
+
+    cameras : indices of these cameras.
     """
     intrinsics = state.intrinsics.copy()
     for camera in cameras:
@@ -254,10 +279,11 @@ def _revised(
     others: list[FittedModel],
     allowed: list[list[Lens]],
 ) -> tuple[QuadraticCost, Lenses]:
-    """The wanted model again, or a better one: an alternative, or one of a new quadratic.
+    """Return the quadratic and the wanted model, or better ones.
 
-    A quadratic holds near the fit at which it was made; one that predicted another cost for the
-    wanted model than it has is made again there.
+    A better model is an alternative with lower cost, or the best model of a new quadratic. A
+    quadratic is accurate near the fit at which it was computed. If its predicted cost of the wanted
+    model differs from the fitted cost, it is computed again at that fit.
     """
     fitting = [o for o in others if all(x in options for x, options in zip(o.lenses, allowed))]
     best = min((fit, *fitting), key=lambda f: quadratic.cost_of_fit(f.lenses, f.cost))
@@ -283,7 +309,8 @@ def _taken(quadratic: QuadraticCost, path: list[Addition], fits: list[FittedMode
 
 
 def _without_worse_predictions(steps: list[Step]) -> list[Step]:
-    """Steps back from the end while the last one predicts left-out views worse."""
+    """Return the steps after those at the end that predict left-out views worse were marked as not
+    taken."""
     last = len(steps) - 1
     while last > 0:
         before, after = (steps[k].fit for k in (last - 1, last))
@@ -299,9 +326,9 @@ def _without_worse_predictions(steps: list[Step]) -> list[Step]:
 def _not_taken(
     quadratic: QuadraticCost, chosen: Lenses, allowed: list[list[Lens]], refused: list[Step]
 ) -> list[Step]:
-    """What one more group would have brought, but for those that were tried and taken back.
+    """Return what one more group would have gained, except for groups that were tried and refused.
 
-    A tilt is not asked for by itself: where aspect and skew bring nothing, it does not either.
+    A tilt is left out here, because it gains nothing where aspect and skew gain nothing.
     """
     known = {(step.camera, step.added) for step in refused}
     out = []
@@ -347,7 +374,8 @@ def _words(
 
 
 def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]) -> str:
-    """What all steps together, and the last one, did for the prediction of left-out views."""
+    """Say how all steps together, and the last one alone, changed the prediction of left-out
+    views."""
     taken = [step for step in steps if step.taken]
     fits = [step.fit for step in taken if step.fit is not None]
     simpler = [fit for fit in fits[:-1] if np.isfinite(fit.held_out)]

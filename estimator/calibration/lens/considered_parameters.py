@@ -1,14 +1,16 @@
-"""Considered parameters: held at nominal by the chosen model, but open in the covariance.
+"""Considered parameters: the chosen model holds them at nominal, but the covariance includes their
+effect.
 
-A group of parameters that is not worth freeing is not therefore zero. Where it acts like what is
-free (a stretch of one camera's image beside that of the other's), leaving it out makes the
-covariance many times smaller than the error: a stretch of three standard deviations bends space by
-thirty. Such a group is *considered* (Schmidt and Kalman's word): the estimate stays that of the
-simpler model, and its mean squared error is counted with the group's value open.
+A group of parameters that is not worth freeing is not therefore zero. Some groups act like
+parameters that are free: the stretch of one camera's image, for instance, acts like that of the
+other camera's. If such a group is ignored, the stated covariance can be many times smaller than the
+true error: a stretch of 3 standard deviations shifts triangulated points by 30 of their stated
+ones. Such a group is *considered* (a term of Schmidt-Kalman filtering). The estimate remains that
+of the simpler model, and its mean squared error is computed with the group's value unknown.
 
-With C the covariance of the model that has the group, v the Gauss-Newton step to its minimum, and
-nothing known of the value but what the data say, E[(estimate - truth)^2] = C + v v^T; the group's
-own rows, held at nominal, are part of it.
+Let C be the covariance of the model that frees the group, and v the Gauss-Newton step from the
+simpler model's estimate to the minimum of that model. If only the data inform about the group, then
+E[(estimate - truth)^2] = C + v v^T. This includes the group's own rows, which are held at nominal.
 """
 
 from __future__ import annotations
@@ -29,16 +31,20 @@ if TYPE_CHECKING:
 Lens = frozenset[str]
 
 CONSIDERED_P_VALUE = 0.01
-"""Of the gain, below which a group is considered though freeing it is not worth its penalty."""
+"""A group is considered if the p-value of its gain is below this, although freeing it is not worth
+its penalty."""
 UNDAMPED = 1e-12
 
 
 def considered_groups(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:
-    """Per camera the groups that are left out and may matter.
+    """Return for each camera the groups that are held at nominal but considered in the covariance.
 
-    Those that another camera of the rig needs (its lens is of the same kind, so that here the group
-    is small rather than absent), and those whose gain is hardly chance. Not those that the views do
-    not determine: of these the weak priors would be all that is known.
+    A group is considered if another camera of the rig needs it (the lenses are of the same kind, so
+    here it is probably small but not zero), or if its gain is unlikely to be chance. A group that
+    the views do not determine is not considered, because its weak prior would then dominate.
+
+    choice : the model choice; None if no choice was made.
+    cameras : number of cameras.
     """
     out: list[set[str]] = [set() for _ in range(cameras)]
     steps = choice.steps if choice is not None else ()
@@ -58,7 +64,9 @@ def _groups(parameters: tuple[str, ...]) -> Lens:
 
 
 def _acts_like(parameters: tuple[str, ...]) -> Lens:
-    """A tilted sensor stretches the image."""
+    """Return the groups of these parameters, and "affine" for a tilt, which also stretches the
+    image.
+    """
     groups = _groups(parameters)
     return groups | {"affine"} if "tilt" in groups else groups
 
@@ -70,10 +78,13 @@ def considered_covariance(
     models: Sequence[str],
     groups: Sequence[Lens],
 ) -> tuple[tuple[tuple[str, ...], ...], JointCovariance]:
-    """Per camera what the covariance speaks of besides what is free, and the covariance.
+    """Return for each camera the parameters in the covariance, and the covariance.
 
-    joint : of the solution.  models : of the solution, per camera.  groups : considered besides,
-    per camera.
+    The parameters are the free ones and the considered ones.
+
+    joint : covariance of the solution.
+    models : name of each camera's model.
+    groups : for each camera the considered groups.
     """
     if not any(groups):
         return problem.free, joint
@@ -88,7 +99,9 @@ def considered_covariance(
 
 
 def considered_words(groups: Sequence[Lens], cameras: Sequence[str]) -> str:
-    """Appended to the words of the choice; empty where nothing is considered."""
+    """Return a clause on the considered parameters, for the end of the choice's words; "" if none
+    are.
+    """
     parts = [
         f"{', '.join(p for g in ordered(more) for p in GROUPS[g])} of camera {camera!r}"
         for camera, more in zip(cameras, groups) if more

@@ -1,4 +1,4 @@
-"""Views that a fit has not seen: how well does it predict them?"""
+"""Cross-validation: how well a fit predicts views that it has not used."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from telerig.factors.projection import State, whitened_error
 FOLDS = 4
 DAMPING = 1e-6
 POSE_STEPS = 3
-"""Of Gauss-Newton, from the pose that the view had in the fit of all."""
+"""Number of Gauss-Newton steps of a left-out view's pose, from its pose in the fit to all views."""
 
 
 def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
-    """Refine every view's pose with cameras and dots held: Gauss-Newton on 6 unknowns a view."""
+    """Return the state after the pose of every view was refined, with cameras and dots held fixed.
+
+    These are Gauss-Newton steps on the 6 unknowns of each view.
+    """
     system = System(problem)
     for _ in range(steps):
         normal = np.zeros((len(problem.views), 6, 6))
@@ -40,10 +43,15 @@ def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
 
 
 def held_out_chi2(problem: Problem, state: State, folds: int = FOLDS) -> Array:
-    """(V,) mean squared whitened residual of each view, predicted by a fit without it.
+    """Return the mean squared whitened residual (V,) of each of V views, predicted by a fit without
+    it.
 
-    state : the minimum with all views. The fit without some is one Gauss-Newton step away.
-    The left-out view's own pose is fitted to it, with cameras and dots of the other views.
+    A fit without some views is one Gauss-Newton step from ``state``. The pose of a left-out view is
+    then fitted to it, with the cameras and dots of the other views. Views whose fold cannot be left
+    out get NaN.
+
+    state : the minimum with all views.
+    folds : number of parts into which the views are divided; one part is left out at a time.
     """
     views = np.arange(len(problem.views))
     out = np.full(len(views), np.nan)

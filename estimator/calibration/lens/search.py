@@ -1,11 +1,13 @@
-"""The best lens model of each camera, from one fit of a rich one.
+"""Search for the best lens model of each camera, from a single fit of a rich model.
 
-At the minimum of the rich model, poses and dots eliminated, the cost is a quadratic form in the
-lens parameters. A simpler model holds some of their combinations d at nominal; its least cost is
-higher by half of d^T C_dd^-1 d, C the rich model's covariance (Wald's statistic, exact where the
-problem is linear). So all models of all cameras are compared by small solves, without a fit.
+Near the minimum of the rich model, with poses and dots eliminated, the cost is a quadratic form in
+the lens parameters. A simpler model holds some coordinates of this form at nominal. Let d be their
+offsets from nominal in the rich fit and C_dd their covariance. The least cost of the simpler model
+is then higher by d^T C_dd^-1 d / 2 (Wald's statistic, exact for a linear problem). All models of
+all cameras can therefore be compared by small linear systems, without a fit of each.
 
-The criterion is the extended Bayesian one (Chen and Chen, Biometrika 95:759, 2008).
+The criterion is the extended Bayesian information criterion (Chen and Chen, Biometrika 95:759,
+2008).
 """
 
 from __future__ import annotations
@@ -25,33 +27,44 @@ from telerig.rig.lens_models import GROUPS, ordered
 from telerig.rig.projection import INDEX
 
 Lens = frozenset[str]
-"""The groups of one camera."""
+"""The parameter groups of one camera's lens model."""
 Lenses = tuple[Lens, ...]
 Addition = tuple[int, str, Lenses]
-"""Camera, group, and the model that has it."""
+"""A camera, a group of parameters, and the model to which this group has been added for this
+camera.
+"""
 
 _HOMOGRAPHY = (("p1", "s3"), ("p2", "s1"))
-"""A tilted sensor's homography is, to first order, p1 = -s3 and p2 = -s1: these sums vanish."""
+"""The homography of a tilted sensor is, to first order, p1 = -s3 and p2 = -s1, so these sums
+vanish.
+"""
 _PLAIN = ("kappa", "affine", "k1", "k2", "p", "s")
 UNDETERMINED = 0.5
-"""Standard deviation over the prior's beyond which the data say little of a parameter."""
+"""A parameter counts as undetermined if its posterior standard deviation is more than this share of
+the prior one."""
 GROUP_PENALTY = 4.0
-"""Penalty of a group, over the logarithm of how many there are: 2 would be Chen and Chen's gamma =
-1; twice that lets one group in about 20 000 in by chance (docs/decisions/014)."""
+"""Penalty of a group of parameters, divided by the logarithm of the number of groups. 2 would be
+gamma = 1 of Chen and Chen; with 4 a group without effect is admitted by chance about once in 20 000
+(docs/decisions/014)."""
 NOISE_DOF = 20.0
-"""Degrees of freedom that the stated noise is worth beside the residuals."""
+"""The stated noise counts as this many degrees of freedom when the variance of the residuals is
+estimated."""
 
 
 @dataclass(frozen=True)
 class QuadraticCost:
-    """The quadratic form at the minimum of a rich model.
+    """The cost as a quadratic form in K coordinates, at the minimum of a rich model.
 
-    names : (camera, parameter) of each coordinate; the homography's two per camera come last.
-    offset : (K,) from nominal at the minimum.  covariance : (K, K).
-    prior : (K,) standard deviations before any data.
+    names : (camera, parameter) of each coordinate. The two sums of each camera that describe a
+        homography come last.
+    offset : (K,) the coordinates at the minimum, relative to nominal.
+    covariance : (K, K) of the coordinates.
+    prior : (K,) prior standard deviations.
     least : chi-square at the minimum.
-    variance : of the residuals, 1 where the stated noise is right; every chi-square is over it.
-    penalty : of one free parameter, in chi-square; group_penalty : of a group besides.
+    variance : of the residuals, relative to the stated noise; 1 if the stated noise is right. All
+        values of chi-square are divided by it.
+    penalty : of one free parameter, in chi-square.
+    group_penalty : of a group, in addition to the penalty of its parameters.
     """
 
     names: tuple[tuple[int, str], ...]
@@ -65,7 +78,9 @@ class QuadraticCost:
 
     @staticmethod
     def of(problem: Problem, solution: Solution) -> QuadraticCost:
-        """From a fit of the rich model, or from any point near its minimum."""
+        """Return the quadratic form from a fit of the rich model, or from any state near its
+        minimum.
+        """
         names = [(c, p) for c, free in enumerate(problem.free) for p in free]
         posterior = solution.equations.posterior(whole=False)
         step, still = solution.equations.step(1e-12)
@@ -101,7 +116,7 @@ class QuadraticCost:
         )  # fmt: skip
 
     def rise(self, lenses: Lenses) -> float:
-        """How much chi-square, in units of the noise, exceeds the rich model's."""
+        """Return by how much chi-square of a model exceeds that of the rich model."""
         held = self._held(lenses)
         if len(held) == 0:
             return 0.0
@@ -109,21 +124,29 @@ class QuadraticCost:
         return float(d @ np.linalg.solve(inside, d)) / self.variance
 
     def cost(self, lenses: Lenses) -> float:
-        """Of a model, by the criterion: chi-square and the penalty of what is free."""
+        """Return the value of the criterion, up to a constant: the rise of chi-square plus the
+        penalties."""
         return self.rise(lenses) + sum(self.penalty_of(lens) for lens in lenses)
 
     def cost_of_fit(self, lenses: Lenses, fitted_cost: float) -> float:
-        """The same of a model that was fitted; fitted_cost : half its chi-square."""
+        """Return the value of the criterion for a model that was fitted.
+
+        fitted_cost : half the model's chi-square.
+        """
         penalties = sum(self.penalty_of(lens) for lens in lenses)
         return 2 * fitted_cost / self.variance - self.least + penalties
 
     def penalty_of(self, lens: Lens) -> float:
-        """A tilt counts as two groups: the stretch, and the homography that it adds."""
+        """Return the penalty of one camera's model.
+
+        A tilt counts as two groups, because it describes a stretch and a homography.
+        """
         free = sum(len(GROUPS[g]) for g in lens - {"centre"})
         return self.penalty * free + self.group_penalty * len((lens - {"centre"}) | _also(lens))
 
     def sd_over_prior(self, lenses: Lenses, camera: int, group: str) -> float:
-        """The largest standard deviation of a group's parameters in a model, over the prior's."""
+        """Return the largest ratio of posterior to prior standard deviation among the parameters of
+        a group."""
         held = self._held(lenses)
         mine = [i for i, n in enumerate(self.names) if n[0] == camera and n[1] in GROUPS[group]]
         cross = self.covariance[np.ix_(mine, held)]
@@ -145,7 +168,7 @@ def _also(lens: Lens) -> Lens:
 
 @cache
 def _held_by(lens: Lens) -> frozenset[str]:
-    """Coordinates that a lens holds at nominal, of all that a quadratic can have."""
+    """Return the coordinates of the quadratic form that a lens model holds at nominal."""
     free = {p for g in lens for p in GROUPS[g]}
     held = {p for g in (*_PLAIN, "centre") for p in GROUPS[g]} - free
     if "tilt" in lens:
@@ -156,10 +179,11 @@ def _held_by(lens: Lens) -> frozenset[str]:
 
 
 def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) -> float:
-    """Chi-square of the images over its expectation, the stated noise counted as `NOISE_DOF`
-    degrees of freedom.
+    """Return the variance of the residuals relative to the stated noise.
 
-    E[r^T r] = rows - numbers + tr(C P), P the information of the priors (docs/theory.md).
+    It is chi-square of the images divided by its expectation, with the stated noise counted as
+    `NOISE_DOF` additional degrees of freedom. E[r^T r] = number of residuals - number of parameters
+    + trace(C P), where C is the covariance and P the information of the priors (docs/theory.md).
     """
     error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
     shared = sum(len(f) for f in problem.free)
@@ -176,10 +200,11 @@ def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) 
 
 
 def possible(rich: Lens) -> list[Lens]:
-    """Every lens that a rich one contains: k2 goes with k1, a tilt in place of aspect and skew.
+    """Return every lens model that a rich one contains.
 
-    A tilt leaves out s, with which its homography would be spanned twice. Where the centre is free,
-    it and kappa always are.
+    k2 is free only with k1, and a tilt replaces aspect and skew. A model with a tilt does not
+    contain s, because both could describe the same homography. If the centre is free, the centre
+    and kappa always are.
     """
     always = rich & {"centre", "kappa"} if "centre" in rich else Lens()
     richest = rich | {"tilt"} if {"affine", "p", "s"} <= rich else rich
@@ -187,9 +212,12 @@ def possible(rich: Lens) -> list[Lens]:
 
 
 def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lenses:
-    """The model of least cost, one camera after the other until none changes.
+    """Return the model with the lowest cost.
 
-    allowed : per camera.  From the richest and the simplest model; the better end is taken.
+    The model of one camera after the other is optimised until none changes, once from the richest
+    and once from the simplest model; the better result is returned.
+
+    allowed : for each camera the lens models to choose from.
     """
     ends = []
     for start in (max, min):
@@ -205,7 +233,8 @@ def search(quadratic: QuadraticCost, allowed: Sequence[Sequence[Lens]]) -> Lense
 
 
 def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Addition]:
-    """(camera, group, model) of every model that is one group richer."""
+    """Yield (camera, group, model) for every allowed model that has one group more than
+    ``lenses``."""
     for c, options in enumerate(allowed):
         for lens in options:
             more = lens - lenses[c]
@@ -214,7 +243,9 @@ def additions(lenses: Lenses, allowed: Sequence[Sequence[Lens]]) -> Iterator[Add
 
 
 def steps_to(quadratic: QuadraticCost, chosen: Lenses, least: Lenses) -> list[Addition]:
-    """The way from the simplest model to the chosen one, the most useful group first."""
+    """Return the steps from the simplest model ``least`` to ``chosen``, the most useful group
+    first.
+    """
     within = [list(_between(low, high)) for low, high in zip(least, chosen)]
     now = least
     out: list[Addition] = []
@@ -226,7 +257,7 @@ def steps_to(quadratic: QuadraticCost, chosen: Lenses, least: Lenses) -> list[Ad
 
 
 def _between(low: Lens, high: Lens) -> Iterator[Lens]:
-    """Every lens that contains ``low`` and is contained in ``high``."""
+    """Yield every lens model that contains ``low`` and is contained in ``high``."""
     more = ordered(high - low)
     for picks in product((False, True), repeat=len(more)):
         lens = low | {g for g, pick in zip(more, picks) if pick}

@@ -1,5 +1,5 @@
-"""The stage's travel axis and the encoder's scale.
+"""Calibration of the stage: the direction of travel and the scale of the encoder.
 
-In: ``stage_axis/`` of a dataset and a calibration. Out: axis and scale with covariance. Read
-``stage_axis`` first.
+In: the folder ``stage_axis/`` of a dataset, and a calibration of the cameras. Out: axis and scale
+with their covariance. Read ``stage_axis`` first.
 """

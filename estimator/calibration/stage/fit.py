@@ -1,7 +1,9 @@
-"""Gauss-Newton on the pixels of a static target that the stage carries the cameras past.
+"""Gauss-Newton fit of the travel axis to images of a static target that the stage carries the
+cameras past.
 
-A dot X of the target, at rest in the lab, stands at R X + t - w s - e in the rig when the encoder
-reads s: w = axis / (1 + scale) is the travel per unit of reading, e the carriage's error there.
+A dot X of the target is at rest in the laboratory. When the encoder reads s, it is at R X + t - w s
+- e in the rig. Here R and t are the pose of the target at reading 0, w = axis / (1 + scale) is the
+travel per unit of reading, and e is the error of the carriage's position in that view.
 """
 
 from __future__ import annotations
@@ -28,9 +30,14 @@ _STATE, _RIG, _FIRST_ERROR = 0, 1, 2
 
 @dataclass(frozen=True)
 class Dots:
-    """view, camera (M,) indices; place_mm (M, 3) in the target's frame; uv_px (M, 2).
+    """M measured dots of one target in V views.
 
-    information : (M, 2, 2) inverse covariances.  views : names; reading_mm : (V,).
+    views : names of the views.
+    reading_mm : (V,) encoder reading of each view.
+    view, camera : (M,) indices of each dot's view and camera.
+    place_mm : (M, 3) position of the dot in the target frame.
+    uv_px : (M, 2).
+    information : (M, 2, 2) inverse covariances of the pixels (1/px^2).
     """
 
     views: tuple[str, ...]
@@ -44,7 +51,11 @@ class Dots:
 
 @dataclass(frozen=True)
 class State:
-    """rig_from_target at reading 0; slope : (3,) w, travel per unit of reading."""
+    """The estimated motion of the target in the rig.
+
+    rig_from_target : pose of the target at reading 0.
+    slope : (3,) w, the travel per unit of reading.
+    """
 
     rig_from_target: Pose
     slope: Array
@@ -52,7 +63,7 @@ class State:
 
 @dataclass(frozen=True)
 class Weights:
-    """Robust weights of dots (M,) and of the views' readings (V,)."""
+    """Robust weights from 0 to 1 of the dots (M,) and of the views' encoder readings (V,)."""
 
     dots: Array
     views: Array
@@ -60,11 +71,14 @@ class Weights:
 
 @dataclass(frozen=True)
 class Linear:
-    """Normal equations of (pose 6, slope 3) with the carriage's errors eliminated.
+    """Normal equations of the 9 unknowns (pose 6, slope 3), after the carriage's errors were
+    eliminated.
 
-    by_rig : (9, P) cross term with the calibration's rig block.
-    shift_mm, shift_covariance : (V, 3), (V, 3, 3) each view's own displacement off the line.
-    dot_score : (M,) squared residuals in sd, each view freely shifted.
+    normal, right : (9, 9) and (9,) the matrix and the right-hand side.
+    by_rig : (9, P) block that couples the unknowns with the P parameters of the cameras.
+    shift_mm, shift_covariance : (V, 3) and (V, 3, 3), displacement of each view from the straight
+        line.
+    dot_score : (M,) squared residuals in standard deviations, if each view is shifted freely.
     """
 
     normal: Array
@@ -82,11 +96,16 @@ def fit(
     state: State,
     sigma_mm: tuple[float, float],
 ) -> tuple[State, Weights, Linear]:
-    """Robust Gauss-Newton from a start. sigma_mm : of the carriage along and across the axis.
+    """Fit the state to the dots by robust Gauss-Newton steps from a start.
 
-    Dots and readings beyond 3.5 sd keep the weight (3.5 / z)^4; the limit halves from iteration
-    to iteration, so that the largest outliers are removed first (graduated non-convexity).
-    Raises CalibrationError when it does not converge.
+    free : for each camera the names of its free intrinsics.
+    sigma_mm : standard deviations of the carriage's position along and across the axis.
+
+    A dot or a reading at z > 3.5 standard deviations gets the weight (3.5 / z)^4. The limit begins
+    above the largest z and is halved in every iteration, so that the largest outliers lose their
+    weight first (graduated non-convexity).
+
+    Raises CalibrationError if the fit does not converge.
     """
     weights = Weights(np.ones(len(dots.view)), np.ones(len(dots.views)))
     system = linearised(cameras, free, dots, state, sigma_mm, weights)
@@ -114,9 +133,11 @@ def fit(
 
 
 def _scores(system: Linear, state: State, sigma_mm: float) -> tuple[Array, Array]:
-    """Squared distances in sd of dots (M,) and of the views' readings (V,).
+    """Return the squared distances of the dots (M,) and of the readings (V,), in standard
+    deviations.
 
-    Readings that scatter by more than twice what is stated are measured by their own scatter.
+    If the readings scatter by more than twice the stated standard deviation, the observed scatter
+    is used instead of it.
     """
     axis = state.slope / np.linalg.norm(state.slope)
     own = np.einsum("i,vij,j->v", axis, system.shift_covariance, axis)
@@ -128,7 +149,8 @@ def _scores(system: Linear, state: State, sigma_mm: float) -> tuple[Array, Array
 
 
 def _reweighted(scores: tuple[Array, Array], limit: float) -> Weights:
-    """(limit / z)^4 beyond ``limit`` standard deviations."""
+    """Return the weights (limit / z)^4 for distances z beyond ``limit`` standard deviations,
+    otherwise 1."""
     cut = [np.minimum(1.0, limit**4 / np.maximum(score, 1.0) ** 2) for score in scores]
     return Weights(cut[0], cut[1])
 
@@ -141,7 +163,8 @@ def linearised(
     sigma_mm: tuple[float, float],
     weights: Weights,
 ) -> Linear:
-    """Linear system at a state; GTSAM eliminates the carriage's error e of each view."""
+    """Return the normal equations at a state. GTSAM eliminates the carriage's error of each
+    view."""
     import gtsam
 
     residual, by_point, by_state, by_rig = derivatives(cameras, free, dots, state)
@@ -179,7 +202,8 @@ def linearised(
 
 
 def _across(slope: Array) -> Array:
-    """(3, 3) unit vectors as columns: the travel's direction and two across it."""
+    """Return unit vectors as columns (3, 3): the direction of travel and two perpendicular to
+    it."""
     basis, _ = np.linalg.qr(np.column_stack([slope, np.eye(3)]))
     return np.asarray(basis)
 
@@ -187,7 +211,11 @@ def _across(slope: Array) -> Array:
 def derivatives(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], dots: Dots, state: State
 ) -> tuple[Array, Array, Array, Array]:
-    """(M, 2) measured - predicted; (M, 2, 3) by rig point, (M, 2, 9) by state, (M, 2, P) by rig."""
+    """Return the residuals (M, 2), measured minus predicted, and the derivatives of the prediction.
+
+    The derivatives are (M, 2, 3) with respect to the rig point, (M, 2, 9) with respect to the
+    state, and (M, 2, P) with respect to the P parameters of the cameras.
+    """
     pose = state.rig_from_target
     points = pose.apply(dots.place_mm) - dots.reading_mm[dots.view, None] * state.slope
     whole = rig_jacobian(cameras, free, points)
@@ -207,9 +235,11 @@ def derivatives(
 
 
 def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
-    """Closed form: dots triangulated view by view, median slopes, the target fitted to medians.
+    """Return a state in closed form from which `fit` can start.
 
-    Raises CalibrationError when no dot is seen by two cameras at two positions.
+    The dots of each view are triangulated, the slope is a median over pairs of views, and the
+    target is fitted to the median position of each dot. Raises CalibrationError if no dot is seen
+    by two cameras at two positions.
     """
     ids = np.unique(dots.place_mm, axis=0, return_inverse=True)[1].reshape(-1)
     keys = dots.view * (ids.max() + 1) + ids
@@ -226,7 +256,8 @@ def start(cameras: tuple[Camera, ...], dots: Dots) -> State:
 
 
 def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
-    """(3,) travel per reading: median over pairs of views of one dot (Theil and Sen)."""
+    """Return the travel per unit of reading (3,) as the median over pairs of views of a dot
+    (Theil-Sen)."""
     slopes = [np.zeros((0, 3))]
     for one in np.unique(dot):
         members = np.flatnonzero(dot == one)
@@ -245,7 +276,7 @@ def _median_slope(reading: Array, dot: Ints, points: Array) -> Array:
 
 
 def _fitted_pose(dot: Ints, place: Array, points: Array) -> Pose:
-    """rig_from_target of least squares over the median place of each dot (Kabsch)."""
+    """Return rig_from_target by a least-squares fit to the median position of each dot (Kabsch)."""
     _, first = np.unique(dot, return_index=True)
     nominal = place[first]
     middle = np.array([np.median(points[dot == d], axis=0) for d in dot[first]])

@@ -1,6 +1,6 @@
 """Travel axis and encoder scale from views of one static target at several stage positions.
 
-Read from the folder `stage_axis/` of a dataset: positions.csv beside dots.csv or images.
+The folder `stage_axis/` of a dataset holds positions.csv, and either dots.csv or images.
 """
 
 from __future__ import annotations
@@ -46,15 +46,20 @@ _CONTRADICTION_DEG = 10.0
 
 @dataclass(frozen=True)
 class StageAxis:
-    """The stage as calibrated.
+    """The calibrated stage.
 
-    axis_rig : (3,) unit vector of travel at growing readings, in rig axes.
-    basis : (3, 2) orthonormal tangent vectors at the axis; covariance : (2, 2) rad^2 in it.
-    scale, scale_sd : reading = (1 + scale) travel.  joint_covariance : (3, 3) of both and scale.
+    axis_rig : (3,) unit vector of travel in rig axes, in the direction of increasing readings.
+    basis : (3, 2) two orthonormal vectors perpendicular to the axis.
+    covariance : (2, 2) rad^2, covariance of the axis in this basis.
+    scale, scale_sd : scale error of the encoder and its standard deviation; reading = (1 + scale)
+        travel.
+    joint_covariance : (3, 3) covariance of the two components of the axis and the scale.
     rig_from_target : pose of the target at reading 0.
-    chi2_dof : of the dots.  position_sigma_mm, wander_sigma_mm : of the carriage along and across
-        the axis, as given, or as observed where that is significantly more.
-    words : for the user.
+    chi2_dof : chi-square of the dots divided by the degrees of freedom; 1 is expected.
+    position_sigma_mm, wander_sigma_mm : standard deviations of the carriage's position along and
+        across the axis. They are the given values, or the observed ones if these are significantly
+        larger.
+    words : sentences for the user.
     """
 
     axis_rig: Array
@@ -70,7 +75,7 @@ class StageAxis:
     words: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for calibration.json."""
+        """Return the contents as plain numbers for calibration.json."""
         return {
             "axis": self.axis_rig.tolist(),
             "basis": self.basis.tolist(),
@@ -90,10 +95,13 @@ class StageAxis:
 
 
 def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | None:
-    """The stage as `stage_axis/` shows it; None when the dataset has no such folder.
+    """Return the stage that the dataset's folder `stage_axis/` gives; None if there is no such
+    folder.
 
-    Raises InputError for a folder without positions.csv, with neither or both of images and
-    dots.csv, and what `stage_axis_of` raises. Words tell when rig.toml states another direction.
+    If rig.toml states another direction of travel, ``words`` of the result says so.
+
+    Raises InputError for a folder without positions.csv and for one with both images and dots.csv
+    or with neither, and the errors of `stage_axis_of`.
     """
     folder = dataset.path / FOLDER
     if not folder.is_dir():
@@ -164,15 +172,19 @@ def stage_axis_of(
     position_sigma_mm: float = 0.001,
     wander_sigma_mm: float = 0.0,
 ) -> StageAxis:
-    """Travel axis and encoder scale with their covariance, the calibration's carried in.
+    """Return the travel axis and the encoder scale with their covariance.
 
-    table : view, camera, dot, u_px, v_px and suu_px2, suv_px2, svv_px2 or sigma_px, as dots.csv.
-    positions_mm : the encoder's reading of each view, or a table view, position_mm.
-    position_sigma_mm, wander_sigma_mm : sd of the carriage along and across the axis; what the
-        views show is taken where that is significantly more.
+    The covariance includes the uncertainty of the cameras' calibration.
 
-    Raises InputError for views without a position and unknown cameras, CalibrationError for
-    fewer than two positions, less than 1 mm between them, or one camera alone.
+    table : columns as in dots.csv: view, camera, dot, u_px, v_px and either suu_px2, suv_px2,
+        svv_px2 or sigma_px.
+    positions_mm : the encoder reading of each view, as a mapping or as a table with the columns
+        view and position_mm.
+    position_sigma_mm, wander_sigma_mm : standard deviations of the carriage's position along and
+        across the axis. Larger values are used if the views show significantly more scatter.
+
+    Raises InputError for views without a position and for unknown cameras, and CalibrationError for
+    fewer than two positions, less than 1 mm between them, or a single camera.
     """
     dots, words = _dots(calibration, table, positions_mm)
     cameras = calibration.cameras
@@ -264,7 +276,10 @@ def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
 
 
 def _covariance(rows: pd.DataFrame, calibration: Calibration) -> Array:
-    """(M, 2, 2) of the dots' pixels; without columns, the scatter of the calibration's own dots."""
+    """Return the covariances (M, 2, 2) of the dots' pixels in px^2.
+
+    Without columns for them, the scatter of the dots in the calibration is used.
+    """
     if all(c in rows for c in _COVARIANCE):
         uu, uv, vv = rows[_COVARIANCE].to_numpy(float).T
     else:
@@ -278,9 +293,11 @@ def _covariance(rows: pd.DataFrame, calibration: Calibration) -> Array:
 def _shown_sigma(
     state: State, weights: Weights, system: Linear, sigma_mm: tuple[float, float]
 ) -> tuple[float, float]:
-    """The given sd of the carriage, or what the views show where that is significantly more.
+    """Return the standard deviations of the carriage's position along and across the axis.
 
-    A straight line takes two of the views' places on each of the three axes.
+    Each is the given value, or the observed one if that is significantly larger. A straight line
+    uses up two of the views' positions in each direction, which the degrees of freedom take into
+    account.
     """
     from scipy.stats import chi2
 

@@ -29,10 +29,13 @@ def summary(calibration: CalibrationFile) -> str:
             for name, deviation in camera.standard_deviations.items()
         ]
         lines.append(f"  camera {camera_name}: " + ", ".join(parts))
-    if "axes_angle_deg" in s:
+    others = s.get("from_first") or ({"": s} if "axes_angle_deg" in s else {})
+    first = next(iter(calibration.cameras))
+    for other, angle in others.items():
+        which = f" of {first} and {other}" if other else ""
         lines.append(
-            f"  angle between the axes {s['axes_angle_deg']:.4f} +- {s['axes_angle_sd_deg']:.2g} "
-            "degrees"
+            f"  angle between the axes{which} {angle['axes_angle_deg']:.4f} +- "
+            f"{angle['axes_angle_sd_deg']:.2g} degrees"
         )
     if "space_sd_um" in s:
         lines.append(

@@ -72,11 +72,11 @@ def _space_numbers(results: CalibrationResults, s: Mapping[str, Any]) -> list[Fi
         f"1 sd per axis of a triangulated point; dots are {number(s.get('space_rms_um'))} µm RMS "
         f"from the fit, rays miss by {number(s.get('ray_miss_rms_um'))} µm"
     )
-    angle = with_sd(s.get("axes_angle_deg"), s.get("axes_angle_sd_deg"))
-    figures = [
-        Figure("In space", precision, remark),
-        Figure("Angle between axes", f"{angle} °", "1 sd; between the optical axes"),
-    ]
+    figures = [Figure("In space", precision, remark)]
+    for name, of in s.get("from_first", {"": s}).items():
+        angle = with_sd(of.get("axes_angle_deg"), of.get("axes_angle_sd_deg"))
+        which = f"of {results.cameras[0].name} and {name}" if name else "between the optical axes"
+        figures.append(Figure("Angle between axes", f"{angle} °", f"1 sd; {which}"))
     if "perspective_centres_distance_mm" in s:
         distance = f"{number(s['perspective_centres_distance_mm'], 6)} mm"
         figures.append(Figure("Base", distance, "between the centres of perspective"))

@@ -71,6 +71,7 @@ def test_what_the_file_says_of_three_cameras(calibrated: Any, tmp_path: Path) ->
     assert file["statistics"]["axes_angle_deg"] == angles["middle"]["axes_angle_deg"]
     assert "where the first two optical axes come closest" in file["gauge"]
     assert "camera right" in calibrated.report()
+    assert "angle between the axes of left and right 1" in calibrated.report()
 
 
 def test_a_third_camera_makes_points_better(calibrated: Any) -> None:

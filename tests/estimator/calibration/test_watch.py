@@ -310,3 +310,22 @@ def test_options_of_watching(empty: Path) -> None:
         result = runner.invoke(app, ["calibrate", str(empty), "--watch", f"--{option}", "nonsense"])
         assert result.exit_code == 2 and "unknown" in result.stderr
         assert "watching" not in result.stdout
+
+
+def test_of_three_cameras_two_make_a_view(paper_images: Path, empty: Path) -> None:
+    rig = (empty / "rig.toml").read_text(encoding="utf-8")
+    third = "[cameras.top]\nimage_size_px = [512, 512]\nscale_px_per_mm = 10.0\n"
+    (empty / "rig.toml").write_text(rig + third, encoding="utf-8")
+    said: list[str] = []
+    name = views(paper_images)[0]
+    folder = WatchedFolder(empty, said.append, patience_s=-1.0)
+    arrive(paper_images, empty, name, ("left",))
+    for _ in range(2):
+        folder.poll()
+    assert folder.complete() == []
+    assert any("no image of camera top" in words for words in said)
+    arrive(paper_images, empty, name, ("right",))
+    said.clear()
+    for _ in range(3):
+        folder.poll()
+    assert folder.complete() == [Path(name).stem] and not said

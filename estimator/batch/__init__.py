@@ -1,5 +1,5 @@
-"""Many datasets and runs, calibrated, tracked and smoothed: one job at a time or many at once.
+"""Calibration, tracking and smoothing of many datasets, one job at a time or several at once.
 
-In: dataset folders. Out: their results folders, and the records of a batch. Read ``jobs``, then
-``batch``.
+In: the folders of datasets. Out: their results folders, and the records of the batch. Read
+``jobs``, then ``batch``.
 """

@@ -1,7 +1,8 @@
-"""Jobs done in order on the cores of this machine or on a Dask cluster, and their records.
+"""Runs jobs in their order on the cores of this computer or on a Dask cluster, and keeps their
+records.
 
-Each job runs in a process of its own, which may die without harm. A journal has one file per job;
-batch.csv and batch.json hold all of them.
+Each job runs in its own process, so a crash does not stop the others. A journal has one file per
+job; batch.csv and batch.json hold the records of all jobs.
 """
 
 from __future__ import annotations
@@ -45,14 +46,19 @@ _stopped = threading.Event()
 
 
 def do_job(job: Job, stage: Stage | None = None) -> dict[str, Any]:
-    """Do it in this process; returns status, words and figures. Raises telerig's errors."""
+    """Do a job in this process and return its status, words and figures.
+
+    stage : function that is called with the progress of the job.
+
+    Raises the errors of calibration, tracking and smoothing.
+    """
     return {"calibrate": _calibrate, "track": _track, "smooth": _smooth}[job.kind](job, stage)
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """Do it in a process of its own; returns its result and never raises.
+    """Do a job in a process of its own and return its result. No error is raised.
 
-    That process ends when this one does, because its standard input closes.
+    The new process ends when this one ends, because its standard input is then closed.
     """
     begun = time.perf_counter()
     result = _outcome(job)
@@ -64,15 +70,15 @@ def perform(job: Job) -> dict[str, Any]:
 
 
 def allow() -> None:
-    """Let `perform` begin work again after `stop_all`."""
+    """Allow `perform` to start jobs again after `stop_all`."""
     _stopped.clear()
 
 
 def stop_all() -> None:
-    """End the processes of `perform` in all threads; jobs that begin later fail at once.
+    """End the processes of `perform` in all threads. Jobs that start later fail at once.
 
-    Each process is interrupted as by Ctrl-C, so that it removes its temporary files, and killed if
-    it has not ended after `_END_WITHIN_S`.
+    Each process is interrupted in the same way as by Ctrl-C, so that it removes its temporary
+    files. It is killed if it has not ended after `_END_WITHIN_S` seconds.
     """
     _stopped.set()
     ending = list(_children)
@@ -117,9 +123,9 @@ def _outcome(job: Job) -> dict[str, Any]:
 
 
 def _answer(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
-    """The answer of the process, and its standard error.
+    """Send the job to a process and return the process's answer and its standard error.
 
-    Its standard input stays open until it has answered.
+    The standard input of the process stays open until it has answered.
     """
     assert child.stdin and child.stdout and child.stderr
     messages: list[str] = []
@@ -140,7 +146,7 @@ def _answer(child: subprocess.Popen[str], job: Job) -> tuple[str, str]:
 
 
 def failure(status: str, words: str) -> dict[str, Any]:
-    """The result of a job that failed."""
+    """Return the result of a job that failed."""
     return {"status": status, "words": words, "figures": {}}
 
 
@@ -217,7 +223,10 @@ def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 
 def summary_line(job: Job, result: Mapping[str, Any], *, whole_path: bool = False) -> str:
-    """The result of a job in one line. whole_path : for datasets that have the same name."""
+    """Return the result of a job in one line.
+
+    whole_path : whether the full path of the dataset is given, for datasets with equal names.
+    """
     place = job.dataset if whole_path else Path(job.dataset).name
     what = f"{job.kind} {place}" + (f" {job.run}" if job.run else "")
     verdict = result["figures"].get("verdict")
@@ -234,23 +243,24 @@ FIGURES = (
 
 
 class Journal:
-    """The folder ``jobs`` of a batch, so that an interrupted batch continues where it was.
+    """The folder ``jobs`` of a batch, from which an interrupted batch continues.
 
-    Several processes may write different jobs into it.
+    Several processes may write records of different jobs to it.
     """
 
     def __init__(self, batch: Path) -> None:
         self.folder = Path(batch) / "jobs"
 
     def done(self, job: Job) -> dict[str, Any] | None:
-        """The record of the job if it was done with the same inputs, options and version."""
+        """Return the record of the job if it was done with the same inputs, options and version,
+        else None."""
         record = self.read(job)
         if record is None or record.get("status") != DONE or not job.result.is_file():
             return None
         return record if record.get("fingerprint") == fingerprint(job) else None
 
     def read(self, job: Job) -> dict[str, Any] | None:
-        """The last record of the job; None when there is none that can be read."""
+        """Return the last record of the job, or None if there is none that can be read."""
         try:
             content = json.loads((self.folder / f"{job.name}.json").read_bytes())
         except (OSError, ValueError):
@@ -258,10 +268,10 @@ class Journal:
         return dict(content) if isinstance(content, dict) else None
 
     def write(self, job: Job, result: Mapping[str, Any], inputs: str) -> dict[str, Any]:
-        """Keep the result of a job; returns the record.
+        """Write the result of a job to the journal and return the record.
 
-        inputs : `fingerprint` before it began, so that a job whose input changes meanwhile is done
-        again.
+        inputs : `fingerprint` of the job before it began. If an input changes while the job runs,
+            the job is therefore done again by the next batch.
         """
         record = {
             "kind": job.kind, "dataset": job.dataset, "run": job.run, **result,
@@ -273,7 +283,10 @@ class Journal:
 
 
 def table_of(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Columns `COLUMNS`, `FIGURES` and the reason of a failure; a row per job, in their order."""
+    """Return the records as a table with one row per job, in their order.
+
+    The columns are `COLUMNS`, `FIGURES` and words, which gives the reason of a failure.
+    """
     rows = []
     for record in records:
         figures = record.get("figures") or {}
@@ -293,7 +306,8 @@ def _first_line(words: object) -> str:
 def write_batch(
     records: Sequence[Mapping[str, Any]], folder: Path, *, report: bool = True
 ) -> pd.DataFrame:
-    """batch.csv, batch.json and report.html in ``folder``; returns the table."""
+    """Write batch.csv, batch.json and report.html to ``folder`` and return the table of
+    `table_of`."""
     table = table_of(records)
     write_table(table, folder / "batch.csv")
     content = {"schema": 1, "kind": "telerig batch", "jobs": list(records)}
@@ -306,7 +320,9 @@ def write_batch(
 
 
 def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
-    """The summary for the user: how many jobs of each kind and status, and each failure."""
+    """Return the summary for the user: the number of jobs of each kind and status, and every
+    failure.
+    """
     lines = []
     for kind in ("calibrate", "track", "smooth"):
         of_kind = [r for r in records if r["kind"] == kind]
@@ -322,7 +338,7 @@ def batch_words(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 Tell = Callable[[Job, dict[str, Any], int, int], None]
-"""Progress: (job, its record, number of jobs done, number of jobs)."""
+"""Function that is told the progress: (job, its record, number of jobs done, number of jobs)."""
 
 _CONNECT_S = 20
 
@@ -330,10 +346,14 @@ _CONNECT_S = 20
 def run_batch(
     jobs: Sequence[Job], executor: Executor, journal: Journal, *, tell: Tell | None = None
 ) -> list[dict[str, Any]]:
-    """Do all jobs, each after those that it needs; returns their records, in the order of jobs.
+    """Do all jobs, each after the jobs that it needs, and return their records in the order of
+    ``jobs``.
 
-    A job that ``journal`` records as done with the same inputs is not done again. A job that fails
-    stops only those that need it: they are left out, and their record says because of which.
+    A job that ``journal`` records as done with the same inputs is not done again. If a job fails,
+    only the jobs that need it are left out, and their records name it.
+
+    executor : runs `perform`, see `local_executor` and `dask_executor`.
+    tell : function that is called after each job.
     """
     by_name = {job.name: job for job in jobs}
     records: dict[str, dict[str, Any]] = {}
@@ -366,7 +386,7 @@ def run_batch(
 def _known_record(
     job: Job, records: dict[str, dict[str, Any]], journal: Journal
 ) -> dict[str, Any] | None:
-    """The record of a job that needs no work; None for one that does."""
+    """Return the record of a job that need not be done, or None for a job that has to be done."""
     for needed in job.needs:
         if records[needed]["status"] != DONE:
             words = f"needs {needed}, which was {records[needed]['status']}"
@@ -376,7 +396,11 @@ def _known_record(
 
 
 def _result(future: Future[dict[str, Any]]) -> dict[str, Any]:
-    """A cluster that gives up a job, for instance because its workers die, raises an error."""
+    """Return the result of a job that an executor has finished.
+
+    An executor raises an error if it gives up a job, for instance because the workers of a cluster
+    died; the job then counts as crashed.
+    """
     error = future.exception()
     if error is None:
         return future.result()
@@ -385,9 +409,12 @@ def _result(future: Future[dict[str, Any]]) -> dict[str, Any]:
 
 @contextmanager
 def local_executor(workers: int | None = None) -> Iterator[Executor]:
-    """Runs ``workers`` jobs at once on this machine, each in a process of its own.
+    """Give an executor that runs ``workers`` jobs at once on this computer, each in its own
+    process.
 
     workers : None means one per core.
+
+    Raises InputError for fewer than 1.
     """
     count = cores() if workers is None else workers
     if count < 1:
@@ -405,12 +432,15 @@ def local_executor(workers: int | None = None) -> Iterator[Executor]:
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster that is running already.
+    """Give an executor that uses the workers of a running Dask cluster.
 
-    address : tcp://host:port of its scheduler. The datasets must be at the same paths on every
-    worker; only the descriptions of jobs and their results are sent. A job whose worker dies is
-    done again by another one, as often as the cluster's setting allowed-failures says (3). Raises
-    InputError when no scheduler answers.
+    The datasets must be at the same paths on every worker, because only the descriptions of the
+    jobs and their results are sent. If a worker dies, its job is done again by another one, as
+    often as the cluster's setting allowed-failures permits (3 by default).
+
+    address : tcp://host:port of the scheduler.
+
+    Raises InputError if Dask is not installed, if no scheduler answers, or if it has no workers.
     """
     try:
         from distributed import Client

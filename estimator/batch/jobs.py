@@ -1,4 +1,4 @@
-"""The jobs of a list of datasets, in an order in which they can be done, and their inputs."""
+"""The jobs for a list of datasets, in an order in which they can be done, and their input files."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ Kind = Literal["calibrate", "track", "smooth"]
 
 MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
 RESERVED = "calibration"
-"""No run can have this name, because results/calibration belongs to the calibration."""
+"""No run can have this name, because results/calibration holds the results of the calibration."""
 _INPUTS = {"calibrate": ("calibration", "stage_axis")}
 
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work. Paths are text, so that a job can be sent to another machine.
+    """The calibration of one dataset, or the tracking or smoothing of one run.
 
-    run : empty for a calibration. calibration : a file for all runs, or empty for the dataset's.
-    model, medium : the lens model of a calibration, and where its target was.
-    needs : names of the jobs that must be done before.
+    Paths are text, so that a job can be sent to another computer.
+
+    run : name of the run; empty for a calibration.
+    calibration : file that is used for all runs; empty for the dataset's own calibration.
+    model, medium : lens model of a calibration, and the medium in which the target was.
+    needs : names of the jobs that must be done before this one.
     """
 
     kind: Kind
@@ -41,33 +44,33 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Unique within a batch, and fit for a file name."""
+        """A name that is unique within a batch and can be a file name."""
         place = Path(self.dataset)
         mark = hashlib.sha256(str(place).encode()).hexdigest()[:6]
         return ".".join(filter(None, (place.name, mark, self.run, self.kind)))
 
     @property
     def where(self) -> str:
-        """For messages."""
+        """The place of the data, for messages."""
         return f"{self.dataset}/runs/{self.run}" if self.run else self.dataset
 
     @property
     def results(self) -> Path:
-        """The folder that it writes."""
+        """The folder to which the job writes."""
         return Path(self.dataset) / "results" / (self.run or "calibration")
 
     @property
     def result(self) -> Path:
-        """The file that exists once the job is done."""
+        """The file that exists when the job is done."""
         return self.results / MAIN_RESULT[self.kind]
 
     def as_json(self) -> str:
-        """One line."""
+        """Return the job as one line of JSON."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, line: str) -> Job:
-        """The job of `as_json`."""
+        """Return the job that `as_json` has written."""
         content = json.loads(line)
         return cls(**{**content, "needs": tuple(content["needs"])})
 
@@ -82,14 +85,16 @@ def jobs_of(
     only: Sequence[str] = (),
     strict: bool = False,
 ) -> list[Job]:
-    """Calibration, tracking and smoothing of every dataset, each job after those that it needs.
+    """Return the calibration, tracking and smoothing of every dataset, each after the jobs that it
+    needs.
 
-    calibration : one for all datasets; then nothing is calibrated. only : names of runs; empty
-    takes all. A dataset without views of the target must have a calibration already.
-    strict : raise InputError for a dataset that cannot be used; otherwise it becomes a calibration
-        job that fails, so that it does not stop the others.
+    calibration : a calibration for all datasets; then none is calibrated.
+    only : names of the runs to be done; empty for all runs.
+    strict : if True, a dataset that cannot be used raises InputError; otherwise it becomes a
+        calibration job that fails, so that the other datasets are still done.
 
-    Raises InputError for folders that do not exist or are named twice, and unknown runs.
+    A dataset without views of the target must have been calibrated before. Raises InputError for
+    folders that do not exist or are named twice, and for unknown runs.
     """
     places = _checked(datasets)
     shared: dict[str, Any] = {
@@ -150,9 +155,9 @@ def _check_only(jobs: Sequence[Job], only: Sequence[str]) -> None:
 
 
 def share_of(jobs: Sequence[Job], index: int, of: int) -> list[Job]:
-    """The jobs of every ``of``-th dataset, from dataset ``index`` (0-based) on.
+    """Return the jobs of every ``of``-th dataset, beginning with dataset ``index`` (from 0).
 
-    A dataset's jobs stay together, as they need each other.
+    The jobs of a dataset stay together, because they need each other.
     """
     places = list(dict.fromkeys(job.dataset for job in jobs))
     mine = set(places[index::of])
@@ -160,7 +165,7 @@ def share_of(jobs: Sequence[Job], index: int, of: int) -> list[Job]:
 
 
 def check_run_name(run: Path) -> None:
-    """Raise InputError for a run whose results would mix with the calibration's."""
+    """Raise InputError for a run whose results would be mixed with those of the calibration."""
     place = Path(run).resolve()
     if place.name == RESERVED and place.parent.name == "runs":
         raise InputError(
@@ -170,7 +175,9 @@ def check_run_name(run: Path) -> None:
 
 
 def check_options(calibration: Path | None, model: str, medium: str = "air") -> None:
-    """Raise InputError for a calibration that is not there, an unknown lens model or medium."""
+    """Raise InputError for a calibration that does not exist, and for an unknown lens model or
+    medium.
+    """
     from telerig.errors import CalibrationError
     from telerig.estimator.calibration.calibrate import checked_medium
     from telerig.rig.lens_models import checked_model
@@ -188,9 +195,10 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
 
 
 def fingerprint(job: Job) -> str:
-    """A hash of all that the result depends on: the program, the options, the input files.
+    """Return a hash of everything on which the result of a job depends: version, options, input
+    files.
 
-    Recorded files count with size and time of change, calibrations and tracks with their content.
+    Recorded files enter by size and time of change, calibrations and tracks by their content.
     """
     hashed = hashlib.sha256(f"{VERSION} {job.as_json()}".encode())
     place = Path(job.dataset)

@@ -1,4 +1,4 @@
-"""`telerig doctor`: what is wrong with the installation, the serial ports or a dataset.
+"""`telerig doctor` finds problems of the installation, the serial ports or a dataset.
 
-In: this machine, or a dataset's folder. Out: one ``Check`` per question, all in ``checks``.
+In: this computer, or the folder of a dataset. Out: one ``Check`` per question, all in ``checks``.
 """

@@ -1,4 +1,4 @@
-"""Checks of the installation, the serial ports and a dataset: one `Check` per question."""
+"""Checks of the installation, the serial ports and a dataset. Each question gives one `Check`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,12 @@ LATENCY = Path("/sys/bus/usb-serial/devices")
 
 @dataclass(frozen=True)
 class Check:
-    """what : the question. words : the answer. todo : the remedy, if one is needed."""
+    """The answer to one question.
+
+    what : what was checked.
+    words : what was found.
+    todo : what the user can do about it, if anything.
+    """
 
     what: str
     status: Status
@@ -49,7 +54,8 @@ class Check:
 
 
 def check_installation() -> Iterator[Check]:
-    """Check Python, the packages that telerig needs, that there is one OpenCV only, the extras."""
+    """Check Python, the packages that telerig needs, that only one OpenCV is installed, and the
+    extras."""
     python = platform.python_version()
     known = _OLDEST <= sys.version_info[:2] <= _NEWEST
     yield Check(
@@ -69,7 +75,7 @@ def check_installation() -> Iterator[Check]:
 
 
 def _required() -> list[str]:
-    """Names of the packages that the installed telerig states as its dependencies."""
+    """Return the names of the packages that the installed telerig lists as its dependencies."""
     try:
         stated = requires("telerig") or []
     except PackageNotFoundError:
@@ -91,7 +97,10 @@ def _package(name: str) -> Check:
 
 
 def _opencv() -> Check:
-    """OpenCV 4 and 5 both work; two distributions of it overwrite each other's files."""
+    """Check that only one distribution of OpenCV is installed; two overwrite each other's files.
+
+    OpenCV 4 and 5 both work.
+    """
     here = {d.metadata["Name"] for d in distributions()}
     rivals = sorted(here & set(_OPENCV))
     have = _version("opencv-python-headless") or "none"
@@ -115,7 +124,8 @@ def _version(name: str) -> str | None:
 
 
 def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
-    """Check of every serial port whether it may be opened, and its adapter's latency timer."""
+    """Check for every serial port whether it may be opened, and the latency timer of its
+    adapter."""
     ports = found_ports()
     if not ports:
         words = "none found"
@@ -132,7 +142,7 @@ def check_ports(latency: Path = LATENCY) -> Iterator[Check]:
 
 
 def _latency(device: str, timer: Path) -> Iterator[Check]:
-    """How long a USB adapter collects bytes before it sends them, often 16 ms."""
+    """Check how long a USB adapter collects bytes before it sends them, which is often 16 ms."""
     try:
         held_ms = int(timer.read_text())
     except (OSError, ValueError):
@@ -174,7 +184,7 @@ def check_dataset(place: Path) -> Iterator[Check]:
 
 
 def _left_over(data: Dataset) -> Iterator[Check]:
-    """Temporary files of commands that were killed, or that are still running."""
+    """Report temporary files of commands that were killed or are still running."""
     found = sorted(p for p in data.results.rglob(".*.part*") if not p.parent.name.startswith("."))
     if found:
         words = ", ".join(str(p.relative_to(data.path)) for p in found[:4])
@@ -209,7 +219,7 @@ def _views(data: Dataset) -> Iterator[Check]:
 
 
 def _decoded(data: Dataset) -> Iterator[Check]:
-    """The first images of every camera must open and have the stated size."""
+    """Check that the first images of every camera can be opened and have the stated size."""
     if data.source != "images":
         return
     for camera in data.rig.cameras:

@@ -1,5 +1,5 @@
-"""Movement of the cameras against each other since the calibration.
+"""Movement of the cameras relative to each other since the calibration.
 
-In: the ray misses of a tracked run's pairs. Out: the change of the pose between the cameras, with
-its covariance. Read ``drift`` first.
+In: the ray misses of the pairs of a tracked run. Out: the change of the pose between the cameras,
+with its covariance. Read ``drift`` first.
 """

@@ -1,13 +1,14 @@
 """A change of the pose between the two cameras, and the ray misses that it causes.
 
 The two rays of a pair miss each other along the common perpendicular n of both lines of sight. If
-the second camera has moved by v and turned by w, the ray miss at a rig point p is n . (v + w x p):
-a constant, and a slope along both lines of sight. Of the six components of the pose between two
-telecentric cameras three are therefore identifiable from ray misses, at any angle between them:
-the shift along n, and the two rotations about axes across n (roll about the second camera's own
-axis, pitch about the axis across that). Shifts in the plane of the lines of sight and the angle
-between them (rotation about n) move the point and cause no ray miss; they keep their calibrated
-values. With perspective lenses more components are identifiable, and they are estimated too.
+the second camera has moved by v and rotated by w, the ray miss at a rig point p is n . (v + w x p),
+which is a constant plus a slope along both lines of sight. Ray misses therefore identify three of
+the six components of the pose between two telecentric cameras, at any angle between them: the shift
+along n, and the two rotations about axes perpendicular to n (roll about the second camera's own
+axis, and pitch about the axis perpendicular to that). Shifts in the plane of the lines of sight and
+the angle between the cameras (rotation about n) move the triangulated point but cause no ray miss;
+they keep their calibrated values. With perspective lenses more components are identifiable, and
+these are estimated too.
 """
 
 from __future__ import annotations
@@ -34,13 +35,15 @@ Pair = tuple[Camera, Camera]
 
 POSE = len(POSE_COMPONENTS)
 FALSE_ALARM = 1e-4
-"""Probability of reporting a movement where there is none."""
+"""Probability of reporting a movement if there is none."""
 
 _LEAST_EFFECT = 0.02
-"""Directions of movement count whose ray misses are larger than this share of the largest one's."""
+"""A direction of movement is estimated if its ray misses are larger than this share of those of the
+direction with the largest ray misses."""
 
 _NOT_IDENTIFIED = 0.5
-"""A rotation is not reported if its standard deviation is larger than this share of the prior's."""
+"""A rotation is not reported if its posterior standard deviation is larger than this share of the
+prior one."""
 
 _GRID = 0.7
 _SINGULAR = 1e-10
@@ -49,10 +52,10 @@ _LEAST_SINE = 0.05
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """Standard deviations of each component of a movement before the run is seen.
+    """Prior standard deviations of each component of a movement.
 
-    They are wide, so that the run decides; components without effect on ray misses stay fixed.
-    Raises InputError for values that are not positive.
+    They are wide, so that the data of the run decide. Components without effect on ray misses are
+    held at 0. Raises InputError for values that are not positive.
     """
 
     rotation_rad: float = 5e-3
@@ -68,14 +71,18 @@ class DriftPrior:
 
 @dataclass(frozen=True)
 class RigChange:
-    """How the second camera has moved against the first since the calibration.
+    """The movement of the second camera relative to the first since the calibration.
 
-    tangent, covariance : (6,), (6, 6) of rig_from_<second>, `POSE_COMPONENTS`, in the identifiable
-        directions; 0 in the others.
-    place_mm : (3,) mean position of the bubbles in the rig frame, where the offset is stated.
-    values, sigmas : (3,) offset (mm) along n, roll and pitch (rad).  prior_sigmas : before the run.
-    chance : p-value, the probability of such ray misses without any movement.
-    refined : rig_from_<second> of calibration and run together; None where it was not refined.
+    camera : name of the second camera.
+    tangent, covariance : (6,) and (6, 6) of rig_from_<second camera> with the components
+        `POSE_COMPONENTS`. They are 0 in the directions that ray misses do not identify.
+    place_mm : (3,) mean position of the bubbles in the rig frame. The offset refers to this point.
+    values, sigmas : (3,) offset along n (mm), roll and pitch (rad), and their standard deviations.
+    prior_sigmas : (3,) their prior standard deviations.
+    chance : p-value, the probability of such ray misses if nothing has moved.
+    pairs : number of pairs from which the movement was estimated.
+    refined : pose rig_from_<second camera> that calibration and run give together; None if it was
+        not estimated.
     """
 
     camera: str
@@ -91,11 +98,11 @@ class RigChange:
 
     @property
     def moved(self) -> bool:
-        """Whether the ray misses exceed what calibration, shake and shapes of bubbles explain."""
+        """Whether calibration errors, shake and bubble shapes do not explain the ray misses."""
         return self.chance < FALSE_ALARM
 
     def size_words(self) -> str:
-        """The identifiable part of the movement with its standard deviations."""
+        """Return the identifiable part of the movement in words, with standard deviations."""
         offset, *turns = zip(1e6 * self.values, 1e6 * self.sigmas)
         text = f"by {_rounded(offset[0] / 1000, offset[1] / 1000)} µm along the shared coordinate"
         identified = self.sigmas[1:] < _NOT_IDENTIFIED * self.prior_sigmas[1:]
@@ -104,7 +111,7 @@ class RigChange:
         return ", ".join([text, *turned]) if turned else f"{text} (its rotations are not seen)"
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of ``rig_change`` in smoothing.json and tracking.json."""
+        """Return the content of ``rig_change`` in smoothing.json and tracking.json."""
         names = ("offset_mm", "roll_rad", "pitch_rad")
         out: dict[str, Any] = {"camera": self.camera, "moved": self.moved, "chance": self.chance}
         out |= {n: float(v) for n, v in zip(names, self.values)}
@@ -127,15 +134,18 @@ class RigChange:
 
 
 def _rounded(value: float, sd: float) -> str:
-    """Value and standard deviation, rounded to two digits of the standard deviation."""
+    """Return value and standard deviation as text, rounded to two digits of the standard
+    deviation."""
     digits = max(0, 1 - math.floor(math.log10(sd))) if sd > 0 else 2
     return f"{value:+.{digits}f} ± {sd:.{digits}f}"
 
 
 def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
-    """Unit vector n = first line of sight x second, and the rig point (3,) where both pass closest.
+    """Return the common perpendicular of both lines of sight, and the rig point where these are
+    closest.
 
-    Raises CalibrationError for cameras that look along one line.
+    The first is the unit vector n (3,) along first line of sight x second line of sight, the other
+    a point (3,) in mm. Raises CalibrationError for cameras that look along one line.
     """
     rays = [c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2) for c in cameras]
     cross = np.cross(rays[0][1], rays[1][1])[0]
@@ -151,7 +161,12 @@ def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class RayMisses:
-    """(M,) mm along n, their variance, and (M, P) derivatives by the rig block's parameters."""
+    """Ray misses of M pairs in mm along n.
+
+    miss_mm : (M,).
+    variance_mm2 : (M,) variance due to the noise of the pixels.
+    by_rig : (M, P) derivative with respect to the P parameters of the cameras.
+    """
 
     miss_mm: Array
     variance_mm2: Array
@@ -165,12 +180,16 @@ def ray_misses(
     uv_px: Array | None = None,
     covariance_px2: Array | None = None,
 ) -> RayMisses:
-    """Ray misses of pixels (M, 2 cameras, 2) near rig points (M, 3), linearised there.
+    """Return the ray misses of M pairs, linearised at rig points near them.
 
-    Of a pair's four pixel coordinates one combination does not change with the point (the left
-    null vector of the projection's Jacobian): the ray miss, here as the shift of the second camera
-    along n that explains it.
-    covariance_px2 : (M, 2, 2, 2). Without pixels or covariances the results are 0.
+    One combination of the four pixel coordinates of a pair does not change with the point; it is
+    given by the left null vector of the projection's Jacobian. This combination is the ray miss. It
+    is scaled to the shift of the second camera along n that would explain it.
+
+    free : for each camera the names of its free intrinsics.
+    points_mm : (M, 3) rig points.
+    uv_px : (M, 2, 2) pixels of each pair in the two cameras; without them the ray misses are 0.
+    covariance_px2 : (M, 2, 2, 2) their covariances; without them the variances are 0.
     """
     n, _ = common_perpendicular(cameras)
     predicted, by_point = stacked_jacobian(cameras, points_mm)
@@ -188,9 +207,10 @@ def ray_misses(
 
 
 def drift_covariance(cameras: Pair, prior: DriftPrior) -> Array:
-    """(6, 6) prior covariance of a movement, in the directions alone that cause ray misses.
+    """Return the prior covariance (6, 6) of a movement, restricted to directions that cause ray
+    misses.
 
-    The ray misses are compared over the volume that both cameras see.
+    The ray misses of different directions are compared over the volume that both cameras see.
     """
     _, middle = common_perpendicular(cameras)
     reach = min(min(c.image_size_px) / c["scale_px_per_mm"] / 2 for c in cameras)
@@ -211,7 +231,12 @@ def described(
     pairs: int,
     refined: Pose | None = None,
 ) -> RigChange:
-    """A movement (6,), its covariance and prior (6, 6), as offset, roll and pitch."""
+    """Return a movement with its offset, roll and pitch.
+
+    tangent : (6,) estimate, as in `RigChange`.
+    covariance, prior : (6, 6) posterior and prior covariance.
+    place_mm : (3,) rig point to which the offset refers.
+    """
     rows = offset_roll_pitch(cameras, place_mm)
     sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
     return RigChange(
@@ -221,7 +246,10 @@ def described(
 
 
 def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
-    """(3, 6): from the tangent of rig_from_second to the offset along n there, roll and pitch."""
+    """Return the matrix (3, 6) that maps the tangent of rig_from_second to offset, roll and pitch.
+
+    The offset is the shift along n at the rig point ``place_mm`` (3,).
+    """
     n, _ = common_perpendicular(cameras)
     pose = cameras[1].camera_from_rig
     across = pose.rotation @ n
@@ -233,9 +261,10 @@ def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
 
 
 def chance_of(tangent: Array, covariance: Array, prior: Array) -> float:
-    """p-value of an estimate under "no movement": chi-square over the prior's free directions.
+    """Return the p-value of an estimate under the hypothesis of no movement.
 
-    The prior shrinks estimates towards 0, so the p-value errs on the large side.
+    It is a chi-square test over the directions that the prior leaves free. The prior shrinks the
+    estimate towards 0, so the true p-value is smaller than the returned one.
     """
     basis = free_directions(prior)
     if not basis.shape[1]:
@@ -246,9 +275,9 @@ def chance_of(tangent: Array, covariance: Array, prior: Array) -> float:
 
 
 def free_directions(covariance: Array, singular: float = _SINGULAR) -> Array:
-    """(P, k) root of a covariance (P, P): directions of unit variance, singular ones left out.
+    """Return a square root (P, k) of a covariance (P, P): its k directions of non-zero variance.
 
-    singular : eigenvalues of the correlation matrix below this share of the largest count as 0.
+    singular : eigenvalues of the correlation matrix below this share of the largest one count as 0.
     """
     unit = _scale(covariance)
     values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
@@ -257,20 +286,26 @@ def free_directions(covariance: Array, singular: float = _SINGULAR) -> Array:
 
 
 def _scale(covariance: Array) -> Array:
-    """(P,) standard deviations, 1 where they are 0."""
+    """Return the standard deviations (P,) of a covariance (P, P), with 1 in place of 0."""
     sd = np.sqrt(np.diagonal(covariance).clip(0))
     return np.where(sd > 0, sd, 1.0)
 
 
 def rig_block(calibration: Calibration) -> tuple[Array, Free]:
-    """Covariance of the rig block and its free intrinsics; zeros for a calibration without."""
+    """Return the covariance of the cameras' parameters, and each camera's free intrinsics.
+
+    The covariance is zero for a calibration that states none.
+    """
     if calibration.covariance.size:
         return calibration.covariance, calibration.free
     return np.zeros((POSE, POSE)), ((), ())
 
 
 def with_drift(covariance: Array, drift: Array) -> Array:
-    """(P, P) covariance of the rig block, that of a movement (6, 6) of the second camera added."""
+    """Return the covariance (P, P) of the cameras' parameters with that of a movement added.
+
+    drift : (6, 6) covariance of a movement of the second camera.
+    """
     total = covariance.copy()
     total[-POSE:, -POSE:] += drift
     return total
@@ -279,11 +314,16 @@ def with_drift(covariance: Array, drift: Array) -> Array:
 def share_of_drift(
     rig: Array, rig_covariance: Array, prior_rig: Array, drift: Array
 ) -> tuple[Array, Array]:
-    """The movement's part of the rig block's posterior: (6,), (6, 6).
+    """Return the movement's part of an estimated error of the cameras' parameters.
 
-    rig, rig_covariance : (P,), (P, P) posterior of the sum of calibration error and movement.
-    prior_rig : the calibration's covariance.  drift : (6, 6) the movement's prior.
-    Gaussian conditioning: the movement given the sum is K times the sum, with its covariance.
+    By Gaussian conditioning, the movement is a gain matrix times the sum of calibration error and
+    movement.
+
+    rig, rig_covariance : (P,) and (P, P) posterior of the sum of calibration error and movement.
+    prior_rig : (P, P) covariance of the calibration.
+    drift : (6, 6) prior covariance of the movement.
+
+    Returns the movement (6,) and its covariance (6, 6).
     """
     total = with_drift(prior_rig, drift)
     unit = _scale(total)
@@ -296,5 +336,6 @@ def share_of_drift(
 
 
 def moved_pose(rig_from_camera: Pose, tangent: Array) -> Pose:
-    """The pose after a small step (6,), right perturbation."""
+    """Return the pose after a small step (6,) (rotation, translation), applied as a right
+    perturbation."""
     return rig_from_camera @ Pose(rotation_from_rotvec(tangent[:3]), tangent[3:])

@@ -1,4 +1,5 @@
-"""A movement of the cameras against each other, estimated from the pairs of a tracked run."""
+"""Estimation of a movement of the cameras relative to each other, from the pairs of a tracked
+run."""
 
 from __future__ import annotations
 
@@ -34,15 +35,15 @@ if TYPE_CHECKING:
 
 LEAST_PAIRS = 20
 LEAST_SEEN_S = 0.5
-"""Least total time of all bubbles' tracks for a verdict: in less, the wander of the outlines'
-centres cannot be told from a movement."""
+"""Least total duration of all tracks for a verdict. In a shorter time, wander of the outlines'
+centres cannot be distinguished from a movement."""
 
 _LEAST_CONFIDENCE = 0.9
 _DOUBTFUL = "shared|ambiguous|merged|border"
 _FAR_SIGMAS = 6.0
 _OUTLIER_SIGMAS = 4.5
 _LEAST = 4
-"""Frames of a run, and pairs of a stretch, below which nothing is estimated."""
+"""With fewer frames in a run, or fewer pairs in a stretch, nothing is estimated."""
 _MOST_ROWS = 520
 _MOST_STRETCHES = 10
 _STRETCH_S = 2.0
@@ -50,11 +51,13 @@ _LEARNED_FROM = 2
 _PASSES = 3
 _SINGULAR = 1e-12
 _SHAPE_PX = 0.02
-"""Constant error of each bubble's centre in each view that its outline does not show."""
+"""Constant error of each bubble's centre in each view that its outline does not reveal."""
 
 
 class PairCollector:
-    """Collects the reliable pairs of a run while it is tracked; estimates a movement at its end."""
+    """Collects the reliable pairs of a run while it is tracked, and estimates a movement at its
+    end.
+    """
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
@@ -73,7 +76,7 @@ class PairCollector:
 
 
 def pair_columns(cameras: Sequence[str]) -> list[str]:
-    """Columns of tracks.csv that are needed."""
+    """Return the names of the columns of tracks.csv that the estimate needs."""
     pixels = ("u_px", "v_px", "du_px", "dv_px", "suu_px2", "suv_px2", "svv_px2")
     base = ["frame", "particle", "t_s", "x_mm", "y_mm", "z_mm", "ray_miss_mm"]
     return base + [f"{c}_{p}" for c in cameras for p in pixels]
@@ -82,9 +85,9 @@ def pair_columns(cameras: Sequence[str]) -> list[str]:
 def rig_change(
     tracks: pd.DataFrame, calibration: Calibration, prior: DriftPrior | None = None
 ) -> tuple[RigChange, Noise] | None:
-    """The movement estimated from a table of tracks, and the noise of its ray misses.
+    """Return the movement estimated from a table of tracks, and the noise model of its ray misses.
 
-    None for fewer than `LEAST_PAIRS` reliable pairs, or without two cameras.
+    Returns None if there are fewer than `LEAST_PAIRS` reliable pairs, or not exactly two cameras.
     """
     if len(calibration.cameras) != 2 or len(tracks) < LEAST_PAIRS:
         return None
@@ -124,7 +127,8 @@ def rig_change(
 
 
 def _reliable(tracks: pd.DataFrame) -> Bools:
-    """Rows with pixels measured in both views, of pairs with high confidence and without flags."""
+    """Return which rows have pixels measured in both views, high confidence and no flag of a
+    doubtful pair."""
     keep = np.isfinite(tracks["ray_miss_mm"].to_numpy(float))
     if "confidence" in tracks:
         keep &= ~(tracks["confidence"].to_numpy(float) < _LEAST_CONFIDENCE)
@@ -134,7 +138,8 @@ def _reliable(tracks: pd.DataFrame) -> Bools:
 
 
 def _without_outliers(table: pd.DataFrame) -> pd.DataFrame:
-    """The rows whose ray miss is not far from all others, their particles numbered from 0."""
+    """Return the rows whose ray miss is not far from those of all others, with particles numbered
+    from 0."""
     miss = table["ray_miss_mm"].to_numpy(float)
     if not len(miss):
         return table
@@ -151,7 +156,10 @@ def _points(table: pd.DataFrame) -> Array:
 
 
 def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
-    """(M, 2, 2) centres with the shape's correction where it is known; (M, 2, 2, 2) covariances."""
+    """Return the centres (M, 2, 2) of M pairs in two cameras, and their covariances (M, 2, 2, 2).
+
+    The centres contain the correction from outline centre to centre of volume if it is known.
+    """
     uv, spread = [], []
     for name in cameras:
         centre = table[[f"{name}_u_px", f"{name}_v_px"]].to_numpy(float)
@@ -167,9 +175,9 @@ def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
 def with_change(
     model: PairModel, change: RigChange | None, calibration: Calibration
 ) -> dict[str, Any]:
-    """The part ``pairs`` of tracking.json.
+    """Return the part ``pairs`` of tracking.json.
 
-    A movement of the cameras replaces the sentence on an offset of the calibration.
+    If the cameras have moved, a sentence on this replaces the one on an offset of the calibration.
     """
     words, moved = model.sentences(), change is not None and change.moved
     if change is not None and moved:
@@ -192,9 +200,10 @@ def with_change(
 
 
 def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
-    """Stretches of a run with at most about 520 pairs each, spread evenly over it.
+    """Return stretches of a run with at most about 520 pairs each, spread evenly over the run.
 
-    Frames are taken evenly: all of them where one bubble is followed, fewer where there are many.
+    Each stretch uses every frame if few bubbles are seen, and every second, third, ... frame if
+    many are.
     """
     frames, counts = np.unique(table["frame"].to_numpy(np.int64), return_counts=True)
     most = max(4, int(_MOST_ROWS / float(counts.mean())))
@@ -213,9 +222,14 @@ def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
 def _estimate(
     table: pd.DataFrame, series_of: Callable[[Any], Series], shape_mm: float
 ) -> tuple[Array, tuple[Array, Array], Noise, int] | None:
-    """Unknowns of unit prior variance (K,), two covariances, the noise, the number of pairs kept.
+    """Return the estimate of K unknowns, which have unit prior variance, from stretches of the run.
 
-    The second covariance includes the constant shape error of each bubble.
+    series_of : function that returns the ray misses of a part of the table.
+    shape_mm : standard deviation of the constant ray miss of each bubble due to its shape.
+
+    Returns the unknowns (K,), two covariances (K, K), the noise model and the number of used pairs.
+    The second covariance includes the constant shape error of each bubble. Returns None if too few
+    pairs remain without outliers.
     """
     parts = [series_of(part) for part in stretches(table)]
     some = np.unique(np.linspace(0, len(parts) - 1, _LEARNED_FROM).astype(int))
@@ -242,7 +256,9 @@ def _estimate(
 
 
 def _shape_share(parts: list[Series], covariance: Array, noise: Noise, shape_mm: float) -> Array:
-    """(K, K) added by a constant ray miss, as if all of the run were one bubble."""
+    """Return the covariance (K, K) due to a constant ray miss, as if the whole run showed one
+    bubble.
+    """
     response = np.zeros(len(covariance))
     for part in parts:
         constant = replace(part, miss_mm=np.full(len(part), shape_mm))

@@ -1,10 +1,12 @@
-"""The noise of ray misses: pixels, differential shake of the cameras, bubbles that change shape.
+"""The noise of ray misses, which comes from pixels, differential shake and bubbles that change
+shape.
 
-A Gaussian process in time with hyper-parameters learned from the ray misses themselves: white
-noise of each pair; damped oscillations common to all pairs of a frame (shake); and for each bubble
-an Ornstein-Uhlenbeck process, as its outline's centre wanders about its centre of volume. Only the
-spectral density near 0 Hz limits the estimate of a constant, and an oscillation has little there:
-the standard error of a plain mean over correlated ray misses would be too large or too small.
+The noise is a Gaussian process in time. Its hyper-parameters are learned from the ray misses
+themselves. It is the sum of white noise of each pair, of damped oscillations that are common to all
+pairs of a frame (shake), and of an Ornstein-Uhlenbeck process for each bubble, because the centre
+of its outline wanders about its centre of volume. Only the spectral density near 0 Hz limits the
+estimate of a constant, and an oscillation has little density there. The usual standard error of a
+mean would be too large or too small, because ray misses are correlated in time.
 """
 
 from __future__ import annotations
@@ -26,22 +28,25 @@ _WANDER_S = 0.1
 _CYCLES = 5.0
 _FACTOR_3, _FACTOR_10 = np.log(3.0), np.log(10.0)
 _INDEPENDENT = 0.5
-"""Weight of each bin: neighbouring bins of a tapered spectrum are correlated."""
+"""Weight of each bin of a spectrum, because neighbouring bins of a tapered spectrum are
+correlated."""
 
 _FIRST_BIN = 2
 _LEAST_FRAMES = 16
 _LEAST_CYCLES = 4.0
-"""Oscillations of fewer cycles in a stretch cannot be told from a slow wander."""
+"""An oscillation with fewer cycles in a stretch cannot be distinguished from a slow wander."""
 
 _MOST_APART = 4
 
 
 @dataclass(frozen=True)
 class Series:
-    """Ray misses in time. frame, bubble, t_s, miss_mm : (M,).
+    """M ray misses in time, linear in K unknowns of unit prior variance.
 
-    relative : (M,) variance of each over the median variance.  by_unknowns : (M, K) derivatives
-    by the unknowns, which have unit prior variance.
+    frame, bubble : (M,) index of each frame and of each bubble.
+    t_s, miss_mm : (M,).
+    relative : (M,) variance of each ray miss divided by the median variance.
+    by_unknowns : (M, K) derivative of each ray miss with respect to the unknowns.
     """
 
     frame: Ints
@@ -58,16 +63,19 @@ class Series:
         return Series(*(getattr(self, column.name)[keep] for column in fields(self)))
 
     def residuals(self) -> Array:
-        """(M,) ray misses less their least-squares fit by the unknowns."""
+        """Return the ray misses (M,) minus their least-squares fit by the unknowns."""
         fit = np.linalg.lstsq(self.by_unknowns, self.miss_mm, rcond=None)[0]
         return np.asarray(self.miss_mm - self.by_unknowns @ fit)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """white_mm : of one ray miss.  wander_mm, wander_s : Ornstein-Uhlenbeck, of each bubble.
+    """Hyper-parameters of the noise of ray misses.
 
-    shake : oscillations common to all pairs: RMS (mm), correlation time (s), frequency (Hz).
+    white_mm : standard deviation of the white noise of a pair.
+    wander_mm, wander_s : standard deviation and correlation time of each bubble's
+        Ornstein-Uhlenbeck process.
+    shake : RMS (mm), decay time (s) and frequency (Hz) of each oscillation that all pairs share.
     """
 
     white_mm: float
@@ -76,11 +84,12 @@ class Noise:
     shake: tuple[tuple[float, float, float], ...] = ()
 
     def own(self, lag_s: Array) -> Array:
-        """Autocovariance of a bubble's wander."""
+        """Return the autocovariance of a bubble's wander at the lags, in mm^2."""
         return np.asarray(self.wander_mm**2 * np.exp(-np.abs(lag_s) / self.wander_s))
 
     def common(self, lag_s: Array) -> Array:
-        """Autocovariance of the shake: damped resonators driven by white noise."""
+        """Return the autocovariance of the shake at the lags, in mm^2: damped resonators driven by
+        white noise."""
         out = np.zeros_like(lag_s)
         for rms, decay, hz in self.shake:
             lag, turn = np.abs(lag_s), 2 * np.pi * hz
@@ -89,7 +98,7 @@ class Noise:
         return out
 
     def covariance(self, series: Series) -> Array:
-        """(M, M) of the ray misses, the unknowns held fixed."""
+        """Return the covariance (M, M) of the ray misses, with the unknowns held fixed."""
         t, index = np.unique(series.t_s, return_inverse=True)
         at = np.ix_(index, index)
         lag = t[:, None] - t
@@ -101,9 +110,12 @@ class Noise:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """A tapered periodogram, and the window's autocorrelation for its expectation.
+    """A tapered periodogram, and what is needed for its expectation.
 
-    common, single : shares of the shake's and of a single bubble's noise in this series.
+    power : periodogram from bin `_FIRST_BIN` on.
+    step_s : interval of the samples.
+    overlap : autocorrelation of the taper.
+    common, single : shares of the shake's variance and of a single bubble's variance in the series.
     """
 
     power: Array
@@ -113,7 +125,7 @@ class _Spectrum:
     single: float
 
     def expected(self, noise: Noise) -> Array:
-        """Expectation of the periodogram, leakage and aliasing included."""
+        """Return the expectation of the periodogram, which includes leakage and aliasing."""
         lag = np.asarray(np.arange(len(self.overlap)) * self.step_s, np.float64)
         covariance = self.common * noise.common(lag) + self.single * noise.own(lag)
         covariance[0] += self.single * noise.white_mm**2
@@ -123,16 +135,18 @@ class _Spectrum:
         return np.asarray(density[_FIRST_BIN : _FIRST_BIN + len(self.power)].clip(1e-18))
 
     def cost(self, noise: Noise) -> float:
-        """Debiased Whittle likelihood (Sykulski et al., Biometrika 106:251, 2019)."""
+        """Return the negative debiased Whittle log-likelihood (Sykulski et al., Biometrika 106:251,
+        2019)."""
         density = self.expected(noise)
         return float(_INDEPENDENT * (np.log(density) + self.power / density).sum())
 
 
 def learned_noise(parts: list[Series]) -> Noise:
-    """Maximum a-posteriori noise of stretches of a run, from the spectra of their residuals.
+    """Return the noise model with the largest posterior, from the spectra of the residuals of
+    stretches.
 
-    Oscillations are added while each raises the log posterior by `_LEAST_LOG_RATIO`, at most two
-    (one for each arm of a camera).
+    Oscillations are added as long as each raises the log posterior by `_LEAST_LOG_RATIO`, at most
+    two (one for the arm of each camera).
     """
     spread = max(float(np.concatenate([p.residuals() for p in parts]).std()), 1e-7)
     start = np.log([spread / 2, spread / 4, _WANDER_S])
@@ -158,7 +172,7 @@ def learned_noise(parts: list[Series]) -> Noise:
 
 
 def _fitted(spectra: list[_Spectrum], start: Array, prior: Prior) -> tuple[Array, float]:
-    """Logarithms of the hyper-parameters and the negative log posterior there."""
+    """Return the logarithms of the hyper-parameters, and the negative log posterior there."""
 
     def cost(log: Array) -> float:
         noise = _noise(log)
@@ -176,7 +190,8 @@ def _noise(log: Array) -> Noise:
 
 
 def _spectra(part: Series) -> list[_Spectrum]:
-    """Of the mean ray miss of a frame, and of single bubbles' deviations from it."""
+    """Return the spectrum of each frame's mean ray miss, and those of single bubbles' deviations
+    from it."""
     left = part.residuals()
     t, index = np.unique(part.t_s, return_inverse=True)
     if len(t) < _LEAST_FRAMES:
@@ -208,7 +223,9 @@ def _spectrum(t_s: Array, values: Array, common: float, single: float) -> _Spect
 
 
 def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
-    """Frequencies (Hz) that stand out most over the noise model's spectrum, well apart."""
+    """Return frequencies (Hz) that exceed the noise model's spectrum most and are not close
+    together.
+    """
     ratio = spectrum.power / spectrum.expected(noise)
     length = len(spectrum.overlap) * spectrum.step_s
     hz = np.arange(_FIRST_BIN, _FIRST_BIN + len(ratio)) / length
@@ -222,9 +239,11 @@ def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
 
 
 def information(series: Series, noise: Noise) -> tuple[Array, Array, Array]:
-    """Information on the unknowns (K, K), (K,), and leave-one-out residuals in sigmas (M,).
+    """Return the information on the unknowns, and the leave-one-out residuals.
 
-    The residuals are taken at the best unknowns of this stretch, whose uncertainty is left out.
+    Returns the matrix (K, K) and the vector (K,) of the normal equations without prior, and the
+    residuals (M,) in standard deviations. The residuals are computed at the best unknowns of this
+    stretch; the uncertainty of these is neglected.
     """
     lower = cholesky(noise.covariance(series), lower=True, check_finite=False)
     inverse = cho_solve((lower, True), np.eye(len(lower)), check_finite=False)

@@ -1,4 +1,5 @@
-"""Faults of an accelerometer's record: unit, gravity left out, clipping, mounting axes."""
+"""Checks of an accelerometer's record for a wrong unit, removed gravity, clipping and wrong
+axes."""
 
 from __future__ import annotations
 
@@ -17,9 +18,10 @@ _UNITS = (
     ("mg or cm/s^2", 1000.0),
     ("ft/s^2", STANDARD_GRAVITY_M_S2 / 0.3048),
 )
-"""Units that are recognised, and gravity in them. They lie so far apart that a factor of 1.5
-either way, as a hard start within a short record may cause it, does no harm; mg and cm/s^2 differ
-by 2 %, less than a bias does, and are named together."""
+"""The units that are recognised, with the value of gravity in each. They differ so much that an
+error of the reading at rest by a factor of 1.5 does no harm; a strong acceleration at the start of
+a short record can cause such an error. mg and cm/s^2 are named together, because they differ by
+only 2 %, less than the effect of a usual bias."""
 
 _WITHIN = 1.5
 _FLOATING_M_S2 = 0.6
@@ -32,7 +34,15 @@ _SMOOTHED_S = 0.03
 
 
 def check_accelerometer(t_s: ArrayLike, reading_m_s2: ArrayLike, *, where: str) -> list[str]:
-    """Warnings about one sensor's readings (N,), (N, 3); InputError for a wrong unit."""
+    """Return warnings about the readings of one sensor.
+
+    t_s : (N,) times.
+    reading_m_s2 : (N, 3).
+    where : file and sensor, for the messages.
+
+    Raises InputError for a wrong unit, for readings without gravity and for values that are not
+    finite.
+    """
     t, reading = np.asarray(t_s, float), np.asarray(reading_m_s2, float).reshape(-1, 3)
     finite = np.isfinite(t) & np.isfinite(reading).all(1)
     if not finite.all():
@@ -53,12 +63,15 @@ def check_accelerometer(t_s: ArrayLike, reading_m_s2: ArrayLike, *, where: str) 
 
 
 def gravity_of(reading: ArrayLike) -> Array:
-    """(3,) median reading of (N, 3): gravity and bias, which shake and clipping do not move."""
+    """Return the median reading (3,) of N readings (N, 3), which is gravity plus bias.
+
+    Shake and clipping hardly change the median.
+    """
     return np.asarray(np.median(np.asarray(reading, float), axis=0))
 
 
 def _check_gravity(size: float, where: str) -> None:
-    """size : of the median reading, which should be gravity in m/s^2."""
+    """Raise InputError if the size of the median reading is not gravity in m/s^2."""
     for unit, expected in _UNITS:
         if expected / _WITHIN < size < expected * _WITHIN:
             factor = STANDARD_GRAVITY_M_S2 / expected
@@ -83,7 +96,12 @@ def _check_gravity(size: float, where: str) -> None:
 
 @dataclass(frozen=True)
 class Clipping:
-    """One axis (0, 1, 2) that stays at one value: count samples, the first at index ``first``."""
+    """One axis of a sensor that is clipped at a limit of its range.
+
+    axis : 0, 1 or 2.
+    value : the limit (m/s^2).
+    count, first : number of clipped samples, and index of the first one.
+    """
 
     axis: int
     value: float
@@ -92,7 +110,11 @@ class Clipping:
 
 
 def clippings(reading: ArrayLike) -> list[Clipping]:
-    """Ends of the range on which (N, 3) samples pile up: 5 or more, 3 times the next value's."""
+    """Return the limits at which samples (N, 3) are clipped.
+
+    The smallest or largest value of an axis counts as a limit if it occurs at least 5 times, and at
+    least 3 times as often as the next value.
+    """
     samples = np.asarray(reading, float)
     out = []
     for axis in range(3):
@@ -108,9 +130,12 @@ def clippings(reading: ArrayLike) -> list[Clipping]:
 
 
 def check_axes(reading_m_s2: ArrayLike, axes: ArrayLike, up: ArrayLike, *, where: str) -> list[str]:
-    """A warning when gravity does not point up by the stated mounting, with axes that would fit.
+    """Return a warning if gravity does not point up with the stated mounting, and axes that would
+    fit.
 
-    reading_m_s2 (N, 3); axes (3, 3) rows are the sensor's axes in rig coordinates; up (3,).
+    reading_m_s2 : (N, 3).
+    axes : (3, 3) whose rows are the sensor's axes in rig coordinates.
+    up : (3,) upward direction in rig axes.
     """
     gravity = gravity_of(reading_m_s2)
     angle = _tilt_deg(gravity, axes, up)
@@ -126,10 +151,11 @@ def check_axes(reading_m_s2: ArrayLike, axes: ArrayLike, up: ArrayLike, *, where
 
 
 def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | None:
-    """(3, 3) the given axes with rows swapped or reversed so that gravity points up.
+    """Return the given axes with rows exchanged or reversed such that gravity points up.
 
-    Of the 24 right-handed exchanges, the one that changes the entries least; None when none brings
-    gravity within 15 degrees of up. Rotations about the vertical remain undetermined.
+    Of the 24 right-handed exchanges, the one that changes the entries least is returned, as (3, 3).
+    None is returned if no exchange brings gravity within 15 degrees of up. A rotation about the
+    vertical remains undetermined.
     """
     from scipy.spatial.transform import Rotation
 
@@ -144,7 +170,7 @@ def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | 
 
 
 def _tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
-    """Angle between the measured gravity, turned into the rig by ``axes``, and up."""
+    """Return the angle between the measured gravity, rotated into the rig by ``axes``, and up."""
     force, upwards = np.asarray(axes, float).T @ np.asarray(gravity, float), np.asarray(up, float)
     across = np.linalg.norm(np.cross(force, upwards))
     return float(np.degrees(np.arctan2(across, force @ upwards)))
@@ -153,10 +179,12 @@ def _tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
 def check_motion(
     t_s: Array, reading: Array, stage: Array, along: Array, *, where: str
 ) -> list[str]:
-    """A warning when the carriage's acceleration appears on another sensor axis than stated.
+    """Return a warning if the carriage's acceleration appears on another axis of the sensor than
+    stated.
 
-    t_s (N,), reading (N, 3); stage (E, 2) times and positions (mm) of the encoder; along : (3,)
-    the travel axis in sensor axes.
+    t_s, reading : (N,) times and (N, 3) readings.
+    stage : (E, 2) times (s) and positions (mm) of the encoder.
+    along : (3,) travel axis in the sensor's axes.
     """
     found = motion_correlation(t_s, reading, stage[:, 0], stage[:, 1]) if len(t_s) > 1 else None
     if found is None:
@@ -176,10 +204,13 @@ def check_motion(
 def motion_correlation(
     t_s: ArrayLike, reading: ArrayLike, stage_t_s: ArrayLike, position_mm: ArrayLike
 ) -> Array | None:
-    """(3,) correlation of each sensor axis with the carriage's acceleration, smoothed over 30 ms.
+    """Return the correlation (3,) of each sensor axis with the carriage's acceleration.
 
-    t_s (N,), reading (N, 3); stage_t_s, position_mm (E,). None where the records overlap by less
-    than 0.3 s or the encoder does not accelerate.
+    Both are smoothed over 30 ms. None is returned if the records overlap by less than 0.3 s, or if
+    the carriage does not accelerate.
+
+    t_s, reading : (N,) times and (N, 3) readings of the accelerometer.
+    stage_t_s, position_mm : (E,) times and positions of the encoder.
     """
     from scipy.signal import savgol_coeffs
 
@@ -202,7 +233,7 @@ def motion_correlation(
 
 
 def _averaged(t: Array, values: Array, grid: Array, step: float) -> Array:
-    """Means over one grid step about each grid time, by the integral of straight lines."""
+    """Return the mean of a piecewise linear signal over one grid step about each grid time."""
     integral = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(t))])
     ends = [np.interp(grid + s * step / 2, t, integral) for s in (-1, 1)]
     width = np.clip(grid + step / 2, t[0], t[-1]) - np.clip(grid - step / 2, t[0], t[-1])

@@ -1,4 +1,4 @@
-"""Checks of a run's sensors and tracks before it is smoothed."""
+"""Checks of the sensors and the tracks of a run before it is smoothed."""
 
 from __future__ import annotations
 
@@ -30,12 +30,14 @@ _SAMPLED = 2000
 def check_sensors(
     run: RunData, *, tracks: Any = None, calibration: Calibration | None = None
 ) -> list[str]:
-    """Warnings about a run's encoder and accelerometers, and about tracks if given.
+    """Return warnings about a run's encoder and accelerometers, and about its tracks if they are
+    given.
 
-    tracks : `Tracks` or a table like tracks.csv, checked against ``calibration``.
-    Raises InputError for what cannot be used: clocks that do not overlap, an encoder that jumps
-    during the frames, accelerometers in another unit or without gravity, sensors that rig.toml
-    does not name, tracks of another rig.
+    tracks : `Tracks`, or a table like tracks.csv, which is compared with ``calibration``.
+
+    Raises InputError for data that cannot be used: clocks that do not overlap, an encoder that
+    jumps during the frames, accelerometers in another unit or without gravity, sensors that
+    rig.toml does not name, and tracks from another rig.
     """
     words = []
     if run.stage is not None:
@@ -51,9 +53,12 @@ def check_sensors(
 
 
 def _check_overlap(t: Array, frames_t_s: ArrayLike, *, where: str) -> list[str]:
-    """A warning when the record does not cover all frames; InputError when it covers none.
+    """Return a warning if the record does not cover all frames.
 
-    t (N,), frames_t_s (F,) in s. The error names the offset or the unit that would explain it.
+    t, frames_t_s : (N,) times of the record and (F,) times of the frames, in s.
+
+    Raises InputError if the record covers no frame. The error names the offset or the unit that
+    would explain this.
     """
     frames = np.asarray(frames_t_s, float)
     share = float(((frames >= t[0]) & (frames <= t[-1])).mean())
@@ -112,10 +117,12 @@ def _check_accelerometers(run: RunData) -> list[str]:
 
 
 def check_tracks(table: Any, calibration: Calibration) -> list[str]:
-    """Whether points and pixels of a table of tracks agree by this calibration.
+    """Return a warning if points and pixels of a table of tracks do not agree with this
+    calibration.
 
-    The pixels are triangulated anew and both points projected; a warning when they differ by more
-    than 0.5 px in the median, InputError by more than 5 px or for cameras that are missing.
+    The pixels are triangulated again, and the old and the new points are projected. There is a
+    warning if they differ by more than 0.5 px (median). Raises InputError if they differ by more
+    than 5 px, or if a camera is missing from the table.
     """
     for camera in calibration.cameras:
         if f"{camera.name}_u_px" not in table:

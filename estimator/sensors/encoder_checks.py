@@ -1,4 +1,4 @@
-"""Faults of an encoder's record: jumps, single wrong readings, a counter that wraps round."""
+"""Checks of an encoder's record for jumps, single wrong readings and overflow of the counter."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SIGMAS = 10.0
 _COUNTS = 4.0
 _LEAST_MM = 0.002
 _PAUSE = 5.0
-"""Steps longer than this many median steps are pauses of the record, not motion to be judged."""
+"""Steps longer than this many median steps are pauses of the record; their motion is not judged."""
 
 _RETURNS = 0.3
 _WRAP_OF_RANGE = 0.5
@@ -32,10 +32,13 @@ _SHOWN = 3
 
 @dataclass(frozen=True)
 class EncoderFault:
-    """t_s : of the first reading after the jump.  size_mm : error of the reading.
+    """A fault in an encoder's record.
 
-    kind : a "jump" stays; a "spike" is taken back after ``readings``; at a "wrap" the counter
-    overflows to the other end of its range.  step_s : between the readings before and after.
+    t_s : time of the first reading after the fault.
+    size_mm : error of the reading.
+    kind : "jump" if the error persists, "spike" if it ends after ``readings`` readings, "wrap" if
+        the counter overflows to the other end of its range.
+    step_s : time between the readings before and after the fault.
     """
 
     t_s: float
@@ -46,11 +49,15 @@ class EncoderFault:
 
     @property
     def acceleration_m_s2(self) -> float:
-        """Least acceleration that moves the carriage by the fault's size within its step."""
+        """The least acceleration that would move the carriage by the size of the fault within its
+        step."""
         return 4e-3 * abs(self.size_mm) / self.step_s**2
 
     def touches(self, t_s: Array, frames_t_s: Array) -> bool:
-        """Whether position differences between frames are wrong by it; t_s : of all readings."""
+        """Return whether the fault changes differences of position between frames.
+
+        t_s, frames_t_s : times of all readings and of all frames.
+        """
         first = int(np.searchsorted(t_s, self.t_s))
         begin = t_s[max(first - 1, 0)]
         if self.kind == "spike":
@@ -80,7 +87,13 @@ class EncoderFault:
 def check_encoder(
     t_s: ArrayLike, position_mm: ArrayLike, frames_t_s: ArrayLike, *, where: str = "stage"
 ) -> list[str]:
-    """Warnings about the encoder's record (E,); InputError for jumps that affect the frames."""
+    """Return warnings about the encoder's record.
+
+    t_s, position_mm : (E,) times and readings.
+    frames_t_s : (F,) times of the frames.
+
+    Raises InputError for jumps that affect the frames.
+    """
     t, frames = np.asarray(t_s, float), np.asarray(frames_t_s, float)
     faults = encoder_faults(t, position_mm)
     grave = [
@@ -99,11 +112,13 @@ def check_encoder(
 
 
 def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]:
-    """Steps that no motion makes, in the order of time.
+    """Return the steps of the record that no motion can explain, in the order of time.
 
-    t_s, position_mm : (E,), times increasing. A step counts as a fault when its speed lies
-    outside the speeds of the two steps before and after it, by 10 standard deviations of the
-    record's own noise: a hard acceleration changes the speed once, a jump changes it twice.
+    A step counts as a fault if its speed lies outside the speeds of the two steps before and the
+    two after it by 10 standard deviations of the record's own noise. A strong acceleration changes
+    the speed only once, whereas a jump changes it twice.
+
+    t_s, position_mm : (E,) times, which increase, and readings.
     """
     t, position = np.asarray(t_s, float), np.asarray(position_mm, float)
     if len(t) < _LEAST_RECORD:
@@ -123,17 +138,19 @@ def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]
 
 
 def _excess_speed(speed: Array) -> Array:
-    """(E - 1,) how far each speed lies outside the range of its two neighbours on each side."""
+    """Return by how much each speed (E - 1,) lies outside the range of its two neighbours on each
+    side."""
     near = np.delete(sliding_window_view(np.pad(speed, 2, constant_values=np.nan), 5), 2, axis=1)
     high, low = np.nanmax(near, 1), np.nanmin(near, 1)
     return np.asarray(np.maximum(speed - high, 0) + np.minimum(speed - low, 0))
 
 
 def _prediction_residual(speed: Array) -> Array:
-    """(E - 1,) each speed less its prediction from four neighbours on each side.
+    """Return each speed (E - 1,) minus its prediction from four neighbours on each side.
 
-    The linear predictor is fitted to the record itself (least squares without the steps that it
-    misses), so that it follows an oscillation too; 0 in short records and at their ends.
+    The linear predictor is fitted to the record itself by least squares, without the steps that it
+    predicts badly, so it also follows an oscillation. The result is 0 for short records, and at the
+    ends.
     """
     width = 2 * _NEIGHBOURS + 1
     if len(speed) < _LEAST_TO_LEARN:
@@ -154,7 +171,8 @@ def _prediction_residual(speed: Array) -> Array:
 
 
 def _least_fault(step: Array) -> float:
-    """The smallest fault that is looked for (mm): some counts of an encoder with coarse counts."""
+    """Return the smallest fault (mm) that is looked for: a few counts of an encoder with coarse
+    counts."""
     moved = np.abs(step[step != 0])
     coarse = len(moved) > 0 and len(np.unique(np.round(moved, 9))) < len(moved) / 4
     return max(_COUNTS * float(np.percentile(moved, 1)) if coarse else 0.0, _LEAST_MM)

@@ -93,7 +93,7 @@ def considered_covariance(
     equations = linearisation(wide)[1](solution.state)
     step, _ = equations.step(UNDAMPED)
     there = replace(solution, equations=equations, slots=slots(wide))
-    # the residuals are those of the simpler fit
+    # the leverage stays that of the simpler fit, because the residuals do
     found = joint_covariance(wide, there, leverage=joint.leverage)
     return wide.free, found.widened(step)
 

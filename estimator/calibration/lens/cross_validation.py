@@ -33,7 +33,7 @@ def pose_only(problem: Problem, state: State, steps: int = 15) -> State:
                 flat = columns[..., a:b].reshape(7, -1)
                 normal[v] += flat[:-1] @ flat[:-1].T
                 right[v] -= flat[:-1] @ flat[-1]
-        # a view seen by one telecentric camera has a depth that nothing moves
+        # a view that only one telecentric camera sees has an undetermined depth
         normal += (1e-9 + 1e-9 * np.trace(normal, axis1=-2, axis2=-1))[:, None, None] * np.eye(6)
         step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
         state = replace(state, rig_from_target=retracted(state.rig_from_target, step))

@@ -1,4 +1,8 @@
-"""The joint covariance of a self-calibration, and what of it reaches a triangulated point."""
+"""The joint covariance of a self-calibration, and its effect on triangulated points.
+
+The *rig block* of the covariance holds the P parameters of the cameras: the free intrinsics of all
+cameras, then the pose (6) of each camera but the first.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +22,26 @@ from telerig.rig.triangulation import stacked_jacobian
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 WHOLE = 4000
-"""Numbers in a calibration up to which the covariance of all with all is kept."""
+"""Up to this number of parameters, the covariance of all parameters with all others is kept."""
 
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """matrix : (D, D) in physical units; names : D strings, ``left.k1``, ``view 03.rx_rad``.
+    """Covariance of all parameters of a calibration with N dots and M used measurements, in
+    physical units.
 
-    Of a calibration of more than `WHOLE` numbers, cameras and views only.
-    Poses are GTSAM's tangent (rotation, translation) at ``rig_from_...``, right perturbation.
-    dots : (N, 3, 3) of each dot.  cross : (C, N, 3) of each dot with cameras and views.
-    leverage : (M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs.
-    units : (D',) physical units per unit of the solver, of all numbers.
+    The first K parameters are those of cameras and views. Poses are expressed in GTSAM's tangent
+    space (rotation, translation) at ``rig_from_...``, with right perturbation.
+
+    names : names of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
+    matrix : (D, D) covariance of all parameters; of cameras and views only (D = K) if there are
+        more than `WHOLE` parameters.
+    dots : (N, 3, 3) covariance of each dot.
+    cross : (K, N, 3) covariance of each dot with cameras and views.
+    rig : P, the size of the rig block.
+    leverage : (M, 2, 2) J C J^T of each used measurement (J its derivative, C the covariance): the
+        share of its noise that the fit absorbs.
+    units : physical units per unit of the solver, for all K + 3 N parameters.
     """
 
     names: tuple[str, ...]
@@ -41,10 +53,13 @@ class JointCovariance:
     units: Array
 
     def of_rig_and(self, dots: Ints) -> Array:
-        """(P + 3 n, P + 3 n) of the rig block and some of the dots.
+        """Return the covariance (P + 3 n, P + 3 n) of the rig block and n dots.
 
-        Without the matrix of all with all, from the dots' independence given cameras and views;
-        only the two dots of a known distance depend on each other besides.
+        dots : (n,) indices of the dots.
+
+        If the full matrix was not kept, the result uses that dots are independent given cameras and
+        views. Only the two dots of a known distance depend on each other in addition, which is
+        neglected.
         """
         common = len(self.cross)
         if len(self.names) > common:
@@ -64,13 +79,13 @@ class JointCovariance:
 
     @property
     def effective_dof(self) -> float:
-        """E[sum of squared whitened residuals] = rows - trace(J C J^T)."""
+        """The expected sum of squared whitened residuals, number of residuals - trace(J C J^T)."""
         return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
     def widened(self, offset: Array) -> JointCovariance:
-        """With the square of a common offset, (D,) in the solver's units, added.
+        """Return the covariance with offset offset^T added.
 
-        Dots stay independent given cameras and views where theirs follows from that of those.
+        offset : (K + 3 N,) an error that is common to all parameters, in the units of the solver.
         """
         shift = offset * self.units
         whole = shift[: len(self.matrix)]
@@ -83,19 +98,21 @@ class JointCovariance:
         )
 
     def rig_block(self) -> tuple[tuple[str, ...], Array]:
-        """Names and covariance of the cameras alone: intrinsics, then the second camera's pose."""
+        """Return the names and the covariance (P, P) of the rig block."""
         return self.names[: self.rig], self.matrix[: self.rig, : self.rig]
 
 
 def joint_covariance(
     problem: Problem, solution: Solution, *, leverage: Array | None = None
 ) -> JointCovariance:
-    """Inverse of the information at the solution, from the solver's own factorisation.
+    """Return the inverse of the information matrix at the solution, from the solver's own
+    factorisation.
 
-    leverage : where it is known already.
-    What no measurement touches (the pose of a view that was left out) is infinitely uncertain.
+    leverage : `JointCovariance.leverage` if it is already known.
 
-    Raises CalibrationError when it is singular to working precision.
+    A parameter that no measurement determines (the pose of a view that was left out) gets an
+    infinite variance. Raises CalibrationError if the information matrix is singular to working
+    precision.
     """
     size = solution.slots["dots"][0].stop
     posterior = solution.equations.posterior(whole=size <= WHOLE)
@@ -132,7 +149,9 @@ def _names(problem: Problem) -> tuple[str, ...]:
 
 
 def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior) -> Array:
-    """(M, 2, 2) J C J^T of each kept dot: the share of its noise that the fit absorbs."""
+    """Return J C J^T (M, 2, 2) of each used measurement: the share of its noise that the fit
+    absorbs.
+    """
     system, out = System(problem), np.empty((int(np.sum(problem.weight > 0)), 2, 2))
     for c, obs in enumerate(system.images):
         columns = system.columns(solution.state, c)[:-1].transpose(2, 1, 0)
@@ -152,7 +171,11 @@ def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior
 def rig_jacobian(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
-    """(..., 2C, P) derivative of the pixels of rig points by the rig block's parameters."""
+    """Return the derivative (..., 2C, P) of the pixels in C cameras with respect to the rig block.
+
+    free : for each camera the names of its free intrinsics.
+    points_mm : (..., 3) rig points.
+    """
     lens = np.cumsum([0, *map(len, free)])
     out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), lens[-1] + 6 * (len(cameras) - 1)))
     for c, camera in enumerate(cameras):
@@ -172,7 +195,13 @@ def aligned_covariance(
     covariance: Array,
     points_mm: Array,
 ) -> Array:
-    """(3 N, 3 N) calibration covariance of rig points, their common rigid motion projected out."""
+    """Return the covariance (3 N, 3 N) of N rig points due to the calibration, without rigid
+    motion.
+
+    A rigid motion that is common to all points is projected out; see `aligned_shift`.
+
+    covariance : (P, P) of the rig block.
+    """
     inner = aligned_shift(cameras, free, points_mm)
     return np.asarray(inner @ covariance @ inner.T)
 
@@ -180,10 +209,12 @@ def aligned_covariance(
 def aligned_shift(
     cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
 ) -> Array:
-    """(3 N, P): rig points by the rig block's parameters, their common rigid motion projected out.
+    """Return the derivative (3 N, P) of N triangulated points with respect to the rig block,
+    without rigid motion.
 
-    What is left is the error of shapes, distances and motions inside the rig; where the rig's own
-    frame lies is a matter of definition (Baarda's S-transformation to the points' own frame).
+    A rigid motion that is common to all points is projected out, because the place of the rig frame
+    is a matter of definition (Baarda's S-transformation to the points' own frame). The result
+    describes errors of shapes, distances and motions inside the rig.
     """
     rows = 2 * len(cameras)
     information = np.broadcast_to(np.eye(rows), (len(points_mm), rows, rows))
@@ -201,7 +232,10 @@ def point_shift_jacobian(
     points_mm: Array,
     information_px: Array,
 ) -> Array:
-    """(..., 3, P): how a triangulated point moves when the rig block's parameters move."""
+    """Return the derivative (..., 3, P) of triangulated points with respect to the rig block.
+
+    information_px : (..., 2C, 2C) inverse covariance of the pixels.
+    """
     _, by_point = stacked_jacobian(cameras, points_mm)
     weighted = np.swapaxes(by_point, -1, -2) @ information_px
     by_rig = rig_jacobian(cameras, free, points_mm)

@@ -1,7 +1,8 @@
-"""The centre of a dot's image is not the image of its centre, unless the camera is affine.
+"""Eccentricity: the centre of a dot's image is not the image of the dot's centre.
 
-With perspective or distortion the projected disc is centred elsewhere. The shift is computed by
-projecting the disc: the mean of many small pieces of its area.
+Both agree only for an affine camera. With perspective or distortion the projected disc is centred
+elsewhere. The shift is computed by projecting many small pieces of the disc and averaging over
+their area.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from telerig.factors.projection import State, pixels
 
 
 def eccentricity_px(problem: Problem, state: State, rings: int = 2, spokes: int = 8) -> Array:
-    """(M, 2) centre of area of each projected disc, minus the projection of its centre.
+    """Return the centre of area of each projected disc minus the projection of its centre (M, 2),
+    in px.
 
-    The disc is sampled at ``rings`` Gauss-Legendre radii in r^2 and ``spokes`` equal angles, and
-    each sample is weighted by the area that it covers in the image.
+    The result has one row for each of the M measured dots. The disc is sampled at ``rings`` radii
+    (Gauss-Legendre points in r^2) and ``spokes`` equal angles. Each sample is weighted by the area
+    that it covers in the image.
     """
     obs = problem.unweighted()
     radius = problem.target.diameter_mm(problem.dot_ids) / 2

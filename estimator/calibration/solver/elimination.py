@@ -1,9 +1,10 @@
-"""The linear factors of a calibration, eliminated by GTSAM.
+"""The linear factors of a calibration and their elimination by GTSAM.
 
-Keys are cameras, views and groups of dots. Whitened blocks of all images are made as arrays and
-handed over as one `JacobianFactor` for each camera, view and group that it sees: with a group as
-one variable a factor holds some 30 rows, and what an object costs is spread over them. Columns
-are scaled to unit length: GTSAM's Cholesky refuses pivots of very different size.
+The variables are cameras, views and groups of dots. The whitened blocks of all images are computed
+as arrays. GTSAM gets one `JacobianFactor` for each camera, view and group of dots that the camera
+sees in this view. A group of dots is one variable so that a factor has about 30 rows, which makes
+the cost of each Python object small. Columns are scaled to unit length, because GTSAM's Cholesky
+factorisation refuses pivots of very different size.
 """
 
 from __future__ import annotations
@@ -22,14 +23,16 @@ from telerig.factors.linear_factors import add_linear_factors
 from telerig.factors.projection import State
 
 LEAST_PIVOT = 1e-10
-"""Of columns of unit length, what elimination has to leave of one."""
+"""Smallest pivot, for columns of unit length, with which the problem still counts as determined."""
 
 
 @dataclass(frozen=True)
 class _Images:
-    """Where one camera's M measurements stand in P factors of one view and one group of G dots.
+    """The place of one camera's M measurements in P factors, each for one view and one group of G
+    dots.
 
-    view, group : (P,).  place : (M,) factor times G plus the dot's number in its group.
+    view, group : (P,) indices of each factor's view and group.
+    place : (M,) index of the factor times G, plus the number of the dot in its group.
     """
 
     view: Ints
@@ -40,9 +43,13 @@ class _Images:
 class GraphLayout:
     """The variables of a problem's graph: cameras, then views, then groups of dots.
 
-    Dots are filled up to whole groups; a dot that is none is a variable that nothing touches.
-    places : per variable where its numbers stand among the W of the graph.
-    families : keys of variables of one size.  order : of elimination.
+    The last group is filled up with variables that no measurement touches.
+
+    per_group : number of dots in a group.
+    size : W, the number of scalars in all variables.
+    places : for each variable the indices of its scalars among the W.
+    families : keys of the variables, collected by size.
+    order : keys in the order of elimination.
     """
 
     def __init__(self, system: System) -> None:
@@ -79,9 +86,12 @@ class GraphLayout:
 
 
 class GraphEquations:
-    """The Gaussian factor graph of a problem at one state.
+    """The Gaussian factor graph of a problem, linearised at one state.
 
-    cost : half the sum of squared residuals.  square, right : (W,) diagonal of J^T J, and -J^T r.
+    cost : half the sum of squared residuals.
+    square, right : (W,) the diagonal of J^T J, and -J^T r, with J the whitened Jacobian and r the
+        residuals.
+    untouched : (W,) whether no measurement and no prior depends on the scalar.
     """
 
     def __init__(self, layout: GraphLayout, state: State) -> None:
@@ -96,7 +106,11 @@ class GraphEquations:
         self.scale = 1 / np.sqrt(np.where(self.untouched, 1.0, self.square))
 
     def _padded(self, state: State, camera: int) -> Array:
-        """(S + 7, 2, P, G) columns of a camera, summed up in ``square`` and ``right`` besides."""
+        """Return the columns (S + 7, 2, P, G) of a camera with S parameters, with zeros for unseen
+        dots.
+
+        The products of the columns are also added to ``square`` and ``right``.
+        """
         layout, where = self.layout, self.layout.images[camera]
         columns = layout.system.columns(state, camera)
         shape = (*columns.shape[:2], len(where.view), layout.per_group)
@@ -136,7 +150,7 @@ class GraphEquations:
 
     @cached_property
     def _undamped(self) -> Any:
-        """The graph of all factors, each column in units of its length."""
+        """The graph of all factors, with columns scaled to unit length."""
         import gtsam
 
         graph = gtsam.GaussianFactorGraph()
@@ -146,7 +160,7 @@ class GraphEquations:
         return graph
 
     def _add_images(self, graph: Any, camera: int) -> None:
-        """One factor for each view and group of dots that the camera sees."""
+        """Add one factor for each view and group of dots that the camera sees."""
         layout, where, padded = self.layout, self.layout.images[camera], self.columns[camera]
         own, per = layout.system.camera_places[camera], layout.per_group
         of_camera = padded[: len(own)] * self.scale[own][:, None, None, None]
@@ -194,7 +208,9 @@ class GraphEquations:
             add_linear_factors(graph, [*keys], [*rows[:, None]], np.array([[-off]]))
 
     def _graph(self, damping: float) -> Any:
-        """The damped graph; what nothing touches stays."""
+        """Return the graph with Marquardt's damping. Scalars that nothing touches are held in
+        place.
+        """
         import gtsam
 
         graph = gtsam.GaussianFactorGraph()
@@ -208,9 +224,11 @@ class GraphEquations:
         return graph
 
     def _net(self, damping: float) -> Any:
-        """The Bayes net: by Cholesky, or by QR where a pivot is too small for it.
+        """Return the Bayes net, by Cholesky factorisation or, if a pivot is too small for that, by
+        QR.
 
-        That is so where a view is seen by one camera alone: along its axis the loose prior is all.
+        A pivot is too small if only one camera sees a view, because only a weak prior then
+        determines the depth of the view along this camera's axis.
         """
         import gtsam
 
@@ -221,16 +239,22 @@ class GraphEquations:
             return graph.eliminateSequential(order, gtsam.EliminateQR)
 
     def step(self, damping: float) -> tuple[Array, float]:
-        """(D,) step with Marquardt's damping, and the decrease of the cost that it promises."""
+        """Return the step (D,) of the D parameters with Marquardt's damping, and its predicted
+        gain.
+
+        The predicted gain is the decrease of the cost according to the linear model.
+        """
         step = np.empty(self.layout.size)
         step[np.concatenate(self.layout.places)] = self._net(damping).optimize().vector()
         step *= self.scale
         return step[: self.layout.system.size], float(0.5 * step @ self.right)
 
     def posterior(self, whole: bool) -> Posterior:
-        """The inverse of J^T J from the Bayes net of the undamped graph; all of it in any case.
+        """Return the inverse of J^T J from the Bayes net of the undamped graph.
 
-        Raises CalibrationError when it is singular to working precision.
+        whole : has no effect; the full inverse is always returned.
+
+        Raises CalibrationError if J^T J is singular to working precision.
         """
         del whole
         root, place = self._square_root()
@@ -244,7 +268,7 @@ class GraphEquations:
         return Posterior.of(matrix[:size, :size], self.layout.system.dots_at, self.untouched[:size])
 
     def information(self) -> Array:
-        """(D, D) dense J^T J."""
+        """Return J^T J as a dense matrix (D, D)."""
         root, place = self._square_root()
         scaled = root / self.scale[place]
         out = np.empty_like(root)
@@ -253,7 +277,8 @@ class GraphEquations:
         return out[: self.layout.system.size, : self.layout.system.size]
 
     def _square_root(self) -> tuple[Array, Ints]:
-        """(W, W) upper triangle R of the Bayes net, and where each of its columns stands."""
+        """Return the upper triangular matrix R (W, W) of the Bayes net, and the scalar (W,) of each
+        column."""
         net = self._net(0.0)
         place = np.concatenate([self.layout.places[key] for key in self.layout.order])
         row_of = np.empty_like(place)

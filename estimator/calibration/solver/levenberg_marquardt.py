@@ -1,8 +1,8 @@
-"""Levenberg-Marquardt over the elimination of a calibration's factor graph.
+"""The Levenberg-Marquardt iteration of a calibration.
 
-GTSAM eliminates the graph of a calibration of usual size (`elimination.GraphEquations`), the Schur
-complement that of a large one (`schur.NormalEquations`); both read the same whitened blocks.
-The loop is ours: see docs/decisions/002 and 020.
+GTSAM eliminates the factor graph of a calibration of usual size (`elimination.GraphEquations`). A
+large calibration is solved by its Schur complement (`schur.NormalEquations`). Both use the same
+whitened blocks. The reasons for an iteration of our own are in docs/decisions/002 and 020.
 """
 
 from __future__ import annotations
@@ -21,18 +21,25 @@ from telerig.estimator.calibration.solver.system import System, slots
 from telerig.factors.projection import State
 
 MANY_DOTS = 5000
-"""Measured dots above which arrays solve the problem; see docs/decisions/020."""
+"""With more measured dots than this, the Schur complement solves the problem
+(docs/decisions/020)."""
 MANY_NUMBERS = 4000
-"""Numbers of a calibration above which the covariance of all with all is too large."""
+"""With more parameters of views and dots than this, the full covariance matrix is too large."""
 NEARLY_UNDAMPED = 1e-6
-"""Marquardt damping below which a step promises what Gauss-Newton could still gain."""
+"""With less damping than this, the predicted gain of a step is what Gauss-Newton could still
+gain."""
 Progress = Callable[[int, float], None]
 Equations = GraphEquations | NormalEquations
 
 
 @dataclass(frozen=True)
 class Solution:
-    """State at the minimum; ``cost`` = half the sum of squared whitened residuals and priors."""
+    """The state at the minimum.
+
+    cost : half the sum of squared whitened residuals, including those of the priors.
+    equations : the linearised equations at the state.
+    slots : indices of each variable's parameters, see `slots`.
+    """
 
     state: State
     cost: float
@@ -42,18 +49,24 @@ class Solution:
 
     @property
     def information(self) -> Array:
-        """(D, D) dense J^T J."""
+        """The information matrix J^T J (D, D)."""
         return self.equations.information()
 
 
 def is_large(problem: Problem) -> bool:
-    """Whether arrays solve the problem rather than GTSAM; see docs/decisions/020."""
+    """Return whether the Schur complement solves the problem rather than GTSAM
+    (docs/decisions/020).
+    """
     numbers = 6 * len(problem.views) + 3 * len(problem.dot_ids)
     return len(problem.view) > MANY_DOTS or numbers > MANY_NUMBERS
 
 
 def linearisation(problem: Problem) -> tuple[System, Callable[[State], Equations]]:
-    """The problem's residuals, and its equations at any state for the solver that it asks for."""
+    """Return the problem's residuals, and a function that returns its linearised equations at a
+    state.
+
+    The equations are those of the solver that ``problem.solver`` asks for.
+    """
     system = System(problem)
     if problem.solver == "schur" or (problem.solver == "auto" and is_large(problem)):
         return system, lambda state: NormalEquations(system, state)
@@ -69,9 +82,13 @@ def solve(
     relative: float = 1e-11,
     progress: Progress | None = None,
 ) -> Solution:
-    """Levenberg-Marquardt with Marquardt's scaling, until no more than ``relative`` can be gained.
+    """Minimise the cost by Levenberg-Marquardt steps from a start.
 
-    Raises CalibrationError when the cost is not finite at the start, or a direction undetermined.
+    The damping has Marquardt's scaling. The iteration ends when a step gains less than ``relative``
+    times the cost.
+
+    Raises CalibrationError if the cost at the start is not finite, or if the measurements leave a
+    direction of the calibration undetermined.
     """
     system, linearised = linearisation(problem)
     point, equations = start, _at(linearised, start)
@@ -100,7 +117,10 @@ def solve(
 
 
 def _at(linearised: Callable[[State], Equations], state: State) -> Equations | None:
-    """None where the cost is not finite: a camera cannot see a dot through its window at all."""
+    """Return the equations at a state, or None if the cost is not finite there.
+
+    The cost is not finite if a camera cannot see a dot through its window at all.
+    """
     try:
         equations = linearised(state)
     except GeometryError:

@@ -1,4 +1,4 @@
-"""From a table of dots to a `Problem`: indices, priors, handedness."""
+"""Conversion of a table of dots to a `Problem`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ IMPOSSIBLE_SD = 20.0
 
 
 def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Target) -> Problem:
-    """A `Problem` with every measured dot, model "none".
+    """Return a `Problem` with every measured dot, in which only the scales of the cameras are free.
 
-    dots : columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
+    dots : table with the columns view, camera, dot, u_px, v_px, suu_px2, suv_px2, svv_px2.
 
-    Raises InputError for values that are not finite, covariances that are none, cameras or dots
-    that the rig does not have and rows given twice, CalibrationError when there are no dots, the
-    dots that set the scale are never seen or their distance contradicts their nominal places.
+    Raises InputError for values that are not finite, covariances that are not positive definite,
+    cameras or dots that the rig does not have, and rows given twice. Raises CalibrationError if
+    there are no dots, if the dots that set the scale are never seen, or if their distance
+    contradicts their nominal positions.
     """
     if len(dots) == 0:
         raise CalibrationError("no dots in any image", todo="run `telerig detect` and look at why")
@@ -70,7 +71,7 @@ def _natural(name: str) -> tuple[int, float, str]:
 
 
 def _check(table: pd.DataFrame, names: Sequence[str], target: Target) -> None:
-    """Refuse rows that cannot be used, naming the first."""
+    """Raise InputError if some rows cannot be used; the error names the first of them."""
     columns = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
     uu, uv, vv = (table[name].to_numpy(float) for name in columns[2:])
     finite = np.isfinite(table[columns].to_numpy(float)).all(1)
@@ -117,7 +118,8 @@ def _scale(target: Target, ids: NDArray[np.int64]) -> tuple[tuple[int, int], flo
 
 
 def _check_distance(target: Target) -> None:
-    """The stated distance must be what the nominal places and their tolerance allow."""
+    """Raise CalibrationError if the stated distance is impossible, given the nominal positions and
+    their tolerance."""
     assert target.scale_dots is not None and target.scale_distance_mm is not None
     ends = target.nominal_mm(np.array(target.scale_dots))
     nominal = float(np.linalg.norm(ends[1] - ends[0]))

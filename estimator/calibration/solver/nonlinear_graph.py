@@ -1,6 +1,6 @@
-"""A calibration as a `gtsam.NonlinearFactorGraph`, for people who go on with GTSAM.
+"""A calibration as a `gtsam.NonlinearFactorGraph`, for users who continue with GTSAM.
 
-Telerig's own solvers evaluate all images at once instead; cost and minimum are the same.
+The solvers of telerig evaluate all images at once instead; the cost and the minimum are the same.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ from telerig.factors.projection import State
 
 
 def keys_of(problem: Problem) -> Keys:
-    """k0... intrinsics, c1... camera poses, v0... views, d0... dots."""
+    """Return the GTSAM keys of a problem's variables.
+
+    They are k0, k1, ... for intrinsics, c1, ... for camera poses, v0, ... for views and d0, ... for
+    dots.
+    """
     import gtsam
 
     cameras = range(len(problem.cameras))
@@ -43,7 +47,8 @@ def keys_of(problem: Problem) -> Keys:
 
 
 def nonlinear_graph(problem: Problem, start: State) -> tuple[Any, Any, Keys]:
-    """(gtsam.NonlinearFactorGraph, gtsam.Values, keys) of a problem at a starting state."""
+    """Return the problem as (gtsam.NonlinearFactorGraph, gtsam.Values, keys), with values from
+    ``start``."""
     import gtsam
 
     keys, system = keys_of(problem), System(problem)

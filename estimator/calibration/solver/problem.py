@@ -1,7 +1,7 @@
-"""One description of a self-calibration problem, for every solver.
+"""The description of a self-calibration problem that all solvers share.
 
-A `Problem` holds the measurements, what is known beforehand (priors, gauge), and which intrinsics
-are free; `telerig.rig.lens_models` names the sets of free intrinsics.
+A `Problem` holds the measurements, the prior knowledge, and which intrinsics are free;
+`telerig.rig.lens_models` gives names to the sets of free intrinsics.
 """
 
 from __future__ import annotations
@@ -22,33 +22,40 @@ from telerig.rig.projection import INDEX, PARAMETERS
 from telerig.rig.target import Target
 
 GAUGE_SIGMA_MM = 1e-4
-"""Holds the rig origin where the optical axes come closest; see docs/decisions/003."""
+"""Standard deviation with which the rig origin is held where the optical axes come closest
+(docs/decisions/003)."""
 
 _CENTRE = ("centre_u_px", "centre_v_px")
 _WALL = ("wall_x_rad", "wall_y_rad")
 
 OUTLIER_SD = 4.5
-"""A dot further than this many standard deviations is left out: 4e-5 of sound dots."""
+"""A dot farther than this many standard deviations from its prediction is left out, with Gaussian
+noise 4e-5 of all correct dots."""
 LEAST_OUTLIER_SD = 3.0
-"""Leaves out one sound dot in 90; nearer in, noise would be taken for outliers."""
+"""The smallest limit that is accepted. It leaves out one correct dot in 90; with a lower limit too
+much ordinary noise would be taken for outliers."""
 
 SOLVERS = ("auto", "gtsam", "schur")
 DOTS_FREE = ("3d", "plane", "nominal")
 
 PRIOR_SIGMA = {
-    "scale_px_per_mm": 0.5,  # relative
-    "aspect": 0.1, "skew": 0.1, "kappa_per_mm": 0.5,  # kappa: per rho
+    "scale_px_per_mm": 0.5,  # relative to the nominal scale
+    "aspect": 0.1, "skew": 0.1, "kappa_per_mm": 0.5,  # kappa in units of 1 / rho
     "k1": 0.5, "k2": 0.5, "k3": 0.5, "p1": 0.2, "p2": 0.2,
     "s1": 0.2, "s2": 0.2, "s3": 0.2, "s4": 0.2,
     "tilt_x": 0.3, "tilt_y": 0.3, "image_convergence_per_mm": 0.05,
-    "centre_u_px": 0.05, "centre_v_px": 0.05,  # of the image width
-    "wall_x_rad": 0.1, "wall_y_rad": 0.1,  # unless the wall says better
+    "centre_u_px": 0.05, "centre_v_px": 0.05,  # relative to the image width
+    "wall_x_rad": 0.1, "wall_y_rad": 0.1,  # unless the window states its own
 }  # fmt: skip
-"""Weak priors: several times what any telecentric lens shows. They bound what data leave open."""
+"""Standard deviations of weak priors, several times the values of usual telecentric lenses. They
+only bound parameters that the data do not determine."""
 
 
 def checked_outlier_sd(outlier_sd: float) -> float:
-    """Raises InputError for what is no number, or so small that sound dots would be left out."""
+    """Return ``outlier_sd`` unchanged after a check.
+
+    Raises InputError if it is not finite, or so small that correct dots would be left out.
+    """
     if not LEAST_OUTLIER_SD <= outlier_sd < np.inf:
         raise InputError(
             f"dots beyond {outlier_sd:g} standard deviations cannot be told as outliers",
@@ -59,16 +66,25 @@ def checked_outlier_sd(outlier_sd: float) -> float:
 
 @dataclass(frozen=True)
 class Problem:
-    """Measurements, knowledge and freedom of one self-calibration.
+    """The measurements, priors and free parameters of one self-calibration.
 
-    cameras : nominal cameras, the first defines the rig frame.
-    views : names.  dot_ids : (N,) sorted ids.  nominal_mm : (N, 3).  dot_sigma_mm : (N, 3).
-    covariance_px2 : (M, 2, 2) of each measured dot, weights not applied.
-    weight : (M,) in [0, 1].
-    free : per camera, names of the free intrinsics.
-    scale : ((index, index), distance_mm, sigma_mm) or None.
-    solver : "gtsam", "schur", or "auto" for the one that suits the size.
-    outlier_sd : standard deviations beyond which a dot is left out.
+    There are C cameras, V views, N dots and M measured dots.
+
+    cameras : the nominal cameras; the first one defines the rig frame.
+    views : names of the views.
+    dot_ids : (N,) ids of the dots, sorted.
+    nominal_mm, dot_sigma_mm : (N, 3) nominal position of each dot, and the standard deviations of
+        the true position from it.
+    view, camera, dot : (M,) indices of each measurement.
+    uv_px : (M, 2).
+    covariance_px2 : (M, 2, 2) of each measurement, without weights.
+    weight : (M,) weights from 0 to 1.
+    free : for each camera the names of its free intrinsics.
+    scale : ((dot index, dot index), distance_mm, sigma_mm) of two dots whose distance is known;
+        None if the nominal positions set the scale.
+    plate_shift : (V, C) as in `Observations`.
+    solver : "gtsam", "schur", or "auto" for the one that suits the size of the problem.
+    outlier_sd : number of standard deviations beyond which a dot is left out.
     """
 
     cameras: tuple[Camera, ...]
@@ -94,14 +110,16 @@ class Problem:
         return tuple(c.rho_mm for c in self.cameras)
 
     def observations(self) -> Observations:
-        """The rows of positive weight, whitened with the square root of their weight."""
+        """Return the measurements of positive weight, whitened with the square root of their
+        weight.
+        """
         keep = self.weight > 0
         whitener = whitening(self.covariance_px2[keep])
         whitener = whitener * np.sqrt(self.weight[keep])[:, None, None]
         return self._rows(keep, whitener)
 
     def unweighted(self) -> Observations:
-        """Every row, whitened by its covariance alone."""
+        """Return all measurements, whitened by their covariance alone."""
         whitener = whitening(self.covariance_px2)
         return self._rows(np.ones(len(self.view), bool), whitener)
 
@@ -113,9 +131,12 @@ class Problem:
         )  # fmt: skip
 
     def with_model(self, model: str | Sequence[str]) -> Problem:
-        """The same problem with another set of free intrinsics: one name for all, or per camera.
+        """Return the same problem with other free intrinsics.
 
-        Names are those of `telerig.rig.lens_models`. Raises CalibrationError for others.
+        model : the name of a model for all cameras, or one name for each; see
+            `telerig.rig.lens_models`.
+
+        Raises CalibrationError for an unknown name.
         """
         names = [model] * len(self.cameras) if isinstance(model, str) else list(model)
         free = (
@@ -125,7 +146,7 @@ class Problem:
         return replace(self, free=tuple(free))
 
     def subset(self, rows: NDArray[np.bool_]) -> Problem:
-        """Only some measurements; views, dots and priors stay."""
+        """Return the problem with only some of the measurements; views, dots and priors stay."""
         parts = {
             name: getattr(self, name)[rows]
             for name in ("view", "camera", "dot", "uv_px", "covariance_px2", "weight")
@@ -133,14 +154,14 @@ class Problem:
         return replace(self, **parts)
 
     def free_indices(self, camera: int) -> Ints:
-        """Indices into `PARAMETERS` of one camera's free intrinsics."""
+        """Return the indices into `PARAMETERS` of one camera's free intrinsics."""
         return np.array([INDEX[p] for p in self.free[camera]], int)
 
 
 def whitening(covariance: Array) -> Array:
-    """(M, 2, 2) covariances -> the inverses of their lower Cholesky factors.
+    """Return the inverses of the lower Cholesky factors of covariances, both (M, 2, 2).
 
-    Raises numpy.linalg.LinAlgError where one is not positive definite.
+    Raises numpy.linalg.LinAlgError if a covariance is not positive definite.
     """
     first, second, mixed = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 1, 0]
     rest = second * first - mixed * mixed
@@ -154,7 +175,9 @@ def whitening(covariance: Array) -> Array:
 
 
 def parameter_unit(camera: Camera) -> Array:
-    """(20,) the change of each parameter that moves a pixel at the image corner by about 1 px."""
+    """Return for each parameter (20,) the change that moves a pixel at the image corner by about 1
+    px.
+    """
     scale, rho = camera["scale_px_per_mm"], camera.rho_mm
     corner_px = scale * rho
     unit = np.full(len(PARAMETERS), 1 / corner_px)
@@ -167,12 +190,13 @@ def parameter_unit(camera: Camera) -> Array:
 
 
 def wall_freedom(camera: Camera) -> tuple[str, ...]:
-    """The wall's orientation where it is not known exactly."""
+    """Return the names of the parameters that turn the window's normal, () if the normal is
+    exact."""
     return _WALL if camera.wall is not None and camera.wall.normal_sigma_rad > 0 else ()
 
 
 def prior_sigma(camera: Camera) -> Array:
-    """(20,) standard deviations of the weak priors, in the parameters' units."""
+    """Return the standard deviations (20,) of the weak priors, in the units of the parameters."""
     sigma = np.array([PRIOR_SIGMA[p] for p in PARAMETERS])
     sigma[INDEX["scale_px_per_mm"]] *= camera["scale_px_per_mm"]
     sigma[INDEX["kappa_per_mm"]] /= camera.rho_mm
@@ -184,7 +208,9 @@ def prior_sigma(camera: Camera) -> Array:
 
 
 def nominal_state(problem: Problem) -> State:
-    """Nominal cameras, views at the origin, dots at their nominal places."""
+    """Return the state with nominal cameras and dots, and with the target of every view at the
+    origin.
+    """
     poses = np.array([matrix_from_camera(c) for c in problem.cameras])
     intrinsics = np.array([c.intrinsics for c in problem.cameras])
     views = np.tile(np.eye(4), (len(problem.views), 1, 1))
@@ -192,14 +218,14 @@ def nominal_state(problem: Problem) -> State:
 
 
 def matrix_from_camera(camera: Camera) -> Array:
-    """(4, 4) rig_from_camera."""
+    """Return rig_from_camera as a matrix (4, 4)."""
     pose, out = camera.rig_from_camera, np.eye(4)
     out[:3, :3], out[:3, 3] = pose.rotation, pose.translation_mm
     return out
 
 
 def held_at_nominal(problem: Problem, state: State) -> State:
-    """The state with every intrinsic that is not free put back to its nominal value."""
+    """Return the state with every intrinsic that is not free set to its nominal value."""
     intrinsics = np.array([c.intrinsics for c in problem.cameras])
     for c in range(len(problem.cameras)):
         free = problem.free_indices(c)
@@ -208,7 +234,7 @@ def held_at_nominal(problem: Problem, state: State) -> State:
 
 
 def cameras_from_state(problem: Problem, state: State) -> tuple[Camera, ...]:
-    """The estimated cameras."""
+    """Return the estimated cameras."""
     return tuple(
         Camera(c.name, c.image_size_px, c.rho_mm, k, Pose(m[:3, :3], m[:3, 3]).inverse(), c.wall)
         for c, k, m in zip(problem.cameras, state.intrinsics, state.rig_from_camera)

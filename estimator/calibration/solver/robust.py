@@ -1,9 +1,9 @@
-"""Robust self-calibration: weights per dot, and a noise floor where the model is not perfect.
+"""Robust self-calibration: a weight for each dot, and a noise floor where the model is not perfect.
 
-GTSAM's robust noise models weigh a whole factor, here a whole image; one wrong dot would cost
-every other dot of the image its weight. Dots are weighted one by one instead (graduated
-non-convexity towards truncated least squares; Yang, Antonante, Tzoumas and Carlone, RA-L 5:1127,
-2020), and every weight is listed.
+GTSAM's robust noise models give one weight to a whole factor, which is a whole image here. A single
+wrong dot would reduce the weight of all other dots of its image. Dots are therefore weighted one by
+one (graduated non-convexity towards truncated least squares; Yang, Antonante, Tzoumas and Carlone,
+RA-L 5:1127, 2020), and every weight is reported.
 """
 
 from __future__ import annotations
@@ -18,13 +18,19 @@ from telerig.estimator.calibration.solver.problem import Problem
 from telerig.factors.projection import State, pixels
 
 LEAST_DOTS = 4
-"""Sound dots below which a view is left out: they would not fix the target's pose."""
-_MEDIAN = 2 * np.log(2)  # of chi-square with two degrees of freedom
+"""A view with fewer kept measurements than this is left out, because they would not determine the
+pose of the target."""
+_MEDIAN = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 
 @dataclass(frozen=True)
 class RobustFit:
-    """The problem with its final weights and covariances, its solution, and the floor (px)."""
+    """The result of a robust fit.
+
+    problem : the problem with the final weights and covariances.
+    solution : its solution.
+    floor_px : standard deviation of the scatter beyond the stated noise of the dots.
+    """
 
     problem: Problem
     solution: Solution
@@ -32,21 +38,27 @@ class RobustFit:
 
 
 def pixel_residuals(problem: Problem, state: State) -> Array:
-    """(M, 2) predicted minus measured of every dot, kept or not."""
+    """Return the residuals (M, 2) of all M measured dots, predicted minus measured, including
+    left-out dots."""
     return pixels(state, problem.unweighted(), problem.rho_mm) - problem.uv_px
 
 
 def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:
-    """(M,) squared Mahalanobis distance."""
+    """Return the squared Mahalanobis distances (M,) of residuals (M, 2) with covariances (M, 2,
+    2)."""
     solved = np.linalg.solve(covariance_px2, residual_px[..., None])[..., 0]
     return np.asarray((residual_px * solved).sum(-1))
 
 
 def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float) -> float:
-    """Isotropic scatter that the residuals show beyond their own covariance; 0 if not significant.
+    """Return the standard deviation of the residuals' scatter beyond their own covariance.
 
-    From the median squared distance, so that up to half of the dots may be wrong. ``free_share``:
-    degrees of freedom over rows.
+    The scatter is taken as equal in all directions; 0 is returned if it is not significant. It
+    follows from the median of the squared distances, so up to half of the dots may be wrong.
+
+    residual_px : (M, 2).
+    covariance_px2 : (M, 2, 2).
+    free_share : degrees of freedom divided by the number of measured coordinates.
     """
     expected = _MEDIAN * free_share
 
@@ -63,7 +75,7 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float)
 
 
 def free_share(problem: Problem) -> float:
-    """Roughly the degrees of freedom per measured coordinate."""
+    """Return the approximate number of degrees of freedom per measured coordinate."""
     rows = int(2 * np.sum(problem.weight > 0))
     used = sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1)
     used += 6 * len(problem.views) + 3 * len(problem.dot_ids)
@@ -73,7 +85,14 @@ def free_share(problem: Problem) -> float:
 def robust_solve(
     problem: Problem, start: State, *, progress: Progress | None = None, rounds: int = 25
 ) -> RobustFit:
-    """Solve, find the floor, down-weight dots beyond the limit, until the kept set stands still."""
+    """Return the robust fit from a start.
+
+    Each round solves the problem, estimates the noise floor and reduces the weight of dots beyond a
+    limit. The limit decreases from round to round to ``problem.outlier_sd``. The rounds end when
+    the set of kept dots no longer changes.
+
+    rounds : the largest number of rounds.
+    """
     base, least = problem.covariance_px2, problem.outlier_sd
     problem = replace(problem, weight=np.ones(len(problem.view)))
     solution = solve(problem, start, progress=progress)
@@ -103,18 +122,23 @@ def robust_solve(
 
 
 def _truncated(distance: Array, before: Array, limit: float) -> Array:
-    """0 or 1; a dot that was out comes back only well inside, so that none flickers."""
+    """Return weights 0 or 1 (M,) by the distances (M,).
+
+    A dot that was left out is taken back only well inside the limit, so that no dot alternates.
+
+    before : (M,) weights of the round before.
+    """
     bar = np.where(before < 0.01, 0.9 * limit, limit)
     return (distance <= bar).astype(float)
 
 
 def _without_lost_views(problem: Problem, weight: Array) -> Array:
-    """No weight for views with too few sound dots to place the target; see `lost_views`."""
+    """Return the weights with 0 for views that have too few kept dots; see `lost_views`."""
     lost = lost_views(problem, weight)
     return np.where(np.isin(problem.view, lost), 0.0, weight)
 
 
 def lost_views(problem: Problem, weight: Array) -> Ints:
-    """Views of which fewer than `LEAST_DOTS` measurements are kept."""
+    """Return the indices of the views of which fewer than `LEAST_DOTS` measurements are kept."""
     kept = np.bincount(problem.view[weight > 0], minlength=len(problem.views))
     return np.flatnonzero(kept < LEAST_DOTS)

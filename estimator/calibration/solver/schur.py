@@ -1,12 +1,14 @@
 """The normal equations of a large calibration, solved through the Schur complement.
 
-    [K  E ] [k]   [a]         D = W W^T, F = E W^-T, S = K - F F^T
-    [E' D ] [d] = [b]
+    [K  E ] [k]   [a]
+    [E' D ] [d] = [b]       D = W W^T,  F = E W^-T,  S = K - F F^T
 
-No view couples with a view and no dot with a dot: dots are eliminated (D), or views where that
-leaves less (Triggs et al., Bundle Adjustment, 1999, section 6). The two dots of a known distance
-couple and stay. The blocks are those that GTSAM gets (`telerig.factors.projection.image_columns`);
-they are summed up a few thousand dots at a time.
+The unknowns are k, which are kept, and d, which are eliminated; W is the Cholesky factor of D and
+S the Schur complement. No view is coupled to another view and no dot to another dot, so D is block
+diagonal if d are the dots, or the views if that leaves fewer unknowns (Triggs et al., Bundle
+Adjustment, 1999, section 6). The two dots of a known distance are coupled and are kept. The blocks
+are the ones that GTSAM gets (`telerig.factors.projection.image_columns`). They are summed over a
+few thousand dots at a time.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from telerig.estimator.calibration.solver.system import System, images_of
 from telerig.factors.projection import State, dot_columns
 
 CHUNK = 4000
-"""Measured dots evaluated at once, about: fewer cost calls, more leave the cache."""
+"""Approximate number of measured dots that are evaluated at once. With fewer, the function calls
+take more time; with more, the arrays do not fit into the processor's cache."""
 
 
 def undetermined() -> CalibrationError:
@@ -38,11 +41,16 @@ def undetermined() -> CalibrationError:
 
 @dataclass(frozen=True)
 class Posterior:
-    """The inverse of J^T J, or what was asked of it; C = intrinsics, camera poses and views.
+    """The inverse of J^T J, or those parts of it that were asked for.
 
-    common : (C, C).  cross : (C, N, 3) with each dot.  dots : (N, 3, 3).
-    whole : (C + 3 N, C + 3 N) or None.
-    untouched : (C + 3 N,) what no measurement or prior reaches; its variance here is 1.
+    There are K parameters of cameras and views, and N dots.
+
+    common : (K, K) of cameras and views.
+    cross : (K, N, 3) of cameras and views with each dot.
+    dots : (N, 3, 3) of each dot.
+    whole : (K + 3 N, K + 3 N), or None if it was not asked for.
+    untouched : (K + 3 N,) whether no measurement and no prior depends on the parameter. Its
+        variance is 1 here.
     """
 
     common: Array
@@ -53,7 +61,7 @@ class Posterior:
 
     @staticmethod
     def of(whole: Array, common: int, untouched: NDArray[np.bool_]) -> Posterior:
-        """From all of the inverse."""
+        """Return the parts of the full inverse ``whole``; ``common`` is K."""
         at = common + np.arange(len(whole) - common).reshape(-1, 3)
         cross = whole[:common, common:].reshape(common, -1, 3)
         return Posterior(
@@ -62,10 +70,13 @@ class Posterior:
 
 
 class NormalEquations:
-    """J^T J and -J^T r in blocks, for C numbers of cameras and views, V views and N dots.
+    """J^T J and -J^T r in blocks, for K parameters of cameras and views and N dots.
 
-    common : (C, C).  dots : (3, 3, N).  cross : (C, 3, N) of cameras and views with each dot.
-    right : (C + 3 N,).  cost : half the sum of squared residuals.
+    common : (K, K) of cameras and views.
+    dots : (3, 3, N) of each dot.
+    cross : (K, 3, N) of cameras and views with each dot.
+    right : (K + 3 N,) -J^T r.
+    cost : half the sum of squared residuals.
     """
 
     def __init__(self, system: System, state: State) -> None:
@@ -95,7 +106,7 @@ class NormalEquations:
         self.untouched = np.concatenate(diagonals) <= 0
 
     def _views(self) -> Ints:
-        """(V, 6) where the numbers of each view stand."""
+        """Return the indices (V, 6) of the parameters of each of the V views."""
         return np.arange(self.system.views_at, self.system.dots_at).reshape(-1, 6)
 
     def _add(self, at: Ints, jacobian: Array, value: Array) -> None:
@@ -122,7 +133,7 @@ class NormalEquations:
                 flat = columns[..., a - start : b - start].reshape(width, -1)
                 np.matmul(flat, flat.T, out=gram[view])
                 dot, block = obs.dot[a:b], by_dot[..., a - start : b - start]
-                # a slice is added in place, an index array by way of two copies
+                # NumPy adds to a slice in place; an index array would cost two copies
                 some = slice(dot[0], dot[-1] + 1) if dot[-1] - dot[0] + 1 == b - a else dot
                 by_view[view][..., some] += block[size:-1]
                 of_camera[..., some] += block[:size]
@@ -139,17 +150,20 @@ class NormalEquations:
         self.squared += float(gram[:, -1, -1].sum())
 
     def step(self, damping: float) -> tuple[Array, float]:
-        """(C + 3 N,) step with Marquardt's damping, and the decrease of the cost that it promises.
+        """Return the step (K + 3 N,) with Marquardt's damping, and its predicted gain.
 
-        Raises CalibrationError when a direction is undetermined.
+        The predicted gain is the decrease of the cost according to the linear model. Raises
+        CalibrationError if the measurements leave a direction undetermined.
         """
         step = self._reduced(damping).solve(self.right)
         return step, float(0.5 * step @ self.right)
 
     def posterior(self, whole: bool) -> Posterior:
-        """The inverse of J^T J from the factorisation that a step uses.
+        """Return the inverse of J^T J, from the same factorisation as a step.
 
-        whole : all of it, dots with dots too.  Raises CalibrationError when it is singular.
+        whole : whether the full inverse is wanted, with the covariances between dots.
+
+        Raises CalibrationError if J^T J is singular.
         """
         reduced, size = self._reduced(0.0), len(self.common)
         if whole:
@@ -158,7 +172,7 @@ class NormalEquations:
         return Posterior(common, cross, dots, None, self.untouched)
 
     def information(self) -> Array:
-        """(C + 3 N, C + 3 N) dense J^T J."""
+        """Return J^T J as a dense matrix (K + 3 N, K + 3 N)."""
         kept, eliminated, matrix, coupling, blocks = self._sides(0.0)
         out = np.zeros((len(self.right),) * 2)
         out[np.ix_(kept, kept)] = matrix
@@ -173,7 +187,11 @@ class NormalEquations:
         return Reduced.of(*self._sides(damping))
 
     def _sides(self, damping: float) -> tuple[Ints, Ints, Array, Array, Array]:
-        """Kept, (B, n) eliminated, and the damped K (K, K), E (K, n, B) and D (B, n, n)."""
+        """Return which parameters are kept and eliminated, and the damped blocks K, E and D.
+
+        With m kept parameters and B eliminated blocks of n parameters, the indices are (m,) and (B,
+        n), and the blocks are K (m, m), E (m, n, B) and D (B, n, n).
+        """
         size, count = len(self.common), self.dots.shape[-1]
         common = _damped(self.common, damping)
         dots = _damped(self.dots.transpose(2, 0, 1), damping)
@@ -208,7 +226,10 @@ class NormalEquations:
         return kept, views, matrix, coupling, common[views[:, :, None], views[:, None]]
 
     def _of_dots(self, dots: Array, some: Ints, damping: float) -> Array:
-        """(3 n, 3 n) damped information of some dots, the known distance included."""
+        """Return the damped information (3 n, 3 n) of n dots, including that of the known distance.
+
+        some : (n,) indices of the dots.
+        """
         out = np.zeros((len(some), 3, len(some), 3))
         each = np.arange(len(some))
         out[each, :, each] = dots[some]
@@ -223,10 +244,13 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class Reduced:
-    """kept : (K,) and eliminated : (B, n), where the numbers of either side stand among all.
+    """The factorised Schur complement, with m kept parameters and B eliminated blocks of n
+    parameters.
 
-    root : (B, n, n) inverse of W.  coupling : (K, n B) F, a component of all blocks side by side.
-    factor : lower Cholesky factor of S, in Fortran's order.
+    kept, eliminated : (m,) and (B, n) indices among all parameters.
+    root : (B, n, n) inverse of W.
+    coupling : (m, n B) F. Its columns are ordered by component, then by block.
+    factor : lower Cholesky factor of S, in Fortran order.
     """
 
     kept: Ints
@@ -237,7 +261,14 @@ class Reduced:
 
     @staticmethod
     def of(kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Array) -> Reduced:
-        """matrix : (K, K) K, overwritten.  coupling : (K, n, B) E.  blocks : (B, n, n) D."""
+        """Return the factorisation of the blocks.
+
+        matrix : (m, m) K; it is overwritten.
+        coupling : (m, n, B) E.
+        blocks : (B, n, n) D.
+
+        Raises CalibrationError if a block or the Schur complement is not positive definite.
+        """
         try:
             root = np.linalg.inv(np.linalg.cholesky(blocks))
         except np.linalg.LinAlgError as error:
@@ -248,7 +279,7 @@ class Reduced:
             for j in range(1, i + 1):
                 whitened[:, i] += coupling[:, j] * root[:, i, j]
         flat = whitened.reshape(len(kept), -1)
-        # a C-ordered array is its transpose in Fortran's order, here of a symmetric matrix
+        # the transpose of a C-ordered array is in Fortran order; the matrix is symmetric
         schur = dsyrk(-1.0, flat.T, 1.0, matrix.T, trans=1, lower=1, overwrite_c=1)
         factor, failed = dpotrf(schur, lower=1, overwrite_a=1, clean=0)
         if failed:
@@ -256,7 +287,7 @@ class Reduced:
         return Reduced(kept, eliminated, root, flat, factor)
 
     def solve(self, right: Array) -> Array:
-        """(D,) solution for a right side (D,)."""
+        """Return the solution (D,) for a right-hand side (D,) of all D parameters."""
         inner = np.einsum("bij,bj->ib", self.root, right[self.eliminated])
         of_kept = right[self.kept] - self.coupling @ inner.ravel()
         first, _ = dpotrs(self.factor, of_kept, lower=1)
@@ -267,19 +298,22 @@ class Reduced:
         return out
 
     def _inverse_kept(self) -> Array:
-        """(K, K) block of the inverse."""
+        """Return the block (m, m) of the inverse that belongs to the kept parameters."""
         lower = np.tril(dpotri(self.factor, lower=1)[0])
         return np.asarray(lower + np.tril(lower, -1).T)
 
     def _through(self) -> Array:
-        """(K, B, n) chol(S)^-1 F W^-1: D^-1 plus its square is the eliminated side's inverse."""
+        """Return T (m, B, n) = chol(S)^-1 F W^-1.
+
+        D^-1 + T^T T is the block of the inverse that belongs to the eliminated parameters.
+        """
         half = dtrsm(1.0, self.factor, self.coupling, lower=1).reshape(
             len(self.kept), -1, len(self.root)
         )
         return np.asarray(np.einsum("kib,bij->kbj", half, self.root, optimize=True))
 
     def inverse(self) -> Array:
-        """(D, D) all of the inverse."""
+        """Return the full inverse (D, D) for all D parameters."""
         through = self._through().reshape(len(self.kept), -1)
         flat, across = (
             self.eliminated.ravel(),
@@ -295,9 +329,12 @@ class Reduced:
         return out
 
     def inverse_blocks(self, size: int) -> tuple[Array, Array, Array]:
-        """(C, C), (C, N, 3) and (N, 3, 3) of the inverse, C the first ``size`` numbers.
+        """Return the blocks (K, K), (K, N, 3) and (N, 3, 3) of the inverse, as in `Posterior`.
 
-        For when dots are eliminated; else from all of it.
+        If dots are eliminated, the blocks are computed directly; otherwise they are taken from the
+        full inverse.
+
+        size : K, the number of parameters of cameras and views.
         """
         if self.root.shape[1] != 3:
             found = Posterior.of(self.inverse(), size, np.zeros(0, bool))
@@ -317,7 +354,10 @@ class Reduced:
 
 
 def _in_chunks(images: Sequence[tuple[int, int, int]]) -> list[Sequence[tuple[int, int, int]]]:
-    """Consecutive images (view, first row, last row + 1) of about `CHUNK` measurements together."""
+    """Return the images in consecutive chunks of about `CHUNK` measurements.
+
+    images : (view, first row, last row + 1) of each image.
+    """
     ends = [end for _, _, end in images]
     parts = max(1, round(max(ends, default=0) / CHUNK))
     cuts = np.unique(np.searchsorted(ends, np.linspace(0, max(ends, default=0), parts + 1)[1:]) + 1)
@@ -325,7 +365,11 @@ def _in_chunks(images: Sequence[tuple[int, int, int]]) -> list[Sequence[tuple[in
 
 
 def _damped(matrix: Array, damping: float) -> Array:
-    """Marquardt's damping; what nothing touches (a view left out) stays where it is."""
+    """Return matrices (..., n, n) with Marquardt's damping.
+
+    A parameter that no measurement touches, for instance in a view that was left out, stays in
+    place.
+    """
     out = matrix.copy()
     i = np.arange(matrix.shape[-1])
     diagonal = matrix[..., i, i]

@@ -1,7 +1,7 @@
-"""The whitened residuals of a problem, and their derivatives, at any state.
+"""The whitened residuals of a problem and their derivatives, at any state.
 
-Every solver reads the same arrays: those of the images from
-`telerig.factors.projection.image_columns`, those of everything else from `Priors`.
+All solvers use the same arrays: those of `telerig.factors.projection.image_columns` for the images,
+and those of `Priors` for all other residuals.
 """
 
 from __future__ import annotations
@@ -26,12 +26,16 @@ from telerig.rig.pose import rotation_from_rotvec
 
 @dataclass(frozen=True)
 class Priors:
-    """Whitened residuals and derivatives of everything that is no image.
+    """Whitened residuals other than those of images, and their derivatives.
 
-    cameras : per camera (r,) and (r, S) by its free intrinsics and, for all but the first, its
-    pose: weak priors and the depth gauge.  views : (V, 3) and (V, 3, 6), loose places.
-    dots : (N, 3) and (N, 3), the diagonal: nominal places.
-    distance : the two dots, a number and (3,) by the first of them, or None.
+    cameras : for each camera the residuals (r,) of the weak priors and the depth gauge, and their
+        derivatives (r, S) with respect to the camera's S parameters: its free intrinsics and,
+        except for the first camera, its pose.
+    views : residuals (V, 3) and derivatives (V, 3, 6) of the weak priors on the V views' positions.
+    dots : residuals (N, 3) of the N dots' nominal positions, and the diagonal (N, 3) of their
+        derivatives.
+    distance : indices of the two dots of a known distance, its residual, and the derivative (3,)
+        with respect to the first dot; None if no distance is known.
     """
 
     cameras: list[tuple[Array, Array]]
@@ -41,17 +45,21 @@ class Priors:
 
     @property
     def squared(self) -> float:
+        """The sum of all squared residuals."""
         parts = [*(value for value, _ in self.cameras), self.views[0], self.dots[0]]
         far = self.distance[1] ** 2 if self.distance is not None else 0.0
         return float(sum(np.vdot(part, part) for part in parts)) + far
 
 
 class System:
-    """A problem's residuals as functions of the state.
+    """The residuals of a problem as functions of the state.
 
-    images : per camera its measurements in the order view, dot.  rows : per camera where these
-    stand in `Problem.observations`.
-    camera_places : per camera where its S numbers stand among all: free intrinsics, then pose.
+    images : for each camera its measurements, sorted by view and dot.
+    rows : for each camera the rows of these measurements in `Problem.observations`.
+    camera_places : for each camera the indices of its S parameters among all D: free intrinsics,
+        then pose.
+    views_at, dots_at : index of the first parameter of the views and of the dots.
+    size : D, the number of all parameters.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -78,7 +86,13 @@ class System:
         self.images = [_components_first(observations.subset(rows)) for rows in self.rows]
 
     def columns(self, state: State, camera: int, rows: slice = slice(None)) -> Array:
-        """(S + 7, 2, M) `image_columns` of some of a camera's measurements, in units of a step."""
+        """Return `image_columns` (S + 7, 2, M) of M measurements of a camera.
+
+        The derivatives are with respect to the parameters in the units of a step
+        (`parameter_unit`).
+
+        rows : which of the camera's measurements are used.
+        """
         obs = self.images[camera].subset(rows)
         out = image_columns(
             state, obs, camera, self.problem.rho_mm[camera], self.free[camera].tolist()
@@ -87,23 +101,25 @@ class System:
         return out
 
     def cost(self, state: State) -> float:
-        """Half the sum of all squared residuals."""
+        """Return half the sum of all squared residuals."""
         errors = [self.error(state, c) for c in range(len(self.images))]
         return 0.5 * (sum(float(np.vdot(e, e)) for e in errors) + self.priors(state).squared)
 
     def error(self, state: State, camera: int) -> Array:
-        """(2, M) whitened residuals of one camera's measurements, without derivatives."""
+        """Return the whitened residuals (2, M) of one camera's measurements, without
+        derivatives."""
         rho_mm = self.problem.rho_mm[camera]
         return whitened_image_error(state, self.images[camera], camera, rho_mm)
 
     def priors(self, state: State) -> Priors:
+        """Return the residuals that do not come from images, and their derivatives."""
         problem, cameras = self.problem, []
         for c, nominal in enumerate(problem.cameras):
             free, unit, sigma = self.free[c], self.unit[c], self.sigma[c]
             value = (state.intrinsics[c] - nominal.intrinsics)[free] / sigma
             jacobian = np.diag(unit / sigma)
             if c:
-                # only the second camera fixes where the origin lies along the first one's axis
+                # only the second camera fixes the origin along the axis of the first camera
                 gauge, by_pose = depth_gauge_residual(state.rig_from_camera[c], GAUGE_SIGMA_MM)
                 first = 0 if c == 1 else 1
                 value = np.concatenate([value, gauge[first:]])
@@ -123,7 +139,8 @@ class System:
         return Priors(cameras, views, dots, distance)
 
     def moved(self, state: State, step: Array) -> State:
-        """The state after a step: poses R exp(w), t + R v."""
+        """Return the state after a step (D,). A pose (R, t) becomes (R exp(w), t + R v) for the
+        tangent (w, v)."""
         intrinsics, cameras = state.intrinsics.copy(), state.rig_from_camera.copy()
         for c, (free, unit, places) in enumerate(zip(self.free, self.unit, self.camera_places)):
             intrinsics[c, free] += step[places[: len(free)]] * unit
@@ -140,7 +157,7 @@ class System:
 
 
 def slots(problem: Problem) -> dict[str, list[slice]]:
-    """Where each variable's components stand in the information matrix."""
+    """Return for each kind of variable the slices of its parameters in the information matrix."""
     out: dict[str, list[slice]] = {"intrinsics": [], "camera": [], "view": [], "dots": []}
     at = 0
     sizes = [("intrinsics", len(f)) for f in problem.free]
@@ -153,20 +170,20 @@ def slots(problem: Problem) -> dict[str, list[slice]]:
 
 
 def images_of(obs: Observations) -> list[tuple[int, int, int]]:
-    """(view, first row, last row + 1) of every image of one camera."""
+    """Return (view, first row, last row + 1) for every image of one camera."""
     edges = np.flatnonzero(np.diff(obs.view, prepend=-1, append=-1)).tolist()
     return [(int(obs.view[a]), a, b) for a, b in pairwise(edges)]
 
 
 def _components_first(obs: Observations) -> Observations:
-    """The same measurements, each component contiguous in memory."""
+    """Return the same measurements with each component contiguous in memory."""
     uv = np.ascontiguousarray(obs.uv_px.T)
     whitener = np.ascontiguousarray(obs.whitener.transpose(1, 2, 0))
     return replace(obs, uv_px=uv.T, whitener=whitener.transpose(2, 0, 1))
 
 
 def retracted(pose: Array, tangent: Array) -> Array:
-    """(..., 4, 4) poses moved by (..., 6) tangents (rotation, translation)."""
+    """Return poses (..., 4, 4) after a step along tangents (..., 6) (rotation, translation)."""
     out = pose.copy()
     turn = pose[..., :3, :3]
     out[..., :3, :3] = turn @ rotation_from_rotvec(tangent[..., :3])

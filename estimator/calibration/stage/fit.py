@@ -178,7 +178,7 @@ def linearised(
     for v in range(count):
         mine = dots.view == v
         along, beside = sigma_mm[0] / np.sqrt(weights.views[v]), sigma_mm[1]
-        # the carriage's error in units of its sd, which may be zero
+        # the carriage's error is in units of its standard deviation, because that may be zero
         by_error = by_point[mine] @ (across * [along, beside, beside])
         white = [whitener[mine] @ part for part in (by_error, by_state[mine], by_rig[mine])]
         rows = 2 * int(mine.sum())

@@ -211,7 +211,7 @@ def _alternatives(
 def _fits(
     problem: Problem, rich: Solution, path: list[Lenses], alternatives: list[Lenses]
 ) -> list[FittedModel]:
-    # a forked copy of a process that has used GTSAM can hang, because GTSAM's threads are not copied
+    # a fork of a process that has used GTSAM can hang, because GTSAM's threads are not copied
     tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in alternatives]
     here = problem.solver == "gtsam" or len(problem.uv_px) < DOTS_FOR_WORKERS
     workers = 1 if here else quick_workers(len(tasks))

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver.covariance import aligned_covariance
@@ -23,8 +23,6 @@ from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX, standing_wall
 from telerig.rig.triangulation import triangulate_any
 from telerig.rig.windows import Wall
-
-Array = NDArray[np.float64]
 
 _NOTABLE_UM = 0.1
 _STEP_MM = 10.0

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.lens.choice import Choice, Step
 from telerig.estimator.calibration.quality.checks import Note
 from telerig.estimator.calibration.result.calibration import Calibration
@@ -26,8 +26,6 @@ from telerig.rig.lens_models import joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.projection import INDEX
 from telerig.rig.triangulation import triangulate_any
-
-Array = NDArray[np.float64]
 
 GAUGE = (
     "rig frame = first camera's frame, its origin where the {two} optical axes come closest; image "

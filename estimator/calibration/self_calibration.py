@@ -10,10 +10,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens import considered_parameters
 from telerig.estimator.calibration.lens.choice import Choice, model_start
+from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.split_half import split_half_check
@@ -39,7 +41,6 @@ from telerig.estimator.calibration.start import (
     tilt_signs,
 )
 from telerig.estimator.calibration.start.unknown_target import dots_from_images
-from telerig.estimator.calibration.views.next_view import next_view
 from telerig.factors.projection import State, whitened_error
 from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.rig.camera import Camera
@@ -53,8 +54,6 @@ from telerig.rig.lens_models import (
 )
 from telerig.rig.projection import INDEX
 from telerig.rig.target import Target
-
-Array = NDArray[np.float64]
 
 SURE_SD = 5.0
 """Standard deviations by which a perspective must differ from none to be one."""

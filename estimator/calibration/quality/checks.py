@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
@@ -14,8 +14,6 @@ from telerig.estimator.calibration.start.known_target import ImageMap, image_map
 from telerig.estimator.dots.grid.numbering import check_handedness
 from telerig.factors.projection import State
 from telerig.rig.projection import INDEX
-
-Array = NDArray[np.float64]
 
 RECOMMENDED_VIEWS = 6
 MINIMUM_DOTS = 4

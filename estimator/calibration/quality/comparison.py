@@ -13,9 +13,9 @@ from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
@@ -24,8 +24,6 @@ from telerig.io.report.page.number_format import number, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
 from telerig.rig.triangulation import triangulate_any
-
-Array = NDArray[np.float64]
 
 UNLIKELY = 1e-3
 """A difference that chance gives less often than this is called a movement."""

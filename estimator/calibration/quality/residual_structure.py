@@ -11,13 +11,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtr
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.problem import Problem
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 UNLIKELY = 1e-3
 """Of all tests together."""

@@ -29,8 +29,6 @@ from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.projection import State
 from telerig.io.report.page.number_format import number
 
-Array = NDArray[np.float64]
-
 LEAST_VIEWS = 4
 """In a half; with fewer, a half does not determine a rig."""
 _SCALE = 1e-7

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.estimator.calibration.quality.comparison import after_rigid_motion
 from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
@@ -20,8 +20,6 @@ from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import intrinsics_from
 from telerig.rig.triangulation import triangulate_any
-
-Array = NDArray[np.float64]
 
 MANY_SD = 4.0
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.rig.camera import Camera
-
-Array = NDArray[np.float64]
 
 STEPS = 7
 VOLUME_SHARE = 0.6

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.summary import summary
 from telerig.estimator.calibration.solver.covariance import (
@@ -36,8 +37,6 @@ from telerig.rig.triangulation import (
     triangulate,
     triangulate_views,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

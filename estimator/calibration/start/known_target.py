@@ -12,8 +12,8 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
@@ -21,7 +21,6 @@ from telerig.factors.projection import State
 from telerig.rig.pose import nearest_rotation
 from telerig.rig.projection import INDEX
 
-Array = NDArray[np.float64]
 STRONG_PERSPECTIVE = 0.01
 """kappa * rho above which the start takes the perspective that the views show."""
 _FLIP = np.array([1.0, 1.0, -1.0])

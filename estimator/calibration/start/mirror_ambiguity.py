@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem
@@ -21,7 +21,6 @@ from telerig.factors.projection import State
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
 from telerig.rig.projection import INDEX
 
-Array = NDArray[np.float64]
 _KAPPA = INDEX["kappa_per_mm"]
 _D = np.diag([1.0, 1.0, -1.0, 1.0])
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust import robust_solve
@@ -19,9 +19,6 @@ from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.factors.projection import State, whitened_residuals
 from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
 from telerig.rig.target import Target
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 TIE_DEG = 15.0
 

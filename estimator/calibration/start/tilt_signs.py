@@ -11,14 +11,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.lens.cross_validation import pose_only
 from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust import robust_solve
 from telerig.factors.projection import State, whitened_error, whitened_residuals
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _D = np.diag([1.0, 1.0, -1.0, 1.0])
 _FLAT_MM = 1e-6

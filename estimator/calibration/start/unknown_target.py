@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import orthogonal_procrustes
 
+from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
 
-Array = NDArray[np.float64]
 LEAST_VIEWS = 4
 """Of one camera, for the shape of a target of unknown dots."""
 

@@ -12,13 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from telerig.estimator.calibration.next_view import (
+    Candidates,
+    NextView,
+    candidates,
+    dots_seen,
+    first_views,
+    hold_words,
+    next_view,
+)
 from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
 from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import cameras_from_state, held_at_nominal
-from telerig.estimator.calibration.views.next_view import NextView, next_view
-from telerig.estimator.calibration.views.poses import Candidates, candidates, dots_seen
-from telerig.estimator.calibration.views.wording import first_views, hold_words
 from telerig.factors.projection import State, pixels
 from telerig.io.report.calibration.report import write_calibration_report
 from telerig.io.report.calibration.results import read_results
@@ -264,7 +270,7 @@ def test_words_for_a_second_camera_anywhere_round_the_first(azimuth_deg: float) 
 
 
 def test_enough_is_said_with_its_reason() -> None:
-    from telerig.estimator.calibration.views.next_view import HeldPose
+    from telerig.estimator.calibration.next_view import HeldPose
 
     def advice(views: int, before: float, after: float) -> NextView:
         return NextView(views, before, (HeldPose(np.eye(4), after, "so", ("why",)),))

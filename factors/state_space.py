@@ -101,7 +101,9 @@ def stationary_covariance(drift: Array, noise: Array) -> Array:
     from scipy.linalg import solve_continuous_lyapunov
 
     if np.max(np.linalg.eigvals(drift).real) >= 0:
-        raise InputError("a motion without damping has no stationary state", todo="damp it")
+        raise InputError(
+            "a motion without damping has no stationary state", todo="give a positive damping"
+        )
     covariance = solve_continuous_lyapunov(drift, -noise @ noise.T)
     return np.asarray((covariance + covariance.T) / 2)
 

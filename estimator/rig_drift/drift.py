@@ -108,7 +108,9 @@ class RigChange:
         identified = self.sigmas[1:] < _NOT_IDENTIFIED * self.prior_sigmas[1:]
         each = zip(("rolled", "pitched"), turns, identified)
         turned = [f"{name} by {_rounded(*turn)} µrad" for name, turn, known in each if known]
-        return ", ".join([text, *turned]) if turned else f"{text} (its rotations are not seen)"
+        return (
+            ", ".join([text, *turned]) if turned else f"{text} (its rotations cannot be determined)"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of ``rig_change`` in smoothing.json and tracking.json."""

@@ -88,7 +88,7 @@ def _check_gravity(size: float, where: str) -> None:
         )
     if not 1 / _WITHIN < size / STANDARD_GRAVITY_M_S2 < _WITHIN:
         raise InputError(
-            f"the sensor reads {size:.4g} at rest, which is gravity in no unit",
+            f"the sensor reads {size:.4g} at rest, which is not gravity in any known unit",
             where=where,
             todo="check the sensor's scale: it should read 9.81 m/s^2 upwards at rest",
         )
@@ -141,13 +141,13 @@ def check_axes(reading_m_s2: ArrayLike, axes: ArrayLike, up: ArrayLike, *, where
     angle = _tilt_deg(gravity, axes, up)
     if angle < _TILTED_DEG:
         return []
-    words = f"{where}: by its axes in rig.toml gravity points {angle:.0f} deg away from up; "
+    words = f"{where}: with its axes in rig.toml, gravity points {angle:.0f} deg away from up; "
     fits = fitting_axes(gravity, axes, up)
     if fits is None:
         direction = ", ".join(f"{v:.2f}" for v in gravity / np.linalg.norm(gravity))
         return [f"{words}no exchange of axes fits: up is ({direction}) in the sensor's axes"]
     rows = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row + 0.0) + "]" for row in fits)
-    return [f"{words}axes = [{rows}] would fit (or that turned about the vertical)"]
+    return [f"{words}axes = [{rows}] would fit (or these axes rotated about the vertical)"]
 
 
 def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | None:

@@ -317,7 +317,9 @@ def _without_worse_predictions(steps: list[Step]) -> list[Step]:
         assert before is not None and after is not None
         if not after.held_out > before.held_out:
             break
-        words = f"left-out views are predicted {after.held_out / before.held_out - 1:.1%} worse"
+        words = (
+            f"left-out views are predicted {after.held_out / before.held_out - 1:.1%} worse with it"
+        )
         steps[last] = replace(steps[last], taken=False, words=words)
         last -= 1
     return steps
@@ -359,7 +361,7 @@ def _words(
         words += (
             "; kappa = 0 is rejected: the scale changes with depth, and the best model without "
             f"it ({joint_name(without[-1].names, cameras)}) leaves {without[-1].rms_px:.3g} px RMS "
-            f"against {chosen.rms_px:.3g}"
+            f"instead of {chosen.rms_px:.3g} px"
         )
     for camera, lens, intrinsics in zip(cameras, chosen.lenses, chosen.state.intrinsics):
         if "affine" in lens:

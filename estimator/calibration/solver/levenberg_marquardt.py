@@ -93,7 +93,10 @@ def solve(
     system, linearised = linearisation(problem)
     point, equations = start, _at(linearised, start)
     if equations is None:
-        raise CalibrationError("the starting point has no finite cost", todo="check rig.toml")
+        raise CalibrationError(
+            "the cost at the start is not finite: a camera cannot see some of its dots at all",
+            todo="check the cameras and windows in rig.toml",
+        )
     damping, iteration = 1e-4, 0
     for iteration in range(1, max_iterations + 1):
         cost = equations.cost

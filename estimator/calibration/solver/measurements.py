@@ -27,7 +27,9 @@ def problem_from_dots(dots: pd.DataFrame, cameras: Sequence[Camera], target: Tar
     contradicts their nominal positions.
     """
     if len(dots) == 0:
-        raise CalibrationError("no dots in any image", todo="run `telerig detect` and look at why")
+        raise CalibrationError(
+            "no dots in any image", todo="run `telerig detect` to see why none is found"
+        )
     names = [c.name for c in cameras]
     _check(dots, names, target)
     table = dots.sort_values(["view", "camera", "dot"])
@@ -85,7 +87,7 @@ def _check(table: pd.DataFrame, names: Sequence[str], target: Target) -> None:
         "are of a camera that the rig does not have": (
             ~table["camera"].isin(list(names)).to_numpy(), f"the rig has {known}",
         ),
-        "are none of the target's": (
+        "have an id that the target does not have": (
             ~target.known_id(table["dot"]), "compare the target in rig.toml with the table",
         ),
         "are given twice": (

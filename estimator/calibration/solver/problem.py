@@ -58,7 +58,8 @@ def checked_outlier_sd(outlier_sd: float) -> float:
     """
     if not LEAST_OUTLIER_SD <= outlier_sd < np.inf:
         raise InputError(
-            f"dots beyond {outlier_sd:g} standard deviations cannot be told as outliers",
+            f"dots beyond {outlier_sd:g} standard deviations cannot be distinguished from "
+            "correct ones",
             todo=f"give {LEAST_OUTLIER_SD:g} or more; {OUTLIER_SD:g} is usual",
         )
     return outlier_sd

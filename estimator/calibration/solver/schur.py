@@ -35,7 +35,7 @@ take more time; with more, the arrays do not fit into the processor's cache."""
 def undetermined() -> CalibrationError:
     return CalibrationError(
         "the measurements leave a direction of the calibration undetermined",
-        todo="add views with other tilts, or fix the model with --model",
+        todo="add views with other tilts, or choose a simpler lens model with --model",
     )
 
 

@@ -160,7 +160,7 @@ def _against(axis: Array, stated: tuple[float, float, float]) -> list[str]:
     direction = ", ".join(f"{v:.3f}" for v in axis)
     return [
         f"rig.toml states a travel direction {angle:.0f} deg away from the measured one: "
-        + ("turn its sign" if angle > 180 - _CONTRADICTION_DEG else f"write ({direction})")
+        + ("reverse its sign" if angle > 180 - _CONTRADICTION_DEG else f"write ({direction})")
     ]
 
 
@@ -214,7 +214,7 @@ def _dots(
     rows = table[known]
     views = tuple(sorted(set(rows["view"].astype(str)), key=lambda v: readings[v]))
     unseen = [v for v in readings if v not in views]
-    words += [f"no dots of view {', '.join(unseen)}"] if unseen else []
+    words += [f"positions.csv lists view {', '.join(unseen)}, which has no dots"] if unseen else []
     reading = np.array([readings[v] for v in views])
     _check_enough(reading, set(rows["camera"]))
     number = {v: i for i, v in enumerate(views)}
@@ -262,7 +262,7 @@ def _check_names(table: pd.DataFrame, column: str, known: list[str], fault: str)
 def _check_enough(reading_mm: Array, seen_by: set[str]) -> None:
     if len(seen_by) < 2:
         raise CalibrationError(
-            "one camera never sees travel along its own axis",
+            "only one camera has dots, and it cannot see travel along its own viewing direction",
             where=FOLDER,
             todo="show the target to two cameras",
         )
@@ -333,13 +333,17 @@ def _suspect_notes(dots: Dots, weights: Weights, system: Linear) -> list[str]:
     for v in np.flatnonzero(weights.views < _LEAST_WEIGHT):
         words.append(
             f"the reading {dots.reading_mm[v]:.6g} mm of view {dots.views[v]} is off by "
-            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm and hardly weighs; check positions.csv"
+            f"{np.linalg.norm(system.shift_mm[v]):.3g} mm and gets almost no "
+            "weight; check positions.csv"
         )
     odd = int((weights.dots < _LEAST_WEIGHT).sum())
     if odd:
-        words.append(f"{odd} of {len(weights.dots)} dots lie far from the model and hardly weigh")
+        words.append(
+            f"{odd} of {len(weights.dots)} dots lie far from their predicted pixels and get almost "
+            "no weight"
+        )
     if len(dots.views) == 2:
-        words.append("with two positions nothing checks the encoder readings; take three or more")
+        words.append("two positions cannot reveal a wrong encoder reading; take three or more")
     return words
 
 

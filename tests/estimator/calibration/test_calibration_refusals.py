@@ -161,7 +161,7 @@ def with_value(column: str, value: Any) -> Callable[[pd.DataFrame], pd.DataFrame
         (with_value("svv_px2", 0.0), "no positive definite covariance"),
         (with_value("suv_px2", 1.0), "no positive definite covariance"),
         (with_value("camera", "rihgt"), "camera that the rig does not have"),
-        (with_value("dot", 99), "none of the target's"),
+        (with_value("dot", 99), "the target does not have"),
         (lambda d: pd.concat([d, d[33:34]]), "1 of 361 dots are given twice"),
     ],
 )

@@ -190,7 +190,7 @@ def test_a_last_step_that_predicts_worse_is_taken_back(fitted: Any) -> None:
     steps = [model_choice.Step(0, ("k1",), f.lenses, 50.0, 40.0, True, "", f) for f in fits]
     after = model_choice._without_worse_predictions(steps)
     assert [s.taken for s in after] == [True, True, True, False, False]
-    assert after[3].words == "left-out views are predicted 10.5% worse"
+    assert after[3].words == "left-out views are predicted 10.5% worse with it"
 
 
 # --- simulated truth ----------------------------------------------------------------------------

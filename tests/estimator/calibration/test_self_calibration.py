@@ -179,7 +179,7 @@ def test_the_user_says_how_far_off_a_dot_may_be(paper: Any) -> None:
     assert left.index.tolist() == [row]
     assert "limit 3.4" in left["reason"].iloc[0]
     for wrong in (2.0, np.nan, np.inf):
-        with pytest.raises(InputError, match="cannot be told as outliers"):
+        with pytest.raises(InputError, match="cannot be distinguished"):
             paper.calibrate("radial", outlier_sd=wrong)
 
 

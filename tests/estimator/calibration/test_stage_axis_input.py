@@ -104,7 +104,7 @@ def test_a_stage_that_runs_the_other_way(folder: Path) -> None:
     dots(dataset).to_csv(folder / "stage_axis" / "dots.csv", index=False)
     found = stage_axis_from(dataset, calibration(dataset))
     assert found is not None
-    assert any("turn its sign" in w for w in found.words)
+    assert any("reverse its sign" in w for w in found.words)
 
 
 def test_no_folder_no_stage_axis(folder: Path) -> None:

@@ -208,7 +208,7 @@ def test_gravity_in_no_unit(run: Path) -> None:
         table[ACCELERATIONS] *= 0.5
 
     spoil(run / "accelerometer.csv", change)
-    refused(run, "gravity in no unit")
+    refused(run, "not gravity in any known unit")
 
 
 def test_saturated_samples_are_counted(run: Path) -> None:

@@ -24,8 +24,8 @@ import telerig
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
+    covariance_root,
     drift_covariance,
-    free_directions,
     moved_pose,
     offset_roll_pitch,
 )
@@ -149,7 +149,7 @@ class Score:
         rows = offset_roll_pitch(cameras, place)
         self.errors.append(1e6 * rows @ (tangent - run.tangent))
         self.sigmas.append(1e6 * np.sqrt(np.diagonal(rows @ covariance @ rows.T)))
-        inverse = np.linalg.pinv(free_directions(drift_covariance(cameras, DriftPrior())))
+        inverse = np.linalg.pinv(covariance_root(drift_covariance(cameras, DriftPrior())))
         error, spread = inverse @ (tangent - run.tangent), inverse @ covariance @ inverse.T
         self.nees.append(float(error @ np.linalg.solve(spread, error)) / len(error))
         self.called += moved

@@ -125,7 +125,7 @@ class Camera:
         """
         ideal = projection.ideal_from_pixel(np.asarray(uv_px, float), self.intrinsics, self.rho_mm)
         if self.wall is not None:
-            wall = projection.standing_wall(self.intrinsics, self.wall)
+            wall = projection.turned_wall(self.intrinsics, self.wall)
             origin, direction = windows.water_from_ideal(ideal, self["kappa_per_mm"], wall)
         else:
             origin, direction = windows.air_rays(ideal, self["kappa_per_mm"])

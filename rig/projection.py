@@ -47,7 +47,7 @@ def intrinsics_from(parameters: Mapping[str, float]) -> Array:
     return np.array([(wall | dict(parameters))[name] for name in PARAMETERS], float)
 
 
-def standing_wall(intrinsics: Array, wall: Wall) -> Wall:
+def turned_wall(intrinsics: Array, wall: Wall) -> Wall:
     """Return the window after its normal has been turned by wall_x_rad and wall_y_rad of the
     intrinsics."""
     return wall.turned(intrinsics[_WALL])
@@ -66,7 +66,7 @@ def pixel_from_camera(
     if wall is None:
         telecentric = points_mm[..., :2] / (1 + intrinsics[_KAPPA] * points_mm[..., 2:3])
     else:
-        turned = standing_wall(intrinsics, wall)
+        turned = turned_wall(intrinsics, wall)
         telecentric = windows.ideal_from_water(points_mm, float(intrinsics[_KAPPA]), turned)
     distorted = distortion.distort(telecentric / rho_mm, intrinsics[_DISTORTION]) * rho_mm
     return _pixel_from_sensor(sensor_from_distorted(distorted, intrinsics), intrinsics)
@@ -145,7 +145,7 @@ def pixel_jacobians(
         by_point[..., 2] = -kappa * towards_axis
         by_kappa, by_turn = -towards_axis * points_mm[..., 2:], np.zeros((*batch, 2, 2))
     else:
-        seen = windows.ideal_jacobians(points_mm, float(kappa), standing_wall(intrinsics, wall))
+        seen = windows.ideal_jacobians(points_mm, float(kappa), turned_wall(intrinsics, wall))
         uv, by_ideal, by_free = _lens_jacobians(seen.value, intrinsics, rho_mm, free)
         by_point = by_ideal @ seen.by_point
         by_kappa = np.einsum("...ij,...j->...i", by_ideal, seen.by_kappa)

@@ -337,7 +337,7 @@ def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
         uv, by_tilted, _ = camera.pixel_jacobians(np.stack([x, y, z], -1), ())
         return uv.T, np.moveaxis(by_tilted @ pose.rotation, 0, -1)
     if camera.wall is not None:
-        matrix, offset = affine_map(projection.standing_wall(camera.intrinsics, camera.wall))
+        matrix, offset = affine_map(projection.turned_wall(camera.intrinsics, camera.wall))
         x, y = matrix @ np.array([x, y, z]) + offset[:, None]
         by_x, by_y = (matrix @ pose.rotation)[:, :, None]
     else:

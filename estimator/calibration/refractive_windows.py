@@ -20,7 +20,7 @@ from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freed
 from telerig.estimator.calibration.start.mirror_ambiguity import ENTOCENTRIC
 from telerig.io.rig_file.description import RigDescription
 from telerig.rig.camera import Camera
-from telerig.rig.projection import INDEX, standing_wall
+from telerig.rig.projection import INDEX, turned_wall
 from telerig.rig.triangulation import triangulate_any
 from telerig.rig.windows import Wall
 
@@ -208,7 +208,7 @@ def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[str]:
     weak = abs(camera["kappa_per_mm"]) * camera.rho_mm < ENTOCENTRIC
     if calibration.medium == "air" or not free or wall is None or not weak:
         return []
-    normal = standing_wall(camera.intrinsics, wall).normal
+    normal = turned_wall(camera.intrinsics, wall).normal
     mirrored = normal * [-1, -1, 1]
     apart, from_stated = (_angle_rad(mirrored, n) for n in (normal, wall.normal))
     sd = max(calibration.sd(f"{camera.name}.{name}") for name in free)

@@ -224,7 +224,7 @@ def drift_covariance(cameras: Pair, prior: DriftPrior) -> Array:
     return np.asarray(sigma[:, None] * (seen.T @ seen) * sigma)
 
 
-def described(
+def rig_change_from(
     cameras: Pair,
     tangent: Array,
     covariance: Array,
@@ -243,7 +243,7 @@ def described(
     sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
     return RigChange(
         cameras[1].name, tangent, covariance, place_mm, rows @ tangent, sigmas, priors,
-        chance_of(tangent, covariance, prior), pairs, refined,
+        p_value_of(tangent, covariance, prior), pairs, refined,
     )  # fmt: skip
 
 
@@ -262,13 +262,13 @@ def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
     return np.stack([offset, roll, np.concatenate([pitch / np.linalg.norm(pitch), np.zeros(3)])])
 
 
-def chance_of(tangent: Array, covariance: Array, prior: Array) -> float:
+def p_value_of(tangent: Array, covariance: Array, prior: Array) -> float:
     """Return the p-value of an estimate under the hypothesis of no movement.
 
     It is a chi-square test over the directions that the prior leaves free. The prior shrinks the
     estimate towards 0, so the true p-value is smaller than the returned one.
     """
-    basis = free_directions(prior)
+    basis = covariance_root(prior)
     if not basis.shape[1]:
         return 1.0
     inverse = np.linalg.pinv(basis)
@@ -276,7 +276,7 @@ def chance_of(tangent: Array, covariance: Array, prior: Array) -> float:
     return float(chdtrc(len(value), value @ np.linalg.solve(spread, value)))
 
 
-def free_directions(covariance: Array, singular: float = _SINGULAR) -> Array:
+def covariance_root(covariance: Array, singular: float = _SINGULAR) -> Array:
     """Return a square root (P, k) of a covariance (P, P): its k directions of non-zero variance.
 
     singular : eigenvalues of the correlation matrix below this share of the largest one count as 0.
@@ -313,7 +313,7 @@ def with_drift(covariance: Array, drift: Array) -> Array:
     return total
 
 
-def share_of_drift(
+def drift_posterior(
     rig: Array, rig_covariance: Array, prior_rig: Array, drift: Array
 ) -> tuple[Array, Array]:
     """Return the movement's part of an estimated error of the cameras' parameters.

@@ -14,13 +14,13 @@ from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
     RigChange,
-    chance_of,
-    described,
+    covariance_root,
     drift_covariance,
-    free_directions,
+    drift_posterior,
+    p_value_of,
     ray_misses,
     rig_block,
-    share_of_drift,
+    rig_change_from,
     with_drift,
 )
 from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, information, learned_noise
@@ -97,7 +97,7 @@ def rig_change(
         return None
     drift = drift_covariance(cameras, prior or DriftPrior())
     covariance, free = rig_block(calibration)
-    root = free_directions(with_drift(covariance, drift), _SINGULAR)
+    root = covariance_root(with_drift(covariance, drift), _SINGULAR)
 
     def series_of(part: pd.DataFrame) -> Series:
         misses = ray_misses(cameras, free, _points(part), *_pixels(part, [c.name for c in cameras]))
@@ -117,12 +117,12 @@ def rig_change(
     unit, spreads, noise, used = found
     rig = root @ unit
     (tangent, own), (_, with_shapes) = (
-        share_of_drift(rig, root @ spread @ root.T, covariance, drift) for spread in spreads
+        drift_posterior(rig, root @ spread @ root.T, covariance, drift) for spread in spreads
     )
-    change = described(cameras, tangent, own, drift, _points(table).mean(0), used)
+    change = rig_change_from(cameras, tangent, own, drift, _points(table).mean(0), used)
     t = np.unique(table["t_s"].to_numpy(float))
     seen_s = float(np.median(np.diff(t)) * len(table))
-    chance = chance_of(tangent, with_shapes, drift) if seen_s >= LEAST_SEEN_S else 1.0
+    chance = p_value_of(tangent, with_shapes, drift) if seen_s >= LEAST_SEEN_S else 1.0
     return replace(change, chance=chance), noise
 
 

@@ -221,10 +221,10 @@ def motion_correlation(
         return None
     grid = np.arange(low, high, step)
     place = _averaged(stage_t, np.asarray(position_mm, float), grid, step)
-    felt = np.stack([_averaged(t, a, grid, step) for a in np.asarray(reading, float).T], -1)
+    sensed = np.stack([_averaged(t, a, grid, step) for a in np.asarray(reading, float).T], -1)
     acceleration = np.convolve(place, savgol_coeffs(13, 3, deriv=2, delta=step), "valid")
     window = np.hanning(15)[1:-1] / np.hanning(15)[1:-1].sum()
-    smooth = np.stack([np.convolve(a, window, "valid") for a in felt.T], -1)
+    smooth = np.stack([np.convolve(a, window, "valid") for a in sensed.T], -1)
     acceleration, smooth = acceleration - acceleration.mean(), smooth - smooth.mean(0)
     size = np.sqrt((acceleration**2).sum() * (smooth**2).sum(0))
     if not np.all(size > 0):

@@ -53,7 +53,7 @@ class EncoderFault:
         step."""
         return 4e-3 * abs(self.size_mm) / self.step_s**2
 
-    def touches(self, t_s: Array, frames_t_s: Array) -> bool:
+    def affects(self, t_s: Array, frames_t_s: Array) -> bool:
         """Return whether the fault changes differences of position between frames.
 
         t_s, frames_t_s : times of all readings and of all frames.
@@ -100,7 +100,7 @@ def check_encoder(
         f
         for f in faults
         if abs(f.size_mm) > _HARMLESS_MM and f.acceleration_m_s2 > _REAL_M_S2
-        if f.touches(t, frames)
+        if f.affects(t, frames)
     ]
     if grave:
         more = f" (and {len(grave) - 1} more)" if len(grave) > 1 else ""

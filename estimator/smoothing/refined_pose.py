@@ -18,10 +18,10 @@ from telerig.errors import InputError
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
     RigChange,
-    described,
     drift_covariance,
+    drift_posterior,
     moved_pose,
-    share_of_drift,
+    rig_change_from,
 )
 from telerig.estimator.rig_drift.from_pairs import LEAST_PAIRS, rig_change
 from telerig.estimator.smoothing.graph.solve import Solution
@@ -95,13 +95,15 @@ def refined_change(solution: Solution, calibration: Calibration) -> RigChange | 
     covariance = unfelt + root @ found.calibration @ root.T
     before = share.covariance.copy()
     before[-6:, -6:] -= share.drift
-    tangent, own = share_of_drift(rig, covariance, before, share.drift)
+    tangent, own = drift_posterior(rig, covariance, before, share.drift)
     pair = (problem.cameras[0], problem.cameras[1])
     place = np.concatenate([b.guess_mm for b in problem.bubbles]).mean(0)
     positions = np.concatenate([problem.encoder_mm[b.first : b.last + 1] for b in problem.bubbles])
     place = place - positions.mean() * problem.axis
     pose = moved_pose(calibration.cameras[1].camera_from_rig.inverse(), rig[-6:])
-    return described(pair, tangent, own, share.drift, place, len(problem.observations) // 2, pose)
+    return rig_change_from(
+        pair, tangent, own, share.drift, place, len(problem.observations) // 2, pose
+    )
 
 
 def change_words(change: RigChange, first: str) -> str:

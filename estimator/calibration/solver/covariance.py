@@ -21,7 +21,7 @@ from telerig.rig.projection import INDEX
 from telerig.rig.triangulation import stacked_jacobian
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
-WHOLE = 4000
+FULL_COVARIANCE_UP_TO = 4000
 """Up to this number of parameters, the covariance of all parameters with all others is kept."""
 
 
@@ -35,7 +35,7 @@ class JointCovariance:
 
     names : names of the D parameters in ``matrix``, for instance ``left.k1`` or ``view 03.rx_rad``.
     matrix : (D, D) covariance of all parameters; of cameras and views only (D = K) if there are
-        more than `WHOLE` parameters.
+        more than `FULL_COVARIANCE_UP_TO` parameters.
     dots : (N, 3, 3) covariance of each dot.
     cross : (K, N, 3) covariance of each dot with cameras and views.
     rig : P, the size of the rig block.
@@ -115,7 +115,7 @@ def joint_covariance(
     precision.
     """
     size = solution.slots["dots"][0].stop
-    posterior = solution.equations.posterior(whole=size <= WHOLE)
+    posterior = solution.equations.posterior(whole=size <= FULL_COVARIANCE_UP_TO)
     matrix = posterior.common if posterior.whole is None else posterior.whole
     matrix = matrix.copy()
     untouched = posterior.untouched[: len(matrix)]

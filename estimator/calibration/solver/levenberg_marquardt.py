@@ -23,7 +23,7 @@ from telerig.factors.projection import State
 MANY_DOTS = 5000
 """With more measured dots than this, the Schur complement solves the problem
 (docs/decisions/020)."""
-MANY_NUMBERS = 4000
+MANY_PARAMETERS = 4000
 """With more parameters of views and dots than this, the full covariance matrix is too large."""
 NEARLY_UNDAMPED = 1e-6
 """With less damping than this, the predicted gain of a step is what Gauss-Newton could still
@@ -58,7 +58,7 @@ def is_large(problem: Problem) -> bool:
     (docs/decisions/020).
     """
     numbers = 6 * len(problem.views) + 3 * len(problem.dot_ids)
-    return len(problem.view) > MANY_DOTS or numbers > MANY_NUMBERS
+    return len(problem.view) > MANY_DOTS or numbers > MANY_PARAMETERS
 
 
 def linearisation(problem: Problem) -> tuple[System, Callable[[State], Equations]]:

@@ -50,7 +50,7 @@ def squared_distance(residual_px: Array, covariance_px2: Array) -> Array:
     return np.asarray((residual_px * solved).sum(-1))
 
 
-def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float) -> float:
+def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float) -> float:
     """Return the standard deviation of the residuals' scatter beyond their own covariance.
 
     The scatter is taken as equal in all directions; 0 is returned if it is not significant. It
@@ -58,9 +58,9 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float)
 
     residual_px : (M, 2).
     covariance_px2 : (M, 2, 2).
-    free_share : degrees of freedom divided by the number of measured coordinates.
+    dof_per_row : degrees of freedom divided by the number of measured coordinates.
     """
-    expected = _MEDIAN * free_share
+    expected = _MEDIAN * dof_per_row
 
     def excess(floor: float) -> float:
         covariance = covariance_px2 + floor**2 * np.eye(2)
@@ -74,7 +74,7 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, free_share: float)
     return float(brentq(excess, 0.0, top, xtol=1e-7)) if excess(top) < 0 else top
 
 
-def free_share(problem: Problem) -> float:
+def dof_per_row(problem: Problem) -> float:
     """Return the approximate number of degrees of freedom per measured coordinate."""
     rows = int(2 * np.sum(problem.weight > 0))
     used = sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1)
@@ -100,7 +100,7 @@ def robust_solve(
     for _ in range(rounds):
         residual = pixel_residuals(problem, solution.state)
         sound = problem.weight > 0
-        floor = noise_floor_px(residual[sound], base[sound], free_share(problem))
+        floor = noise_floor_px(residual[sound], base[sound], dof_per_row(problem))
         covariance = base + floor**2 * np.eye(2)
         distance = np.sqrt(squared_distance(residual, covariance))
         worst = float(distance.max())
@@ -111,10 +111,10 @@ def robust_solve(
         else:
             weight = _without_lost_views(problem, _truncated(distance, problem.weight, least))
         problem = replace(problem, weight=weight, covariance_px2=covariance)
-        settled = np.array_equal(weight, previous.weight) and np.allclose(
+        unchanged = np.array_equal(weight, previous.weight) and np.allclose(
             covariance, previous.covariance_px2, rtol=1e-3
         )
-        if settled:
+        if unchanged:
             break
         steps = 4 if limit > least else 60
         solution = solve(problem, solution.state, max_iterations=steps, progress=progress)

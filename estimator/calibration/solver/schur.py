@@ -155,7 +155,7 @@ class NormalEquations:
         The predicted gain is the decrease of the cost according to the linear model. Raises
         CalibrationError if the measurements leave a direction undetermined.
         """
-        step = self._reduced(damping).solve(self.right)
+        step = self._schur_complement(damping).solve(self.right)
         return step, float(0.5 * step @ self.right)
 
     def posterior(self, whole: bool) -> Posterior:
@@ -165,7 +165,7 @@ class NormalEquations:
 
         Raises CalibrationError if J^T J is singular.
         """
-        reduced, size = self._reduced(0.0), len(self.common)
+        reduced, size = self._schur_complement(0.0), len(self.common)
         if whole:
             return Posterior.of(reduced.inverse(), size, self.untouched)
         common, cross, dots = reduced.inverse_blocks(size)
@@ -173,7 +173,7 @@ class NormalEquations:
 
     def information(self) -> Array:
         """Return J^T J as a dense matrix (K + 3 N, K + 3 N)."""
-        kept, eliminated, matrix, coupling, blocks = self._sides(0.0)
+        kept, eliminated, matrix, coupling, blocks = self._kept_and_eliminated(0.0)
         out = np.zeros((len(self.right),) * 2)
         out[np.ix_(kept, kept)] = matrix
         flat = eliminated.ravel()
@@ -183,10 +183,10 @@ class NormalEquations:
         out[self.untouched, self.untouched] = 0.0
         return out
 
-    def _reduced(self, damping: float) -> Reduced:
-        return Reduced.of(*self._sides(damping))
+    def _schur_complement(self, damping: float) -> SchurComplement:
+        return SchurComplement.of(*self._kept_and_eliminated(damping))
 
-    def _sides(self, damping: float) -> tuple[Ints, Ints, Array, Array, Array]:
+    def _kept_and_eliminated(self, damping: float) -> tuple[Ints, Ints, Array, Array, Array]:
         """Return which parameters are kept and eliminated, and the damped blocks K, E and D.
 
         With m kept parameters and B eliminated blocks of n parameters, the indices are (m,) and (B,
@@ -243,7 +243,7 @@ class NormalEquations:
 
 
 @dataclass(frozen=True)
-class Reduced:
+class SchurComplement:
     """The factorised Schur complement, with m kept parameters and B eliminated blocks of n
     parameters.
 
@@ -260,7 +260,9 @@ class Reduced:
     factor: Array
 
     @staticmethod
-    def of(kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Array) -> Reduced:
+    def of(
+        kept: Ints, eliminated: Ints, matrix: Array, coupling: Array, blocks: Array
+    ) -> SchurComplement:
         """Return the factorisation of the blocks.
 
         matrix : (m, m) K; it is overwritten.
@@ -284,7 +286,7 @@ class Reduced:
         factor, failed = dpotrf(schur, lower=1, overwrite_a=1, clean=0)
         if failed:
             raise undetermined()
-        return Reduced(kept, eliminated, root, flat, factor)
+        return SchurComplement(kept, eliminated, root, flat, factor)
 
     def solve(self, right: Array) -> Array:
         """Return the solution (D,) for a right-hand side (D,) of all D parameters."""
@@ -302,7 +304,7 @@ class Reduced:
         lower = np.tril(dpotri(self.factor, lower=1)[0])
         return np.asarray(lower + np.tril(lower, -1).T)
 
-    def _through(self) -> Array:
+    def _whitened_coupling(self) -> Array:
         """Return T (m, B, n) = chol(S)^-1 F W^-1.
 
         D^-1 + T^T T is the block of the inverse that belongs to the eliminated parameters.
@@ -314,7 +316,7 @@ class Reduced:
 
     def inverse(self) -> Array:
         """Return the full inverse (D, D) for all D parameters."""
-        through = self._through().reshape(len(self.kept), -1)
+        through = self._whitened_coupling().reshape(len(self.kept), -1)
         flat, across = (
             self.eliminated.ravel(),
             -dtrsm(1.0, self.factor, through, lower=1, trans_a=1),
@@ -339,7 +341,7 @@ class Reduced:
         if self.root.shape[1] != 3:
             found = Posterior.of(self.inverse(), size, np.zeros(0, bool))
             return found.common, found.cross, found.dots
-        through, inverse = self._through(), self._inverse_kept()
+        through, inverse = self._whitened_coupling(), self._inverse_kept()
         count = (len(self.kept) - size) // 3 + len(self.eliminated)
         cross, dots = np.empty((size, count, 3)), np.empty((count, 3, 3))
         flat = through.reshape(len(through), -1)

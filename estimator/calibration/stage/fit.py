@@ -70,7 +70,7 @@ class Weights:
 
 
 @dataclass(frozen=True)
-class Linear:
+class StageEquations:
     """Normal equations of the 9 unknowns (pose 6, slope 3), after the carriage's errors were
     eliminated.
 
@@ -95,7 +95,7 @@ def fit(
     dots: Dots,
     state: State,
     sigma_mm: tuple[float, float],
-) -> tuple[State, Weights, Linear]:
+) -> tuple[State, Weights, StageEquations]:
     """Fit the state to the dots by robust Gauss-Newton steps from a start.
 
     free : for each camera the names of its free intrinsics.
@@ -132,7 +132,7 @@ def fit(
     )
 
 
-def _scores(system: Linear, state: State, sigma_mm: float) -> tuple[Array, Array]:
+def _scores(system: StageEquations, state: State, sigma_mm: float) -> tuple[Array, Array]:
     """Return the squared distances of the dots (M,) and of the readings (V,), in standard
     deviations.
 
@@ -162,7 +162,7 @@ def linearised(
     state: State,
     sigma_mm: tuple[float, float],
     weights: Weights,
-) -> Linear:
+) -> StageEquations:
     """Return the normal equations at a state. GTSAM eliminates the carriage's error of each
     view."""
     import gtsam
@@ -188,9 +188,9 @@ def linearised(
         add_linear_factors(graph, (_FIRST_ERROR + v,), (np.eye(3)[None],), np.zeros((1, 3)))
         order.push_back(_FIRST_ERROR + v)
         seen = np.einsum("mki,mkl,mlj->ij", by_point[mine], information[mine], by_point[mine])
-        felt = np.einsum("mki,mkl,ml->i", by_point[mine], information[mine], residual[mine])
+        gradient = np.einsum("mki,mkl,ml->i", by_point[mine], information[mine], residual[mine])
         spread[v] = np.linalg.pinv(seen, rcond=1e-9)
-        shift[v] = spread[v] @ felt
+        shift[v] = spread[v] @ gradient
     _, left = graph.eliminatePartialSequential(order)
     kept = gtsam.Ordering()
     for key in (_STATE, _RIG) if by_rig.shape[-1] else (_STATE,):
@@ -198,7 +198,7 @@ def linearised(
     normal, right = left.hessian(kept)
     off = residual - np.einsum("mki,mi->mk", by_point, shift[dots.view])
     score = np.einsum("mi,mij,mj->m", off, dots.information, off)
-    return Linear(normal[:9, :9], right[:9], normal[:9, 9:], shift, spread, score)
+    return StageEquations(normal[:9, :9], right[:9], normal[:9, 9:], shift, spread, score)
 
 
 def _across(slope: Array) -> Array:

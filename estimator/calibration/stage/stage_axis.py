@@ -17,7 +17,7 @@ from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.stage.fit import (
     LEAST_TRAVEL_MM,
     Dots,
-    Linear,
+    StageEquations,
     State,
     Weights,
     fit,
@@ -116,7 +116,7 @@ def stage_axis_from(dataset: Dataset, calibration: Calibration) -> StageAxis | N
     )
     if described is None:
         return found
-    return replace(found, words=(*found.words, *_against(found.axis_rig, described.axis)))
+    return replace(found, words=(*found.words, *_contradiction(found.axis_rig, described.axis)))
 
 
 def _positions(folder: Path) -> pd.DataFrame:
@@ -153,7 +153,7 @@ def _image_views(dataset: Dataset, folder: Path) -> tuple[View, ...]:
     return tuple(View(name, paths[name]) for name in sorted(paths, key=natural))
 
 
-def _against(axis: Array, stated: tuple[float, float, float]) -> list[str]:
+def _contradiction(axis: Array, stated: tuple[float, float, float]) -> list[str]:
     angle = float(np.degrees(np.arccos(np.clip(axis @ np.asarray(stated), -1, 1))))
     if angle < _CONTRADICTION_DEG:
         return []
@@ -191,10 +191,10 @@ def stage_axis_of(
     state = start(cameras, dots)
     sigma = (position_sigma_mm, wander_sigma_mm)
     state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
-    shown = _shown_sigma(state, weights, system, sigma)
-    if shown != sigma:
-        words += _scatter_words(sigma, shown)
-        sigma = shown
+    observed = _observed_sigma(state, weights, system, sigma)
+    if observed != sigma:
+        words += _scatter_words(sigma, observed)
+        sigma = observed
         state, weights, system = fit(cameras, calibration.free, dots, state, sigma)
     words += _suspect_notes(dots, weights, system)
     return _result(calibration, dots, state, weights, system, sigma, words)
@@ -290,8 +290,8 @@ def _covariance(rows: pd.DataFrame, calibration: Calibration) -> Array:
     return np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
 
 
-def _shown_sigma(
-    state: State, weights: Weights, system: Linear, sigma_mm: tuple[float, float]
+def _observed_sigma(
+    state: State, weights: Weights, system: StageEquations, sigma_mm: tuple[float, float]
 ) -> tuple[float, float]:
     """Return the standard deviations of the carriage's position along and across the axis.
 
@@ -318,17 +318,17 @@ def _shown_sigma(
     return float(max(out[0], sigma_mm[0])), float(max(out[1], sigma_mm[1]))
 
 
-def _scatter_words(given: tuple[float, float], shown: tuple[float, float]) -> list[str]:
+def _scatter_words(given: tuple[float, float], observed: tuple[float, float]) -> list[str]:
     names = ("the encoder readings scatter", "the carriage moves across its axis")
     return [
         f"{name} by {1000 * new:.2g} µm, more than the {1000 * old:.2g} µm that were stated; the "
         "larger value is used"
-        for name, old, new in zip(names, given, shown)
+        for name, old, new in zip(names, given, observed)
         if new > old
     ]
 
 
-def _suspect_notes(dots: Dots, weights: Weights, system: Linear) -> list[str]:
+def _suspect_notes(dots: Dots, weights: Weights, system: StageEquations) -> list[str]:
     words = []
     for v in np.flatnonzero(weights.views < _LEAST_WEIGHT):
         words.append(
@@ -352,7 +352,7 @@ def _result(
     dots: Dots,
     state: State,
     weights: Weights,
-    system: Linear,
+    system: StageEquations,
     sigma_mm: tuple[float, float],
     words: list[str],
 ) -> StageAxis:
@@ -360,33 +360,34 @@ def _result(
     spare = 2 * int(kept.sum()) - 3 * len(dots.views) - 3
     chi2_dof = float(system.dot_score[kept].sum() / spare) if spare > 0 else 1.0
     inverse = np.linalg.inv(system.normal)
-    felt = -inverse @ system.by_rig
-    full = max(chi2_dof, 1.0) * inverse + felt @ calibration.covariance @ felt.T
-    pace = float(np.linalg.norm(state.slope))
-    axis = state.slope / pace
+    by_rig = -inverse @ system.by_rig
+    full = max(chi2_dof, 1.0) * inverse + by_rig @ calibration.covariance @ by_rig.T
+    travel_per_reading = float(np.linalg.norm(state.slope))
+    axis = state.slope / travel_per_reading
     basis = across(axis)
-    turn = np.vstack([basis.T / pace, -axis / pace**2])
+    turn = np.vstack([basis.T / travel_per_reading, -axis / travel_per_reading**2])
     joint = turn @ full[6:, 6:] @ turn.T
     return StageAxis(
         axis,
         basis,
         joint[:2, :2],
-        1 / pace - 1,
+        1 / travel_per_reading - 1,
         float(np.sqrt(joint[2, 2])),
         joint,
         state.rig_from_target,
         chi2_dof,
         *sigma_mm,
-        (*_summary(dots, axis, pace, joint), *words),
+        (*_summary(dots, axis, travel_per_reading, joint), *words),
     )
 
 
-def _summary(dots: Dots, axis: Array, pace: float, joint: Array) -> list[str]:
+def _summary(dots: Dots, axis: Array, travel_per_reading: float, joint: Array) -> list[str]:
     angle = np.degrees(np.sqrt(np.linalg.eigvalsh(joint[:2, :2])[-1]))
     direction = ", ".join(f"{v:.6f}" for v in axis)
+    scale_ppm = 1e6 * (1 / travel_per_reading - 1)
     return [
         f"travel along ({direction}) +- {angle:.2g} deg, from {len(dots.views)} positions over "
         f"{np.ptp(dots.reading_mm):.4g} mm",
-        f"the encoder reads {1e6 * (1 / pace - 1):+.0f} +- {1e6 * np.sqrt(joint[2, 2]):.0f} ppm "
+        f"the encoder reads {scale_ppm:+.0f} +- {1e6 * np.sqrt(joint[2, 2]):.0f} ppm "
         "more than the travel",
     ]

@@ -26,7 +26,7 @@ from telerig.io.exchange.export.volume import (
 from telerig.io.files.atomic import atomic_path
 from telerig.rig.camera import Camera
 from telerig.rig.distortion import COEFFICIENTS
-from telerig.rig.projection import standing_wall
+from telerig.rig.projection import turned_wall
 from telerig.rig.windows import ideal_jacobians
 
 _OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "", "", "", "s1", "s2", "s3", "s4")
@@ -101,7 +101,7 @@ def _telecentric_matrix(camera: Camera) -> Array:
     kappa, out = camera["kappa_per_mm"], np.eye(3, 4)
     out[2] = [0, 0, kappa, 1]
     if camera.wall is not None:
-        wall = standing_wall(camera.intrinsics, camera.wall)
+        wall = turned_wall(camera.intrinsics, camera.wall)
         seen = ideal_jacobians(np.zeros(3), kappa, wall)
         spread = kappa * wall.ratios[1] * np.sqrt(np.linalg.det(seen.by_point[:, :2]))
         out[2, 2] = spread

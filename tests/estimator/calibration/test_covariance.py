@@ -60,13 +60,13 @@ def test_it_is_that_of_gtsams_marginals(preset: str, model: str, solver: str, sc
 
 
 def test_a_large_problem_keeps_the_same_blocks(scene: Any, monkeypatch: Any) -> None:
-    """Above `WHOLE` numbers only cameras, views and each dot's own block are kept."""
+    """With more parameters only cameras, views and each dot's own block are kept."""
     made = scene("paper", 4)
     problem = problem_from_dots(made.dots, made.cameras, made.target).with_model("radial")
     problem = replace(problem, solver="schur")
     start = known_target.stereo_states(problem, problem.nominal_mm)[0]
     solution = graph.solve(problem, held_at_nominal(problem, start))
-    monkeypatch.setattr("telerig.estimator.calibration.solver.covariance.WHOLE", 10)
+    monkeypatch.setattr("telerig.estimator.calibration.solver.covariance.FULL_COVARIANCE_UP_TO", 10)
     ours = joint_covariance(problem, solution)
     theirs = by_marginals(problem, solution.state)
     sd = np.sqrt(np.diag(theirs))
@@ -88,7 +88,7 @@ def test_a_large_problem_is_advised_too(scene: Any, monkeypatch: Any) -> None:
     """The same advice with and without the covariance of all with all."""
     made = scene("paper", 4, views=8)
     whole = made.calibrate("radial").diagnostics["next_view"]
-    monkeypatch.setattr("telerig.estimator.calibration.solver.covariance.WHOLE", 10)
+    monkeypatch.setattr("telerig.estimator.calibration.solver.covariance.FULL_COVARIANCE_UP_TO", 10)
     part = made.calibrate("radial").diagnostics["next_view"]
     assert part["before_um"] == pytest.approx(whole["before_um"], rel=1e-9)
     assert part["after_um"] == pytest.approx(whole["after_um"], rel=1e-3)

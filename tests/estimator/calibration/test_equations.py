@@ -300,7 +300,7 @@ def test_a_large_calibration_keeps_cameras_and_views(
     problem = replace(problem_of(("k1",), rng), solver="schur")
     solution = solved(problem, state_of(problem, {"k1": 0.02}, rng))
     whole = joint_covariance(problem, solution)
-    monkeypatch.setattr(covariance, "WHOLE", 10)
+    monkeypatch.setattr(covariance, "FULL_COVARIANCE_UP_TO", 10)
     parts = joint_covariance(problem, solution)
     n = len(parts.names)
     assert parts.names == whole.names[:n]

@@ -43,7 +43,7 @@ from telerig.io.results.calibration import CalibrationFile
 from telerig.io.rig_file.description import WallDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.rig.camera import Camera
-from telerig.rig.projection import PARAMETERS, standing_wall
+from telerig.rig.projection import PARAMETERS, turned_wall
 from telerig.rig.windows import Wall
 from telerig.scripts.main import app
 
@@ -368,7 +368,7 @@ def test_a_target_in_the_water_shows_how_the_walls_stand(
     }  # fmt: skip
     for camera, glass in zip(found["estimated"].cameras, walls.values()):
         assert camera.wall is not None
-        stands = standing_wall(camera.intrinsics, camera.wall)
+        stands = turned_wall(camera.intrinsics, camera.wall)
         off = np.arccos(stands.normal @ glass.normal)
         sd = [found["estimated"].sd(f"{camera.name}.{n}") for n in ("wall_x_rad", "wall_y_rad")]
         assert max(sd) < np.radians(0.2)

@@ -18,12 +18,12 @@ from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.rig_drift.drift import (
     DriftPrior,
     RigChange,
+    covariance_root,
     drift_covariance,
-    free_directions,
+    drift_posterior,
     moved_pose,
     offset_roll_pitch,
     ray_misses,
-    share_of_drift,
 )
 from telerig.estimator.rig_drift.from_pairs import PairCollector, rig_change, with_change
 from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, learned_noise
@@ -119,7 +119,7 @@ def test_three_components_are_identifiable_with_telecentric_lenses_at_any_angle(
     angle: float,
 ) -> None:
     cameras = rig(angle)
-    directions = free_directions(drift_covariance(cameras, DriftPrior()))
+    directions = covariance_root(drift_covariance(cameras, DriftPrior()))
     assert directions.shape == (6, 3)
     points = np.random.default_rng(0).uniform(-15, 15, (200, 3))
     n = np.cross(*(c.camera_from_rig.rotation[2] for c in cameras))
@@ -136,7 +136,7 @@ def test_three_components_are_identifiable_with_telecentric_lenses_at_any_angle(
 
 
 def test_more_components_are_identifiable_with_perspective_lenses() -> None:
-    assert free_directions(drift_covariance(rig(90.0, 1 / 300), DriftPrior())).shape == (6, 5)
+    assert covariance_root(drift_covariance(rig(90.0, 1 / 300), DriftPrior())).shape == (6, 5)
 
 
 @pytest.mark.parametrize(("angle", "kappa"), [(90.0, 0.0), (60.0, 0.0), (90.0, 1e-5)])
@@ -175,7 +175,7 @@ def test_coverage_with_and_without_shake(shake_mm: float) -> None:
     rng = np.random.default_rng(5)
     cameras = rig()
     prior = DriftPrior()
-    basis = np.linalg.pinv(free_directions(drift_covariance(cameras, prior)))
+    basis = np.linalg.pinv(covariance_root(drift_covariance(cameras, prior)))
     nees, called = [], 0
     for _ in range(8):
         known = calibration(cameras)
@@ -280,7 +280,7 @@ def test_the_share_of_a_movement_is_gaussian_conditioning() -> None:
     gain = both @ by_both.T @ np.linalg.inv(by_both @ both @ by_both.T + sigma**2 * np.eye(5))
     mean, left = gain @ seen, both - gain @ by_both @ both
     total = np.concatenate([np.eye(8), np.eye(8)[:, 2:]], 1)
-    tangent, covariance = share_of_drift(total @ mean, total @ left @ total.T, before, drift)
+    tangent, covariance = drift_posterior(total @ mean, total @ left @ total.T, before, drift)
     assert np.allclose(tangent, mean[8:], atol=1e-9)
     assert np.allclose(covariance, left[8:, 8:], atol=1e-11)
 

@@ -363,6 +363,11 @@ def _cached_orders(drift: bytes, noise: bytes, size: int) -> tuple[float, ...]:
 
 
 def _steps(components: Sequence[Component], which: Sequence[int], lengths_s: Array) -> Steps:
+    """Return the exact steps of processes of equal kind.
+
+    which : indices of the processes in the caller's list.
+    lengths_s : (U,) lengths of the steps.
+    """
     n, k = components[0].input.shape
     shape = (len(components), len(lengths_s))
     begin = np.array([c.start_covariance for c in components])

@@ -103,6 +103,7 @@ class Pose:
         return np.asarray(rotated + self.translation_mm[..., None, :])
 
     def inverse(self) -> Pose:
+        """Return ``source_from_target``."""
         back = self.rotation.mT
         return Pose(back, -np.einsum("...ij,...j->...i", back, self.translation_mm))
 

@@ -95,6 +95,7 @@ def stop_all() -> None:
 
 
 def _outcome(job: Job) -> dict[str, Any]:
+    """Run a job in a new process and return its result, or a failure if the process dies."""
     if not Path(job.dataset).is_dir():
         return failure(
             FAILED, f"{job.dataset}: this machine has no such folder; share it with this machine"
@@ -151,6 +152,7 @@ def failure(status: str, words: str) -> dict[str, Any]:
 
 
 def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
+    """Calibrate a dataset and write its results."""
     from telerig.estimator.calibration.calibrate import run_calibration
     from telerig.estimator.calibration.results_folder import write_report, write_results
     from telerig.io.dataset.dataset import load_dataset
@@ -175,6 +177,7 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 
 def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
+    """Track a run and write its results."""
     from telerig.estimator.tracking.calibration_of_run import calibration_for
     from telerig.estimator.tracking.results_folder import write_tracking
     from telerig.estimator.tracking.track import TrackOptions
@@ -199,6 +202,7 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 
 def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
+    """Smooth a tracked run and write its results."""
     from telerig.estimator.smoothing.results_folder import smooth_run
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
     from telerig.estimator.tracking.calibration_of_run import calibration_for

@@ -195,6 +195,7 @@ def _left_over(data: Dataset) -> Iterator[Check]:
 
 
 def _views(data: Dataset) -> Iterator[Check]:
+    """Check the number of views, and that they have images of both cameras."""
     done = (data.results / "calibration" / "calibration.json").is_file()
     if not data.views:
         words = "no views of the target, but a calibration" if done else "no views of the target"
@@ -233,6 +234,7 @@ def _decoded(data: Dataset) -> Iterator[Check]:
 
 
 def _run(data: Dataset, name: str) -> Iterator[Check]:
+    """Check that a run can be loaded, then its clocks and its sensors."""
     what = f"run {name}"
     try:
         check_run_name(data.runs[name].path)
@@ -253,6 +255,7 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
 
 
 def _clocks(run: RunData, what: str) -> Iterator[Check]:
+    """Report frames that are farther apart than the median step."""
     steps = np.diff(run.t_s)
     if not len(steps):
         return
@@ -268,6 +271,7 @@ def _clocks(run: RunData, what: str) -> Iterator[Check]:
 
 
 def _sensors(run: RunData, what: str) -> Iterator[Check]:
+    """Check the run's sensors and list them with their sampling rates."""
     from telerig.estimator.sensors.checks import check_sensors
 
     try:
@@ -295,6 +299,7 @@ def _rate(t_s: np.ndarray) -> str:
 
 
 def _disk(data: Dataset) -> Check:
+    """Check that there is enough disk space for the results."""
     free = shutil.disk_usage(data.path).free
     frames = sum(len(list(r.path.rglob("*.tif*"))) for r in data.runs.values())
     wanted = max(_LEAST_FREE_GB * 1e9, frames * _RESULT_BYTES_PER_FRAME)

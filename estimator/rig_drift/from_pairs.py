@@ -64,10 +64,13 @@ class PairCollector:
         self.parts: list[pd.DataFrame] = []
 
     def add(self, tracks: pd.DataFrame) -> None:
+        """Add the reliable pairs of a part of the tracks."""
         names = pair_columns([c.name for c in self.calibration.cameras])
         self.parts.append(tracks.loc[_reliable(tracks), [n for n in names if n in tracks]])
 
     def found(self) -> RigChange | None:
+        """Return the movement that all collected pairs give, or None if there are too few of
+        them."""
         import pandas as pd
 
         filled = [p for p in self.parts if len(p)]

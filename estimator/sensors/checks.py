@@ -75,6 +75,9 @@ def _check_overlap(t: Array, frames_t_s: ArrayLike, *, where: str) -> list[str]:
 
 
 def _clock_remedy(t: Array, frames: Array) -> str:
+    """Return the unit or the offset that would make the record's clock agree with that of the
+    frames.
+    """
     length, wanted = t[-1] - t[0], frames[-1] - frames[0]
     for name, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
         near = t[0] / factor <= frames[-1] and t[-1] / factor >= frames[0]
@@ -85,6 +88,7 @@ def _clock_remedy(t: Array, frames: Array) -> str:
 
 
 def _check_accelerometers(run: RunData) -> list[str]:
+    """Return the warnings of all checks for each accelerometer of the run."""
     table, words = run.accelerometers, []
     assert table is not None
     file = f"{run.name}/accelerometer.csv"
@@ -148,6 +152,7 @@ def check_tracks(table: Any, calibration: Calibration) -> list[str]:
 
 
 def _off_px(table: Any, calibration: Calibration) -> float:
+    """Return the median distance in px between the tracks' points and points from their pixels."""
     some = np.unique(np.linspace(0, len(table) - 1, min(len(table), _SAMPLED)).astype(int))
     rows = table.iloc[some]
     points = rows[["x_mm", "y_mm", "z_mm"]].to_numpy(float)

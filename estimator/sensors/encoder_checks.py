@@ -67,6 +67,7 @@ class EncoderFault:
 
     @property
     def words(self) -> str:
+        """The fault in words."""
         at = f"{self.size_mm:+.4g} mm"
         if self.kind == "spike":
             return f"{self.readings} reading(s) from {self.t_s:.6g} s on are off by {at}"
@@ -75,6 +76,7 @@ class EncoderFault:
 
     @property
     def remedy(self) -> str:
+        """What the user can do about the fault."""
         if self.kind == "spike":
             return "remove those rows from stage.csv"
         what = "unwrap the counter: " if self.kind == "wrap" else ""
@@ -181,6 +183,11 @@ def _least_fault(step: Array) -> float:
 def _classified(
     steps: NDArray[np.intp], excess: Array, t: Array, position: Array
 ) -> list[EncoderFault]:
+    """Return the faults at the given steps as jumps, spikes or wraps.
+
+    steps : indices of the faulty steps.
+    excess : (E - 1,) part of each step that no motion explains, in mm.
+    """
     out: list[EncoderFault] = []
     left = [int(i) for i in steps]
     pace = np.median(np.delete(np.diff(position), steps))

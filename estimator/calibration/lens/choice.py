@@ -212,6 +212,9 @@ def _fits(
     problem: Problem, rich: Solution, path: list[Lenses], alternatives: list[Lenses]
 ) -> list[FittedModel]:
     # a fork of a process that has used GTSAM can hang, because GTSAM's threads are not copied
+    """Return the fitted models of the path and of the alternatives; only the path is
+    cross-validated.
+    """
     tasks = [(lenses, True) for lenses in path] + [(lenses, False) for lenses in alternatives]
     here = problem.solver == "gtsam" or len(problem.uv_px) < DOTS_FOR_WORKERS
     workers = 1 if here else quick_workers(len(tasks))
@@ -300,6 +303,7 @@ def _revised(
 
 
 def _taken(quadratic: QuadraticCost, path: list[Addition], fits: list[FittedModel]) -> list[Step]:
+    """Return the steps along the path of fitted models, all marked as taken."""
     out = [Step(-1, (), fits[0].lenses, float("nan"), float("nan"), True, "", fits[0])]
     for (camera, group, lenses), before, after in zip(path, fits, fits[1:]):
         gain = 2 * (before.cost - after.cost) / quadratic.variance
@@ -353,6 +357,7 @@ def _not_taken(
 def _words(
     problem: Problem, steps: list[Step], chosen: FittedModel, others: list[FittedModel]
 ) -> str:
+    """Return the choice in sentences for the user."""
     cameras = [c.name for c in problem.cameras]
     name = joint_name(chosen.names, cameras)
     words = f"{name}: {_prediction_words(steps, chosen, cameras)}"
@@ -399,6 +404,7 @@ def _prediction_words(steps: list[Step], chosen: FittedModel, cameras: list[str]
 
 
 def _stretch_words(camera: str, intrinsics: Array) -> str:
+    """Return a clause on the stretch of a camera's image that aspect ratio and skew describe."""
     aspect, skew = intrinsics[[INDEX["aspect"], INDEX["skew"]]]
     axes = np.linalg.svd(np.array([[1.0, skew], [0.0, aspect]]), compute_uv=False)
     return (

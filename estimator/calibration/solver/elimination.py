@@ -77,6 +77,7 @@ class GraphLayout:
         return _Images(*np.divmod(pairs, len(self.group_key)), which * self.per_group + slot)
 
     def gtsam_order(self) -> Any:
+        """Return the order of elimination as a `gtsam.Ordering`."""
         import gtsam
 
         order = gtsam.Ordering()
@@ -131,6 +132,7 @@ class GraphEquations:
         return padded
 
     def _add_priors(self) -> None:
+        """Add the contributions of the priors to ``square`` and ``right``."""
         layout, priors = self.layout, self.priors
         for own, (value, jacobian) in zip(layout.system.camera_places, priors.cameras):
             self.square[own] += (jacobian**2).sum(0)
@@ -183,6 +185,7 @@ class GraphEquations:
         )
 
     def _add_prior_factors(self, graph: Any) -> None:
+        """Add the factors of the priors and of the known distance to the graph."""
         layout, priors, scale = self.layout, self.priors, self.scale
         for camera, (value, jacobian) in enumerate(priors.cameras):
             block = jacobian * scale[layout.system.camera_places[camera]]

@@ -33,6 +33,7 @@ take more time; with more, the arrays do not fit into the processor's cache."""
 
 
 def undetermined() -> CalibrationError:
+    """Return the error for measurements that do not determine all parameters."""
     return CalibrationError(
         "the measurements leave a direction of the calibration undetermined",
         todo="add views with other tilts, or choose a simpler lens model with --model",
@@ -110,10 +111,13 @@ class NormalEquations:
         return np.arange(self.system.views_at, self.system.dots_at).reshape(-1, 6)
 
     def _add(self, at: Ints, jacobian: Array, value: Array) -> None:
+        """Add the contribution of a residual ``value`` whose derivatives belong to the parameters
+        ``at``."""
         self.common[np.ix_(at, at)] += jacobian.T @ jacobian
         self.right[at] -= jacobian.T @ value
 
     def _add_images(self, state: State, camera: int) -> None:
+        """Add the contributions of all images of one camera to the blocks."""
         system = self.system
         obs, own, views = system.images[camera], system.camera_places[camera], self._views()
         size, width, first = len(own), len(own) + 7, system.views_at

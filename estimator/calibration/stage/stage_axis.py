@@ -129,6 +129,7 @@ def _positions(folder: Path) -> pd.DataFrame:
 
 
 def _measured(dataset: Dataset, folder: Path) -> pd.DataFrame:
+    """Return the table of measured dots, from dots.csv or from the images in the folder."""
     table = folder / "dots.csv"
     views = _image_views(dataset, folder)
     if table.is_file() == bool(views):
@@ -154,6 +155,7 @@ def _image_views(dataset: Dataset, folder: Path) -> tuple[View, ...]:
 
 
 def _contradiction(axis: Array, stated: tuple[float, float, float]) -> list[str]:
+    """Return a note if rig.toml states a direction that differs from the measured one."""
     angle = float(np.degrees(np.arccos(np.clip(axis @ np.asarray(stated), -1, 1))))
     if angle < _CONTRADICTION_DEG:
         return []
@@ -203,6 +205,8 @@ def stage_axis_of(
 def _dots(
     calibration: Calibration, table: pd.DataFrame, positions_mm: Mapping[str, float] | pd.DataFrame
 ) -> tuple[Dots, list[str]]:
+    """Return the dots that the calibration knows, and notes for the user on those that it does
+    not."""
     readings = _readings(positions_mm)
     names = [c.name for c in calibration.cameras]
     _check_names(table, "view", list(readings), "has no position")
@@ -232,6 +236,10 @@ def _dots(
 
 
 def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, float]:
+    """Return the encoder reading of each view, from a mapping or a table.
+
+    Raises InputError for a view with two positions and for positions that are not finite.
+    """
     if isinstance(positions_mm, Mapping):
         out = {str(view): float(position) for view, position in positions_mm.items()}
     else:
@@ -329,6 +337,9 @@ def _scatter_words(given: tuple[float, float], observed: tuple[float, float]) ->
 
 
 def _suspect_notes(dots: Dots, weights: Weights, system: StageEquations) -> list[str]:
+    """Return notes on readings and dots that got almost no weight, and on having only two
+    positions.
+    """
     words = []
     for v in np.flatnonzero(weights.views < _LEAST_WEIGHT):
         words.append(
@@ -356,6 +367,7 @@ def _result(
     sigma_mm: tuple[float, float],
     words: list[str],
 ) -> StageAxis:
+    """Return the stage with its covariance, which includes that of the cameras' calibration."""
     kept = weights.dots > _LEAST_WEIGHT
     spare = 2 * int(kept.sum()) - 3 * len(dots.views) - 3
     chi2_dof = float(system.dot_score[kept].sum() / spare) if spare > 0 else 1.0

@@ -1,4 +1,4 @@
-"""How a bubble moves. Tracking, learning and smoothing all use the models of this module.
+"""Models how a bubble moves. Tracking, learning and smoothing all use the models of this module.
 
 Over a run, the position along each axis is a path plus zigzags. The velocity of the path is a
 constant mean U plus an Ornstein-Uhlenbeck process; a zigzag is a stochastic oscillator. Smoothing
@@ -26,7 +26,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Zigzag:
-    """A stochastic oscillation of the bubbles' paths.
+    """Describes a stochastic oscillation of the bubbles' paths.
 
     rms_mm : RMS displacement along the rig's x, y and z axes; 0 for no oscillation along an axis.
     damping : damping ratio.
@@ -42,7 +42,7 @@ class Zigzag:
 
 @dataclass(frozen=True)
 class BubbleModel:
-    """The prior distribution of the motion of every bubble.
+    """Describes the prior distribution of the motion of every bubble.
 
     velocity_sigma_mm_s, velocity_tau_s : standard deviation and correlation time of the velocity
         about its constant mean (Ornstein-Uhlenbeck process).
@@ -64,7 +64,8 @@ class BubbleModel:
 
 @dataclass(frozen=True)
 class Process:
-    """One stochastic process along one direction, with the hyper-parameters that define it.
+    """Describes one stochastic process along one direction, with the hyper-parameters that define
+    it.
 
     stem : common first part of the hyper-parameters' names, for instance "bubble.zigzags.0".
     make : function that returns the process as a `Component`.

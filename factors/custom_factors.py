@@ -1,4 +1,5 @@
-"""The factors of a self-calibration as `gtsam.CustomFactor`, for users who build their own graphs.
+"""Provides the factors of a self-calibration as `gtsam.CustomFactor`, for users who build their own
+graphs.
 
 Each one wraps the NumPy function that defines its residual. The solvers of telerig do not use these
 wrappers.
@@ -21,7 +22,7 @@ Residual = Callable[[Any], tuple[Array, list[Array]]]
 
 @dataclass(frozen=True)
 class Keys:
-    """The GTSAM keys of a calibration's variables, and how intrinsics are scaled.
+    """Holds the GTSAM keys of a calibration's variables, and how intrinsics are scaled.
 
     intrinsics : for each camera the key of a vector of its F_c free intrinsics, given as
         differences from the start and in multiples of ``unit``.

@@ -1,4 +1,4 @@
-"""Whitened linear factors as arrays, and the conversion to GTSAM.
+"""Represents whitened linear factors as arrays, and converts them to GTSAM.
 
 A factor is |sum_k A_k x_k - b|^2 with unit noise. Many factors of equal shape are computed together
 in NumPy and then given to GTSAM one by one. GTSAM's `JacobianFactor` takes up to three keys.
@@ -19,7 +19,7 @@ from telerig.arrays import Array
 
 @dataclass(frozen=True)
 class LinearFactors:
-    """M whitened linear factors of equal shape.
+    """Holds M whitened linear factors of equal shape.
 
     keys : for each variable of the factors an array of keys (M,).
     blocks : for each variable its Jacobians A_k (M, rows, columns).

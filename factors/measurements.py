@@ -1,4 +1,4 @@
-"""Predicted measurements of cameras and accelerometers, with derivatives.
+"""Predicts the measurements of cameras and accelerometers, with derivatives.
 
 A measurement depends on the positions of the bubble and of the carriage and on the offset of the
 camera. Leading axes (...) are batch axes. Lengths are in mm, times in s, angles in rad,
@@ -19,7 +19,7 @@ from telerig.rig.camera import Camera
 
 @dataclass(frozen=True)
 class ImagePrediction:
-    """Predicted pixels of points, and their derivatives.
+    """Holds predicted pixels of points, and their derivatives.
 
     uv_px : (..., 2).
     by_point, by_offset : (..., 2, 3) with respect to the lab point and to the camera's offset.
@@ -58,7 +58,7 @@ def image_of_point(
 
 @dataclass(frozen=True)
 class AccelerometerPrediction:
-    """Predicted readings of an accelerometer, and their derivatives.
+    """Holds predicted readings of an accelerometer, and their derivatives.
 
     reading_mm_s2 : (..., 3) along the sensor's axes.
     by_acceleration : (..., 3, 3) with respect to the acceleration of the sensor's mount, in rig

@@ -1,4 +1,5 @@
-"""Motion priors as whitened linear factors. Several processes are put side by side in one state."""
+"""Expresses motion priors as whitened linear factors. Several processes are put side by side in one
+state."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from telerig.factors.state_space import (
 
 @dataclass(frozen=True)
 class Motion:
-    """Whitened steps of several processes: W (x' - Phi x - G c) has unit noise.
+    """Holds whitened steps of several processes: W (x' - Phi x - G c) has unit noise.
 
     Here x (n,) and x' (n,) are the states before and after a step, Phi (n, n) the transition, c
     (K,) the constant inputs, G (n, K) their effect, and W (n, n) the whitening matrix. There are M

@@ -1,4 +1,5 @@
-"""Residuals of the self-calibration that are not images: known distance, depth gauge, weak priors.
+"""Defines the residuals of the self-calibration that are not images: known distance, depth gauge,
+weak priors.
 
 Each is a pure function that returns whitened residuals and their derivatives.
 """

@@ -1,4 +1,4 @@
-"""The projection factor: dots of a target as the cameras of the rig see them.
+"""Defines the projection factor: where the cameras of the rig see the dots of a target.
 
 `image_columns` defines the residual and its derivatives, for all dots of one camera at once. All
 solvers, and all other functions in this module that need derivatives, use it.
@@ -19,7 +19,7 @@ from telerig.rig.windows import Wall
 
 @dataclass(frozen=True)
 class State:
-    """All quantities that a calibration estimates, for C cameras, V views and N dots.
+    """Holds all quantities that a calibration estimates, for C cameras, V views and N dots.
 
     intrinsics : (C, 20) in the order of `telerig.rig.projection.PARAMETERS`.
     rig_from_camera : (C, 4, 4); the first is the identity.
@@ -35,7 +35,7 @@ class State:
 
 @dataclass(frozen=True)
 class Observations:
-    """M dots measured in images by C cameras in V views, sorted by image (view, camera).
+    """Holds M dots measured in images by C cameras in V views, sorted by image (view, camera).
 
     view, camera, dot : (M,) indices of each measurement.
     uv_px : (M, 2).
@@ -87,7 +87,8 @@ def apparent_shift_mm(cosine: Array, thickness_mm: float, index: float) -> tuple
 
 @dataclass(frozen=True)
 class _Placed:
-    """Positions of M dots that one camera sees. Components come first, so that each is contiguous.
+    """Holds the positions of M dots that one camera sees. Components come first, so that each is
+    contiguous.
 
     rotation : (3, 3, M) camera from target.
     target : (3, M) coordinates in the target frame, with the shift of the plate through which the
@@ -223,7 +224,7 @@ def _add_plate_slopes(
 
 @dataclass(frozen=True)
 class Residuals:
-    """Whitened residuals of M dots and their derivatives.
+    """Holds whitened residuals of M dots and their derivatives.
 
     value : (M, 2) residuals.
     by_dot : (M, 2, 3) with respect to the dot.

@@ -1,4 +1,4 @@
-"""Linear stochastic processes of bubbles and rig, and their exact discretisation.
+"""Defines linear stochastic processes of bubbles and rig, and discretises them exactly.
 
 Every process is x' = F x + B c + L w. Here x (n,) is the state, w (m,) is white noise of unit
 two-sided density, and c (k,) are constant inputs, for instance a bubble's mean velocity. A step of
@@ -30,7 +30,8 @@ a nanosecond vary in the last digit."""
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """One stochastic process. Lengths are in mm (or px or rad, as the caller chooses), times in s.
+    """Describes one stochastic process. Lengths are in mm (or px or rad, as the caller chooses),
+    times in s.
 
     drift : (n, n) F.
     noise : (n, m) L.
@@ -280,7 +281,7 @@ def independent(sigma: float) -> Component:
 
 @dataclass(frozen=True)
 class Steps:
-    """Exact steps of N processes of equal kind, with n states and k inputs, over U lengths.
+    """Holds exact steps of N processes of equal kind, with n states and k inputs, over U lengths.
 
     which : (N,) indices of the processes in the caller's list.
     transition, covariance : (N, U, n, n) of each step.
@@ -350,7 +351,7 @@ def discretise(
 
 
 def _kind(component: Component) -> object:
-    """Return a value that is equal for processes that one batch can hold."""
+    """Return a key that is equal for all processes that can be computed in one batch."""
     drift, noise = (a.astype(bool).tobytes() for a in (component.drift, component.noise))
     inputs = component.input.astype(bool).tobytes()
     return component.memoryless, inputs, _cached_orders(drift, noise, component.size)

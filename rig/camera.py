@@ -1,4 +1,5 @@
-"""The camera model. A lens is telecentric, nearly telecentric or, in the limit, perspective."""
+"""This module defines the camera, whose lens is telecentric, nearly telecentric or, in the limit,
+perspective."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from telerig.rig.windows import Wall
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera of the rig.
+    """Describes one camera of the rig.
 
     intrinsics : (20,) parameters of the lens and the sensor, in the order of
         `telerig.rig.projection.PARAMETERS`.

@@ -1,4 +1,4 @@
-"""Lens distortion in normalised coordinates: radial, tangential and thin-prism terms.
+"""Models lens distortion in normalised coordinates by radial, tangential and thin-prism terms.
 
 The definitions are those of OpenCV (Weng, Cohen and Herniou, PAMI 14:965, 1992). They map ideal
 coordinates (x, y) to distorted ones (x', y'), with r2 = x^2 + y^2, r4 = r2^2 and r6 = r2^3:

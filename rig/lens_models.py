@@ -1,4 +1,5 @@
-"""Names of lens models. A lens model says which intrinsics of a camera are free besides the scale.
+"""A lens model says which intrinsics of a camera are free besides the scale; this module names
+them.
 
 A model is a set of parameter groups. Its name joins their names by "+": ``kappa+brown``,
 ``tilt+radial``, ``k1+k2``. The model of a rig is one name for all cameras, or one for each:

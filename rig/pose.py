@@ -1,5 +1,5 @@
-"""Rigid transformations as a rotation and a translation. Tangent vectors have the order of GTSAM's
-Pose3: rotation first."""
+"""Describes rigid transformations by a rotation and a translation. Tangent vectors have the order
+of GTSAM's Pose3, rotation first."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """A rigid transformation ``target_from_source``: x_target = rotation @ x_source + translation.
+    """Describes the rigid transformation ``target_from_source``: x_target = rotation @ x_source +
+    translation.
 
     rotation : (..., 3, 3).
     translation_mm : (..., 3).

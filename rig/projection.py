@@ -1,4 +1,4 @@
-"""The camera model as pure functions: pixels of points in camera coordinates, and derivatives.
+"""Models the camera by pure functions, from camera coordinates to pixels and their derivatives.
 
 The steps are residual perspective (kappa), distortion, sensor tilt and an affine map, all about
 one centre. The tilt follows Steger (IJCV 123:121, 2017), in one formula for both kinds of

@@ -1,4 +1,4 @@
-"""The shape of a nearly ellipsoidal body from its silhouettes in two cameras.
+"""Computes the shape of a nearly ellipsoidal body from its silhouettes in two cameras.
 
 The body is x(s) = centre + A s (1 + h(s)). Here s lies on the unit sphere, A is a symmetric matrix
 (an ellipsoid), and h is a sum of spherical harmonics of degree 3 and higher. An affine camera maps
@@ -80,7 +80,7 @@ def zonal_traces(projection: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class EllipsePair:
-    """The elliptic silhouettes of one ellipsoid in two affine cameras, in mm.
+    """Holds the elliptic silhouettes of one ellipsoid in two affine cameras, in mm.
 
     shared : (..., 3) unit vector perpendicular to both viewing directions. Both cameras measure the
         coordinate along it.
@@ -220,11 +220,11 @@ def _joined(flat: tuple[Array, Array]) -> Array:
 
 
 def _most_spherical(moments: Array, gram: Array) -> Array:
-    """Return the moment between both sides that makes the ellipsoid most spherical.
+    """Return the second moment between both sides that makes the ellipsoid most spherical.
 
     It makes det(moments) / trace(gram moments)^3 stationary, with a positive determinant.
 
-    moments : (..., 3, 3) in the axes (shared, first side, second side).
+    moments : (..., 3, 3) second moments in the axes (shared, first side, second side).
     gram : (..., 3, 3) the matrix with which the trace is taken, because these axes are not
         orthogonal.
     """

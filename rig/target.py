@@ -1,5 +1,5 @@
-"""The flat target: the nominal positions of its dots, and the numbers (ids) by which dots are
-known.
+"""Describes the flat target: the nominal positions of its dots, and the numbers (ids) by which dots
+are known.
 
 The dot in row r and column c is nominally at (c * pitch_x, r * pitch_y, 0); z = x cross y.
 """
@@ -29,7 +29,7 @@ QUARTER_TURNS: tuple[Ints, ...] = tuple(
 
 @dataclass(frozen=True)
 class Target:
-    """Nominal geometry of the target, as `[target]` in `rig.toml` states it.
+    """Holds the nominal geometry of the target, as `[target]` in `rig.toml` states it.
 
     layout : "grid", or "points" for dots at listed positions.
     rows, columns : size of the grid. On an unbounded grid, size of the block in which the ids in

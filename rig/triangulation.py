@@ -1,4 +1,5 @@
-"""Triangulation: points in space from their pixels, by the mid-point of rays or maximum likelihood.
+"""Triangulates points in space from their pixels, by the mid-point of rays or by maximum
+likelihood.
 
 `triangulate` takes two cameras that both see every point. `triangulate_views` takes any number of
 cameras, and each point may be seen by only some of them.
@@ -27,7 +28,7 @@ _ROWS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Triangulated points with their covariance.
+    """Holds triangulated points with their covariance.
 
     points_mm : (..., 3) in the rig frame.
     covariance_mm2 : (..., 3, 3) covariance of the points. If a calibration triangulates, it

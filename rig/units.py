@@ -1,4 +1,4 @@
-"""Units that are defined by a number. Every conversion uses the constant from here."""
+"""Defines units that are given by a number. Every conversion uses the constant from here."""
 
 from __future__ import annotations
 

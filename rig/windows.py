@@ -1,4 +1,4 @@
-"""Refraction at a plane window (a glass wall) between a camera and the water.
+"""Models refraction at a plane window (a glass wall) between a camera and the water.
 
 The window is given in the camera's frame: its near face meets the camera's axis at
 ``distance_mm``. Let d be the unit direction of a ray in air, n the normal of the window and
@@ -35,7 +35,7 @@ Newton's method."""
 
 @dataclass(frozen=True)
 class Wall:
-    """A plane window in the camera's frame.
+    """Describes a plane window in the camera's frame.
 
     normal : (3,) unit vector that points away from the camera (z > 0).
     distance_mm : where the camera's axis meets the near face, measured from the camera's origin;
@@ -107,7 +107,7 @@ class Wall:
 
 @dataclass(frozen=True)
 class IdealPrediction:
-    """Telecentric coordinates of points in water, and their derivatives.
+    """Holds telecentric coordinates of points in water, and their derivatives.
 
     value : (..., 2) mm, where the ray in air crosses depth 0.
     by_point : (..., 2, 3) with respect to the point.
@@ -123,7 +123,7 @@ class IdealPrediction:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays in air and in the water, with the symbols of the module's docstring.
+    """Holds rays in air and in the water, with the symbols of the module's docstring.
 
     entry : (..., 3) H, the point on the near face.
     direction : (..., 3) direction in air, not normalised.

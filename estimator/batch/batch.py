@@ -247,7 +247,8 @@ FIGURES = (
 
 
 class Journal:
-    """The folder ``jobs`` of a batch, from which an interrupted batch continues.
+    """Keeps the records of a batch in its folder ``jobs``, so that an interrupted batch can
+    continue.
 
     Several processes may write records of different jobs to it.
     """

@@ -1,4 +1,5 @@
-"""The jobs for a list of datasets, in an order in which they can be done, and their input files."""
+"""Lists the jobs for a list of datasets, in an order in which they can be done, and their input
+files."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ _INPUTS = {"calibrate": ("calibration", "stage_axis")}
 
 @dataclass(frozen=True)
 class Job:
-    """The calibration of one dataset, or the tracking or smoothing of one run.
+    """Describes the calibration of one dataset, or the tracking or smoothing of one run.
 
     Paths are text, so that a job can be sent to another computer.
 

@@ -1,4 +1,4 @@
-"""Checks of the installation, the serial ports and a dataset. Each question gives one `Check`."""
+"""Checks the installation, the serial ports and a dataset. Each question gives one `Check`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LATENCY = Path("/sys/bus/usb-serial/devices")
 
 @dataclass(frozen=True)
 class Check:
-    """The answer to one question.
+    """Holds the answer to one question.
 
     what : what was checked.
     words : what was found.

@@ -1,4 +1,4 @@
-"""A change of the pose between the two cameras, and the ray misses that it causes.
+"""Models a change of the pose between the two cameras, and the ray misses that it causes.
 
 The two rays of a pair miss each other along the common perpendicular n of both lines of sight. If
 the second camera has moved by v and rotated by w, the ray miss at a rig point p is n . (v + w x p),
@@ -52,7 +52,7 @@ _LEAST_SINE = 0.05
 
 @dataclass(frozen=True)
 class DriftPrior:
-    """Prior standard deviations of each component of a movement.
+    """Holds the prior standard deviations of each component of a movement.
 
     They are wide, so that the data of the run decide. Components without effect on ray misses are
     held at 0. Raises InputError for values that are not positive.
@@ -71,7 +71,7 @@ class DriftPrior:
 
 @dataclass(frozen=True)
 class RigChange:
-    """The movement of the second camera relative to the first since the calibration.
+    """Describes the movement of the second camera relative to the first since the calibration.
 
     camera : name of the second camera.
     tangent, covariance : (6,) and (6, 6) of rig_from_<second camera> with the components
@@ -163,7 +163,7 @@ def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class RayMisses:
-    """Ray misses of M pairs in mm along n.
+    """Holds the ray misses of M pairs in mm along n.
 
     miss_mm : (M,).
     variance_mm2 : (M,) variance due to the noise of the pixels.

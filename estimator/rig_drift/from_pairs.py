@@ -1,5 +1,4 @@
-"""Estimation of a movement of the cameras relative to each other, from the pairs of a tracked
-run."""
+"""Estimates a movement of the cameras relative to each other, from the pairs of a tracked run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The noise of ray misses, which comes from pixels, differential shake and bubbles that change
-shape.
+"""Models the noise of ray misses, which comes from pixels, differential shake and bubbles that
+change shape.
 
 The noise is a Gaussian process in time. Its hyper-parameters are learned from the ray misses
 themselves. It is the sum of white noise of each pair, of damped oscillations that are common to all
@@ -41,7 +41,7 @@ _MOST_APART = 4
 
 @dataclass(frozen=True)
 class Series:
-    """M ray misses in time, linear in K unknowns of unit prior variance.
+    """Holds M ray misses in time, which are linear in K unknowns of unit prior variance.
 
     frame, bubble : (M,) index of each frame and of each bubble.
     t_s, miss_mm : (M,).
@@ -70,7 +70,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Noise:
-    """Hyper-parameters of the noise of ray misses.
+    """Holds the hyper-parameters of the noise of ray misses.
 
     white_mm : standard deviation of the white noise of a pair.
     wander_mm, wander_s : standard deviation and correlation time of each bubble's
@@ -110,7 +110,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """A tapered periodogram, and what is needed for its expectation.
+    """Holds a tapered periodogram, and what is needed for its expectation.
 
     power : periodogram from bin `_FIRST_BIN` on.
     step_s : interval of the samples.

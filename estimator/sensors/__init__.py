@@ -1,4 +1,4 @@
-"""Checks of the records of the encoder and the accelerometers.
+"""This folder checks the records of the encoder and the accelerometers.
 
 In: the sensor tables of a run. Out: warnings, and errors for records that cannot be used. Read
 ``checks`` first.

@@ -1,5 +1,4 @@
-"""Checks of an accelerometer's record for a wrong unit, removed gravity, clipping and wrong
-axes."""
+"""Checks an accelerometer's record for a wrong unit, removed gravity, clipping and wrong axes."""
 
 from __future__ import annotations
 
@@ -96,7 +95,7 @@ def _check_gravity(size: float, where: str) -> None:
 
 @dataclass(frozen=True)
 class Clipping:
-    """One axis of a sensor that is clipped at a limit of its range.
+    """Describes one axis of a sensor that is clipped at a limit of its range.
 
     axis : 0, 1 or 2.
     value : the limit (m/s^2).

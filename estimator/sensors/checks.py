@@ -1,4 +1,4 @@
-"""Checks of the sensors and the tracks of a run before it is smoothed."""
+"""Checks the sensors and the tracks of a run before it is smoothed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of an encoder's record for jumps, single wrong readings and overflow of the counter."""
+"""Checks an encoder's record for jumps, single wrong readings and overflow of the counter."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SHOWN = 3
 
 @dataclass(frozen=True)
 class EncoderFault:
-    """A fault in an encoder's record.
+    """Describes a fault in an encoder's record.
 
     t_s : time of the first reading after the fault.
     size_mm : error of the reading.

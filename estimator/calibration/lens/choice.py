@@ -1,4 +1,4 @@
-"""The choice of each camera's lens model by what the data support.
+"""Chooses each camera's lens model by what the data support.
 
 A rich model is fitted once, and the information criterion of `search` selects the best model that
 it contains. The models between the simplest one and the selected one are then fitted, with one more
@@ -53,7 +53,7 @@ _SCALE = INDEX["scale_px_per_mm"]
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A fitted lens model of all cameras.
+    """Holds a fitted lens model of all cameras.
 
     lenses : parameter groups of each camera.
     parameters : number of free intrinsics of all cameras together.
@@ -87,8 +87,8 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the model choice. It adds a group of parameters to one camera's model and is kept
-    or not.
+    """Describes one step of the model choice, which adds a group of parameters to one camera's
+    model and is kept or not.
 
     camera, added : index of the camera and names of the added parameters; -1 and () for the first
         step, which is the simplest model.
@@ -117,7 +117,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen lens model.
+    """Holds the chosen lens model and the steps that led to it.
 
     steps : the steps up to the chosen model, then those that were not taken.
     chosen : the fitted model.
@@ -257,7 +257,7 @@ def model_start(problem: Problem, state: State) -> State:
 
 
 def tilted(state: State, cameras: Sequence[int]) -> State:
-    """Return the state after aspect and skew of some cameras were replaced by an equivalent tilt.
+    """Return the state in which an equivalent tilt replaces aspect and skew of some cameras.
 
     The tilt is that of a lens that is telecentric on both sides: by `telerig.rig.projection` it
     stretches the image by sqrt(1 + q^2) along q. The sign of q is arbitrary.
@@ -313,8 +313,9 @@ def _taken(quadratic: QuadraticCost, path: list[Addition], fits: list[FittedMode
 
 
 def _without_worse_predictions(steps: list[Step]) -> list[Step]:
-    """Return the steps after those at the end that predict left-out views worse were marked as not
-    taken."""
+    """Mark the steps at the end that predict left-out views worse as not taken, and return all
+    steps.
+    """
     last = len(steps) - 1
     while last > 0:
         before, after = (steps[k].fit for k in (last - 1, last))

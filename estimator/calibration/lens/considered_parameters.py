@@ -1,4 +1,4 @@
-"""Considered parameters: the chosen model holds them at nominal, but the covariance includes their
+"""The chosen model holds considered parameters at nominal, but the covariance includes their
 effect.
 
 A group of parameters that is not worth freeing is not therefore zero. Some groups act like

@@ -1,4 +1,4 @@
-"""Cross-validation: how well a fit predicts views that it has not used."""
+"""Cross-validation tests how well a fit predicts views that it has not used."""
 
 from __future__ import annotations
 

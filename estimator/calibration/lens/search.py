@@ -1,4 +1,4 @@
-"""Search for the best lens model of each camera, from a single fit of a rich model.
+"""Searches for the best lens model of each camera, from a single fit of a rich model.
 
 Near the minimum of the rich model, with poses and dots eliminated, the cost is a quadratic form in
 the lens parameters. A simpler model holds some coordinates of this form at nominal. Let d be their
@@ -53,7 +53,7 @@ estimated."""
 
 @dataclass(frozen=True)
 class QuadraticCost:
-    """The cost as a quadratic form in K coordinates, at the minimum of a rich model.
+    """Describes the cost as a quadratic form in K coordinates, at the minimum of a rich model.
 
     names : (camera, parameter) of each coordinate. The two sums of each camera that describe a
         homography come last.

@@ -1,4 +1,4 @@
-"""The joint covariance of a self-calibration, and its effect on triangulated points.
+"""Computes the joint covariance of a self-calibration, and its effect on triangulated points.
 
 The *rig block* of the covariance holds the P parameters of the cameras: the free intrinsics of all
 cameras, then the pose (6) of each camera but the first.
@@ -27,8 +27,8 @@ FULL_COVARIANCE_UP_TO = 4000
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Covariance of all parameters of a calibration with N dots and M used measurements, in
-    physical units.
+    """Holds the covariance of all parameters of a calibration with N dots and M used measurements,
+    in physical units.
 
     The first K parameters are those of cameras and views. Poses are expressed in GTSAM's tangent
     space (rotation, translation) at ``rig_from_...``, with right perturbation.
@@ -83,9 +83,9 @@ class JointCovariance:
         return float(2 * len(self.leverage) - np.trace(self.leverage, axis1=-2, axis2=-1).sum())
 
     def widened(self, offset: Array) -> JointCovariance:
-        """Return the covariance with offset offset^T added.
+        """Return the covariance plus offset offset^T.
 
-        offset : (K + 3 N,) an error that is common to all parameters, in the units of the solver.
+        offset : (K + 3 N,) an error that all parameters share, in the units of the solver.
         """
         shift = offset * self.units
         whole = shift[: len(self.matrix)]

@@ -1,4 +1,4 @@
-"""The linear factors of a calibration and their elimination by GTSAM.
+"""Builds the linear factors of a calibration and eliminates them with GTSAM.
 
 The variables are cameras, views and groups of dots. The whitened blocks of all images are computed
 as arrays. GTSAM gets one `JacobianFactor` for each camera, view and group of dots that the camera
@@ -28,8 +28,8 @@ LEAST_PIVOT = 1e-10
 
 @dataclass(frozen=True)
 class _Images:
-    """The place of one camera's M measurements in P factors, each for one view and one group of G
-    dots.
+    """Says where one camera's M measurements stand in P factors, each for one view and one group of
+    G dots.
 
     view, group : (P,) indices of each factor's view and group.
     place : (M,) index of the factor times G, plus the number of the dot in its group.
@@ -41,7 +41,7 @@ class _Images:
 
 
 class GraphLayout:
-    """The variables of a problem's graph: cameras, then views, then groups of dots.
+    """Orders the variables of a problem's graph: cameras, then views, then groups of dots.
 
     The last group is filled up with variables that no measurement touches.
 
@@ -87,7 +87,7 @@ class GraphLayout:
 
 
 class GraphEquations:
-    """The Gaussian factor graph of a problem, linearised at one state.
+    """Holds the Gaussian factor graph of a problem, linearised at one state.
 
     cost : half the sum of squared residuals.
     square, right : (W,) the diagonal of J^T J, and -J^T r, with J the whitened Jacobian and r the

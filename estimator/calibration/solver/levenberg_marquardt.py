@@ -1,4 +1,4 @@
-"""The Levenberg-Marquardt iteration of a calibration.
+"""Solves a calibration by Levenberg-Marquardt iteration.
 
 GTSAM eliminates the factor graph of a calibration of usual size (`elimination.GraphEquations`). A
 large calibration is solved by its Schur complement (`schur.NormalEquations`). Both use the same
@@ -34,7 +34,7 @@ Equations = GraphEquations | NormalEquations
 
 @dataclass(frozen=True)
 class Solution:
-    """The state at the minimum.
+    """Holds the state at the minimum.
 
     cost : half the sum of squared whitened residuals, including those of the priors.
     equations : the linearised equations at the state.

@@ -1,4 +1,4 @@
-"""Conversion of a table of dots to a `Problem`."""
+"""Converts a table of dots to a `Problem`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A calibration as a `gtsam.NonlinearFactorGraph`, for users who continue with GTSAM.
+"""Converts a calibration to a `gtsam.NonlinearFactorGraph`, for users who continue with GTSAM.
 
 The solvers of telerig evaluate all images at once instead; the cost and the minimum are the same.
 """

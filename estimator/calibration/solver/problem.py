@@ -1,4 +1,4 @@
-"""The description of a self-calibration problem that all solvers share.
+"""Defines the description of a self-calibration problem that all solvers share.
 
 A `Problem` holds the measurements, the prior knowledge, and which intrinsics are free;
 `telerig.rig.lens_models` gives names to the sets of free intrinsics.
@@ -67,7 +67,7 @@ def checked_outlier_sd(outlier_sd: float) -> float:
 
 @dataclass(frozen=True)
 class Problem:
-    """The measurements, priors and free parameters of one self-calibration.
+    """Holds the measurements, priors and free parameters of one self-calibration.
 
     There are C cameras, V views, N dots and M measured dots.
 

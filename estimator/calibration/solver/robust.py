@@ -1,4 +1,4 @@
-"""Robust self-calibration: a weight for each dot, and a noise floor where the model is not perfect.
+"""Calibrates robustly: each dot has a weight, and a noise floor covers errors of the model.
 
 GTSAM's robust noise models give one weight to a whole factor, which is a whole image here. A single
 wrong dot would reduce the weight of all other dots of its image. Dots are therefore weighted one by
@@ -25,7 +25,7 @@ _MEDIAN = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 @dataclass(frozen=True)
 class RobustFit:
-    """The result of a robust fit.
+    """Holds the result of a robust fit.
 
     problem : the problem with the final weights and covariances.
     solution : its solution.

@@ -1,4 +1,4 @@
-"""The normal equations of a large calibration, solved through the Schur complement.
+"""Solves the normal equations of a large calibration through the Schur complement.
 
     [K  E ] [k]   [a]
     [E' D ] [d] = [b]       D = W W^T,  F = E W^-T,  S = K - F F^T
@@ -42,7 +42,7 @@ def undetermined() -> CalibrationError:
 
 @dataclass(frozen=True)
 class Posterior:
-    """The inverse of J^T J, or those parts of it that were asked for.
+    """Holds the inverse of J^T J, or those parts of it that were asked for.
 
     There are K parameters of cameras and views, and N dots.
 
@@ -71,7 +71,7 @@ class Posterior:
 
 
 class NormalEquations:
-    """J^T J and -J^T r in blocks, for K parameters of cameras and views and N dots.
+    """Holds J^T J and -J^T r in blocks, for K parameters of cameras and views and N dots.
 
     common : (K, K) of cameras and views.
     dots : (3, 3, N) of each dot.
@@ -248,7 +248,7 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class SchurComplement:
-    """The factorised Schur complement, with m kept parameters and B eliminated blocks of n
+    """Holds the factorised Schur complement, with m kept parameters and B eliminated blocks of n
     parameters.
 
     kept, eliminated : (m,) and (B, n) indices among all parameters.

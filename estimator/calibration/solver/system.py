@@ -1,4 +1,4 @@
-"""The whitened residuals of a problem and their derivatives, at any state.
+"""Computes the whitened residuals of a problem and their derivatives, at any state.
 
 All solvers use the same arrays: those of `telerig.factors.projection.image_columns` for the images,
 and those of `Priors` for all other residuals.
@@ -26,7 +26,7 @@ from telerig.rig.pose import rotation_from_rotvec
 
 @dataclass(frozen=True)
 class Priors:
-    """Whitened residuals other than those of images, and their derivatives.
+    """Holds whitened residuals other than those of images, and their derivatives.
 
     cameras : for each camera the residuals (r,) of the weak priors and the depth gauge, and their
         derivatives (r, S) with respect to the camera's S parameters: its free intrinsics and,
@@ -52,7 +52,7 @@ class Priors:
 
 
 class System:
-    """The residuals of a problem as functions of the state.
+    """Computes the residuals of a problem as functions of the state.
 
     images : for each camera its measurements, sorted by view and dot.
     rows : for each camera the rows of these measurements in `Problem.observations`.

@@ -1,5 +1,5 @@
-"""Gauss-Newton fit of the travel axis to images of a static target that the stage carries the
-cameras past.
+"""Fits the travel axis to images of a static target that the stage carries the cameras past, by
+Gauss-Newton steps.
 
 A dot X of the target is at rest in the laboratory. When the encoder reads s, it is at R X + t - w s
 - e in the rig. Here R and t are the pose of the target at reading 0, w = axis / (1 + scale) is the
@@ -30,7 +30,7 @@ _STATE, _RIG, _FIRST_ERROR = 0, 1, 2
 
 @dataclass(frozen=True)
 class Dots:
-    """M measured dots of one target in V views.
+    """Holds M measured dots of one target in V views.
 
     views : names of the views.
     reading_mm : (V,) encoder reading of each view.
@@ -51,7 +51,7 @@ class Dots:
 
 @dataclass(frozen=True)
 class State:
-    """The estimated motion of the target in the rig.
+    """Holds the estimated motion of the target in the rig.
 
     rig_from_target : pose of the target at reading 0.
     slope : (3,) w, the travel per unit of reading.
@@ -63,7 +63,7 @@ class State:
 
 @dataclass(frozen=True)
 class Weights:
-    """Robust weights from 0 to 1 of the dots (M,) and of the views' encoder readings (V,)."""
+    """Holds robust weights from 0 to 1 of the dots (M,) and of the views' encoder readings (V,)."""
 
     dots: Array
     views: Array
@@ -71,8 +71,8 @@ class Weights:
 
 @dataclass(frozen=True)
 class StageEquations:
-    """Normal equations of the 9 unknowns (pose 6, slope 3), after the carriage's errors were
-    eliminated.
+    """Holds the normal equations of the 9 unknowns (pose 6, slope 3), after the carriage's errors
+    were eliminated.
 
     normal, right : (9, 9) and (9,) the matrix and the right-hand side.
     by_rig : (9, P) block that couples the unknowns with the P parameters of the cameras.

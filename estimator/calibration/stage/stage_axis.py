@@ -1,4 +1,5 @@
-"""Travel axis and encoder scale from views of one static target at several stage positions.
+"""Estimates travel axis and encoder scale from views of one static target at several stage
+positions.
 
 The folder `stage_axis/` of a dataset holds positions.csv, and either dots.csv or images.
 """
@@ -46,7 +47,7 @@ _CONTRADICTION_DEG = 10.0
 
 @dataclass(frozen=True)
 class StageAxis:
-    """The calibrated stage.
+    """Describes the calibrated stage.
 
     axis_rig : (3,) unit vector of travel in rig axes, in the direction of increasing readings.
     basis : (3, 2) two orthonormal vectors perpendicular to the axis.

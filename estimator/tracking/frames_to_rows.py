@@ -55,7 +55,7 @@ class Linked:
 
 
 @dataclass
-class Linker:
+class RowMaker:
     """Turns frames of detections into finished rows; holds the frames still open, and a few."""
 
     cameras: tuple[Camera, Camera]

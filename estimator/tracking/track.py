@@ -36,7 +36,7 @@ from telerig.estimator.tracking.detect_run import (
     make_scene,
 )
 from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
-from telerig.estimator.tracking.frames_to_rows import Linked, Linker
+from telerig.estimator.tracking.frames_to_rows import Linked, RowMaker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
 from telerig.io.dataset.run import RunData
@@ -72,7 +72,7 @@ class TrackingStream:
 
     run: RunData
     calibration: Calibration
-    linker: Linker
+    linker: RowMaker
     frames_without: dict[str, dict[str, int]]
     scene: Scene | None
     marks: FollowedMarks | None
@@ -197,7 +197,7 @@ def tracking_stream(
     sample = _sample(run, cameras, batches())
     model = estimate_pair_model(sample, cameras)
     tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
-    linker = Linker(cameras, model, tracker, _shape_sigma(sample, cameras, model))
+    linker = RowMaker(cameras, model, tracker, _shape_sigma(sample, cameras, model))
     rows = _linked(run, cameras, batches(), linker, without, stage)
     if labels is not None:
         rows = (_labelled(part, labels) for part in rows)
@@ -324,7 +324,7 @@ def _linked(
     run: RunData,
     cameras: tuple[Camera, Camera],
     batches: Iterator[pd.DataFrame],
-    linker: Linker,
+    linker: RowMaker,
     without: dict[str, dict[str, int]],
     stage: Progress | None,
 ) -> Iterator[Linked]:

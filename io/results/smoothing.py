@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -24,35 +24,6 @@ class Verdict(StrEnum):
     RESOLVED = "RESOLVED"
     PARTIAL = "PARTIAL"
     UNRESOLVED = "UNRESOLVED"
-
-
-class VerdictWords(NamedTuple):
-    """A verdict in words: the headline of a page, what follows from it, and of one axis."""
-
-    headline: str
-    consequence: str
-    of_axis: str
-
-
-VERDICT_WORDS = {
-    Verdict.RESOLVED: VerdictWords(
-        "RESOLVED: the data separate the motion of the bubbles from the shake of the rig",
-        "The uncertainty of the shake hardly widens the bands below.",
-        "bubble motion and shake are separated",
-    ),
-    Verdict.PARTIAL: VerdictWords(
-        "PARTIAL: the data separate the bubbles' motion from the rig's shake only in part",
-        "Part of the shake may still stand in the trajectories, or part of the bubbles' motion in "
-        "the shake; the bands below say how much.",
-        "shake widens the positions {q:.2g} times",
-    ),
-    Verdict.UNRESOLVED: VerdictWords(
-        "UNRESOLVED: the data cannot separate the bubbles' motion from the rig's shake",
-        "What is drawn below as motion of bubbles may be shake, and the other way round: do not "
-        "interpret any motion as fast as the shake.",
-        "bubble motion and shake cannot be separated",
-    ),
-}
 
 
 class Flag(StrEnum):

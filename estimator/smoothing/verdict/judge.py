@@ -14,7 +14,8 @@ from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.identifiability import AxisVerdict, verdicts
 from telerig.estimator.smoothing.verdict.modes import Place, ShakeMode, shake_modes
-from telerig.io.results.smoothing import AXES, VERDICT_WORDS, Flag, Verdict
+from telerig.io.results.smoothing import AXES, Flag, Verdict
+from telerig.io.results.verdict_words import VERDICT_WORDS
 from telerig.rig.camera import Camera
 
 _STRIP = "fix a strip of dots to the tank inside both views"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import default_model
-from telerig.estimator.tracking.frames_to_rows import Linker
+from telerig.estimator.tracking.frames_to_rows import RowMaker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
@@ -66,7 +66,7 @@ def linked(
     """
     rng = np.random.default_rng(seed)
     truth, shake = paths(rng), rng.normal(0, SHAKE_PX, (FRAMES, 2, 2))
-    linker = Linker(CAMERAS, MODEL, Tracker(CAMERAS), np.full(2, 1e-3))
+    linker = RowMaker(CAMERAS, MODEL, Tracker(CAMERAS), np.full(2, 1e-3))
     for frame in range(FRAMES):
         tables = []
         for camera in (0, 1):

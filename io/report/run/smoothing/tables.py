@@ -30,7 +30,8 @@ from telerig.io.report.run.smoothing.results import (
 )
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.report.run.tracking.tables import Headline
-from telerig.io.results.smoothing import VERDICT_WORDS, AttributedLine, Flag, Mode, Verdict
+from telerig.io.results.smoothing import AttributedLine, Flag, Mode, Verdict
+from telerig.io.results.verdict_words import FLAG_WORDS, NOT_JUDGED, REMEDY, VERDICT_WORDS
 
 
 def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str, Any]:
@@ -58,30 +59,10 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
     }
 
 
-REMEDY = (
-    "fix a strip of dots to the tank where both cameras see it, or put one accelerometer on each "
-    "camera arm, and record again."
-)
-_NOT_JUDGED = (
-    "Not judged: smoothing.json does not say whether bubble motion and shake are separable",
-    "usable",
-    "The bands below are right if the model of bubbles and shake is right. Whether the data can "
-    "separate the two was not tested.",
-)
 _COLOURS = {
     Verdict.RESOLVED: "good",
     Verdict.PARTIAL: "usable",
     Verdict.UNRESOLVED: "rejected",
-}
-_FLAGS: dict[str, str] = {
-    Flag.LABEL_AMBIGUOUS: (
-        "A line in the spectrum could be the bubbles' or the rig's, and the data do not say whose "
-        "it is. The bands are widened by what lies between the two readings."
-    ),
-    Flag.SHAKE_BELOW_NOISE: (
-        "The shake is smaller than what the images can show. It does no harm here: the bubbles' "
-        "motion is as good as it would be on a rig that stands still."
-    ),
 }
 _HARMLESS = {Flag.SHAKE_BELOW_NOISE}
 _HEADS = {
@@ -97,7 +78,7 @@ _ELSEWHERE = {"words", "lines", "shake_rms_mm"}
 def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headline:
     """What the smoother says of itself, with the remedy where there is one to take."""
     file = results.file
-    headline, colour, meaning = _NOT_JUDGED
+    (headline, meaning, _), colour = NOT_JUDGED, "usable"
     if file.verdict is not None:
         colour = _COLOURS[file.verdict]
         headline, meaning, _ = VERDICT_WORDS[file.verdict]
@@ -109,7 +90,8 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headli
     if file.verdict in (Verdict.PARTIAL, Verdict.UNRESOLVED) and not in_words:
         sentences.append(f"To resolve it, {file.remedy or REMEDY}")
     flags = {
-        flag: f"{flag}: {_FLAGS.get(flag, flag.replace('_', ' ').lower())}" for flag in file.flags
+        flag: f"{flag}: {FLAG_WORDS.get(flag, flag.replace('_', ' ').lower())}"
+        for flag in file.flags
     }
     sentences += [text for flag, text in flags.items() if flag in _HARMLESS]
     warnings = [text for flag, text in flags.items() if flag not in _HARMLESS]

@@ -57,9 +57,9 @@ PERSPECTIVE_PX = 0.5
 _POINTS_PER_EDGE = 25
 _PIXELS_PER_EDGE = 41
 _DIAGONAL = 1e-13
-_POLYNOMIAL = {"k1": 2, "k2": 4, "k3": 6, "p2": 1, "p1": 1}
-"""HALCON's distortion coefficients, in the order of OpenCV's that do the same, which are named
-k1 k2 k3 p1 p2, and the power of length in their units."""
+_POLYNOMIAL = {"k1": ("k1", 2), "k2": ("k2", 4), "k3": ("k3", 6), "p1": ("p2", 1), "p2": ("p1", 1)}
+"""For each of telerig's distortion coefficients that HALCON has: its name in HALCON, where p1 and
+p2 are exchanged, and the power of length in HALCON's unit of it."""
 
 
 @dataclass(frozen=True)
@@ -186,13 +186,18 @@ def _fitted_distortion(camera: Camera, stretch: Array, rotation: Array) -> dict[
     centre = np.array([camera["centre_u_px"], camera["centre_v_px"]])
     distorted = np.linalg.solve(stretch, (uv - centre).T).T / rho
     undistorted = projection.ideal_from_pixel(uv, camera.intrinsics, rho) @ rotation.T / rho
-    design = coefficient_jacobian(distorted)[..., : len(_POLYNOMIAL)].reshape(uv.size, -1)
+    design = coefficient_jacobian(distorted, _places()).reshape(uv.size, -1)
     found = np.linalg.lstsq(design, (undistorted - distorted).reshape(-1), rcond=None)[0]
     in_metres = {
         name: float(value) / (rho * 1e-3) ** power
-        for value, (name, power) in zip(found, _POLYNOMIAL.items())
+        for value, (name, power) in zip(found, _POLYNOMIAL.values())
     }
     return {name: in_metres[name] for name in ("k1", "k2", "k3", "p1", "p2")}
+
+
+def _places() -> list[int]:
+    """Return the index in `COEFFICIENTS` of each coefficient of `_POLYNOMIAL`."""
+    return [COEFFICIENTS.index(name) for name in _POLYNOMIAL]
 
 
 def _pixel_from_camera(points_m: Array, values: dict[str, float]) -> Array:
@@ -213,7 +218,7 @@ def _distorted(undistorted_m: Array, values: dict[str, float]) -> Array:
     if "kappa" in values:
         return undistorted_m
     coefficients = np.zeros(len(COEFFICIENTS))
-    coefficients[: len(_POLYNOMIAL)] = [values[name] for name in _POLYNOMIAL]
+    coefficients[_places()] = [values[name] for name, _ in _POLYNOMIAL.values()]
     failure = GeometryError(
         "HALCON's distortion has no inverse at some of these points",
         todo="keep to a smaller volume, or export to OpenCV, which has telerig's distortion",

@@ -22,7 +22,7 @@ from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, came
 from telerig.io.files.text import read_text
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.distortion import distort
+from telerig.rig.distortion import COEFFICIENTS, distort
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
 WORST_FIT_PX = 0.5
@@ -225,5 +225,7 @@ def _distorted_px(file: _Orientation, straight_px: Array, sensor: Sensor) -> Arr
     matrix = _pixel_from_metric(file, sensor)
     flat = np.linalg.solve(matrix[:2, :2], (straight_px - matrix[:2, 2]).T).T
     k1, k2, k3, p1, p2 = file.added[:5]
-    distorted = distort(flat * [1, -1], np.array([k1, k2, k3, p2, p1, 0, 0, 0, 0]))
+    given = {"k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1}
+    coefficients = np.array([given.get(name, 0.0) for name in COEFFICIENTS])
+    distorted = distort(flat * [1, -1], coefficients)
     return distorted * [1, -1] @ matrix[:2, :2].T + matrix[:2, 2]

@@ -11,8 +11,10 @@ from camera_pairs import DISTORTED, PRISM, RIGHT, SQUARE_ON, Array, pair, random
 from scipy.optimize import fsolve
 
 from telerig.errors import GeometryError
+from telerig.io.exchange.export import halcon
 from telerig.io.exchange.export.halcon import halcon_cameras, hdevelop_lines, write_halcon
 from telerig.io.exchange.export.volume import seen_points, working_volume
+from telerig.rig import distortion
 from telerig.rig.pose import Pose
 
 # ------------------------------------------------------------------------------------- HALCON
@@ -142,6 +144,24 @@ def test_halcon_distortion_is_fitted_and_its_error_stated(
         assert ours.misfit.rms_px == pytest.approx(np.sqrt(np.mean(distance**2)), rel=1e-6)
         assert 0 < distance.max() < limit_px
         assert np.linalg.norm(pixels - camera.project(some), axis=1).max() <= distance.max()
+
+
+def test_halcon_takes_the_coefficients_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another order of the coefficients in the distortion module must not change the export."""
+    cameras = pair(**DISTORTED)
+    usual = halcon_cameras(cameras)
+    last = len(distortion.COEFFICIENTS) - 1
+    monkeypatch.setattr(halcon, "COEFFICIENTS", distortion.COEFFICIENTS[::-1])
+    monkeypatch.setattr(
+        halcon,
+        "coefficient_jacobian",
+        lambda xy, which: distortion.coefficient_jacobian(xy, [last - i for i in which]),
+    )
+    for name in ("undistort", "distortion_jacobian"):
+        function = getattr(distortion, name)
+        monkeypatch.setattr(halcon, name, lambda xy, c, f=function: f(xy, c[::-1]))
+    for before, after in zip(usual, halcon_cameras(cameras)):
+        assert after.parameters == before.parameters and after.misfit == before.misfit
 
 
 def test_halcon_states_the_residual_perspective_it_leaves_out() -> None:

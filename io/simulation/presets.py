@@ -1,4 +1,8 @@
-"""Named examples of simulated calibrations and runs: add one here, and every command knows it."""
+"""Named examples of simulated calibrations and runs.
+
+Every command knows a preset that is added here. Add its name to the help of `scripts/simulate.py`
+too.
+"""
 
 from __future__ import annotations
 

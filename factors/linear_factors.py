@@ -92,7 +92,8 @@ def add_linear_factors(
     noise, factor = _unit_noise(rows), cast(Any, gtsam.JacobianFactor)
     columns: list[Any] = []
     for key, block in kept:
-        columns.append(np.broadcast_to(np.asarray(key), (count,)).tolist())
-        columns.append(np.broadcast_to(block, (count, *block.shape[-2:])))
+        columns.append(np.asarray(key).tolist() if np.ndim(key) else [key] * count)
+        columns.append(block if block.ndim == 3 and len(block) == count else [block] * count)
+    push_back = graph.push_back
     for parts in zip(*columns, rhs):
-        graph.push_back(factor(*parts, noise))
+        push_back(factor(*parts, noise))

@@ -22,6 +22,8 @@ from telerig.estimator.calibration.solver.system import System
 from telerig.factors.linear_factors import add_linear_factors
 from telerig.factors.projection import State
 
+DOTS_OF_GROUP = 10
+"""Number of dots, about, that are one variable of the graph; see docs/decisions/020."""
 LEAST_PIVOT = 1e-10
 """Smallest pivot, for columns of unit length, with which the problem still counts as determined."""
 
@@ -48,34 +50,41 @@ class GraphLayout:
     per_group : number of dots in a group.
     size : W, the number of scalars in all variables.
     places : for each variable the indices of its scalars among the W.
-    families : keys of the variables, collected by size.
+    families : keys (M,) of the variables of one size, and where their scalars stand (M, size).
     order : keys in the order of elimination.
     """
 
     def __init__(self, system: System) -> None:
         problem, self.system = system.problem, system
         count, cameras, views = len(problem.dot_ids), len(problem.cameras), len(problem.views)
-        self.per_group = 8 if count <= 30 else 16
-        groups = -(-count // self.per_group)
+        groups = max(1, round(count / DOTS_OF_GROUP))
+        self.per_group = -(-count // groups)
         self.view_key = cameras + np.arange(views)
         self.group_key = cameras + views + np.arange(groups)
         self.size = system.dots_at + 3 * self.per_group * groups
         self.of_views = np.arange(system.views_at, system.dots_at).reshape(views, 6)
         self.of_groups = np.arange(system.dots_at, self.size).reshape(groups, -1)
         self.places = [*system.camera_places, *self.of_views, *self.of_groups]
-        self.families = [np.array([c]) for c in range(cameras)]
-        self.families += [self.view_key, self.group_key]
+        families = [(np.array([c]), system.camera_places[c][None]) for c in range(cameras)]
+        families += [(self.view_key, self.of_views), (self.group_key, self.of_groups)]
+        self.families = families
         first, second = self.view_key, self.group_key
         if views <= count:
             first, second = second, first
         self.order = [*first.tolist(), *second.tolist(), *range(cameras)]
         self.images = [self._images(obs.view, obs.dot) for obs in system.images]
 
+    @cached_property
+    def every_place(self) -> Ints:
+        """Return the places of all variables, one after the other in the order of their keys."""
+        return np.concatenate(self.places)
+
     def _images(self, view: Ints, dot: Ints) -> _Images:
         group, slot = np.divmod(dot, self.per_group)
         pairs, which = np.unique(view * len(self.group_key) + group, return_inverse=True)
         return _Images(*np.divmod(pairs, len(self.group_key)), which * self.per_group + slot)
 
+    @cached_property
     def gtsam_order(self) -> Any:
         """Return the order of elimination as a `gtsam.Ordering`."""
         import gtsam
@@ -220,8 +229,8 @@ class GraphEquations:
         graph.push_back(self._undamped)
         weight = np.sqrt(np.where(self.untouched, 1.0, damping))
         if weight.any():
-            for keys in self.layout.families:
-                diagonal = weight[[self.layout.places[key] for key in keys.tolist()]]
+            for keys, places in self.layout.families:
+                diagonal = weight[places]
                 blocks = diagonal[:, None] * np.eye(diagonal.shape[1])
                 add_linear_factors(graph, (keys,), (blocks,), np.zeros_like(diagonal))
         return graph
@@ -235,7 +244,7 @@ class GraphEquations:
         """
         import gtsam
 
-        graph, order = self._graph(damping), self.layout.gtsam_order()
+        graph, order = self._graph(damping), self.layout.gtsam_order
         try:
             return graph.eliminateSequential(order)
         except RuntimeError:
@@ -248,7 +257,7 @@ class GraphEquations:
         The predicted gain is the decrease of the cost according to the linear model.
         """
         step = np.empty(self.layout.size)
-        step[np.concatenate(self.layout.places)] = self._net(damping).optimize().vector()
+        step[self.layout.every_place] = self._net(damping).optimize().vector()
         step *= self.scale
         return step[: self.layout.system.size], float(0.5 * step @ self.right)
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from telerig.io.rig_file.description import RigDescription
 
 Stage = Callable[[str, int, int], None]
-"""Progress: (what, done, of)."""
+"""Function that reports progress. Its arguments: name of the step, parts done, parts in all."""
 
 
 MEDIA = ("air", "water")
@@ -33,14 +33,18 @@ MEDIA = ("air", "water")
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """A calibration with the detections it came from; None when it came from dots.csv."""
+    """Hold a calibration and the detected dots that it was made from.
+
+    calibration : the calibration.
+    detected : the dots detected in the images; None if the dots were read from `dots.csv`.
+    """
 
     calibration: Calibration
     detected: DatasetDots | None
 
 
 def checked_medium(medium: str) -> str:
-    """Raises InputError for anything but "air" and "water"."""
+    """Return ``medium`` unchanged. Raises InputError for anything but "air" and "water"."""
     if medium not in MEDIA:
         raise InputError(f"unknown medium {medium!r}", todo=f"known: {', '.join(MEDIA)}")
     return medium
@@ -58,8 +62,11 @@ def check_options(
 ) -> None:
     """Check the options of `run_calibration` before any image is read.
 
-    cameras : names of the rig's, where they are known already.
-    Raises InputError or CalibrationError for an unknown word.
+    model, solver, medium, dots_free, outlier_sd : as for `run_calibration`; other options are
+        ignored.
+    cameras : names of the rig's cameras; empty if they are not known yet.
+
+    Raises InputError or CalibrationError for a value that is not allowed.
     """
     checked_medium(medium)
     checked_outlier_sd(outlier_sd)
@@ -73,7 +80,7 @@ def check_options(
 
 
 def nominal_cameras(rig: RigDescription) -> tuple[Camera, ...]:
-    """The cameras as `rig.toml` states them, all at the rig's origin."""
+    """Return the cameras with the intrinsics of `rig.toml`, all with the pose of the rig frame."""
     return tuple(
         Camera.create(
             c.name, c.image_size_px, c.scale_px_per_mm,
@@ -94,14 +101,19 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from the images or the dots of a dataset.
 
+    dataset : the dataset, which holds `rig.toml` and the images or the table of dots.
     model : "auto" (chosen for each camera), the name of a lens model (none, radial, brown,
-        kappa+radial, ...), or one by camera: {"left": "brown"}, "left=brown,right=auto".
+        kappa+radial, ...), or one for each camera: {"left": "brown"}, "left=brown,right=auto".
     solver : "gtsam", "schur" (the same minimum, faster for many dots) or "auto".
-    medium : "air" or "water", of the target; with `[walls]` in `rig.toml` runs are in water.
-    outlier_sd : standard deviations from the model beyond which a dot is left out.
-    seed : recorded with the result; the calibration itself draws no random numbers.
+    medium : "air" or "water", in which the target is. If `rig.toml` has `[walls]` (refractive
+        windows), the runs are in water in both cases.
+    outlier_sd : a dot that is further from the model than this is left out, in standard
+        deviations.
+    seed : number that is written with the result; the calibration itself uses no random numbers.
 
-    Raises InputError, DetectionError or CalibrationError, each with what, where and what to do.
+    Returns the calibration; no file is written.
+    Raises InputError, DetectionError or CalibrationError; each says what happened, where, and what
+    to do.
     """
     run = run_calibration(
         dataset, model=model, solver=solver, medium=medium, outlier_sd=outlier_sd, seed=seed
@@ -122,10 +134,17 @@ def run_calibration(
     pictures: bool = False,
     detected: DatasetDots | None = None,
 ) -> CalibrationRun:
-    """Like `calibrate`, with progress, the choice of what dots may do, and the detections.
+    """Calibrate like `calibrate`, with further options, and return the detected dots as well.
 
-    pictures : draw what was found over each image, as `write_results` needs.
-    detected : made before, by `detect` or `telerig.estimator.calibration.watch`; None detects now.
+    dataset, model, solver, medium, seed, outlier_sd : as for `calibrate`.
+    dots_free : how far the target's dots may move from their nominal positions; "3d" lets them
+        move in all three directions. `DOTS_FREE` lists the allowed values.
+    stage : function that is called with the progress, see `Stage`; None for none.
+    pictures : whether to draw the detections over each image, as `write_results` needs.
+    detected : dots that `detect` or `telerig.estimator.calibration.watch` found before; None
+        detects them now.
+
+    Raises the same errors as `calibrate`.
     """
     check_options(
         model=model, solver=solver, medium=medium, dots_free=dots_free, outlier_sd=outlier_sd,
@@ -167,7 +186,15 @@ def solve_dots(
     stage: Stage | None = None,
     notes: Sequence[str] = (),
 ) -> Calibration:
-    """The self-calibration of a table of dots, without the stage and walls that runs go through."""
+    """Calibrate the rig from a table of dots, without the stage's axis and the runs' windows.
+
+    dataset : gives the rig and the target; its images are not read.
+    table : the measured dots, a row for each dot in each image.
+    model, solver, medium, dots_free, outlier_sd, stage : as for `run_calibration`.
+    notes : sentences that the calibration keeps.
+
+    The refractive windows are part of the model only if ``medium`` is "water".
+    """
     from telerig.estimator.calibration.refractive_windows import stated_windows, with_windows
     from telerig.estimator.calibration.self_calibration import self_calibrate
 
@@ -191,9 +218,11 @@ def solve_dots(
 def detect(
     dataset: Dataset, *, stage: Stage | None = None, pictures: bool = False
 ) -> DatasetDots | None:
-    """The dots of a dataset's images; None where it brings a table of dots instead.
+    """Detect the dots in all images of a dataset.
 
-    pictures : as for `run_calibration`.
+    stage, pictures : as for `run_calibration`.
+
+    Returns the dots, or None if the dataset holds a table of dots instead of images.
     """
     if dataset.source != "images":
         return None
@@ -213,7 +242,10 @@ def _load_libraries() -> None:
 
 
 def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> dict[str, Any]:
-    """Travel axis and encoder scale from `stage_axis/`; empty without it, or a usable rig."""
+    """Return the travel axis and encoder scale that the folder `stage_axis/` gives.
+
+    The result is empty if there is no such folder or if the calibration was rejected.
+    """
     from telerig.estimator.calibration.stage.stage_axis import stage_axis_from
 
     if calibration.verdict["status"] == "REJECTED":

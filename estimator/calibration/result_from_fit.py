@@ -40,13 +40,18 @@ BAD_FLOOR = 5.0
 
 @dataclass(frozen=True)
 class Fit:
-    """A finished self-calibration.
+    """Hold a finished self-calibration of C cameras.
 
-    models : the chosen one of each camera.  choice : None when they were given.
-    centre_held : (C, 4, 4) the cameras' poses with the image centres held at the middle of the
-        image, when strong perspective frees them.
-    mirror : None until it is known which of the two mirror solutions is kept.
-    mirrored_cost : of the other one.  tilts_deg : (view, camera) -> tilt of the target.
+    robust : the fit, with its problem, its solution and the weights of the dots.
+    models : name of the lens model of each camera.
+    model_words : a phrase about the models for the report.
+    choice : how the models were chosen; None if the user gave them.
+    centre_held : (C, 4, 4) poses of the cameras from a fit with the image centres held at the
+        middle of the image; None if the centres are held there in this fit, too.
+    mirror : which of the two solutions of the mirror ambiguity is kept; None until it is decided.
+    mirrored_cost : cost of the other solution (half the chi-square).
+    tilts_deg : by (index of the view, index of the camera), tilt of the target, in degrees.
+    notes : notes for the user.
     """
 
     robust: RobustFit
@@ -61,7 +66,7 @@ class Fit:
 
     @property
     def model(self) -> str:
-        """In one name."""
+        """Return the models of all cameras as one name."""
         return joint_name(self.models, [c.name for c in self.robust.problem.cameras])
 
 
@@ -74,10 +79,15 @@ def calibration_from_fit(
     nominal_rotvec_deg: Nominal,
     name: str,
 ) -> Calibration:
-    """Assemble the public result.
+    """Make the public `Calibration` from a finished fit.
 
-    free : per camera, the intrinsics of which the covariance speaks.
-    weak : sentences of `checks.weak_parameters` on the fit.
+    fit : the finished fit; its ``mirror`` has to be decided.
+    joint : covariance of all parameters.
+    free : for each camera, the names of the intrinsics that the covariance contains.
+    weak : sentences of `checks.weak_parameters` about this fit.
+    nominal_rotvec_deg : by index of a camera, its nominal rotation relative to the first (rotation
+        vector, degrees), as `rig.toml` states it.
+    name : name of the rig.
     """
     problem, state = fit.robust.problem, fit.robust.solution.state
     cameras = cameras_from_state(problem, state)
@@ -118,7 +128,7 @@ def calibration_from_fit(
 
 
 def dot_table(problem: Problem) -> pd.DataFrame:
-    """The measured dots as `results/calibration/dots.csv` holds them."""
+    """Return the table of the measured dots (for `dots.csv`), one row for each dot in each image."""
     ids = problem.dot_ids[problem.dot]
     row, column = problem.target.row_column_from_id(ids)
     return pd.DataFrame(
@@ -132,7 +142,11 @@ def dot_table(problem: Problem) -> pd.DataFrame:
 
 
 def residual_table(problem: Problem, state: State) -> pd.DataFrame:
-    """`residuals.csv`: measured minus predicted, weight, and the reason for a weight below one."""
+    """Return the table of the residuals (for `residuals.csv`), one row for each dot in each image.
+
+    Its columns are those of `dot_table`, the residual du_px and dv_px (measured minus predicted,
+    px), the weight in the fit, and the reason if this weight is less than 1.
+    """
     residual = -pixel_residuals(problem, state)
     distance = np.sqrt(squared_distance(residual, problem.covariance_px2))
     table = dot_table(problem)
@@ -153,7 +167,10 @@ def _reason(distance: float, lost_view: bool, limit: float) -> str:
 
 
 def odd_views(problem: Problem) -> list[str]:
-    """Views of which most dots were left out: wrongly numbered, or of a target that moved."""
+    """Return a sentence for each view of which more than half of the dots were left out.
+
+    The cause may be wrong numbers of the dots, or a target that moved between the cameras' images.
+    """
     measured = np.bincount(problem.view, minlength=len(problem.views))
     kept = np.bincount(problem.view[problem.weight > 0.5], minlength=len(problem.views))
     return [
@@ -195,7 +212,7 @@ def _scatter(covariance: Array) -> float:
 
 
 def _rms(values: Array) -> float:
-    """Per coordinate."""
+    """Return the RMS of all values, NaN if there are none."""
     return float(np.sqrt((values**2).mean())) if values.size else float("nan")
 
 
@@ -220,7 +237,7 @@ def _geometry(fit: Fit, joint: JointCovariance) -> dict[str, Any]:
 
 
 def _from_first(fit: Fit, joint: JointCovariance, camera: int) -> dict[str, Any]:
-    """Rotation of a camera against the first, and the angle between their axes."""
+    """Return a camera's rotation relative to the first, and the angle between the optical axes."""
     turn = fit.robust.solution.state.rig_from_camera[camera, :3, :3].T
     rotvec = rotvec_from_rotation(turn)
     angle = float(np.arccos(np.clip(turn[2, 2], -1, 1)))
@@ -240,10 +257,10 @@ def _from_first(fit: Fit, joint: JointCovariance, camera: int) -> dict[str, Any]
 
 
 def _angle_systematic(fit: Fit, angle_rad: float, camera: int) -> float:
-    """How far the angle moves when the image centres are held at the middle of the image.
+    """Return how far the angle (rad) changes if the image centres are held at the image's middle.
 
-    With strong perspective the angle trades with the centres; the centres come from the
-    perspective alone only as far as the distortion model is right. 0 when they are held anyway.
+    With strong perspective, a change of the angle and a change of the centres have similar effects,
+    and an error of the distortion model moves both. The result is 0 if the centres are held anyway.
     """
     if fit.centre_held is None:
         return 0.0
@@ -251,7 +268,7 @@ def _angle_systematic(fit: Fit, angle_rad: float, camera: int) -> float:
 
 
 def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dict[str, Any]:
-    """How the printed target differs from nominal, a rigid motion and a stretch set aside."""
+    """Return how the printed target differs from the nominal one, as entries of the statistics."""
     dots, nominal = state.dots_mm, problem.nominal_mm
     design = np.c_[nominal[:, :2], np.ones(len(dots))]
     affine, *_ = np.linalg.lstsq(design, dots, rcond=None)
@@ -270,9 +287,9 @@ def _target_shape(problem: Problem, state: State, joint: JointCovariance) -> dic
 
 
 def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str, Any]:
-    """Residuals in space, and the predicted uncertainty of a triangulated point (um per axis).
+    """Return the residuals in space and the predicted uncertainty of points (um per axis).
 
-    The calibration's share is without the common rigid motion of all points.
+    The part that the calibration's errors cause does not include a rigid motion of all points.
     """
     if len(problem.cameras) < 2:
         return {}
@@ -296,8 +313,10 @@ def _space(calibration: Calibration, problem: Problem, state: State) -> dict[str
 
 
 def _seen_in_space(problem: Problem, state: State) -> tuple[Array, Array]:
-    """(C, K, 2) pixels of dots kept in two cameras of a view or more, NaN elsewhere, and the dots'
-    (K, 3) fitted places.
+    """Return the pixels and the fitted positions of the dots that two or more cameras see.
+
+    Returns (C, K, 2) pixels in C cameras of K dots, NaN where a camera does not see the dot, and
+    (K, 3) positions in the rig frame, in mm. Only dots with a weight above 0.5 are used.
     """
     key = problem.view * len(problem.dot_ids) + problem.dot
     kept = problem.weight > 0.5
@@ -352,7 +371,11 @@ def _kappa_hint(fit: Fit) -> str:
 
 
 def _mirror(fit: Fit, nominal_rotvec_deg: Nominal) -> dict[str, Any]:
-    """``nominal_rotvec_deg`` is one vector of a pair, and by camera of more."""
+    """Return the entry "twin" of `calibration.json`, about the mirror ambiguity.
+
+    Its ``nominal_rotvec_deg`` is one vector for two cameras, and a mapping by the camera's name for
+    more of them.
+    """
     assert fit.mirror is not None
     cameras = fit.robust.problem.cameras
     stated: Any = {cameras[c].name: list(rotvec) for c, rotvec in nominal_rotvec_deg.items()}
@@ -368,7 +391,7 @@ def _mirror(fit: Fit, nominal_rotvec_deg: Nominal) -> dict[str, Any]:
 
 
 def _model(fit: Fit) -> dict[str, Any]:
-    """The chosen model, why, and a row for each step of the choice, taken or not."""
+    """Return the entry "model" of `calibration.json`: the models and each step of their choice."""
     cameras = [c.name for c in fit.robust.problem.cameras]
     steps = fit.choice.steps if fit.choice is not None else ()
     return {
@@ -380,7 +403,7 @@ def _model(fit: Fit) -> dict[str, Any]:
 
 
 def _step(step: Step, before: Step, cameras: list[str]) -> dict[str, Any]:
-    """What was not fitted, or did not have to predict, is None."""
+    """Return one step of the choice as a row; values that were not computed are None."""
     row: dict[str, Any] = {
         "model": joint_name([name_of(lens) for lens in step.lenses], cameras),
         "camera": cameras[step.camera] if step.camera >= 0 else "",

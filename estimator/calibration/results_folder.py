@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def input_files(dataset: Dataset) -> list[Path]:
-    """The files that a calibration reads."""
+    """Return the paths of the files that a calibration of this dataset reads."""
     beside = dataset.path / "stage_axis"
     files = [dataset.path / "rig.toml", *sorted(p for p in beside.rglob("*") if p.is_file())]
     if dataset.source == "dots":
@@ -33,9 +33,10 @@ def input_files(dataset: Dataset) -> list[Path]:
 
 
 def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
-    """The report of a results folder, whose path is returned.
+    """Write the HTML report of a results folder and return its path.
 
-    dot : the pictures of its dot_example.npz, where they are drawn already.
+    folder : a results folder with `calibration.json` and the other files of a calibration.
+    dot : the pictures of `dot_example.npz`, if they are drawn already; None draws them now.
     """
     from telerig.io.report.calibration.report import write_calibration_report
 
@@ -43,14 +44,18 @@ def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
 
 
 class ReportBeside:
-    """`write_report` by an assistant, which draws what it can while the dots are solved for."""
+    """Write the report in a second process, the assistant.
+
+    The assistant draws the pictures that need no calibration while this process calibrates. Call
+    the object with a results folder, as `write_report`; it returns the path of the report.
+    """
 
     def __init__(self, call: Assistant) -> None:
         self._call = call
         self._dot: Callable[[], list[Picture] | None] = lambda: None
 
     def begin(self, detected: DatasetDots) -> None:
-        """Draw what needs no calibration."""
+        """Start to draw the pictures that need the detected dots only."""
         self._dot = self._call.begin(_draw_dot, detected.example)
 
     def __call__(self, folder: Path) -> Path:
@@ -59,9 +64,11 @@ class ReportBeside:
 
 @contextmanager
 def report_beside(wanted: bool) -> Iterator[ReportBeside | None]:
-    """A process that loads the report's libraries while this one detects and calibrates.
+    """Start a second process, which loads the report's libraries while this one calibrates.
 
-    None where no report is wanted.
+    wanted : whether a report is wanted.
+
+    Yields a `ReportBeside`, or None if no report is wanted. The process ends with the context.
     """
     if not wanted:
         yield None
@@ -96,11 +103,18 @@ def write_results(
     change: RigComparison | None = None,
     report: Callable[[Path], object] | None = write_report,
 ) -> Path:
-    """Fill ``folder`` with what docs/files.md lists; returns the report's path.
+    """Write the results folder of a calibration; `docs/files.md` lists its files.
 
-    change : since an earlier calibration, for comparison.json.
-    report : writes the report of a folder; None leaves it out.
-    Files appear together at the end, so an interrupted command leaves the old ones.
+    dataset : the dataset that was calibrated.
+    run : the calibration and the detections that it was made from.
+    folder : the folder to write. All files appear together at the end, so that an interrupted
+        command leaves the old ones.
+    command, options, seconds : the command, its options by name, and the time (s) that each part
+        took, by name, for `run.json`.
+    change : comparison with an earlier calibration, for `comparison.json`; None writes none.
+    report : function that writes the report of a folder; None writes no report.
+
+    Returns the path at which the report is, if there is one.
     """
     record = run_record(command, dataset.path, input_files(dataset), options, seconds)
     with atomic_folder(folder) as staged:
@@ -120,7 +134,12 @@ def write_results(
 
 
 def write_uncertainty(calibration: Calibration, path: Path) -> None:
-    """Covariances over the working volume, as docs/files.md lists them."""
+    """Write the covariances of points over the working volume to a NumPy file (.npz).
+
+    calibration : a calibration of two or more cameras.
+    path : the file to write. It holds points_mm (N, 3), calibration_mm2 and measurement_mm2
+        (N, 3, 3) in mm^2, and sigma_px, the noise of the pixels in px.
+    """
     from telerig.estimator.calibration.quality.uncertainty_map import uncertainty_map
 
     found = uncertainty_map(calibration)
@@ -132,7 +151,12 @@ def write_uncertainty(calibration: Calibration, path: Path) -> None:
 
 
 def write_detections(detected: DatasetDots, folder: Path) -> None:
-    """rejected.csv, and where they were made overlays/<camera>/<view>.jpg and dot_example.npz."""
+    """Write what was detected in the images into a results folder.
+
+    The files are `rejected.csv` (candidates that are no dots) and, if they were made,
+    `overlays/<camera>/<view>.jpg` (the detections drawn over the images) and `dot_example.npz`
+    (one dot with its fit).
+    """
     from telerig.io.files.csv_table import write_table
 
     write_table(detected.rejected, folder / "rejected.csv")

@@ -20,18 +20,22 @@ MINIMUM_DOTS = 4
 PARALLEL_DEG = 3.0
 SMALL_TILT_DEG = 10.0
 PERSPECTIVE = 0.01
-"""kappa * rho from which on a lens shows the depth of a view."""
+"""If kappa * rho (no unit) exceeds this, the image shows the depth of a view. Rho is half
+the diagonal of the field of view, in mm."""
 LOOSE = 0.03
-"""How much less the views fix an offset than the best fixed one, to call it undetermined."""
+"""An offset is undetermined if the views determine it less well than the best one by this factor
+or more."""
 CLEAR_MISFIT = 0.1
-"""Misfit of an image's map, over the spread of its dots, up to which the map is believed."""
+"""Largest misfit of an image's map that is accepted, as a share of the spread of its dots."""
 
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence for the user.
+    """Hold a sentence for the user.
 
-    code : what it is about.  affects_verdict : the calibration is then usable with warnings only.
+    code : short name of the subject, for example "few views".
+    words : the sentence.
+    affects_verdict : whether the verdict then is "USABLE, with warnings" instead of "GOOD".
     """
 
     code: str
@@ -41,18 +45,28 @@ class Note:
 
 @dataclass(frozen=True)
 class PreCheck:
-    """tilts_deg : (view, camera) -> tilt of the target to that camera; notes for the user."""
+    """Hold the result of the checks before a calibration.
+
+    tilts_deg : by (index of the view, index of the camera), the angle between the target's normal
+        and the optical axis, in degrees.
+    notes : sentences for the user.
+    """
 
     tilts_deg: dict[tuple[int, int], float]
     notes: tuple[Note, ...]
 
 
 def pre_check(problem: Problem, dots_mm: Array, *, unknown_dots: bool) -> PreCheck:
-    """Refuse what cannot be solved, warn of what will be weak.
+    """Check before a calibration whether the views can determine it.
 
+    problem : the measured dots and the nominal cameras.
+    dots_mm : (N, 3) positions of the target's N dots in its frame, in mm.
+    unknown_dots : whether these positions are only estimates; then more views are needed.
+
+    Returns the tilts of the target, and notes about what will be poorly determined.
     Raises CalibrationError for too few views, too few dots or views that are all parallel; the
-    message names what is undetermined and what to do. DetectionError for mirrored images of an
-    opaque plate.
+    message names what is undetermined and what to do. Raises DetectionError for mirrored images of
+    a target that is visible from one side only.
     """
     maps = image_maps(problem, dots_mm)
     stereo = len(problem.cameras) > 1
@@ -126,13 +140,16 @@ def _refuse_too_few(
 
 
 def _those(problem: Problem) -> str:
-    """The cameras that must see a view, in words."""
+    """Return in words which cameras must see a view."""
     known = {1: "the camera", 2: "both cameras"}
     return known.get(len(problem.cameras), "two cameras or more")
 
 
 def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
-    """Every camera must share two views with another one of those that lead to the first."""
+    """Raise CalibrationError if a camera is connected to the first one by fewer than two views.
+
+    The connection may lead over other cameras; images : (view, camera) of all usable images.
+    """
     for a, b in overlap_tree(problem, images):
         count = sum({(v, a), (v, b)} <= images for v in range(len(problem.views)))
         if count < 2:
@@ -145,11 +162,13 @@ def _refuse_thin_links(problem: Problem, images: set[tuple[int, int]]) -> None:
 
 
 def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
-    """Cameras whose offset against the others no view fixes, though their rotation is known.
+    """Return a note for each camera whose offset relative to the others no view determines.
 
-    A telecentric camera sees no depth, so a view of two cameras fixes their offset along the
-    common perpendicular of their axes alone, and one of three cameras closes what is left. The
-    views' positions are eliminated from the linear equations of all offsets; see docs/theory.md.
+    A telecentric camera sees no depth. So a view that two cameras see determines their offset only
+    along the common perpendicular of their axes; a view that three cameras see determines the
+    rest. The views' positions are eliminated from the linear equations of all offsets; see
+    docs/theory.md.
+    With fewer than three cameras, or with clear perspective in all lenses, there is no note.
     """
     count = len(problem.cameras)
     kappa_rho = state.intrinsics[:, INDEX["kappa_per_mm"]] * np.array(problem.rho_mm)
@@ -186,10 +205,10 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
 
 
 def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[Note]:
-    """Refuse images of which some are mirrored.
+    """Check whether images are mirrored; raise DetectionError if only some of them are.
 
-    Not judged: an image seen nearly edge on, and one in which the dots are not where any view of
-    the target has them.
+    Two kinds of images are left out of this check: those that show the target nearly edge on, and
+    those whose dots do not fit the target. Returns a note if all images are mirrored.
     """
     hands = {}
     for (v, c), m in maps.items():
@@ -216,9 +235,11 @@ def _tilt_deg(jacobian: Array) -> float:
 def _refuse_parallel(
     problem: Problem, maps: dict[tuple[int, int], ImageMap], usable: list[int]
 ) -> None:
-    """Views are parallel when each camera sees them foreshortened alike along the same dots.
+    """Raise CalibrationError if the target has the same tilt in all views.
 
-    A roll of the plate in its own plane is enough to tell them apart: see docs/theory.md.
+    This is so if each camera sees it foreshortened by the same factor along the same direction of
+    the target. A rotation of the target in its own plane changes this direction, so it is enough
+    to distinguish two views: see docs/theory.md.
     """
     spread = 0.0
     for c in range(len(problem.cameras)):
@@ -254,7 +275,11 @@ def _coverage_note(problem: Problem, c: int) -> list[Note]:
 
 
 def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:
-    """Sentences on the rig's parameters that are left to their priors or correlate with others."""
+    """Return sentences about parameters of the rig that the views determine poorly.
+
+    A parameter is named if its standard deviation exceeds half of its prior's, or if its
+    correlation with another one exceeds 0.98.
+    """
     names, covariance = joint.rig_block()
     sd = np.sqrt(np.diag(covariance))
     out = []

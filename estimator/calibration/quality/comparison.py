@@ -26,7 +26,7 @@ from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
 from telerig.rig.triangulation import triangulate_any
 
 UNLIKELY = 1e-3
-"""A difference that chance gives less often than this is called a movement."""
+"""A difference with a smaller probability under chance alone is called a movement."""
 _RANK = 1e-3
 """Directions with a smaller share of the largest standard deviation are left out: there, the
 second order of the others is larger than the prediction."""
@@ -37,7 +37,13 @@ _LEAST_CHANCE = 1e-12
 
 @dataclass(frozen=True)
 class Rig:
-    """What is compared: C cameras, their free intrinsics, the covariance of the rig block."""
+    """Hold what is compared of one calibration.
+
+    cameras : the C cameras.
+    free : for each camera, the names of its free (estimated) intrinsics.
+    covariance : (P, P) covariance of the rig block's P parameters: all free intrinsics, camera by
+        camera, then the rotation (rad) and translation (mm) of each camera but the first.
+    """
 
     cameras: tuple[Camera, ...]
     free: tuple[tuple[str, ...], ...]
@@ -46,7 +52,13 @@ class Rig:
 
 @dataclass(frozen=True)
 class Change:
-    """One quantity: ``change`` of second minus first in ``unit``, with its standard deviation."""
+    """Hold the change of one quantity between two calibrations.
+
+    quantity : its name for the reader.
+    unit : unit of ``change`` and ``sd``: "urad", "um" or "ppm".
+    change : value of the second calibration minus that of the first.
+    sd : standard deviation of the change.
+    """
 
     quantity: str
     unit: str
@@ -55,15 +67,20 @@ class Change:
 
     @property
     def deviations(self) -> float:
+        """Return the change divided by its standard deviation; infinite if the latter is 0."""
         return self.change / self.sd if self.sd > 0 else np.inf * np.sign(self.change)
 
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """The same pixels through both rigs, best rigid motion removed.
+    """Hold how far two rigs place the same pixels apart in space.
 
-    points_mm, shift_mm : (N, 3).  sd_mm : (N, 3) expected of the shift.  p_value : how often chance
-    gives as large a field, by chi-square over the directions that the two covariances span.
+    points_mm : (N, 3) points in the rig frame, in mm.
+    shift_mm : (N, 3) point of the second rig minus point of the first, from the same pixels, after
+        the best rigid motion has been removed, in mm.
+    sd_mm : (N, 3) standard deviations of the shift that both covariances predict, in mm.
+    p_value : probability that the predicted errors alone cause a shift as large as this, from a
+        chi-square test.
     """
 
     points_mm: Array
@@ -73,21 +90,26 @@ class FieldDifference:
 
     @property
     def rms_um(self) -> float:
-        """Per axis."""
+        """Return the RMS of the shift per axis, in um."""
         return float(1e3 * np.sqrt(np.mean(self.shift_mm**2)))
 
     @property
     def predicted_um(self) -> float:
-        """What `rms_um` is for two calibrations of a rig at rest."""
+        """Return the value of `rms_um` (um) that is expected if the rig did not change."""
         return float(1e3 * np.sqrt(np.mean(self.sd_mm**2)))
 
 
 @dataclass(frozen=True)
 class RigComparison:
-    """changes : four of each camera but the first (rotation, offset), then the C scales.
+    """Hold the comparison of two calibrations of one rig with C cameras.
 
-    cameras : their names.  p_moved : of the poses between the cameras.
-    exchanged : each camera now has the scale that the other had.  media : of first and second.
+    cameras : names of the C cameras.
+    changes : for each camera but the first, its rotation about x, y and z and its offset along the
+        common perpendicular, both relative to the first camera; then the C changes of the scales.
+    field : how far the two rigs place the same pixels apart in space.
+    p_moved : probability that errors alone cause changes of the poses as large as these.
+    exchanged : whether each of two cameras now has the scale that the other one had.
+    media : "air" or "water", in which the target was, for the first and the second calibration.
     """
 
     cameras: tuple[str, ...]
@@ -99,19 +121,24 @@ class RigComparison:
 
     @property
     def identical(self) -> bool:
-        """The same to rounding, as no two independent sets of views are."""
+        """Return whether both calibrations are equal except for rounding errors.
+
+        Then both come from the same views.
+        """
         return self.field.rms_um < _ROUNDING * self.field.predicted_um
 
     @property
     def moved(self) -> bool:
+        """Return whether a camera moved relative to the first by more than chance explains."""
         return self.p_moved < UNLIKELY
 
     @property
     def differs(self) -> bool:
+        """Return whether points in space differ by more than chance explains."""
         return self.field.p_value < UNLIKELY
 
     def words(self) -> str:
-        """The verdict for a reader."""
+        """Return the result as one sentence for the user."""
         if self.identical:
             return (
                 "both calibrations are the same to rounding, so they come from the same views. To "
@@ -135,7 +162,7 @@ class RigComparison:
         return "; ".join([first, *self._scale_words(), second, *self._medium_words()])
 
     def _size(self, camera: int) -> str:
-        """How far a camera moved against the first."""
+        """Return in words how far a camera (by index) moved relative to the first."""
         own = self.changes[4 * camera - 4 : 4 * camera]
         shift, turn = own[3], _norm(own[:3])
         between = "the cameras"
@@ -147,7 +174,7 @@ class RigComparison:
         )
 
     def _scale_words(self) -> list[str]:
-        """Of scales that changed by more than chance."""
+        """Return the sentence about scales that changed by more than chance; empty if none did."""
         if self.exchanged:
             return [
                 "each camera has the scale that the other one had, as if their images or cables "
@@ -169,7 +196,7 @@ class RigComparison:
         ]
 
     def as_dict(self) -> dict[str, Any]:
-        """For comparison.json."""
+        """Return the content of `comparison.json`."""
         return {
             "verdict": "MOVED" if self.moved else "DIFFERENT" if self.differs else "SAME",
             "words": self.words(),
@@ -184,12 +211,13 @@ class RigComparison:
 
 
 def compare_calibrations(first: Calibration, second: Calibration) -> RigComparison:
-    """How the rig changed from ``first`` to ``second``.
+    """Compare two calibrations of one rig: how did it change from ``first`` to ``second``?
 
-    The two are taken as independent: errors that they share (a target's stated distance) make the
-    standard deviations too large, never too small.
+    The errors of the two are taken as independent. Errors that they share, for example of the
+    target's stated distance, make the standard deviations too large, never too small.
+    Refractive windows are left out of the comparison.
 
-    Raises InputError for rigs with other cameras, image sizes, or a single camera.
+    Raises InputError if the two have different cameras or image sizes, or only one camera.
     """
     check_same_rig(first.cameras, second.cameras)
     found = compare_rigs(_rig(first), _rig(second))
@@ -197,7 +225,7 @@ def compare_calibrations(first: Calibration, second: Calibration) -> RigComparis
 
 
 class Named(Protocol):
-    """A camera, calibrated or of `rig.toml`."""
+    """Describe what `check_same_rig` needs of a camera, calibrated or of `rig.toml`."""
 
     @property
     def name(self) -> str: ...
@@ -206,7 +234,11 @@ class Named(Protocol):
 
 
 def check_same_rig(first: Sequence[Named], second: Sequence[Named]) -> None:
-    """Raises InputError for other cameras, another order, other image sizes, or a single camera."""
+    """Check that two lists of cameras belong to the same rig.
+
+    Raises InputError if names, order or image sizes (width and height in px) differ, or if both
+    lists have a single camera.
+    """
     mine, theirs = ([(c.name, tuple(c.image_size_px)) for c in k] for k in (first, second))
     if len(mine) < 2 and len(theirs) < 2:
         raise InputError(
@@ -232,7 +264,10 @@ def _named(cameras: list[tuple[str, tuple[int, ...]]]) -> str:
 
 
 def compare_rigs(first: Rig, second: Rig) -> RigComparison:
-    """The differences second minus first, with covariances added."""
+    """Compare two rigs with the same cameras.
+
+    Returns the changes, second minus first; their covariance is the sum of both covariances.
+    """
     cameras = tuple(camera.name for camera in first.cameras)
     pose, covariance = _pose_change(first, second)
     sd = np.sqrt(np.diag(covariance))
@@ -254,7 +289,7 @@ def compare_rigs(first: Rig, second: Rig) -> RigComparison:
 
 
 def _exchanged(first: Rig, second: Rig, scales: list[Change]) -> bool:
-    """Whether the scales of two cameras left them by far and came to where the other's was."""
+    """Return whether two cameras have exchanged their scales, beyond the uncertainty."""
     before, after = ([c["scale_px_per_mm"] for c in r.cameras] for r in (first, second))
     left = [abs(c.deviations) > _FAR for c in scales]
     came = [
@@ -276,8 +311,10 @@ def _of(medium: str) -> str:
 
 
 def _pose_change(first: Rig, second: Rig) -> tuple[Array, Array]:
-    """Of each camera but the first, (4,) rotation (rad, rig axes) and offset along the common
-    perpendicular (mm), one after the other; their covariance.
+    """Return how each camera but the first moved relative to the first, and the covariance.
+
+    Each of these cameras has four numbers, one camera after the other: the rotation about the x, y
+    and z axis of the rig frame (rad) and the offset along the common perpendicular (mm).
     """
     others = len(first.cameras) - 1
     changes, rows = [], np.zeros((4 * others, 6 * others))
@@ -308,13 +345,23 @@ def _scale_change(first: Rig, second: Rig, camera: int) -> Change:
 
 
 def after_rigid_motion(found_mm: Array, points_mm: Array) -> Array:
-    """(N, 3) ``found_mm`` less ``points_mm`` about their means, after the best rotation."""
+    """Return how two sets of points differ after the best rigid motion.
+
+    found_mm, points_mm : (N, 3) corresponding points, in mm.
+
+    Returns (N, 3) ``found_mm``, moved rigidly to fit best, minus ``points_mm``, in mm.
+    """
     a, b = found_mm - found_mm.mean(0), points_mm - points_mm.mean(0)
     return np.asarray(a @ nearest_rotation(b.T @ a).T - b)
 
 
 def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference:
-    """Over the working volume: pixels by the first rig, points by the second."""
+    """Compute how far two rigs place the same pixels apart over the working volume.
+
+    first, second : the rigs. The first projects the points of a grid to pixels, and the second
+        triangulates these pixels.
+    steps : number of grid points along each edge of the volume.
+    """
     points = working_volume(first.cameras, steps)
     pixels = [camera.project(points) for camera in first.cameras]
     found = triangulate_any(second.cameras, pixels, 1.0).points_mm
@@ -331,13 +378,18 @@ def field_difference(first: Rig, second: Rig, steps: int = 5) -> FieldDifference
 
 
 def _root(covariance: Array) -> Array:
-    """R with R R^T = covariance."""
+    """Return a matrix R with R R^T = covariance."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
 
 
 def _chance(difference: Array, root: Array) -> float:
-    """Probability of so large a chi-square in the directions of the covariance root root^T."""
+    """Return the probability that chance gives a difference as large as this.
+
+    difference : (K,) values.
+    root : (K, L) matrix; root root^T is their covariance. Directions with (almost) no variance are
+        left out of the chi-square.
+    """
     directions, sizes, _ = np.linalg.svd(root, full_matrices=False)
     seen = sizes > _RANK * sizes.max()
     along = directions[:, seen].T @ difference / sizes[seen]
@@ -345,7 +397,7 @@ def _chance(difference: Array, root: Array) -> float:
 
 
 def _norm(parts: tuple[Change, ...]) -> Change:
-    """Length of a vector of changes; its sd along its own direction."""
+    """Return the length of a vector of changes, with the standard deviation along it."""
     vector, sd = (np.array([getattr(p, k) for p in parts]) for k in ("change", "sd"))
     length = float(np.linalg.norm(vector))
     along = float(np.sqrt(((vector / max(length, 1e-12)) ** 2 * sd**2).sum()))

@@ -17,7 +17,7 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.problem import Problem
 
 UNLIKELY = 1e-3
-"""Of all tests together."""
+"""Probability that any of the tests finds structure in residuals that have none."""
 CELLS = 4
 LEAST_IN_CELL = 5
 _LEAST_DOTS = 3
@@ -25,7 +25,15 @@ _LEAST_DOTS = 3
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """One test: ``size`` of the effect in standard deviations of a residual, chance, and words."""
+    """Hold the result of one test of a camera's residuals.
+
+    name : kind of the test: "region", "direction", "neighbours" or "view".
+    camera : name of the camera.
+    size : size of the effect. For "region" it is in standard deviations of a residual, for
+        "view" it is a ratio to the other views; for the others it is a relative measure.
+    p_value : probability that chance alone gives an effect as large as this.
+    words : sentence for the user.
+    """
 
     name: str
     camera: str
@@ -35,10 +43,16 @@ class ResidualTest:
 
 
 def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[str, Any]:
-    """For `Calibration.diagnostics`: a verdict, words, and every test.
+    """Test whether the residuals of a calibration have any structure left.
 
-    whitened : (M, 2) residuals, leverage : (M, 2, 2) J C J^T of each dot, both in the order of
-    ``problem.observations()``.
+    problem : the calibration's measurements; M is the number of its observations (a dot in an
+        image), in the order of ``problem.observations()``.
+    whitened : (M, 2) whitened residuals in u and v.
+    leverage : (M, 2, 2) covariance of each whitened prediction, which is the share of the noise
+        that the fit absorbs.
+
+    Returns the content of `Calibration.diagnostics`, entry "structure": "sound" (whether no test
+    found anything), "words" (sentences) and "tests" (the fields of each `ResidualTest`).
     """
     obs = problem.observations()
     standardised = standardised_residuals(whitened, leverage)
@@ -60,9 +74,13 @@ def residual_tests(problem: Problem, whitened: Array, leverage: Array) -> dict[s
 
 
 def standardised_residuals(whitened: Array, leverage: Array) -> Array:
-    """(M, 2) whitened residuals over the spread that the fit leaves them: (1 - h)^1/2.
+    """Scale whitened residuals to unit variance.
 
-    leverage : (M, 2, 2) J C J^T of each. A dot that the fit follows wholly counts as zero.
+    whitened : (M, 2) whitened residuals of M dots. The fit absorbs a share of their noise.
+    leverage : (M, 2, 2) this share for each dot.
+
+    Returns (M, 2) residuals, multiplied by (identity - leverage)^(-1/2). Components of which the
+    fit absorbs more than 98 % are set to 0.
     """
     left = np.eye(2) - leverage
     values, vectors = np.linalg.eigh(0.5 * (left + np.swapaxes(left, -1, -2)))
@@ -71,7 +89,11 @@ def standardised_residuals(whitened: Array, leverage: Array) -> Array:
 
 
 def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int]) -> ResidualTest:
-    """Do residuals point the same way in a part of the image? What the lens model lacks."""
+    """Test whether the residuals point the same way in a part of the image.
+
+    If they do, the lens model lacks a term. values : (M, 2) standardised residuals at the pixels
+    uv_px (M, 2); size_px : width and height of the image in px.
+    """
     cell = np.clip((uv_px + 0.5) / np.array(size_px) * CELLS, 0, CELLS - 1).astype(int)
     index = cell[:, 1] * CELLS + cell[:, 0]
     count = np.bincount(index, minlength=CELLS**2)
@@ -92,9 +114,10 @@ def _regions(camera: str, values: Array, uv_px: Array, size_px: tuple[int, int])
 
 
 def _direction(camera: str, values: Array, share: float) -> ResidualTest:
-    """Are residuals longer in one direction? Vibration, motion blur, an interlaced sensor.
+    """Test whether the residuals (M, 2) are longer in one direction.
 
-    share : degrees of freedom per row.
+    Vibration, motion blur or an interlaced sensor can cause this. share : degrees of freedom
+    divided by the number of residuals.
     """
     u, v = values.T
     mean = 0.5 * float((u**2 + v**2).mean())
@@ -142,7 +165,7 @@ def _neighbours(camera: str, values: Array, uv_px: Array, view: Ints) -> Residua
 
 
 def _views(camera: str, values: Array, view: Ints, names: tuple[str, ...]) -> list[ResidualTest]:
-    """Is a view worse than the others?"""
+    """Test for each view whether its residuals are larger than those of the other views."""
     squares = (values**2).sum(-1)
     usual = float(np.median(squares)) / (2 * np.log(2))
     out = []

@@ -30,15 +30,22 @@ from telerig.factors.projection import State
 from telerig.io.report.page.number_format import number
 
 LEAST_VIEWS = 4
-"""In a half; with fewer, a half does not determine a rig."""
+"""Least number of views in each half; fewer do not determine a rig."""
 _SCALE = 1e-7
 
 
 def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
-    """For `Calibration.diagnostics`: words, figures and the field of differences.
+    """Calibrate from each half of the views and compare the two rigs.
 
-    The target's size is common to both halves and tells nothing about repeatability: the known
-    distance, or without one that of two dots far apart, is taken as exact in both.
+    problem, state : the measurements and the solution of the calibration.
+
+    Returns the content of `Calibration.diagnostics`, entry "halves": always "words" (a sentence),
+    and if the check was possible also the number of views of each half, the RMS difference and its
+    prediction (um per axis), the p-value, "agree", and the differences at a grid of points.
+
+    Both halves use the same size of the target, which tells nothing about repeatability. So the
+    known distance of two dots is taken as exact in both; if none is known, the estimated distance
+    of two dots far apart is used.
     """
     if len(problem.cameras) < 2:
         return {"words": "one camera: the split-half check compares points in space and needs two"}
@@ -71,7 +78,8 @@ def split_half_check(problem: Problem, state: State) -> dict[str, Any]:
 def _size(
     problem: Problem, state: State, parts: list[NDArray[np.int64]]
 ) -> tuple[tuple[int, int], float, float] | None:
-    """The estimated distance of two dots far apart that both halves see, as a known one."""
+    """Return two dots far apart that both halves see, their estimated distance (mm), and 0 for
+    its standard deviation (mm); None if the halves share fewer than two dots."""
     weighed = problem.weight > 0
     one, other = (problem.dot[weighed & np.isin(problem.view, views)] for views in parts)
     both = np.intersect1d(one, other)
@@ -102,8 +110,10 @@ def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
 
 
 def _in_turn(problem: Problem) -> NDArray[np.int64]:
-    """The views that are used. Of three cameras or more, those that the same cameras see stand
-    together, so that each half has as many of a kind.
+    """Return the indices of the used views, in the order in which the halves take turns.
+
+    With three or more cameras, views that the same cameras see stand together, so that each half
+    gets equally many of each kind.
     """
     used = np.unique(problem.view[problem.weight > 0])
     if len(problem.cameras) == 2:
@@ -114,7 +124,7 @@ def _in_turn(problem: Problem) -> NDArray[np.int64]:
 
 
 def _images(problem: Problem) -> set[tuple[int, int]]:
-    """(view, camera) of every image with dots enough to place the target."""
+    """Return (view, camera) of each image with enough dots to determine the target's pose."""
     kept = problem.weight > 0
     images, counts = np.unique(
         np.stack([problem.view[kept], problem.camera[kept]], 1), axis=0, return_counts=True

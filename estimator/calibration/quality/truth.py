@@ -26,9 +26,12 @@ MANY_SD = 4.0
 
 @dataclass(frozen=True)
 class SpaceError:
-    """Errors of triangulated points, after the best rigid motion, in um per axis.
+    """Hold the errors of N triangulated points after the best rigid motion.
 
-    predicted_um : from the calibration's covariance, the same motion projected out.
+    rms_um : RMS of the errors per axis, in um.
+    predicted_um : the RMS that the calibration's covariance predicts, in um per axis.
+    errors_mm : (N, 3) estimated minus true points, in mm.
+    covariance_mm2 : (3N, 3N) predicted covariance of these errors, in mm^2.
     """
 
     rms_um: float
@@ -39,6 +42,14 @@ class SpaceError:
 
 @dataclass(frozen=True)
 class Comparison:
+    """Hold the comparison of a calibration with the simulator's truth.
+
+    table : a text table, with one line for each quantity.
+    verdict : a sentence that begins with PASSED or FAILED.
+    passed : whether all quantities agree with the truth within their stated uncertainty.
+    space : errors of triangulated points.
+    """
+
     table: str
     verdict: str
     passed: bool
@@ -46,7 +57,7 @@ class Comparison:
 
 
 def true_cameras(truth: Mapping[str, Any]) -> tuple[Camera, ...]:
-    """Cameras from the dictionary of `truth/truth.json`."""
+    """Make the true cameras from the content of `truth/truth.json`."""
     out = []
     for name, data in truth["cameras"].items():
         pose = data["camera_from_rig"]
@@ -63,9 +74,13 @@ def true_cameras(truth: Mapping[str, Any]) -> tuple[Camera, ...]:
 def space_error(
     calibration: Calibration, truth: tuple[Camera, ...], points_mm: Array
 ) -> SpaceError:
-    """Triangulate the true pixels of true points with the estimated rig, and align rigidly.
+    """Triangulate the true pixels of true points with the estimated rig, and return the errors.
 
-    Of cameras alone: without the walls that runs are taken through.
+    calibration : the estimated rig; its refractive windows are left out.
+    truth : the true cameras, in the same order.
+    points_mm : (N, 3) true points in the rig frame, in mm.
+
+    The errors are what remains after the best rigid motion.
     """
     calibration = calibration.in_air()
     pixels = [camera.project(points_mm) for camera in truth]
@@ -81,7 +96,13 @@ def space_error(
 
 
 def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Comparison:
-    """Estimate beside truth, in standard deviations, and a verdict."""
+    """Compare a calibration with the truth.
+
+    truth : the content of `truth/truth.json`.
+
+    Returns a table of estimated and true values, with their differences in standard deviations, and
+    a verdict. Nothing is written.
+    """
     cameras = true_cameras(truth)
     space = space_error(calibration, cameras, working_volume(cameras))
     rows = _parameters(calibration, cameras)
@@ -106,7 +127,10 @@ def compare_with_truth(calibration: Calibration, truth: Mapping[str, Any]) -> Co
 def _parameters(
     calibration: Calibration, cameras: tuple[Camera, ...]
 ) -> list[tuple[str, float, float, float]]:
-    """(name, estimate, truth, sd) of what does not depend on the gauge."""
+    """Return the rows (name, estimate, truth, standard deviation) of the comparison.
+
+    Only quantities that do not depend on the gauge are compared.
+    """
     rows = []
     for estimate, truth in zip(calibration.cameras, cameras):
         for name in ("scale_px_per_mm", "k1"):

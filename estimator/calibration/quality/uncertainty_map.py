@@ -17,7 +17,12 @@ VOLUME_SHARE = 0.6
 
 
 def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
-    """(steps^3, 3) grid of rig points that all cameras see."""
+    """Return a cubic grid of points in the rig frame that all cameras see.
+
+    steps : number of points along each edge.
+
+    Returns (steps^3, 3) points, in mm.
+    """
     field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
     axis = np.linspace(-0.5, 0.5, steps) * VOLUME_SHARE * field
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -25,10 +30,14 @@ def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
 
 @dataclass(frozen=True)
 class UncertaintyMap:
-    """Standard deviations over the working volume, split by where they come from.
+    """Hold covariances of triangulated points over the working volume, split by their cause.
 
-    points_mm : (N, 3) grid of rig points.  calibration_mm2, measurement_mm2 : (N, 3, 3); the first
-    is common to all points of a run, the second is drawn anew for every point from ``sigma_px``.
+    points_mm : (N, 3) grid of points in the rig frame, in mm.
+    calibration_mm2 : (N, 3, 3) covariances that the calibration's errors cause, in mm^2. These
+        errors are common to all points of a run.
+    measurement_mm2 : (N, 3, 3) covariances that the noise of the pixels causes, in mm^2. This noise
+        is independent for each point.
+    sigma_px : standard deviation of the pixels, in px.
     """
 
     points_mm: Array
@@ -40,8 +49,12 @@ class UncertaintyMap:
 def uncertainty_map(
     calibration: Calibration, *, sigma_px: float | None = None, steps: int = STEPS
 ) -> UncertaintyMap:
-    """Of points triangulated from all cameras' pixels, good to ``sigma_px`` (None: as the
-    calibration's dots are).
+    """Compute how uncertain points are that are triangulated from the pixels of all cameras.
+
+    calibration : a calibration of two or more cameras.
+    sigma_px : standard deviation of the pixels, in px; None takes the scatter of the calibration's
+        own dots.
+    steps : number of grid points along each edge of the working volume.
 
     Raises CalibrationError for a single camera.
     """

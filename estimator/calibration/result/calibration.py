@@ -41,20 +41,31 @@ from telerig.rig.triangulation import (
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated rig. The rig frame is the first camera's frame.
+    """Hold a calibrated rig. The rig frame is the first camera's frame.
 
-    cameras : in the order of `rig.toml`.
-    dot_ids : (N,); target_points_mm : (N, 3) estimated dots in the target's frame.
-    target_poses : view name -> rig_from_target.
-    covariance : (P, P) of the rig block, ``covariance_names`` its components: the free intrinsics
-        of each camera, then the tangent (rotation, translation) of rig_from_<camera> of each
-        camera but the first.
-    free : per camera, names of the free intrinsics.
-    joint_names, joint_covariance : the whole estimate, or empty when loaded without it.
-    stage : travel axis and encoder scale with their covariance (`StageAxis.as_dict`), or empty.
-    medium : of the target, "air" or "water". Cameras may have walls either way: points that are
-        projected and triangulated lie in the water behind them.
-    statistics, twin, model : what `calibration.json` says of them; see docs/files.md.
+    cameras : the cameras, in the order of `rig.toml`.
+    dot_ids : (N,) numbers of the target's N dots.
+    target_points_mm : (N, 3) estimated positions of these dots in the target's frame, in mm.
+    target_poses : by name of a view, the pose rig_from_target, which maps points of the target's
+        frame into the rig frame.
+    covariance : (P, P) covariance of the P parameters of the rig block: the free intrinsics of
+        each camera, then the small rotation (rad) and translation (mm) of the pose of each camera
+        but the first. Each parameter has the unit with which its name ends.
+    covariance_names : names of these P parameters, in the same order.
+    free : for each camera, the names of its free (estimated) intrinsics.
+    name : name of the rig.
+    verdict : "status" (a word) and "reasons" (sentences).
+    statistics, twin, model, diagnostics : the parts of `calibration.json` that have these names;
+        `docs/files.md` describes them. "twin" is about the mirror ambiguity.
+    notes : sentences for the user.
+    stage : travel axis and encoder scale with their covariance (`StageAxis.as_dict`); empty if
+        they are not known.
+    medium : "air" or "water", in which the target was. The cameras may have refractive windows in
+        both cases; then points that are projected or triangulated lie in the water behind them.
+    joint_names, joint_covariance : names and covariance matrix of all parameters of the estimate,
+        including the dots and the views' poses; empty if they were not loaded.
+    dots, residuals : tables (pandas) of the measured dots and of their residuals, as `dots.csv`
+        and `residuals.csv` hold them; None if the calibration was loaded from a file.
     """
 
     cameras: tuple[Camera, ...]
@@ -79,7 +90,12 @@ class Calibration:
     residuals: Any = None
 
     def camera(self, camera: str | int) -> Camera:
-        """A camera by name or index; raises CalibrationError for one that is not there."""
+        """Return one camera.
+
+        camera : its name, or its index in the order of `rig.toml`, from 0.
+
+        Raises CalibrationError if there is no such camera.
+        """
         if isinstance(camera, (int, np.integer)) and 0 <= camera < len(self.cameras):
             return self.cameras[camera]
         for candidate in self.cameras:
@@ -89,22 +105,40 @@ class Calibration:
         raise CalibrationError(f"no camera {camera!r} in this calibration", todo=f"it has {names}")
 
     def in_air(self) -> Calibration:
-        """The same rig without its walls: for points in air, such as a target held there."""
+        """Return the same rig without its refractive windows.
+
+        The result is for points in air, for example those of a target in air.
+        """
         return replace(self, cameras=tuple(replace(c, wall=None) for c in self.cameras))
 
     def project(self, camera: str | int, points_mm: ArrayLike) -> Array:
-        """(N, 3) rig points, behind the camera's wall if it has one -> (N, 2) pixels."""
+        """Return the (N, 2) pixels at which a camera sees points.
+
+        camera : its name or index.
+        points_mm : (N, 3) points in the rig frame, in mm. If the camera has a refractive window,
+            the points lie in the water behind it.
+        """
         return self.camera(camera).project(points_mm)
 
     def unproject(self, camera: str | int, uv_px: ArrayLike) -> tuple[Array, Array]:
-        """(N, 2) pixels -> (N, 3) ray origins and (N, 3) unit directions in the rig frame.
+        """Return the rays that belong to pixels of a camera.
 
-        Behind a wall the rays are those in the water.
+        camera : its name or index.
+        uv_px : (N, 2) pixels.
+
+        Returns (N, 3) origins (mm) and (N, 3) unit directions of the rays in the rig frame. If the
+        camera has a refractive window, these are the rays in the water behind it.
         """
         return self.camera(camera).unproject(uv_px)
 
     def project_covariance(self, camera: str | int, points_mm: ArrayLike) -> Array:
-        """(N, 2, 2) covariance of projected points (px^2) that comes from the calibration."""
+        """Return the covariance of projected points that the calibration's errors cause.
+
+        camera : its name or index.
+        points_mm : (N, 3) points in the rig frame, in mm.
+
+        Returns (N, 2, 2) covariances, in px^2.
+        """
         index = self.cameras.index(self.camera(camera))
         jacobian = rig_jacobian(self.cameras, self.free, np.asarray(points_mm, float))
         rows = jacobian[..., 2 * index : 2 * index + 2, :]
@@ -119,18 +153,22 @@ class Calibration:
         method: str = "ml",
         include_calibration: bool = True,
     ) -> Triangulation:
-        """Points in the rig frame from their pixels in two or more cameras.
+        """Compute N points in the rig frame from their pixels in two or more cameras.
 
-        uv_first_px, uv_second_px : (N, 2) pixels in the first and in the second camera; or, as the
-            only argument, pixels by the camera's name, NaN where a camera does not see a point.
-        sigma_px : pixel noise, a scalar, (N,), (N, 2, 2), or these for each camera: a pair, or by
-            the camera's name. None takes the scatter of this calibration's own dots.
-        method : "ml" or "midpoint".
-        include_calibration : add the calibration's share to ``covariance_mm2``. It is common to
-            all points; ``measurement_covariance_mm2`` is the share that is not.
+        uv_first_px, uv_second_px : (N, 2) pixels in the first and in the second camera. For more
+            cameras, give ``uv_first_px`` alone: a mapping from the camera's name to (N, 2) pixels,
+            which are NaN where this camera does not see the point.
+        sigma_px : noise of the pixels. A number or (N,) are standard deviations in px; (N, 2, 2)
+            are covariances in px^2. It may differ between the cameras: then give a pair, or a
+            mapping from the camera's name. None means the scatter of this calibration's own dots.
+        method : "ml" (maximum likelihood) or "midpoint" (the point midway between the rays).
+        include_calibration : whether ``covariance_mm2`` of the result includes the errors of the
+            calibration. They are common to all points; ``measurement_covariance_mm2`` contains
+            only the noise of the pixels.
 
-        With pixels by name ``ray_miss_mm`` is (N, C), a column for each camera of this
-        calibration, and points that fewer than two cameras see are NaN (``unplaced`` counts them).
+        Returns a `Triangulation`. If the pixels were given by name, its ``ray_miss_mm`` is (N, C),
+        with one column for each of the C cameras of this calibration; points that fewer than two
+        cameras see are NaN, and ``unplaced`` is their number.
         Raises CalibrationError for a single camera or an unknown name, InputError for shapes that
         do not match.
         """
@@ -172,7 +210,7 @@ class Calibration:
     def _triangulate_views(
         self, uv_px: Mapping[str, ArrayLike], sigma: Any, method: str, include_calibration: bool
     ) -> Triangulation:
-        """`triangulate` from pixels by camera."""
+        """Do the work of `triangulate` for pixels that are given by the camera's name."""
         given = {self.camera(name).name: np.asarray(uv, float) for name, uv in uv_px.items()}
         if len(given) < 2:
             raise InputError(
@@ -209,11 +247,16 @@ class Calibration:
         return replace(found, covariance_mm2=covariance.reshape(found.covariance_mm2.shape))
 
     def pair(self, first: str | int, second: str | int) -> Calibration:
-        """The calibration of two of the cameras, in the same rig frame.
+        """Return the calibration of two of the cameras, in the same rig frame.
 
-        ``first`` must stand before ``second`` in `rig.toml`. The covariance is that of both
-        cameras with the first one's pose held: its uncertainty in the rig frame is common to
-        both, so it moves all points alike (an S-transformation of the gauge).
+        first, second : names or indices of the cameras. ``first`` must stand before ``second`` in
+            `rig.toml`.
+
+        In the result's covariance the pose of the first of the two is taken as exact. Its
+        uncertainty in the rig frame is common to both cameras, so it moves all triangulated points
+        in the same way (an S-transformation of the gauge).
+
+        Raises CalibrationError if a camera does not exist or if the order is wrong.
         """
         cameras = [self.camera(first), self.camera(second)]
         a, b = (self.cameras.index(camera) for camera in cameras)
@@ -243,18 +286,22 @@ class Calibration:
         )
 
     def sd(self, name: str) -> float:
-        """Standard deviation of one component of the rig block; 0 when it is held."""
+        """Return the standard deviation of one parameter of the rig block.
+
+        name : the parameter, as in ``covariance_names``; the result has the unit with which this
+            name ends. The result is 0 for a parameter that was held fixed.
+        """
         if name not in self.covariance_names:
             return 0.0
         i = self.covariance_names.index(name)
         return float(np.sqrt(self.covariance[i, i]))
 
     def report(self) -> str:
-        """A summary in plain words."""
+        """Return a summary in plain words, as text of several lines."""
         return summary(self.record())
 
     def record(self) -> CalibrationFile:
-        """The content of calibration.json."""
+        """Return the content of `calibration.json`; no file is written."""
         content = {
             "schema": CalibrationFile.SCHEMA,
             "kind": CalibrationFile.KIND,
@@ -290,9 +337,13 @@ class Calibration:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write calibration.json, covariance.npz, dots.csv and residuals.csv into a folder.
+        """Write `calibration.json`, `covariance.npz`, `dots.csv` and `residuals.csv` into a folder.
 
-        A path that ends in ``.json`` writes that file, and covariance.npz beside it.
+        path : the folder, which is created if necessary. If the path ends in ``.json``, only this
+            file is written, and `covariance.npz` beside it.
+
+        What is not known (``joint_names`` empty, ``dots`` or ``residuals`` None) is not written;
+        an old `covariance.npz` is then deleted.
         """
         place = Path(path)
         alone = place.suffix == ".json"
@@ -310,9 +361,13 @@ class Calibration:
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read ``calibration.json`` (or its folder), with covariance.npz if it lies beside.
+    """Read a calibration from `calibration.json` and, if it exists, `covariance.npz` beside it.
 
-    Raises InputError when a file is missing, is not what telerig wrote, or is of a newer schema.
+    path : the JSON file, or the folder that contains it.
+
+    Returns a `Calibration` without the tables ``dots`` and ``residuals``.
+    Raises InputError if a file is missing, was not written by telerig, has a newer schema, or if
+    the two files belong to different calibrations.
     """
     place = Path(path)
     file = place / "calibration.json" if place.is_dir() else place

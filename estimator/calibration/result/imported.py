@@ -26,13 +26,18 @@ def calibration_from_cameras(
     sigma_px: float = 0.1,
     notes: Sequence[str] = (),
 ) -> Calibration:
-    """A calibration held fixed: no free intrinsics, the poses' covariance zero, a note saying so.
+    """Make a `Calibration` from cameras that are taken as exactly known.
 
-    sigma_px : pixel noise that `Calibration.triangulate` takes when none is given.
-    notes : further sentences to keep with it, such as the files it came from.
+    cameras : one or more cameras. The frame of the first has to be the rig frame.
+    name : name of the rig.
+    sigma_px : standard deviation of the pixels (px) that `Calibration.triangulate` assumes if none
+        is given.
+    notes : further sentences to keep with the calibration, for example the names of its files.
 
-    Raises CalibrationError when there is no camera, names are not unique, the first camera's frame
-    is not the rig frame, or sigma_px is not positive.
+    The result has no free intrinsics, and the covariance of its poses is zero; its first note says
+    that the uncertainty is unknown.
+    Raises CalibrationError if there is no camera, if two cameras have the same name, if the first
+    camera's frame is not the rig frame, or if sigma_px is not positive.
     """
     names = [c.name for c in cameras]
     if not names or len(set(names)) != len(names):

@@ -6,7 +6,13 @@ from telerig.io.results.calibration import CalibrationFile
 
 
 def summary(calibration: CalibrationFile) -> str:
-    """Verdict first, then residuals, cameras with standard deviations, twin, warnings."""
+    """Return a calibration's summary as text of several lines.
+
+    calibration : the content of `calibration.json`.
+
+    The text begins with the verdict. Then it states the residuals, each camera's parameters with
+    their standard deviations, how the mirror ambiguity was decided, and the notes.
+    """
     s = calibration.statistics
     if "views" not in s:
         return _imported(calibration)
@@ -63,7 +69,7 @@ def _cost(cost: float | None) -> str:
 
 
 def _trust(calibration: CalibrationFile) -> list[str]:
-    """What halves of the views and the residuals say of the stated uncertainty."""
+    """Return the lines about the split-half check and about the structure of the residuals."""
     halves = calibration.diagnostics.halves
     structure = calibration.diagnostics.structure
     lines = [f"  {'' if halves.get('agree', True) else '! '}{halves['words']}"] if halves else []
@@ -72,7 +78,7 @@ def _trust(calibration: CalibrationFile) -> list[str]:
 
 
 def _imported(calibration: CalibrationFile) -> str:
-    """Of cameras that were not calibrated here: what they are, and the notes."""
+    """Return the summary of cameras that another program calibrated: scale, kappa and notes."""
     lines = [f"Calibration {calibration.name!r}: {calibration.verdict.status}"]
     for name, camera in calibration.cameras.items():
         lines.append(

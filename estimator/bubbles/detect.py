@@ -45,9 +45,14 @@ _SMUDGE_BLUR, _SMUDGE = 0.4, 0.75
 
 @dataclass(frozen=True)
 class Bubbles:
-    """``accepted``: columns DETECTION_COLUMNS; ``rejected``: u_px v_px radius_px reason.
+    """Hold the bubbles of one image.
 
-    ``noise``: grey sigma as a share of the background; ``reason``: why there is nothing, if so.
+    accepted : table with a row for each bubble and the columns DETECTION_COLUMNS.
+    rejected : table of the shadows that are no bubbles: centre u_px and v_px, radius_px, and the
+        reason in words.
+    noise : standard deviation of the image's noise, as a share of the background's grey level; NaN
+        if it was not measured.
+    reason : why there are no bubbles, in words; empty if there are some.
     """
 
     accepted: pd.DataFrame
@@ -63,15 +68,19 @@ def detect_bubbles(
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
 ) -> pd.DataFrame:
-    """Every bubble of a backlit grey image, unordered, with the columns DETECTION_COLUMNS.
+    """Find all bubbles in a backlit grey image.
 
-    ``background`` (rows, columns) is the bright-field level; without it the level of the screen
-    is estimated from the image itself. ``min_contrast`` is the least depth of a shadow, as a
-    share of the background. An image that holds nothing gives an empty table whose
-    ``attrs["reason"]`` says why.
+    image : (rows, columns) grey levels.
+    background : (rows, columns) grey levels of the lit screen without bubbles; None estimates them
+        from the image itself.
+    min_diameter_px : least equivalent diameter of a bubble, in px; at least 4.
+    min_contrast : least depth of a bubble's shadow, as a share of the background.
 
-    Raises InputError for anything but a 2-D image of finite numbers, and for a background of
-    another shape or one that is not positive.
+    Returns a table with a row for each bubble, in no particular order, and the columns
+    DETECTION_COLUMNS. If there is no bubble, the table is empty and its ``attrs["reason"]`` says
+    why.
+    Raises InputError if the image is not a 2-D array of finite numbers, if the background has
+    another shape or is not positive, or if an option is out of range.
     """
     return find_bubbles(
         image,
@@ -88,7 +97,10 @@ def find_bubbles(
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
 ) -> Bubbles:
-    """Like :func:`detect_bubbles`, with what was rejected and why."""
+    """Find all bubbles like :func:`detect_bubbles`, and return the rejected shadows as well.
+
+    The arguments and the errors are those of :func:`detect_bubbles`.
+    """
     image = checked_image(image, min_diameter_px, min_contrast)
     reason = nothing_to_see(image)
     if reason:
@@ -214,9 +226,10 @@ def _flags(
 
 
 def _merged(outlines: Outlines, parts: list[Part]) -> Bools:
-    """Blobs that could not be split, and implausible parts.
+    """Return (B,) whether each outline belongs to merged bubbles.
 
-    Where one part of a blob is implausible, so are all whose outline is not mostly seen.
+    This is so for blobs that could not be split and for implausible parts. If one part of a blob is
+    implausible, then so are all parts of it of which less than 60 % of the outline is visible.
     """
     merged: Bools = np.array([part.merged for part in parts]) | implausible_parts(outlines, parts)
     blobs = {part.blob for part, bad in zip(parts, merged, strict=True) if bad}
@@ -236,7 +249,7 @@ def _reasons(
     min_diameter_px: float,
     min_contrast: float,
 ) -> list[str]:
-    """Why each fitted outline is no bubble; empty where it is one."""
+    """Return for each fitted outline why it is no bubble; an empty text means that it is one."""
     reasons = []
     typical = float(np.median(columns["contrast"]))
     for i in range(outlines.ellipse.shape[0]):

@@ -128,7 +128,7 @@ def calibration_from_fit(
 
 
 def dot_table(problem: Problem) -> pd.DataFrame:
-    """Return the table of the measured dots (for `dots.csv`), one row for each dot in each image."""
+    """Return the table of the measured dots (for `dots.csv`), a row per dot and image."""
     ids = problem.dot_ids[problem.dot]
     row, column = problem.target.row_column_from_id(ids)
     return pd.DataFrame(

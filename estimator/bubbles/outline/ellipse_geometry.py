@@ -1,6 +1,7 @@
 """Ellipses with harmonics: nearest points, displacements, area, curvature; and the table of them.
 
-An ellipse is a row (u, v, a, b, angle). Points belong to ellipses through an index array, so that
+An ellipse is a row of five numbers: centre u and v (px), semi-axes a >= b (px), and the angle from
++u to the major axis (rad, towards +v). Points belong to ellipses through an index array, so that
 outlines of different length need no padding. Outlines leave this folder as the rows of a detection
 table, whose columns are named here.
 """
@@ -31,9 +32,14 @@ _SAMPLES = 64
 
 @dataclass(frozen=True)
 class Foot:
-    """Nearest point of each point's ellipse: eccentric anomaly as (cos, sin), ``distance``
-    outside the ellipse, ``speed`` |dp/dphi|, ``curvature`` and outward ``normal`` (2, N) there,
-    the latter along the ellipse's axes."""
+    """Hold, for each of N points, the nearest point on the ellipse to which it belongs (its foot).
+
+    cos, sin : (N,) cosine and sine of the foot's eccentric anomaly phi.
+    distance : (N,) distance of the point from the ellipse (px), positive outside.
+    speed : (N,) length (px) of the derivative of the ellipse's point by phi.
+    curvature : (N,) curvature of the ellipse at the foot, in 1/px.
+    normal : (2, N) outward unit normal at the foot, along the major and the minor axis.
+    """
 
     cos: Floats
     sin: Floats
@@ -44,12 +50,21 @@ class Foot:
 
 
 def spread(values: Array, counts: Index) -> Float32:
-    """Values (..., B) repeated for the points of each of B owners: (..., N), single precision."""
+    """Repeat one value for each of B owners, for all points of this owner.
+
+    values : (..., B); counts : (B,) number of points of each owner, N in all.
+
+    Returns (..., N) in single precision.
+    """
     return np.repeat(np.asarray(values, dtype=np.float32), counts, axis=-1)
 
 
 def rough_distance(ellipse: Array, u: Floats, v: Floats) -> Array:
-    """Distance of points outside ellipses (..., 5) by (g - 1) / |grad g|; broadcasts."""
+    """Return the approximate distance of points from ellipses (px), positive outside.
+
+    ellipse : (..., 5) ellipses; u, v : (...) pixels of the points. The shapes are broadcast.
+    It is the first-order value (g - 1) / |grad g|, where g is 1 on the ellipse.
+    """
     cos, sin = np.cos(ellipse[..., 4]), np.sin(ellipse[..., 4])
     a, b = ellipse[..., 2], ellipse[..., 3]
     du, dv = u - ellipse[..., 0], v - ellipse[..., 1]
@@ -60,7 +75,12 @@ def rough_distance(ellipse: Array, u: Floats, v: Floats) -> Array:
 
 
 def foot_points(ellipse: Array, counts: Index, u: Floats, v: Floats, *, rounds: int = 2) -> Foot:
-    """Nearest points on ellipses (B, 5) to points (u, v) (N,), ``counts`` (B,) for each in turn.
+    """Find the nearest points on ellipses.
+
+    ellipse : (B, 5) ellipses.
+    counts : (B,) number of points that belong to each ellipse, N in all.
+    u, v : (N,) pixels of the points, those of the first ellipse first.
+    rounds : number of iterations.
 
     Iteration by the evolute's centre of curvature: no trigonometry, two rounds are exact to
     1e-4 px near the outline of an ellipse of axis ratio 2. In the precision of ``u``; the caller
@@ -96,7 +116,12 @@ def foot_points(ellipse: Array, counts: Index, u: Floats, v: Floats, *, rounds: 
 
 
 def ellipse_basis(foot: Foot, out: Floats) -> None:
-    """Outward displacement (5, N) of the outline by centre (along a, along b), a, b and shear."""
+    """Write into ``out`` how each parameter of an ellipse moves its outline.
+
+    foot : N points on ellipses.
+    out : (5, N) receives the derivatives of the outward displacement by the centre along the major
+        axis and along the minor axis, by a, by b, and by the shear between the axes.
+    """
     out[:2] = foot.normal
     np.multiply(foot.normal[0], foot.cos, out=out[2])
     np.multiply(foot.normal[1], foot.sin, out=out[3])
@@ -105,7 +130,12 @@ def ellipse_basis(foot: Foot, out: Floats) -> None:
 
 
 def harmonic_basis(cos: Floats, sin: Floats) -> Floats:
-    """(8, N): cos k phi, sin k phi for the orders in HARMONICS, from cos phi and sin phi."""
+    """Return cos(k phi) and sin(k phi) for the orders k in HARMONICS.
+
+    cos, sin : (N,) cosine and sine of phi.
+
+    Returns (8, N): cosine and sine of order 3, then of orders 4, 5 and 6.
+    """
     basis = np.empty((2 * len(HARMONICS), cos.size), dtype=cos.dtype)
     real, imaginary = cos, sin
     for order in range(2, HARMONICS[-1] + 1):
@@ -117,9 +147,14 @@ def harmonic_basis(cos: Floats, sin: Floats) -> Floats:
 
 
 def moved(ellipse: Array, step: Array) -> tuple[Array, Array]:
-    """Ellipses (B, 5) after displacements (B, 5), and how far their major axes turned (B,).
+    """Apply displacements to ellipses.
 
-    a and b stay positive and a >= b.
+    ellipse : (B, 5) ellipses.
+    step : (B, 5) displacements (px): of the centre along the major and the minor axis, of a, of b,
+        and the shear between the axes.
+
+    Returns the new ellipses (B, 5), with a >= b > 0, and the angles (B,) in rad by which their
+    major axes have turned.
     """
     cos, sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
     u = ellipse[:, 0] + cos * step[:, 0] - sin * step[:, 1]
@@ -134,7 +169,10 @@ def moved(ellipse: Array, step: Array) -> tuple[Array, Array]:
 
 
 def turned_harmonics(harmonics: Array, turn: Array) -> Array:
-    """Coefficients (B, 8) about axes that have turned by ``turn`` (B,)."""
+    """Return the coefficients (B, 8) of the harmonics after the major axes have turned.
+
+    harmonics : (B, 8) coefficients before (px); turn : (B,) angles in rad.
+    """
     angle = turn[:, None] * np.array(HARMONICS)
     cos, sin = np.cos(angle), np.sin(angle)
     c, s = harmonics[:, 0::2], harmonics[:, 1::2]
@@ -144,7 +182,15 @@ def turned_harmonics(harmonics: Array, turn: Array) -> Array:
 
 
 def points_on(ellipse: Array, harmonics: Array, phi: Array) -> Array:
-    """Outline points (B, n, 2) of ellipses (B, 5) with harmonics (B, 8) at anomalies (n,)."""
+    """Return points on outlines.
+
+    ellipse : (B, 5) ellipses.
+    harmonics : (B, 8) coefficients (px) of the displacement along the ellipse's normal, in the
+        order of `harmonic_basis`.
+    phi : (n,) eccentric anomalies (rad).
+
+    Returns (B, n, 2) pixels (u, v).
+    """
     cos, sin = np.cos(phi), np.sin(phi)
     a, b = ellipse[:, 2:3], ellipse[:, 3:4]
     speed = np.sqrt((a * sin) ** 2 + (b * cos) ** 2)
@@ -158,8 +204,11 @@ def points_on(ellipse: Array, harmonics: Array, phi: Array) -> Array:
 
 
 def _sampled(ellipse: Array, harmonics: Array) -> tuple[Complex, Complex, Complex]:
-    """Outlines about their ellipses' centres as complex numbers (B, 64), and their first and
-    second derivatives by the anomaly, spectral and so exact to rounding."""
+    """Return 64 points of each outline as complex numbers u + i v, and their derivatives.
+
+    The points (B, 64) are relative to the ellipse's centre (px). The first and second derivatives
+    (B, 64) are by the eccentric anomaly; a Fourier transform gives them without truncation error.
+    """
     phi = np.linspace(0.0, 2.0 * np.pi, _SAMPLES, endpoint=False)
     points = points_on(ellipse * [0.0, 0.0, 1.0, 1.0, 1.0], harmonics, phi)
     place = points[..., 0] + 1j * points[..., 1]
@@ -169,7 +218,10 @@ def _sampled(ellipse: Array, harmonics: Array) -> tuple[Complex, Complex, Comple
 
 
 def outline_moments(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
-    """Area (B,) and area centroid (B, 2) inside outlines, by Green's theorem."""
+    """Return the areas (B,) in px^2 and the centroids (B, 2) in px of what outlines enclose.
+
+    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px), see `points_on`.
+    """
     place, slope, _ = _sampled(ellipse, harmonics)
     step = np.pi / _SAMPLES
     area = step * np.sum((np.conj(place) * slope).imag, axis=1)
@@ -179,14 +231,23 @@ def outline_moments(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
 
 
 def outline_curvature(ellipse: Array, harmonics: Array) -> tuple[Array, Array]:
-    """Points (B, 64, 2) and curvature (B, 64) of outlines, positive where convex."""
+    """Return 64 points (B, 64, 2) in px on each outline, and the curvature (B, 64) there in 1/px.
+
+    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px), see `points_on`. The curvature
+    is positive where the outline is convex.
+    """
     place, slope, bend = _sampled(ellipse, harmonics)
     curvature = (np.conj(slope) * bend).imag / np.abs(slope) ** 3
     return ellipse[:, None, :2] + np.stack([place.real, place.imag], axis=-1), curvature
 
 
 def deepest_concavity(ellipse: Array, harmonics: Array) -> Array:
-    """Most inward curvature (B,) of outlines in units of 1 / radius, 0 where all is convex."""
+    """Return how strongly each outline is curved inwards at most.
+
+    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px), see `points_on`.
+
+    Returns (B,) curvatures multiplied by the mean radius (no unit); 0 for a convex outline.
+    """
     _, curvature = outline_curvature(ellipse, harmonics)
     radius = np.sqrt(ellipse[:, 2] * ellipse[:, 3])
     return np.asarray(np.maximum(-np.min(curvature, axis=1) * radius, 0.0))
@@ -216,7 +277,13 @@ FLAGS = ("border", "defocus", "overlap", "merged", "small", "saturated")
 
 
 def outline_points(row: pd.Series[Any] | dict[str, Any], n: int = 64) -> Array:
-    """Outline (n, 2) [px] of one row of the detection table, evenly spaced in the anomaly."""
+    """Return n points on the outline of one detected bubble.
+
+    row : one row of a detection table.
+    n : number of points; they are evenly spaced in the eccentric anomaly.
+
+    Returns (n, 2) pixels (u, v).
+    """
     ellipse = np.array([[row[name] for name in CENTRE_COLUMNS + AXES_COLUMNS]], dtype=float)
     harmonics = np.nan_to_num(np.array([[row[name] for name in HARMONIC_COLUMNS]], dtype=float))
     phi = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
@@ -224,10 +291,12 @@ def outline_points(row: pd.Series[Any] | dict[str, Any], n: int = 64) -> Array:
 
 
 def outline_centroid(table: pd.DataFrame) -> Array:
-    """Centroid (N, 2) [px] of the area inside each outline of a detection table.
+    """Return the centroids of the areas inside the outlines of a detection table.
 
-    It differs from the ellipse's centre by the products of the outline's harmonics with each
-    other and with the ellipse's flattening.
+    table : a detection table with N rows.
+
+    Returns (N, 2) pixels. A centroid differs from the ellipse's centre because of the outline's
+    harmonics.
     """
     ellipse = table[CENTRE_COLUMNS + AXES_COLUMNS].to_numpy(dtype=np.float64)
     harmonics = np.nan_to_num(table[HARMONIC_COLUMNS].to_numpy(dtype=np.float64))
@@ -235,7 +304,12 @@ def outline_centroid(table: pd.DataFrame) -> Array:
 
 
 def columns(table: pd.DataFrame, names: list[str]) -> Array:
-    """(N, K) columns as numbers; NaN where there is none, or no number."""
+    """Return some columns of a table as numbers.
+
+    table : a table with N rows; names : the K names of the columns.
+
+    Returns (N, K) numbers; they are NaN where the column does not exist or holds no number.
+    """
     out = np.full((len(table), len(names)), np.nan)
     for k, name in enumerate(names):
         if name in table:
@@ -247,11 +321,11 @@ def columns(table: pd.DataFrame, names: list[str]) -> Array:
 
 
 def centre_covariances(table: pd.DataFrame) -> Array:
-    """(N, 2, 2) [px^2], NaN where unknown."""
+    """Return the covariances (N, 2, 2) in px^2 of the detected centres, NaN if unknown."""
     return columns(table, COVARIANCE_COLUMNS)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
 
 
 def flag_words(table: pd.DataFrame) -> list[list[str]]:
-    """The words of each row's flags."""
+    """Return for each row of a detection table the list of its flags; see `FLAGS`."""
     flags = table["flags"].tolist() if "flags" in table else [""] * len(table)
     return [text.split("|") if isinstance(text, str) and text else [] for text in flags]

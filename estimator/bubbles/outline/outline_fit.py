@@ -47,10 +47,14 @@ _THIN_ABOVE_PX = 10.0
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels (N,) of B bubbles, one bubble after the other: ``owner``, place and value.
+    """Hold the N pixels at the rims of B bubbles, one bubble after the other.
 
-    ``u`` and ``v`` count from ``origin`` (B, 2), a pixel near the bubble's centre, so that single
-    precision serves; ``counts`` (B,) says how many are whose.
+    owner : (N,) number of the bubble to which the pixel belongs, from 0.
+    counts : (B,) number of pixels of each bubble.
+    origin : (B, 2) pixel (u, v) near each bubble's centre.
+    u, v : (N,) positions of the pixels relative to ``origin`` (px), so that single precision is
+        sufficient.
+    value : (N,) grey levels divided by the background.
     """
 
     owner: Index
@@ -62,28 +66,33 @@ class Pixels:
 
     @property
     def bubbles(self) -> int:
-        """How many bubbles."""
+        """Return the number B of bubbles."""
         return int(self.counts.size)
 
     def parts(self) -> Iterator[slice]:
-        """The slice of each bubble."""
+        """Yield for each bubble the slice of its pixels."""
         edges = np.concatenate([[0], np.cumsum(self.counts)]).tolist()
         return (slice(low, high) for low, high in itertools.pairwise(edges))
 
     def sums(self, values: Float32) -> Array:
-        """Sum (B,) of values (N,) over each bubble."""
+        """Return the sums (B,) of values (N,) over the pixels of each bubble."""
         weights = values.astype(np.float64)
         return np.bincount(self.owner, weights, self.bubbles).astype(np.float64)
 
     def local(self, ellipse: Array) -> Array:
-        """Ellipses (B, 5) with their centres counted from ``origin``."""
+        """Return ellipses (B, 5) with their centres relative to ``origin``."""
         moved = ellipse.copy()
         moved[:, :2] -= self.origin
         return moved
 
     def hidden(self, ellipse: Array, everyone: Array, reach_px: Array, own: Index) -> Bools:
-        """Pixels (N,) within ``reach_px`` (A,) of, or inside, any of the ellipses ``everyone``
-        (A, 5) that is not their own, number ``own`` (B,) of these."""
+        """Return (N,) whether each pixel lies inside or near the ellipse of another bubble.
+
+        ellipse : (B, 5) ellipses of the bubbles of these pixels.
+        everyone : (A, 5) ellipses of all bubbles in the image.
+        reach_px : (A,) distance (px) from each of these up to which a pixel is near it.
+        own : (B,) positions of the B bubbles in ``everyone``.
+        """
         hidden = np.zeros(self.owner.size, dtype=np.bool_)
         parts = list(self.parts())
         for index, other in close_pairs(ellipse, everyone, reach_px[own], reach_px, own):
@@ -98,7 +107,14 @@ class Pixels:
 def close_pairs(
     ellipse: Array, everyone: Array, reach_px: Array, reach_everyone_px: Array, own: Index
 ) -> list[tuple[int, int]]:
-    """Pairs (of B, of A) of ellipses whose surroundings may meet; ``own`` (B,) is left out."""
+    """Find pairs of ellipses that may be near each other.
+
+    ellipse : (B, 5) ellipses; everyone : (A, 5) ellipses with which they are compared.
+    reach_px, reach_everyone_px : (B,), (A,) widths (px) of the surroundings of each ellipse.
+    own : (B,) positions of the B ellipses in ``everyone``; these pairs are left out.
+
+    Returns pairs (position in ``ellipse``, position in ``everyone``).
+    """
     size, other_size = ellipse[:, 2] + 2.0 * reach_px, everyone[:, 2] + 2.0 * reach_everyone_px
     gap = np.hypot(
         ellipse[:, None, 0] - everyone[None, :, 0], ellipse[:, None, 1] - everyone[None, :, 1]
@@ -111,9 +127,13 @@ def close_pairs(
 def rim_pixels(
     ratio: Float32, ellipse: Array, sigma: Array, slack_px: Array, *, thin: bool = False
 ) -> Pixels:
-    """Pixels of ``ratio`` within 3 sigma and ``slack_px`` (B,) of the ellipses (B, 5).
+    """Gather the pixels near the rims of B ellipses.
 
-    ``thin``: one in two, one in four round large bubbles.
+    ratio : (rows, columns) grey levels divided by the background.
+    ellipse : (B, 5) ellipses.
+    sigma : (B,) blur of the edges (px); pixels up to about three times this distance are taken.
+    slack_px : (B,) additional distance (px).
+    thin : whether to take only one pixel in four for ellipses with b above 10 px.
     """
     reach = _REACH_SIGMA * sigma + _REACH_PX + slack_px
     columns = ratio.shape[1]
@@ -148,7 +168,10 @@ def rim_pixels(
 def _ring(
     ellipse: Array, origin: Array, columns: Index, rows: Index, reach: float
 ) -> tuple[Float32, Float32]:
-    """Places (n,), counted from ``origin``, of the pixels within ``reach`` of one ellipse."""
+    """Return u and v (n,), relative to ``origin`` (px), of the pixels near one ellipse.
+
+    columns, rows : the pixels among which to look; reach : largest distance (px).
+    """
     local = ellipse.copy()
     local[:2] -= origin
     u = (columns - origin[0]).astype(np.float32)
@@ -174,11 +197,19 @@ def _ring(
 def unlike_rim(
     pixels: Pixels, foot: Foot, distance: Float32, residual: Float32, sigma: Array, contrast: Array
 ) -> Bools:
-    """Pixels (N,) at and beyond the first ring that departs from the model, in each octant.
+    """Find pixels that glare, dirt or a neighbouring bubble has changed.
 
-    Rings are one pixel wide. Inside, a departure towards bright is glare; outside, one towards
-    dark is dirt or a neighbour. ``residual`` is in units of the noise, ``contrast`` (B,) too. A
-    ring counts when its mean is off by 1.5 % of the contrast and by 3 sigma of its own error.
+    pixels, foot : N pixels of B bubbles, and their nearest points on the ellipses.
+    distance : (N,) distance from the outline (px), positive outside.
+    residual : (N,) measured minus predicted grey level, divided by the noise.
+    sigma : (B,) blur of the edges (px).
+    contrast : (B,) background level minus the bubble's level, divided by the noise.
+
+    Returns (N,) whether each pixel should be left out. For this, the pixels of each bubble are
+    divided into rings of 1 px, inside and outside the outline, and into eight octants. In each
+    octant, the pixels are left out from the first ring on that departs from the model: that is
+    brighter inside (glare) or darker outside (dirt, neighbour), by more than 1.5 % of the contrast
+    and by more than 3 standard deviations of the ring's mean.
     """
     depth = np.abs(distance)
     rings = int(np.max(depth, initial=0.0)) + 2
@@ -201,7 +232,8 @@ def unlike_rim(
 
 
 BLUR, OUTER, INNER, FIRST_HARMONIC = 5, 6, 7, 8
-"""Places in the parameter vector; before BLUR the five displacements of the ellipse."""
+"""Positions in the vector of the 16 parameters: blur, outer level, inner level, and the first of
+the eight harmonics. The first five are the displacements of the ellipse."""
 PARAMETERS = FIRST_HARMONIC + 2 * len(HARMONICS)
 _RESOLVED_BLURS = 3.0
 _BENDING_FROM, _MAX_RETREAT = 0.2, 0.3
@@ -212,8 +244,12 @@ _NODES = 96
 
 @dataclass(frozen=True)
 class RimState:
-    """Outlines of B bubbles: ``ellipse`` (B, 5), ``harmonics`` (B, 8), and the edges' ``sigma``
-    [px], ``outer`` and ``inner`` levels (B,)."""
+    """Hold the outlines of B bubbles during a fit.
+
+    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px).
+    sigma : (B,) standard deviation of the edges' blur, including the pixel (px).
+    outer, inner : (B,) grey levels outside and inside the bubble, as shares of the background.
+    """
 
     ellipse: Array
     harmonics: Array
@@ -224,10 +260,16 @@ class RimState:
 
 @dataclass(frozen=True)
 class Linear:
-    """What stays while outlines move a little: the pixels' feet, and the outward displacement
-    ``shape`` (13, N) there by each parameter of the outline. Harmonics of bubbles that are not
-    ``resolved`` (B,), too small against their blur, are not to be fitted. ``bending`` (N,) is the
-    curvature's second derivative along the arc over 8, where the blur makes it matter."""
+    """Hold what stays constant while the outlines move a little: the linearisation of the fit.
+
+    foot : nearest points on the ellipses to the N pixels.
+    shape : (13, N) derivatives of the outward displacement there by each of the outline's
+        parameters (5 of the ellipse, 8 harmonics).
+    resolved : (B,) False for bubbles that are too small compared with their blur; their harmonics
+        are not fitted.
+    bending : (N,) second derivative of the curvature by the arc's length, divided by 8 (1/px^3);
+        None if the blur is so small that it does not matter.
+    """
 
     foot: Foot
     shape: Float32
@@ -235,7 +277,10 @@ class Linear:
     bending: Float32 | None
 
     def displacements(self, pixels: Pixels, shifts: Array) -> Float32:
-        """Outward displacement (N,) of the outline at each pixel's foot for shifts (B, 13)."""
+        """Return how far (N,) the outline moves outwards at each pixel's foot (px).
+
+        shifts : (B, 13) changes of the outline's parameters since the linearisation (px).
+        """
         result = np.empty(self.shape.shape[1], dtype=np.float32)
         for part, own in zip(pixels.parts(), shifts.astype(np.float32), strict=True):
             np.matmul(own, self.shape[:, part], out=result[part])
@@ -243,7 +288,7 @@ class Linear:
 
 
 def linearised(state: RimState, pixels: Pixels) -> Linear:
-    """Feet and displacements at the state's ellipses.
+    """Compute the linearisation at a state: the pixels' feet and the outlines' derivatives.
 
     Blur damps an outline's wave of order k against a shift (k = 1) by I_k / I_1 of Bessel's
     functions, nearly exp(-(k^2 - 1) sigma^2 / (2 R^2)).
@@ -284,9 +329,13 @@ def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Float32:
 def rim_model(
     state: RimState, pixels: Pixels, linear: Linear, shifts: Array
 ) -> tuple[Float32, Float32, Float32]:
-    """Grey (N,), its Jacobian (16, N) and the share F (N,) of the bubble's own level.
+    """Compute the grey levels that the model predicts for N pixels.
 
-    ``shifts`` (B, 13): displacements of the outline since the linearisation.
+    state, pixels, linear : the outlines' blur and levels, the pixels, and the linearisation.
+    shifts : (B, 13) displacements of the outline's parameters since the linearisation (px).
+
+    Returns the grey levels (N,) as shares of the background, their derivatives (16, N) by the 16
+    parameters, and the share (N,) of each pixel that the blurred bubble covers (0 to 1).
     """
     counts = pixels.counts
     inverse_sigma, contrast, outer = spread(
@@ -316,7 +365,13 @@ def rim_model(
 def normal_equations(
     jacobian: Float32, residual: Float32, weight: Float32, pixels: Pixels
 ) -> tuple[Array, Array]:
-    """Information (B, 16, 16) and pull (B, 16) of weighted residuals (N,)."""
+    """Compute the normal equations of each bubble's fit.
+
+    jacobian : (16, N) derivatives of the grey levels by the bubble's 16 parameters.
+    residual : (N,) measured minus predicted grey levels; weight : (N,) inverse variances.
+
+    Returns the information matrices (B, 16, 16) and the right-hand sides (B, 16).
+    """
     information = np.empty((pixels.bubbles, PARAMETERS, PARAMETERS))
     pull = np.empty((pixels.bubbles, PARAMETERS))
     root = np.sqrt(weight)
@@ -330,8 +385,12 @@ def normal_equations(
 
 @dataclass(frozen=True)
 class Profile:
-    """Share of the disc's light ``value`` at each place, with derivatives by distance and by
-    curvature (both in units of the blur)."""
+    """Hold the profile of a blurred disc at N places.
+
+    value : (N,) share of the disc's level there, from 0 (far outside) to 1 (deep inside).
+    by_distance, by_curvature : (N,) its derivatives. Distance is in units of the blur, curvature in
+        units of 1 / blur.
+    """
 
     value: Float32
     by_distance: Float32
@@ -339,7 +398,10 @@ class Profile:
 
 
 def blurred_disc(distance: Array, radius: Array) -> Array:
-    """Coverage of a disc after a unit Gaussian blur, ``distance`` outside its rim.
+    """Return the share (0 to 1) that a disc covers after a Gaussian blur of standard deviation 1.
+
+    distance : distance of the place from the disc's rim, positive outside, in units of the blur.
+    radius : radius of the disc, in units of the blur.
 
     The chord integral int phi(y) [Phi(c - r) - Phi(-c - r)] dy with c^2 = R^2 - y^2, by
     Gauss-Legendre quadrature. Shapes broadcast.
@@ -369,9 +431,12 @@ def _table() -> tuple[Float32, int]:
 
 
 def rim_profile(distance: Float32, curvature: Float32) -> Profile:
-    """Profile at signed ``distance`` outside a rim of ``curvature``, both (N,) in units of blur.
+    """Look up the profile of a blurred disc in a table.
 
-    Bilinear in the table: good to 1e-4 of the contrast.
+    distance : (N,) distance from the rim, positive outside, in units of the blur.
+    curvature : (N,) curvature of the rim, in units of 1 / blur.
+
+    The table is interpolated bilinearly; the error is at most 1e-4 of the contrast.
     """
     table, columns = _table()
     x = np.clip(distance, -_DISTANCE_LIMIT, _DISTANCE_LIMIT - 1e-3)
@@ -403,17 +468,22 @@ def rim_profile(distance: Float32, curvature: Float32) -> Profile:
 
 _LEVEL_SPREAD = 0.3
 _FREE, _UNLEARNT, _LEAST, _HELD = 0.25, 0.02, 0.002, 1e-7
-"""Spread of the harmonics' coefficients, as a share of the radius: too wide to affect whole
-outlines; without whole outlines to learn from; the least that is learnt; tied to their start."""
+"""Prior standard deviations of the harmonics' coefficients, as shares of the radius. The first is
+so wide that it does not affect whole outlines. The second holds if there are no whole outlines to
+learn from. The third is the least value that is learnt. The last holds harmonics at their start."""
 
 _WIDENED = 1.5
 _ENOUGH_WHOLE = 4
 
 
 def learnt_spread(outlines: Outlines, partial: Bools) -> Array:
-    """(B,) standard deviation of each outline's harmonics, as a share of its radius.
+    """Return the prior standard deviation of each outline's harmonics.
 
-    ``partial`` (B,) outlines, which are hidden in part, get that of the frame's whole outlines.
+    outlines : the fitted outlines of B bubbles.
+    partial : (B,) whether an outline is partly hidden. Such outlines get a standard deviation that
+        is learnt from the frame's whole outlines; the prior of whole outlines has no effect.
+
+    Returns (B,) standard deviations, as shares of the radius.
     """
     whole = outlines.resolved & ~partial
     share = _UNLEARNT
@@ -427,9 +497,12 @@ def learnt_spread(outlines: Outlines, partial: Bools) -> Array:
 def prior_equations(
     information: Array, pull: Array, state: RimState, shifts: Array, inner: Array, spread: Array
 ) -> None:
-    """Add the prior at outlines ``shifts`` (B, 13) away from the state's ellipses.
+    """Add the prior to the normal equations of B outlines; both are changed in place.
 
-    inner : (B,) expected level; spread : (B,) of the harmonics as a share of the radius.
+    information, pull : (B, 16, 16) and (B, 16) normal equations.
+    state : the outlines; shifts : (B, 13) their displacements since the linearisation (px).
+    inner : (B,) expected grey level inside, as a share of the background.
+    spread : (B,) prior standard deviation of the harmonics, as a share of the radius.
     """
     level = 1.0 / _LEVEL_SPREAD**2
     information[:, OUTER, OUTER] += level
@@ -457,8 +530,14 @@ _MEAN_SLOPE = 0.35
 
 @dataclass(frozen=True)
 class Start:
-    """Where the fits begin: ``ellipse`` (B, 5), ``harmonics`` (B, 8), ``blur_px`` and ``inner``
-    level (B,), noise ``sigma_outer`` and ``sigma_inner`` (B,) as shares of the background."""
+    """Hold the start values of the fits of B outlines.
+
+    ellipse : (B, 5) ellipses; harmonics : (B, 8) coefficients (px).
+    blur_px : (B,) standard deviation of the optical blur (px).
+    inner : (B,) grey level inside the bubble, as a share of the background.
+    sigma_outer, sigma_inner : (B,) standard deviation of a pixel's noise outside and inside the
+        bubble, as shares of the background.
+    """
 
     ellipse: Array
     harmonics: Array
@@ -476,13 +555,20 @@ class Start:
 
 @dataclass(frozen=True)
 class Outlines:
-    """Fitted outlines of B bubbles.
+    """Hold the fitted outlines of B bubbles.
 
-    ``ellipse`` (B, 5), ``harmonics`` (B, 8; 0 where ``resolved`` is False), ``sigma_px`` blur of
-    optics and pixel, ``outer`` and ``inner`` levels, ``centre_covariance_px2`` (B, 2, 2),
-    ``sigma_outline_px`` of a harmonic's coefficient, ``chi2_dof``, ``coverage`` (share of the
-    outline that was seen), ``misfit_px`` (how far the rim strays from the outline, beyond noise)
-    and ``shift_px`` (largest displacement since the linearisation).
+    ellipse : (B, 5) ellipses.
+    harmonics : (B, 8) coefficients (px); they are 0 where ``resolved`` is False.
+    resolved : (B,) whether the bubble is large enough, compared with its blur, to fit harmonics.
+    sigma_px : (B,) standard deviation of the blur of optics and pixel together (px).
+    outer, inner : (B,) grey levels outside and inside, as shares of the background.
+    centre_covariance_px2 : (B, 2, 2) covariance of the ellipse's centre (px^2).
+    sigma_outline_px : (B,) standard deviation of a harmonic's coefficient (px).
+    chi2_dof : (B,) chi-square per degree of freedom.
+    coverage : (B,) share of the outline that is visible, 0 to 1.
+    misfit_px : (B,) RMS distance between the rim in the image and the outline, beyond the noise
+        (px).
+    shift_px : (B,) largest displacement since the linearisation (px).
     """
 
     ellipse: Array
@@ -500,16 +586,16 @@ class Outlines:
 
     @property
     def blur_px(self) -> Array:
-        """Blur (B,) of the optics alone."""
+        """Return the blur (B,) of the optics alone (standard deviation, px)."""
         return np.asarray(np.sqrt(np.maximum(self.sigma_px**2 - _PIXEL_VARIANCE_PX2, 0.0)))
 
     def state(self, index: Index) -> RimState:
-        """The outlines ``index`` as a point to go on from."""
+        """Return the outlines at the positions ``index`` as the state from which a fit goes on."""
         every = (self.ellipse, self.harmonics, self.sigma_px, self.outer, self.inner)
         return RimState(*(values[index] for values in every))
 
     def updated(self, index: Index, other: Outlines) -> Outlines:
-        """These outlines with those at ``index`` replaced by ``other``."""
+        """Return a copy with the outlines at the positions ``index`` replaced by ``other``."""
         changed = {}
         for field in fields(self):
             changed[field.name] = getattr(self, field.name).copy()
@@ -518,11 +604,14 @@ class Outlines:
 
 
 def fit_outlines(ratio: Float32, start: Start) -> Outlines:
-    """Fit B outlines to the normalised image ``ratio`` (grey over background).
+    """Fit the outlines of B bubbles to an image.
 
-    Pixels inside or near another bubble of ``start`` are left out, and so are glare, dirt and
-    whatever else is unlike a rim. A first look at some of the pixels brings blur and levels; the
-    fit to all is repeated for outlines that moved far or are partly hidden.
+    ratio : (rows, columns) grey levels divided by the background.
+    start : start values of the B outlines.
+
+    Pixels inside or near another bubble of ``start`` are left out, and so are glare, dirt and other
+    pixels that do not look like a rim. A first fit to some of the pixels yields blur and levels.
+    The fit to all pixels is repeated for outlines that moved far or are partly hidden.
     """
     everyone = np.arange(len(start))
     state = RimState(
@@ -549,7 +638,7 @@ def fit_outlines(ratio: Float32, start: Start) -> Outlines:
 
 
 def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
-    """Ellipse, blur and levels from a share of the pixels within a narrow band."""
+    """Fit ellipse, blur and levels to some of the pixels in a narrow band at the rim."""
     pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state), thin=True)
     linear = linearised(state, pixels)
     distance, sigma = _distance(state, pixels, linear), spread(state.sigma, pixels.counts)
@@ -578,8 +667,14 @@ def _shifts(state: RimState) -> Array:
 
 @dataclass(frozen=True)
 class _Descent:
-    """Where Gauss-Newton stands: ``shifts`` (B, 13) since the linearisation, covariance
-    (B, 16, 16) and what is left of the grey levels (N,)."""
+    """Hold the result of Gauss-Newton steps for B outlines.
+
+    state : the outlines; ``shifts`` are not yet applied to its ellipses.
+    shifts : (B, 13) displacements since the linearisation (px).
+    covariance : (B, 16, 16) covariance of the parameters.
+    residual : (N,) measured minus predicted grey levels, as shares of the background.
+    shift_px : (B,) largest of the displacements (px).
+    """
 
     state: RimState
     shifts: Array
@@ -596,7 +691,12 @@ def _refined(
     own: Index,
     prior: Array,
 ) -> Outlines:
-    """One linearisation: pixels, window, steps, results of the bubbles ``own`` of everyone."""
+    """Fit the outlines of some bubbles with one linearisation.
+
+    state, start : the bubbles to fit; own : their positions in ``everyone``.
+    everyone : the outlines of all bubbles in the image.
+    prior : (B,) prior standard deviation of the harmonics, as a share of the radius.
+    """
     pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state))
     linear = linearised(state, pixels)
     hidden = pixels.hidden(state.ellipse, everyone.ellipse, _HIDING_SIGMA * everyone.sigma, own)
@@ -609,7 +709,7 @@ def _refined(
 def _window(
     state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Bools
 ) -> Float32:
-    """Weights (N,): inverse variances, 0 for what must not be looked at."""
+    """Return the weights (N,): inverse variances of the pixels, 0 for those that are left out."""
     counts = pixels.counts
     grey, _, inside = rim_model(state, pixels, linear, _shifts(state))
     outside, change = start.sigma_outer**2, start.sigma_inner**2 - start.sigma_outer**2
@@ -643,7 +743,7 @@ def _descend(
     *,
     steps: int,
 ) -> _Descent:
-    """Gauss-Newton at fixed feet."""
+    """Do Gauss-Newton steps with the nearest points on the ellipses held fixed."""
     first, shifts = state, _shifts(state)
     for index in range(steps):
         grey, jacobian, _ = rim_model(state, pixels, linear, shifts)
@@ -669,7 +769,7 @@ def _descend(
 
 
 def _solved(information: Array, pull: Array) -> tuple[Array, Array]:
-    """Steps (B, 16) and covariances (B, 16, 16)."""
+    """Solve the normal equations; return the steps (B, 16) and covariances (B, 16, 16)."""
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", information), 1e-12))
     equilibrated = information * scale[:, :, None] * scale[:, None, :]
     diagonal = np.arange(PARAMETERS)
@@ -680,7 +780,7 @@ def _solved(information: Array, pull: Array) -> tuple[Array, Array]:
 
 
 def _limited(step: Array, state: RimState) -> Array:
-    """Steps that keep within the range where the linearisation holds."""
+    """Shorten steps (B, 16) so that the linearisation stays valid."""
     reach = np.max(np.abs(step[:, :BLUR]), axis=1)
     share = np.minimum(1.0, np.minimum(1.5, 0.3 * state.ellipse[:, 3]) / (reach + 1e-12))
     share = np.minimum(share, 0.4 * state.sigma / (np.abs(step[:, BLUR]) + 1e-12))
@@ -693,7 +793,7 @@ def _moved(state: RimState, shifts: Array) -> RimState:
 
 
 def _coverage(pixels: Pixels, linear: Linear, weight: Float32, sigma: Array) -> Array:
-    """Share of the outline (B,) at which pixels at the edge were looked at."""
+    """Return the share (B,) of each outline at which pixels of the edge were used."""
     close = np.abs(linear.foot.distance) < spread(1.2 * sigma + 0.3, pixels.counts)
     near = np.flatnonzero(close & (weight > 0.0))
     angle = np.arctan2(linear.foot.sin[near], linear.foot.cos[near])
@@ -705,9 +805,10 @@ def _coverage(pixels: Pixels, linear: Linear, weight: Float32, sigma: Array) -> 
 def _misfit(
     state: RimState, pixels: Pixels, linear: Linear, residual: Float32, hidden: Bools, start: Start
 ) -> Array:
-    """RMS distance (B,) between rim and outline: grey residuals over the edge's slope.
+    """Return the RMS distance (B,) between the rim in the image and the outline (px).
 
-    At the edge's steepest, outliers included, with the noise's share taken away.
+    It is the RMS of the grey residuals near the steepest part of the edge, divided by the edge's
+    slope. Outliers are included; the variance of the noise is subtracted.
     """
     counts = pixels.counts
     near = np.abs(_distance(state, pixels, linear)) < spread(state.sigma, counts)
@@ -726,7 +827,10 @@ def _result(
     hidden: Bools,
     start: Start,
 ) -> Outlines:
-    """Covariances are widened by chi2_dof where that exceeds 1 by 3 sigma."""
+    """Make the public result of the fits.
+
+    Covariances are multiplied by chi2_dof if this exceeds 1 by 3 standard deviations.
+    """
     state = _moved(descent.state, descent.shifts)
     fitted = np.where(linear.resolved, PARAMETERS, FIRST_HARMONIC)
     dof = np.maximum(pixels.sums((weight > 0.0).astype(np.float32)) - fitted, 1.0)

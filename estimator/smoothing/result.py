@@ -30,11 +30,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Smoothing:
-    """What `telerig.smooth` returns.
+    """Hold what `telerig.smooth` returns.
 
-    trajectories, shake : see docs/files.md.  verdict : the content of smoothing.json that says
-    how far bubble motion and shake could be told apart; empty when nothing judged it.
-    summary : the rest of smoothing.json.  solution : states, covariances, the graph's layout.
+    trajectories : table of positions and velocities of the bubbles; `docs/files.md` describes it.
+    shake : table of the cameras' shake in each frame; `docs/files.md` describes it.
+    verdict : the part of smoothing.json that states how far the data separate the bubbles' motion
+        from the shake; empty if this was not judged.
+    summary : the rest of smoothing.json.
+    model : the hyper-parameters that were used.
+    solution : the estimated states and their covariances.
     """
 
     trajectories: pd.DataFrame
@@ -45,7 +49,7 @@ class Smoothing:
     solution: Solution = field(repr=False)
 
     def save(self, folder: str | Path) -> None:
-        """Write trajectories.csv, shake.csv, smoothing.json and results.h5."""
+        """Write trajectories.csv, shake.csv, smoothing.json and results.h5 (HDF5) into a folder."""
         from telerig.io.files.csv_table import write_table
 
         out = Path(folder)
@@ -57,7 +61,11 @@ class Smoothing:
 
 
 def summary_of(solution: Solution) -> dict[str, Any]:
-    """Hyper-parameters, constants with their standard deviations, residuals, in numbers."""
+    """Return the content of smoothing.json without the verdict.
+
+    It holds the hyper-parameters, the estimated constants with their standard deviations, and
+    numbers about the residuals.
+    """
     graph = solution.graph
     problem, model = graph.problem, graph.model
     names = [c.name for c in problem.cameras]
@@ -109,7 +117,11 @@ def _residuals(solution: Solution, which: int) -> dict[str, Any]:
 
 
 def _encoder(solution: Solution) -> dict[str, Any]:
-    """Scale and delay; ``scale_from`` : "run" where marks told it, else where it was known from."""
+    """Return the estimated scale and delay of the encoder; empty without an encoder.
+
+    ``scale_from`` is "run" if marks determined the scale in this run, otherwise it names where the
+    scale was known from.
+    """
     graph, block = solution.graph, _block(solution, "encoder")
     if graph.problem.stage is None:
         return {}
@@ -179,7 +191,10 @@ def _with_sd(names: list[str], values: Array, covariance: Array | None) -> dict[
 
 
 def write_hdf5(smoothing: Smoothing, path: Path) -> None:
-    """Both tables as columns, states and covariances as arrays, and how to read them."""
+    """Write both tables, the states and their covariances into an HDF5 file.
+
+    The file's attribute ``rows`` explains how positions and velocities follow from the states.
+    """
     import h5py
 
     from telerig.io.files.atomic import atomic_path
@@ -210,13 +225,21 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
 
 AXES = ("x", "y", "z")
 LONGEST_RTS = 5000
-"""Tracks with more frames get no RTS baseline: filterpy takes longer than the whole graph."""
+"""Largest number of frames of a track for which the result of a plain RTS smoother is also
+computed. For longer tracks filterpy would need more time than the whole smoothing graph.
+"""
 
 
 def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFrame:
-    """One row for every frame between a bubble's first and last detection; lab frame.
+    """Return the table of the bubbles' positions (mm) and velocities (mm/s) in the laboratory
+    frame.
 
-    The standard deviations hold what is not known of the encoder's scale and the travel axis.
+    The table has one row for every frame from a bubble's first to its last detection. The standard
+    deviations include the uncertainty of the encoder's scale and of the travel axis; their columns
+    are missing if the solution has no covariances.
+
+    tracks : table with the columns of tracks.csv, from which the triangulated positions, the result
+        of a plain RTS smoother and the diameters are added; None to leave these columns out.
     """
     import pandas as pd
 
@@ -249,12 +272,16 @@ def _named(values: Array, pattern: str) -> dict[str, Array]:
 
 
 def _sigma(rows: Array, covariance: Array) -> Array:
-    """(n, 3) standard deviations of rows (3, d) or (n, 3, d) of states with (n, d, d)."""
+    """Return the standard deviations (n, 3) of linear combinations of n states with d components.
+
+    rows : (3, d) or (n, 3, d) coefficients.  covariance : (n, d, d) covariances of the states.
+    """
     return np.asarray(np.sqrt(((rows @ covariance) * rows).sum(-1).clip(0)))
 
 
 def _observed(solution: Solution) -> Ints:
-    """1 where a camera saw the bubble and the pixel was not an outlier."""
+    """Return for each row 1 if a camera saw the bubble and the pixel was no outlier, otherwise 0.
+    """
     graph, obs = solution.graph, solution.graph.problem.observations
     out = np.zeros(graph.rows, np.int64)
     kept = solution.weights[0] > 0.5
@@ -263,7 +290,9 @@ def _observed(solution: Solution) -> Ints:
 
 
 def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
-    """Naive and RTS positions and velocities; the diameter that the tracker found."""
+    """Return columns for comparison: triangulated ("naive") positions, the result of a plain RTS
+    smoother, and the diameters that the tracker found.
+    """
     graph, problem = solution.graph, solution.graph.problem
     number = {b.particle: i for i, b in enumerate(problem.bubbles)}
     item = tracks["particle"].map(number).to_numpy(np.int64)
@@ -295,7 +324,13 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
 
 
 def _central_velocity(t_s: Array, position_mm: Array) -> Array:
-    """(n, 3) differences over two frames, one at the ends; NaN beside a missing position."""
+    """Return velocities (n, 3) in mm/s as differences between the frame before and the frame after.
+
+    At the ends, the frame itself replaces the missing one. The velocity is NaN beside a missing
+    position.
+
+    t_s : (n,) times.  position_mm : (n, 3) positions, NaN where missing.
+    """
     if len(t_s) < 2:
         return np.full_like(position_mm, np.nan)
     before, after = (np.clip(np.arange(len(t_s)) + i, 0, len(t_s) - 1) for i in (-1, 1))
@@ -306,10 +341,13 @@ def _central_velocity(t_s: Array, position_mm: Array) -> Array:
 def _rts(
     t_s: Array, position_mm: Array, covariance_mm2: Array, model: BubbleModel
 ) -> tuple[Array, Array]:
-    """filterpy's Kalman filter and RTS smoother on lab positions, no shake in the model.
+    """Return the result of filterpy's Kalman filter and RTS smoother, whose model has no shake.
 
-    t_s (n,), position_mm (n, 3) with NaN where there is none, covariance_mm2 (n, 3, 3).
-    Returns positions and velocities (n, 3).
+    t_s : (n,) times.
+    position_mm : (n, 3) positions in the laboratory frame, NaN where missing.
+    covariance_mm2 : (n, 3, 3) their covariances.
+
+    Returns positions (n, 3) in mm and velocities (n, 3) in mm/s.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -337,9 +375,11 @@ def _rts(
 
 
 def shake(solution: Solution) -> pd.DataFrame:
-    """One row a frame: carriage and each camera's offset from it, rig axes.
+    """Return a table with one row per frame: the carriage's position and the offset of each camera
+    from the carriage, in mm along the axes of the rig frame.
 
-    Along its depth a camera's own shake is unseen: the estimate is 0 and its sd the prior's.
+    A camera's own shake along its optical axis cannot be seen. Its estimate is 0 and its standard
+    deviation is that of the prior.
     """
     import pandas as pd
 

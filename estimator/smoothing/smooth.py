@@ -57,7 +57,9 @@ Learn = Callable[[SmoothingProblem], ShakeModel]
 _COARSE_STEP_S = 2e-3
 _ENCODER_SIGMA_MM = 0.005
 _LEAST_LEARNED_S = 0.2
-"""In less time a slow shake shows no period, and would be learned not to be there."""
+"""Shortest time of a bubble for which shake is learned. In less time a slow shake shows no period,
+and learning would find no shake.
+"""
 
 
 def smooth(
@@ -74,22 +76,30 @@ def smooth(
     progress: Progress | None = None,
     refine_rig: bool | DriftPrior = False,
 ) -> Smoothing:
-    """Smooth a run: every bubble in the lab and every camera's shake, with their covariances.
+    """Smooth a run: estimate every bubble's motion in the laboratory frame and every camera's
+    shake.
 
-    tracks : `Tracks`, a table like tracks.csv, or None to estimate offsets alone.
-    stage : a table t_s, position_mm, or the `RunData` that holds all of the run's records, which
-        then are used where nothing else is given.
-    accelerometers : a table t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2, whose sensors ``rig``
-        describes, or a mapping of name to {t_s, a_m_s2 (N, 3), mounted_on, axes,
-        noise_density_ug_sqrt_hz}.
-    references : a table frame, camera, mark, u_px, v_px[, sigma_px].
-    model : "auto" (defaults for the information at hand; learned modes for images alone),
-        "default", a `ShakeModel`, or a function that makes one.
-    rig : the description in rig.toml: travel axis (where the calibration has no stage), how well
-        the encoder's scale is known, sensors. t_s : (F,) frame times, else those of
-        the tracks.
-    refine_rig : estimate with it how the cameras have moved against each other since the
-        calibration (``summary["rig_change"]``); a `DriftPrior` says how far they may have.
+    tracks : `Tracks`, or a table with the columns of tracks.csv; None to estimate only the shake.
+    calibration : calibration of the cameras.
+    stage : a table with the columns t_s and position_mm; or the `RunData` of the run, whose other
+        records are then used as well where nothing else is given; None without an encoder.
+    accelerometers : a table with the columns t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2, whose sensors
+        ``rig`` describes; or a mapping of the sensor's name to {t_s (N,), a_m_s2 (N, 3),
+        mounted_on, axes, noise_density_ug_sqrt_hz}; None for none.
+    references : a table of marks fixed to the tank with the columns frame, camera, mark, u_px, v_px
+        and possibly sigma_px; None to take those of ``tracks``, if it has any.
+    model : "auto" (default hyper-parameters for the available measurements; modes are learned if
+        only images are available), "default", a `ShakeModel`, or a function that returns one for a
+        `SmoothingProblem`.
+    rig : the description in rig.toml. It gives the travel axis if the calibration has none, how
+        well the encoder's scale is known, and the sensors. None if there is no description.
+    t_s : (F,) times of the frames; None to take those of the tracks.
+    options : settings of the solver; None for the defaults.
+    progress : function that is called with the name of the step and the share (0 to 1) that is
+        done.
+    refine_rig : whether to estimate also how the cameras have moved relative to each other since
+        the calibration (``summary["rig_change"]``); a `DriftPrior` states how far they may have
+        moved.
 
     Raises InputError for tables that cannot be used together.
     """
@@ -158,9 +168,13 @@ def problem_of(
     t_s: ArrayLike | None = None,
     drift: Array | None = None,
 ) -> tuple[SmoothingProblem, Tracked | None, float]:
-    """The smoothing problem of these tables, the tracks read, and the encoder's sd (mm).
+    """Return the smoothing problem of these tables, the tracks that were read, and the standard
+    deviation of the encoder in mm.
 
-    drift : (6, 6) prior of a movement of the second camera since the calibration.
+    The arguments are those of `smooth`. The tracks are None if none were given.
+
+    drift : (6, 6) prior covariance of a movement of the second camera since the calibration
+        (rotation in rad, translation in mm); None if it has not moved.
     """
     if hasattr(stage, "frame_count"):
         run = stage
@@ -207,7 +221,12 @@ def problem_of(
 
 
 def _stage_geometry(described: StageDescription | None) -> tuple[Array, float, float]:
-    """Up, the encoder's sd (mm) and gravity (m/s^2); not described: upwards in the images."""
+    """Return the unit vector (3,) that points upwards in the rig frame, the standard deviation of
+    the encoder in mm, and gravity in m/s^2.
+
+    described : the stage in rig.toml; None for the defaults, where upwards is upwards in the
+        images.
+    """
     if described is None:
         return np.array([0.0, -1.0, 0.0]), _ENCODER_SIGMA_MM, STANDARD_GRAVITY_M_S2
     up = np.asarray(described.up, float)
@@ -218,7 +237,12 @@ def _stage_geometry(described: StageDescription | None) -> tuple[Array, float, f
 def choose_model(
     problem: SmoothingProblem, model: ShakeModel | Learn | str, encoder_sigma_mm: float
 ) -> ShakeModel:
-    """The hyper-parameters: given, default or learned. Raises InputError for an unknown word."""
+    """Return the hyper-parameters: the given, the default or the learned ones.
+
+    model : as for `smooth`.  encoder_sigma_mm : standard deviation of one encoder reading.
+
+    Raises InputError for an unknown word.
+    """
     if isinstance(model, ShakeModel):
         return model
     if callable(model):
@@ -234,7 +258,7 @@ def choose_model(
 
 
 def _longest_s(problem: SmoothingProblem) -> float:
-    """Time from a bubble's first frame to its last, the longest; 0 without bubbles."""
+    """Return the longest time from a bubble's first to its last frame; 0 without bubbles."""
     t = problem.t_s
     return max((float(t[b.last] - t[b.first]) for b in problem.bubbles), default=0.0)
 
@@ -242,7 +266,9 @@ def _longest_s(problem: SmoothingProblem) -> float:
 def _adapted_solution(
     problem: SmoothingProblem, model: ShakeModel, options: Options, progress: Progress | None
 ) -> Solution:
-    """A first solution with few sensor samples sets noise, RMS and delays of the second."""
+    """Return the solution whose noise, RMS and delays have been set from a first solution, which
+    uses few samples of the sensors.
+    """
     sensors = problem.accelerometers
     coarse = replace(problem, accelerometers=thinned(sensors, _COARSE_STEP_S))
     first = solve(coarse, model, options, progress)

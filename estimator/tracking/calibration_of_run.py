@@ -1,4 +1,4 @@
-"""Which calibration a run is tracked with."""
+"""Choice of the calibration with which a run is tracked."""
 
 from __future__ import annotations
 
@@ -10,9 +10,13 @@ from telerig.estimator.calibration.result.calibration import Calibration, load_c
 
 
 def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
-    """Of a calibration of more than two cameras, the two by which a run is tracked.
+    """Return the calibration of the two cameras that recorded a run.
 
-    names : of the run's cameras. Others than two that it has are left to `check_calibration`.
+    calibration : the calibration of two or more cameras.
+    names : names of the run's cameras.
+
+    The calibration is returned unchanged if it has fewer than three cameras, or if ``names`` are
+    not two of its cameras; `check_calibration` then reports the error.
     """
     known = [camera.name for camera in calibration.cameras]
     if len(known) < 3 or len(names) != 2 or not set(names) <= set(known):
@@ -22,11 +26,15 @@ def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
 
 
 def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:
-    """The calibration and the files it came from.
+    """Read the calibration for a run.
 
-    files : None takes the dataset's own; one calibration.json or its folder; or the two camera
-    files of OpenLPT (.txt), first camera first.
-    Raises InputError when there is none, or the files do not go together.
+    run : folder of the run.
+    files : None to read results/calibration/calibration.json of the run's dataset; one
+        calibration.json or its folder; or the two camera files of OpenLPT (.txt), first camera
+        first.
+
+    Returns the calibration and the files that were read. Raises InputError when there is no
+    calibration, or when the files do not belong together.
     """
     if not files:
         default = run.resolve().parent.parent / "results" / "calibration" / "calibration.json"

@@ -59,18 +59,27 @@ _SPARE = 16
 
 
 class OpenFrames:
-    """The ids of frames that are still open, and when each living particle was last seen."""
+    """Hold the track ids of the frames that are still undecided, and when each track was last seen.
+    """
 
     def __init__(self) -> None:
         self._frames: dict[int, tuple[float, Ints, Ints]] = {}
         self._seen: dict[int, int] = {}
 
     def begin(self, frame: int, t_s: float, points: int, singles: int) -> None:
+        """Add a frame without ids.
+
+        points : number of bubbles that both cameras saw.  singles : number that one camera saw.
+        """
         self._frames[frame] = (t_s, np.full(points, NO_PARTICLE), np.full(singles, NO_PARTICLE))
 
     def write(self, entries: Iterable[tuple[int, int]], particle: int) -> None:
-        """entries : (frame, column), column -1 where it was missed; they replace the particle's
-        earlier entries in these frames."""
+        """Set the id of a track in some frames; the track's earlier entries in these frames are
+        removed.
+
+        entries : (frame, index of the measurement); the index is -1 where the track was missed.
+        particle : id of the track, or -1 to remove the ids of these measurements.
+        """
         for frame, column in entries:
             ids = self._frames[frame][1]
             if particle != NO_PARTICLE:
@@ -79,18 +88,24 @@ class OpenFrames:
                 ids[column] = particle
 
     def write_single(self, frame: int, index: int, particle: int) -> None:
+        """Set the id of the single-camera measurement ``index`` of a frame."""
         self._frames[frame][2][index] = particle
 
     def now(self, frame: int) -> tuple[Ints, Ints]:
+        """Return copies of a frame's ids: of the pairs (M,) and of the single-camera measurements
+        (L,).
+        """
         _, particle, single = self._frames[frame]
         return particle.copy(), single.copy()
 
     def close(
         self, before_frame: int, alive: set[int]
     ) -> tuple[tuple[FrameIds, ...], list[TrackEvent]]:
-        """The frames before ``before_frame``, and the gaps that their tracks bridge.
+        """Return and forget the ids of all frames before ``before_frame``.
 
-        Particles that are not ``alive`` are forgotten now and then.
+        alive : ids of the living tracks; when many others have been collected, they are forgotten.
+
+        Returns the final ids of the frames, and a "gap" event for each gap that a track bridges.
         """
         out, events = [], []
         for frame in [f for f in self._frames if f < before_frame]:
@@ -114,7 +129,13 @@ _TOUCHING = 1.5
 def born(
     scan: Scan, column: int, velocity_mm_s: Array, encoder: bool, tracks: Sequence[Track]
 ) -> Track:
-    """A tentative track at a measurement; ``tracks``: the confirmed ones it may stem from."""
+    """Return a tentative track that starts at a measurement.
+
+    scan : the measurements of the frame.  column : index of the measurement.
+    velocity_mm_s : (3,) first velocity.
+    encoder : whether an encoder has given the stage's speed.
+    tracks : confirmed tracks; the nearest one is noted as a possible parent.
+    """
     point = scan.measured.points_mm[column]
     covariance = birth_covariance(scan.settings, scan.measured.covariance_mm2[column], encoder)
     x = np.zeros(len(covariance))
@@ -128,9 +149,16 @@ def born(
 def extend(
     tentative: Sequence[Track], scan: Scan, common: Common, mean_gain: Array | None
 ) -> tuple[list[Track], Common, Array | None]:
-    """Continue the tentative tracks with the free measurements; those with a rival are given up.
+    """Continue the tentative tracks with the measurements that no confirmed track uses.
 
-    Where no confirmed track determined the common shift (mean_gain None), they determine it.
+    Tracks for which two measurements fit almost equally well are given up.
+
+    common : the error that all bubbles have in common.
+    mean_gain : (12, 3) mean Kalman gain of the confirmed tracks; None if no confirmed track was
+        measured. The tentative tracks then determine the common shift.
+
+    Returns the tracks that continue, the common error, and the mean gain (None if no track was
+    measured).
     """
     if not tentative:
         return [], common, mean_gain
@@ -160,13 +188,17 @@ def extend(
 
 
 def hopeless(track: Track, frame: int, settings: TrackerSettings) -> bool:
-    """Whether a tentative track was missed too often to be confirmed."""
+    """Return whether a tentative track was missed too often to be confirmed."""
     missed = frame - track.born_frame + 1 - len(track.history)
     return missed > settings.confirm_frames - settings.confirm_hits
 
 
 def split_off(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[TrackEvent]:
-    """The event that a newly confirmed track is a part of the one it was born beside, if it is."""
+    """Return a "split" event if a newly confirmed track is a part of the track beside which it was
+    born.
+
+    The list is empty if the volumes before and after do not agree.
+    """
     parents = {t.particle: t for t in confirmed}
     if track.parent is None or track.parent[0] not in parents:
         return []
@@ -180,7 +212,13 @@ def split_off(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[Trac
 def ended(
     tracks: Sequence[Track], confirmed: Sequence[Track], scan: Scan
 ) -> tuple[set[int], list[TrackEvent]]:
-    """Particles unseen for too long, and the events; a track just lost remembers who was beside."""
+    """Find the tracks that have been unseen for too long.
+
+    tracks : the tracks to examine; one that has just been lost notes the nearest confirmed track.
+    confirmed : all confirmed tracks.
+
+    Returns the ids of the ended tracks, and their "death" and "merge" events.
+    """
     dead, events = set(), []
     for track in tracks:
         if track.seen_frame == scan.frame:
@@ -209,7 +247,9 @@ def _merged_into(track: Track, confirmed: Sequence[Track], scan: Scan) -> list[T
 
 
 def _beside(point_mm: Array, tracks: Sequence[Track]) -> tuple[int, float] | None:
-    """The nearest track whose bubble could touch one at the point: its id, its size before."""
+    """Return the nearest track whose bubble could touch a bubble at a point (3,), as its id and its
+    former diameter in mm; None if no track is near enough.
+    """
     sized = [t for t in tracks if np.isfinite(t.d_eq_mm)]
     if not sized:
         return None
@@ -225,7 +265,11 @@ def _beside(point_mm: Array, tracks: Sequence[Track]) -> tuple[int, float] | Non
 def _volumes_balance(
     whole_mm: float, part_a_mm: float, part_b_mm: float, settings: TrackerSettings
 ) -> bool:
-    """Whether the volumes of two diameters add up to that of a third, within the tolerance."""
+    """Return whether the volumes of two parts add up to the volume of the whole, within the
+    tolerance.
+
+    The arguments are equivalent diameters in mm.
+    """
     off = abs(part_a_mm**3 + part_b_mm**3 - whole_mm**3)
     return bool(off <= settings.balance_tolerance * whole_mm**3)
 
@@ -233,8 +277,15 @@ def _volumes_balance(
 def continue_alone(
     missed: Sequence[Track], scan: Scan, cameras: Sequence[Camera], common_mm2: Array
 ) -> list[tuple[Track, int, SeenAlone]]:
-    """Update the tracks by single-camera measurements: track, index of the measurement, where the
-    track is then."""
+    """Update the tracks that were missed by measurements of only one camera.
+
+    missed : tracks without a pair in this frame.
+    cameras : cameras of the rig.
+    common_mm2 : (3, 3) covariance of the position error that all bubbles have in common.
+
+    Returns for each updated track: the track, the index of the measurement, and the track's
+    position and diameter after the update.
+    """
     singles = scan.measured.singles
     out = []
     for index, camera in enumerate(cameras):
@@ -255,15 +306,19 @@ def continue_alone(
 
 
 class Tracker:
-    """Measurements of one frame after the other in, particle ids out.
+    """Follow bubbles: take the measurements of one frame after another and return track ids.
 
-    cameras : those of the rig; only single-camera measurements need them.
-    axis_rig : the stage's travel direction in the rig frame, also the bubbles' way up.
-    first_id : of the first particle; larger than any id that is given with the measurements.
+    cameras : cameras of the rig; only single-camera measurements need them.
+    axis_rig : (3,) the stage's travel direction in the rig frame, along which bubbles also rise. It
+        need not have unit length.
+    settings : None for the defaults.
+    first_id : id of the first track; it has to be larger than any id given with the measurements.
 
-    Write ids to tables from `FrameResult.final` and `finish`: a frame stays open while a
-    conflict or a birth in it is undecided, at most ``window_frames`` or ``confirm_frames``.
-    Memory does not grow with the run.
+    Take the ids for tables from `FrameResult.final` and from `finish`. A frame stays undecided
+    while a conflict or a birth in it is undecided, at most for ``window_frames`` or
+    ``confirm_frames`` frames. The memory that is needed does not grow with the length of the run.
+
+    Raises InputError when axis_rig is no direction.
     """
 
     def __init__(
@@ -294,10 +349,13 @@ class Tracker:
         self.events: list[TrackEvent] = []
 
     def predict(self, t_s: float, position_mm: float | None = None) -> Prediction:
-        """Expected positions of the confirmed tracks in the rig frame; the tracker is not changed.
+        """Return the expected positions of the confirmed tracks in the rig frame; the tracker is
+        unchanged.
 
-        t_s : of the frame.  position_mm : of the stage then; None is extrapolated.
-        Raises InputError when t_s is not after the last frame's.
+        t_s : time of the frame.
+        position_mm : encoder position of the stage at that time; None if it has to be extrapolated.
+
+        Raises InputError when t_s is not later than the last frame's time.
         """
         tracks = self._confirmed()
         x, spread = np.zeros((0, STATES)), np.zeros((0, 3, 3))
@@ -320,10 +378,14 @@ class Tracker:
         measured: FrameMeasurements,
         position_mm: float | None = None,
     ) -> FrameResult:
-        """One frame; position_mm is the encoder's reading, None or NaN where there is none.
+        """Take in the measurements of one frame and return the track ids.
 
-        Raises InputError when frame or t_s do not increase, or a single-camera measurement names
-        a camera that the tracker does not have.
+        frame, t_s : number and time of the frame; both have to increase.
+        measured : the bubbles of the frame.
+        position_mm : encoder position of the stage; None or NaN if there is none.
+
+        Raises InputError when frame or t_s do not increase, or when a single-camera measurement
+        names a camera that the tracker does not have.
         """
         self._check(frame, t_s, measured)
         motion = self._predict_all(t_s, position_mm)
@@ -343,9 +405,11 @@ class Tracker:
         return FrameResult(frame, *now, tuple(self.events), final, alone, moved)
 
     def finish(self) -> FrameResult | None:
-        """Decide the frames still open, conflicts as if their time were over; None if no frame.
+        """Decide everything that is undecided at the end of the run; conflicts end as if their
+        window ended.
 
-        The result's own ids are empty: no measurements came with it.
+        Returns the last result, whose ``final`` holds the remaining frames and whose own ids are
+        empty; None if there was no frame.
         """
         if self.last is None:
             return None
@@ -394,7 +458,9 @@ class Tracker:
     def _motion(
         self, stage: StageMotion, t_s: float, position_mm: float | None
     ) -> tuple[Transition, Array, Array]:
-        """The step, the control input (n,) and what to add to velocities before it (3,)."""
+        """Return the transition to the next frame, the stage's effect on the states (12,), and the
+        vector (3,) in mm/s that has to be added to all velocities before the step.
+        """
         assert self.last is not None
         dt = t_s - self.last[1]
         if not dt > 0:

@@ -21,12 +21,17 @@ EVENT_COLUMNS = ["frame", "t_s", "kind", "particles", "reason"]
 
 @dataclass(frozen=True)
 class Tracks:
-    """detections : every bubble found, with the id of its track, blank where it has none.
+    """Hold the tracks of a run.
 
-    table : one row per frame and bubble seen by both cameras, see docs/files.md; rig frame.
-    events : births, deaths, gaps, breaks, splits and mergers, each with its reason.
-    summary : numbers and sentences of tracking.json.
-    references : dots of a strip fixed to the tank, found in the images; None where there is none.
+    name : name of the run.
+    detections : table of all bubbles found in the images, with the id of the track in the column
+        ``particle``, blank for none.
+    table : table with one row per frame and bubble that both cameras saw, positions in mm in the
+        rig frame; `docs/files.md` describes the columns.
+    events : table of births, deaths, gaps, breaks, splits and mergers, each with its reason.
+    summary : content of tracking.json.
+    references : table of the dots of a strip fixed to the tank that were found in the images; None
+        if there is no strip.
     """
 
     name: str
@@ -41,7 +46,10 @@ class Tracks:
         return int(self.table["particle"].nunique())
 
     def save(self, folder: str | Path) -> None:
-        """Write detections.csv, tracks.csv, events.csv, tracking.json; references.csv if any."""
+        """Write detections.csv, tracks.csv, events.csv and tracking.json into a folder.
+
+        references.csv is written too if the tracks have references.
+        """
         from telerig.io.files.csv_table import write_table
 
         out = Path(folder)
@@ -56,7 +64,7 @@ class Tracks:
 
 
 def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
-    """In the order of time."""
+    """Return the events as a table with the columns `EVENT_COLUMNS`, in the order of time."""
     rows = [
         (e.frame, e.t_s, e.kind, " ".join(str(p) for p in e.particles), e.reason)
         for e in sorted(events, key=lambda e: e.frame)
@@ -65,7 +73,11 @@ def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
 
 
 def load_tracks(folder: str | Path) -> Tracks:
-    """Read what `telerig track` wrote. Raises InputError when it is not there."""
+    """Read the files that `telerig track` wrote into a folder.
+
+    Raises InputError when one of detections.csv, tracks.csv, events.csv and tracking.json is
+    missing.
+    """
     place = Path(folder)
     files = [place / n for n in ("detections.csv", "tracks.csv", "events.csv", "tracking.json")]
     for file in files:
@@ -81,7 +93,10 @@ def load_tracks(folder: str | Path) -> Tracks:
 
 
 def tracking_words(summary: Mapping[str, Any], seconds: float) -> str:
-    """What `telerig track` prints."""
+    """Return the text that `telerig track` prints.
+
+    summary : content of tracking.json.  seconds : time that the tracking took.
+    """
     tracks = "1 track" if summary["tracks"] == 1 else f"{summary['tracks']} tracks"
     lines = [
         f"Run {summary['run']!r}: {tracks}, {summary['points']} points in space "

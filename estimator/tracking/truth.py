@@ -16,17 +16,23 @@ if TYPE_CHECKING:
 
 
 NEAR_PX = 3.0
-"""A point shows a bubble when both its pixels are this near to the bubble's true ones."""
+"""Largest distance in px, in both images, between a point's pixels and the true pixels of the
+bubble that it is said to show.
+"""
 
 
 @dataclass(frozen=True)
 class Score:
-    """Bubbles that an image cuts are neither right nor wrong.
+    """Compare the points of a tracked run with the truth.
 
-    in_view : (bubble, frame) pairs that both images show whole; right : of these, with a point.
-    wrong : points that show no bubble, or one that has a point already.
-    centre_px, corrected_px : RMS per coordinate of the outlines' centres against the projected
-    centre of volume, as measured and with the shape's correction.
+    Bubbles that are cut by an image's edge count neither as right nor as wrong.
+
+    in_view : number of (bubble, frame) pairs in which both images show the whole bubble.
+    right : number of these pairs that have a point.
+    wrong : number of points that show no bubble, or a bubble that has a point already.
+    tracks : number of tracks.
+    centre_px, corrected_px : RMS per coordinate of the difference between the outlines' centres and
+        the projected centre of volume, without and with the correction for the bubble's shape.
     """
 
     in_view: int
@@ -38,15 +44,21 @@ class Score:
 
     @property
     def recall(self) -> float:
+        """Share of the bubbles in view that have a point."""
         return self.right / max(self.in_view, 1)
 
     @property
     def precision(self) -> float:
+        """Share of the points that are right."""
         return self.right / max(self.right + self.wrong, 1)
 
 
 def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) -> Score:
-    """Compare with the simulator's `truth/runs/<run>/bubbles.csv`."""
+    """Compare tracks with the truth of a simulated run.
+
+    truth : the simulator's table `truth/runs/<run>/bubbles.csv`.
+    cameras : names of the two cameras.
+    """
     bubble, right = matched(tracks.table, truth, cameras)
     wrong = (bubble["row"].isna() | bubble["row"].duplicated()).sum()
     measured, shift = (
@@ -60,8 +72,15 @@ def score_tracks(tracks: Tracks, truth: pd.DataFrame, cameras: Sequence[str]) ->
 def matched(
     table: pd.DataFrame, truth: pd.DataFrame, cameras: Sequence[str]
 ) -> tuple[pd.DataFrame, Bools]:
-    """For each point the true bubble that it shows and its ``row`` in truth, blank without one;
-    and whether it is the only one to show it, and the bubble is whole in both images."""
+    """Find the true bubble that each of N points shows.
+
+    table : N points, as in tracks.csv.  truth : the simulator's table of bubbles.
+    cameras : names of the cameras.
+
+    Returns a table of N rows of ``truth``, with the row's number in the column ``row`` (blank if
+    the point shows no bubble), and N booleans (N,). A boolean is True if the point is the first one
+    that shows its bubble and the bubble is whole in both images.
+    """
     rows_of = truth.groupby("frame").indices
     at, true = (pixels(t, cameras, "{c}_{x}_px").reshape(len(t), -1, 2) for t in (table, truth))
     chosen = np.full(len(table), np.nan)
@@ -77,12 +96,16 @@ def matched(
 
 
 def whole(truth: pd.DataFrame, cameras: Sequence[str]) -> pd.Series[bool]:
-    """Which bubbles both images show uncut."""
+    """Return for each row of the simulator's table whether all images show the whole bubble."""
     return (truth[[f"{c}_whole" for c in cameras]] == 1).all(axis=1)
 
 
 def pixels(table: pd.DataFrame, cameras: Sequence[str], name: str) -> Array:
-    """(N, 2 cameras) columns of the name pattern {c} camera, {x} u or v."""
+    """Return pixels from N rows of a table, (N, 4) for two cameras: u and v of the first, then of
+    the second.
+
+    name : pattern of the column names, in which {c} stands for the camera and {x} for u or v.
+    """
     return table[[name.format(c=c, x=x) for c in cameras for x in "uv"]].to_numpy(float)
 
 

@@ -1,4 +1,4 @@
-"""What a smoothing problem is: measurements, geometry and the priors of bubbles and rig."""
+"""Definition of a smoothing problem: measurements, geometry, and the priors of bubbles and rig."""
 
 from __future__ import annotations
 
@@ -16,15 +16,22 @@ from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 CARRIAGE = -1
-"""In place of a camera's index: a sensor on the carriage, or a mode common to all cameras."""
+"""This value in place of a camera's index stands for a sensor on the carriage of the stage, or for
+a vibration that is common to all cameras.
+"""
 
 
 @dataclass(frozen=True)
 class RigMode:
-    """One vibration of the rig, independent along each axis where its RMS is not 0.
+    """Describe one vibration of the rig.
 
-    camera : index of the camera whose arm shakes, or CARRIAGE for all cameras.
-    force_hz : low-pass cut-off of the force (two poles); None: white, only without sensors.
+    The vibrations along the axes x, y and z of the rig frame are independent of each other.
+
+    damping : damping ratio.
+    rms_mm : RMS displacement along x, y and z; 0 for no vibration along an axis.
+    camera : index of the camera whose arm vibrates, or CARRIAGE for all cameras.
+    force_hz : cut-off frequency of the two-pole low-pass filter of the driving force; None for a
+        white force, which is possible only without accelerometers.
     """
 
     frequency_hz: float
@@ -36,10 +43,14 @@ class RigMode:
 
 @dataclass(frozen=True)
 class BroadBand:
-    """Shake without modal knowledge, of one camera or (CARRIAGE) common to all.
+    """Describe shake whose modes are unknown, of one camera or of all cameras.
 
-    low_hz, high_hz, floor, tail : see `telerig.factors.state_space.broad_band`.  slow_rms_mm,
-    slow_tau_s : an Ornstein-Uhlenbeck offset besides, which accelerometers do not measure.
+    rms_mm : RMS displacement along the axes x, y and z of the rig frame.
+    camera : index of the camera, or CARRIAGE for all cameras.
+    low_hz, high_hz, floor, tail : shape of the spectrum, see
+        `telerig.factors.state_space.broad_band`.
+    slow_rms_mm, slow_tau_s : RMS and correlation time of an additional slow offset
+        (Ornstein-Uhlenbeck process), which accelerometers do not measure.
     """
 
     rms_mm: Triple
@@ -54,12 +65,14 @@ class BroadBand:
 
 @dataclass(frozen=True)
 class CarriageModel:
-    """How the carriage moves along the axis.
+    """Describe the prior of the carriage's motion along the travel axis.
 
-    kind : "readings", no dynamics: its position at a frame is what the encoder reads there;
-        "force", an acceleration of the given RMS, low-pass filtered by three poles at corner_hz,
-        which accelerometers and slow encoders need.
-    servo : (RMS mm, Hz, damping) of a following error besides.
+    kind : "readings" for no dynamics, where the position at a frame is what the encoder reads;
+        "force" for a random acceleration, which accelerometers and slow encoders need.
+    acceleration_rms_mm_s2, corner_hz : RMS of this acceleration, and cut-off frequency of its
+        three-pole low-pass filter.
+    servo : RMS (mm), frequency (Hz) and damping ratio of an additional oscillation about the
+        commanded position; None for none.
     """
 
     kind: Literal["readings", "force"] = "readings"
@@ -70,12 +83,20 @@ class CarriageModel:
 
 @dataclass(frozen=True)
 class ShakeModel:
-    """Every hyper-parameter of the smoother; each can be given.
+    """Hold every hyper-parameter of the smoother.
 
-    encoder_sigma_mm : of one reading.  encoder_scale_sigma, encoder_delay_sigma_s,
-    accelerometer_scale_sigma, accelerometer_delay_sigma_s : priors of constants, 0 to hold them.
-    pixel_inflation : factor on the stated pixel noise.  name : where the values come from.
-    learned : sd of log-parameters, by name, of a model that was learned.
+    bubble : prior of the bubbles' motion.
+    modes, broad_bands : vibrations of the rig.
+    carriage : prior of the carriage's motion.
+    encoder_sigma_mm : standard deviation (sd) of one reading of the encoder.
+    encoder_scale_sigma, accelerometer_scale_sigma : prior sd of the relative scale errors; 0 if the
+        scale is not estimated.
+    encoder_delay_sigma_s, accelerometer_delay_sigma_s : prior sd of the delays; 0 if the delay is
+        not estimated.
+    pixel_inflation : factor by which the stated pixel noise is multiplied.
+    name : origin of the values, in words.
+    learned : for a model that was learned, the sd of the natural logarithm of each hyper-parameter,
+        by name.
     """
 
     bubble: BubbleModel = field(default_factory=BubbleModel)
@@ -93,20 +114,25 @@ class ShakeModel:
 
     @property
     def force_hz(self) -> float | None:
-        """Low-pass cut-off of the modes' forces; None where they are white, or differ."""
+        """Cut-off frequency of the low-pass filter of the modes' forces; None if the forces are
+        white or have different cut-off frequencies.
+        """
         cutoffs = {m.force_hz for m in self.modes if m.force_hz is not None}
         return cutoffs.pop() if len(cutoffs) == 1 else None
 
     def without_shake(self) -> ShakeModel:
-        """The oracle's model: the cameras stand still on the carriage."""
+        """Return this model without any shake: the cameras stand still on the carriage."""
         return replace(self, modes=(), broad_bands=())
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Pixels of one kind: frame, camera (M,), uv_px (M, 2), covariance_px2 (M, 2, 2).
+    """Hold the M pixels at which bubbles, or marks, were measured.
 
     item : (M,) index of the bubble or mark.
+    frame, camera : (M,) indices of the frame and of the camera.
+    uv_px : (M, 2) pixels (u, v).
+    covariance_px2 : (M, 2, 2) covariances of the pixels in px^2.
     """
 
     item: Ints
@@ -119,20 +145,29 @@ class Observations:
         return len(self.frame)
 
     def of(self, keep: NDArray[Any]) -> Observations:
+        """Return the chosen observations.
+
+        keep : (M,) booleans, or indices.
+        """
         parts = (self.item, self.frame, self.camera, self.uv_px, self.covariance_px2)
         return Observations(*(p[keep] for p in parts))
 
     @staticmethod
     def none() -> Observations:
+        """Return zero observations."""
         ints = np.zeros(0, np.int64)
         return Observations(ints, ints, ints, np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
 
 @dataclass(frozen=True)
 class Bubble:
-    """particle : its id.  first, last : frames.  start_mm : (3,) lab, the prior's mean.
+    """Describe one bubble that is smoothed.
 
-    guess_mm : (last - first + 1, 3) lab positions where the projection is linearised first.
+    particle : id of its track.
+    first, last : its first and its last frame.
+    start_mm : (3,) prior mean of its position in the first frame, in the laboratory frame.
+    guess_mm : (last - first + 1, 3) positions in the laboratory frame at which the projection is
+        linearised in the first pass.
     """
 
     particle: int
@@ -147,7 +182,11 @@ class Bubble:
 
 @dataclass(frozen=True)
 class Mark:
-    """A feature fixed to the tank. guess_mm : (3,) lab; the prior is that, within sigma_mm."""
+    """Describe a mark, a feature fixed to the tank.
+
+    guess_mm : (3,) prior mean of its position in the laboratory frame.
+    sigma_mm : prior standard deviation of its position along each axis.
+    """
 
     name: str
     guess_mm: Array
@@ -156,7 +195,11 @@ class Mark:
 
 @dataclass(frozen=True)
 class Stage:
-    """The encoder's record: t_s, position_mm (E,), a calibrated scale taken off."""
+    """Hold the record of the encoder, which has E readings.
+
+    t_s : (E,) times.
+    position_mm : (E,) positions along the travel axis, already corrected for a calibrated scale.
+    """
 
     t_s: Array
     position_mm: Array
@@ -164,12 +207,15 @@ class Stage:
 
 @dataclass(frozen=True)
 class Travel:
-    """The stage's travel as known before the run.
+    """Hold what is known about the stage's travel before the run.
 
-    axis : (3,) unit vector in rig axes.  basis : (3, 2) unit vectors across it.
-    scale : (reading - travel) / travel, already taken off the readings of `Stage`.
-    covariance : (3, 3) of the axis' tilts (rad, along basis) and the scale.
-    source : "stage_axis" (calibrated), "rig.toml" (stated) or "assumed".
+    axis : (3,) unit vector of the travel axis in the rig frame.
+    basis : (3, 2) two unit vectors perpendicular to it, as columns.
+    scale : relative scale error of the encoder, (reading - travel) / travel. The readings of
+        `Stage` are already corrected for it.
+    covariance : (3, 3) covariance of the axis' two tilts (rad, along the columns of ``basis``) and
+        of the scale.
+    source : "stage_axis" if calibrated, "rig.toml" if stated there, or "assumed".
     """
 
     axis: Array
@@ -181,10 +227,14 @@ class Travel:
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """One sensor. camera : index, or CARRIAGE.  t_s (N,), reading_mm_s2 (N, 3).
+    """Hold the record of one accelerometer, which has N samples.
 
-    axes : (3, 3) rows are its axes in rig coordinates.  sigma_mm_s2 : of one sample, each axis.
-    delay_s : a reading stamped t describes t - delay.
+    camera : index of the camera that carries it, or CARRIAGE.
+    t_s : (N,) times.  reading_mm_s2 : (N, 3) readings.
+    axes : (3, 3) the sensor's axes as rows, in the rig frame.
+    sigma_mm_s2 : noise standard deviation of one sample along each axis.
+    bias_sigma_mm_s2 : prior standard deviation of the bias along each axis.
+    delay_s : a sample with time t was measured at t - delay_s.
     """
 
     name: str
@@ -199,12 +249,17 @@ class Accelerometer:
 
 @dataclass(frozen=True)
 class CalibrationShare:
-    """What of the calibration's uncertainty reaches the pixels: unit-variance directions.
+    """Hold the part of the calibration's uncertainty that moves pixels, as r independent
+    directions.
 
-    root : (P, r), covariance = root root^T up to directions that move no pixel.
-    free : per camera, names of the free intrinsics (the order of P, see `Calibration`).
-    covariance : (P, P) before the run, ``root`` its part that moves pixels.
-    drift : (6, 6) of a movement of the second camera since, which is part of it; None: held.
+    The P parameters are those of the calibration's rig block. Each direction has unit variance.
+
+    root : (P, r); root root^T is the covariance, except for directions that move no pixel.
+    free : for each camera the names of its free intrinsics, in the order of the P parameters.
+    covariance : (P, P) whole covariance before the run.
+    drift : (6, 6) prior covariance of a movement of the second camera since the calibration
+        (rotation in rad, translation in mm), which ``covariance`` includes; None if it is assumed
+        not to have moved.
     """
 
     root: Array
@@ -214,7 +269,10 @@ class CalibrationShare:
 
 
 def check_increasing(t_s: Array, where: str, first_row: int) -> None:
-    """Raises InputError that names the row at which times (N,) do not increase."""
+    """Raise InputError, which names the row, if the times (N,) do not increase.
+
+    where : name of the table for the message.  first_row : row number of the first time.
+    """
     bad = np.flatnonzero(~(np.diff(t_s) > 0))
     if len(bad):
         raise InputError(
@@ -226,12 +284,19 @@ def check_increasing(t_s: Array, where: str, first_row: int) -> None:
 
 @dataclass(frozen=True)
 class SmoothingProblem:
-    """Everything that was measured in one run, and the geometry it is seen through.
+    """Hold everything that was measured in one run of F frames, and the geometry of the rig.
 
-    t_s : (F,) frame times.  axis, up : (3,) unit vectors in rig axes.
-    observations, references : pixels of ``bubbles`` and of ``marks``.
-    travel : how well axis and encoder are known; None: exactly.
-    gravity_m_s2 : of the laboratory, which accelerometers read at rest.
+    t_s : (F,) times of the frames.
+    axis, up : (3,) unit vectors in the rig frame: the travel axis, and the direction opposite to
+        gravity.
+    bubbles, observations : the bubbles and their pixels.
+    stage : record of the encoder; None without an encoder.
+    marks, references : the marks fixed to the tank and their pixels.
+    calibration : uncertainty of the calibration; None if it moves no pixel.
+    travel : how well travel axis and encoder scale are known; None if they are exact.
+    gravity_m_s2 : gravity of the laboratory, which accelerometers read at rest.
+
+    Raises InputError for times that do not increase and for fewer than two frames.
     """
 
     cameras: tuple[Camera, ...]
@@ -250,12 +315,12 @@ class SmoothingProblem:
 
     @property
     def gravity_mm_s2(self) -> Array:
-        """(3,) the acceleration of gravity in rig axes, downwards."""
+        """Acceleration of gravity (3,) in the rig frame, which points downwards."""
         return -1000 * self.gravity_m_s2 * self.up
 
     @property
     def encoder_mm(self) -> Array:
-        """(F,) the encoder's reading at the frames, interpolated; 0 without a stage."""
+        """Readings (F,) of the encoder, interpolated at the frames; 0 without an encoder."""
         if self.stage is None:
             return np.zeros(len(self.t_s))
         return np.asarray(np.interp(self.t_s, self.stage.t_s, self.stage.position_mm))
@@ -267,7 +332,9 @@ class SmoothingProblem:
 
     @property
     def measures_shake(self) -> bool:
-        """Whether marks fixed to the tank, or an accelerometer on each arm, show the shake."""
+        """Whether the shake is measured, by marks fixed to the tank or by an accelerometer on each
+        arm.
+        """
         return len(self.references) > 0 or len(self.arms_with_sensor) == len(self.cameras)
 
     def __post_init__(self) -> None:

@@ -1,7 +1,8 @@
-"""How bubbles, shake and stage move between two frames: exact discretisation for any interval.
+"""Motion of bubbles, shake and stage between two frames, exact for any time between them.
 
-State of a bubble: position, velocity, acceleration and drift velocity, three components each, in
-the rig frame. The velocity is relative to the lab once an encoder has given the stage's speed.
+The state of a bubble has 12 components in the rig frame: position (mm), velocity (mm/s),
+acceleration (mm/s^2) and drift velocity (mm/s), three components each. The velocity is relative to
+the laboratory once an encoder has given the stage's speed, and relative to the rig before that.
 """
 
 from __future__ import annotations
@@ -22,9 +23,12 @@ STATES = 12
 
 @dataclass(frozen=True)
 class Transition:
-    """Over one interval: x -> matrix @ x, plus noise; all (12, 12).
+    """Describe how states change over one interval: x becomes matrix @ x, plus random noise.
 
-    common_noise : of what moves all bubbles alike: shake, and the stage without an encoder.
+    matrix : (12, 12).
+    noise : (12, 12) covariance of each bubble's own random motion.
+    common_noise : (12, 12) covariance of the motion that all bubbles share: the shake and, without
+        an encoder, the motion of the stage.
     """
 
     matrix: Array
@@ -36,9 +40,11 @@ class Transition:
 def transition(
     settings: TrackerSettings, up: tuple[float, float, float], dt_s: float, encoder: bool
 ) -> Transition:
-    """The step of every bubble over ``dt_s``; up is the unit vector of the rise.
+    """Return the transition of every bubble over an interval.
 
-    encoder : whether it gives the stage's motion over this step.
+    up : unit vector in the rig frame along which bubbles rise.
+    dt_s : length of the interval.
+    encoder : whether an encoder gives the stage's motion over this interval.
     """
     along = np.outer(up, up)
     rise = rise_motion(settings.rise_acceleration_mm_s2, settings.acceleration_time_s)
@@ -58,7 +64,11 @@ def transition(
 
 
 def _common_noise(settings: TrackerSettings, dt_s: float, encoder: bool) -> Array:
-    """Shake: steps of an Ornstein-Uhlenbeck offset; unknown stage: constant acceleration."""
+    """Return the covariance (12, 12) of the motion that all bubbles share.
+
+    The shake is an Ornstein-Uhlenbeck process. The unknown acceleration of the stage is constant
+    over the interval.
+    """
     out = np.zeros((STATES, STATES))
     forgotten = -np.expm1(-dt_s / settings.shake_time_s)
     out[POSITION, POSITION] = 2 * settings.shake_sd_mm**2 * forgotten * np.eye(3)
@@ -70,7 +80,11 @@ def _common_noise(settings: TrackerSettings, dt_s: float, encoder: bool) -> Arra
 
 
 def birth_covariance(settings: TrackerSettings, measured: Array, encoder: bool) -> Array:
-    """(12, 12) of a new track at a measured point of covariance (3, 3)."""
+    """Return the covariance (12, 12) of a new track's state.
+
+    measured : (3, 3) covariance of the measured position in mm^2.
+    encoder : whether an encoder has given the stage's speed.
+    """
     out = np.zeros((STATES, STATES))
     speed = settings.birth_speed_sd_mm_s
     if not encoder:
@@ -84,10 +98,12 @@ def birth_covariance(settings: TrackerSettings, measured: Array, encoder: bool) 
 
 @dataclass(frozen=True)
 class StageStep:
-    """moved_mm : of the stage along its axis; known : whether the encoder gave it.
+    """Describe the stage's motion over one interval.
 
-    found_speed_mm_s : not 0 in the one step that ends with the second reading of the encoder:
-    until then velocities were relative to the rig.
+    moved_mm : travel of the stage along its axis.
+    known : whether the encoder gave it.
+    found_speed_mm_s : the stage's speed in the one interval that ends with the second reading of
+        the encoder, otherwise 0. Before that reading, velocities are relative to the rig.
     """
 
     moved_mm: float
@@ -97,10 +113,14 @@ class StageStep:
 
 @dataclass
 class StageMotion:
-    """The stage's motion as the filters' control input, with and without an encoder.
+    """Follow the stage's motion, which is the known input of all filters, with and without an
+    encoder.
 
-    in_lab : velocities are relative to the lab, as the encoder has given a speed.
-    read_mm, read_t_s : the last reading; assumed_mm : the position that the filters assume.
+    in_lab : whether velocities are relative to the laboratory, because the encoder has given a
+        speed.
+    read_mm, read_t_s : position and time of the last reading of the encoder, NaN before the first.
+    assumed_mm : position of the stage that the filters assume.
+    speed_mm_s : speed between the last two readings.
     """
 
     in_lab: bool = False
@@ -110,7 +130,12 @@ class StageMotion:
     speed_mm_s: float = 0.0
 
     def step(self, position_mm: float | None, t_s: float, dt_s: float) -> StageStep:
-        """Without a reading (None, NaN) the last speed holds; the next reading corrects it."""
+        """Return the stage's motion over one interval and remember the reading.
+
+        position_mm : reading of the encoder at the end of the interval. If it is None or NaN, the
+            last speed is assumed to continue, and the next reading corrects the position.
+        t_s : time of the end of the interval.  dt_s : its length.
+        """
         if position_mm is None or not np.isfinite(position_mm):
             moved = self.speed_mm_s * dt_s if self.in_lab else 0.0
             self.assumed_mm += moved

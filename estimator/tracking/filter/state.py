@@ -1,9 +1,12 @@
-"""One bubble's Kalman filter, and the error that all bubbles have in common.
+"""Kalman filter of one bubble, and the error that all bubbles have in common.
 
-The error of bubble i is own_i + common: `Track.filter` carries the own part (independent between
-bubbles), `Common` the part that shake and stage give to all alike. Both follow the same motion, so
-prediction keeps the form; so does the update with equal gains, and a gain that differs from the
-mean adds its share to the own part. Differences between bubbles are free of the common part.
+The error of a bubble is its own error plus the common error. `Track.filter` carries the own error,
+which is independent between bubbles; `Common` carries the error that shake and stage give to all
+bubbles alike. Both follow the same equation of motion, so that a prediction keeps this form. The
+Kalman gain is the matrix by which a filter multiplies the measured minus the predicted position to
+correct its state. An update keeps the form if all bubbles have the same gain; a gain that differs
+from the mean adds its share to the own error. Differences between bubbles are free of the common
+error.
 """
 
 from __future__ import annotations
@@ -24,13 +27,22 @@ _IDENTITY = np.eye(STATES)
 
 @dataclass
 class Track:
-    """A bubble that is followed.
+    """Hold the state of one bubble that is followed.
 
-    filter : filterpy KalmanFilter, state as in `motion`; d_eq_mm : running mean, NaN if unknown;
-    d_last_mm : the last measured, d_before_mm : the mean before that. seen_frame, seen_t_s : of
-    the last measurement; misses : frames since. history : (frame, point) of a track that is not
-    confirmed yet. parent, near : id and former size of the nearest track at its birth, and when it
-    was first missed.
+    filter : filterpy KalmanFilter; its state (12,) is described in `motion`.
+    particle : id of the track, -1 as long as it has none.
+    d_eq_mm : running mean of the equivalent diameter, NaN if unknown.
+    d_last_mm : last measured diameter.
+    d_before_mm : running mean before the last measurement.
+    born_frame : frame of the first measurement.
+    seen_frame, seen_t_s : frame and time of the last measurement.
+    misses : number of frames since the last measurement.
+    history : (frame, index of the measurement) for each measurement of a track that is not
+        confirmed.
+    parent : id and former diameter (mm) of the nearest track at this track's birth; None if no
+        track was near enough to touch it.
+    near : the same for the nearest track at the time when this track was first missed; None while
+        the track is seen.
     """
 
     filter: Any
@@ -48,37 +60,58 @@ class Track:
 
     @property
     def point_mm(self) -> Array:
-        """(3,) its position in the rig frame."""
+        """Position (3,) in the rig frame."""
         return np.asarray(self.filter.x[POSITION])
 
     @property
     def point_covariance_mm2(self) -> Array:
-        """(3, 3) of the position, own part."""
+        """Covariance (3, 3) of the position, without the error that all bubbles have in common."""
         return np.asarray(self.filter.P[POSITION, POSITION])
 
     def copy(self) -> Track:
-        """Independent of the original: filterpy replaces its arrays, it never writes into them."""
+        """Return a copy that can be changed without changing this track.
+
+        The arrays are shared, because filterpy replaces its arrays and never writes into them.
+        """
         return replace(self, filter=copy(self.filter), history=list(self.history))
 
     def predict(self, step: Transition, control: Array) -> None:
-        """control : (n,) added to the state: the stage's motion."""
+        """Move the state to the next frame.
+
+        step : the transition over the time between the frames.
+        control : (12,) vector that is added to the state because of the stage's motion.
+        """
         self.filter.predict(u=control, B=_IDENTITY, F=step.matrix, Q=step.noise)
 
     def missed(self, shift: Array, mean_gain: Array, common_mm2: Array) -> None:
-        """No measurement in this frame; shift (n,) common to all, mean_gain (n, 3)."""
+        """Update the track for a frame in which it has no measurement.
+
+        shift : (12,) shift of this frame, common to all bubbles.
+        mean_gain : (12, 3) mean Kalman gain of the bubbles that were measured.
+        common_mm2 : (3, 3) covariance of the common position error.
+        """
         self.misses += 1
         self.filter.x = self.filter.x + shift
         self.filter.P = self.filter.P + mean_gain @ common_mm2 @ mean_gain.T
 
     def update(self, z: Array, r: Array, shift: Array, mean_gain: Array, common_mm2: Array) -> None:
-        """Measured at z (3,) with covariance r (3, 3), the common shift (n,) being known."""
+        """Update the track by a measured position.
+
+        z : (3,) position in mm.  r : (3, 3) its covariance in mm^2.
+        shift : (12,) shift of this frame, common to all bubbles.
+        mean_gain : (12, 3) mean Kalman gain of the bubbles that were measured.
+        common_mm2 : (3, 3) covariance of the common position error.
+        """
         self.filter.x = self.filter.x + shift
         self.filter.update(z, R=r)
         unequal = mean_gain - self.filter.K
         self.filter.P = self.filter.P + unequal @ common_mm2 @ unequal.T
 
     def saw(self, frame: int, t_s: float, d_eq_mm: float) -> None:
-        """Record a measurement in a frame; d_eq_mm : NaN if unknown."""
+        """Record that the track was measured in a frame.
+
+        d_eq_mm : measured equivalent diameter, NaN if unknown.
+        """
         self.seen_frame, self.seen_t_s, self.misses, self.near = frame, t_s, 0, None
         if np.isfinite(d_eq_mm):
             self.d_last_mm, self.d_before_mm = d_eq_mm, self.d_eq_mm
@@ -89,7 +122,12 @@ class Track:
 
 
 def new_filter(x: Array, p: Array) -> Any:
-    """A filterpy KalmanFilter that measures the position; F, Q and R come with every step."""
+    """Return a filterpy KalmanFilter that measures the position of a bubble.
+
+    x : (12,) first state.  p : (12, 12) its covariance.
+
+    The matrices F, Q and R are given with each prediction and each update.
+    """
     from filterpy.kalman import KalmanFilter
 
     kalman = KalmanFilter(dim_x=len(x), dim_z=3)
@@ -100,9 +138,11 @@ def new_filter(x: Array, p: Array) -> Any:
 
 @dataclass(frozen=True)
 class Common:
-    """The error common to all bubbles.
+    """Hold the error that all bubbles of a frame have in common.
 
-    shift : (n,) of this frame, not yet added to the tracks; covariance : (n, n).
+    shift : (12,) estimate of the common shift of this frame's states; it is not yet added to the
+        tracks.
+    covariance : (12, 12) covariance of the shift.
     """
 
     shift: Array = field(default_factory=lambda: np.zeros(STATES))
@@ -117,11 +157,17 @@ class Common:
         return self.covariance[POSITION, POSITION]
 
     def predicted(self, step: Transition) -> Common:
+        """Return the common error in the next frame: the shift is 0 and the covariance has grown.
+        """
         grown = step.matrix @ self.covariance @ step.matrix.T + step.common_noise
         return Common(np.zeros(STATES), grown)
 
     def informed(self, innovations: Array, covariances: Array) -> Common:
-        """After innovations (E, 3) of bubbles whose own covariances are (E, 3, 3)."""
+        """Return the common error after it has been estimated from E bubbles.
+
+        innovations : (E, 3) measured minus predicted positions in mm.
+        covariances : (E, 3, 3) covariances of the innovations in mm^2, without the common error.
+        """
         if len(innovations) == 0:
             return self
         information = np.linalg.inv(covariances)
@@ -132,7 +178,11 @@ class Common:
         return Common(self.shift + gain @ score, self.covariance - (lost + lost.T) / 2)
 
     def applied(self, mean_gain: Array) -> Common:
-        """The remainder once the tracks have taken the shift and their measurements."""
+        """Return the error that remains after the tracks have taken over the shift and their
+        measurements.
+
+        mean_gain : (12, 3) mean Kalman gain of the measured tracks.
+        """
         keep = np.eye(STATES)
         keep[:, POSITION] -= mean_gain
         return Common(np.zeros(STATES), keep @ self.covariance @ keep.T)

@@ -16,30 +16,48 @@ NO_PARTICLE = -1
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """Defaults suit bubbles of 5 mm that rise at 280 mm/s, seen at 100 to 1000 Hz.
+    """Hold the settings of the tracker.
 
-    rise_mm_s, birth_speed_sd_mm_s : velocity of a new track along the travel axis and its sd on
-        each axis; without an encoder the mean is 0 and the sd birth_speed_sd_no_encoder_mm_s.
-    lateral_acceleration_mm_s2, rise_acceleration_mm_s2 : RMS across and along the travel axis.
+    The defaults suit bubbles of 5 mm that rise at 280 mm/s and are recorded at 100 to 1000 Hz.
+    "Along" and "across" refer to the stage's travel axis. Raises InputError for values outside
+    their range.
+
+    rise_mm_s : mean velocity of a new track along the axis, used if an encoder gives the stage's
+        motion; otherwise the mean is 0.
+    birth_speed_sd_mm_s, birth_speed_sd_no_encoder_mm_s : standard deviation (sd) of a new track's
+        velocity in each coordinate, with and without an encoder.
+    lateral_acceleration_mm_s2, rise_acceleration_mm_s2 : RMS acceleration across and along the
+        axis.
     acceleration_time_s : correlation time of the acceleration along the axis (Singer's model).
-    zigzag_hz, zigzag_damping : frequency at which the velocity across the travel axis oscillates,
-        and its damping ratio: small for one frequency, 0.7 for any up to it.
-    drift_sd_mm_s, drift_time_s : of the slow velocity across the axis about which it oscillates.
-    shake_sd_mm, shake_time_s : offset common to all bubbles in a frame, sd and correlation time.
-    stage_acceleration_mm_s2 : of the stage, where the encoder does not give its position.
-    size_scatter : relative sd of d_eq_mm from frame to frame; size_cap_log_ratio : largest penalty
-        (log-likelihood) of a wrong size.
-    detection_probability, missed_again_probability : of a bubble in a frame; of one that was
-        missed in the frame before to be missed again. end_probability : to leave for good in a
-        frame; so a track that was missed for long hardly claims a measurement.
-    new_per_mm3, new_per_px2 : density of clutter and new bubbles in space and in one image.
-    gate_probability : that a true continuation lies inside its gate.
-    margin_log_ratio : least log-likelihood ratio to the runner-up for a safe decision when the
-        window ends; prune_log_ratio : hypotheses further behind the best are dropped at once.
-    window_frames : how long a conflict may stay open. max_hypotheses : per conflict.
-    confirm_hits, confirm_frames : a new track needs so many measurements in its first frames.
-    gap_s, gap_frames : a track unseen for longer than both ends.
-    balance_tolerance : of the volume, to call a birth a split or an end a merger.
+    zigzag_hz, zigzag_damping : frequency at which the velocity across the axis oscillates, and its
+        damping ratio. A small ratio means one frequency; 0.7 means any frequency up to zigzag_hz.
+    drift_sd_mm_s, drift_time_s : sd and correlation time of the slow velocity across the axis about
+        which the velocity oscillates.
+    shake_sd_mm, shake_time_s : sd and correlation time of the offset that all bubbles of a frame
+        share.
+    stage_acceleration_mm_s2 : acceleration of the stage in frames without an encoder position.
+    size_scatter : relative sd of d_eq_mm (equivalent diameter) from frame to frame.
+    size_cap_log_ratio : largest penalty of a wrong size, as a difference of log-likelihoods.
+    detection_probability : probability that a bubble is detected in a frame.
+    missed_again_probability : probability that a bubble which was missed in the frame before is
+        missed again.
+    end_probability : probability that a bubble leaves for good in a frame. Because of it, a track
+        that was missed for long hardly claims a measurement.
+    new_per_mm3, new_per_px2 : density of false detections and new bubbles in space (1/mm^3) and in
+        one image (1/px^2).
+    gate_probability : probability that the true continuation of a track lies inside its gate.
+    margin_log_ratio : smallest log-likelihood ratio between the best and the second-best hypothesis
+        for which the best one counts as safe when the window ends.
+    prune_log_ratio : a hypothesis whose log-likelihood is smaller than the best one's by more than
+        this is dropped at once.
+    window_frames : number of frames for which a conflict (tracks that compete for the same
+        measurements) may stay undecided.
+    max_hypotheses : largest number of hypotheses in one conflict.
+    confirm_hits, confirm_frames : a new track is confirmed if it has at least confirm_hits
+        measurements in its first confirm_frames frames.
+    gap_s, gap_frames : a track that is unseen for longer than both of these ends.
+    balance_tolerance : largest difference between the volumes before and after, as a share of the
+        larger bubble's volume, for which a birth counts as a split or a death as a merger.
     """
 
     rise_mm_s: float = 280.0
@@ -95,9 +113,11 @@ class TrackerSettings:
 
 @dataclass(frozen=True)
 class SingleMeasurements:
-    """Bubbles that one camera saw without a partner in the other.
+    """Hold the L bubbles of one frame that only one camera saw.
 
-    camera : (L,) index; uv_px : (L, 2); covariance_px2 : (L, 2, 2).
+    camera : (L,) index of the camera.
+    uv_px : (L, 2) pixel (u, v).
+    covariance_px2 : (L, 2, 2) covariance of the pixel in px^2.
     """
 
     camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -110,10 +130,15 @@ class SingleMeasurements:
 
 @dataclass(frozen=True)
 class FrameMeasurements:
-    """One frame's bubbles, in the rig frame.
+    """Hold the M bubbles of one frame that both cameras saw, and the bubbles seen by only one
+    camera.
 
-    points_mm : (M, 3); covariance_mm2 : (M, 3, 3); d_eq_mm : (M,), NaN where unknown;
-    confidence : (M,) in (0, 1]; particle : (M,) given ids, -1 where there is none.
+    points_mm : (M, 3) positions in the rig frame.
+    covariance_mm2 : (M, 3, 3) covariances of the positions.
+    d_eq_mm : (M,) equivalent diameters, NaN where unknown.
+    confidence : (M,) confidence in (0, 1] that the pair of detections is one bubble.
+    particle : (M,) ids given with the data, -1 where no id is given.
+    singles : the bubbles that only one camera saw.
     """
 
     points_mm: Array
@@ -133,7 +158,17 @@ class FrameMeasurements:
         particle: ArrayLike | None = None,
         singles: SingleMeasurements | None = None,
     ) -> FrameMeasurements:
-        """Checked: raises InputError for shapes that do not fit, or values that are not finite."""
+        """Return the measurements of a frame after checking them.
+
+        points_mm : (M, 3).  covariance_mm2 : (M, 3, 3), or one (3, 3) for all points.
+        d_eq_mm : (M,); None if all diameters are unknown.
+        confidence : (M,); None for 1 everywhere.
+        particle : (M,) whole numbers, -1 for no id; None if no ids are given.
+        singles : bubbles seen by only one camera; None for none.
+
+        Raises InputError for shapes that do not fit, for points or covariances that are not finite,
+        and for an id that occurs twice.
+        """
         points = np.asarray(points_mm, float).reshape(-1, 3)
         m = len(points)
         covariance = np.broadcast_to(np.asarray(covariance_mm2, float), (m, 3, 3))
@@ -161,20 +196,25 @@ class FrameMeasurements:
 
     @property
     def labelled(self) -> Ints:
-        """Positions of the bubbles with given ids."""
+        """Indices of the bubbles whose ids were given with the data."""
         return np.flatnonzero(self.particle != NO_PARTICLE)
 
     @property
     def free(self) -> Ints:
-        """Positions of the others."""
+        """Indices of the bubbles without a given id."""
         return np.flatnonzero(self.particle == NO_PARTICLE)
 
 
 @dataclass(frozen=True)
 class TrackEvent:
-    """kind : birth, death, gap, break, resolved, split or merge.
+    """Describe one event in the life of tracks.
 
-    particles : the tracks concerned, the older first; frame, t_s : when; reason : a sentence.
+    kind : "birth", "death", "gap" (frames without a measurement were bridged), "break" (a track was
+        cut because its continuation was not safe), "resolved" (a conflict was decided), "split" or
+        "merge".
+    frame, t_s : frame and its time in s.
+    particles : ids of the tracks concerned, the older track first.
+    reason : the reason in words.
     """
 
     kind: str
@@ -186,7 +226,12 @@ class TrackEvent:
 
 @dataclass(frozen=True)
 class FrameIds:
-    """Final: particle : (M,) and single : (L,) ids of a frame's measurements, -1 for none."""
+    """Hold the final track ids of one frame's measurements.
+
+    frame : number of the frame.
+    particle : (M,) ids of the bubbles that both cameras saw, -1 for no track.
+    single : (L,) ids of the bubbles that one camera saw, -1 for no track.
+    """
 
     frame: int
     particle: Ints
@@ -195,7 +240,11 @@ class FrameIds:
 
 @dataclass(frozen=True)
 class SeenAlone:
-    """A track after its update by one camera alone: point_mm (3,), d_eq_mm (NaN if unknown)."""
+    """Describe a track after an update by a measurement of only one camera.
+
+    point_mm : (3,) position in the rig frame.
+    d_eq_mm : equivalent diameter, NaN if unknown.
+    """
 
     point_mm: Array
     d_eq_mm: float
@@ -203,9 +252,13 @@ class SeenAlone:
 
 @dataclass(frozen=True)
 class Motion:
-    """From the frame before: a bubble's state x -> matrix @ x + offset (n,), plus noise (n, n).
+    """Describe the motion of every bubble from the frame before to this frame.
 
-    The offset holds the stage's travel and the shift common to all bubbles.
+    A bubble's state x (see `motion`) becomes matrix @ x + offset, plus random noise.
+
+    matrix : (12, 12).
+    noise : (12, 12) covariance of the random part.
+    offset : (12,) effect of the stage's travel and of the shift that all bubbles share.
     """
 
     matrix: Array
@@ -213,7 +266,11 @@ class Motion:
     offset: Array
 
     def shifted(self, shift: Array, covariance_mm2: Array) -> Motion:
-        """With the common shift (n,) and the covariance of its position (3, 3)."""
+        """Return this motion with the shift of a frame added, which all bubbles share.
+
+        shift : (12,) is added to the offset.
+        covariance_mm2 : (3, 3) covariance of the shift's position, which is added to the noise.
+        """
         noise = self.noise.copy()
         noise[:3, :3] += covariance_mm2
         return Motion(self.matrix, noise, self.offset + shift)
@@ -221,12 +278,15 @@ class Motion:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """particle, single : ids as of now, the best guess where a conflict or a birth is still open.
+    """Hold what the tracker returns for one frame with M pairs and L single-camera measurements.
 
-    final : the earlier frames (and this one, if nothing is open) whose ids are final now, in
-        order; write these to the tables. events : what became known in this frame.
-    alone : by index of the single measurement, the tracks that one camera alone continued.
-    motion : None in the first frame.
+    particle, single : (M,) and (L,) ids as known now, -1 for no track. While a conflict or a birth
+        is undecided, they are the best guess.
+    events : events that became known in this frame.
+    final : ids of earlier frames that are final now, in the order of the frames; this frame is
+        among them if nothing in it is undecided. Write these ids to the tables.
+    alone : tracks that only one camera continued, by index of the single-camera measurement.
+    motion : motion of the bubbles since the frame before; None in the first frame.
     """
 
     frame: int

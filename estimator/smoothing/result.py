@@ -280,8 +280,7 @@ def _sigma(rows: Array, covariance: Array) -> Array:
 
 
 def _observed(solution: Solution) -> Ints:
-    """Return for each row 1 if a camera saw the bubble and the pixel was no outlier, otherwise 0.
-    """
+    """Return for each row 1 if a camera saw the bubble and the pixel was no outlier, else 0."""
     graph, obs = solution.graph, solution.graph.problem.observations
     out = np.zeros(graph.rows, np.int64)
     kept = solution.weights[0] > 0.5

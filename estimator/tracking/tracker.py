@@ -59,8 +59,7 @@ _SPARE = 16
 
 
 class OpenFrames:
-    """Hold the track ids of the frames that are still undecided, and when each track was last seen.
-    """
+    """Hold the track ids of the undecided frames, and when each track was last seen."""
 
     def __init__(self) -> None:
         self._frames: dict[int, tuple[float, Ints, Ints]] = {}

@@ -157,7 +157,8 @@ class Common:
         return self.covariance[POSITION, POSITION]
 
     def predicted(self, step: Transition) -> Common:
-        """Return the common error in the next frame: the shift is 0 and the covariance has grown.
+        """Return the common error in the next frame: the shift is 0, and the covariance has
+        grown.
         """
         grown = step.matrix @ self.covariance @ step.matrix.T + step.common_noise
         return Common(np.zeros(STATES), grown)

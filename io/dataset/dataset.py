@@ -31,7 +31,12 @@ _LAYOUT = "put images at calibration/<camera>/<view>.tif, or dots in calibration
 
 @dataclass(frozen=True)
 class View:
-    """One pose of the target. image_paths : by camera; empty when the source is dots.csv."""
+    """Hold one view: one position of the calibration target.
+
+    name : the file name of its images without the extension, or the text in the column `view`.
+    image_paths : the image file of each camera that has one, by camera name. It is empty when the
+    dots are read from dots.csv.
+    """
 
     name: str
     image_paths: Mapping[str, Path] = field(default_factory=dict)
@@ -39,13 +44,16 @@ class View:
 
 @dataclass(frozen=True)
 class Run:
-    """One recording: the folder `runs/<name>`."""
+    """Hold the name and the folder `runs/<name>` of one recording of bubbles."""
 
     name: str
     path: Path
 
     def load(self, **options: Any) -> RunData:
-        """Its tables and frames; options as for `telerig.io.dataset.run.load_run`."""
+        """Read the run's tables and open its frames with `telerig.io.dataset.run.load_run`.
+
+        options : passed on to `load_run`.
+        """
         from telerig.io.dataset.run import load_run
 
         return load_run(self.path, **options)
@@ -53,10 +61,16 @@ class Run:
 
 @dataclass(frozen=True)
 class Dataset:
-    """What `load_dataset` found.
+    """Hold what `load_dataset` found in a dataset folder.
 
-    views : in natural order of their names. source : where the views come from; None when no
-    views were asked for and none could be chosen. notes : what a user should know, in words.
+    path : the dataset folder.
+    rig : the content of its rig.toml.
+    views : the calibration views in natural order of their names (2 before 10).
+    runs : the recordings by name.
+    source : "images" or "dots", the form in which the views are given. It is None when no views
+    were required and the folder has either no views or both forms.
+    notes : sentences that a user should read.
+    table : the dots as `read_dots_csv` returns them; None unless the source is "dots".
     """
 
     path: Path
@@ -69,17 +83,20 @@ class Dataset:
 
     @property
     def target(self) -> Target:
+        """Return the calibration target that rig.toml describes."""
         return self.rig.target
 
     @property
     def results(self) -> Path:
-        """Where commands write unless --out names another folder."""
+        """Return the folder into which commands write, unless --out names another one."""
         return self.path / "results"
 
     def dots(self) -> pd.DataFrame:
-        """The table of `calibration/dots.csv`, see `telerig.io.dataset.tables.read_dots_csv`.
+        """Return a copy of the table that was read from `calibration/dots.csv`.
 
-        Raises InputError when the views are images: their dots must be detected first.
+        Its columns are described in `telerig.io.dataset.tables.read_dots_csv`.
+        Raises InputError when no such table was read, because the views are images: their dots must
+        be detected first.
         """
         if self.table is None:
             raise InputError(
@@ -90,9 +107,13 @@ class Dataset:
         return self.table.copy()
 
     def image(self, view: View, camera: str | int) -> Image:
-        """The view's image from one camera, of the size that `rig.toml` states.
+        """Read the image of a view from one camera.
 
-        Raises InputError when the camera has no image of the view, or one that cannot be used.
+        camera : name or index of the camera.
+        Returns the pixels, an array (height, width) of uint8, uint16 or float32, with the size that
+        `rig.toml` states.
+        Raises InputError when the camera has no image of the view, or when the image cannot be
+        used.
         """
         name = self.rig.camera_name(camera)
         if name not in view.image_paths:
@@ -106,7 +127,11 @@ class Dataset:
 
     @cached_property
     def truth(self) -> dict[str, Any] | None:
-        """The simulator's `truth/truth.json`; None in a real dataset. Never for estimators."""
+        """Return the content of the simulator's `truth/truth.json`; None in a real dataset.
+
+        The file is read at the first use. It serves for comparison only; no estimator may use it.
+        Raises InputError when the file is not valid JSON.
+        """
         file = self.path / "truth" / "truth.json"
         if not file.is_file():
             return None
@@ -125,12 +150,16 @@ def load_dataset(
     *,
     need_views: bool = True,
 ) -> Dataset:
-    """Read a dataset's rig file and list what else it holds; no image is decoded.
+    """Read a dataset's rig.toml and, if there is one, its dots.csv, and list its views and runs.
 
-    source : "images" or "dots" when `calibration/` holds both.
-    need_views : False for work on runs with a calibration from elsewhere; then a dataset without
-    views, or with views of two kinds, is no error.
-    Raises InputError for a folder that is not a dataset or views that are not distinct.
+    No image is decoded and nothing is written.
+    path : the dataset folder.
+    source : "images" or "dots"; needed when `calibration/` holds both. None takes the only one.
+    need_views : False for work on runs with a calibration from elsewhere. Then it is no error if
+    the dataset has no views, or has them in both forms.
+    Returns the `Dataset`.
+    Raises InputError when the folder is not a dataset, and when two views cannot be distinguished
+    by their names. Raises NoViewsError when views are needed and there are none.
     """
     folder = _dataset_folder(Path(path))
     rig = read_rig_toml(folder / "rig.toml")
@@ -180,7 +209,10 @@ def _dataset_folder(path: Path) -> Path:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What a folder holds in natural order, hidden entries left out; nothing if it is not there."""
+    """List the files and folders in a folder in natural order, without hidden ones.
+
+    Returns an empty list when the folder does not exist.
+    """
     if not folder.is_dir():
         return []
     found = (p for p in folder.iterdir() if not p.name.startswith("."))
@@ -204,7 +236,7 @@ def _choose_source(
 
 
 class NoViewsError(InputError):
-    """A dataset in which no calibration views are found, yet."""
+    """Report that a dataset has no calibration views yet."""
 
 
 def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> NoViewsError:
@@ -222,6 +254,11 @@ def _no_views(folder: Path, rig: RigDescription, wanted: list[Source]) -> NoView
 
 
 def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tuple[View, ...]:
+    """Return the views whose images lie in calibration/<camera>/, in natural order of their names.
+
+    A sentence about every unused file, and about views of a single camera, is added to ``notes``.
+    Raises InputError for the folder of an unknown camera and for views with ambiguous names.
+    """
     by_view: dict[str, dict[str, Path]] = {}
     for entry in _entries(calibration):
         if not entry.is_dir():
@@ -245,7 +282,11 @@ def _image_views(calibration: Path, rig: RigDescription, notes: list[str]) -> tu
 
 
 def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
-    """The images of one camera by view name; what is no image is noted."""
+    """Return the image files of one camera by view name, which is the file name without extension.
+
+    A sentence that names the files that are no images is added to ``notes``.
+    Raises InputError when two images have the same view name.
+    """
     images = list_images(folder)
     unused = [p.name for p in _entries(folder) if p not in images]
     if unused:
@@ -266,7 +307,10 @@ def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
 
 
 def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
-    """Names that differ only in case are one view on some file systems and two on others."""
+    """Raise InputError when the names of two views differ only in upper and lower case.
+
+    Some file systems treat them as one name and others as two.
+    """
     spelled: dict[str, str] = {}
     for view in by_view:
         other = spelled.setdefault(view.casefold(), view)
@@ -281,7 +325,11 @@ def _check_case(by_view: dict[str, dict[str, Path]], calibration: Path) -> None:
 
 
 def _note_single(cameras_of: Mapping[Any, set[str]], rig: RigDescription, notes: list[str]) -> None:
-    """Add a note for the views that only one camera has, which say nothing about the other."""
+    """Add a sentence to ``notes`` about the views that only one camera has.
+
+    Such a view does not help to determine the pose of another camera.
+    cameras_of : the set of camera names by view name.
+    """
     for camera in rig.cameras if len(rig.cameras) > 1 else ():
         alone = sorted((str(v) for v, seen in cameras_of.items() if seen == {camera}), key=natural)
         if alone:

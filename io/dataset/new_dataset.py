@@ -1,4 +1,4 @@
-"""A new dataset: its folders, and a rig.toml with a comment on every line that needs one."""
+"""Make a new dataset: its folders and a rig.toml with comments for the person who completes it."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ def new_dataset(
     scale_px_per_mm: float = 10.0,
     angle_deg: float = 90.0,
 ) -> list[Path]:
-    """Make the folders of a dataset and its rig.toml; returns what was made, rig.toml first.
+    """Make the folders of a new dataset and write its rig.toml.
 
-    cameras : two to four names. image_size_px : (width, height). angle_deg : from each camera's
-    axis to the next one's.
-    What is there already stays: folders are completed, a rig.toml is never written over.
-    Raises InputError for a folder that has one, or values that no rig can have.
+    folder : the dataset folder; it is made if it does not exist. Folders that exist already stay.
+    cameras : two to four different names.
+    image_size_px : (width, height) of every camera's image in px.
+    scale_px_per_mm : nominal scale of every camera in px/mm.
+    angle_deg : nominal angle in degrees between the optical axes of one camera and the next.
+    Returns the paths of rig.toml and of the folders for the images and the runs, in this order.
+    Raises InputError when the folder already has a rig.toml, and for values that no rig can have.
     """
     place = Path(folder)
     rig = place / "rig.toml"
@@ -58,12 +61,14 @@ def new_dataset(
 
 
 def _camera(name: str, image_size_px: tuple[int, int], scale_px_per_mm: float) -> str:
+    """Return the text of the table [cameras.<name>]; the size is in px, the scale in px/mm."""
     width, height = image_size_px
     size = f"image_size_px = [{width}, {height}]"
     return f"[cameras.{name}]\n{size}\nscale_px_per_mm = {float(scale_px_per_mm)}\n\n"
 
 
 def _check(cameras: Sequence[str], size: tuple[int, int], scale: float) -> None:
+    """Raise InputError for camera names, an image size (px) or a scale (px/mm) that cannot be."""
     if not 2 <= len(cameras) <= MOST_CAMERAS:
         raise InputError(f"{len(cameras)} cameras", todo=f"name two to {MOST_CAMERAS}")
     for name in cameras:

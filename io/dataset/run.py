@@ -1,6 +1,6 @@
-"""A recording of bubbles: its frames, which stay on disk, and its tables, checked together.
+"""Read a recording of bubbles: its tables are read and checked, its frames stay on disk.
 
-Frames of several cameras are paired by the numbers in their names, or in order.
+The frames of several cameras are paired by the numbers in their names, or by their order.
 """
 
 from __future__ import annotations
@@ -35,14 +35,24 @@ RunSource = Literal["images", "detections"]
 
 @dataclass(frozen=True)
 class RunData:
-    """What `load_run` found.
+    """Hold what `load_run` found in a run's folder; it has F frames.
 
-    cameras : names, the rig's first camera first. t_s : (F,) mid-exposure.
-    position_mm : (F,) the stage's position at t_s, NaN outside its record; None without stage.csv.
-    detections : None when the source is images. image_sizes_px : (width, height) by camera.
-    notes : what a user should know, in words; frames found unreadable later are added.
-    skip_unreadable : whether `image` gives None for a frame that cannot be read; None: only for
-    the last one.
+    name, path : the run's name and folder.
+    cameras : the names of the cameras that the run is read for.
+    frame_count : F.
+    t_s : (F,) the middle of each frame's exposure in s.
+    position_mm : (F,) the encoder position of the stage in mm at t_s, NaN outside the encoder's
+    record; None without stage.csv.
+    image_sizes_px : (width, height) of the image in px, by camera.
+    source : "images" or "detections".
+    rig : the content of rig.toml; None where there is no such file.
+    stage, accelerometers, references : the tables of the run; None where the file does not exist.
+    detections : the table of detections.csv; None when the source is images.
+    notes : sentences that a user should read. `image` adds one for each frame that it cannot read.
+    skip_unreadable : True if `image` returns None for every frame that cannot be read, False if for
+    none; None means that only the last frame of a recording may be unreadable.
+    sources : the opened frames by camera; empty when the source is detections.
+    positions : (F,) by camera, where in its source each frame lies; -1 where it is missing.
     """
 
     name: str
@@ -64,10 +74,13 @@ class RunData:
     positions: Mapping[str, Ints] = field(default_factory=dict, repr=False, compare=False)
 
     def image(self, camera: str | int, frame: int) -> Image | None:
-        """(height, width) as stored; None when the frame is missing in that camera.
+        """Read one frame of one camera.
 
-        Raises InputError for a frame that cannot be read (see ``skip_unreadable``), has another
-        size, or when the run has detections in place of images.
+        camera : name or index. frame : counted from 0.
+        Returns the pixels as stored, an array (height, width); None when that camera misses the
+        frame, or when the frame cannot be read and ``skip_unreadable`` allows it.
+        Raises InputError for any other frame that cannot be read, for an image of another size, and
+        when the run was loaded from detections.
         """
         name = self.camera_name(camera)
         if name not in self.sources:
@@ -99,10 +112,14 @@ class RunData:
         return image
 
     def camera_name(self, camera: str | int) -> str:
-        """The camera's name from its name or its index. Raises InputError for an unknown one."""
+        """Return the camera's name from its name or its index.
+
+        Raises InputError for an unknown camera.
+        """
         return camera_named(camera, list(self.cameras), where=str(self.path))
 
     def _may_skip(self, camera: str, position: int) -> bool:
+        """Return whether the image at this position may be left out if it is unreadable."""
         last = position == len(self.sources[camera]) - 1
         return last and position > 0 if self.skip_unreadable is None else self.skip_unreadable
 
@@ -117,17 +134,18 @@ def load_run(
     pair_by: Pairing = "auto",
     skip_unreadable: bool | None = None,
 ) -> RunData:
-    """Read a run's tables and find its frames; only the first and last images are decoded.
+    """Read a run's tables and open its frames; only the first and the last images are decoded.
 
     path : `DATASET/runs/NAME`, or any folder that holds the same files.
-    rig : None looks for `rig.toml` two folders up.
-    source : "images" or "detections" where the folder has both.
-    cameras, image_sizes_px : from a calibration, where there is no rig.toml. With one, the run is
-    that of the two cameras that `[tracking]` names; what it has of others is left out.
-    pair_by : how images of several cameras come together, see `pair_frames`.
-    skip_unreadable : True leaves out every frame that cannot be read, False none; by default only
-    the last of a recording, which is cut short when the disk is full or the power fails.
-
+    rig : the content of rig.toml; None looks for a `rig.toml` two folders above the run.
+    source : "images" or "detections"; needed where the folder has both. None takes the only one.
+    cameras : names of the cameras, for example from a calibration. None takes the two cameras that
+    `[tracking]` in rig.toml names, or the first two; data of other cameras are left out.
+    image_sizes_px : (width, height) in px by camera; they replace those of rig.toml.
+    pair_by : how the images of several cameras are paired, see `pair_frames`.
+    skip_unreadable : True leaves out every frame that cannot be read, False none. None leaves out
+    only the last one of a recording, which is cut short when the disk is full or the power fails.
+    Returns the `RunData`. Nothing is written.
     Raises InputError, with the file, the row or frame, and what to do.
     """
     folder = _run_folder(Path(path))
@@ -176,6 +194,10 @@ def load_run(
 
 
 def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
+    """Return the names of the tracking cameras.
+
+    Raises InputError without a rig or without cameras.
+    """
     if rig is None or not rig.cameras:
         raise InputError(
             "there is no rig.toml two folders up, so the cameras are not known",
@@ -186,12 +208,16 @@ def _cameras_of(rig: RigDescription | None, folder: Path) -> list[str]:
 
 
 def _of(names: list[str], table: pd.DataFrame) -> pd.DataFrame:
-    """The rows of some cameras."""
+    """Return the rows whose camera is one of ``names``, in the same order."""
     mine = table["camera"].isin(names)
     return table if mine.all() else table[mine].reset_index(drop=True)
 
 
 def _run_folder(path: Path) -> Path:
+    """Return the absolute path of the run's folder.
+
+    Raises InputError when there is no such folder.
+    """
     if path.is_dir():
         return path.resolve()
     if path.exists():
@@ -207,11 +233,13 @@ def _run_folder(path: Path) -> Path:
 
 
 def _rig_above(folder: Path) -> RigDescription | None:
+    """Read the rig.toml two folders above the run; returns None when there is no such file."""
     file = folder.parent.parent / "rig.toml"
     return read_rig_toml(file) if file.is_file() else None
 
 
 def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSource:
+    """Return "images" or "detections". Raises InputError when the folder has none, or has both."""
     has: dict[RunSource, bool] = {
         "images": bool(recordings(folder)),
         "detections": (folder / "detections.csv").is_file(),
@@ -228,7 +256,10 @@ def _choose_source(folder: Path, names: list[str], source: str | None) -> RunSou
 
 
 def recordings(folder: Path) -> dict[str, Path]:
-    """Whatever in the folder looks like a camera's frames, by its name without extension."""
+    """List the image folders, multi-page TIFF files and videos that lie in a run's folder.
+
+    Returns the path of each by its name without extension. No file is opened.
+    """
     found = {}
     for entry in sorted(folder.iterdir()):
         frames = entry.suffix.lower() in PAGE_EXTENSIONS + VIDEO_EXTENSIONS and entry.is_file()
@@ -238,9 +269,10 @@ def recordings(folder: Path) -> dict[str, Path]:
 
 
 def _open_sources(folder: Path, names: list[str], every: list[str]) -> dict[str, FrameSource]:
-    """The frames of the cameras ``names``; ``every`` : all of the rig.
+    """Open the frames of the cameras ``names``.
 
-    Raises InputError for a camera without frames, and for frames of no known camera.
+    every : the names of all cameras of the rig.
+    Raises InputError for a camera without frames, and for frames of an unknown camera.
     """
     strangers = {name: p for name, p in recordings(folder).items() if name not in every}
     for name, entry in strangers.items():
@@ -267,6 +299,12 @@ def _paired(
     pair_by: Pairing,
     notes: list[str],
 ) -> dict[str, Ints]:
+    """Pair the frames of the cameras, and append what a user should know to ``notes``.
+
+    Dropped frames are taken from the column ``missing`` of frames.csv, if it exists.
+    Returns (F,) by camera: the position of each frame in the camera's source, -1 where it is
+    missing.
+    """
     file, missing = folder / "frames.csv", None
     if file.is_file():
         table = read_frames_csv(file, None, every)
@@ -279,6 +317,7 @@ def _paired(
 
 
 def _size(source: FrameSource) -> tuple[int, int]:
+    """Return (width, height) in px of the first frame."""
     height, width = source.read(0).shape
     return width, height
 
@@ -290,6 +329,11 @@ def _detections(
     sizes: Mapping[str, tuple[int, int]],
     notes: list[str],
 ) -> pd.DataFrame:
+    """Read detections.csv and keep the rows of the cameras ``names``.
+
+    every : the names of all cameras of the rig. sizes : (width, height) in px, by camera.
+    Appends sentences to ``notes``. Raises InputError when no row is left.
+    """
     file = folder / "frames.csv"
     count = len(read_frames_csv(file, None, every)) if file.is_file() else None
     table = _of(names, read_detections_csv(folder / "detections.csv", every, sizes, count))
@@ -313,6 +357,11 @@ def _times(
     detections: pd.DataFrame | None,
     notes: list[str],
 ) -> Array:
+    """Return the (F,) times in s of the frames from frames.csv, or else from run.toml.
+
+    count : number of frames of the images; None when the detections decide.
+    Appends sentences to ``notes``. Raises InputError when neither file gives the times.
+    """
     file, settings = folder / "frames.csv", folder / "run.toml"
     if file.is_file():
         if settings.is_file():
@@ -335,6 +384,10 @@ def _times(
 
 
 def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array:
+    """Return the (F,) stage positions in mm, interpolated from the encoder's record at ``t_s`` (s).
+
+    Positions outside the record are NaN. Appends sentences about gaps in the record to ``notes``.
+    """
     t, position = stage["t_s"].to_numpy(float), stage["position_mm"].to_numpy(float)
     at = np.interp(t_s, t, position, left=np.nan, right=np.nan)
     outside = np.flatnonzero(np.isnan(at))
@@ -353,7 +406,10 @@ def _stage_positions(stage: pd.DataFrame, t_s: Array, notes: list[str]) -> Array
 
 
 def _outside_record(t_s: Array, outside: Ints) -> str:
-    """Which frames lie outside the stage's record, in words."""
+    """Return the words that say which frames lie outside the record of the stage's encoder.
+
+    t_s : (F,) times in s. outside : indices of those frames.
+    """
     first, last = int(outside[0]), int(outside[-1])
     frames = f"frame {first}" if outside.size == 1 else f"{outside.size} frames ({first} to {last})"
     span = f"{t_s[first]:.6g} s" + ("" if first == last else f" to {t_s[last]:.6g} s")
@@ -361,11 +417,15 @@ def _outside_record(t_s: Array, outside: Ints) -> str:
 
 
 def _table(file: Path, read: Callable[[Path], pd.DataFrame]) -> pd.DataFrame | None:
+    """Read a table with ``read``; returns None when the file does not exist."""
     return read(file) if file.is_file() else None
 
 
 def _with_ends_checked(run: RunData) -> RunData:
-    """Each camera's first and last image are decoded, so that wrong sizes and cuts show at once."""
+    """Decode the first and the last image of each camera, so that wrong sizes show at once.
+
+    Returns the same run. Raises InputError as `RunData.image` does.
+    """
     for name, positions in run.positions.items():
         present = np.flatnonzero(positions >= 0)
         for frame in present[[0, -1]] if present.size else ():
@@ -387,11 +447,17 @@ def pair_frames(
     missing: Mapping[str, Bools] | None,
     where: str,
 ) -> tuple[dict[str, Ints], list[str]]:
-    """(F,) position in each camera's source, -1 where the frame is missing; and notes.
+    """Find which images of several cameras belong to the same frame.
 
-    pair_by : "numbers" in the names, "order", or what fits ("auto").
-    missing : (F,) by camera, frames that frames.csv says were dropped; None if it says nothing.
-    Raises InputError when the cameras' images cannot be paired safely.
+    sources : the opened frames by camera.
+    pair_by : "numbers" pairs by the numbers in the file names, "order" by the order of the images,
+    and "auto" by the numbers if they are plausible, otherwise by the order.
+    missing : (F,) by camera, True for the frames that frames.csv reports as dropped; None if it
+    reports none.
+    where : the place that errors name.
+    Returns (F,) by camera, the position of each frame in that camera's source, -1 where the frame
+    is missing; and a list of sentences for the user.
+    Raises InputError when the images cannot be paired safely.
     """
     if missing is not None:
         return _by_missing(sources, missing, where)
@@ -416,7 +482,13 @@ def pair_frames(
 
 
 def _trustworthy(numbers: Mapping[str, Ints], where: str) -> bool:
-    """Whether the numbers in the names count frames: dense, and the same in every camera."""
+    """Return whether the numbers in the file names can be used to pair the frames.
+
+    They can if they have few gaps and are largely the same for every camera.
+    numbers : (images,) the number in each file name, by camera.
+    Raises InputError when the counts agree but the numbers are shifted, so that both pairings are
+    plausible.
+    """
     step = _step(numbers)
     spans = [int(n[-1] - n[0]) // step + 1 for n in numbers.values()]
     if any(span > 2 * len(n) + 8 for span, n in zip(spans, numbers.values())):
@@ -440,12 +512,14 @@ def _trustworthy(numbers: Mapping[str, Ints], where: str) -> bool:
 
 
 def _step(numbers: Mapping[str, Ints]) -> int:
+    """Return the greatest common step of the numbers, for example 2 for 0, 2, 4; at least 1."""
     first = min(int(n[0]) for n in numbers.values())
     offsets = np.concatenate([n - first for n in numbers.values()])
     return int(np.gcd.reduce(offsets)) or 1
 
 
 def _by_numbers(numbers: Mapping[str, Ints]) -> tuple[dict[str, Ints], list[str]]:
+    """Pair frames by the numbers in their names; the returned values are those of `pair_frames`."""
     step, first = _step(numbers), min(int(n[0]) for n in numbers.values())
     count = max(int(n[-1] - first) // step + 1 for n in numbers.values())
     notes = [f"the names of the images count in steps of {step}"] if step > 1 else []
@@ -459,6 +533,10 @@ def _by_numbers(numbers: Mapping[str, Ints]) -> tuple[dict[str, Ints], list[str]
 
 
 def _in_order(counts: Mapping[str, int]) -> tuple[dict[str, Ints], list[str]]:
+    """Pair frames by their order; the returned values are those of `pair_frames`.
+
+    counts : the number of images of each camera.
+    """
     frames = np.arange(max(counts.values()), dtype=np.int64)
     positions = {name: np.where(frames < count, frames, -1) for name, count in counts.items()}
     return positions, [note for name, p in positions.items() for note in _missing_note(name, p)]
@@ -467,6 +545,10 @@ def _in_order(counts: Mapping[str, int]) -> tuple[dict[str, Ints], list[str]]:
 def _by_missing(
     sources: Mapping[str, FrameSource], missing: Mapping[str, Bools], where: str
 ) -> tuple[dict[str, Ints], list[str]]:
+    """Pair frames by the column ``missing`` of frames.csv; returns and raises as `pair_frames`.
+
+    A camera may have an image for every frame, or only for those that it did not drop.
+    """
     positions, notes = {}, []
     for name, source in sources.items():
         gone = missing[name]
@@ -488,6 +570,11 @@ def _by_missing(
 
 
 def _missing_note(camera: str, positions: Ints) -> list[str]:
+    """Return a sentence that counts a camera's missing frames, in a list.
+
+    positions : (F,) as in `pair_frames`, -1 where the frame is missing.
+    Returns an empty list when no frame is missing.
+    """
     gone = np.flatnonzero(positions < 0)
     if not gone.size:
         return []

@@ -1,6 +1,6 @@
-"""The tables of a dataset and of a run, checked against rig, frames and cameras.
+"""Read the CSV tables of a dataset and of a run, and check them against rig, frames and cameras.
 
-Every error names the file, the row (header = 1), the column, and what to do.
+Every error names the file, the row (the header is row 1), the column, and what to do.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from telerig.rig.target import Target
 AnySource = TypeVar("AnySource", bound=str)
 
 DEFAULT_SIGMA_PX = 0.02
-"""Standard deviation of a dot's centre where the table does not state it."""
+"""Standard deviation (px) of a dot's centre that is assumed where the table does not state one."""
 
 OUTSIDE_PX = 3.0
-"""A centre may lie this far outside the image: rounding, half-seen dots, an earlier crop."""
+"""A centre may lie at most this far (px) outside the image, for example after cropping."""
 
 COVARIANCE = ["suu_px2", "suv_px2", "svv_px2"]
 DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *COVARIANCE]
@@ -37,10 +37,15 @@ DOTS_COLUMNS = ["view", "camera", "dot", "row", "column", "u_px", "v_px", *COVAR
 def choose_source(
     has: Mapping[AnySource, bool], source: str | None, folder: Path
 ) -> AnySource | None:
-    """The source of measurements to use: the one asked for, else the only one; None: not there.
+    """Choose the form of the measurements that is used: images or a table.
 
-    has : whether the folder has images or a table, by the words that ``source`` may be.
-    Raises InputError for another word, and for two sources of which none was asked for.
+    has : two entries; for each form ("images", and "dots" or "detections"), whether the folder has
+    it.
+    source : the form that the user asked for; None takes the only one that there is.
+    folder : named in errors.
+    Returns the form; None when the folder does not have it.
+    Raises InputError when ``source`` is another word, and when the folder has both forms and
+    ``source`` is None.
     """
     first, second = has
     if source is not None and source not in has:
@@ -57,13 +62,17 @@ def choose_source(
 
 
 def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFrame:
-    """The dots of `calibration/dots.csv`, or of `results/calibration/dots.csv`.
+    """Read a CSV table of detected dots: `calibration/dots.csv` or `results/calibration/dots.csv`.
 
-    Columns `DOTS_COLUMNS` (and chi2_dof if the file has it): view and camera text; dot the id of
-    `rig.target`, also on an unbounded grid, where the file's own dot is opaque and row, column
-    count; covariance from suu_px2, suv_px2, svv_px2, else sigma_px, else `DEFAULT_SIGMA_PX`;
-    ``attrs["sigma_known"]`` says whether the file stated it. Rows keep the file's order.
-    Raises InputError, with the row (header = 1) and the column, for anything that cannot be.
+    Returns one row per dot in the file's order. Its columns are `DOTS_COLUMNS` (and chi2_dof if the
+    file has it): view and camera (text), dot (its number on `rig.target`), row, column, the centre
+    u_px, v_px in px, and its covariance suu_px2, suv_px2, svv_px2 in px^2.
+    The covariance is read from these three columns; without them it follows from sigma_px, and
+    without that from `DEFAULT_SIGMA_PX`. ``attrs["sigma_known"]`` is True when the file stated it.
+    On an unbounded target the file's own dot numbers are ignored: the numbers are computed from row
+    and column, which the file must have.
+    Raises InputError, with the row (the header is row 1) and the column, for a value that is not
+    possible and for a dot that stands twice in one image.
     """
     file = Path(path)
     table = read_table(file, _columns(rig.target))
@@ -87,6 +96,7 @@ def read_dots_csv(path: str | PathLike[str], rig: RigDescription) -> pd.DataFram
 
 
 def _columns(target: Target) -> list[Column]:
+    """Return the columns that a dots.csv for this target may have."""
     unbounded = not target.bounded
     return [
         Column("view", "text"),
@@ -117,13 +127,18 @@ def check_names(table: pd.DataFrame, column: str, thing: str, names: list[str], 
 
 
 def check_pixels(table: pd.DataFrame, sizes_px: Mapping[str, tuple[int, int]], file: Path) -> None:
-    """Raise InputError for the first row whose pixel lies outside its camera's image."""
+    """Raise InputError for the first row whose pixel lies outside its camera's image.
+
+    sizes_px : (width, height) of the image in px, by camera name.
+    A pixel may lie `OUTSIDE_PX` outside.
+    """
     sizes = np.array([sizes_px[name] for name in table["camera"]], float).reshape(-1, 2)
     for column, size in zip(("u_px", "v_px"), sizes.T):
         _check_inside(table, column, size, file)
 
 
 def _check_inside(table: pd.DataFrame, column: str, size: Any, file: Path) -> None:
+    """Raise InputError for a pixel coordinate outside its image; size : (rows,) limit in px."""
     value = table[column].to_numpy()
     rows_of(table, file).refuse(
         (value < -0.5 - OUTSIDE_PX) | (value > size - 0.5 + OUTSIDE_PX),
@@ -134,7 +149,10 @@ def _check_inside(table: pd.DataFrame, column: str, size: Any, file: Path) -> No
 
 
 def _check_dots(table: pd.DataFrame, target: Target, file: Path) -> None:
-    """Check the ids; check row and column against them, or fill them in."""
+    """Check the dots' numbers against the target; fill in or check their row and column.
+
+    The table is changed in place. Raises InputError for the first row that is wrong.
+    """
     dot, ids = table["dot"].to_numpy(), target.ids()
     numbers = f"its {len(ids)} dots are numbered from {ids.min()} to {ids.max()}"
     rows_of(table, file).refuse(
@@ -150,6 +168,7 @@ def _check_dots(table: pd.DataFrame, target: Target, file: Path) -> None:
 
 
 def _check_place(table: pd.DataFrame, column: str, expected: Any, file: Path) -> None:
+    """Raise InputError for the first row whose row or column differs from ``expected`` (rows,)."""
     given, dot = table[column].to_numpy(), table["dot"].to_numpy()
     rows_of(table, file).refuse(
         given != expected,
@@ -160,6 +179,7 @@ def _check_place(table: pd.DataFrame, column: str, expected: Any, file: Path) ->
 
 
 def _check_repeats(table: pd.DataFrame, target: Target, file: Path) -> None:
+    """Raise InputError when a dot stands twice in the same view of the same camera."""
     keys = ["view", "camera", "dot"]
     again = table.duplicated(keys).to_numpy()
     if not again.any():
@@ -173,9 +193,13 @@ def _check_repeats(table: pd.DataFrame, target: Target, file: Path) -> None:
 
 
 def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *, of: str) -> bool:
-    """Set the covariance columns from what the file has; whether it stated the noise.
+    """Set the table's columns suu_px2, suv_px2, svv_px2 (px^2); the table is changed in place.
 
-    of : what the standard deviation belongs to, for errors. Raises InputError for what is no
+    The columns stay if the file has them. If it does not, they are computed from the column
+    sigma_px, or else from ``default_sigma_px`` (px).
+    of : to which point the standard deviation belongs, in words for the errors.
+    Returns whether the file stated the noise.
+    Raises InputError when only some of the three columns exist, and for values that are no
     covariance.
     """
     given = [name for name in COVARIANCE if name in table]
@@ -210,20 +234,24 @@ def fill_covariance(table: pd.DataFrame, file: Path, default_sigma_px: float, *,
 Sizes = Mapping[str, tuple[int, int]]
 
 DETECTION_SIGMA_PX = 0.5
-"""Standard deviation of a bubble's centre where detections.csv does not state it."""
+"""Standard deviation (px) of a bubble's centre that is assumed where detections.csv states none."""
 
 REFERENCE_SIGMA_PX = 0.1
-"""Standard deviation of a reference mark where references.csv does not state it."""
+"""Standard deviation (px) of a mark's centre that is assumed where references.csv states none."""
 
 _RUN_KEYS = ["frame_rate_hz", "start_s"]
 
 
 def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> pd.DataFrame:
-    """`frames.csv`: frame, t_s (mid-exposure), and what else it has; one row per frame from 0.
+    """Read `frames.csv`, which gives the time of every frame of a run.
 
-    frame_count : how many frames the images have; None where the table itself says it.
-    An optional column ``missing`` names the cameras that dropped the frame, joined by ``|``.
-    Raises InputError for times that do not increase and frames without a time or an image.
+    frame_count : how many frames the images have; None where the table decides.
+    cameras : names of the rig's cameras.
+    Returns one row per frame, counted from 0 without gaps, with the columns frame, t_s (the middle
+    of the exposure in s) and all further columns of the file. The optional column ``missing`` names
+    the cameras that dropped the frame, joined by ``|``.
+    Raises InputError for times that do not increase, a frame without a time or without an image,
+    and an unknown camera in ``missing``.
     """
     columns = [
         Column("frame", "whole"),
@@ -253,6 +281,10 @@ def read_frames_csv(path: Path, frame_count: int | None, cameras: list[str]) -> 
 
 
 def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> None:
+    """Raise InputError unless the column frame counts 0, 1, 2, ... up to the last image.
+
+    frame_count : how many frames the images have; None where the table decides.
+    """
     frame, expected = table["frame"].to_numpy(), np.arange(len(table))
 
     def refuse(bad: Bools, what: Callable[[int], str], todo: str) -> None:
@@ -281,7 +313,11 @@ def _check_frames(table: pd.DataFrame, frame_count: int | None, rows: Rows) -> N
 
 
 def read_run_toml(path: Path) -> tuple[float, float]:
-    """(frame_rate_hz, start_s) of `run.toml`. Raises InputError for what cannot be."""
+    """Read `run.toml`, which gives equally spaced frame times.
+
+    Returns the frame rate in Hz and the time of frame 0 in s (0 when the file does not state it).
+    Raises InputError when the file is no TOML, has an unknown key, or has no positive frame rate.
+    """
     try:
         raw = tomllib.loads(read_text(path, "write frame_rate_hz = 500.0"))
     except tomllib.TOMLDecodeError as error:
@@ -299,6 +335,10 @@ def read_run_toml(path: Path) -> tuple[float, float]:
 
 
 def _number(raw: dict[str, Any], key: str, path: Path) -> float | None:
+    """Return the finite number at ``key``; None without the key.
+
+    Raises InputError for any other value.
+    """
     value = raw.get(key)
     if value is None:
         return None
@@ -309,9 +349,11 @@ def _number(raw: dict[str, Any], key: str, path: Path) -> float | None:
 
 
 def read_stage_csv(path: Path) -> pd.DataFrame:
-    """`stage.csv`: t_s, position_mm, and what else it has, in the order of time.
+    """Read `stage.csv`, the record of the stage's encoder.
 
-    Raises InputError for fewer than two rows and times that do not increase.
+    Returns one row per reading with the columns t_s (s), position_mm (the encoder position in mm)
+    and all further columns of the file.
+    Raises InputError for fewer than two rows and for times that do not increase.
     """
     table = read_table(path, [Column("t_s"), Column("position_mm")], extra=True)
     if len(table) < 2:
@@ -325,9 +367,13 @@ def read_stage_csv(path: Path) -> pd.DataFrame:
 
 
 def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFrame:
-    """`accelerometer.csv`: t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2; each sensor in time's order.
+    """Read `accelerometer.csv`, the readings of all accelerometers of a run.
 
-    sensors : the names in rig.toml; None where there is no rig file.
+    sensors : the names of the sensors in rig.toml; None where there is no rig file, then any name
+    is accepted.
+    Returns one row per reading with the columns t_s (s), sensor (text), ax_m_s2, ay_m_s2, az_m_s2
+    (m/s^2 along the sensor's own axes) and all further columns of the file.
+    Raises InputError for an unknown sensor and for times of a sensor that do not increase.
     """
     axes = [Column(f"a{axis}_m_s2") for axis in "xyz"]
     table = read_table(path, [Column("t_s"), Column("sensor", "text"), *axes], extra=True)
@@ -339,6 +385,7 @@ def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFram
 
 
 def _check_increasing(table: pd.DataFrame, path: Path) -> None:
+    """Raise InputError for the first row whose t_s is not later than that of the row before."""
     t = table["t_s"].to_numpy()
     rows_of(table, path).refuse(
         np.diff(t, prepend=-np.inf) <= 0,
@@ -351,7 +398,16 @@ def _check_increasing(table: pd.DataFrame, path: Path) -> None:
 def read_references_csv(
     path: Path, cameras: list[str], sizes_px: Sizes, frame_count: int | None
 ) -> pd.DataFrame:
-    """`references.csv`: frame, camera, mark (text), u_px, v_px and covariance; extras kept."""
+    """Read `references.csv`, the image positions of the marks that are fixed to the tank.
+
+    cameras : names of the rig's cameras.
+    sizes_px : (width, height) of the image in px, by camera.
+    frame_count : number of frames of the run; None where it is not known.
+    Returns one row per mark, frame and camera with the columns frame, camera, mark (text), u_px,
+    v_px (px), suu_px2, suv_px2, svv_px2 (px^2) and all further columns of the file. The covariance
+    follows from sigma_px, or else from `REFERENCE_SIGMA_PX`, where the file has no such columns.
+    Raises InputError, with the row and the column, for values that are not possible.
+    """
     table = _pixel_table(path, [Column("mark", "text")], cameras, sizes_px, frame_count)
     _check_named_once(table, "mark", path)
     known = fill_covariance(table, path, REFERENCE_SIGMA_PX, of="the mark's place")
@@ -361,12 +417,20 @@ def read_references_csv(
 def read_detections_csv(
     path: Path, cameras: list[str], sizes_px: Sizes, frame_count: int | None
 ) -> pd.DataFrame:
-    """`detections.csv`: frame, camera, u_px, v_px, covariance, particle (text), extras kept.
+    """Read `detections.csv`, the bubbles that were found in the images.
 
-    Covariance from suu_px2, suv_px2, svv_px2, else sigma_px, else `DETECTION_SIGMA_PX`, and
-    ``attrs["sigma_known"]`` says whether the file stated it. particle is "" where blank: not
-    matched. a_px, b_px, angle_rad may be blank (NaN). sizes_px : (width, height) by camera.
-    frame_count : None where the table itself says it. Rows keep the file's order.
+    cameras : names of the rig's cameras.
+    sizes_px : (width, height) of the image in px, by camera. If a camera is not in it, pixels are
+    not checked against the image size.
+    frame_count : number of frames of the run; None where the table decides.
+    Returns one row per bubble, frame and camera in the file's order, with the columns frame,
+    camera, the centre u_px, v_px (px), its covariance suu_px2, suv_px2, svv_px2 (px^2), particle
+    (text; "" where the bubble is not yet matched between the cameras) and all further columns of
+    the file. The semi-axes a_px, b_px (px) and angle_rad of the fitted ellipse may be NaN.
+    The covariance is read from its three columns; without them it follows from sigma_px, and
+    without that from `DETECTION_SIGMA_PX`. ``attrs["sigma_known"]`` is True when the file stated
+    it.
+    Raises InputError, with the row and the column, for values that are not possible.
     """
     own = [
         Column("particle", "text", required=False, blank=True),
@@ -385,6 +449,10 @@ def read_detections_csv(
 def _pixel_table(
     path: Path, own: list[Column], cameras: list[str], sizes_px: Sizes, frame_count: int | None
 ) -> pd.DataFrame:
+    """Read a CSV table of pixels and check its cameras, pixels (px) and frames.
+
+    own : the columns that only this table has. frame_count : None where the number is not known.
+    """
     columns = [
         Column("frame", "whole"),
         Column("camera", "text"),
@@ -410,6 +478,7 @@ def _pixel_table(
 
 
 def _check_named_once(table: pd.DataFrame, name: str, path: Path) -> None:
+    """Raise InputError when a name in the column ``name`` is repeated in a frame of a camera."""
     again = table.duplicated(["frame", "camera", name]) & (table[name] != "")
     frame, camera, label = (table[key].to_numpy() for key in ("frame", "camera", name))
     rows_of(table, path).refuse(
@@ -421,6 +490,7 @@ def _check_named_once(table: pd.DataFrame, name: str, path: Path) -> None:
 
 
 def _check_axes(table: pd.DataFrame, path: Path) -> None:
+    """Raise InputError unless a_px and b_px (px) are positive semi-axes with a_px >= b_px."""
     given = [name for name in ("a_px", "b_px", "angle_rad") if name in table]
     missing = [name for name in ("a_px", "b_px") if name not in given]
     if given and missing:
@@ -448,6 +518,7 @@ def _check_axes(table: pd.DataFrame, path: Path) -> None:
 
 
 def _finished(table: pd.DataFrame, sigma_known: bool) -> pd.DataFrame:
+    """Return the table with rows counted from 0 and with ``attrs["sigma_known"]`` set."""
     table = table.reset_index(drop=True)
     table.attrs["sigma_known"] = sigma_known
     return table

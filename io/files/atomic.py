@@ -1,4 +1,4 @@
-"""Files that are either complete or absent: write beside, then rename into place."""
+"""Write files that are either complete or absent: write beside the place, then rename."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ WRITE_TODO = "choose a folder that can be written (--out) or make room on the di
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, with its suffix; renamed to it when all went well.
+    """Yield a temporary path beside ``path``, with the same suffix, and rename it at the end.
 
-    Missing parent folders are made. On an exception the temporary file is removed and what was
-    at ``path`` before stays. Raises InputError when the place cannot be written.
+    Missing parent folders are made. On an exception the temporary file is removed, and a file that
+    was at ``path`` before stays.
+    Raises InputError when the place cannot be written.
     """
     final = Path(path)
     if final.is_dir():
@@ -47,8 +48,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield an empty temporary folder; its files are renamed into ``folder`` at the very end.
 
-    Until then ``folder`` is as before, so an interrupted command leaves the old results whole.
-    Files that are already in ``folder`` and are not written anew stay.
+    Until then ``folder`` is as before, so an interrupted command leaves the old results unchanged.
+    Files that are already in ``folder`` and are not written again stay.
     Raises InputError when the place cannot be written.
     """
     final = Path(folder)
@@ -75,7 +76,10 @@ def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
-    """UTF-8, line ends as they stand in ``text``. Raises InputError when it cannot be written."""
+    """Write a text file in UTF-8 with the line ends of ``text``, completely or not at all.
+
+    Raises InputError when it cannot be written.
+    """
     with atomic_path(path) as temporary:
         try:
             temporary.write_bytes(text.encode("utf-8"))
@@ -84,16 +88,22 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
 
 
 def write_json_atomic(path: str | os.PathLike[str], content: Any) -> None:
-    """Strict JSON with NumPy arrays as lists, dataclasses as objects, NaN and infinity as null.
+    """Write a strict JSON file, completely or not at all.
 
-    Floats keep every digit. Raises TypeError for an object that has no form in JSON.
+    NumPy arrays become lists, dataclasses become objects, NaN and infinity become null. Floats keep
+    every digit.
+    Raises TypeError for an object that JSON cannot represent, InputError when the file cannot be
+    written.
     """
     text = json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False)
     write_text_atomic(path, text + "\n")
 
 
 def plain(content: Any) -> Any:
-    """``content`` in the types of JSON; non-finite numbers become None."""
+    """Return ``content`` in the types of JSON; numbers that are not finite become None.
+
+    Raises TypeError for an object that JSON cannot represent.
+    """
     if isinstance(content, dict):
         return {str(key): plain(value) for key, value in content.items()}
     if isinstance(content, np.ndarray | np.generic):

@@ -1,6 +1,7 @@
-"""CSV tables: read strictly, with the file's row and column in every error; written exactly.
+"""Read CSV tables strictly, with file, row and column in every error, and write them exactly.
 
-One header line, comma, UTF-8. Rows are counted as an editor shows them: the header is row 1.
+A table has one header line, commas and UTF-8. Rows are counted as an editor shows them: the header
+is row 1.
 """
 
 from __future__ import annotations
@@ -26,15 +27,17 @@ _EVERY_DIGIT: dict[str, Any] = (
     {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1)
     else {"float_precision": "round_trip"}
 )  # fmt: skip
-"""For `pandas.read_csv`, whose default parser rounds correctly from pandas 3.1 on."""
+"""An option for `pandas.read_csv`, whose default parser rounds correctly from pandas 3.1 on."""
 _EXPORT = "export the table as comma-separated UTF-8 with one header line"
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column that a table may have.
+    """Describe a column that a table may have.
 
-    blank : empty cells are legal and read as NaN (number, whole) or "" (text).
+    kind : "number" (float), "whole" (whole number) or "text".
+    required : whether the table must have the column.
+    blank : whether cells may be empty; they are read as NaN (number, whole) or "" (text).
     """
 
     name: str
@@ -46,12 +49,15 @@ class Column:
 def read_table(
     path: str | PathLike[str], columns: Sequence[Column], *, extra: bool = False
 ) -> pd.DataFrame:
-    """The table with the columns that the file has, in the file's order.
+    """Read a CSV table and check its header and its cells.
 
-    The index is the row in the file (header = 1), for errors that later checks raise. "whole"
-    columns are int64, or float64 where cells may be blank. With ``extra``, columns that are not
-    in ``columns`` are kept as well, as numbers if all their cells are. Raises InputError for a
-    missing or unknown column, a cell that is not a finite number, a ragged row, an empty table.
+    columns : the columns that the table may have or must have.
+    extra : True keeps further columns, as numbers if all their cells are numbers; False refuses
+    them.
+    Returns the columns that the file has, in the file's order. The index is the row in the file
+    (the header is row 1). "whole" columns are int64, or float64 where cells may be blank.
+    Raises InputError for a missing or unknown column, a cell that is not a finite number, a row
+    with too few or too many cells, and an empty table.
     """
     file = Path(path)
     table = _sound_table(file, columns, "keep" if extra else "refuse")
@@ -75,10 +81,12 @@ def read_table(
 
 
 def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = False) -> pd.DataFrame:
-    """Those of the ``columns`` that a table of results has; a text column is blank without it.
+    """Read a CSV table of results and return those of its columns that ``columns`` names.
 
-    A header without rows is legal, because a run may have no tracks. optional : a file that is not
-    there reads as one without rows. Raises InputError as `read_table` does.
+    Other columns are left out; a text column that the file lacks is filled with "". A table without
+    rows is allowed, because a run may have no tracks.
+    optional : True treats a file that does not exist as a table without rows.
+    Raises InputError as `read_table` does.
     """
     if optional and not file.is_file():
         table = pd.DataFrame({c.name: [] for c in columns if c.required})
@@ -92,9 +100,11 @@ def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = Fals
 
 
 def write_table(table: pd.DataFrame, path: str | PathLike[str]) -> None:
-    """Write a CSV whose floats read back bit for bit; NaN is a blank cell, truth values 0 and 1.
+    """Write a CSV table whose floats have exactly the same values when they are read again.
 
-    The index is left out. Written beside and renamed. Raises InputError when it cannot be.
+    NaN becomes a blank cell, truth values become 0 and 1, the index is left out. The file is
+    written completely or not at all.
+    Raises InputError when it cannot be written.
     """
     flags = {name: int for name, kind in table.dtypes.items() if kind.kind == "b"}
     with atomic_path(path) as temporary:
@@ -103,15 +113,20 @@ def write_table(table: pd.DataFrame, path: str | PathLike[str]) -> None:
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a file, for errors. numbers : each row's number in the file, the header being 1."""
+    """Name rows of a file in errors.
+
+    numbers : (rows,) each row's number in the file, where the header is row 1.
+    """
 
     file: Path
     numbers: Any
 
     def refuse(self, bad: Bools, column: str, what: str | Callable[[int], str], todo: str) -> None:
-        """Raise InputError for the first of the ``bad`` rows, naming the others; or do nothing.
+        """Raise InputError for the first bad row, and list further ones; do nothing without one.
 
-        what : what is wrong, or a function that says it for the position of a row in the table.
+        bad : (rows,) True where a row is wrong. column : the column at fault; "" names none.
+        what : what is wrong, or a function that returns it for the position of a row in the table.
+        todo : what to do about it.
         """
         positions = np.flatnonzero(bad)
         if not positions.size:
@@ -126,14 +141,18 @@ class Rows:
 
 
 def rows_of(table: pd.DataFrame, file: Path) -> Rows:
-    """The rows of a table that `read_table` gave, or of a part of it."""
+    """Return the `Rows` of a table that `read_table` returned, or of a part of it."""
     return Rows(file, table.index)
 
 
 def _sound_table(
     file: Path, columns: Sequence[Column], others: Literal["refuse", "keep", "leave out"]
 ) -> pd.DataFrame | None:
-    """The table by pandas' fast reader; None for anything unusual, whose error `_cells` tells."""
+    """Read a CSV table with pandas' fast reader.
+
+    others : what happens to columns that are not in ``columns``.
+    Returns None for any unusual file; the slower `_cells` then finds the error.
+    """
     try:
         content = file.read_bytes()
         header = content.split(b"\n", 1)[0].decode("utf-8-sig").rstrip("\r").split(",")
@@ -179,7 +198,11 @@ def _sound_table(
 
 
 def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
-    """Header, the cells column by column, and each row's number; blank lines are passed over."""
+    """Read a CSV file as text; blank lines are skipped.
+
+    Returns the header, the cells of each column, and the number of each row in the file.
+    Raises InputError for an empty file, another separator, and rows of different lengths.
+    """
     lines = read_text(file, _EXPORT).split("\n")
     numbers = [i for i, line in enumerate(lines, 1) if line.strip(", \r")]
     if not numbers:
@@ -201,12 +224,16 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
 
 
 def header_of(file: Path, todo: str) -> list[str]:
-    """The names in the first line of a table; none in an empty file. Raises as `read_text` does."""
+    """Read the names in the first line of a CSV table; the list is [""] for an empty file.
+
+    todo : the advice in an error. Raises InputError as `read_text` does.
+    """
     first, _, _ = read_text(file, todo).partition("\n")
     return [name.strip() for name in first.split(",")]
 
 
 def _check_header(header: list[str], columns: Sequence[Column], extra: bool, file: Path) -> None:
+    """Raise InputError for a repeated, an unknown or a missing column."""
     where, known = f"{file} row 1", [column.name for column in columns]
     for name in header:
         if header.count(name) > 1:
@@ -267,7 +294,7 @@ def _extra(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
 
 
 def _floats(cells: Sequence[str]) -> Array:
-    """NaN for what is no number; Python's own conversion keeps every digit."""
+    """Return (cells,) numbers, NaN for a cell that is no number; every digit is kept."""
     return np.array([_float(cell) for cell in cells], float)
 
 

@@ -1,4 +1,4 @@
-"""Text files of any origin: UTF-8 with or without a byte order mark."""
+"""Read text files in UTF-8, with or without a byte order mark."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from telerig.errors import InputError
 
 
 def read_text(file: Path, todo: str = "check the path and the file") -> str:
-    """The text of a file, its lines ended by LF. Raises InputError when it cannot be read.
+    """Read a UTF-8 text file and return its text, in which lines end with a line feed.
 
-    todo : what to do about a file that is there, but is no UTF-8 text.
+    todo : the advice for a file that exists but is not UTF-8 text.
+    Raises InputError when the file cannot be read.
     """
     try:
         return file.read_text(encoding="utf-8-sig")

@@ -35,7 +35,7 @@ _AGAIN = "calibrate again (`telerig calibrate`), or name the right results folde
 
 
 class Status(StrEnum):
-    """How far a calibration may be used."""
+    """Name how far a calibration may be used."""
 
     GOOD = "GOOD"
     USABLE = "USABLE, with warnings"
@@ -44,12 +44,18 @@ class Status(StrEnum):
 
 
 class Verdict(Part):
+    """Hold the verdict on a calibration: its status, and sentences that give the reasons."""
+
     status: Status
     reasons: tuple[str, ...] = ()
 
 
 class PoseRecord(Part):
-    """A rigid transformation; ``rotvec_deg`` says the rotation once more for a reader."""
+    """Hold a rigid transformation: a rotation matrix (3, 3) and a translation (3,) in mm.
+
+    rotvec_deg : the same rotation as a rotation vector (3,) in degrees, for a human reader; None
+    where the file does not have it. `pose` does not use it.
+    """
 
     rotation: Matrix3
     rotvec_deg: Vector3 | None = None
@@ -57,6 +63,7 @@ class PoseRecord(Part):
 
     @classmethod
     def of_pose(cls, pose: Pose) -> Self:
+        """Make the record of a pose."""
         return cls(
             rotation=pose.rotation,
             rotvec_deg=np.degrees(pose.rotvec_rad),
@@ -64,11 +71,20 @@ class PoseRecord(Part):
         )
 
     def pose(self) -> Pose:
+        """Return the pose that the record holds."""
         return Pose(self.rotation, self.translation_mm)
 
 
 class CameraRecord(Part):
-    """A calibrated camera. ``standard_deviations`` are of the ``free`` parameters."""
+    """Hold one calibrated camera.
+
+    image_size_px : (width, height) in px.
+    rho_mm : the length in mm by which coordinates are divided before the distortion is computed.
+    parameters : the value of each intrinsic by name.
+    free : the names of the parameters that the calibration estimated.
+    standard_deviations : of each free parameter in its own unit; None where it is not known.
+    camera_from_rig : the camera's pose in the rig frame.
+    """
 
     image_size_px: tuple[int, int]
     rho_mm: float = Field(gt=0)
@@ -79,7 +95,11 @@ class CameraRecord(Part):
 
 
 class Target(Part):
-    """``points_mm`` (N, 3) of the ``dots`` (N,), in the target's frame."""
+    """Hold the calibrated target.
+
+    dots : (dots,) the number of each dot.
+    points_mm : (dots, 3) their positions in mm in the target's frame.
+    """
 
     dots: Wholes
     points_mm: Points3
@@ -92,7 +112,7 @@ class Target(Part):
 
 
 class Covariance(Part):
-    """``matrix`` (P, P) of the components ``names``."""
+    """Hold a covariance matrix (parameters, parameters) and the names of its rows and columns."""
 
     names: tuple[str, ...]
     matrix: Square
@@ -105,9 +125,13 @@ class Covariance(Part):
 
 
 class Mirror(Part):
-    """Which of the two mirror-symmetric solutions was kept, and what decided.
+    """Hold which of the two mirror-symmetric solutions was kept, and what decided between them.
 
-    nominal_rotvec_deg : of the second of two cameras, or by camera of more.
+    cost, other_cost : the sum of squared whitened residuals of the kept and of the other solution;
+    None where only one was computed.
+    decided_by, words : what decided, as a code and as a sentence.
+    nominal_rotvec_deg : nominal rotation (3,) in degrees of the second of two cameras; for more
+    cameras, one by camera name. None where rig.toml states none.
     """
 
     cost: float | None = None
@@ -118,9 +142,17 @@ class Mirror(Part):
 
 
 class LadderStep(Part):
-    """A lens model that was tried. Numbers are None for a model that was not fitted.
+    """Hold one lens model that was tried. Numbers are None for a model that was not fitted.
 
-    held_out : mean squared error of the prediction of left-out views.
+    model, camera : the model's name, and the camera for which it was tried.
+    added : the parameters that it has in addition to the previous model.
+    taken : whether it was accepted.
+    chi2_gain, bic_gain : by how much chi-square and the Bayesian information criterion fell.
+    p_value : probability of such a fall in chi-square if the added parameters were 0.
+    parameters : number of free parameters. chi2_dof : chi-square per degree of freedom.
+    bic : the extended Bayesian information criterion. rms_px : RMS of the residuals in px.
+    held_out, held_out_before : mean squared error of the prediction of views that were left out of
+    the fit, for this model and for the previous one.
     """
 
     model: str = ""
@@ -140,7 +172,7 @@ class LadderStep(Part):
 
 
 class LensModel(Part):
-    """The lens model of each camera, and the ladder of models that were tried."""
+    """Hold the name of the lens model, the model of each camera, and all models that were tried."""
 
     name: str = ""
     by_camera: dict[str, str] = Field(default_factory=dict)
@@ -149,12 +181,18 @@ class LensModel(Part):
 
 
 class Stage(Part):
-    """Travel axis and encoder scale.
+    """Hold the stage's calibrated travel axis and encoder scale.
 
-    axis : unit vector in the rig frame.  basis : two unit vectors across it, about which its
-        tilts are counted.  encoder_scale : the share by which the encoder reads too much.
-    joint_covariance : of both tilts (rad) and the scale.
-    wander_sigma_mm : of the carriage across the axis, position_sigma_mm : along it.
+    axis : (3,) unit vector of the travel in the rig frame.
+    basis : (3, 2) two unit vectors perpendicular to the axis. The axis's two tilts (rad) are
+    measured along them.
+    axis_covariance_rad2 : (2, 2) covariance of the two tilts in rad^2; None where it is not known.
+    encoder_scale : relative error of the encoder; 0.001 means that it reads 0.1 % too much.
+    encoder_scale_sd : its standard deviation; None where it is not known.
+    joint_covariance : (3, 3) covariance of both tilts (rad) and of the encoder scale.
+    chi2_dof : chi-square per degree of freedom of the fit; None where there is none.
+    position_sigma_mm, wander_sigma_mm : standard deviation in mm of the carriage's position along
+    the axis and perpendicular to it; None where they were not estimated.
     """
 
     axis: Vector3
@@ -170,6 +208,14 @@ class Stage(Part):
 
 
 class Diagnostics(Part):
+    """Hold further findings of a calibration, which the report shows.
+
+    gauge : how origin, axes and scale were chosen. weak : names of badly determined quantities.
+    tilts_deg : tilts in degrees by name; None where one is not known.
+    halves : the split-half check. structure : the structure in the residuals.
+    next_view : the recommended next view of the target.
+    """
+
     gauge: str = ""
     weak: tuple[str, ...] = ()
     tilts_deg: dict[str, float | None] = Field(default_factory=dict)
@@ -179,7 +225,16 @@ class Diagnostics(Part):
 
 
 class CalibrationFile(Record):
-    """calibration.json."""
+    """Hold the content of calibration.json, the result of a calibration.
+
+    verdict : whether the calibration can be used.
+    cameras : the calibrated cameras by name; the first camera's frame is the rig frame.
+    walls : the refractive window of each camera that has one, by camera name.
+    target, views : the calibrated target, and its pose in each view.
+    covariance : of the rig block; None where there is none, for example after an import.
+    stage : travel axis and encoder scale; None where no stage was calibrated.
+    twin : the decision about the mirror ambiguity.
+    """
 
     KIND: ClassVar[str] = "telerig calibration"
     MISSING: ClassVar[str] = "no calibration here"
@@ -219,7 +274,11 @@ class CalibrationFile(Record):
         return {} if stage is None else stage.content()
 
     def rig_cameras(self, *, behind_walls: bool) -> tuple[Camera, ...]:
-        """The cameras, with the glass walls of the water tank before them or without."""
+        """Return the calibrated cameras in the order of the file.
+
+        behind_walls : True for cameras that look through their refractive windows into the water,
+        False for the same cameras without windows.
+        """
         walls = self.walls if behind_walls else {}
         return tuple(
             Camera(
@@ -231,9 +290,11 @@ class CalibrationFile(Record):
 
 
 class Change(Part):
-    """One quantity: ``change`` of the second minus the first calibration, in ``unit``.
+    """Hold by how much one quantity differs between two calibrations.
 
-    deviations : the change over its standard deviation; None where that is 0.
+    change : value of the second minus value of the first calibration, in ``unit``.
+    sd : standard deviation of the change in the same unit.
+    deviations : the change divided by its standard deviation; None where that is 0.
     """
 
     quantity: str
@@ -244,7 +305,7 @@ class Change(Part):
 
 
 class ComparisonFile(Record):
-    """comparison.json: what changed since an earlier calibration of the same rig."""
+    """Hold the content of comparison.json: what changed since an earlier calibration of the rig."""
 
     AGAIN: ClassVar[str] = _AGAIN
 
@@ -271,7 +332,12 @@ _DOT_EXAMPLE = ("patch", "model", "u0", "v0", "u_px", "v_px", "a_px", "b_px", "a
 
 
 def read_joint_covariance(file: Path) -> tuple[tuple[str, ...], Array]:
-    """Names (P,) and matrix (P, P) of covariance.npz, the whole estimate; empty without a file."""
+    """Read covariance.npz, the covariance of all estimated parameters of a calibration.
+
+    Returns the names of the parameters, and their covariance (parameters, parameters), each in the
+    unit that its name states. Both are empty when the file does not exist.
+    Raises InputError for a file that cannot be read or whose arrays do not fit together.
+    """
     if not file.is_file():
         return (), np.zeros((0, 0))
     archive = _arrays(file, ("names", "covariance"))
@@ -284,12 +350,19 @@ def read_joint_covariance(file: Path) -> tuple[tuple[str, ...], Array]:
 
 
 def write_joint_covariance(file: Path, names: tuple[str, ...], matrix: Array) -> None:
+    """Write covariance.npz with the names and the covariance (parameters, parameters)."""
     with file.open("wb") as stream:
         np.savez_compressed(stream, names=np.array(names), covariance=matrix.astype(np.float64))
 
 
 def read_uncertainty(file: Path) -> dict[str, Array]:
-    """Arrays of uncertainty.npz, covariances over the working volume; empty without a file."""
+    """Read uncertainty.npz, the covariance of triangulated points in the working volume.
+
+    Returns the arrays points_mm (points, 3) in mm, calibration_mm2 and measurement_mm2 (points, 3,
+    3) in mm^2, the contributions of calibration and of image noise, and the scalar sigma_px, the
+    image noise in px. The dictionary is empty when the file does not exist.
+    Raises InputError for a file that cannot be read or whose arrays do not fit together.
+    """
     if not file.is_file():
         return {}
     arrays = _floats(file, _UNCERTAINTY)
@@ -301,7 +374,14 @@ def read_uncertainty(file: Path) -> dict[str, Array]:
 
 
 def read_dot_example(file: Path) -> dict[str, Array]:
-    """Arrays of dot_example.npz, one dot and its fitted model; empty without a file."""
+    """Read dot_example.npz, the image of one dot and the model that was fitted to it.
+
+    Returns the arrays by name: patch and model (rows, columns) are the measured and the fitted
+    image; u0, v0 (px) are the image column and row of the patch's first pixel; u_px, v_px, a_px,
+    b_px and angle_rad describe the fitted ellipse. The dictionary is empty when the file does not
+    exist.
+    Raises InputError for a file that cannot be read or whose two images differ in shape.
+    """
     if not file.is_file():
         return {}
     arrays = _floats(file, _DOT_EXAMPLE)
@@ -312,6 +392,7 @@ def read_dot_example(file: Path) -> dict[str, Array]:
 
 
 def _floats(file: Path, names: tuple[str, ...]) -> dict[str, Array]:
+    """Read the named arrays of an .npz file as floats. Raises InputError when that fails."""
     try:
         return {name: np.asarray(a, float) for name, a in _arrays(file, names).items()}
     except (TypeError, ValueError) as error:
@@ -319,6 +400,7 @@ def _floats(file: Path, names: tuple[str, ...]) -> dict[str, Array]:
 
 
 def _arrays(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
+    """Read the named arrays of an .npz file. Raises InputError when the file lacks one."""
     try:
         with np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in names}

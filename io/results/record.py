@@ -1,4 +1,4 @@
-"""JSON files of a results folder as checked records, and run.json, which says what made them.
+"""Read and write the JSON files of a results folder, among them run.json, as checked records.
 
 A record is a frozen pydantic model. Keys that this version does not know are kept, so that a newer
 file of the same schema is read and written without loss. Arrays are NumPy arrays of finite numbers
@@ -28,7 +28,11 @@ _LONGEST_MESSAGE = 400
 
 
 def _checked_array(*shape: int | None, kind: type = float) -> Callable[[Any], NDArray[Any]]:
-    """A validator for arrays of this shape, in which None is any length."""
+    """Return a function that converts a value to an array and checks its shape and its numbers.
+
+    shape : the length of each axis; None allows any length. kind : the type of the elements.
+    The function raises ValueError for a wrong shape and for numbers that are not finite.
+    """
 
     def check(value: Any) -> NDArray[Any]:
         try:
@@ -61,35 +65,35 @@ Wholes = Annotated[Ints, PlainValidator(_checked_array(None, kind=np.int64)), _a
 
 
 class Part(BaseModel):
-    """Part of a results file."""
+    """Describe a part of a JSON results file; each subclass has one field for each key."""
 
     model_config = ConfigDict(
         frozen=True, extra="allow", arbitrary_types_allowed=True, allow_inf_nan=False
     )
 
     def content(self) -> dict[str, Any]:
-        """What the file holds: the keys that were given, in the types of JSON."""
+        """Return the keys that were given and their values, in types that JSON can hold."""
         return dict(plain(self.model_dump(exclude_unset=True, by_alias=True)))
 
 
 class Record(Part):
-    """A whole JSON file of a results folder."""
+    """Describe a whole JSON file of a results folder."""
 
     KIND: ClassVar[str] = ""
-    """What the key ``kind`` has to say; "" where the file has no such key."""
+    """The value that the key ``kind`` must have; "" where the file has no such key."""
     SCHEMA: ClassVar[int] = 1
     MISSING: ClassVar[str] = "there is no such file"
     MAKE: ClassVar[str] = ""
-    """The command that makes the file."""
+    """The command line that makes the file."""
     AGAIN: ClassVar[str] = ""
-    """What to do about a file that cannot be used."""
+    """The advice in the error for a file that cannot be used."""
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """Read and check a file.
+        """Read and check a JSON file; returns the record.
 
-        Raises InputError when it is missing, is of another kind or a newer schema, or does not
-        hold what the schema says.
+        Raises InputError when the file is missing, is of another kind or of a newer schema, or does
+        not have the keys and values that the schema requires.
         """
         if not file.is_file():
             raise InputError(cls.MISSING, where=str(file), todo=f"run `{cls.MAKE}` first")
@@ -108,24 +112,33 @@ class Record(Part):
 
     @classmethod
     def read_if_there(cls, file: Path) -> Self:
-        """As `read`; an empty record where there is no file. For records without needed keys."""
+        """Read and check a JSON file; returns an empty record when the file does not exist.
+
+        This is for records without required keys. Raises InputError as `read` does.
+        """
         return cls.read(file) if file.is_file() else cls()
 
     @classmethod
     def of(cls, content: Mapping[str, Any], file: Path) -> Self:
-        """Check the content of ``file``. Raises InputError that names the key."""
+        """Check ``content``, which was read from ``file``, and return the record.
+
+        Raises InputError that names the faulty key.
+        """
         try:
             return cls.model_validate(plain(dict(content)))
         except ValidationError as error:
             raise InputError(_fault(error), where=str(file), todo=cls.AGAIN) from error
 
     def write(self, file: Path) -> None:
-        """Write the file whole or not at all."""
+        """Write the JSON file; it is replaced completely, or not at all if writing fails.
+
+        Raises InputError when it cannot be written.
+        """
         write_json_atomic(file, self.content())
 
 
 def _fault(error: ValidationError) -> str:
-    """The first fault with its key, short enough for a terminal."""
+    """Return the first fault with its key, in words short enough for a terminal."""
     faults = error.errors(include_url=False, include_input=False, include_context=False)
     key = ".".join(str(part)[:60] for part in faults[0]["loc"][:6])
     reason = faults[0]["msg"].removeprefix("Value error, ")
@@ -135,7 +148,10 @@ def _fault(error: ValidationError) -> str:
 
 
 def read_object(file: Path, todo: str) -> Mapping[str, Any]:
-    """A JSON object. Raises InputError for a file that holds none."""
+    """Read a JSON file whose content is an object, and return it as a dictionary.
+
+    todo : the advice in an error. Raises InputError for a file that holds no JSON object.
+    """
     try:
         content = json.loads(file.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
@@ -150,7 +166,13 @@ PACKAGES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "scikit-image",
 
 
 class RunFile(Record):
-    """run.json. ``tracks`` is the record of the tracking that a smoothing started from."""
+    """Hold the content of run.json: which command made a results folder, and from what.
+
+    command : the command's name. telerig : the version of telerig; None where it is not known.
+    seconds : duration in s of each step by name. options : the values of the command's options.
+    inputs_sha256 : the SHA-256 hash of each input file by its path relative to the dataset.
+    tracks : the run.json of the tracking on which a smoothing is based; otherwise empty.
+    """
 
     AGAIN: ClassVar[str] = "run the command again that made this folder"
 
@@ -163,7 +185,7 @@ class RunFile(Record):
 
 
 def sha256(path: Path) -> str:
-    """Hash of a file's bytes."""
+    """Read a file and return the SHA-256 hash of its bytes, in hexadecimal digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -175,7 +197,12 @@ def run_record(
     options: Mapping[str, Any],
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The content of run.json. inputs : hashed, named relative to the dataset."""
+    """Return the content of run.json for a command that has just finished; nothing is written.
+
+    dataset : the dataset folder. inputs : the files that the command read; they are hashed and
+    named relative to the dataset.
+    options : the values of the command's options. seconds : duration in s of each step by name.
+    """
     return {
         "command": command,
         "telerig": _version("telerig"),
@@ -190,6 +217,7 @@ def run_record(
 
 
 def _version(package: str) -> str | None:
+    """Return the installed version of a package; None when it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

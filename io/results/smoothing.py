@@ -1,4 +1,4 @@
-"""The files of a smoothed run: smoothing.json, trajectories.csv, shake.csv."""
+"""Describe the files of a smoothed run: smoothing.json, trajectories.csv and shake.csv."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from telerig.io.results.tracking import RigChange
 
 AXES = ("x", "y", "z")
 POSITION, VELOCITY = "{}_mm", "v{}_mm_s"
-"""Columns of trajectories.csv for an axis; with "s", "naive_" and "rts_" in front the standard
-deviation and two simpler estimates."""
+"""Patterns of column names in trajectories.csv for one axis: position (mm) and velocity (mm/s).
+
+A leading "s" marks the standard deviation, "naive_" and "rts_" two simpler estimates.
+"""
 
 
 class Verdict(StrEnum):
-    """Can the run tell the bubbles' motion from the rig's shake? From the best to the worst."""
+    """Name whether a run can separate the bubbles' motion from the rig's shake, best case first."""
 
     RESOLVED = "RESOLVED"
     PARTIAL = "PARTIAL"
@@ -27,14 +29,21 @@ class Verdict(StrEnum):
 
 
 class Flag(StrEnum):
-    """Conditions that qualify a verdict."""
+    """Name the conditions that qualify a verdict."""
 
     LABEL_AMBIGUOUS = "LABEL_AMBIGUOUS"
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
 
 
 class AttributedLine(Part):
-    """A spectral line, its owner, and the log-likelihood ratio against the other owner."""
+    """Hold a spectral line and whose motion it is: the bubbles' or the rig's.
+
+    owner : to whom the line is attributed. frequency_hz : its frequency in Hz.
+    rms_mm : RMS of its displacement in mm; None where it is not known.
+    other_owner_costs_nats : log-likelihood ratio against the other owner; None where it was not
+    computed.
+    ambiguous : whether the data cannot decide between the two owners.
+    """
 
     owner: str = ""
     frequency_hz: float
@@ -44,7 +53,14 @@ class AttributedLine(Part):
 
 
 class AxisVerdict(Part):
-    """The verdict along one axis of the rig, and the numbers behind it."""
+    """Hold the verdict along one axis of the rig, and the numbers on which it is based.
+
+    Numbers are None where they were not computed.
+    q : standard deviation of a position divided by the one it would have if the shake were known.
+    eta : share of the shake's prior variance that the data have removed, 1 at best.
+    sigma_mm, sigma_shake_known_mm : these two standard deviations of a position in mm.
+    shake_rms_mm : RMS of the shake in mm. lines : the spectral lines that were attributed.
+    """
 
     verdict: Verdict | None = None
     flags: tuple[str, ...] = ()
@@ -58,7 +74,13 @@ class AxisVerdict(Part):
 
 
 class Mode(Part):
-    """A vibration of the rig: of the model, or a peak in the spectrum of the estimated shake."""
+    """Hold a vibration of the rig: one of the model, or a peak in the estimated shake's spectrum.
+
+    where : the part of the rig that vibrates. frequency_hz : its frequency in Hz.
+    damping : damping ratio; None where it is not known.
+    rms_mm : RMS of the displacement in mm, in total or for each axis; None where it is not known.
+    source, remedy : the probable cause and what helps against it, in words.
+    """
 
     where: str
     frequency_hz: float
@@ -69,7 +91,11 @@ class Mode(Part):
 
 
 class PixelResiduals(Part):
-    """Residuals of the pixels in units of their stated standard deviations."""
+    """Hold statistics of pixel residuals, divided by their stated standard deviations.
+
+    pixels, outliers : number of pixel coordinates, and how many of them are outliers.
+    rms_sigmas, median_sigmas : RMS and median of these ratios; None where there are none.
+    """
 
     pixels: int = 0
     outliers: int = 0
@@ -78,7 +104,15 @@ class PixelResiduals(Part):
 
 
 class SmoothingFile(Record):
-    """smoothing.json. ``depth_axes``: per camera, the direction in rig axes that it cannot see."""
+    """Hold the content of smoothing.json, the result of smoothing a run.
+
+    verdict, flags, axes : the verdict of the run, what qualifies it, and the verdict by axis.
+    words, remedy : the verdict as a sentence, and what to do about it.
+    frames, bubbles : how many were smoothed. modes : the vibrations of the rig.
+    log_evidence : logarithm of the model's probability density for the data; None if not computed.
+    depth_axes : by camera, unit vector (3,) in rig axes along which that camera cannot measure.
+    rig_change : movement of the cameras relative to each other; None where it was not tested.
+    """
 
     MISSING: ClassVar[str] = "this run is not smoothed"
     MAKE: ClassVar[str] = "telerig smooth RUN"
@@ -113,11 +147,16 @@ class SmoothingFile(Record):
 
 
 def _optional(names: Sequence[str]) -> list[Column]:
+    """Return columns of numbers that a table may lack and whose cells may be blank."""
     return [Column(name, required=False, blank=True) for name in names]
 
 
 def shake_columns(cameras: Sequence[str]) -> list[Column]:
-    """Columns of shake.csv."""
+    """Return the columns of shake.csv, which has one row per frame.
+
+    They are frame, t_s (s), for each camera and axis the shake and its standard deviation in mm,
+    and the stage position with its standard deviation in mm.
+    """
     columns = [Column("frame", "whole"), Column("t_s")]
     for camera in cameras:
         columns += [Column(f"{camera}_{axis}_mm") for axis in AXES]
@@ -126,7 +165,7 @@ def shake_columns(cameras: Sequence[str]) -> list[Column]:
 
 
 STATE = tuple(pattern.format(axis) for pattern in (POSITION, VELOCITY) for axis in AXES)
-"""Position and velocity columns of trajectories.csv."""
+"""The names of the position columns (mm) and velocity columns (mm/s) of trajectories.csv."""
 
 TRAJECTORIES = [
     Column("frame", "whole"),

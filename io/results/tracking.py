@@ -1,4 +1,4 @@
-"""The files of a tracked run: tracking.json, and the tables of tracks, detections and events."""
+"""Describe the files of a tracked run: tracking.json, and the CSV tables beside it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ PIXEL = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 
 
 class WorstFrame(Part):
-    """A frame that a person should look at first, and why."""
+    """Hold a frame that a person should inspect first, its score, and the reason in words.
+
+    score : larger is worse; None where the frame has none.
+    """
 
     frame: int
     score: float | None = None
@@ -25,7 +28,14 @@ class WorstFrame(Part):
 
 
 class Pairs(Part):
-    """What the pairs of the run say of both views: bias and scatter of the ray miss."""
+    """Hold what the pairs of detections tell about bias and scatter of the ray miss.
+
+    The numbers are in px; None where they were not computed.
+    bias_px : mean ray miss. rms_px : its RMS. scatter_px : its scatter about the bias.
+    frame_px : the part of the scatter that all pairs of a frame share.
+    calibration_problem : whether the ray miss indicates a wrong calibration.
+    words : sentences for the user.
+    """
 
     bias_px: float | tuple[float, ...] | None = None
     rms_px: tuple[float | None, ...] = ()
@@ -36,7 +46,11 @@ class Pairs(Part):
 
 
 class RigChange(Part):
-    """How far a camera has moved against the other since the calibration."""
+    """Hold how far a camera has moved relative to the other one since the calibration.
+
+    camera : the camera that is described. moved : whether the movement is significant.
+    offset_mm : its part along the common perpendicular in mm; None where it is not known.
+    """
 
     camera: str = ""
     moved: bool = False
@@ -45,7 +59,13 @@ class RigChange(Part):
 
 
 class TrackingFile(Record):
-    """tracking.json."""
+    """Hold the content of tracking.json, the result of tracking a run.
+
+    frames, detections, points, tracks : how many the run has; None where they were not counted.
+    events : number of events of each kind. pairs : statistics of the ray miss, or None.
+    rig_change : movement of the cameras relative to each other; None where it was not tested.
+    up : (3,) unit vector against gravity in the rig frame; None where it is not known.
+    """
 
     KIND: ClassVar[str] = "telerig tracks"
     MISSING: ClassVar[str] = "no tracks here"
@@ -77,11 +97,17 @@ class TrackingFile(Record):
 
 
 def _numbers(names: Sequence[str], *, required: bool = True) -> list[Column]:
+    """Return columns of numbers whose cells may be blank."""
     return [Column(name, required=required, blank=True) for name in names]
 
 
 def tracks_columns(cameras: Sequence[str]) -> list[Column]:
-    """Columns of tracks.csv."""
+    """Return the columns of tracks.csv, which has one row per frame and bubble.
+
+    They are frame, particle, t_s (s), the position (mm) and its covariance (mm^2), for each camera
+    the pixel (px) and its covariance (px^2), the ray miss and the equivalent diameter (mm), and
+    further columns.
+    """
     per_camera = [f"{camera}_{name}" for camera in cameras for name in PIXEL]
     return [
         Column("frame", "whole"),

@@ -1,4 +1,4 @@
-"""The words of the smoothing verdict. `telerig.io.results.smoothing` has its codes and numbers."""
+"""Hold the words of the smoothing verdict; its codes and numbers are in `smoothing.py`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from telerig.io.results.smoothing import Flag, Verdict
 
 
 class VerdictWords(NamedTuple):
-    """A verdict in words: the headline of a page, what follows from it, and of one axis."""
+    """Hold a verdict in words: a page's headline, the consequence, and the words for one axis."""
 
     headline: str
     consequence: str

@@ -79,7 +79,7 @@ class CameraRecord(Part):
     """Hold one calibrated camera.
 
     image_size_px : (width, height) in px.
-    rho_mm : the length in mm by which coordinates are divided before the distortion is computed.
+    rho_mm : half the diagonal of the image in mm, measured in object space at the nominal scale.
     parameters : the value of each intrinsic by name.
     free : the names of the parameters that the calibration estimated.
     standard_deviations : of each free parameter in its own unit; None where it is not known.
@@ -127,11 +127,11 @@ class Covariance(Part):
 class Mirror(Part):
     """Hold which of the two mirror-symmetric solutions was kept, and what decided between them.
 
-    cost, other_cost : the sum of squared whitened residuals of the kept and of the other solution;
-    None where only one was computed.
+    cost, other_cost : the cost of the kept and of the other solution, which the fit minimises; None
+    where it was not computed.
     decided_by, words : what decided, as a code and as a sentence.
-    nominal_rotvec_deg : nominal rotation (3,) in degrees of the second of two cameras; for more
-    cameras, one by camera name. None where rig.toml states none.
+    nominal_rotvec_deg : nominal rotation vector (3,) in degrees of the second of two cameras; for
+    more cameras, one by camera name. None where rig.toml states none.
     """
 
     cost: float | None = None
@@ -142,17 +142,18 @@ class Mirror(Part):
 
 
 class LadderStep(Part):
-    """Hold one lens model that was tried. Numbers are None for a model that was not fitted.
+    """Hold one lens model that was tried. Numbers are None where they were not computed.
 
-    model, camera : the model's name, and the camera for which it was tried.
-    added : the parameters that it has in addition to the previous model.
-    taken : whether it was accepted.
-    chi2_gain, bic_gain : by how much chi-square and the Bayesian information criterion fell.
-    p_value : probability of such a fall in chi-square if the added parameters were 0.
+    model, camera : the model's name, and the camera to whose model parameters were added.
+    added : the names of the added parameters.
+    taken : whether the model was accepted.
+    chi2_gain : decrease of chi-square. bic_gain : this decrease minus the penalty of the extended
+    Bayesian information criterion.
+    p_value : probability of such a decrease of chi-square if the added parameters were 0.
     parameters : number of free parameters. chi2_dof : chi-square per degree of freedom.
     bic : the extended Bayesian information criterion. rms_px : RMS of the residuals in px.
     held_out, held_out_before : mean squared error of the prediction of views that were left out of
-    the fit, for this model and for the previous one.
+    the fit, with this model and with the previous one.
     """
 
     model: str = ""
@@ -183,16 +184,16 @@ class LensModel(Part):
 class Stage(Part):
     """Hold the stage's calibrated travel axis and encoder scale.
 
-    axis : (3,) unit vector of the travel in the rig frame.
-    basis : (3, 2) two unit vectors perpendicular to the axis. The axis's two tilts (rad) are
-    measured along them.
+    axis : (3,) unit vector of the travel in the rig frame, towards increasing encoder readings.
+    basis : (3, 2) two unit vectors perpendicular to the axis, along which its two tilts (rad) are
+    measured.
     axis_covariance_rad2 : (2, 2) covariance of the two tilts in rad^2; None where it is not known.
     encoder_scale : relative error of the encoder; 0.001 means that it reads 0.1 % too much.
     encoder_scale_sd : its standard deviation; None where it is not known.
     joint_covariance : (3, 3) covariance of both tilts (rad) and of the encoder scale.
     chi2_dof : chi-square per degree of freedom of the fit; None where there is none.
     position_sigma_mm, wander_sigma_mm : standard deviation in mm of the carriage's position along
-    the axis and perpendicular to it; None where they were not estimated.
+    the axis and perpendicular to it; None where the file does not state it.
     """
 
     axis: Vector3
@@ -334,8 +335,8 @@ _DOT_EXAMPLE = ("patch", "model", "u0", "v0", "u_px", "v_px", "a_px", "b_px", "a
 def read_joint_covariance(file: Path) -> tuple[tuple[str, ...], Array]:
     """Read covariance.npz, the covariance of all estimated parameters of a calibration.
 
-    Returns the names of the parameters, and their covariance (parameters, parameters), each in the
-    unit that its name states. Both are empty when the file does not exist.
+    Returns the names of the parameters and their covariance (parameters, parameters). Both are
+    empty when the file does not exist.
     Raises InputError for a file that cannot be read or whose arrays do not fit together.
     """
     if not file.is_file():

@@ -59,7 +59,8 @@ class AxisVerdict(Part):
     q : standard deviation of a position divided by the one it would have if the shake were known.
     eta : share of the shake's prior variance that the data have removed, 1 at best.
     sigma_mm, sigma_shake_known_mm : these two standard deviations of a position in mm.
-    shake_rms_mm : RMS of the shake in mm. lines : the spectral lines that were attributed.
+    shake_rms_mm : RMS of the shake in mm of the camera that shakes most.
+    lines : the spectral lines that were attributed to the rig or to the bubbles.
     """
 
     verdict: Verdict | None = None

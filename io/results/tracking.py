@@ -19,7 +19,7 @@ PIXEL = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")
 class WorstFrame(Part):
     """Hold a frame that a person should inspect first, its score, and the reason in words.
 
-    score : larger is worse; None where the frame has none.
+    score : None where the file does not state one.
     """
 
     frame: int
@@ -31,9 +31,13 @@ class Pairs(Part):
     """Hold what the pairs of detections tell about bias and scatter of the ray miss.
 
     The numbers are in px; None where they were not computed.
-    bias_px : mean ray miss. rms_px : its RMS. scatter_px : its scatter about the bias.
-    frame_px : the part of the scatter that all pairs of a frame share.
-    calibration_problem : whether the ray miss indicates a wrong calibration.
+    bias_px : the systematic part of the ray miss: a constant, or the coefficients of a polynomial
+    in the position whose first one is the constant.
+    rms_px : RMS of the ray misses as they are, after the constant, after the whole systematic part,
+    and with each pair left out of its own systematic part.
+    scatter_px : scatter of single pairs beyond the noise of their detections.
+    frame_px : RMS of the shift that all pairs of a frame share, for example because of shake.
+    calibration_problem : whether the ray misses indicate a wrong calibration.
     words : sentences for the user.
     """
 

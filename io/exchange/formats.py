@@ -1,4 +1,4 @@
-"""The registry of other programs' formats: one line for each export and for each importer.
+"""List the formats of other programs: one entry for each export and for each importer.
 
 A new export or importer is one file in ``export`` or ``importing`` and one line here; `telerig
 export`, `telerig import` and their help read these tables.
@@ -22,11 +22,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Format:
-    """One format, whose module is imported at its first use.
+    """Describe one format, whose module is imported at its first use.
 
-    program : whose format it is. function : "module:name" below ``telerig.io.exchange``.
-    description : for the help. suffix : of an exported file; empty where a folder is filled.
-    options : which of the options that a command offers are passed to the function.
+    program : the program to which the format belongs.
+    function : "module:name" below ``telerig.io.exchange``.
+    description : words for the help text.
+    suffix : of an exported file; empty where files are written into a folder.
+    options : which of the command's options are passed to the function.
     extra : the optional dependency that it needs, as in ``pip install 'telerig[tdms]'``.
     """
 
@@ -38,13 +40,16 @@ class Format:
     extra: str = ""
 
     def load(self) -> Callable[..., Any]:
-        """The function that reads or writes the format."""
+        """Import and return the function that reads or writes the format."""
         module, name = self.function.split(":")
         function: Callable[..., Any] = getattr(import_module(f"telerig.io.exchange.{module}"), name)
         return function
 
     def __call__(self, *arguments: Any, **offered: Any) -> Any:
-        """What the function returns; of the offered options it gets those that it takes."""
+        """Call the function with the arguments and with those offered options that it takes.
+
+        Returns what the function returns.
+        """
         return self.load()(*arguments, **{key: offered[key] for key in self.options})
 
 
@@ -96,7 +101,7 @@ SENSOR_IMPORTERS = {
 
 
 def described(formats: dict[str, Format]) -> str:
-    """The names of formats, each with its description, for a help text."""
+    """Return the names of formats, each with its description, for a help text."""
     return ", ".join(f"{name} ({known.description})" for name, known in formats.items())
 
 
@@ -109,11 +114,15 @@ def export_results(
     out: Path | None = None,
     **options: Any,
 ) -> list[str]:
-    """Write cameras or a run in the format ``to``; returns lines on what was written and where.
+    """Write cameras or a run in the format ``to``.
 
-    source : a dataset, one of its results folders, or a calibration.json. run : name of a run,
-    where there are several. calibration : instead of the dataset's own. out : a file or folder;
-    None writes into the dataset's results/export. options : as for `export_cameras`.
+    source : a dataset, one of its results folders, or a calibration.json.
+    to : a name in `CAMERA_EXPORTS` or `RUN_EXPORTS`.
+    run : the run's name; None takes the only one with results.
+    calibration : a calibration that is used in place of the dataset's own; None uses that one.
+    out : the file or folder that is written; None writes into the dataset's results/export.
+    options : as for `export_cameras`.
+    Returns lines of text that say what was written and where.
     Raises InputError for an unknown format, and for results that are missing or cannot be used.
     """
     from telerig.io.exchange.export.run_results import (
@@ -140,10 +149,13 @@ def export_results(
 def export_cameras(
     cameras: Sequence[Camera], to: str, out: Path, *, volume: Volume | None = None, **options: Any
 ) -> list[str]:
-    """Write the cameras in one of `CAMERA_EXPORTS`; returns the volume and each camera's error.
+    """Write the cameras in one of the formats `CAMERA_EXPORTS`.
 
+    out : the file or folder that is written.
     volume : where errors are measured and polynomials fitted; None takes `working_volume`.
-    Raises InputError for a volume that the cameras do not see and a place that cannot be written.
+    options : those that the format takes.
+    Returns lines of text with the volume and each camera's error.
+    Raises InputError for a volume that the cameras do not see, and when ``out`` cannot be written.
     """
     from telerig.io.exchange.export.volume import working_volume
 
@@ -161,9 +173,11 @@ def export_cameras(
 def export_run(
     results: RunResults, to: str, out: Path, cameras: Sequence[Camera] = ()
 ) -> list[str]:
-    """Write a run in one of `RUN_EXPORTS`; returns lines on what was written.
+    """Write a run in one of the formats `RUN_EXPORTS` into the file ``out``.
 
-    Raises InputError for what the format cannot hold and a place that cannot be written.
+    cameras : they are written too, if the format can hold them.
+    Returns lines of text that say what was written.
+    Raises InputError for data that the format cannot hold, and when ``out`` cannot be written.
     """
     RUN_EXPORTS[to](results, out, cameras=cameras)
     count = results.points["particle"].nunique()

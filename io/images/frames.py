@@ -31,9 +31,10 @@ PAGE_EXTENSIONS = (".tif", ".tiff")
 
 
 class FrameSource(Protocol):
-    """One camera's frames in the order of recording, not yet in step with another camera's.
+    """Give access to one camera's frames by their position in the order of recording.
 
-    path : the folder or the file. cut_short : the file ends within its last frame.
+    Frames are not yet paired with those of another camera.
+    path : the folder or the file. cut_short : whether the file ends within its last frame.
     """
 
     @property
@@ -45,20 +46,25 @@ class FrameSource(Protocol):
     def __len__(self) -> int: ...
 
     def read(self, position: int) -> Image:
-        """As `read_image`. Raises InputError, naming file and frame, if it cannot be read."""
+        """Read the frame at ``position`` (from 0); returns pixels (height, width) as `read_image`.
+
+        Raises InputError, naming file and frame, if it cannot be read.
+        """
 
     def where(self, position: int) -> str:
-        """File and frame, for errors."""
+        """Return the names of file and frame, for errors."""
 
     def numbers(self) -> Ints | None:
-        """(N,) what the names count, increasing; None when they do not count."""
+        """Return the increasing (frames,) numbers in the file names; None if the names do not
+        count.
+        """
 
 
 @dataclass(frozen=True)
 class ImageFiles:
-    """A folder of images, one per frame: their names in natural order.
+    """Give access to a folder that holds one image file per frame, in natural order of the names.
 
-    Names and not paths, which take ten times the memory and go to every process.
+    Names are kept instead of paths, which need ten times the memory and are sent to every process.
     """
 
     path: Path
@@ -75,7 +81,7 @@ class ImageFiles:
         return str(self.path / self.names[position])
 
     def numbers(self) -> Ints | None:
-        """The last number in each name, when the rest of the names is alike."""
+        """Return the last number in each name, (frames,); None if the rest of the names differs."""
         parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", Path(n).stem) for n in self.names]
         if not all(parts) or len({(m[1], m[3]) for m in parts if m}) != 1:
             return None
@@ -86,7 +92,10 @@ class ImageFiles:
 
 
 class PageFrames:
-    """A multi-page TIFF; pages are found by their offsets and read one at a time."""
+    """Give access to the pages of a multi-page TIFF, which are read one at a time.
+
+    Raises InputError when the file is not a TIFF with at least one complete page.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -155,7 +164,9 @@ class PageFrames:
 
 @dataclass(frozen=True)
 class _Stack:
-    """Frames one behind the other behind a single page header, as ImageJ writes them."""
+    """Hold where frames lie that follow each other behind one page header, as ImageJ writes
+    them.
+    """
 
     offset: int
     count: int
@@ -169,7 +180,9 @@ class _Stack:
 
 
 def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
-    """When the file's description counts more frames than there are page headers."""
+    """Return the stack if the file's description counts more frames than page headers, else
+    None.
+    """
     page = tiff.pages[0]
     if page.samplesperpixel != 1 or page.photometric == 0:
         return None
@@ -182,7 +195,7 @@ def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
 
 
 def _page_offsets(path: Path) -> tuple[Ints, bool]:
-    """Where each page's header begins, and whether the chain of headers leads out of the file."""
+    """Return where each page's header begins (bytes), and whether the file ends too early."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
         file.seek(0)
@@ -217,10 +230,12 @@ def _found(offsets: list[int], path: Path) -> Ints:
 
 
 def open_frames(folder: Path, camera: str) -> FrameSource | None:
-    """The frames of one camera in a run's folder, not yet decoded; None when it has none.
+    """Open the frames of one camera in a run's folder; none is decoded.
 
-    `<camera>/*.tif|png|bmp|jpg`, else `<camera>.tif` (multi-page), else `<camera>.avi|mp4`.
-    Raises InputError when there is more than one of them, or a file cannot be opened.
+    They are `<camera>/*.tif|png|bmp|jpg`, or `<camera>.tif` (multi-page), or a video
+    `<camera>.avi|mp4|mov|mkv`.
+    Returns None when the camera has no frames.
+    Raises InputError when there is more than one of these, or when a file cannot be opened.
     """
     found = camera_entries(folder, camera)
     if len(found) > 1:
@@ -252,7 +267,7 @@ def open_frames(folder: Path, camera: str) -> FrameSource | None:
 
 
 def camera_entries(folder: Path, camera: str) -> list[Path]:
-    """What in a run's folder may hold this camera's frames."""
+    """Return the folder and the files in a run's folder that may hold this camera's frames."""
     known = PAGE_EXTENSIONS + VIDEO_EXTENSIONS
     files = (p for p in folder.iterdir() if p.suffix.lower() in known and p.stem == camera)
     found = sorted(p for p in files if p.is_file())
@@ -281,11 +296,12 @@ _WIDE_GREY = {"gray9", "gray10", "gray12", "gray14", "gray16"}
 
 
 class VideoFrames:
-    """Frames by index: read in sequence at the decoder's speed, elsewhere from a key frame on.
+    """Give access to the frames of a video by their position.
 
-    Grey formats come out as stored (uint8, or uint16 for 9 to 16 bits); of YUV formats the luma
-    plane as stored, without a change of range; RGB must be grey. Raises InputError when PyAV is
-    missing or the file is no video that can be decoded.
+    Successive frames are read at the decoder's speed; for other frames decoding starts at a key
+    frame. Grey formats are returned as stored (uint8, or uint16 for 9 to 16 bits), YUV formats as
+    their stored brightness; RGB frames must be grey.
+    Raises InputError when PyAV is not installed or the file is no video that can be decoded.
     """
 
     def __init__(self, path: Path) -> None:
@@ -305,7 +321,9 @@ class VideoFrames:
         return None
 
     def read(self, position: int) -> Image:
-        """The frame, (height, width). Raises InputError, naming file and frame."""
+        """Read one frame; returns pixels (height, width). Raises InputError, naming file and
+        frame.
+        """
         with self._lock:
             try:
                 return image_from_pixels(self._pixels(position), self.path)

@@ -11,10 +11,12 @@ Window = tuple[slice, slice]
 
 
 def cell_coverage(polygon: Array, size: tuple[int, int]) -> Array:
-    """(rows, columns) share of each unit cell inside a closed polygon (N, 2), exact.
+    """Compute the exact share of each unit cell that lies inside a closed polygon.
 
-    Cell (row i, column j) spans j..j+1 in x and i..i+1 in y; the polygon must lie inside the grid.
-    Each edge is cut at the cells' borders; a piece adds its height to all cells to its right.
+    polygon : (points, 2) x and y in cells; it must lie inside the grid. size : (rows, columns).
+    Returns (rows, columns) shares from 0 to 1. The cell (row i, column j) spans j..j+1 in x and
+    i..i+1 in y. Each edge is cut at the cells' borders; a piece adds its height to all cells to its
+    right.
     """
     rows, columns = size
     start, end = _pieces(polygon)
@@ -86,7 +88,12 @@ def pixel_weights(
 def overlap(
     shape: tuple[int, ...], patch_shape: tuple[int, ...], row: int, column: int
 ) -> tuple[Window, Window]:
-    """Where a patch at (row, column) lies in an image, and which part of it does; may be empty."""
+    """Return where a patch lies in an image, and which part of the patch lies in the image.
+
+    shape, patch_shape : (rows, columns) of the image and of the patch. row, column : the patch's
+    first pixel in the image, which may be negative.
+    Both results are a pair of slices (rows, columns); they may be empty.
+    """
     first = np.maximum([row, column], 0)
     end = np.maximum(np.minimum(np.add([row, column], patch_shape), shape), first)
     inside = slice(first[0], end[0]), slice(first[1], end[1])
@@ -95,7 +102,7 @@ def overlap(
 
 
 def refined(outline: Array, count: int) -> Array:
-    """(N, 2) a smooth closed outline -> (count, 2), by trigonometric interpolation."""
+    """Interpolate a smooth closed outline (points, 2) trigonometrically to (count, 2) points."""
     n = len(outline)
     spectrum = np.fft.rfft(outline, axis=0)
     if n % 2 == 0:

@@ -32,12 +32,14 @@ _MONO = "save it with one grey channel; set a colour camera to a mono mode"
 def read_image(
     path: str | PathLike[str], *, expected_size_px: tuple[int, int] | None = None
 ) -> Image:
-    """(height, width) pixels as the file holds them: uint8, uint16, or float32 (float TIFF).
+    """Read one grey image from a TIFF, PNG, BMP or JPEG file.
 
-    expected_size_px : (width, height) that the image must have.
-    Three equal channels count as grey and an opaque alpha channel is dropped. No EXIF rotation,
-    no gamma, no scaling. Raises InputError for a file that is missing, truncated or of no known
-    format, that holds several pages, colour or non-finite values, or has another size.
+    expected_size_px : (width, height) in px that the image must have; None accepts any size.
+    Returns the pixels (height, width) as the file holds them: uint8, uint16, or float32 (float
+    TIFF). Three equal channels count as grey and an opaque alpha channel is removed. There is no
+    EXIF rotation, no gamma and no scaling.
+    Raises InputError for a file that is missing, truncated or of an unknown format, that holds
+    several pages, colour or values that are not finite, or has another size.
     """
     file = Path(path)
     try:
@@ -57,15 +59,16 @@ def read_image(
 
 
 def image_from_pixels(pixels: NDArray[Any], file: Path) -> Image:
-    """What `read_image` makes of decoded pixels, with the same checks; for pages and videos.
+    """Convert decoded pixels as `read_image` does, with the same checks; for pages and videos.
 
-    file : for errors.
+    pixels : (height, width) or (height, width, channels). file : named in errors.
+    Returns the grey image (height, width). Raises InputError as `read_image` does.
     """
     return _native(_grey(pixels, file), file)
 
 
 def list_images(folder: str | PathLike[str]) -> list[Path]:
-    """The image files in a folder by their extensions, in natural order (2 before 10).
+    """List the image files in a folder, by their extensions, in natural order (2 before 10).
 
     Hidden files are left out. Raises InputError when there is no such folder.
     """
@@ -77,7 +80,7 @@ def list_images(folder: str | PathLike[str]) -> list[Path]:
 
 
 def natural(name: str) -> tuple[Any, ...]:
-    """Sorting key in which runs of digits count as numbers."""
+    """Return a sorting key for a name, in which runs of digits count as numbers."""
     parts = re.split(r"(\d+)", name)
     return tuple(int(p) if i % 2 else p.lower() for i, p in enumerate(parts)), name
 
@@ -93,7 +96,7 @@ def _decoder(data: bytes, file: Path) -> Callable[[bytes, Path], NDArray[Any]]:
 
 
 def damaged(path: Path, detail: str) -> InputError:
-    """The error for a file that ends too early or cannot be decoded."""
+    """Return the error for a file that ends too early or cannot be decoded."""
     return InputError(f"is truncated or damaged: {detail}", where=str(path), todo=_COPY)
 
 

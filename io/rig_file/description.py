@@ -50,9 +50,11 @@ class Table:
 
 @dataclass(frozen=True)
 class CameraDescription(Table):
-    """image_size_px : (width, height). scale_px_per_mm : nominal.
+    """Hold what rig.toml states about one camera.
 
-    telecentricity_per_mm : nominal residual perspective kappa; None when the file is silent.
+    image_size_px : (width, height) in px. scale_px_per_mm : the nominal scale.
+    telecentricity_per_mm : nominal residual perspective kappa in 1/mm; None when the file does not
+    state it.
     """
 
     name: str
@@ -68,10 +70,15 @@ class CameraDescription(Table):
 
 @dataclass(frozen=True)
 class StageDescription(Table):
-    """axis : nominal travel direction, up : away from gravity; unit vectors in rig axes.
+    """Hold what rig.toml states about the stage.
 
-    scale_sigma : sd of the encoder's relative scale error, 0 if it is exact; None: not stated.
-    gravity_m_s2 : of the laboratory; on Earth's surface it is between 9.76 and 9.84.
+    axis : (3,) nominal direction of travel; up : (3,) direction against gravity. Both are unit
+    vectors in the rig frame.
+    position_sigma_mm : standard deviation of an encoder reading in mm.
+    scale_sigma : standard deviation of the encoder's relative scale error, 0 if the scale is exact;
+    None when the file does not state it.
+    gravity_m_s2 : gravity in the laboratory in m/s^2; on Earth's surface it is between 9.76 and
+    9.84.
     """
 
     axis: Direction
@@ -93,9 +100,12 @@ class StageDescription(Table):
 
 @dataclass(frozen=True)
 class AccelerometerDescription(Table):
-    """axes : rows are the sensor's x, y, z as unit vectors in rig axes.
+    """Hold what rig.toml states about one accelerometer.
 
-    mounted_on : a camera's name or "carriage". noise_density_ug_sqrt_hz : micro-g per root hertz.
+    mounted_on : a camera's name, or "carriage" for the stage itself.
+    axes : (3, 3) whose rows are the sensor's x, y, z axes as unit vectors in the rig frame.
+    noise_density_ug_sqrt_hz : noise density in micro-g per root hertz.
+    bias_sigma_m_s2 : prior standard deviation of the bias of each axis in m/s^2.
     """
 
     name: str
@@ -112,7 +122,7 @@ class AccelerometerDescription(Table):
 
 @dataclass(frozen=True)
 class ReferencesDescription(Table):
-    """Dots at unknown places fixed to the tank and seen by the cameras."""
+    """Describe the marks: dots at unknown places, fixed to the tank and seen by the cameras."""
 
     kind: Literal["dots"] = "dots"
     polarity: Polarity = "black_on_white"
@@ -121,13 +131,16 @@ class ReferencesDescription(Table):
 
 @dataclass(frozen=True)
 class WallDescription(Table):
-    """Plane glass between a camera and the water, in that camera's frame.
+    """Describe the plane glass between a camera and the water, in that camera's frame.
 
-    normal : unit vector pointing away from the camera (z > 0).
-    indices : of the medium on the camera's side, the glass, and the medium behind it.
-    distance_mm : along the camera's axis from its origin to the wall's near face, negative where
-    that lies before the origin; None where nothing but the image's place depends on it (kappa = 0).
-    normal_sigma_deg : how well the normal is known, 0 for exactly.
+    normal : (3,) unit vector that points away from the camera (z > 0).
+    indices : refractive indices of the medium on the camera's side, of the glass, and of the medium
+    behind it.
+    thickness_mm : thickness of the glass in mm.
+    distance_mm : distance in mm along the camera's axis from its origin to the near face, negative
+    if the face lies before the origin. None is allowed for kappa = 0, where only the image's place
+    depends on it.
+    normal_sigma_deg : standard deviation of the normal's direction in degrees, 0 if it is exact.
     """
 
     camera: str
@@ -145,7 +158,9 @@ class WallDescription(Table):
     normal_sigma_deg: Annotated[float, Field(ge=0, le=10, description="degrees from 0 to 10")] = 0.0
 
     def wall(self) -> Wall:
-        """For `Camera.wall`; without a distance the near face is at the camera's origin."""
+        """Return the `Wall` for a camera; without a distance the near face is at the camera's
+        origin.
+        """
         sigma_rad = float(np.radians(self.normal_sigma_deg))
         distance_mm = self.distance_mm or 0.0
         return Wall(np.array(self.normal), distance_mm, self.thickness_mm, self.indices, sigma_rad)
@@ -196,14 +211,15 @@ class DeviceDescription(Table):
 
 @dataclass(frozen=True)
 class RigDescription:
-    """The whole of `rig.toml`; the first camera's frame is the rig frame.
+    """Hold the whole content of `rig.toml`; the first camera's frame is the rig frame.
 
-    rotvec_from_first_deg : by camera, the nominal rotation <camera>_from_<first>, for those that
-    the file gives; decides the mirror ambiguity.
-    tracking : the two cameras whose images of bubbles are paired, in the rig's order; None when
-    the file does not say, which means the first two.
+    cameras, accelerometers, walls, devices : the tables of the file by name. A device is a sensor
+    on a serial line.
+    rotvec_from_first_deg : by camera, the nominal rotation vector (3,) in degrees of
+    <camera>_from_<first>, for the cameras that the file states. It decides the mirror ambiguity.
+    tracking : the two cameras whose images of bubbles are paired, in the rig's order; None when the
+    file does not state them, which means the first two.
     stage, references : None when the file has no such table.
-    devices : sensors on serial lines, by name.
     """
 
     name: str
@@ -238,12 +254,15 @@ class RigDescription:
 
 
 def rotvec_key(camera: str, first: str) -> str:
-    """The key of `[stereo]` that holds a camera's nominal rotation."""
+    """Return the key of the table `[stereo]` that holds a camera's nominal rotation."""
     return f"{camera}_from_{first}_rotvec_deg"
 
 
 def camera_named(camera: str | int, names: list[str], *, where: str) -> str:
-    """One of the cameras' ``names``, from itself or its index. Raises InputError without it."""
+    """Return the name of a camera, given as one of ``names`` or as an index into them.
+
+    Raises InputError for an unknown camera.
+    """
     if isinstance(camera, int) and 0 <= camera < len(names):
         return names[camera]
     if isinstance(camera, str) and camera in names:

@@ -70,19 +70,20 @@ class _TrackingTable(Table):
 
 
 def read_rig_toml(path: str | PathLike[str]) -> RigDescription:
-    """Read and check a rig file.
+    """Read and check a rig.toml.
 
-    Directions come out as unit vectors, sigmas with their defaults filled in. Raises one
-    InputError that lists every fault with its table, its key and what to do.
+    Directions are returned as unit vectors, standard deviations with their default values filled
+    in.
+    Raises one InputError that lists every fault with its table, its key and what to do.
     """
     file = Path(path)
     return description_from_toml(_text(file), where=str(file), name=file.resolve().parent.name)
 
 
 def write_rig_toml(rig: RigDescription, path: str | PathLike[str]) -> None:
-    """Write a rig file that `read_rig_toml` gives back unchanged.
+    """Write a rig.toml that `read_rig_toml` reads back without a change.
 
-    Raises InputError when a rig file could not be read that holds this description.
+    Raises InputError when the description is not valid, and when the file cannot be written.
     """
     text = rig_toml(rig)
     description_from_toml(text, where=str(path))
@@ -90,7 +91,11 @@ def write_rig_toml(rig: RigDescription, path: str | PathLike[str]) -> None:
 
 
 def description_from_toml(text: str, *, where: str, name: str = "rig") -> RigDescription:
-    """The rig described by the text of a rig file; ``name`` is used when the text gives none."""
+    """Return the rig that the text of a rig.toml describes.
+
+    where : the file that errors name. name : the rig's name, used when the text states none.
+    Raises one InputError that lists every fault.
+    """
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

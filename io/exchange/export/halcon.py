@@ -52,7 +52,10 @@ from telerig.rig.distortion import (
 from telerig.rig.pose import Pose
 
 PERSPECTIVE_PX = 0.5
-"""A lens whose residual perspective moves a point of the volume by more is exported as such."""
+"""The largest error (px) that exporting a lens as telecentric may cause in the volume.
+
+A lens whose residual perspective moves a point by more is exported as perspective.
+"""
 
 _POINTS_PER_EDGE = 25
 _PIXELS_PER_EDGE = 41
@@ -64,11 +67,12 @@ p2 are exchanged, and the power of length in HALCON's unit of it."""
 
 @dataclass(frozen=True)
 class HalconCamera:
-    """Parameters in HALCON's names and units (m, px, degrees), in HALCON's order.
+    """Hold one camera's parameters in HALCON's names, order and units (m, px, degrees).
 
-    kind : HALCON's camera type. camera_from_rig : HALCON's external parameters, mm here.
-    misfit : against the camera of this library over the working volume.
-    notes : what was fitted or left out; empty where HALCON's camera is exactly telerig's.
+    camera : the camera's name. kind : HALCON's camera type.
+    camera_from_rig : HALCON's external parameters, here in mm.
+    misfit : distance in px to telerig's camera over the working volume.
+    notes : what was fitted or left out; empty where HALCON's camera is equal to telerig's.
     """
 
     camera: str
@@ -79,13 +83,22 @@ class HalconCamera:
     notes: tuple[str, ...]
 
     def project(self, points_mm: ArrayLike) -> Array:
-        """(..., 3) rig points -> (..., 2) pixels (column, row) by HALCON's model."""
+        """Project points in the rig frame, (..., 3) in mm, to pixels (..., 2) by HALCON's model.
+
+        The pixels are (column, row) in px. Raises GeometryError where HALCON's distortion has no
+        inverse.
+        """
         points = self.camera_from_rig.apply(np.atleast_2d(points_mm)) * 1e-3
         return _pixel_from_camera(points, self.parameters).reshape(*np.shape(points_mm)[:-1], 2)
 
 
 def export_halcon(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[str]:
-    """Write the HALCON files of all cameras into the folder ``out``; returns a line per camera."""
+    """Write the HALCON files of all cameras into the folder ``out``.
+
+    volume : the box over which errors are measured.
+    Returns one line of text per camera with its type, notes and misfit. Raises InputError as
+    `halcon_cameras` and `write_halcon` do.
+    """
     exported = halcon_cameras(cameras, volume)
     write_halcon(exported, out)
     return [
@@ -97,10 +110,11 @@ def export_halcon(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[
 def halcon_cameras(
     cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[HalconCamera, ...]:
-    """Every camera in HALCON's model.
+    """Convert every camera to HALCON's model.
 
     A camera is exported as telecentric unless that moves points of the volume by more than
-    `PERSPECTIVE_PX`. volume : None takes `working_volume`.
+    `PERSPECTIVE_PX`.
+    volume : the box over which errors are measured; None takes `working_volume`.
     Raises InputError when the cameras do not see the volume, and for an unknown lens parameter.
     """
     refuse_unknown_parameters(cameras, "HALCON")
@@ -252,10 +266,10 @@ _DAT = {
 
 
 def write_halcon(cameras: Sequence[HalconCamera], folder: str | PathLike[str]) -> list[str]:
-    """Into a folder: cameras.hdev.txt, and per camera <camera>.dat and <camera>_pose.dat.
+    """Write cameras.hdev.txt, and <camera>.dat and <camera>_pose.dat for each camera, in a folder.
 
-    Returns the names of the files. A camera with a tilted sensor has no `.dat`: its layout is not
-    documented. Raises InputError when the folder cannot be written.
+    Returns the names of the files. A camera with a tilted sensor gets no `.dat` file, because its
+    layout is not documented. Raises InputError when the folder cannot be written.
     """
     names = []
     with atomic_folder(folder) as place:
@@ -268,7 +282,7 @@ def write_halcon(cameras: Sequence[HalconCamera], folder: str | PathLike[str]) -
 
 
 def hdevelop_lines(cameras: Sequence[HalconCamera]) -> str:
-    """Assignments to paste into HDevelop: CamParam<i> (camera type first), Pose<i>."""
+    """Return assignments to paste into HDevelop: CamParam<i> (camera type first) and Pose<i>."""
     lines = [
         "* World: telerig's rig frame, the first camera's.",
         "* Pixels: the centre of the top-left pixel is (0, 0).",
@@ -290,7 +304,10 @@ def hdevelop_lines(cameras: Sequence[HalconCamera]) -> str:
 
 
 def pose_tuple(pose: Pose) -> Array:
-    """(6,) translation in m, then angles in degrees, R = Rx Ry Rz (HALCON's type 0: Rp+T, gba)."""
+    """Return a pose (6,) as HALCON writes it: translation in m, then three angles in degrees.
+
+    The rotation is R = Rx Ry Rz (HALCON's pose type 0: Rp+T, gba).
+    """
     r = pose.rotation
     beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))
     alpha = np.arctan2(-r[1, 2], r[2, 2]) if np.hypot(r[1, 2], r[2, 2]) > 1e-9 else 0.0

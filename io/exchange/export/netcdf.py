@@ -1,4 +1,4 @@
-"""Trajectories as NetCDF after the CF conventions: a contiguous ragged array of trajectories.
+"""Write trajectories as NetCDF by the CF conventions: a contiguous ragged array of trajectories.
 
 CF-1.8, section 9.3.3 and appendix H.4.3. The file is NetCDF-3 with 64-bit offsets, which SciPy
 writes without a further dependency and every NetCDF program reads. It has no compression, and whole
@@ -30,10 +30,12 @@ _WORDS = {
 
 
 def write_netcdf(results: RunResults, path: str | PathLike[str]) -> None:
-    """Dimensions ``trajectory`` and ``obs``; ``rowSize`` counts each trajectory's rows.
+    """Write a run's trajectories to a NetCDF-3 file.
 
-    Variables have the names of the table's columns, but for time, x, y, z. Text is in fixed-width
-    characters. Raises InputError for ids beyond 32 bits and when the file cannot be written.
+    Its dimensions are ``trajectory`` and ``obs`` (the rows); ``rowSize`` gives each trajectory's
+    number of rows. Variables have the names of the table's columns, except time, x, y, z. Text is
+    stored as characters of fixed width.
+    Raises InputError for whole numbers beyond 32 bits, and when the file cannot be written.
     """
     from scipy.io import netcdf_file
 

@@ -65,9 +65,10 @@ def export_opencv(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[
 
 
 def undistorted_matrix(camera: Camera) -> Array:
-    """(3, 4) projection of the camera without its distortion, in closed form.
+    """Return the projection matrix (3, 4) of the camera without its distortion, in closed form.
 
-    Behind a refractive window it is exact for kappa = 0 only.
+    It maps homogeneous points in mm in the rig frame to homogeneous pixels in px. Behind a
+    refractive window it is exact for kappa = 0 only.
     """
     q = np.array([camera["tilt_x"], camera["tilt_y"]])
     tilt = np.eye(3)
@@ -110,7 +111,7 @@ def _telecentric_matrix(camera: Camera) -> Array:
 
 
 def projected(matrix: Array, points_mm: Array) -> Array:
-    """(..., 3) -> (..., 2) by a (3, 4) matrix."""
+    """Project points (..., 3) in mm to pixels (..., 2) in px by a projection matrix (3, 4)."""
     image = points_mm @ matrix[:, :3].T + matrix[:, 3]
     return np.asarray(image[..., :2] / image[..., 2:])
 
@@ -118,10 +119,11 @@ def projected(matrix: Array, points_mm: Array) -> Array:
 def camera_matrices(
     cameras: Sequence[Camera], volume: Volume | None = None
 ) -> tuple[Matrices, ...]:
-    """The matrices of every camera; misfits over what all of them see of the volume.
+    """Compute the matrices of every camera.
 
-    volume : None takes `working_volume`. Raises InputError when the cameras do not see it,
-    and for an unknown lens parameter.
+    Misfits are measured over the part of the volume that all cameras see.
+    volume : None takes `working_volume`.
+    Raises InputError when the cameras do not see the volume, and for an unknown lens parameter.
     """
     refuse_unknown_parameters(cameras, "OpenCV")
     points = seen_points(cameras, volume or working_volume(cameras), _POINTS_PER_EDGE)
@@ -157,7 +159,7 @@ def _opencv_distortion(camera: Camera) -> tuple[Array | None, Array | None]:
 
 
 def write_opencv(matrices: Sequence[Matrices], path: str | PathLike[str]) -> None:
-    """One YAML file with a map for each camera; every float keeps all its digits.
+    """Write one YAML file for OpenCV with an entry for each camera; floats keep all their digits.
 
     Raises InputError when it cannot be written.
     """

@@ -1,4 +1,4 @@
-"""What a run's results folder holds, as every export of trajectories takes it; and where it is."""
+"""Read a run's results folder for the exports of trajectories, and find that folder."""
 
 from __future__ import annotations
 
@@ -36,10 +36,14 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class RunResults:
-    """points : one row per frame and bubble, sorted by particle, then frame; see docs/files.md.
+    """Hold the results of a run for export.
 
-    frame : `LAB` (smoothed) or `RIG` (tracked only), in words. shake : the cameras' shake, or None.
-    verdict : of the smoothing, and what it warns of; "" where nothing was smoothed.
+    name : the run's name.
+    frame : the frame of the positions in words: `LAB` (smoothed) or `RIG` (tracked only).
+    points : one row per frame and bubble, sorted by particle, then frame; see docs/files.md.
+    shake : the table of shake.csv, the cameras' shake; None where the run was not smoothed.
+    verdict : verdict of the smoothing with its flags; "" where the run was not smoothed.
+    source : the name of the file from which ``points`` was read.
     """
 
     name: str
@@ -51,9 +55,9 @@ class RunResults:
 
 
 def read_results(folder: str | PathLike[str]) -> RunResults:
-    """`trajectories.csv` of a smoothed run, else `tracks.csv`.
+    """Read `trajectories.csv` of a smoothed run, or else `tracks.csv`, from its results folder.
 
-    Raises InputError when the folder has neither, or a table that cannot be read.
+    Raises InputError when the folder has neither, or when a table cannot be read.
     """
     place = Path(folder)
     names = [n for n in _TRAJECTORIES if (place / n).is_file()]
@@ -80,7 +84,10 @@ def read_results(folder: str | PathLike[str]) -> RunResults:
 
 
 def _whole_particles(points: pd.DataFrame) -> pd.DataFrame:
-    """Ids as whole numbers where all of them are; given names stay text, so does "007"."""
+    """Return the table with whole numbers as particle ids if all ids are such; otherwise with text.
+
+    An id like "007" counts as text.
+    """
     text = points["particle"].astype(str)
     if text.str.fullmatch(r"0|-?[1-9]\d{0,17}").all():
         return points.assign(particle=text.astype(np.int64))
@@ -88,6 +95,7 @@ def _whole_particles(points: pd.DataFrame) -> pd.DataFrame:
 
 
 def _verdict(file: Path) -> str:
+    """Read the verdict and its flags from smoothing.json; returns "" when there is no such file."""
     if not file.is_file():
         return ""
     found = SmoothingFile.read(file)
@@ -96,14 +104,18 @@ def _verdict(file: Path) -> str:
 
 
 def unit_of(column: str) -> str:
-    """UDUNITS name of a column's unit, from the end of its name; "1" where it has none."""
+    """Return the UDUNITS name of a column's unit, from the end of the column's name.
+
+    Returns "1" for a column without a unit.
+    """
     return next((unit for end, unit in _UNITS.items() if column.endswith(end)), "1")
 
 
 def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:
-    """(N,) whole numbers for the particles, and their names in the order of these numbers.
+    """Return a whole number for each row's particle, (rows,), and the names of the particles.
 
-    Ids that are whole numbers stay as they are, and there are no names.
+    The names are in the order of the numbers. Ids that are whole numbers already stay as they are,
+    and the list of names is empty.
     """
     if points["particle"].dtype.kind == "i":
         return points["particle"].to_numpy(np.int64), []
@@ -112,7 +124,7 @@ def numbered(points: pd.DataFrame) -> tuple[Ints, list[str]]:
 
 
 def facts(results: RunResults) -> dict[str, str]:
-    """What every file says of its content."""
+    """Return what every exported file states about its content: run, frame, source and verdict."""
     try:
         made_by = f"telerig {version('telerig')}"
     except PackageNotFoundError:
@@ -126,15 +138,16 @@ def facts(results: RunResults) -> dict[str, str]:
 
 
 def identifier(name: str) -> str:
-    """A name that MATLAB takes for a field: letters, digits, underscores, a letter first."""
+    """Return a name that MATLAB accepts as a field: letters, digits, _, with a letter first."""
     plain = re.sub(r"\W", "_", name, flags=re.ASCII)
     return (plain if plain[:1].isalpha() else f"n_{plain}")[:63]
 
 
 def results_root(source: Path) -> Path:
-    """DATASET/results for a dataset, one of its results folders, or a file in one of them.
+    """Return the folder DATASET/results that belongs to ``source``.
 
-    Raises InputError when there is nothing at ``source``, or a folder of something else.
+    source : a dataset, one of its results folders, or a file in one of them.
+    Raises InputError when ``source`` does not exist, or is a folder of another kind.
     """
     if not source.exists():
         raise InputError("there is no such dataset", where=str(source), todo="check the path")
@@ -155,9 +168,11 @@ def results_root(source: Path) -> Path:
 
 
 def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Sequence[Camera]:
-    """The cameras of ``calibration``, of ``source`` or of its dataset; () where there are none.
+    """Read the calibrated cameras, which include their refractive windows.
 
-    Raises InputError when there are none and they are required.
+    They come from ``calibration`` (a calibration.json or its folder), or else from ``source``, or
+    else from the dataset of ``source``.
+    required : True raises InputError when no calibration is found; False then returns ().
     """
     trials = [results_root(source) / "calibration" / "calibration.json"]
     if source.suffix == ".json":
@@ -178,9 +193,10 @@ def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Seq
 
 
 def run_folder(source: Path, run: str | None) -> Path:
-    """The results folder of a run.
+    """Return the results folder of the run named ``run``.
 
-    Raises InputError when it is not there, or when none of several was named.
+    run : None takes ``source`` itself, or else the only run with results.
+    Raises InputError when run is None and no run or several runs have results.
     """
 
     def holds(folder: Path) -> bool:

@@ -1,7 +1,7 @@
-"""Soloff's polynomial camera: cubic in x and y, quadratic in z, 19 terms for u and for v.
+"""Fit Soloff's polynomial camera: cubic in x and y, quadratic in z, 19 terms for u and for v.
 
 S. M. Soloff, R. J. Adrian and Z.-C. Liu, Meas. Sci. Technol. 8:1441 (1997), equation 8. PIV
-programs take it in place of a camera model. It is fitted to the calibrated camera over the working
+programs use it in place of a camera model. It is fitted to the calibrated camera over the working
 volume.
 """
 
@@ -28,7 +28,7 @@ POWERS = (
 """Exponents of x, y, z in the order of the paper's a0 ... a18."""
 
 CUBIC_Z = (0, 0, 3)
-"""The 20th term, which the paper leaves out; a camera that looks along x has its image along z."""
+"""Exponents of the 20th term, which the paper omits. A camera that looks along x needs it."""
 
 FIT_POINTS_PER_EDGE = 21
 CHECK_POINTS_PER_EDGE = 34
@@ -36,10 +36,13 @@ CHECK_POINTS_PER_EDGE = 34
 
 @dataclass(frozen=True)
 class Soloff:
-    """coefficients : (19, 2), or (20, 2) with `CUBIC_Z` last, for u and v in px; x, y, z in mm of
-    the rig frame.
+    """Hold the polynomial that was fitted to one camera.
 
-    misfit : against the camera, at points that were not fitted.
+    camera : the camera's name.
+    coefficients : (19, 2), or (20, 2) with the term `CUBIC_Z` last. The columns give u and v in px
+    for x, y, z in mm in the rig frame.
+    misfit : distance to the calibrated camera in px, at points that were not used in the fit.
+    volume : the box in which the polynomial is valid.
     """
 
     camera: str
@@ -56,9 +59,12 @@ def export_soloff(
     full_cubic: bool = False,
     first_pixel: float = 0.0,
 ) -> list[str]:
-    """Write soloff_<camera>.csv for all cameras into the folder ``out``; returns a line per camera.
+    """Fit a polynomial to each camera and write it to soloff_<camera>.csv in the folder ``out``.
 
-    full_cubic : see `fit_soloff`. first_pixel : see `write_soloff`.
+    volume : the box over which it is fitted. full_cubic : see `fit_soloff`. first_pixel : see
+    `write_soloff`.
+    Returns one line of text per camera with the number of terms and the misfit.
+    Raises InputError when the cameras do not see the volume, and when a file cannot be written.
     """
     fits = fit_soloff(cameras, volume, full_cubic=full_cubic)
     with atomic_folder(out) as folder:
@@ -68,7 +74,10 @@ def export_soloff(
 
 
 def terms(points_mm: Array, count: int = len(POWERS)) -> Array:
-    """(..., 3) -> (..., count) monomials in the order of `POWERS`, then `CUBIC_Z`."""
+    """Return the monomials (..., count) of points (..., 3) in mm, in the order of `POWERS`.
+
+    count : 19, or 20 to add `CUBIC_Z`.
+    """
     powers = np.array([*POWERS, CUBIC_Z][:count])
     return np.asarray(np.prod(points_mm[..., None, :] ** powers, axis=-1))
 
@@ -76,10 +85,12 @@ def terms(points_mm: Array, count: int = len(POWERS)) -> Array:
 def fit_soloff(
     cameras: Sequence[Camera], volume: Volume | None = None, *, full_cubic: bool = False
 ) -> tuple[Soloff, ...]:
-    """One polynomial for each camera, by least squares over what all cameras see of the volume.
+    """Fit one polynomial per camera by least squares, over the part of the volume that all see.
 
-    full_cubic : add the term z^3 (20 terms), for programs that take the exponents from the file.
-    volume : None takes `working_volume`. Raises InputError when the cameras do not see it.
+    volume : None takes `working_volume`.
+    full_cubic : True adds the term z^3 (20 terms), for programs that take the exponents from the
+    file.
+    Raises InputError when the cameras do not see the volume.
     """
     box = volume or working_volume(cameras)
     fitted = seen_points(cameras, box, FIT_POINTS_PER_EDGE)
@@ -99,10 +110,12 @@ def fit_soloff(
 
 
 def write_soloff(fit: Soloff, path: str | PathLike[str], first_pixel: float = 0.0) -> None:
-    """A CSV of the terms below a header in words: volume, units, pixel origin, fit error.
+    """Write a CSV file of the polynomial's terms below a header in words.
 
-    first_pixel : the coordinate that the other program gives the centre of the top-left pixel: 0
-    as here, 0.5 where it counts from the pixel's corner, 1 in MATLAB.
+    The header states volume, units, pixel origin and misfit.
+    first_pixel : the coordinate in px that the other program gives to the centre of the top-left
+    pixel: 0 as in telerig, 0.5 where it counts from the pixel's corner, 1 in MATLAB.
+    Raises InputError when the file cannot be written.
     """
     shifted = fit.coefficients.copy()
     shifted[0] += first_pixel

@@ -1,4 +1,4 @@
-"""Trajectories as HDF5, MATLAB and trackpy tables."""
+"""Write trajectories as HDF5, as MATLAB files and as tables for trackpy."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ from telerig.rig.windows import Wall
 def write_hdf5(
     results: RunResults, path: str | PathLike[str], cameras: Sequence[Camera] = ()
 ) -> None:
-    """Groups ``trajectories``, ``shake`` and ``cameras``: a dataset per column with its unit.
+    """Write an HDF5 file with the groups ``trajectories``, ``shake`` and ``cameras``.
 
+    Each column of a table is a dataset with the attribute ``units``; each camera is a group with
+    attributes. ``shake`` is left out for a run that was not smoothed.
     Raises InputError when the file cannot be written.
     """
     import h5py
@@ -49,10 +51,11 @@ def write_hdf5(
 def write_mat(
     results: RunResults, path: str | PathLike[str], cameras: Sequence[Camera] = ()
 ) -> None:
-    """MATLAB 5 file: structs ``trajectories`` and ``shake`` of columns, ``cameras``, ``info``.
+    """Write a MATLAB 5 file with the structs ``info``, ``trajectories``, ``shake`` and ``cameras``.
 
-    Names that MATLAB does not accept are changed (`identifier`); text columns are cells.
-    Raises InputError when two names become one, or the file cannot be written.
+    Each column of a table is a field. Names that MATLAB does not accept are changed (`identifier`);
+    text columns become cells. ``shake`` is left out for a run that was not smoothed.
+    Raises InputError when two names become equal, or when the file cannot be written.
     """
     from scipy.io import savemat
 
@@ -101,9 +104,10 @@ def _wall(wall: Wall) -> dict[str, Any]:
 
 
 def trackpy_table(results: RunResults) -> pd.DataFrame:
-    """Columns frame, particle, x, y, z (mm, so mpp = 1 in trackpy), then all the others.
+    """Return the trajectories with the columns frame, particle, x, y, z, then all other columns.
 
-    Particles that have names instead of numbers are numbered; ``particle_name`` keeps the names.
+    x, y, z are in mm, so trackpy's mpp is 1. Particles with names instead of numbers are numbered;
+    the column ``particle_name`` keeps their names.
     """
     points = results.points
     numbers, names = numbered(points)
@@ -117,5 +121,5 @@ def trackpy_table(results: RunResults) -> pd.DataFrame:
 
 
 def write_trackpy(results: RunResults, path: str | PathLike[str]) -> None:
-    """`trackpy_table` as CSV. Raises InputError when it cannot be written."""
+    """Write `trackpy_table` as a CSV file. Raises InputError when it cannot be written."""
     write_table(trackpy_table(results), path)

@@ -1,4 +1,4 @@
-"""The volume that all cameras see, as points at which two camera models are compared."""
+"""Describe the volume that all cameras see, by points at which two camera models are compared."""
 
 from __future__ import annotations
 
@@ -16,18 +16,20 @@ from telerig.rig.projection import PARAMETERS
 
 @dataclass(frozen=True)
 class Volume:
-    """A box in the rig frame: lower_mm (3,) and upper_mm (3,)."""
+    """Hold a box in the rig frame by two corners: lower_mm (3,) and upper_mm (3,), in mm."""
 
     lower_mm: Array
     upper_mm: Array
 
     def grid(self, per_edge: int) -> Array:
-        """(per_edge^3, 3) points, the faces included."""
+        """Return the points (per_edge^3, 3) in mm of a regular grid; the outermost lie on the
+        faces.
+        """
         edges = [np.linspace(a, b, per_edge) for a, b in zip(self.lower_mm, self.upper_mm)]
         return np.stack(np.meshgrid(*edges, indexing="ij"), -1).reshape(-1, 3)
 
     def words(self) -> str:
-        """The box in words, for a file's header."""
+        """Return the box in words, for a file's header."""
         return ", ".join(
             f"{axis} {a:.6g} to {b:.6g} mm"
             for axis, a, b in zip("xyz", self.lower_mm, self.upper_mm)
@@ -36,9 +38,9 @@ class Volume:
 
 @dataclass(frozen=True)
 class Misfit:
-    """The distance between two projections over some points, in pixels.
+    """Hold the distance in px between two projections of the same points.
 
-    rms_px : root mean square; max_px : the largest; points : number of points.
+    rms_px : its root mean square; max_px : its maximum; points : the number of points.
     """
 
     rms_px: float
@@ -47,13 +49,13 @@ class Misfit:
 
     @staticmethod
     def between(one_px: Array, other_px: Array) -> Misfit:
-        """one_px, other_px : (N, 2)."""
+        """Compute the misfit of two projections, one_px and other_px, both (points, 2) in px."""
         distance = np.linalg.norm(one_px - other_px, axis=-1)
         rms = float(np.sqrt(np.mean(distance**2)))
         return Misfit(rms, float(distance.max()), len(distance))
 
     def words(self) -> str:
-        """The two figures and the number of points."""
+        """Return both distances and the number of points in words."""
         return f"RMS {self.rms_px:.3g} px, largest {self.max_px:.3g} px, at {self.points} points"
 
 
@@ -79,7 +81,10 @@ def refuse_unknown_parameters(cameras: Sequence[Camera], program: str) -> None:
 
 
 def volume_of(bounds_mm: ArrayLike) -> Volume:
-    """The box of ((x, x), (y, y), (z, z)). Raises InputError when it is empty."""
+    """Return the box with the bounds ((x_low, x_high), (y_low, y_high), (z_low, z_high)) in mm.
+
+    Raises InputError when the bounds have another shape or the box is empty.
+    """
     bounds = np.asarray(bounds_mm, float)
     if bounds.shape != (3, 2) or not np.all(bounds[:, 0] < bounds[:, 1]):
         raise InputError(
@@ -90,10 +95,11 @@ def volume_of(bounds_mm: ArrayLike) -> Volume:
 
 
 def working_volume(cameras: Sequence[Camera]) -> Volume:
-    """A cube about the point where the rays of the image centres come closest.
+    """Return a cube around the point where the rays of the image centres come closest.
 
-    Its edge is the shortest image edge of any camera at nominal scale. Parts of it may lie outside
-    an image: see `seen_points`.
+    Its edge is the shortest image edge of any camera, converted to mm with the camera's scale.
+    Parts of the cube may lie outside an image: see `seen_points`.
+    Raises InputError without cameras.
     """
     if not cameras:
         raise InputError("no camera", todo="give at least one")
@@ -109,9 +115,10 @@ def working_volume(cameras: Sequence[Camera]) -> Volume:
 
 
 def seen_points(cameras: Sequence[Camera], volume: Volume, per_edge: int) -> Array:
-    """(N, 3) points of the volume's grid that lie inside the image of every camera.
+    """Return the points of the volume's grid that every camera sees, (points, 3) in mm.
 
-    Raises InputError when fewer than 100 do.
+    per_edge : number of grid points along each edge of the volume.
+    Raises InputError when fewer than 100 points are seen.
     """
     points = volume.grid(per_edge)
     seen = np.ones(len(points), bool)

@@ -32,13 +32,17 @@ COLUMNS = ["t_s", "sensor", "ax_m_s2", "ay_m_s2", "az_m_s2"]
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the readings are in a file, and what they mean.
+    """Hold where the readings are in a file, and what they mean.
 
-    channels : names (CSV, MAT, TDMS) or numbers from 0 of x, y, z; None takes common names.
-    time : name of the channel of times in s; None takes a common name, or the file's own rate.
-    rate_hz : instead of times. start_s : added to every time, to bring the sensor's clock to the
-    run's. unit : one of `UNITS`, or scale_m_s2 : m/s^2 for 1 in the file, one number or three
-    (WAV: for full scale; volts: 9.80665 / (V per g)). group : of a TDMS file.
+    channels : names (CSV, MAT, TDMS) or numbers from 0 of the channels x, y, z; None looks for
+    common names.
+    time : name of the channel of times in s; None looks for a common name, or uses the file's rate.
+    rate_hz : the sampling rate in Hz, in place of times; None uses what the file has.
+    start_s : is added to every time (s), to bring the sensor's clock to that of the run.
+    unit : one of `UNITS`; None uses the unit that the file states.
+    scale_m_s2 : the acceleration in m/s^2 that 1 in the file means, one number or three (WAV: for
+    full scale; volts: 9.80665 / (V per g)). It is given in place of ``unit``.
+    group : the group of a TDMS file.
     """
 
     channels: tuple[str | int, str | int, str | int] | None = None
@@ -53,10 +57,12 @@ class Layout:
 def read_accelerations(
     path: str | PathLike[str], sensor: str, layout: Layout | None = None
 ) -> pd.DataFrame:
-    """Columns t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2, in the order of time.
+    """Read the recording of one accelerometer from a CSV, WAV, MAT or TDMS file.
 
-    sensor : its name in rig.toml. Raises InputError, naming the file and what it holds, when a
-    channel, the times or the unit are missing, or a value is not a finite number.
+    sensor : the sensor's name in rig.toml. layout : None looks for common names and units.
+    Returns the columns t_s (s), sensor, ax_m_s2, ay_m_s2, az_m_s2 (m/s^2), in the order of time.
+    Raises InputError, naming the file and what it holds, when a channel, the times or the unit are
+    missing, or when a value is not a finite number.
     """
     layout = layout or Layout()
     recording = open_recording(Path(path), layout.group)
@@ -90,10 +96,10 @@ def read_accelerations(
 
 
 def merge_accelerations(table: pd.DataFrame, path: str | PathLike[str]) -> list[str]:
-    """Write ``table`` to `accelerometer.csv`, keeping what the file has of other sensors.
+    """Write ``table`` to `accelerometer.csv`, and keep the readings of other sensors in that file.
 
-    Returns the names of the sensors whose readings were replaced. Raises InputError when the file
-    that is there cannot be read, or the new one not written.
+    Returns the names of the sensors whose earlier readings were replaced.
+    Raises InputError when the existing file cannot be read, or the new one cannot be written.
     """
     from telerig.io.dataset.tables import read_accelerometer_csv
 
@@ -186,10 +192,10 @@ def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
 
 
 def layout_from(options: dict[str, Any]) -> Layout:
-    """A `Layout` from the options of a command line.
+    """Return a `Layout` from the options of a command line.
 
-    channels is "2,3,4" or "x,y,z"; scale_m_s2 is "9.8" or three numbers. Raises InputError for a
-    scale that is no number.
+    channels is "2,3,4" or "x,y,z"; scale_m_s2 is one number or three, separated by commas.
+    Raises InputError for a scale that is not a number.
     """
     values = {key: value for key, value in options.items() if value is not None}
     if "channels" in values:
@@ -208,9 +214,12 @@ def layout_from(options: dict[str, Any]) -> Layout:
 
 @dataclass(frozen=True)
 class Recording:
-    """channels : name -> (N,) raw values. units : name -> unit, where the file has one.
+    """Hold the channels of a sensor's file before they are converted.
 
-    rate_hz, offset_s : of the samples, where the file has them.
+    where : the file, for errors. channels : name -> (samples,) raw values.
+    units : name -> unit, for the channels that state one.
+    rate_hz : sampling rate in Hz; None where the file does not state it.
+    offset_s : the time of the first sample in s.
     """
 
     where: str
@@ -220,14 +229,15 @@ class Recording:
     offset_s: float = 0.0
 
     def error(self, what: str, todo: str) -> InputError:
-        """The error of this recording."""
+        """Return the error that names this recording's file."""
         return InputError(what, where=self.where, todo=todo)
 
 
 def open_recording(path: Path, group: str | None = None) -> Recording:
-    """Read a file by its ending: .csv .txt .tsv, .wav, .tdms, .mat.
+    """Read a file according to its extension: .csv, .txt, .tsv, .wav, .tdms or .mat.
 
-    group : of a TDMS file with several. Raises InputError for what cannot be read.
+    group : the group of a TDMS file that has several; None where there is only one.
+    Raises InputError for a file that does not exist or cannot be read.
     """
     readers = {".csv": _csv, ".txt": _csv, ".tsv": _csv, ".wav": _wav, ".mat": _mat}
     ending = path.suffix.lower()

@@ -27,13 +27,13 @@ _WIDTHS = {"image size": 2, "camera matrix": 3, "rotation matrix": 3, "translati
 def read_openlpt_cameras(
     paths: Sequence[str | PathLike[str]], names: Sequence[str] | None = None
 ) -> ImportedCameras:
-    """Cameras of OpenLPT text files.
+    """Read the pinhole cameras of OpenLPT text files.
 
-    The rig frame is the first camera's, its origin where the first two optical axes come closest
-    (for one camera: at the depth of the world's origin). names : default the files' stems.
-
-    Raises InputError for files that cannot be read or are of another camera model, for distortion
-    that this library's model cannot express exactly, and for cameras of unequal handedness.
+    The rig frame is the first camera's; its origin lies where the first two optical axes come
+    closest (for one camera: at the depth of the world's origin).
+    names : the cameras' names; None takes the files' names without extension.
+    Raises InputError for files that cannot be read or contain another camera model, for distortion
+    that telerig's model cannot express exactly, and for cameras of unequal handedness.
     """
     files = [_read(Path(p)) for p in paths]
     if not files:

@@ -55,9 +55,7 @@ class FrameSource(Protocol):
         """Return the names of file and frame, for errors."""
 
     def numbers(self) -> Ints | None:
-        """Return the increasing (frames,) numbers in the file names; None if the names do not
-        count.
-        """
+        """Return the increasing numbers (frames,) in the file names; None without such numbers."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +162,10 @@ class PageFrames:
 
 @dataclass(frozen=True)
 class _Stack:
-    """Hold where frames lie that follow each other behind one page header, as ImageJ writes
-    them.
+    """Hold where frames lie that follow each other after one page header, as ImageJ does it.
+
+    offset : first byte. count : number of frames. shape : (height, width) in px. dtype : of a
+    pixel.
     """
 
     offset: int
@@ -180,8 +180,9 @@ class _Stack:
 
 
 def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
-    """Return the stack if the file's description counts more frames than page headers, else
-    None.
+    """Return the stack if the file's description counts more frames than there are page headers.
+
+    Returns None for any other file.
     """
     page = tiff.pages[0]
     if page.samplesperpixel != 1 or page.photometric == 0:
@@ -321,8 +322,9 @@ class VideoFrames:
         return None
 
     def read(self, position: int) -> Image:
-        """Read one frame; returns pixels (height, width). Raises InputError, naming file and
-        frame.
+        """Read the frame at ``position`` (from 0); returns pixels (height, width).
+
+        Raises InputError, naming file and frame, if it cannot be read.
         """
         with self._lock:
             try:

@@ -158,8 +158,9 @@ class WallDescription(Table):
     normal_sigma_deg: Annotated[float, Field(ge=0, le=10, description="degrees from 0 to 10")] = 0.0
 
     def wall(self) -> Wall:
-        """Return the `Wall` for a camera; without a distance the near face is at the camera's
-        origin.
+        """Return the `Wall` for a camera.
+
+        Without a distance the near face is placed at the camera's origin.
         """
         sigma_rad = float(np.radians(self.normal_sigma_deg))
         distance_mm = self.distance_mm or 0.0

@@ -22,9 +22,7 @@ class Volume:
     upper_mm: Array
 
     def grid(self, per_edge: int) -> Array:
-        """Return the points (per_edge^3, 3) in mm of a regular grid; the outermost lie on the
-        faces.
-        """
+        """Return the points (per_edge^3, 3) in mm of a regular grid, which includes the faces."""
         edges = [np.linspace(a, b, per_edge) for a, b in zip(self.lower_mm, self.upper_mm)]
         return np.stack(np.meshgrid(*edges, indexing="ij"), -1).reshape(-1, 3)
 

@@ -30,16 +30,22 @@ from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
 
 REACH = 1.7
-"""Half-width of the patch in semi-major axes, besides five pixels."""
+"""Half the width of the patch in semi-major axes, to which 5 px are added."""
 
 
 def dot_example(
     image: NDArray[Any], u_px: float, v_px: float, a_px: float, *, polarity: Any
 ) -> dict[str, Array] | None:
-    """The dot nearest to (u_px, v_px) with its luminance model; None when it is not found again.
+    """Fit the dot nearest to a pixel, as an example for the report.
 
-    Returns patch and model (h, w) in grey levels, u0 and v0 (pixel of the patch's corner), the
-    ellipse (u_px, v_px, a_px, b_px, angle_rad) and the grey noise.
+    image : (rows, columns) grey levels.
+    u_px, v_px : position of the dot; a_px : its semi-major axis (px).
+    polarity : as for `locate_dots`.
+
+    Returns None if the dot is not found. Otherwise it returns a mapping: "patch" and "model", (h,
+    w) measured and fitted grey levels of a crop of h x w pixels; "u0" and "v0", the crop's first
+    pixel; "u_px", "v_px", "a_px", "b_px" and "angle_rad", the fitted ellipse; "noise", the standard
+    deviation of a grey level.
     """
     half = int(np.ceil(REACH * a_px + 5))
     v0, u0 = max(0, round(v_px) - half), max(0, round(u_px) - half)
@@ -85,10 +91,15 @@ NO_DOTS = pd.DataFrame(columns=["dot", "row", "column", *MEASURED])
 
 @dataclass(frozen=True)
 class ImageDots:
-    """One image: its numbered dots and its rejected candidates.
+    """Hold what was found in one image.
 
-    failure : why the image was left out; empty where it was not.
-    overlay : a JPEG of the image with all of them, where it was asked for.
+    view, camera : names of the view and of the camera.
+    dots, rejected : tables of the numbered dots and of the rejected candidates, see
+        `TargetDetection`.
+    handedness : +1; -1 if the image shows the target mirrored; 0 if the target was not found.
+    failure : why the image was left out; empty if it is used.
+    notes : sentences for the user.
+    overlay : JPEG data of the image with all dots and candidates drawn; empty if not asked for.
     """
 
     view: str
@@ -103,10 +114,12 @@ class ImageDots:
 
 @dataclass(frozen=True)
 class DatasetDots:
-    """dots, rejected : tables of all images, first columns view and camera.
+    """Hold what was found in all images of a dataset.
 
-    images : per image, in the order of views and cameras.  notes : sentences for the user.
-    example : one dot with its fit as `dot_example` returns it, where overlays were asked for.
+    dots, rejected : tables of all images together; their first columns are view and camera.
+    images : the results of the images, in the order of views and cameras.
+    notes : sentences for the user.
+    example : one dot with its fit, as `dot_example` returns it; empty if no overlays were made.
     """
 
     dots: pd.DataFrame
@@ -124,8 +137,9 @@ def detect_dataset(
     overlays: bool = False,
     meanwhile: Callable[[], object] | None = None,
 ) -> DatasetDots:
-    """Detect the target in every calibration image.
+    """Detect the target in every calibration image of a dataset.
 
+    progress : function that is called with (images done, images in all); None for none.
     workers : number of processes; None takes one per core where that saves time.
     overlays : draw the overlay of each image, and fit one dot as an example.
     meanwhile : called in this process while the worker processes run.
@@ -158,7 +172,13 @@ def _load_before_forking(dataset: Dataset, overlays: bool, task: tuple[View, str
 
 
 def detect_image(dataset: Dataset, view: View, camera: str, *, overlay: bool = False) -> ImageDots:
-    """The target in one image. Raises InputError for an image that cannot be read."""
+    """Read one image of a dataset and detect the target in it.
+
+    overlay : whether to draw the result over the image.
+
+    A target that is not found is no error; the result's ``failure`` says so.
+    Raises InputError if the image cannot be read.
+    """
     image = dataset.image(view, camera)
     found = _numbered_image(dataset, image, view, camera)
     if not overlay:
@@ -174,10 +194,9 @@ def _detect_task(dataset: Dataset, overlay: bool, task: tuple[View, str]) -> Ima
 
 
 def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
-    """Tables and notes of images that were detected one by one.
+    """Put the results of all images together.
 
-    Raises DetectionError when none shows the target, or when they contradict each other's
-    handedness.
+    Raises DetectionError if no image shows the target, or if only some of the images are mirrored.
     """
     failures = [i for i in found if i.failure]
     if len(failures) == len(found):
@@ -197,7 +216,7 @@ def detected_together(dataset: Dataset, found: list[ImageDots]) -> DatasetDots:
 
 
 def with_example(dataset: Dataset, detected: DatasetDots) -> DatasetDots:
-    """With the fit of a typical dot: the one whose chi-square is the median."""
+    """Add the fit of a typical dot, the one with the median chi-square; its image is read."""
     from telerig.estimator.dots.dataset_dots import dot_example
 
     order = np.argsort(detected.dots["chi2_dof"].to_numpy())
@@ -249,6 +268,6 @@ def _numbered_image(dataset: Dataset, image: NDArray[Any], view: View, camera: s
 
 
 def _smallest_px(dataset: Dataset, camera: str) -> float:
-    """About a third of the nominal diameter, which a strong tilt leaves; smaller blobs are dirt."""
+    """Return the least diameter of a dot (px): about a third of the nominal one."""
     nominal = dataset.target.dot_diameter_mm * dataset.rig.cameras[camera].scale_px_per_mm
     return float(max(5.0, 0.35 * nominal))

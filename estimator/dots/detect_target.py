@@ -21,10 +21,12 @@ MEASURED = [
 
 @dataclass(frozen=True)
 class TargetDetection:
-    """The target in one image.
+    """Hold the target as it was found in one image.
 
-    table : dot, row, column and the measured columns of each numbered dot; by dot.
-    rejected : u_px, v_px, a_px, b_px, angle_rad, reason of everything dot-like that was left out.
+    table : a row for each numbered dot, sorted by number: dot (number), row, column (on the target)
+        and the measured columns of `locate_dots` up to chi2_dof.
+    rejected : a row for each candidate that was left out: u_px, v_px, a_px, b_px, angle_rad and the
+        reason in words.
     numbering : how the dots were numbered.
     """
 
@@ -34,13 +36,17 @@ class TargetDetection:
 
 
 def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
-    """Numbered dots of the target in a grey (H, W) image.
+    """Find the target's dots in an image and number them.
 
-    Columns: dot row column u_px v_px suu_px2 suv_px2 svv_px2 a_px b_px angle_rad chi2_dof. The
-    numbers of a symmetric target without marks are one choice of several that fit equally well.
+    image : (rows, columns) grey levels.
+    target : the target, as `rig.toml` describes it.
 
-    Raises DetectionError when the target is not found or its numbers are ambiguous, InputError
-    for what is no image.
+    Returns a table with a row for each dot and the columns dot (number), row, column, u_px, v_px,
+    suu_px2, suv_px2, svv_px2, a_px, b_px, angle_rad, chi2_dof; see `locate_dots`. A symmetric
+    target without marks can be numbered in several ways that fit equally well; the table then
+    holds one of them.
+    Raises DetectionError if the target is not found or its numbers are ambiguous, and InputError
+    if ``image`` is no grey image.
     """
     found = numbered(measure_dots(image, polarity=target.polarity), target)
     if found.numbering.ambiguous:
@@ -49,9 +55,10 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
 
 
 def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
-    """The target among measured dots; ambiguous numberings are returned too.
+    """Number the target's dots among the measured dots of an image.
 
-    Raises DetectionError where the dots cannot be numbered at all.
+    An ambiguous numbering is returned, too; ``numbering.ambiguous`` of the result says so.
+    Raises DetectionError if the dots cannot be numbered at all.
     """
     numbering = number_dots(measured.dots, target)
     rows = measured.dots.iloc[numbering.table["index"].to_numpy()][MEASURED]
@@ -64,7 +71,7 @@ def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
 
 
 def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
-    """The error that says how many numberings are equally good and how to make one the best."""
+    """Return (not raise) the error for a numbering that is not unique."""
     found, wanted = len(numbering.marks_found), len(target.marks)
     hands = set(numbering.equivalent_handedness.tolist())
     mirrored = "; some of them take the image for a mirrored one" if len(hands) > 1 else ""
@@ -77,7 +84,12 @@ def ambiguous_numbering(numbering: Numbering, target: Target) -> DetectionError:
 
 
 def rejected_table(measured: DotMeasurement, index: Any, reason: Any) -> pd.DataFrame:
-    """Rejected blobs, and the dots at positions ``index`` (n,) with their ``reason`` (n,)."""
+    """Return the table of all rejected candidates of an image.
+
+    measured : the dots and the blobs that are no dots.
+    index : (n,) positions of dots that are rejected as well, or a slice.
+    reason : (n,) reasons in words, or one for all.
+    """
     dots = measured.dots.iloc[index].assign(reason=reason)[REJECTED]
     parts = [part for part in (measured.rejected, dots) if len(part)]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=REJECTED)

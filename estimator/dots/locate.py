@@ -59,18 +59,21 @@ REJECTED = ["u_px", "v_px", "a_px", "b_px", "angle_rad", "reason"]
 _FIRST_SIGMA_PX = 1.0
 _PILOTS = 5
 _FEWEST_PIXELS = 25
-"""A dot whose first fit left the image has no window for a second one."""
+"""Least number of pixels for a second fit; a dot whose first fit left the image has fewer."""
 _ROUNDS = 10
 _MOVED_SD = 0.1
-"""A dot that moves by less of its standard deviation does not make its neighbours fitted again."""
+"""If a dot moves by more standard deviations than this, its neighbours are fitted again."""
 
 
 @dataclass(frozen=True)
 class DotMeasurement:
-    """The dots of one image.
+    """Hold the dots of one image.
 
-    dots : `COLUMNS` of each accepted dot, see `locate_dots`. rejected : `REJECTED` of each
-    candidate that is no dot. noise : of the image. polarity : the one that was used.
+    dots : table with a row for each accepted dot; `locate_dots` describes its columns.
+    rejected : table of the candidates that are no dots: ellipse (u_px, v_px, a_px, b_px,
+        angle_rad) and the reason in words.
+    noise : model of the image's noise.
+    polarity : "white_on_black" or "black_on_white", as it was used.
     """
 
     dots: pd.DataFrame
@@ -85,12 +88,18 @@ def locate_dots(
     polarity: Literal["auto", "white_on_black", "black_on_white"] = "auto",
     min_diameter_px: float = 5.0,
 ) -> pd.DataFrame:
-    """Every dot of a grey image, unordered.
+    """Find all dots in a grey image.
 
-    Columns: ``u_px v_px`` centre, ``suu_px2 suv_px2 svv_px2`` its covariance, ``a_px >= b_px``
-    semi-axes, ``angle_rad`` of a from +u towards +v, ``chi2_dof`` of the fit; and
-    ``inner_level outer_level`` grey levels at the centre, ``blur_px`` Gaussian blur without the
-    pixel, ``ring`` (a mark with a hole), ``noise`` grey sigma at the outer level.
+    image : (rows, columns) grey levels.
+    polarity : whether the dots are white on black or black on white; "auto" decides this.
+    min_diameter_px : smaller dots are left out (px).
+
+    Returns a table with a row for each dot, in no particular order. Its columns are: ``u_px``,
+    ``v_px`` centre; ``suu_px2``, ``suv_px2``, ``svv_px2`` covariance of the centre; ``a_px`` >=
+    ``b_px`` semi-axes; ``angle_rad`` angle of the major axis from +u towards +v; ``chi2_dof``
+    chi-square per degree of freedom of the fit; ``inner_level``, ``outer_level`` grey levels of the
+    dot and of the background at the centre; ``blur_px`` standard deviation of the optical blur;
+    ``ring`` whether it is a mark with a hole; ``noise`` standard deviation of a grey level.
 
     Raises InputError for anything but a 2-D array of finite numbers.
     """
@@ -104,9 +113,9 @@ def measure_dots(
     min_diameter_px: float = 5.0,
     max_diameter_px: float = np.inf,
 ) -> DotMeasurement:
-    """Like :func:`locate_dots`, with the rejected candidates and the noise model.
+    """Find all dots like :func:`locate_dots`; return the rejected candidates and the noise as well.
 
-    max_diameter_px : larger blobs are no dots, and do not count in the usual size of the dots.
+    max_diameter_px : larger blobs are left out, and are not used for the typical size of the dots.
     """
     grey = _checked(image, polarity, min_diameter_px)
     keep_freed_memory()
@@ -177,7 +186,7 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
 
 
 def _row(blob: Candidate, fit: DotFit, noise: NoiseModel) -> tuple[Any, ...]:
-    """The values of `COLUMNS` of an accepted dot."""
+    """Return the values of the columns `COLUMNS` of an accepted dot."""
     blur = float(np.sqrt(max(fit.sigma_px**2 - PIXEL_VARIANCE_PX2, 0.0)))
     (suu, suv), (_, svv) = fit.inflated_covariance_px2
     place = (*fit.centre_px, suu, suv, svv, *axes_from_shape(fit.shape_px), fit.chi2_dof)
@@ -198,14 +207,19 @@ def _noise_with_inner_level(noise: NoiseModel, fits: list[DotFit]) -> NoiseModel
 
 @dataclass(frozen=True)
 class _Scene:
-    """The image (rows, columns), its blobs' labels, and the blobs whose dots are to be fitted."""
+    """Hold an image and the blobs in it whose dots are to be fitted.
+
+    grey : (rows, columns) grey levels.
+    labels : (rows, columns) number of the blob to which a pixel belongs, 0 for none.
+    blobs : the blobs to fit.
+    """
 
     grey: Float32
     labels: NDArray[np.int32]
     blobs: list[Candidate]
 
     def first_fits(self, noise: NoiseModel) -> list[DotFit]:
-        """Every dot by itself; the blur of the first few is where the others start."""
+        """Fit each dot independently; the blur of the first five is the start value for the rest."""
         pilots = self._coarse_fits(self.blobs[:_PILOTS], noise, _FIRST_SIGMA_PX)
         if len(self.blobs) <= _PILOTS:
             return pilots
@@ -224,10 +238,11 @@ class _Scene:
         return fit_dots(windows, starts, noise, priors, tolerance=0.3, outlier_rounds=1)
 
     def second_fits(self, fits: list[DotFit], noise: NoiseModel) -> list[DotFit]:
-        """Every dot again, with the light and its neighbours known.
+        """Fit each dot again, with the illumination and its neighbours known from the first fits.
 
-        Dots that share pixels are fitted in turn, each beside the last fits of the others, until
-        none moves (Gauss-Seidel: the limit is the fit of all together).
+        Dots that share pixels are fitted in turn. Each time, the light of the neighbours is
+        subtracted as their last fits predict it, until no dot moves any more (Gauss-Seidel
+        iteration; its limit is the fit of all dots together).
         """
         priors = with_common_blur(contrast_gradients(fits, self.grey.shape), fits)
         neighbours = close_neighbours(fits)
@@ -254,7 +269,7 @@ class _Scene:
         return fits
 
     def _window(self, dot: int, fits: list[DotFit], near: list[int]) -> Window:
-        """A dot's pixels without its neighbours' light."""
+        """Return the pixels of a dot after the light of its neighbours is subtracted."""
         blobs = self.blobs
         known = [blobs[k].label for k in near if fits[k].converged and not blobs[k].holes]
         window = dot_window(self.grey, self.labels, blobs[dot], _start(fits[dot]), known=known)
@@ -262,7 +277,7 @@ class _Scene:
 
 
 def _apart(dots: Sequence[int], neighbours: list[list[int]]) -> Iterator[list[int]]:
-    """Groups of dots that share no pixels, so that those of one may be fitted together."""
+    """Yield groups of dots; the dots of a group share no pixels, so they can be fitted together."""
     left = list(dots)
     while left:
         group: list[int] = []

@@ -27,10 +27,13 @@ _UNSEEN_SHARE = 0.2
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of a pixel's grey level: ``alpha + beta * level``, at least that of rounding.
+    """Describe the variance of a pixel's grey level as ``alpha + beta * level``.
 
-    step : between grey levels. relative_error : of the variance. lowest, highest : range of the
-    grey levels at which the noise was measured.
+    alpha : variance at grey level 0 (grey levels squared); beta : its increase per grey level.
+    step : distance between neighbouring grey levels, 0 for floats. The variance is never less than
+        that of rounding to this step.
+    relative_error : relative standard deviation of the variance.
+    lowest, highest : range of the grey levels at which the noise was measured.
     """
 
     alpha: float
@@ -41,26 +44,31 @@ class NoiseModel:
     highest: float = np.inf
 
     def variance(self, level: Array) -> Array:
-        """Variance [grey^2] at the given grey levels."""
+        """Return the variance (grey levels squared) at the given grey levels, in the same shape."""
         floor = max(self.step**2 / 12.0, 1e-300)
         return np.maximum(self.alpha + self.beta * np.asarray(level, dtype=np.float64), floor)
 
     def sigma_at(self, level: float) -> float:
-        """Standard deviation [grey] at one grey level."""
+        """Return the standard deviation (in grey levels) at one grey level."""
         return float(np.sqrt(self.variance(np.asarray(level))))
 
     def scaled(self, factor: float) -> NoiseModel:
-        """The same model with every variance times ``factor``."""
+        """Return the same model with every variance multiplied by ``factor``."""
         return replace(self, alpha=self.alpha * factor, beta=self.beta * factor)
 
 
 def with_inner_level(
     noise: NoiseModel, inner_level: float, outer_level: float, ratio: float, pixels: int
 ) -> NoiseModel:
-    """The noise corrected at the dots' own grey level, where the image may have no flat pixels.
+    """Correct the noise model at the grey level of the dots, where the image may have no flat area.
 
-    ratio : mean whitened square of ``pixels`` residuals at ``inner_level``. The slope between both
-    levels follows from it where it differs from 1 by more than 4 standard deviations.
+    noise : the model measured in flat areas.
+    inner_level, outer_level : grey levels of the dots and of the background.
+    ratio : mean square of the whitened residuals of the dots' own pixels.
+    pixels : number of these pixels.
+
+    Returns the model unchanged if the noise was measured near ``inner_level``, or if ``ratio``
+    differs from 1 by less than about 4 standard deviations.
     """
     unseen = max(noise.lowest - inner_level, inner_level - noise.highest)
     if unseen < _UNSEEN_SHARE * abs(inner_level - outer_level):
@@ -73,11 +81,14 @@ def with_inner_level(
 
 
 def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
-    """Factor on the noise variance from the fits' own chi2_dof (N,) with dof (N,).
+    """Return the factor by which the noise variance has to be multiplied.
 
-    Where edges are dense, few flat pixels show the noise, but the fits' residuals do. Their median
-    is averaged with the estimate by inverse variance if both agree to 3 standard deviations; if
-    not, the excess is misfit rather than noise and the factor is 1.
+    noise : the estimate from flat areas of the image.
+    chi2_dof, dof : (N,) chi-square per degree of freedom of N fits, and degrees of freedom.
+
+    Images with many edges have few flat areas, but there the fits' residuals show the noise. The
+    median of chi2_dof is averaged with the estimate, weighted by the inverse variances, if both
+    agree to 3 standard deviations. If not, the model does not fit, and the factor is 1.
     """
     if chi2_dof.size == 0:
         return 1.0
@@ -90,7 +101,10 @@ def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
 
 
 def grey_step(image: NDArray[np.generic]) -> float:
-    """Distance between neighbouring grey levels (0 for floats): 16 for 12 bits held in 16."""
+    """Return the distance between neighbouring grey levels of an image (rows, columns).
+
+    It is 0 for floats, and for example 16 for values of 12 bits that are stored in 16 bits.
+    """
     if not np.issubdtype(image.dtype, np.integer):
         return 0.0
     levels = np.unique(image[:: max(1, image.shape[0] // 256)]).astype(np.int64)
@@ -98,7 +112,11 @@ def grey_step(image: NDArray[np.generic]) -> float:
 
 
 def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
-    """Standard deviation without outliers; unlike a MAD it is not quantised to the grey levels."""
+    """Return the standard deviation of values (N,), around 0 and without outliers.
+
+    Unlike the median absolute deviation it is not quantised to the grey levels. rounds : largest
+    number of iterations.
+    """
     sigma = float(np.std(values))
     for _ in range(rounds):
         kept = values[np.abs(values) <= _CLIP * sigma]
@@ -112,13 +130,20 @@ def clipped_sigma(values: Array, *, rounds: int = 12) -> float:
 
 
 def high_pass(image: Float32) -> Float32:
-    """The image without its locally plane part, scaled to keep the variance of white noise."""
+    """Remove everything from an image (rows, columns) that is locally a plane.
+
+    The result has the same shape; it is scaled so that white noise keeps its variance.
+    """
     kernel = _SECOND_DIFFERENCES.astype(np.float32)
     return np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT))
 
 
 def rough_sigma(response: Float32) -> float:
-    """A first guess of the noise: the quietest fifth of 8 x 8 tiles of the high-passed image."""
+    """Return a first estimate of the noise's standard deviation (in grey levels).
+
+    response : (rows, columns) the image after `high_pass`. The fifth of its 8 x 8 tiles that
+    varies least is used.
+    """
     rows, columns = (n // 8 * 8 for n in response.shape)
     tiles = response[:rows, :columns].reshape(rows // 8, 8, columns // 8, 8)
     tiles = tiles[:: max(1, response.size // _MAX_SAMPLES)]
@@ -134,9 +159,12 @@ def estimate_noise(
     step: float,
     bins: int = 8,
 ) -> NoiseModel:
-    """Noise of ``image`` (rows, columns) over the pixels marked ``flat``, which show no edges.
+    """Estimate the noise of an image from its flat areas.
 
-    ``response`` is the :func:`high_pass` of the image.
+    image : (rows, columns) grey levels; response : the same image after :func:`high_pass`.
+    flat : (rows, columns) whether a pixel is far from all edges.
+    step : distance between neighbouring grey levels, see `grey_step`.
+    bins : largest number of groups of grey levels.
 
     Pixels are grouped by the grey level of their surroundings, as their own level holds the noise.
     A line is fitted through the clipped variances of the groups if they differ significantly.
@@ -160,7 +188,7 @@ def estimate_noise(
 
 
 def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float) -> NoiseModel:
-    """Line through the variances against grey level; constant unless its slope is significant."""
+    """Fit a line to the variances over the grey levels; its slope is 0 unless significant."""
     relative = np.sqrt(2.0 * _CORRELATED / counts)
     total = float(np.sqrt(2.0 * _CORRELATED / np.sum(counts)))
     mean = float(np.average(variances, weights=counts))

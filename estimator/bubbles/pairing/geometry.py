@@ -32,21 +32,27 @@ from telerig.rig.triangulation import midpoint
 NO_SIZE_FLAGS = ("border", "merged")
 _SCATTER_FACTOR = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
 _UNSURE_SHARE = {"overlap": 0.01, "merged": 0.05, "border": 0.05}
-"""What hidden outline may add to a centre's sd, as a share of the larger semi-axis."""
+"""By flag, the standard deviation that a partly hidden outline adds to the centre, as a share of
+the major semi-axis."""
 _OUTLINE_SAMPLES = 96
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera's detections, seen along the shared axis; N rows.
+    """Hold the N detections of one camera, as `pair_geometry` compares them.
 
-    uv_px : (N, 2).  origin_mm, direction : (N, 3) rays.
-    mm_by_px : (N, 2, 2) camera-plane mm by pixel, at depth 0.
-    covariance_px2 : (N, 2, 2).
-    middle_mm : (N,) middle of top and bottom less the centre, along the shared axis.
+    The shared axis is the common perpendicular of both cameras' optical axes.
+
+    camera : the camera.
+    uv_px, covariance_px2 : (N, 2) centres (px) and their (N, 2, 2) covariances (px^2).
+    origin_mm, direction : (N, 3) origins (mm) and unit directions of the rays in the rig frame.
+    mm_by_px : (N, 2, 2) derivative of a point at depth 0 in the camera's frame (mm) by the pixel.
+    middle_mm : (N,) position midway between the outline's top and bottom along the shared axis,
+        minus the centre's position (mm).
     log_size : (N, 2) logarithms of half the height and half the width (mm), along and across the
-        shared axis; NaN where unknown.  log_contrast : (N, 1), likewise.
-    scatter_factor : (N,) factor for the scatter of flagged detections.
+        shared axis; NaN where unknown.
+    log_contrast : (N, 1) logarithm of the contrast; NaN where unknown.
+    scatter_factor : (N,) factor on the scatter of the gap, above 1 for detections with some flags.
     """
 
     camera: Camera
@@ -66,13 +72,18 @@ class View:
 
 @dataclass(frozen=True)
 class PairGeometry:
-    """All N1 x N2 combinations of one frame's detections.
+    """Compare all combinations of a frame's N1 first and N2 second detections.
 
-    gap_px : (N1, N2) first less second along the shared axis, in px of the first image, bias
-    included; positive along that image's +u or +v, whichever is nearer the axis.
-    variance_px2 : its variance by the detections' covariances.  points_mm : (N1, N2, 3) mid-points.
-    size, contrast : (N1, N2, 2), (N1, N2, 1) logarithms of the ratios first / second.
-    mm_per_px : (N1, N2) length of a pixel of the gap.  scatter_factor : (N1, N2).
+    views : the detections of both cameras.
+    gap_px : (N1, N2) position of the first minus that of the second along the shared axis, in px of
+        the first image, including any bias. It is positive along +u or +v of this image, whichever
+        is nearer to the axis.
+    variance_px2 : (N1, N2) variance of the gap that follows from the detections' covariances.
+    points_mm : (N1, N2, 3) points midway between the two rays, in the rig frame (mm).
+    size : (N1, N2, 2) logarithms of the ratios first / second of height and width.
+    contrast : (N1, N2, 1) logarithm of the ratio first / second of the contrast.
+    mm_per_px : (N1, N2) length of one pixel of the gap (mm).
+    scatter_factor : (N1, N2) the larger of both detections' factors.
     """
 
     views: tuple[View, View]
@@ -86,9 +97,11 @@ class PairGeometry:
 
 
 def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
-    """(3,) unit vector in the rig frame, across both optical axes; along +u or +v of the first.
+    """Return the direction of the common perpendicular of two cameras' optical axes.
 
-    Raises InputError for cameras that look along one direction.
+    Returns a unit vector (3,) in the rig frame. It points along +u or +v of the first camera's
+    image, whichever is nearer.
+    Raises InputError if both cameras look along nearly the same direction.
     """
     first, second = (c.camera_from_rig.rotation[2] for c in cameras)
     cross = np.cross(first, second)
@@ -103,7 +116,13 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
 
 
 def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
-    """Rays and sizes of a detection table.  Raises InputError for columns or values not there."""
+    """Compute rays and sizes from the detections of one camera.
+
+    table : table of `detect_bubbles`; camera : the calibrated camera.
+    axis : (3,) shared axis in the rig frame, see `shared_axis`.
+
+    Raises InputError if a column is missing, or if a centre or its covariance is not finite.
+    """
     missing = {*CENTRE_COLUMNS, *COVARIANCE_COLUMNS, *AXES_COLUMNS[:2]} - set(table)
     if missing:
         raise InputError(
@@ -140,7 +159,7 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
 
 
 def pair_geometry(first: View, second: View) -> PairGeometry:
-    """Every combination of a detection of the first view with one of the second."""
+    """Compare each detection of the first view with each of the second."""
     views = (first, second)
     origins = (first.origin_mm[:, None], second.origin_mm[None])
     directions = (first.direction[:, None], second.direction[None])
@@ -171,9 +190,14 @@ def pair_geometry(first: View, second: View) -> PairGeometry:
 
 
 def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
-    """Middle and half the extent of outlines along per-row covectors (N, 2), in the latter's unit.
+    """Compute how far outlines extend along a direction.
 
-    The middle is relative to (u_px, v_px). Harmonics are used where they were fitted.
+    table : detection table with N rows.
+    across : (N, 2) for each row, the increase (mm) of the coordinate along this direction per px
+        of u and of v.
+
+    Returns two arrays (N,) in mm: the middle of each outline's extent relative to its centre, and
+    half of the extent. Harmonics are used if they were fitted.
     """
     a, b, angle = columns(table, AXES_COLUMNS).T
     angle = np.nan_to_num(angle)
@@ -197,7 +221,7 @@ def outline_extent(table: pd.DataFrame, across: Array) -> tuple[Array, Array]:
 
 
 def _peak(profile: Array) -> Array:
-    """Maximum of each periodic row, refined by a parabola through its highest sample."""
+    """Return the maximum of each row of a periodic profile, refined by a parabola."""
     rows, i = np.arange(len(profile)), np.argmax(profile, axis=1)
     n = profile.shape[1]
     before, here, after = profile[rows, i - 1], profile[rows, i], profile[rows, (i + 1) % n]
@@ -214,10 +238,10 @@ def _mm_by_px(camera: Camera, uv_px: Array) -> Array:
 
 
 def _trust(table: pd.DataFrame) -> tuple[Bools, Array, Array]:
-    """(N,) each, from the flags of the detections.
+    """Return how far each of N detections can be trusted, as its flags say.
 
-    Whether the size is known, the factor on the standard deviation of the place, and the relative
-    standard deviation of the size.
+    Returns three arrays (N,): whether the size is known, the factor on the scatter of the gap, and
+    the additional standard deviation of the centre as a share of the major semi-axis.
     """
     flags = flag_words(table)
     known = np.array([not any(word in NO_SIZE_FLAGS for word in row) for row in flags], bool)

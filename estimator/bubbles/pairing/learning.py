@@ -58,7 +58,10 @@ _FEW_PAIRS, _CLEAR_VOTE = 5.0, 3.0
 
 
 def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
-    """A model for a calibration that is believed, before any detection was seen."""
+    """Return the pair model to use before any detection is known.
+
+    It assumes that the calibration is right: its bias is 0. Raises InputError for parallel cameras.
+    """
     axis = shared_axis(cameras)
     size, contrast = (
         LogRatioModel(np.zeros(len(usual)), _PRIOR[name], np.zeros((2, len(usual))), 9.0 * usual)
@@ -74,13 +77,16 @@ def default_model(cameras: tuple[Camera, Camera]) -> PairModel:
 def estimate_pair_model(
     frames: Sequence[tuple[pd.DataFrame, pd.DataFrame]], cameras: tuple[Camera, Camera]
 ) -> PairModel:
-    """Bias and scatter of the shared coordinate, scatter of the ratios, share without a partner.
+    """Learn from a run how the two images of one bubble agree.
 
-    frames : detection tables of the first and second camera, one pair per frame; at most
-    ``MOST_FRAMES`` are used, spread evenly. With nothing to learn from, the default model with
-    a finding that says so. A bias up to ``MOST_BIAS_PX`` is found. The bias is a constant, or
-    linear or quadratic in space when that predicts pairs left out better (at least three pairs
-    per term).
+    frames : for each frame, the detection tables of the first and of the second camera. At most
+        ``MOST_FRAMES`` frames are used, evenly spread.
+    cameras : the two calibrated cameras.
+
+    Returns the model. If no frame has detections in both cameras, it is the default model with the
+    finding NO_DETECTIONS. A bias up to ``MOST_BIAS_PX`` is found. The bias is a constant, or
+    linear or quadratic in space if this predicts pairs better that are left out of its fit (at
+    least three pairs per term).
 
     Raises InputError for tables without centres or covariances and for parallel cameras.
     """

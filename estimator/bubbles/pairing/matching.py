@@ -39,7 +39,13 @@ _EXACT_SIDE = 11
 
 
 def best_assignment(log_odds: Array) -> tuple[Ints, Ints]:
-    """Rows and columns of the assignment of highest probability; what is left out is not named."""
+    """Find the most probable assignment of rows to columns.
+
+    log_odds : (N1, N2) log odds of each pair of a first and a second detection.
+
+    Returns the row and the column of each pair (two arrays of equal length). Rows and columns
+    without a partner do not occur.
+    """
     from scipy.optimize import linear_sum_assignment
 
     gain = np.where(log_odds > 0, log_odds, 0.0)
@@ -49,11 +55,15 @@ def best_assignment(log_odds: Array) -> tuple[Ints, Ints]:
 
 
 def marginals(log_odds: Array, negligible: float = NEGLIGIBLE) -> Array:
-    """(N1, N2) log odds -> (N1, N2) posterior probability of each pair.
+    """Compute the posterior probability of each pair.
 
-    Exact per connected component with up to 11 detections on its smaller side (sum over all
-    assignments by dynamic programming over subsets). Of a larger component the least likely pairs
-    are left out, one unit of log odds after the other, until it falls apart.
+    log_odds : (N1, N2) log odds of each pair of a first and a second detection.
+    negligible : pairs with smaller log odds get the probability 0.
+
+    Returns (N1, N2) probabilities. They are exact per connected component with up to 11 detections
+    on its smaller side (sum over all assignments by dynamic programming over subsets). Of a larger
+    component the least likely pairs are left out, one unit of log odds after the other, until it
+    falls apart.
     """
     out = np.zeros(log_odds.shape)
     possible = log_odds > negligible
@@ -120,10 +130,10 @@ def _exact(log_odds: Array) -> Array:
 
 @dataclass(frozen=True)
 class LogRatioModel:
-    """How the logarithms of K properties compare between the two images of one bubble.
+    """Describe how the logarithms of K properties differ between the two images of one bubble.
 
-    difference, scatter : (K,), (K, K) mean and covariance of first - second over true pairs.
-    means : (2, K) over all bubbles, in the first and in the second view.
+    difference, scatter : (K,) mean and (K, K) covariance of first minus second, over true pairs.
+    means : (2, K) means over all bubbles in the first and in the second view.
     spread : (K, K) covariance over all bubbles of a view.
     """
 
@@ -134,12 +144,12 @@ class LogRatioModel:
 
     @property
     def sd(self) -> Array:
-        """(K,) scatter of each property."""
+        """Return the standard deviation (K,) of each property's difference."""
         return np.sqrt(np.diag(self.scatter))
 
 
 class Finding(Enum):
-    """What `estimate_pair_model` found beside the numbers."""
+    """Name what `estimate_pair_model` has to tell the user; `PairModel.sentences` explains each."""
 
     NO_DETECTIONS = auto()
     CALIBRATION_OFFSET = auto()
@@ -151,20 +161,27 @@ class Finding(Enum):
 
 @dataclass(frozen=True)
 class PairModel:
-    """What the two images of one bubble have in common, learnt from a run (`estimate_pair_model`).
+    """Describe how the two images of one bubble agree; `estimate_pair_model` learns it from a run.
 
-    bias_px, bias_covariance_px2 : (B,), (B, B) coefficients of the gap's systematic part: 1, then
-        with B = 4 x y z, with B = 10 also xx yy zz xy xz yz of the rig point less ``origin_mm``
-        over ``reach_mm``.
-    scatter_px : of single gaps beyond the detections' own covariance.
-    frame_px : of a shift common to all gaps of a frame (the cameras shake).
-    size : of (height, width) in mm, along and across the shared axis.  contrast : of the contrast.
-    unmatched_share : share of the detections of each view without a partner.
-    span_px : length of the shared coordinate that both images cover, in px of the first.
-    pairs : number of pairs it rests on (a sum of probabilities); 0 for a model not learnt.
-    mean_gap_px : mean of the pairs' gaps (the best constant) and its standard error.
-    rms_px : root mean square of the gaps as they are, after the constant, after the whole bias,
-        and with every pair left out of its own bias.
+    A gap is the distance between two detections along the axis that both cameras share, in px of
+    the first image.
+
+    bias_px, bias_covariance_px2 : (B,) coefficients of the gap's systematic part (px) and their
+        (B, B) covariance (px^2). B is 1, 4 or 10: a constant; with x, y, z; with all products of
+        two of these. x, y, z are the point's coordinates in the rig frame minus ``origin_mm``,
+        divided by ``reach_mm``.
+    origin_mm, reach_mm : (3,) origin and scale of these coordinates (mm).
+    scatter_px : standard deviation of single gaps beyond the detections' own covariance.
+    frame_px : standard deviation of a shift that all gaps of a frame share (the cameras shake).
+    size : model for height and width (mm), along and across the shared axis.
+    contrast : model for the contrast.
+    unmatched_share : for each view, the share of its detections that have no partner.
+    span_px : length of the shared coordinate that both images cover.
+    pairs : number of pairs from which it was learnt (a sum of probabilities); 0 if not learnt.
+    mean_gap_px : mean of the pairs' gaps and its standard error.
+    rms_px : RMS of the gaps: as they are; without the constant; without the whole bias; and
+        without a bias that is fitted without the pair itself.
+    findings : what the user should know.
     """
 
     bias_px: Array
@@ -184,24 +201,30 @@ class PairModel:
 
     @property
     def calibration_problem(self) -> bool:
-        """Whether the gaps' systematic part is beyond chance and beyond half a pixel."""
+        """Return whether the gaps have a systematic part beyond chance and beyond half a pixel."""
         return bool({Finding.CALIBRATION_OFFSET, Finding.OFFSET_VARIES} & set(self.findings))
 
     def basis(self, points_mm: Array, terms: int | None = None) -> Array:
-        """(..., 3) rig points -> (..., B) terms of the bias."""
+        """Return the terms (..., B) of the bias at points (..., 3) of the rig frame (mm).
+
+        terms : number B of terms (1, 4 or 10); None takes that of this model.
+        """
         scaled = (points_mm - self.origin_mm) / self.reach_mm
         x, y, z = np.moveaxis(np.clip(scaled, -1.5, 1.5), -1, 0)
         every = [np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
         return np.stack(every[: len(self.bias_px) if terms is None else terms], -1)
 
     def bias(self, points_mm: Array) -> tuple[Array, Array]:
-        """(...,) systematic gap (px) at rig points, and its variance (px^2)."""
+        """Return the systematic gap (...) in px and its variance (...) in px^2.
+
+        points_mm : (..., 3) points in the rig frame, in mm.
+        """
         basis = self.basis(points_mm)
         variance = np.einsum("...i,ij,...j", basis, self.bias_covariance_px2, basis)
         return basis @ self.bias_px, np.asarray(variance)
 
     def sentences(self, without: Collection[Finding] = ()) -> list[str]:
-        """The findings in plain words, one string each, but those in ``without``."""
+        """Return a summary and a text for each finding except those in ``without``."""
         if Finding.NO_DETECTIONS in self.findings:
             return ["No frame has detections in both cameras: nothing was learnt about the pairs."]
         offset, error = self.mean_gap_px
@@ -260,9 +283,12 @@ _LARGEST_MAHALANOBIS2 = 60.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the live tracks are expected in a frame, in the rig frame.
+    """Hold where K tracks are expected in a frame.
 
-    ids : (K,); points_mm : (K, 3); covariance_mm2 : (K, 3, 3); d_eq_mm : (K,).
+    ids : (K,) numbers of the tracks.
+    points_mm, covariance_mm2 : (K, 3) expected positions in the rig frame (mm) and their (K, 3, 3)
+        covariances (mm^2).
+    d_eq_mm : (K,) equivalent diameters of the bubbles (mm).
     """
 
     ids: Ints
@@ -273,14 +299,16 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Matches:
-    """Pairs of one frame. Rows are positions in the two detection tables.
+    """Hold the M pairs of one frame.
 
-    first, second : (M,) rows.  confidence : (M,) posterior probability of the pair.
-    gap_px, gap_sigma : (M,) mismatch along the shared axis, first less second, the model's bias
-        and the frame's common shift removed; in px of the first image and in standard deviations.
-    height_ratio : (M,) height (mm) in the first view over that in the second; NaN where unknown.
+    first, second : (M,) positions of the pair's rows in the two detection tables, from 0.
+    confidence : (M,) posterior probability of the pair.
+    gap_px, gap_sigma : (M,) mismatch along the shared axis, first minus second, after the model's
+        bias and the frame's common shift are subtracted; in px of the first image, and in standard
+        deviations.
+    height_ratio : (M,) height (mm) in the first view divided by that in the second; NaN if unknown.
     ambiguous : (M,) whether the pair's posterior log odds are below ``SAFE_LOG_ODDS``.
-    frame_shift_px : the shift common to this frame's gaps.
+    frame_shift_px : the shift that all gaps of this frame share, in px of the first image.
     """
 
     first: Ints
@@ -304,10 +332,13 @@ def match_pairs(
     *,
     predicted: Prediction | None = None,
 ) -> Matches:
-    """Pairs of the detections of one frame.
+    """Find the pairs among the detections of one frame.
 
-    first, second : tables of `detect_bubbles`, in pixels of ``cameras``; other row labels than
-    0..N-1 do not matter, results are positions. model : `estimate_pair_model` or `default_model`.
+    first, second : tables of `detect_bubbles` for the first and the second camera. Their row labels
+        are not used; the result contains positions.
+    cameras : the two calibrated cameras.
+    model : result of `estimate_pair_model` or `default_model`.
+    predicted : where tracks are expected; None if there are no tracks.
 
     Raises InputError for tables without centres or covariances and for parallel cameras.
     """
@@ -335,10 +366,15 @@ def match_pairs(
 def common_shift(
     geometry: PairGeometry, model: PairModel, by_tracks: Array | float = 0.0
 ) -> tuple[Array, Array, Array, float]:
-    """Gaps (bias and the frame's shift removed), their variances, log odds, and the shift.
+    """Estimate the shift that all gaps of a frame share.
 
-    The shift starts as unknown within ``model.frame_px`` and is then the mean over the pairs
-    by their probabilities, with that scatter as its prior.
+    geometry : all combinations of N1 first and N2 second detections.
+    by_tracks : (N1, N2) log odds from the predicted tracks, or 0.
+
+    Returns four values: the gaps (N1, N2) in px after bias and shift are subtracted, their
+    variances (N1, N2) in px^2, the log odds (N1, N2) of all pairs, and the shift (px). The shift
+    starts as unknown within ``model.frame_px`` and is then the mean over the pairs by their
+    probabilities, with that scatter as its prior.
     """
     bias, bias_variance = model.bias(geometry.points_mm)
     raw = geometry.gap_px - bias
@@ -356,9 +392,11 @@ def common_shift(
 
 
 def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
-    """(N1, N2) log odds by height, width, contrast and the number of detections; not the gap.
+    """Return the log odds (N1, N2) of all pairs from everything but the gap.
 
-    Heights that differ beyond all measurement exclude a pair; flagged ones may differ twice that.
+    They come from height, width, contrast and the number of detections. If two heights differ by
+    more than any measurement error, the pair is excluded; for flagged detections this limit is
+    twice as large.
     """
     first, second = geometry.views
     odds = np.full(
@@ -376,14 +414,21 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
 
 
 def _prior_log_odds(n1: int, n2: int, unmatched: tuple[float, float]) -> float:
-    """Expected pairs over the product of the expected detections without a partner."""
+    """Return the prior log odds of a pair of n1 first and n2 second detections.
+
+    unmatched : for each view, the expected share of detections without a partner.
+    """
     alone = (max(n1 * unmatched[0], 1e-3), max(n2 * unmatched[1], 1e-3))
     pairs = max(np.sqrt(n1 * (1 - unmatched[0]) * n2 * (1 - unmatched[1])), 1e-3)
     return float(np.log(pairs / (alone[0] * alone[1])))
 
 
 def _gap_log_odds(gap: Array, variance: Array, model: PairModel) -> Array:
-    """A normal core with wider tails (upset outlines), cut off, against any place in the span."""
+    """Return log odds from gaps (px) and their variances (px^2), both (N1, N2).
+
+    The density of a true pair's gap is normal with wider tails (for disturbed outlines), and 0
+    beyond a limit. It is compared with a uniform density over the span that both images cover.
+    """
     core = np.exp(-0.5 * gap**2 / variance)
     wide = variance + np.clip(3 * variance, *_TAIL_PX2)
     tail = np.exp(-0.5 * gap**2 / wide) * np.sqrt(variance / wide)
@@ -420,7 +465,7 @@ def _ratio_log_odds(
 def track_log_odds(
     geometry: PairGeometry, model: PairModel, predicted: Prediction
 ) -> Array | float:
-    """(N1, N2) log odds to add for the predicted tracks.
+    """Return the log odds (N1, N2) that the predicted tracks add; 0 if there are no tracks.
 
     Without tracks pairs lie anywhere in the volume that both cameras see. With them most lie where
     a track is expected (both pixels at once, through the point in space), and so do the

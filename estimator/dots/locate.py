@@ -219,7 +219,7 @@ class _Scene:
     blobs: list[Candidate]
 
     def first_fits(self, noise: NoiseModel) -> list[DotFit]:
-        """Fit each dot independently; the blur of the first five is the start value for the rest."""
+        """Fit each dot independently; the first five give the start value of the blur."""
         pilots = self._coarse_fits(self.blobs[:_PILOTS], noise, _FIRST_SIGMA_PX)
         if len(self.blobs) <= _PILOTS:
             return pilots

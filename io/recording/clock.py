@@ -40,13 +40,19 @@ _TREND = 0.5
 
 @dataclass(frozen=True)
 class ClockFit:
-    """host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6).
+    """Hold how the host's time follows from the time of a device's clock.
 
-    drift_ppm : how much faster the device's clock runs than the host's. sd_offset_us : scatter of
-    the least delays in parts of the record. sd_drift_ppm : from a jackknife, or from that scatter
-    if it is larger; NaN where the drift is that of a longer count. delay_*_ms : above the least.
-    wander_us : range of the least delays of the parts after the fit. knots_s, bend_s : where the
-    rate changed, the correction in s at these times, which are counted from device_mean_s.
+    host_s = host_mean_s + offset_s + (device_s - device_mean_s) / (1 + drift_ppm * 1e-6), all times
+    in s.
+    drift_ppm : by how many parts in a million the device's clock runs faster than the host's.
+    sd_offset_us : scatter in microseconds of the least delays in parts of the record.
+    sd_drift_ppm : standard deviation of the drift, from a jackknife, or from that scatter if it is
+    larger; NaN where the drift was taken from a longer record.
+    delay_median_ms, delay_max_ms : median and largest delay in ms, above the least one.
+    wander_us : range in microseconds of the least delays of the parts after the fit.
+    readings : number of readings.
+    knots_s, bend_s : times in s from device_mean_s at which the rate changed, and the corrections
+    of the host time there in s; empty for a constant rate.
     """
 
     device_mean_s: float
@@ -63,7 +69,10 @@ class ClockFit:
     bend_s: tuple[float, ...] = ()
 
     def host_s(self, device_s: Array) -> Array:
-        """Host time of device time (unwrapped, of this fit's count)."""
+        """Return the host times in s of device times in s, in the same shape.
+
+        The device times must be unwrapped and belong to the count that was fitted.
+        """
         slope = 1 / (1 + 1e-6 * self.drift_ppm)
         x = device_s - self.device_mean_s
         line = self.host_mean_s + self.offset_s + x * slope
@@ -72,9 +81,12 @@ class ClockFit:
 
 @dataclass(frozen=True)
 class ClockRecord:
-    """t_s : (N,) host time of each reading, NaN for each of the ``wrong`` stamps.
+    """Hold the host times of a device's readings.
 
-    segment : (N,) index of the fit; -1 for wrong stamps. wraps : how often the counter wrapped.
+    t_s : (readings,) host time in s; NaN for a reading with a wrong stamp.
+    segment : (readings,) index of the fit, -1 for a wrong stamp.
+    fits : one fit for each uninterrupted count of the device's clock.
+    wraps : how often the counter wrapped. wrong : number of wrong stamps.
     """
 
     t_s: Array
@@ -85,11 +97,13 @@ class ClockRecord:
 
 
 def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockRecord:
-    """Host times of readings stamped by a device.
+    """Compute the host times of readings that a device stamps with its own clock.
 
-    host_s : (N,) arrival, not decreasing. device_s : (N,) the device's stamps in seconds, modulo
-    ``wrap_s`` (0: never wraps). A stamp that is neither between its neighbours nor the first of a
-    restarted clock is wrong; so is one that repeats its predecessor.
+    host_s : (readings,) times of arrival in s, not decreasing.
+    device_s : (readings,) the device's stamps in s, modulo ``wrap_s``; 0 means that they never
+    wrap.
+    A stamp is wrong if it repeats the previous one, or if it is neither between its neighbours nor
+    the first of a clock that has restarted.
     """
     t_s = np.full(len(host_s), np.nan)
     segment = np.full(len(host_s), -1, np.int64)
@@ -108,7 +122,10 @@ def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockReco
 
 
 def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
-    """(N,) the count without wraps; the host time between readings gives their number."""
+    """Return the device's times (readings,) in s without wraps.
+
+    The host time between readings determines the number of wraps. Arguments are as in `host_times`.
+    """
     if not wrap_s or not len(device_s):
         return np.array(device_s)
     ahead = device_s - host_s
@@ -117,10 +134,11 @@ def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
 
 
 def lower_line(x: Array, y: Array, at: float | None = None) -> tuple[float, float]:
-    """(y at ``at``, slope) of the line below all points that is highest there.
+    """Return the line that lies below all points and is highest at ``at``: its y there, and slope.
 
-    at : default the mean of x, where it is the line with the least sum of distances to the points.
-    x must increase.
+    x, y : (points,); x must increase.
+    at : None takes the mean of x, where it is the line with the least sum of distances to the
+    points.
     """
     hull = _lower_hull(x, y)
     middle = float(np.mean(x)) if at is None else at
@@ -197,7 +215,11 @@ def _fits(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, ...]:
 
 
 def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) -> ClockFit:
-    """The line below all stamps of one count, ``device_s`` increasing; ``drift_ppm`` if known."""
+    """Fit the line below all stamps of one count of a device's clock.
+
+    host_s, device_s : (readings,) times in s; ``device_s`` must increase.
+    drift_ppm : the drift if it is known; None estimates it.
+    """
     x_mean, y_mean = float(np.mean(device_s)), float(np.mean(host_s))
     x, late = device_s - x_mean, (host_s - y_mean) - (device_s - x_mean)
     edge, least = _least_delays(x, late)

@@ -33,6 +33,12 @@ RECEIVED, SENT, LOST, FOUND, END = 1, 2, 3, 4, 5
 
 @dataclass(frozen=True)
 class Entry:
+    """Hold one entry of the raw log.
+
+    kind : `RECEIVED`, `SENT`, `LOST`, `FOUND` or `END`. device : index of the device in the header.
+    time_ns : the host's monotonic time in ns. data : the bytes that were received or sent.
+    """
+
     kind: int
     device: int
     time_ns: int
@@ -41,7 +47,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class LogHeader:
-    """start_ns : the host's monotonic time at 0 s of the run; started : the wall clock then."""
+    """Hold the header of a raw log.
+
+    start_ns : the host's monotonic time in ns at 0 s of the run. started : date and time then.
+    cameras : the names of the cameras. devices : the devices that were recorded.
+    """
 
     start_ns: int
     started: str
@@ -50,7 +60,10 @@ class LogHeader:
 
 
 class RawLog:
-    """Writes a log; `append` keeps entries in memory, `flush` brings them to the disk."""
+    """Write a raw log; `append` keeps entries in memory, `flush` writes them to the disk.
+
+    Raises InputError when the file exists already or cannot be written.
+    """
 
     def __init__(self, path: Path, header: LogHeader) -> None:
         self.path = path
@@ -113,14 +126,14 @@ def _make(folder: Path) -> None:
 
 
 def packed(entry: Entry) -> bytes:
-    """The bytes of one entry."""
+    """Return the bytes of one entry as they stand in the file."""
     head = _HEAD.pack(entry.kind, entry.device, entry.time_ns, len(entry.data))
     crc = zlib.crc32(entry.data, zlib.crc32(head))
     return b"".join((MARKER, head, entry.data, _CRC.pack(crc)))
 
 
 def log_error(path: Path, error: OSError) -> InputError:
-    """The error of a log that cannot be written."""
+    """Return the error for a log that cannot be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return InputError(
             "the disk is full: the recording ends here",
@@ -135,12 +148,15 @@ def log_error(path: Path, error: OSError) -> InputError:
 
 
 def read_header(path: Path) -> LogHeader:
-    """The log's header. Raises InputError for a file that is no log."""
+    """Read the header of a raw log. Raises InputError for a file that is no log."""
     return _open(path)[0]
 
 
 def read_log(path: Path) -> Iterator[Entry]:
-    """Every undamaged entry, in the order of writing (see `damaged_bytes`)."""
+    """Read a raw log and yield every undamaged entry, in the order of writing.
+
+    Raises InputError for a file that is no log. Damaged parts are skipped (see `damaged_bytes`).
+    """
     header, start = _open(path)
     for piece in _pieces(path, start):
         if isinstance(piece, Entry) and piece.device < max(len(header.devices), 1):
@@ -148,7 +164,7 @@ def read_log(path: Path) -> Iterator[Entry]:
 
 
 def damaged_bytes(path: Path) -> int:
-    """Number of bytes of the log that belong to no undamaged entry."""
+    """Read a raw log and return the number of bytes that belong to no undamaged entry."""
     _, start = _open(path)
     return sum(p for p in _pieces(path, start) if isinstance(p, int))
 
@@ -187,7 +203,7 @@ def _no_log(path: Path, what: str) -> InputError:
 
 
 def _pieces(path: Path, start: int) -> Iterator[Entry | int]:
-    """Entries, and the lengths of damaged stretches between them."""
+    """Yield the entries of a log, and the length in bytes of each damaged part between them."""
     with path.open("rb") as stream:
         stream.seek(start)
         data, at = b"", 0
@@ -202,7 +218,10 @@ def _pieces(path: Path, start: int) -> Iterator[Entry | int]:
 
 
 def _entry(data: bytes, at: int, *, final: bool) -> tuple[Entry | int, int] | None:
-    """The piece at ``at`` and where the next one begins; None for more data, or at the end."""
+    """Return the entry at ``at``, or the length of a damaged part, and where the next piece begins.
+
+    Returns None when more data are needed, and at the end of the data.
+    """
     left = len(data) - at
     if left == 0 or (left < _LEAST and not final):
         return None

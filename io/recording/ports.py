@@ -15,15 +15,15 @@ from telerig.io.recording.protocols import poll_command
 from telerig.io.rig_file.description import DeviceDescription
 
 WAIT_S = 0.1
-"""Longest wait for a byte before a reader checks whether it has to stop."""
+"""Longest wait in s for a byte before a reader checks whether it has to stop."""
 WRITE_S = 1.0
-"""A port that does not accept a written byte for so long is lost."""
+"""A port that does not accept a written byte for this time in s counts as lost."""
 NO_PERMISSION = "sudo usermod -a -G dialout $USER (uucp on some systems), then log in again"
 """The remedy for a port that may not be opened."""
 
 
 def found_ports() -> list[tuple[str, str]]:
-    """(device file, description or "") of the serial ports that the machine has now."""
+    """List the machine's serial ports: (device file, description), "" without a description."""
     from serial.tools import list_ports
 
     return sorted(
@@ -33,12 +33,15 @@ def found_ports() -> list[tuple[str, str]]:
 
 
 def known_ports() -> list[str]:
-    """`found_ports`, as one text for each port."""
+    """Return the ports of `found_ports`, each as one text."""
     return [device + (f" ({name})" if name else "") for device, name in found_ports()]
 
 
 def open_port(device: DeviceDescription) -> Any:
-    """The open port, its input buffer emptied. Raises InputError when it cannot be opened."""
+    """Open the serial port of a device and empty its input buffer; returns pyserial's port.
+
+    Raises InputError when it cannot be opened.
+    """
     import serial
 
     try:
@@ -52,9 +55,10 @@ def open_port(device: DeviceDescription) -> Any:
 
 
 def read_chunk(port: Any) -> tuple[int, bytes]:
-    """(host's monotonic time in ns, bytes received), after waiting for the first byte.
+    """Wait for the first byte at a port, and read all bytes that have arrived.
 
-    The time is taken after all of these bytes have arrived, before they are copied.
+    Returns the host's monotonic time in ns and the bytes. The time is taken after all of these
+    bytes have arrived, before they are copied. The bytes are empty if none came in time.
     """
     first = port.read(1)
     if not first:
@@ -91,15 +95,17 @@ def _cannot_open(device: DeviceDescription, error: Exception) -> InputError:
 
 
 RETRY_S = 0.2
-"""How often a lost port is tried again."""
+"""Time in s between two attempts to open a lost port."""
 ANSWER_S = 0.5
-"""How long a polled device may take to answer."""
+"""Longest time in s that a polled device may take to answer."""
 
 
 class Reader(threading.Thread):
-    """Reads a port until `stop` is called; opens it again after it was unplugged.
+    """Read a port in a thread until `stop` is called; a port that was unplugged is opened again.
 
-    emit : called in this thread with every entry. `fault` : the exception that ended the thread.
+    index : the device's index in the log. device : its description. port : the open port.
+    emit : is called in this thread with every entry.
+    The attribute ``fault`` is the exception that ended the thread; None if there was none.
     """
 
     def __init__(

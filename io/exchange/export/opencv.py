@@ -54,7 +54,12 @@ class Matrices:
 
 
 def export_opencv(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[str]:
-    """Write the matrices of all cameras into the file ``out``; returns a line per camera."""
+    """Write the matrices of all cameras into the YAML file ``out``.
+
+    volume : the box over which errors are measured and the affine matrices fitted.
+    Returns one line of text per camera with the errors of its matrices.
+    Raises InputError as `camera_matrices` and `write_opencv` do.
+    """
     matrices = camera_matrices(cameras, volume)
     write_opencv(matrices, out)
     return [

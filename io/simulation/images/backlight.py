@@ -15,11 +15,13 @@ _SPECK_REACH = 3.5
 
 @dataclass(frozen=True)
 class Screen:
-    """A smooth bright field, known at every place, so that it can move through the image.
+    """Describe a smooth bright field that is known everywhere, so that it can move in the image.
 
-    level : fraction of full scale at the image's middle; gradient : (2,) relative change per half
-    diagonal; vignetting : relative loss in the corners (always fixed in the image).
-    waves_per_px : (K, 2) angular; amplitude, phase_rad : (K,) of the texture.
+    level : grey level at the image's middle as a fraction of full scale.
+    gradient : (2,) relative change over half the image's diagonal, along u and v.
+    vignetting : relative loss in the corners; it does not move with the screen.
+    waves_per_px : (waves, 2) angular wave numbers of the texture in rad/px.
+    amplitude, phase_rad : (waves,) relative amplitude and phase in rad of each wave.
     """
 
     level: float
@@ -30,10 +32,11 @@ class Screen:
     phase_rad: Array
 
     def image(self, size_px: tuple[int, int], shift_px: Array) -> Float32:
-        """(height, width) with the texture and gradient displaced by (2,) pixels.
+        """Return the image (height, width) of the screen as fractions of full scale.
 
+        size_px : (width, height) in px. shift_px : (2,) displacement of texture and gradient in px.
         Each plane wave is a product of two, so the image is one product of narrow matrices. The
-        gradient flattens out smoothly far from the middle.
+        gradient becomes flat far from the middle.
         """
         width, height = size_px
         u, v = np.arange(width) - shift_px[0], np.arange(height) - shift_px[1]
@@ -63,7 +66,11 @@ def random_screen(
     texture: float,
     wavelength_px: tuple[float, float] = (60.0, 600.0),
 ) -> Screen:
-    """A screen of random directions; texture : RMS relative to the level."""
+    """Draw a screen with waves and a gradient in random directions.
+
+    level, gradient, vignetting : see `Screen`. texture : RMS of the waves relative to the level.
+    wavelength_px : the shortest and the longest wavelength in px.
+    """
     angle = rng.uniform(0, 2 * np.pi, _WAVES)
     length = _log_uniform(rng, wavelength_px, _WAVES)
     waves = 2 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -76,14 +83,21 @@ def random_screen(
 
 @dataclass(frozen=True)
 class Specks:
-    """Dirt: uv_px (N, 2) places without displacement, sigma_px (N,), depth (N,) share taken."""
+    """Describe specks of dirt.
+
+    uv_px : (specks, 2) places in px without displacement. sigma_px : (specks,) radius (standard
+    deviation of a Gaussian) in px. depth : (specks,) share of the light that is absorbed.
+    """
 
     uv_px: Array
     sigma_px: Array
     depth: Array
 
     def darken(self, image: Float32, shift_px: Array) -> None:
-        """Multiply the image, in place, by the specks' transmission, displaced by (2,) pixels."""
+        """Multiply ``image`` (height, width) in place by the transmission of the specks.
+
+        shift_px : (2,) displacement of all specks in px.
+        """
         height, width = image.shape
         reach = np.ceil(_SPECK_REACH * self.sigma_px)
         places = self.uv_px + shift_px
@@ -108,7 +122,10 @@ def random_specks(
     sigma_px: tuple[float, float],
     depth: tuple[float, float],
 ) -> Specks:
-    """``count`` specks spread evenly over the rectangle low_px..high_px."""
+    """Draw ``count`` specks, evenly distributed in the rectangle from low_px to high_px.
+
+    low_px, high_px : (2,) corners in px. sigma_px, depth : the smallest and the largest value.
+    """
     places = rng.uniform(low_px, high_px, (count, 2))
     sigma = _log_uniform(rng, sigma_px, count)
     return Specks(places, sigma, rng.uniform(*depth, count))

@@ -48,7 +48,7 @@ class Bodies:
         )
 
     def moved(self, by_mm: ArrayLike) -> Bodies:
-        """The bodies displaced by (..., 3)."""
+        """Return the bodies displaced by (..., 3) mm."""
         return Bodies(
             self.origin_mm + np.asarray(by_mm), self.rotation, self.semi_axes_mm, self.modes
         )
@@ -78,24 +78,30 @@ def bodies_about(
 
 
 def volume_mm3(bodies: Bodies) -> Array:
-    """(...) exact: the quadrature integrates polynomials of degree 23, the volume has 12."""
+    """Return the exact volumes (...) in mm^3.
+
+    The quadrature integrates polynomials of degree 23 exactly; the volume has degree 12.
+    """
     return np.asarray(_sphere_moments(bodies.modes)[0] * np.prod(bodies.semi_axes_mm, -1))
 
 
 def d_eq_mm(bodies: Bodies) -> Array:
-    """(...) diameter of the sphere of the same volume."""
+    """Return the equivalent diameters (...) in mm."""
     return np.asarray(np.cbrt(6 / np.pi * volume_mm3(bodies)))
 
 
 def volume_centre_mm(bodies: Bodies) -> Array:
-    """(..., 3) exact centre of volume."""
+    """Return the exact centres of volume (..., 3) in mm."""
     offset = bodies.semi_axes_mm * _sphere_moments(bodies.modes)[1]
     turned = np.einsum("...ij,...j->...i", bodies.rotation, offset)
     return np.asarray(bodies.origin_mm + turned)
 
 
 def surface_modes(directions: Array) -> Array:
-    """(..., 3) unit vectors -> (..., 21) real harmonics, each with greatest absolute value 1."""
+    """Return the real spherical harmonics (..., 21) at unit vectors (..., 3).
+
+    Each has the greatest absolute value 1. Their order is that of `MODES`.
+    """
     x, y, z = np.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     xy, minus = 2 * x * y, xx - yy
@@ -129,7 +135,10 @@ def outline_px(bodies: Bodies, camera: Camera, count: int = 128) -> Array:
 
 
 def rim_mm(bodies: Bodies, direction: ArrayLike, count: int = 128) -> Array:
-    """(..., count, 3) points of the surface that form the outline seen along (..., 3)."""
+    """Return the points (..., count, 3) in mm of the surface that form its outline.
+
+    direction : (..., 3) the direction of view, in the bodies' frame.
+    """
     axes = _viewing_axes(bodies, np.asarray(direction, float))
     angle = np.arange(count) * 2 * np.pi / count
     across = axes[..., None, 0, :] * np.cos(angle)[:, None] + axes[..., None, 1, :] * np.sin(

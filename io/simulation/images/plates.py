@@ -28,11 +28,12 @@ _RIM = 24
 
 @dataclass(frozen=True)
 class Light:
-    """Smooth multiplicative light, and an additive glare, over one image.
+    """Describe smooth light that multiplies an image, and a glare that is added to it.
 
-    gain : at the image's centre; gradient : (2,) relative change per half diagonal along u and v;
-    vignetting : relative loss in the corners.
-    glare : (u_px, v_px, radius_px, strength) of a Gaussian spot in fractions of full scale.
+    gain : factor at the image's centre. gradient : (2,) relative change over half the diagonal,
+    along u and v. vignetting : relative loss in the corners.
+    glare : (u_px, v_px, radius_px, strength) of a Gaussian spot, its strength as a fraction of full
+    scale; None for no glare.
     """
 
     gain: float = 1.0
@@ -44,9 +45,11 @@ class Light:
 def render(
     camera: Camera, rig_from_target: Pose, plate: Plate, light: Light, *, blur_px: float
 ) -> Array:
-    """(height, width) noise-free grey levels in fractions of full scale.
+    """Render the image of a dotted plate without noise.
 
-    blur_px : standard deviation of the isotropic Gaussian point spread function.
+    rig_from_target : the plate's pose. blur_px : standard deviation in px of the isotropic Gaussian
+    point spread function.
+    Returns (height, width) grey levels as fractions of full scale.
     """
     width, height = camera.image_size_px
     dots = disc_coverage(
@@ -243,7 +246,10 @@ class Plate:
 def plate_from_pixel(
     camera: Camera, rig_from_target: Pose, uv_px: ArrayLike, plate: Plate, z_mm: ArrayLike = 0.0
 ) -> Array:
-    """(..., 2) pixels -> (..., 2) x, y where their rays meet the plane at z_mm of the target."""
+    """Return where the rays of pixels (..., 2) meet the plane at height ``z_mm`` of the target.
+
+    The result is (..., 2), x and y in mm in the target's frame.
+    """
     origin, direction = camera.unproject(uv_px)
     target_from_rig = rig_from_target.inverse()
     origin = target_from_rig.apply(np.atleast_2d(origin))
@@ -256,10 +262,11 @@ def plate_from_pixel(
 def pixel_from_plate(
     camera: Camera, rig_from_target: Pose, points_mm: ArrayLike, plate: Plate
 ) -> Array:
-    """(..., 3) points on the plate -> (..., 2) exact pixels, through the glass if seen from behind.
+    """Project points on the plate, (..., 3) in mm in the target's frame, to pixels (..., 2) in px.
 
-    A ray's shift by the glass depends on its direction, which for kappa = 0 all rays share; else
-    the fixed point contracts by about kappa times the thickness.
+    A camera behind the plate sees them through the glass. A ray's shift by the glass depends on its
+    direction, which all rays share for kappa = 0; otherwise it is found by iteration, whose error
+    shrinks in each step by a factor of about kappa times the thickness.
     """
     points = np.asarray(points_mm, float)
     uv = camera.project(rig_from_target.apply(points))

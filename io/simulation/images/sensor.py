@@ -19,11 +19,14 @@ def digitise(
     bit_depth: int = 8,
     left_aligned: bool = False,
 ) -> Image:
-    """(height, width) grey levels in fractions of full scale -> integers, clipped at full scale.
+    """Convert grey levels to the noisy integers that a camera delivers.
 
+    grey : (height, width) fractions of full scale. Noise is computed in its precision.
     read_noise : standard deviation; shot_noise : standard deviation at full scale (it grows with
-    the root of the grey level). Noise is computed in the precision of ``grey``.
-    left_aligned : data of fewer than 16 bits stand in the high bits of 16, as many cameras write.
+    the root of the grey level). Both are fractions of full scale.
+    left_aligned : True puts data of fewer than 16 bits into the high bits of 16, as many cameras
+    do.
+    Returns (height, width) uint8 for 8 bits, otherwise uint16, clipped at full scale.
     Raises InputError for a bit depth outside 8..16.
     """
     if not 8 <= bit_depth <= 16:

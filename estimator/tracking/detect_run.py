@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, int, int], None]
 Batch = tuple[int, int]
-"""First frame, and the one after the last."""
+"""The first frame of a batch, and the frame after its last."""
 
 FRAMES_FOR_WORKERS = 40
 """Below this, starting fresh worker processes costs more than it saves."""
@@ -55,10 +55,12 @@ _LARGEST_BATCH = 64
 
 @dataclass(frozen=True)
 class Scene:
-    """What the detections of all frames have in common.
+    """Hold what the detections of all F frames have in common.
 
-    backgrounds : by camera; shift_px : by camera, (F, 2) travel of the rig, see `lab_shift_px`.
-    strips : by camera, dots fixed to the tank, which are erased from the images.
+    backgrounds : background image of each camera, by name.
+    shift_px : (F, 2) travel of the rig in px of each camera, by name; see `lab_shift_px`.
+    min_diameter_px : dark spots that are smaller count as dirt.
+    strips : by camera name, the dots fixed to the tank, which are erased from the images.
     """
 
     run: RunData
@@ -68,7 +70,9 @@ class Scene:
     strips: Mapping[str, StripInImages] = field(default_factory=dict)
 
     def image(self, camera: str, frame: int) -> NDArray[Any] | None:
-        """(H, W) without the strip's dots; None where it is missing."""
+        """Return an image (height, width) without the strip's dots; None if the image is
+        missing.
+        """
         return _image(self.run, self.strips, camera, frame)
 
 
@@ -80,7 +84,12 @@ def make_scene(
     progress: Progress | None = None,
     strips: Mapping[str, StripInImages] | None = None,
 ) -> Scene:
-    """Estimate each camera's background from the run itself."""
+    """Estimate each camera's background from the images of the run.
+
+    axis_rig : (3,) unit vector of the stage's travel in the rig frame.
+    progress : function that is called with the name of the step, the number done and the total.
+    strips : dots to erase, by camera name; None for none.
+    """
     shifts = {c.name: lab_shift_px(c, axis_rig, run.position_mm, run.frame_count) for c in cameras}
     names = [c.name for c in cameras]
     estimate = partial(_background, run, shifts, strips or {})
@@ -109,10 +118,14 @@ def _background(
 def lab_shift_px(
     camera: Camera, axis_rig: Array, position_mm: Array | None, frame_count: int
 ) -> Array:
-    """(F, 2) travel of the rig since the first frame, in px of the image.
+    """Return the travel of the rig since the first frame as (F, 2) in px of a camera.
 
-    A thing fixed in the lab and seen at p at first is seen at p - shift. Evaluated in the middle
-    of the image at depth 0; 0 in frames without a stage position.
+    An object at rest in the laboratory that is seen at pixel p in the first frame is later seen at
+    p minus this shift. It is computed for the middle of the image at depth 0, and is 0 in frames
+    without a stage position.
+
+    axis_rig : (3,) unit vector of the travel in the rig frame.
+    position_mm : (F,) encoder positions, NaN where missing; None without an encoder.
     """
     if position_mm is None:
         return np.zeros((frame_count, 2))
@@ -124,10 +137,11 @@ def lab_shift_px(
 
 
 class DetectionStore:
-    """Batches of detections in files, so that an interrupted run continues where it stopped.
+    """Keep the detections of each batch of frames in CSV files, so that an interrupted run can
+    continue.
 
-    The folder belongs to one fingerprint of input and options; with another one it is emptied.
-    Two kinds of tables stand in it: "detections" of bubbles, "dots" of a strip.
+    The folder belongs to one fingerprint of input and options; it is emptied if the fingerprint is
+    a different one. It holds tables of two kinds: "detections" of bubbles and "dots" of a strip.
     """
 
     def __init__(self, folder: Path, fingerprint: str, frame_count: int, workers: int) -> None:
@@ -156,10 +170,11 @@ class DetectionStore:
         progress: Progress | None,
         name: str,
     ) -> None:
-        """Make and write the tables that are missing, in parallel.
+        """Compute the missing tables of one kind in parallel and write them.
 
-        table_of : from (first, last) frame to the table; a `functools.partial` of a function.
-        progress, name : called with the name of the work and the number of frames done.
+        table_of : function that returns the table of a batch; it has to work in another process.
+        progress : function that is called with ``name``, the number of frames done and the total;
+            or None.
         """
         missing = self.missing(kind)
         frames = sum(last - first for first, last in missing)
@@ -180,7 +195,7 @@ def _write(
 
 
 def read_batch(path: Path) -> pd.DataFrame:
-    """A table that `write_table` wrote; empty texts are ""."""
+    """Read a CSV table that `write_table` wrote; blank texts become ""."""
     kinds = {"camera": str, "flags": str, "reason": str}
     table = pd.read_csv(path, dtype=kinds)
     texts = [name for name in kinds if name in table]
@@ -189,7 +204,9 @@ def read_batch(path: Path) -> pd.DataFrame:
 
 
 def fingerprint(run: RunData, options: dict[str, Any]) -> str:
-    """A hash of the recording's files, the options and the version."""
+    """Return a hash of the version, the options, and the names, sizes and times of the recording's
+    files.
+    """
     from telerig.version import VERSION
 
     found = hashlib.sha256(json.dumps([VERSION, options], default=str).encode())
@@ -252,8 +269,10 @@ _MOVED_DIAMETERS = 2.0
 
 @dataclass(frozen=True)
 class FollowedMarks:
-    """table : REFERENCE_COLUMNS, None without a mark.  strips : by camera that sees one.
+    """Hold the marks of a strip that were followed through the images.
 
+    table : table with the columns `REFERENCE_COLUMNS`; None if no mark was found.
+    strips : the strip as seen by each camera that sees marks, by name.
     summary : the part "references" of tracking.json.
     """
 
@@ -263,7 +282,10 @@ class FollowedMarks:
 
 
 def described_strip(run: RunData) -> ReferencesDescription | None:
-    """The strip to look for; None when the run has its own references.csv, or no images."""
+    """Return the description of the strip of dots in rig.toml.
+
+    It is None if there is none, if the run has its own references.csv, or if it has no images.
+    """
     described = run.rig.references if run.rig is not None else None
     return described if run.source == "images" and run.references is None else None
 
@@ -275,7 +297,11 @@ def follow_references(
     store: DetectionStore,
     progress: Progress | None = None,
 ) -> FollowedMarks | None:
-    """None where rig.toml describes no strip. Dots found before are taken from the store.
+    """Follow the dots of the strip that rig.toml describes; return None if it describes none.
+
+    axis_rig : (3,) unit vector of the stage's travel in the rig frame.
+    store : files of dots; those found before are read, the others are computed and written.
+    progress : as for `make_scene`.
 
     Raises GeometryError for a camera that looks along the travel.
     """
@@ -363,7 +389,9 @@ def _sightings(
 
 
 def _held_positions(run: RunData) -> Array:
-    """(F,) the stage's positions, the last known one where there is none, else 0."""
+    """Return the stage's positions (F,) in mm; a missing one is replaced by the last known one, or
+    0.
+    """
     if run.position_mm is None:
         return np.zeros(run.frame_count)
     known = np.where(np.isfinite(run.position_mm), np.arange(run.frame_count), -1)
@@ -380,7 +408,10 @@ def _moved(follower: Follower, held_mm: Array) -> bool:
 
 
 def _mark_numbers(sightings: pd.DataFrame, kept: Mapping[str, list[Mark]]) -> Ints:
-    """(N,) mark of each sighting: 0.. and 1000.. by order of appearance; -1 for other dots."""
+    """Return the mark's number (N,) for each of N sightings, -1 for dots that are no marks.
+
+    Marks are numbered from 0 for the first camera and from 1000 for the second.
+    """
     numbers: dict[tuple[str, int], int] = {}
     base = 0
     for name, marks in kept.items():

@@ -48,7 +48,7 @@ standard deviation (unit mean square over the sphere; their k = 1 part along a g
 
 @dataclass(frozen=True)
 class Linked:
-    """Finished rows of `tracks.csv` and `detections.csv`."""
+    """Hold final rows of tracks.csv and detections.csv."""
 
     tracks: pd.DataFrame
     detections: pd.DataFrame
@@ -71,7 +71,12 @@ class RowMaker:
     def add(
         self, number: int, t_s: float, position_mm: float | None, tables: Tables
     ) -> Linked | None:
-        """One frame; returns rows when enough of them are final."""
+        """Take in one frame; return final rows when there are enough of them, otherwise None.
+
+        number, t_s : number and time of the frame.
+        position_mm : encoder position of the stage; None without one.
+        tables : the detections of the two cameras.
+        """
         predicted = self.tracker.predict(t_s, position_mm)
         pixels = _pixels(tables[0], self._wander), _pixels(tables[1], self._wander)
         pairs, offset_px = pair_frame(tables, pixels, self.cameras, self.model, predicted)
@@ -94,7 +99,7 @@ class RowMaker:
         return WANDER * float(sigma[0])
 
     def finish(self) -> Linked | None:
-        """The rows still open at the end of the run."""
+        """Return the remaining rows at the end of the run; None if there are none."""
         result = self.tracker.finish()
         if result is not None:
             self._take_final(result)
@@ -186,9 +191,16 @@ def pair_frame(
     model: PairModel,
     predicted: Prediction | None,
 ) -> tuple[Pairs, Array]:
-    """The triangulated pairs of a frame, and (2, 2) the common shift of each camera's pixels.
+    """Return the triangulated pairs of a frame, and the median shift of each camera's pixels.
 
-    Detections with given ids pair up by these; the others are matched.
+    Detections with given ids are paired by their ids; all others are matched.
+
+    tables : detections of the two cameras.  pixels : their centres (px) and covariances (px^2).
+    model : the model for pairing.
+    predicted : expected positions of the tracks; None if there are none.
+
+    The shift is (2, 2) in px: for each camera the median of measured minus projected pixels over
+    the pairs; 0 if there are fewer than three pairs.
     """
     ids = [given_ids(table) for table in tables]
     given = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1]).astype(np.int64)

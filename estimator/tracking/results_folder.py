@@ -86,11 +86,18 @@ def write_tracking(
     report: bool = True,
     stage: Progress | None = None,
 ) -> dict[str, Any]:
-    """Track a run into ``folder``; returns the content of tracking.json.
+    """Track a run, write the results into a folder, and return the content of tracking.json.
 
-    Detections made before an interruption are taken up again from ``.<folder>.work`` beside it.
-    Result files appear together at the end. Raises InputError for bubbles that were given names
-    when there is to be a report: it numbers them.
+    Detections made before an interruption are read from ``.<folder>.work`` beside the folder. All
+    files of results appear together at the end.
+
+    record : command, inputs, options and times for run.json.
+    report : whether the HTML report is written.
+    stage : function that is called with the name of the step, the number done and the total; or
+        None.
+
+    Raises InputError if a report is wanted and the bubbles were given ids that are no whole
+    numbers.
     """
     if report and run.detections is not None:
         _check_ids(run.detections)

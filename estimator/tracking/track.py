@@ -55,7 +55,11 @@ _RELIABLE = 0.99
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """min_diameter_px : smaller dark spots count as dirt.  tracker : see `TrackerSettings`."""
+    """Hold the options of tracking.
+
+    min_diameter_px : dark spots that are smaller count as dirt.
+    tracker : settings of the tracker.
+    """
 
     min_diameter_px: float = 8.0
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
@@ -63,11 +67,14 @@ class TrackOptions:
 
 @dataclass
 class TrackingStream:
-    """A run while it is tracked. Read ``rows`` to their end; then ask for the ``summary``.
+    """Hold a run while it is tracked. Read ``rows`` to their end, then ask for the ``summary``.
 
-    rows : final rows of the tables, some frames at a time.  events : what happened to tracks.
-    shape_sigma : see `estimate_shape_sigma`.  frames_without : per camera, by reason, how often.
-    scene : None when all detections were there before.  marks : None without a strip of dots.
+    linker : turns detections into rows of the tables.
+    frames_without : for each camera, how often each reason for a frame without bubbles occurred.
+    scene : backgrounds of the images; None if all detections existed before.
+    marks : marks that were followed in the images; None without a strip of dots.
+    linked : the rows, which are computed while they are read.
+    detections, points, particles : numbers of detections and points, and ids of tracks, so far.
     """
 
     run: RunData
@@ -86,10 +93,12 @@ class TrackingStream:
 
     @property
     def events(self) -> list[TrackEvent]:
+        """Events of the tracks so far."""
         return self.linker.events
 
     @property
     def rows(self) -> Iterator[Linked]:
+        """Final rows of tracks.csv and detections.csv, some frames at a time."""
         for part in self.linked:
             self.detections += int(np.isfinite(part.detections["u_px"].to_numpy(float)).sum())
             self.points += len(part.tracks)
@@ -98,7 +107,7 @@ class TrackingStream:
             yield part
 
     def summary(self) -> dict[str, Any]:
-        """The content of tracking.json. Raises InputError when no bubble was found."""
+        """Return the content of tracking.json. Raises InputError when no bubble was found."""
         run, model, kinds = self.run, self.linker.model, [e.kind for e in self.events]
         if not self.detections:
             raise InputError(
@@ -143,11 +152,16 @@ def track(
     options: TrackOptions | None = None,
     stage: Progress | None = None,
 ) -> Tracks:
-    """Detect, pair and follow the bubbles of a run.
+    """Detect the bubbles of a run, pair them across the two views, and follow them in time.
 
-    run : `telerig.io.dataset.run.load_run`, or ``dataset.runs[name].load()``.
-    Raises InputError for recordings that cannot be used, CalibrationError for the calibration of
-    another rig.
+    run : the run as read by `telerig.io.dataset.run.load_run` or ``dataset.runs[name].load()``.
+    calibration : calibration of the rig.
+    options : None for the defaults.
+    stage : function that is called with the name of the step, the number done and the total; or
+        None.
+
+    Raises InputError for recordings that cannot be used, and CalibrationError for the calibration
+    of another rig.
     """
     with tempfile.TemporaryDirectory(prefix="telerig-") as work:
         stream = tracking_stream(run, calibration, Path(work) / "work", options, stage)
@@ -170,7 +184,13 @@ def tracking_stream(
     options: TrackOptions | None = None,
     stage: Progress | None = None,
 ) -> TrackingStream:
-    """Detect (detections are kept in ``work``), learn the pair model, then link lazily."""
+    """Detect the bubbles, learn the model for pairing them, and return a stream that tracks them.
+
+    work : folder into which the detections are written, so that an interrupted run can continue.
+
+    The other arguments and the errors are those of `track`. Tracks are computed while the stream's
+    rows are read.
+    """
     chosen = options or TrackOptions()
     calibration = pair_of_run(calibration, run.cameras)
     cameras = check_calibration(run, calibration)
@@ -212,7 +232,10 @@ def _settings(options: TrackOptions, run: RunData) -> TrackerSettings:
 
 
 def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, Camera]:
-    """The two cameras; raises CalibrationError when the run was not taken with them."""
+    """Return the two cameras of the calibration.
+
+    Raises CalibrationError when it has not two cameras, or when the run was not taken with them.
+    """
     if len(calibration.cameras) != 2:
         raise CalibrationError(
             f"tracking in space needs two cameras, but the calibration has "
@@ -239,7 +262,10 @@ def check_calibration(run: RunData, calibration: Calibration) -> tuple[Camera, C
 
 
 def stage_axis(run: RunData, calibration: Calibration) -> Array:
-    """(3,) unit travel direction in the rig frame: calibrated, from rig.toml, or upwards."""
+    """Return the unit vector (3,) of the stage's travel in the rig frame.
+
+    It comes from the calibration, otherwise from rig.toml, otherwise it is upwards in the images.
+    """
     axis: ArrayLike = (0.0, -1.0, 0.0)
     if calibration.stage:
         axis = calibration.stage["axis"]
@@ -256,7 +282,10 @@ def _complete(detections: pd.DataFrame) -> pd.DataFrame:
 
 
 def numbered_particles(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str] | None]:
-    """Given ids as numbers, -1 where blank; and their names, None when all are whole numbers."""
+    """Return the table with the given ids as whole numbers, -1 where blank, and the ids' names.
+
+    The names map each number to the id's text; they are None if all given ids are whole numbers.
+    """
     texts = table["particle"].astype(str) if "particle" in table else pd.Series("", table.index)
     given = sorted(set(texts) - {""})
     if all(text.isascii() and text.isdecimal() and str(int(text)) == text for text in given):

@@ -39,12 +39,13 @@ _STACK_BYTES = 512 << 20
 
 @dataclass(frozen=True)
 class Options:
-    """passes : relinearisations at most, some more while a sensor's clock moves.
+    """Hold the settings of the solver.
 
-    robust : down-weight pixels that do not fit.
-    covariances : of states ("frames"), or none (False) when only the evidence is asked.
-    tolerance_px : passes end when no bubble moved more in the last. Affine cameras and held
-        constants need one pass.
+    passes : largest number of linearisations; some more are allowed while a sensor's delay changes.
+    robust : whether pixels that do not fit get less weight.
+    covariances : whether the covariances of the states are computed.
+    tolerance_px : the passes end when no bubble moved by more than this in the last one. Affine
+        cameras with constants that are not estimated need only one pass.
     """
 
     passes: int = 6
@@ -55,9 +56,13 @@ class Options:
 
 @dataclass(frozen=True)
 class Covariances:
-    """shake : (F, Ds, Ds) at the frames.  bubbles : (rows, Db, Db).  Constants one each.
+    """Hold the posterior covariances of the states and of the estimated constants.
 
-    cross : (rows, Ds, Db) of the shake with each bubble at the same frame.
+    shake : (F, Ds, Ds) for the F frames, with Ds states of carriage and cameras.
+    bubbles : (rows, Db, Db), one row per bubble and frame, with Db states of a bubble.
+    cross : (rows, Ds, Db) between the shake and each bubble in the same frame.
+    means : (K, 3, 3) for the mean velocities of K bubbles.
+    sensors, encoder, calibration, marks, clocks : for the constants of `State` with the same names.
     """
 
     shake: Array
@@ -73,11 +78,15 @@ class Covariances:
 
 @dataclass(frozen=True)
 class Solution:
-    """The posterior.
+    """Hold the posterior of a smoothing problem.
 
-    weights : of the bubbles' pixels (M,) and of the marks' (R,), 0 for outliers.
-    residuals : whitened, (M, 2) and (R, 2).  log_evidence : exact for linear cameras, else at the
-    last linearisation.  delays_s : (A,) the accelerometers'.
+    graph : layout of the variables.  state : their estimates.
+    covariances : None if they were not asked for.
+    weights : (M,) weights of the bubbles' pixels and (R,) of the marks' pixels; 0 for outliers.
+    residuals : whitened residuals (M, 2) of the bubbles' pixels and (R, 2) of the marks' pixels.
+    log_evidence : natural logarithm of the marginal likelihood; exact for affine cameras, otherwise
+        at the last linearisation.
+    passes : number of linearisations that were made.
     """
 
     graph: GraphLayout
@@ -90,6 +99,7 @@ class Solution:
 
     @property
     def delays_s(self) -> Array:
+        """Delays (A,) of the A accelerometers."""
         delays = self.graph.delays_s
         if self.graph.sensor_flags[1] and len(delays):
             return np.asarray(delays + self.state.clocks[self.graph.clock_of, 0])
@@ -103,7 +113,13 @@ def solve(
     progress: Progress | None = None,
     start: Solution | None = None,
 ) -> Solution:
-    """Smooth. ``start``: a solution of the same measurements under another model.
+    """Return the solution of a smoothing problem.
+
+    model : the hyper-parameters.
+    progress : function that is called with the name of the step and the share (0 to 1) that is
+        done.
+    start : solution of the same measurements under another model, from which the first guess is
+        taken; None to start from the triangulated positions.
 
     Raises CalibrationError when the measurements leave something undetermined.
     """
@@ -289,7 +305,11 @@ class Truncation:
     def update(
         self, weights: tuple[Array, Array], residuals: tuple[Array, Array]
     ) -> tuple[tuple[Array, Array], bool]:
-        """New weights, and whether they have changed."""
+        """Return the new weights, and whether they have changed.
+
+        weights : (M,) and (R,), of the bubbles' and the marks' pixels.
+        residuals : (M, 2) and (R, 2), whitened.
+        """
         squares = [(r**2).sum(-1) for r in residuals]
         largest = max((float(s.max(initial=0.0)) for s in squares), default=0.0)
         bound = _OUTLIER_SIGMAS**2
@@ -318,14 +338,19 @@ def _truncated(squares: Array, bound: float, control: float) -> Array:
 
 
 def delays_have_moved(graph: GraphLayout, state: State) -> bool:
-    """Whether a sensor's delay has moved so far that its samples belong elsewhere."""
+    """Return whether an accelerometer's delay has changed so much that its samples belong to other
+    times.
+    """
     if not (graph.sensor_flags[1] and graph.problem.accelerometers):
         return False
     return bool(np.max(np.abs(state.clocks)) >= _DELAY_STEP_S)
 
 
 def with_moved_nodes(graph: GraphLayout, state: State) -> tuple[GraphLayout, State, bool]:
-    """Move the nodes of sensors whose estimated delay has moved."""
+    """Place the states of accelerometers, whose delay has changed, at the new times.
+
+    Returns the layout, the state, and whether anything was changed.
+    """
     if not delays_have_moved(graph, state):
         return graph, state, False
     leap = np.clip(state.clocks[graph.clock_of, 0], -_DELAY_LEAP_S, _DELAY_LEAP_S)
@@ -338,10 +363,11 @@ def with_moved_nodes(graph: GraphLayout, state: State) -> tuple[GraphLayout, Sta
 
 
 def in_large_stack(task: Callable[[], T]) -> T:
-    """Run in a thread with a large stack: GTSAM's recursion is as deep as the run is long.
+    """Run a task in a thread with a large stack and return its result.
 
-    Python's cycle collector rests meanwhile: it would walk through a million small arrays, none of
-    them in a cycle, again and again, more than linearly in the length of the run.
+    GTSAM's recursion is as deep as the run is long. Python's cycle collector is switched off
+    meanwhile, because it would examine a million small arrays again and again, although none is in
+    a cycle.
     """
     result: list[T] = []
     fault: list[BaseException] = []

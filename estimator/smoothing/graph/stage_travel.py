@@ -24,9 +24,11 @@ _FAR = 3.0
 
 
 def travel_of(calibrated: Mapping[str, Any], described: Any) -> Travel:
-    """As calibrated from `stage_axis/` (calibration.json's ``stage``), else as in rig.toml.
+    """Return what is known about the stage's travel.
 
-    described : `StageDescription` or None, which means upwards in the images.
+    calibrated : the part ``stage`` of calibration.json; it is used if it is not empty.
+    described : the stage in rig.toml; None if it is not described. The axis is then assumed to be
+        upwards in the images.
     """
     if calibrated:
         return Travel(
@@ -56,9 +58,11 @@ def default_scale_sigma(travel: Travel | None) -> float:
 
 
 def wider_scale_sigma(solution: Solution) -> float | None:
-    """The prior's sd for a scale that the run puts far outside an assumed one; None: it stays.
+    """Return a wider prior standard deviation of the encoder's scale, or None if the prior can
+    stay.
 
-    Twice the estimate, which the narrow prior has drawn towards 0.
+    It is wider if the run determines a scale far outside an assumed prior. It is then twice the
+    estimate, because the narrow prior has drawn the estimate towards 0.
     """
     prior, travel = solution.graph.model.encoder_scale_sigma, solution.graph.problem.travel
     assumed = travel is None or travel.source == "assumed"
@@ -69,14 +73,20 @@ def wider_scale_sigma(solution: Solution) -> float | None:
 
 
 def considered_variance(solution: Solution) -> tuple[Array, Array]:
-    """(rows, 3) variances of the bubbles' positions and velocities from scale and axis."""
+    """Return variances of the bubbles that the uncertain encoder scale and travel axis cause.
+
+    Returns (rows, 3) in mm^2 for positions and (rows, 3) in mm^2/s^2 for velocities.
+    """
     at = solution.graph.frame_of_row
     places, speeds = carriage(solution)
     return _variance(solution, places[at]), _variance(solution, speeds[at])
 
 
 def carriage(solution: Solution) -> tuple[Array, Array]:
-    """(F,) position (mm) and velocity (mm/s) along the axis at the frames, scale taken off."""
+    """Return the carriage's position (F,) in mm and velocity (F,) in mm/s along the travel axis.
+
+    The estimated scale error of the encoder is corrected.
+    """
     graph, t = solution.graph, solution.graph.problem.t_s
     readings = graph.shake_at_frames(solution.state.shake) @ graph.shake.position
     position = readings / (1 + solution.state.encoder_scale(graph))
@@ -99,7 +109,10 @@ def scale_sigma(solution: Solution) -> float:
 
 
 def total_scale(solution: Solution) -> float:
-    """(reading - travel) / travel: the calibrated scale and what the run adds to it."""
+    """Return the relative scale error of the encoder, (reading - travel) / travel.
+
+    It includes the calibrated scale and the correction that the run adds.
+    """
     travel = solution.graph.problem.travel
     before = 0.0 if travel is None else travel.scale
     return float((1 + before) * (1 + solution.state.encoder_scale(solution.graph)) - 1)

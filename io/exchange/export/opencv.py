@@ -35,12 +35,14 @@ _POINTS_PER_EDGE = 25
 
 @dataclass(frozen=True)
 class Matrices:
-    """One camera. Pixels = (matrix @ (x, y, z, 1)) divided by its last row; mm in the rig frame.
+    """Hold the matrices of one camera; they map (x, y, z, 1), in mm in the rig frame, to pixels.
 
-    undistorted : (3, 4) exact but for the lens distortion; its misfit is that of leaving it out.
+    A pixel is the first two components of the product divided by the third one.
+    undistorted : (3, 4) exact except for the lens distortion; its misfit is the effect of omitting
+    it.
     affine : (3, 4) the best matrix with last row 0 0 0 1, and its misfit.
-    camera_matrix (3, 3), distortion (12,) : for cv2.undistortPoints with P = camera_matrix, or
-        None where OpenCV's model has no place for this camera's skew or sensor tilt.
+    camera_matrix (3, 3), distortion (12,) : for cv2.undistortPoints with P = camera_matrix; None
+    where OpenCV's model cannot express this camera's skew or sensor tilt.
     """
 
     camera: str

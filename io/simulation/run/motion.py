@@ -121,7 +121,7 @@ class LinearProcess:
 
 
 def square_root(covariance: Array) -> Array:
-    """(n, n) S with S S^T = covariance, which may be singular."""
+    """Return a matrix S (n, n) with S S^T = ``covariance`` (n, n), which may be singular."""
     sigma = np.sqrt(np.diag(covariance))
     unit = np.where(sigma > 0, sigma, 1.0)
     values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
@@ -166,13 +166,17 @@ def rig_mode(rms: float, frequency_hz: float, damping: float, force_hz: float) -
 
 
 def mode_acceleration(states: Array, process: LinearProcess) -> Array:
-    """(..., 4) states of a `rig_mode` -> (...) its acceleration."""
+    """Return the acceleration (...) in mm/s^2 of a `rig_mode` from its states (..., 4)."""
     return np.asarray(states @ process.drift[VELOCITY])
 
 
 @dataclass(frozen=True)
 class Path:
-    """height_mm : (...) along the stage's axis; lateral_mm : (..., 2) across; with velocities."""
+    """Hold places and velocities of bubbles in the laboratory frame.
+
+    height_mm, height_mm_s : (...) along the stage's axis, in mm and mm/s.
+    lateral_mm, lateral_mm_s : (..., 2) perpendicular to it, in mm and mm/s.
+    """
 
     height_mm: Array
     lateral_mm: Array
@@ -219,7 +223,7 @@ def constant_speed_path(
 def constant_speed_rise_mm_s(
     speed_mm_s: float, frequency_hz: float, amplitudes_mm: tuple[float, float]
 ) -> float:
-    """Mean vertical velocity of `constant_speed_path`."""
+    """Return the mean vertical velocity of `constant_speed_path` in mm/s."""
     whole = constant_speed_path([1 / frequency_hz], speed_mm_s, frequency_hz, amplitudes_mm)
     return float(whole.height_mm[0] * frequency_hz)
 
@@ -262,9 +266,10 @@ def stochastic_paths(
 def stage_trajectory(
     t_s: ArrayLike, speed_mm_s: float, ramp_s: float
 ) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration (each as t_s) of a start from rest at t = 0.
+    """Return position (mm), velocity (mm/s) and acceleration (mm/s^2) of a start from rest at 0 s.
 
-    The velocity rises like half a cosine within ramp_s, so the acceleration has no step.
+    t_s : times in s of any shape, which the three results have too. ramp_s : duration in s of the
+    acceleration; the velocity rises like half a cosine, so the acceleration has no step.
     """
     t = np.asarray(t_s, float)
     if ramp_s == 0:
@@ -278,7 +283,10 @@ def stage_trajectory(
 
 @dataclass(frozen=True)
 class Shake:
-    """Offsets of the cameras from the carriage with their derivatives: (cameras, steps, axes)."""
+    """Hold the cameras' offsets from the carriage, and their first and second derivative in time.
+
+    Each array is (cameras, steps, axes), in mm, mm/s and mm/s^2.
+    """
 
     offset_mm: Array
     velocity_mm_s: Array

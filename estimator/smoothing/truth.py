@@ -15,10 +15,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MotionError:
-    """RMS over all axes and rows, where position and velocity are known.
+    """Hold the RMS errors of positions and velocities over all axes and rows in which both are
+    known.
 
-    A constant shift of the positions is a matter of gauge (where the image centres are) and is
-    taken off. predicted_um, predicted_mm_s : what the standard deviations say, NaN without them.
+    A constant shift of all positions is subtracted, because the images cannot determine it.
+
+    predicted_um, predicted_mm_s : RMS of the stated standard deviations; NaN if there are none.
     """
 
     position_um: float
@@ -28,7 +30,12 @@ class MotionError:
 
 
 def motion_error(trajectories: pd.DataFrame, truth: pd.DataFrame, prefix: str = "") -> MotionError:
-    """Errors of ``<prefix>x_mm ...`` against the simulator's bubbles.csv, one bubble per frame."""
+    """Return the errors of smoothed trajectories against the truth of a simulated run.
+
+    trajectories : table of one bubble, as in trajectories.csv.
+    truth : the simulator's bubbles.csv with one bubble per frame.
+    prefix : first part of the names of the columns to compare, "" for the smoothed ones.
+    """
     joined = trajectories.merge(truth, on="frame", suffixes=("", "_true"))
     position = _columns(joined, prefix + "{}_mm") - _columns(joined, "{}_lab_mm")
     velocity = _columns(joined, prefix + "v{}_mm_s") - _columns(joined, "v{}_lab_mm_s")

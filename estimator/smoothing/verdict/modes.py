@@ -36,9 +36,13 @@ class Place(StrEnum):
 
 @dataclass(frozen=True)
 class ShakeMode:
-    """One row.  camera : its name, of an arm or a single view.  rms_mm : (x, y, z).
+    """Describe one vibration of the rig.
 
-    source : "model", or "estimate" of a peak in the spectrum of the estimated offsets.
+    place : what vibrates.
+    camera : name of the camera, if the mode belongs to an arm or to a single view; otherwise "".
+    damping : damping ratio.
+    rms_mm : RMS displacement along x, y and z of the rig frame.
+    source : "model", or "estimate" for a peak in the spectrum of the estimated offsets.
     """
 
     place: Place

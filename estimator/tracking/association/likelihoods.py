@@ -31,10 +31,14 @@ _MAX_NODES = 4000
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairings inside the widest gate: row of a track, column of a measurement, both (E,).
+    """Hold E possible pairings of tracks with measurements, all inside the widest gate.
 
-    innovation_mm : (E, 3) without the common shift; covariance_mm2 : (E, 3, 3) of bubble and
-    measurement; information : its inverse; constant : (E,) the score without the distance.
+    row, column : (E,) index of the track and index of the measurement.
+    innovation_mm : (E, 3) measured minus predicted position, without the shift common to all
+        bubbles.
+    covariance_mm2 : (E, 3, 3) covariance of the innovation.
+    information : (E, 3, 3) inverse of the covariance, in 1/mm^2.
+    constant : (E,) score (log-likelihood ratio) without the part that depends on the distance.
     """
 
     row: Ints
@@ -209,8 +213,12 @@ def alternatives(
 
 @dataclass(frozen=True)
 class Projected:
-    """Points in one camera: pixels (K, 2), their derivatives by the rig point (K, 2, 3), and the
-    pixels' covariance (K, 2, 2) from the points' own."""
+    """Hold K points as projected into one camera.
+
+    uv_px : (K, 2) pixels.
+    by_point : (K, 2, 3) derivatives of the pixels by the point, in px/mm.
+    covariance_px2 : (K, 2, 2) covariances of the pixels that follow from those of the points.
+    """
 
     uv_px: Array
     by_point: Array
@@ -218,13 +226,18 @@ class Projected:
 
 
 def projected(camera: Camera, points_mm: Array, covariance_mm2: Array) -> Projected:
-    """Of rig points (K, 3) with covariances (K, 3, 3)."""
+    """Return K points of the rig frame (K, 3) with covariances (K, 3, 3), projected into a
+    camera.
+    """
     uv, by_point = stacked_jacobian((camera,), points_mm)
     return Projected(uv, by_point, by_point @ covariance_mm2 @ np.swapaxes(by_point, -1, -2))
 
 
 def px_per_mm(by_point: Array) -> Array:
-    """(K,) scale across the line of sight, from derivatives (K, 2, 3) of pixels by the point."""
+    """Return the scale (K,) in px/mm across the line of sight.
+
+    by_point : (K, 2, 3) derivatives of the pixels by the point, in px/mm.
+    """
     return np.asarray(np.linalg.det(by_point @ np.swapaxes(by_point, -1, -2)) ** 0.25)
 
 

@@ -273,9 +273,13 @@ def _maximum_likelihood(
     covariances: list[Array],
     points: Array,
 ) -> tuple[Array, Array]:
-    """Return points (..., 3) and covariances (..., 3, 3) by Gauss-Newton steps from ``points``.
+    """Return the most likely points (..., 3) in mm and their covariances (..., 3, 3) in mm^2.
 
-    The points are processed in blocks that fit into the processor's cache.
+    The points are found by Gauss-Newton steps, in blocks that fit into the processor's cache.
+
+    uv_px : for each camera the measured pixels (..., 2).
+    covariances : for each camera the covariances (..., 2, 2) of its pixels in px^2.
+    points : (..., 3) rig points in mm from which the iteration starts.
     """
     flat = points.reshape(-1, 3).T
     measured = np.concatenate([uv.reshape(-1, 2) for uv in uv_px], -1).T
@@ -300,11 +304,11 @@ def _weights(covariance: Array) -> Array:
 def _gauss_newton(
     cameras: tuple[Camera, ...], measured: Array, weights: Array, points: Array
 ) -> tuple[Array, Array]:
-    """Return N points (3, N) and their covariances (N, 3, 3).
+    """Return the most likely N rig points (3, N) in mm and their covariances (N, 3, 3) in mm^2.
 
-    measured : (2C, N) pixels in C cameras.
-    weights : (C, 3, N) as `_weights` gives them.
-    points : (3, N) where the iteration starts.
+    measured : (2C, N) measured pixels in C cameras: u and v of the first camera, then of the next.
+    weights : (C, 3, N) in 1/px^2, for each camera as `_weights` returns them.
+    points : (3, N) rig points in mm from which the iteration starts.
     """
     points = np.ascontiguousarray(points)
     inverse = np.empty((6, points.shape[1]))

@@ -155,9 +155,10 @@ def tangent_basis(normal: Array) -> Array:
 
 
 def affine_map(wall: Wall) -> tuple[Array, Array]:
-    """Return the map from a point in water to telecentric coordinates for kappa = 0.
+    """Return the affine map from a point in water to its telecentric coordinates for kappa = 0.
 
-    Returns the matrix (2, 3) and the offset (2,) in mm.
+    Returns the matrix (2, 3) and the offset (2,) in mm: coordinates = matrix @ point + offset, with
+    the point in the camera's frame in mm.
     """
     tangential = _tangential_of_axis(wall)
     glass, water = (_sideways(m, 1 - wall.normal[2] ** 2) for m in wall.ratios)
@@ -169,11 +170,17 @@ def affine_map(wall: Wall) -> tuple[Array, Array]:
 
 
 def ideal_from_water(points_mm: Array, kappa: float, wall: Wall) -> Array:
-    """Return the telecentric coordinates (..., 2) of points (..., 3) in water, in the camera's
-    frame.
+    """Return the telecentric coordinates (..., 2) in mm of points in water.
 
-    These coordinates are where the point's ray in air crosses depth 0. Raises GeometryError for
-    points that no ray of the camera reaches.
+    They are the x and y at which the point's ray in air, prolonged without refraction if need be,
+    crosses depth 0. Depth 0 is the plane z = 0 of the camera's frame, through the camera's origin
+    and perpendicular to its axis.
+
+    points_mm : (..., 3) in the camera's frame, in mm.
+    kappa : residual perspective in 1/mm.
+    wall : the window between camera and water, in the camera's frame.
+
+    Raises GeometryError for points that no ray of the camera reaches.
     """
     matrix, offset = affine_map(wall)
     ideal = points_mm @ matrix.T + offset
@@ -337,13 +344,23 @@ def _wall_jacobian(rays: _Rays, points: Array, wall: Wall) -> Array:
 
 
 def _start(points: Array, kappa: float, wall: Wall) -> Array:
-    """Return telecentric coordinates from which Newton's method of `ideal_from_water` converges.
+    """Return telecentric coordinates (..., 2) in mm from which `ideal_from_water` converges.
 
-    The rays are found in the plane through the perspective centre, the point and the normal. Let q
-    be the tangent of the angle of incidence. Then kappa times the point's distance from the normal
-    through the perspective centre is D q + kappa (thickness tan(angle in glass) + h tan(angle in
-    water)), with D = n_z + kappa near. This function of q increases, and it is concave (kappa > 0)
-    or convex (kappa < 0), so Newton's method from q = 0 always converges.
+    points : (..., 3) in mm, in water, in the camera's frame.
+    kappa : residual perspective in 1/mm, not 0.
+
+    Each ray lies in the plane through the perspective centre, the point and the window's normal n.
+    Let q be the tangent of the angle between the ray in air and n, t the thickness of the glass, h
+    the height of the point above the far face of the window, and r the distance of the point from
+    the line along n through the perspective centre (all in mm). Then
+
+        kappa r = D q + kappa (t tan(angle in the glass) + h tan(angle in the water)),
+
+    with D = n_z + kappa wall.near_mm, where n_z is the z component of n. D / kappa is the distance
+    of the perspective centre from the near face, along n. The right side increases with q, and it
+    is concave (kappa > 0) or convex (kappa < 0), so Newton's method from q = 0 always converges.
+
+    Raises GeometryError for points that no ray of the camera reaches.
     """
     normal = wall.normal
     depth = normal[2] + kappa * wall.near_mm

@@ -52,7 +52,8 @@ def export(
     first_pixel: Annotated[
         float,
         typer.Option(
-            help="For soloff: coordinate of the centre of the first pixel; MATLAB counts from 1."
+            help="For soloff: u and v that the other program gives the centre of the top-left "
+            "pixel: 0 if it counts pixels from 0, as telerig does, 1 for MATLAB."
         ),
     ] = 0.0,
 ) -> None:

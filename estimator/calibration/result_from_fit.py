@@ -334,9 +334,9 @@ def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
     reasons = []
     if statistics["noise_floor_px"] > BAD_SCATTER_PX:
         reasons.append(
-            f"the model {fit.model!r} does not describe these images: the dots scatter by "
-            f"{statistics['scatter_px']:.2g} px round it, their own image noise is "
-            f"{statistics['image_noise_px']:.2g} px" + _kappa_hint(fit)
+            f"the model {fit.model!r} does not describe these images: the dots deviate from it by "
+            f"{statistics['scatter_px']:.2g} px (standard deviation of u and of v), but the noise "
+            f"of the images explains only {statistics['image_noise_px']:.2g} px" + _kappa_hint(fit)
         )
     if statistics["share_kept"] < BAD_KEPT:
         reasons.append(
@@ -351,9 +351,11 @@ def _verdict(fit: Fit, statistics: dict[str, Any]) -> dict[str, Any]:
         reasons.append(f"chi-square per degree of freedom is {chi2:.2f}, not 1")
     if statistics["noise_floor_px"] > BAD_FLOOR * statistics["image_noise_px"]:
         reasons.append(
-            f"the dots scatter by {statistics['scatter_px']:.2g} px round the model {fit.model!r}, "
-            f"their own image noise is {statistics['image_noise_px']:.2g} px: what is left is "
-            "systematic, and errors in space may exceed their stated standard deviations"
+            f"the dots deviate from the model {fit.model!r} by {statistics['scatter_px']:.2g} px "
+            "(standard deviation of u and of v), but the noise of the images explains only "
+            f"{statistics['image_noise_px']:.2g} px: the rest is systematic, so errors in space "
+            "may exceed their stated standard deviations; look for a pattern in residuals.csv, "
+            "and try --model auto"
         )
     reasons += [note.words for note in fit.notes if note.affects_verdict]
     reasons += odd_views(fit.robust.problem)

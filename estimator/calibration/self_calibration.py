@@ -165,7 +165,11 @@ def _trust(
 
 
 def dots_unknown(problem: Problem) -> bool:
-    """True when the nominal places are too vague to start from: a tenth of the spacing."""
+    """Return whether the dots' nominal positions are too inexact to start the calibration from.
+
+    They are if their stated standard deviation, ``print_sigma_mm`` of the target, is more than a
+    tenth of the dots' mean spacing. The positions are then estimated from the views.
+    """
     spread = np.ptp(problem.nominal_mm[:, :2], axis=0).max()
     spacing = spread / max(1.0, np.sqrt(len(problem.dot_ids)))
     return bool(problem.target.print_sigma_mm > 0.1 * spacing)

@@ -132,7 +132,7 @@ class WatchedFolder:
         return found
 
     def _views(self, dataset: Dataset) -> tuple[View, ...]:
-        """Of the images detected so far."""
+        """Return the views with those of their images whose dots have been detected so far."""
         views = (
             View(v.name, {c: p for c, p in v.image_paths.items() if p in self._found})
             for v in dataset.views
@@ -140,7 +140,7 @@ class WatchedFolder:
         return tuple(v for v in views if v.image_paths)
 
     def images(self) -> list[ImageDots]:
-        """Detections in the order of views and cameras."""
+        """Return the detected dots of each image, in the order of the views and cameras."""
         if self.dataset is None:
             return []
         return [self._found[p][1] for v in self.dataset.views for p in v.image_paths.values()]
@@ -160,7 +160,7 @@ class WatchedFolder:
         return frozenset((p, s) for p, (s, i) in self._found.items() if i.view in complete)
 
     def detected(self) -> DatasetDots:
-        """The dots of all images of all cameras that have arrived, in one table.
+        """Return the dots of all images that have arrived, of all cameras, in one table.
 
         Raises CalibrationError when no image has arrived, DetectionError when none shows the
         target.

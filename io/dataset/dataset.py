@@ -120,7 +120,8 @@ class Dataset:
             raise InputError(
                 f"camera {name} has no image of view {view.name}",
                 where=str(self.path / "calibration" / name),
-                todo="add the image, or go by view.image_paths",
+                todo="add the image, or ask only for cameras in view.image_paths, which holds the "
+                "image files of the view by camera",
             )
         size = self.rig.cameras[name].image_size_px
         return read_image(view.image_paths[name], expected_size_px=size)

@@ -141,10 +141,14 @@ def _check_schema(raw: dict[str, Any], where: str) -> None:
     if schema is None:
         raise InputError("is missing", where=place, todo=f"begin the file with schema = {SCHEMA}")
     if not isinstance(schema, int) or isinstance(schema, bool) or schema < 1:
-        raise InputError(f"is {schema!r}", where=place, todo=f"write schema = {SCHEMA}")
+        raise InputError(
+            f"is {schema!r}; the version of the file format must be a whole number, at least 1",
+            where=place,
+            todo=f"write schema = {SCHEMA}; the other lines may stay as they are",
+        )
     if schema > SCHEMA:
         raise InputError(
-            f"is {schema}, newer than the {SCHEMA} that this telerig reads",
+            f"is {schema}; this telerig reads the file format up to version {SCHEMA}",
             where=place,
             todo="install a newer telerig",
         )

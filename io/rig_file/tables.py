@@ -37,10 +37,13 @@ class Problem:
 
 
 class Problems(list[Problem]):
-    """All that is wrong with a file."""
+    """Collects all faults of a file, so that one error can report them together.
+
+    It raises nothing itself: the function that reads the whole file raises the error at its end.
+    """
 
     def add(self, table: str, key: str, what: str, todo: str, *involved: str) -> None:
-        """Arguments as the fields of `Problem`."""
+        """Append a `Problem` with these fields."""
         self.append(Problem(table, key, what, todo, involved))
 
 

@@ -142,7 +142,10 @@ def measured_dots(
     cameras: Mapping[str, Camera],
     rng: np.random.Generator,
 ) -> pd.DataFrame:
-    """The dots that lie wholly inside, with noise and outliers."""
+    """Return the rows of ``exact`` whose dot lies wholly inside the image, with noise and outliers.
+
+    exact : table of the true pixels of all dots; its column inside is 1 or 0.
+    """
     dots = exact[exact["inside"] == 1].drop(columns="inside").reset_index(drop=True)
     uv = dots[["u_px", "v_px"]].to_numpy()
     size = np.array([cameras[name].image_size_px for name in dots["camera"]])
@@ -162,7 +165,10 @@ def write_images(
     folder: Path,
     rng: np.random.Generator,
 ) -> None:
-    """``folder/<camera>/<view>.tif`` of every view."""
+    """Render and write a TIFF image ``folder/<camera>/<view>.tif`` for each camera of each view.
+
+    Missing folders are made. rng : draws the light and the noise of the images.
+    """
     import tifffile
 
     for view in views:
@@ -180,7 +186,7 @@ def view_image(
     rig_from_target: Pose,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """(height, width) one image of the target with random light and noise."""
+    """Return one image (height, width) of the target, with random light and noise."""
     angle = rng.uniform(0, 2 * np.pi)
     gain = np.exp(config.exposure_spread * rng.standard_normal())
     place = rng.uniform(0, 1, 2) * camera.image_size_px

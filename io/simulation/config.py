@@ -111,7 +111,7 @@ class SimulationConfig:
     dirt_diameter_mm: Range = (0.1, 0.5)
 
     def __post_init__(self) -> None:
-        """Raises InputError for values that no simulation can have."""
+        """Check the fields. Raises InputError if a value is outside its range."""
         low, high = self.tilt_deg
         faults = {
             "views": (self.views < 1, "at least 1"),

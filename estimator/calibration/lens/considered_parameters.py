@@ -31,19 +31,23 @@ if TYPE_CHECKING:
 Lens = frozenset[str]
 
 CONSIDERED_P_VALUE = 0.01
-"""A group is considered if the p-value of its gain is below this, although freeing it is not worth
-its penalty."""
+"""A group is considered if the improvement of the fit when it is freed has a p-value below this,
+even if the improvement is too small to free the group in the model."""
 UNDAMPED = 1e-12
 
 
 def considered_groups(choice: Choice | None, cameras: int) -> tuple[Lens, ...]:
-    """Return for each camera the groups that are held at nominal but considered in the covariance.
+    """Return for each camera the considered groups of lens parameters (names as in `GROUPS`).
 
-    A group is considered if another camera of the rig needs it (the lenses are of the same kind, so
-    here it is probably small but not zero), or if its gain is unlikely to be chance. A group that
-    the views do not determine is not considered, because its weak prior would then dominate.
+    A considered group is held at its nominal value in the fit, but the covariance of the result
+    includes its uncertainty. A group that the lens model of a camera does not free is considered if
+    the model of another camera frees it (the lenses are of the same kind, so its value is probably
+    small but not zero here), or if the improvement of the fit when it is freed is unlikely to be
+    chance (p-value below `CONSIDERED_P_VALUE`). A group that the views do not determine is not
+    considered, because its weak prior would then dominate the covariance.
 
-    choice : the model choice; None if no choice was made.
+    choice : the steps by which the lens models were chosen; None if they were not chosen
+        automatically. No group is then considered.
     cameras : number of cameras.
     """
     out: list[set[str]] = [set() for _ in range(cameras)]

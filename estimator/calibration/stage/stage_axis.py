@@ -255,7 +255,9 @@ def _readings(positions_mm: Mapping[str, float] | pd.DataFrame) -> dict[str, flo
     bad = [view for view, position in out.items() if not np.isfinite(position)]
     if bad:
         raise InputError(
-            f"the position of view {bad[0]!r} is not finite", where=FOLDER, todo="leave it out"
+            f"the encoder position of view {bad[0]!r} is missing or not a finite number",
+            where=FOLDER,
+            todo=f"give its position in mm, or remove the view from {_POSITIONS}",
         )
     return out
 

@@ -43,7 +43,10 @@ class ImageMap:
 
 
 def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageMap]:
-    """The map of every image that has at least four dots, keyed by (view, camera)."""
+    """Return the map of each image that has at least four dots, by (view, camera).
+
+    dots_mm : (N, 3) or (N, 2) positions of the dots in the target's frame.
+    """
     out = {}
     for v in range(len(problem.views)):
         for c, camera in enumerate(problem.cameras):
@@ -79,7 +82,12 @@ def _image_map(xy_mm: Array, uv_px: Array) -> ImageMap:
 
 
 def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
-    """(2, 2) map -> (3, 3) camera_from_target up to its mirror image, and the scale in px/mm."""
+    """Return the rotation camera_from_target (3, 3) and the scale in px/mm from an image's map.
+
+    jacobian : (2, 2) in px/mm, derivative of the pixel with respect to the target's x and y.
+
+    The rotation is one of two: its mirror image (see `mirrored`) gives the same map.
+    """
     _, singular, vt = np.linalg.svd(jacobian)
     top = jacobian / singular[0]
     sine = np.sqrt(max(0.0, 1 - (singular[1] / singular[0]) ** 2))
@@ -91,12 +99,18 @@ def rotation_from_jacobian(jacobian: Array) -> tuple[Array, float]:
 
 
 def mirrored(rotation: Array) -> Array:
-    """(..., 3, 3) D R D: the rotation in the mirrored solution."""
+    """Return the rotations (..., 3, 3) in the mirror image of the scene.
+
+    The mirror reverses the depth z of every camera's frame: R becomes D R D with
+    D = diag(1, 1, -1). A telecentric camera gives the same image of both.
+
+    rotation : (..., 3, 3) camera_from_target, or the rotation between two cameras.
+    """
     return rotation * _MIRROR
 
 
 def angle_between(a: Array, b: Array) -> Array:
-    """(...,) angle of a^T b in radians."""
+    """Return the angles (...) in rad between rotations a and b (..., 3, 3)."""
     chord = np.linalg.norm(a - b, axis=(-2, -1)) / np.sqrt(8)
     return np.asarray(2 * np.arcsin(np.minimum(1.0, chord)))
 

@@ -102,11 +102,13 @@ def consistent_start(
         ] or list(range(1, len(problem.cameras)))
         names = " and ".join(repr(problem.cameras[c].name) for c in unsure)
         raise CalibrationError(
-            f"{len(different)} rigs fit these views alike, mirror images of each other in camera "
-            f"{names}: no view is seen by three cameras at once",
+            f"{len(different)} rigs fit these views equally well; they are mirror images of each "
+            f"other in camera {names}, because at most two cameras see each view",
             where="rig.toml [stereo]",
-            todo=f"add {_lines(problem, unsure)}, 20 degrees is near enough; or add views that "
-            "three cameras see at once",
+            todo=f"add {_lines(problem, unsure)}, with your own angles (x, y, z of the rotation "
+            "vector from the first camera's frame to this camera's; an error of up to 20 degrees "
+            "is allowed), or add views in which any three of the cameras see the target at the "
+            "same time",
         )
     return states[different[int(order[0])]]
 

@@ -155,10 +155,11 @@ def _numbered_alike_in_pair(
     close = np.flatnonzero(ranked[:, 1] - ranked[:, 0] < np.radians(TIE_DEG) / 5)
     if len(close):
         raise CalibrationError(
-            "two numberings of the symmetric target explain "
-            f"{_names(problem, pair)} alike in view "
-            f"{problem.views[both[int(close[0])]]!r}",
-            todo="put marks on the target, or leave this view out",
+            "the target has no orientation marks and looks the same after a turn, and in view "
+            f"{problem.views[both[int(close[0])]]!r} two ways to number its dots fit the images "
+            f"of {_names(problem, pair)} equally well",
+            todo="leave this view out, or use a target with orientation marks (marks in rig.toml "
+            "[target])",
         )
     # image v of the second camera agrees once turned by spin k: its ids follow the turn back
     choice = {(v, second): labels[-int(k)] for v, k in zip(both, angles.argmin(1))}

@@ -95,9 +95,9 @@ def _metric(maps: list[Array]) -> Array:
     """(2, 2) C = Q Q^T from the maps of one camera, the first where it has views enough."""
     if len(maps) < LEAST_VIEWS:
         raise CalibrationError(
-            f"no camera has more than {len(maps)} usable views; unknown dots need at least "
-            f"{LEAST_VIEWS}",
-            todo="add views at other tilts",
+            f"no camera has more than {len(maps)} usable views; a target whose dot positions are "
+            f"unknown needs at least {LEAST_VIEWS}",
+            todo="add views with the plate tilted by other angles and about other axes",
         )
     size = np.mean([np.linalg.norm(m) for m in maps])
     rows = []
@@ -110,8 +110,11 @@ def _metric(maps: list[Array]) -> Array:
     metric = np.array([[c11, c12], [c12, c22]])
     if rank < 4 or singular[-1] < 1e-6 * singular[0] or np.linalg.eigvalsh(metric)[0] <= 0:
         raise CalibrationError(
-            "these views do not determine the shape of the target (its metric is not positive)",
-            todo="add views at other tilts and directions, or give the nominal dot positions",
+            "these views do not determine the distances and angles between the target's dots, "
+            "which are unknown before the calibration",
+            todo="add views with the plate tilted by other angles and about other axes, or give "
+            "the dots' nominal positions with a print_sigma_mm of less than a tenth of their "
+            "spacing in rig.toml [target]",
         )
     return metric
 

@@ -70,7 +70,8 @@ def prior_of(name: str) -> Prior:
         if fnmatch(name, pattern):
             return prior
     raise InputError(
-        f"{name!r} is no hyper-parameter that is learned", todo=f"use one of {', '.join(PRIORS)}"
+        f"{name!r} is not a hyper-parameter that can be learned",
+        todo=f"use one of {', '.join(PRIORS)}, where * is the number of the process from 0",
     )
 
 
@@ -83,7 +84,10 @@ def value_of(model: ShakeModel, name: str) -> float:
         for part in name.split("."):
             found = found[int(part)] if part.isdigit() else getattr(found, part)
     except (AttributeError, IndexError, TypeError) as error:
-        raise InputError(f"the model has no {name!r}", todo="see names_of(model)") from error
+        raise InputError(
+            f"the model has no hyper-parameter {name!r}",
+            todo="use one of the names that names_of(model) returns",
+        ) from error
     return float(max(found)) if isinstance(found, tuple) else float(found)
 
 

@@ -26,7 +26,7 @@ from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "g": STANDARD_GRAVITY_M_S2,
          "mg": 1e-3 * STANDARD_GRAVITY_M_S2}  # fmt: skip
-_EXPORT_AGAIN = "export the recording again, or give another file"
+_EXPORT_AGAIN = "export the recording again from the program that made it, or give another file"
 COLUMNS = ["t_s", "sensor", "ax_m_s2", "ay_m_s2", "az_m_s2"]
 
 
@@ -282,7 +282,9 @@ def _csv(path: Path) -> Recording:
             )
         rows.append(cells[1])
     if len(set(header)) != len(header):
-        raise InputError("two columns have the same name", where=str(path), todo="rename one")
+        raise InputError(
+            "two columns have the same name", where=str(path), todo="rename one of them"
+        )
     return Recording(str(path), dict(zip(header, np.array(rows).T)))
 
 
@@ -328,7 +330,9 @@ def _mat(path: Path) -> Recording:
         content = loadmat(path, squeeze_me=True)
     except NotImplementedError as error:
         raise InputError(
-            "is a MATLAB 7.3 file", where=str(path), todo="save it with -v7"
+            "is a MATLAB 7.3 file, which cannot be read",
+            where=str(path),
+            todo="in MATLAB, save it with the option -v7",
         ) from error
     except (ValueError, OSError, TypeError, MatReadError) as error:
         raise InputError(

@@ -117,9 +117,10 @@ def _one(
     if default is not None:
         return default
     raise InputError(
-        f"has none of {', '.join(wanted)}",
+        f"has no matrix with one of the names {', '.join(wanted)}",
         where=where,
-        todo=f"rename the matrix, or add the file that has it; there are: {', '.join(content)}",
+        todo="give this matrix one of these names, or give also the file that holds it; the names "
+        f"found are: {', '.join(content)}",
     )
 
 
@@ -131,7 +132,8 @@ def _size(content: dict[str, Array], where: str) -> tuple[int, int]:
     if {"image_width", "image_height"} <= set(content):
         return int(content["image_width"]), int(content["image_height"])
     raise InputError(
-        "does not tell the image size",
+        "does not say how large the images are",
         where=where,
-        todo="give image_size_px=(width, height), on the command line --image-size",
+        todo="give the width and height in px: image_size_px=(width, height) in Python, "
+        "--image-size on the command line",
     )

@@ -73,8 +73,8 @@ def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> 
     """
     if len(names) != len(pinholes) or len(set(names)) != len(names):
         raise InputError(
-            f"{len(pinholes)} cameras with the names {list(names)}",
-            todo="give as many names as cameras, all different",
+            f"the files hold {len(pinholes)} cameras, but the names are {list(names)}",
+            todo=f"give {len(pinholes)} names, one for each camera, all different",
         )
     mirror = np.diag([1.0, 1.0, -1.0 if pinholes[0].mirrored else 1.0])
     for one in pinholes:

@@ -48,7 +48,10 @@ def nominal_rotation(config: SimulationConfig, camera: int = 1) -> Array:
 
 
 def true_cameras(config: SimulationConfig) -> Mapping[str, Camera]:
-    """The cameras by name; the rig's origin is where the first two optical axes come closest.
+    """Return the true cameras of the simulated rig, by name.
+
+    The rig's origin is where the optical axes of the first two cameras come closest. A single
+    camera is the rig frame itself, so its optical axis passes through the origin.
 
     Raises InputError unless there are one to four cameras of different names.
     """
@@ -148,13 +151,17 @@ def hand_held_views(
     target: TrueTarget,
     rng: np.random.Generator,
 ) -> list[View]:
-    """Random poses by rejection. Raises InputError when no pose meets the demands."""
+    """Return views whose random poses of the target meet the demands of ``config``.
+
+    Raises InputError if no pose is found that meets them.
+    """
     names = tuple(cameras)
     groups = config.seen_by or (names,)
     unknown = sorted({name for group in groups for name in group} - set(names))
     if unknown:
         raise InputError(
-            f"seen_by names {', '.join(unknown)}", todo=f"the cameras are {', '.join(names)}"
+            f"seen_by names {', '.join(unknown)}, which the simulated rig does not have",
+            todo=f"use names of its cameras: {', '.join(names)}",
         )
     digits = len(str(config.views - 1))
     views = []
@@ -170,7 +177,11 @@ def hand_held_views(
 def _plate_normals(
     config: SimulationConfig, cameras: list[Camera], rng: np.random.Generator
 ) -> Array:
-    """(N, 3) directions of the target's z in the rig, spread evenly over the tilts allowed."""
+    """Return N allowed directions (N, 3) of the target's z axis in the rig frame.
+
+    They are spread evenly over the directions whose angle to the optical axis of each camera is
+    within ``tilt_deg`` of ``config``. Raises InputError if there are hardly any.
+    """
     directions = rng.standard_normal((_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     axes = np.array([camera.camera_from_rig.rotation[2] for camera in cameras])
@@ -181,10 +192,13 @@ def _plate_normals(
     allowed = directions[np.all((cosine >= low) & (cosine <= high), 1)]
     if len(allowed) < 3:
         raise InputError(
-            f"no plate can be tilted by {config.tilt_deg[0]:g} to {config.tilt_deg[1]:g} deg "
-            f"towards every camera when they stand {config.angle_deg:g} deg apart",
-            todo="widen tilt_deg (for opaque plates the tilts add up to the angle), "
-            "choose an angle of 20 to 110 deg, or a two-sided target",
+            "no plate can stand so that its normal is between "
+            f"{config.tilt_deg[0]:g} and {config.tilt_deg[1]:g} deg (tilt_deg) from the optical "
+            f"axis of every camera: neighbouring cameras stand {config.angle_deg:g} deg "
+            "(angle_deg) apart",
+            todo="widen tilt_deg (the tilts towards two cameras that see the same side of the "
+            "plate add up to at least the angle between these cameras), choose angle_deg between "
+            "20 and 110 deg, or simulate a two-sided target",
         )
     return allowed
 

@@ -180,7 +180,7 @@ def test_what_cannot_be_used() -> None:
     twice = pd.DataFrame({"view": ["v1", "v1"], "position_mm": [0.0, 1.0]})
     with pytest.raises(InputError, match="two positions"):
         stage_axis_of(CALIBRATION, table, twice)
-    with pytest.raises(InputError, match="not finite"):
+    with pytest.raises(InputError, match="not a finite number"):
         stage_axis_of(CALIBRATION, table, positions | {"v2": np.nan})
     extra = pd.concat([table, table.iloc[:4].assign(dot=77)])
     assert "4 dots are not in the calibration and are not used" in (

@@ -151,7 +151,7 @@ def test_default_run_is_the_only_one(place: Path, to: str) -> None:
         ("telerig export data --to halcon --volume 1,2", "six numbers"),
         ("telerig export data --to halcon --volume 90,95,0,1,0,1", "inside the images"),
         ("telerig export data/runs/rise --to soloff", "neither a dataset nor a folder of results"),
-        ("telerig import opencv extrinsics.yml --out x", "has none of M1"),
+        ("telerig import opencv extrinsics.yml --out x", "no matrix with one of the names M1"),
         ("telerig import openptv cam1.tif.ori --out x", "sensor is not known"),
         ("telerig import openptv cam1.tif.ori --image-size 3 --pixel-mm 1,1 --out x", "two num"),
         ("telerig import accelerometer arm.wav --run data/runs/rise --sensor a", "the unit"),

@@ -83,7 +83,7 @@ def test_opencv_one_file_for_each_camera_units_and_rotation_vector(tmp_path: Pat
 
 def test_opencv_says_what_is_missing(tmp_path: Path) -> None:
     both = {"M1": MATRICES[0], "M2": MATRICES[1], "T": TRANSLATION}
-    with pytest.raises(InputError, match="has none of R, rotation_matrix"):
+    with pytest.raises(InputError, match="no matrix with one of the names R, rotation_matrix"):
         read_opencv_cameras([write(tmp_path / "a.yml", **both)])
     path = write(tmp_path / "b.yml", **both, R=ROTATION)
     with pytest.raises(InputError, match="image size"):

@@ -240,7 +240,12 @@ def residual_rows(results: SmoothingResults) -> list[Row]:
 
 
 def unseen_words(results: SmoothingResults) -> list[str]:
-    """A sentence per camera on the axes that are left out."""
+    """Return a sentence for each camera that does not see its own shake along some rig axes.
+
+    These are the axes along which the camera looks. The sentence names them, and says that the
+    figures and the verdict leave out the camera's shake along them. A camera that sees its shake
+    along all axes has no sentence.
+    """
     words = []
     for camera in results.cameras:
         left_out = results.unseen(camera)

@@ -255,8 +255,8 @@ def _clock_words(device: dict[str, Any]) -> Iterator[str]:
     if device["half_question_to_answer_ms"]:
         half = device["half_question_to_answer_ms"]
         yield (
-            f"its times are known to ±{half:.2g} ms, half the time between the request to the "
-            "device and its answer"
+            "the time of each reading is the middle between the request to the device and its "
+            f"answer, so it is off by at most half of the time between them, {half:.2g} ms (median)"
         )
 
 

@@ -132,7 +132,7 @@ def _size(content: dict[str, Array], where: str) -> tuple[int, int]:
     if {"image_width", "image_height"} <= set(content):
         return int(content["image_width"]), int(content["image_height"])
     raise InputError(
-        "does not say how large the images are",
+        "does not state the image size",
         where=where,
         todo="give the width and height in px: image_size_px=(width, height) in Python, "
         "--image-size on the command line",

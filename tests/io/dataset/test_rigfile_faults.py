@@ -68,7 +68,7 @@ BAD = [
      "telecentricity_per_mm is not 0", "add distance_mm"),
     ("[1.0, 1.52, 1.333]", "[0.5, 1.52, 1.333]", "[walls.left] indices", "item [0] is 0.5", "1 or"),
     ("schema = 1", "", "rig.toml schema", "is missing", "schema = 1"),
-    ("schema = 1", "schema = 2", "rig.toml schema", "newer than the 1", "install a newer telerig"),
+    ("schema = 1", "schema = 2", "rig.toml schema", "up to version 1", "install a newer telerig"),
     ("schema = 1", 'schema = "1"', "rig.toml schema", "is '1'", "write schema = 1"),
     ('name = "tank 2"', "name = tank", "rig.toml", "not valid TOML", "line 3"),
     ('name = "tank 2"', "name = 2", "name", "is 2", "must be text"),

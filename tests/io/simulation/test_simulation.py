@@ -286,7 +286,7 @@ def test_refusals(tmp_path):
         preset("papr")
     with pytest.raises(InputError, match="no setting"):
         preset("paper", angel_deg=3)
-    with pytest.raises(InputError, match="no plate can be tilted"):
+    with pytest.raises(InputError, match="no plate can stand"):
         simulate(preset("paper", angle_deg=150.0), rng=np.random.default_rng(0), out=tmp_path / "a")
     with pytest.raises(InputError, match="no pose"):
         simulate(preset("paper", border_px=150.0), rng=np.random.default_rng(0), out=tmp_path / "b")

@@ -46,7 +46,9 @@ def entered(work: Callable[[], object]) -> set[str]:
         work()
     finally:
         sys.setprofile(None)
-    return {f for f in found if ("/telerig/" in f or f.startswith(str(ROOT))) and "benchmarks" not in f}
+    return {
+        f for f in found if ("/telerig/" in f or f.startswith(str(ROOT))) and "benchmarks" not in f
+    }
 
 
 def files_entered() -> dict[str, set[str]]:

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.system import System
-from telerig.factors.projection import State
+from telerig.factors.projection import State, whitened_error
 from telerig.rig.pose import hat, rotation_from_rotvec
 
 Array = NDArray[np.float64]
@@ -65,7 +65,8 @@ class Flat:
 
     def residuals(self, x: Array) -> Array:
         state, system = self.state(x), self.system
-        images = [system.error(state, c).T.ravel() for c in range(2)]
+        rho_mm = system.problem.rho_mm
+        images = [whitened_error(state, obs, rho_mm).ravel() for obs in system.images]
         priors = system.priors(state)
         assert priors.distance is not None
         own = [value for value, _ in priors.cameras]

@@ -141,13 +141,6 @@ def _pixels(state: State, obs: Observations, camera: int, rho_mm: float) -> Arra
     return projection.pixel_from_camera(points, state.intrinsics[camera], rho_mm, obs.wall(camera))
 
 
-def whitened_image_error(state: State, obs: Observations, camera: int, rho_mm: float) -> Array:
-    """Return the whitened residuals (2, M) of one camera's dots, one row per component."""
-    u, v = (_pixels(state, obs, camera, rho_mm) - obs.uv_px).T
-    white = obs.whitener.transpose(1, 2, 0)
-    return np.asarray(white[:, 0] * u + white[:, 1] * v)
-
-
 def image_columns(
     state: State, obs: Observations, camera: int, rho_mm: float, free: Sequence[int]
 ) -> Array:

@@ -1,4 +1,4 @@
-"""Read text files in UTF-8, with or without a byte order mark."""
+"""Read whole files: bytes, and text in UTF-8 with or without a byte order mark."""
 
 from __future__ import annotations
 
@@ -7,23 +7,38 @@ from pathlib import Path
 from telerig.errors import InputError
 
 
-def read_text(file: Path, todo: str = "check the path and the file") -> str:
-    """Read a UTF-8 text file and return its text, in which lines end with a line feed.
+def read_bytes(file: Path, missing: str = "check the path") -> bytes:
+    """Read a whole file.
 
-    todo : the advice for a file that exists but is not UTF-8 text.
+    missing : the advice for a file that does not exist.
     Raises InputError when the file cannot be read.
     """
     try:
-        return file.read_text(encoding="utf-8-sig")
+        return file.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError("does not exist", where=str(file), todo=missing) from error
     except OSError as error:
         raise InputError(
             f"cannot be read: {error.strerror}",
             where=str(file),
-            todo="check the path and its permissions",
+            todo="check that it is a file and its permissions",
         ) from error
+
+
+def read_text(
+    file: Path, todo: str = "save it as UTF-8 in your editor", missing: str = "check the path"
+) -> str:
+    """Read a UTF-8 text file and return its text, in which lines end with a line feed.
+
+    todo : the advice for a file that is not UTF-8 text.  missing : as in `read_bytes`.
+    Raises InputError when the file cannot be read.
+    """
+    try:
+        text = read_bytes(file, missing).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"is not UTF-8 text: {error.reason} at byte {error.start}",
             where=str(file),
             todo=todo,
         ) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")

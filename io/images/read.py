@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Float32
 from telerig.errors import InputError
+from telerig.io.files.text import read_bytes
 
 Image = NDArray[np.uint8] | NDArray[np.uint16] | Float32
 
@@ -42,14 +43,7 @@ def read_image(
     several pages, colour or values that are not finite, or has another size.
     """
     file = Path(path)
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror}",
-            where=str(file),
-            todo="check the path and its permissions",
-        ) from error
+    data = read_bytes(file)
     if not data:
         raise InputError("is empty (0 bytes)", where=str(file), todo=_COPY)
     image = image_from_pixels(_decoder(data, file)(data, file), file)

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.files.atomic import write_text_atomic
+from telerig.io.files.text import read_text
 from telerig.io.rig_file.description import (
     CARRIAGE,
     MOST_CAMERAS,
@@ -77,7 +78,8 @@ def read_rig_toml(path: str | PathLike[str]) -> RigDescription:
     Raises one InputError that lists every fault with its table, its key and what to do.
     """
     file = Path(path)
-    return description_from_toml(_text(file), where=str(file), name=file.resolve().parent.name)
+    text = read_text(file, missing="write one with `telerig init`")
+    return description_from_toml(text, where=str(file), name=file.resolve().parent.name)
 
 
 def write_rig_toml(rig: RigDescription, path: str | PathLike[str]) -> None:
@@ -112,27 +114,6 @@ def description_from_toml(text: str, *, where: str, name: str = "rig") -> RigDes
     if problems or rig is None:
         raise _as_error(problems, where)
     return rig
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(
-            "does not exist", where=str(file), todo="write one with `telerig init`"
-        ) from error
-    except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror}",
-            where=str(file),
-            todo="check that it is a file and its permissions",
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"is not UTF-8 text (byte {error.start})",
-            where=str(file),
-            todo="save it as UTF-8 in your editor",
-        ) from error
 
 
 def _check_schema(raw: dict[str, Any], where: str) -> None:

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
 from telerig.estimator.calibration.solver.levenberg_marquardt import Solution, linearisation
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.estimator.calibration.solver.system import slots
 from telerig.rig.lens_models import GROUPS, groups_of, name_of, ordered
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ def considered_covariance(
     wide = problem.with_model(names)
     equations = linearisation(wide)[1](solution.state)
     step, _ = equations.step(UNDAMPED)
-    there = replace(solution, equations=equations, slots=slots(wide))
+    there = replace(solution, equations=equations)
     # the leverage stays that of the simpler fit, because the residuals do
     found = joint_covariance(wide, there, leverage=joint.leverage)
     return wide.free, found.widened(step)

@@ -14,7 +14,7 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.levenberg_marquardt import Solution
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.schur import Posterior
-from telerig.estimator.calibration.solver.system import System, images_of
+from telerig.estimator.calibration.solver.system import System, images_of, slots
 from telerig.rig.camera import Camera
 from telerig.rig.pose import hat
 from telerig.rig.projection import INDEX
@@ -114,7 +114,7 @@ def joint_covariance(
     infinite variance. Raises CalibrationError if the information matrix is singular to working
     precision.
     """
-    size = solution.slots["dots"][0].stop
+    size = slots(problem)["dots"][0].stop
     posterior = solution.equations.posterior(whole=size <= FULL_COVARIANCE_UP_TO)
     matrix = posterior.common if posterior.whole is None else posterior.whole
     matrix = matrix.copy()

@@ -248,13 +248,18 @@ class GraphEquations:
         try:
             return graph.eliminateSequential(order)
         except RuntimeError:
+            pass  # GTSAM's word for a pivot below 1/4096 of the one before
+        try:
             return graph.eliminateSequential(order, gtsam.EliminateQR)
+        except RuntimeError as error:
+            raise undetermined() from error
 
     def step(self, damping: float) -> tuple[Array, float]:
         """Return the step (D,) of the D parameters with Marquardt's damping, and its predicted
         gain.
 
-        The predicted gain is the decrease of the cost according to the linear model.
+        The predicted gain is the decrease of the cost according to the linear model. Raises
+        CalibrationError when GTSAM can eliminate the graph neither by Cholesky nor by QR.
         """
         step = np.empty(self.layout.size)
         step[self.layout.every_place] = self._net(damping).optimize().vector()

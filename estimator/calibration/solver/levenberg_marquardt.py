@@ -17,7 +17,7 @@ from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.elimination import GraphEquations, GraphLayout
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.schur import NormalEquations
-from telerig.estimator.calibration.solver.system import System, slots
+from telerig.estimator.calibration.solver.system import System
 from telerig.factors.projection import State
 
 MANY_DOTS = 5000
@@ -38,14 +38,12 @@ class Solution:
 
     cost : half the sum of squared whitened residuals, including those of the priors.
     equations : the linearised equations at the state.
-    slots : indices of each variable's parameters, see `slots`.
     """
 
     state: State
     cost: float
     iterations: int
     equations: Equations
-    slots: dict[str, list[slice]]
 
     @property
     def information(self) -> Array:
@@ -116,7 +114,7 @@ def solve(
             damping *= 10
             if damping > 1e12:
                 break
-    return Solution(point, float(equations.cost), iteration, equations, slots(problem))
+    return Solution(point, float(equations.cost), iteration, equations)
 
 
 def _at(linearised: Callable[[State], Equations], state: State) -> Equations | None:

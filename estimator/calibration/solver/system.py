@@ -19,7 +19,7 @@ from telerig.estimator.calibration.solver.problem import (
     prior_sigma,
 )
 from telerig.factors.priors import depth_gauge_residual, distance_residual, place_residual
-from telerig.factors.projection import Observations, State, image_columns, whitened_image_error
+from telerig.factors.projection import Observations, State, image_columns
 from telerig.io.machine.parallel import keep_freed_memory
 from telerig.rig.pose import rotation_from_rotvec
 
@@ -99,17 +99,6 @@ class System:
         )
         out[: len(self.free[camera])] *= self.unit[camera][:, None, None]
         return out
-
-    def cost(self, state: State) -> float:
-        """Return half the sum of all squared residuals."""
-        errors = [self.error(state, c) for c in range(len(self.images))]
-        return 0.5 * (sum(float(np.vdot(e, e)) for e in errors) + self.priors(state).squared)
-
-    def error(self, state: State, camera: int) -> Array:
-        """Return the whitened residuals (2, M) of one camera's measurements, without
-        derivatives."""
-        rho_mm = self.problem.rho_mm[camera]
-        return whitened_image_error(state, self.images[camera], camera, rho_mm)
 
     def priors(self, state: State) -> Priors:
         """Return the residuals that do not come from images, and their derivatives."""

@@ -185,7 +185,7 @@ def _target_traces(outline: RigOutline) -> list[Trace]:
 
 def rig_plan(results: CalibrationResults) -> Picture:
     """Cameras, fields and targets, projected along the common perpendicular of the axes."""
-    with drawing(4.2, legend="upper right") as sheet:
+    with drawing(4.2, legend="above") as sheet:
         draw_plan(sheet.axes, results)
     caption = (
         "The plane of the optical axes, seen along their common perpendicular: the targets (grey) "
@@ -273,7 +273,7 @@ def _images(results: CalibrationResults, pose: Array, advice: Mapping[str, Any])
 
 def _plan(results: CalibrationResults, pose: Array) -> Picture:
     corners = _moved(pose, plate_corners(results.points_mm, _MARGIN)) @ common_plane(results).T
-    with drawing(4.2, legend="upper right") as sheet:
+    with drawing(4.2, legend="above") as sheet:
         draw_plan(sheet.axes, results)
         sheet.axes.fill(*corners.T, color=MODEL, alpha=0.15, linewidth=0)
         sheet.axes.plot(*corners[[0, 1, 2, 3, 0]].T, color=MODEL, linewidth=1.4, label="next")

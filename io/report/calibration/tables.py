@@ -125,7 +125,8 @@ def _largest_distortion(camera: Camera) -> str:
         return "not invertible in the whole image"
     points = np.concatenate([ideal, np.zeros((*ideal.shape[:-1], 1))], -1)
     moved = grid - projection.pixel_from_camera(points, straight.intrinsics, camera.rho_mm)
-    return f"{number(float(np.hypot(moved[..., 0], moved[..., 1]).max()))} px"
+    largest_px = float(np.hypot(moved[..., 0], moved[..., 1]).max())
+    return f"{number(round(largest_px, 9))} px"  # below 1e-9 px it is rounding
 
 
 def pose_rows(results: CalibrationResults) -> list[Row]:

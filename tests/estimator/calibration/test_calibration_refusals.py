@@ -27,7 +27,7 @@ def test_one_view_is_refused(scene: Any) -> None:
 def test_three_views_of_unknown_dots_are_refused(scene: Any) -> None:
     made = scene("paper", 1, views=3)
     target = replace(made.target, print_sigma_mm=3.0)
-    with pytest.raises(CalibrationError, match="unknown dots need"):
+    with pytest.raises(CalibrationError, match="positions are unknown needs at least"):
         replace(made, target=target).calibrate("radial")
 
 

@@ -141,7 +141,7 @@ def test_parameters_by_name() -> None:
     assert log_prior(model, names) < 0
     with pytest.raises(InputError, match="the model has no"):
         value_of(model, "modes.7.damping")
-    with pytest.raises(InputError, match="no hyper-parameter"):
+    with pytest.raises(InputError, match="not a hyper-parameter"):
         log_prior(model, ["encoder_sigma_mm"])
 
 

@@ -218,7 +218,7 @@ def test_files_that_are_no_images(content: bytes, tmp_path: Path) -> None:
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    assert "cannot be read" in error_of(tmp_path / "nothing.tif")
+    assert "does not exist" in error_of(tmp_path / "nothing.tif")
     (tmp_path / "folder.tif").mkdir()
     assert "cannot be read" in error_of(tmp_path / "folder.tif")
 

@@ -206,7 +206,7 @@ def test_empty_tables(tmp_path: Path) -> None:
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         read_dots_csv(tmp_path / "none.csv", BOUNDED)
     (tmp_path / "dots.csv").write_bytes(DOTS.encode("utf-16"))
     with pytest.raises(InputError, match="not UTF-8") as caught:

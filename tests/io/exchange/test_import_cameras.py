@@ -209,7 +209,7 @@ def test_openptv_refuses_what_it_cannot_read(tmp_path: Path) -> None:
     paths[0].write_text("one two")
     with pytest.raises(InputError, match="no number"):
         read_openptv_cameras(paths, SENSOR)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         read_openptv_cameras([tmp_path / "none.ori"], SENSOR)
 
 

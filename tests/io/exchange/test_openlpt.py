@@ -182,7 +182,7 @@ def test_what_cannot_be_expressed_is_refused(tmp_path: Path) -> None:
     paths[1].write_text(text(np.diag([1.0, 1, 0.5]), two[1]))
     with pytest.raises(InputError, match="is not a rotation"):
         read_openlpt_cameras(paths)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         read_openlpt_cameras([tmp_path / "nowhere.txt"])
     with pytest.raises(InputError, match="no camera files"):
         read_openlpt_cameras([])

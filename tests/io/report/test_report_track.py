@@ -207,7 +207,7 @@ def test_importing_the_report_draws_in_no_plotting_library() -> None:
         ("tracking.json", '{"kind": "telerig calibration"}', "is not a tracks file"),
         ("tracking.json", '{"kind": "telerig tracks", "schema": 9}', "newer"),
         ("tracking.json", '{"kind": "telerig tracks", "schema": 1, "pairs": 3}', "garbles 'pairs'"),
-        ("tracks.csv", None, "cannot be read"),
+        ("tracks.csv", None, "does not exist"),
         ("tracks.csv", "frame,particle\n1,2\n", "its columns are of cameras"),
         ("detections.csv", "frame,camera,u_px,v_px\n1,left,2,3\n", "particle"),
         ("detections.csv", "frame,camera,particle,u_px,v_px\n1,left,,2,x\n", "row 2, column v_px"),

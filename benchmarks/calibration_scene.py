@@ -11,10 +11,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.calibrate import nominal_cameras
-from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.measurements import eccentricity_px, problem_from_dots
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 from telerig.io.simulation.calibration.scene import (
     TrueTarget,
     View,

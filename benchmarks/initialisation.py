@@ -27,7 +27,7 @@ from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
 from telerig.estimator.calibration.start import mirror_ambiguity
 from telerig.estimator.calibration.start.known_target import angle_between
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.io.simulation.presets import preset
 from telerig.rig.target import Target

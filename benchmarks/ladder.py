@@ -39,7 +39,7 @@ from telerig.estimator.calibration.solver.problem import (
     held_at_nominal,
     parameter_unit,
 )
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.rig.lens_models import name_of
 from telerig.rig.target import Target

@@ -15,8 +15,8 @@ from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import with_plate
 from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
-from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
 from telerig.estimator.calibration.solver.levenberg_marquardt import linearisation, solve
+from telerig.estimator.calibration.solver.measurements import eccentricity_px
 from telerig.estimator.calibration.solver.problem import held_at_nominal
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import SimulationConfig

@@ -14,8 +14,7 @@ from solver_scipy import right_jacobian
 
 from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem
 from telerig.estimator.calibration.solver.system import System
-from telerig.factors.priors import depth_gauge_residual, distance_residual
-from telerig.factors.projection import State
+from telerig.factors.calibration import State, depth_gauge_residual, distance_residual
 from telerig.rig.pose import rotation_from_rotvec
 from telerig.rig.projection import INDEX
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from telerig.estimator.calibration.solver.problem import Problem, matrix_from_camera
 from telerig.estimator.calibration.start import known_target
-from telerig.factors.projection import Observations, State, pixels
+from telerig.factors.calibration import Observations, State, pixels
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.target import Target

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.system import System
-from telerig.factors.projection import State, whitened_error
+from telerig.factors.calibration import State, whitened_error
 from telerig.rig.pose import hat, rotation_from_rotvec
 
 Array = NDArray[np.float64]

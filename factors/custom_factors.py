@@ -14,8 +14,15 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array, Ints
-from telerig.factors.priors import depth_gauge_residual, distance_residual, place_residual
-from telerig.factors.projection import Observations, State, dot_columns, image_columns
+from telerig.factors.calibration import (
+    Observations,
+    State,
+    depth_gauge_residual,
+    distance_residual,
+    dot_columns,
+    image_columns,
+    place_residual,
+)
 
 Residual = Callable[[Any], tuple[Array, list[Array]]]
 

@@ -246,7 +246,7 @@ def _stage(dataset: Dataset, calibration: Calibration, stage: Stage | None) -> d
 
     The result is empty if there is no such folder or if the calibration was rejected.
     """
-    from telerig.estimator.calibration.stage.stage_axis import stage_axis_from
+    from telerig.estimator.calibration.stage_axis import stage_axis_from
 
     if calibration.verdict["status"] == "REJECTED":
         return {}

@@ -21,7 +21,7 @@ from telerig.estimator.calibration.solver.robust import (
     squared_distance,
 )
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 from telerig.rig.lens_models import joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.projection import INDEX

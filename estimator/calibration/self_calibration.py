@@ -22,9 +22,8 @@ from telerig.estimator.calibration.quality.split_half import split_half_check
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
-from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
 from telerig.estimator.calibration.solver.levenberg_marquardt import Progress, Solution, solve
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.measurements import eccentricity_px, problem_from_dots
 from telerig.estimator.calibration.solver.problem import (
     OUTLIER_SD,
     SOLVERS,
@@ -38,10 +37,9 @@ from telerig.estimator.calibration.start import (
     known_target,
     mirror_ambiguity,
     symmetric_target,
-    tilt_signs,
 )
 from telerig.estimator.calibration.start.unknown_target import dots_from_images
-from telerig.factors.projection import State, whitened_error
+from telerig.factors.calibration import State, whitened_error
 from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.rig.camera import Camera
 from telerig.rig.lens_models import (
@@ -109,7 +107,7 @@ def self_calibrate(
     problem = with_plate(problem, nominal)
     start = best_start(problem, start_dots, nominal)
     mirror = mirror_ambiguity.choose_start(start, problem, nominal)
-    start = tilt_signs.with_tilt_signs(problem, mirror.state)
+    start = mirror_ambiguity.with_tilt_signs(problem, mirror.state)
     found_notes += checks.position_notes(problem, start)
     fit = _fit(problem, start, models, solver, progress)
     if len(cameras) > 1 and mirror.decided_by != mirror_ambiguity.BY_PLATE:

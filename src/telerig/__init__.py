@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import (
         load_calibration as load_calibration,
     )
-    from telerig.estimator.dots.detect_target import detect_target as detect_target
+    from telerig.estimator.dots.dataset_dots import detect_target as detect_target
     from telerig.estimator.dots.locate import locate_dots as locate_dots
     from telerig.estimator.smoothing.problem.problem import ShakeModel as ShakeModel
     from telerig.estimator.smoothing.result import Smoothing as Smoothing
@@ -55,7 +55,7 @@ _WHERE = {
     "Tracks": "telerig.estimator.tracking.tracks",
     "compare_calibrations": "telerig.estimator.calibration.quality.comparison",
     "detect_bubbles": "telerig.estimator.bubbles.detect",
-    "detect_target": "telerig.estimator.dots.detect_target",
+    "detect_target": "telerig.estimator.dots.dataset_dots",
     "load_calibration": "telerig.estimator.calibration.result.calibration",
     "load_dataset": "telerig.io.dataset.dataset",
     "load_run": "telerig.io.dataset.run",

@@ -16,15 +16,16 @@ from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.nonlinear_graph import nonlinear_graph
 from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem, prior_sigma
 from telerig.estimator.calibration.start import known_target
-from telerig.factors.custom_factors import Keys, custom_factor
-from telerig.factors.priors import depth_gauge_residual, distance_residual
-from telerig.factors.projection import (
+from telerig.factors.calibration import (
     Observations,
     State,
     apparent_shift_mm,
+    depth_gauge_residual,
+    distance_residual,
     whitened_error,
     whitened_residuals,
 )
+from telerig.factors.custom_factors import Keys, custom_factor
 from telerig.rig.pose import rotation_from_rotvec
 from telerig.rig.projection import INDEX, PARAMETERS
 

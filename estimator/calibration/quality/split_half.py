@@ -26,7 +26,7 @@ from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.estimator.calibration.solver.robust import LEAST_DOTS
 from telerig.estimator.calibration.start.known_target import overlap_tree
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 from telerig.io.report.page.number_format import number
 
 LEAST_VIEWS = 4

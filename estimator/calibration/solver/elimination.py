@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dpotri
 from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.schur import Posterior, undetermined
 from telerig.estimator.calibration.solver.system import System
+from telerig.factors.calibration import State
 from telerig.factors.linear_factors import add_linear_factors
-from telerig.factors.projection import State
 
 DOTS_OF_GROUP = 10
 """Number of dots, about, that are one variable of the graph; see docs/decisions/020."""

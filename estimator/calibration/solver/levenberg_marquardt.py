@@ -18,7 +18,7 @@ from telerig.estimator.calibration.solver.elimination import GraphEquations, Gra
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.schur import NormalEquations
 from telerig.estimator.calibration.solver.system import System
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 
 MANY_DOTS = 5000
 """With more measured dots than this, the Schur complement solves the problem

@@ -16,6 +16,7 @@ from telerig.estimator.calibration.solver.problem import (
     prior_sigma,
 )
 from telerig.estimator.calibration.solver.system import System, images_of
+from telerig.factors.calibration import State
 from telerig.factors.custom_factors import (
     Keys,
     depth_gauge_factor,
@@ -23,7 +24,6 @@ from telerig.factors.custom_factors import (
     image_factor,
     place_factor,
 )
-from telerig.factors.projection import State
 
 
 def keys_of(problem: Problem) -> Keys:

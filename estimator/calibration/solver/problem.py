@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
-from telerig.factors.projection import Observations, State
+from telerig.factors.calibration import Observations, State
 from telerig.rig.camera import Camera
 from telerig.rig.lens_models import parameters_of
 from telerig.rig.pose import Pose

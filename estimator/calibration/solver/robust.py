@@ -15,7 +15,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.estimator.calibration.solver.levenberg_marquardt import Progress, Solution, solve
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.factors.projection import State, pixels
+from telerig.factors.calibration import State, pixels
 
 LEAST_DOTS = 4
 """A view with fewer kept measurements than this is left out, because they would not determine the

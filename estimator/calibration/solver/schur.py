@@ -7,7 +7,7 @@ The unknowns are k, which are kept, and d, which are eliminated; W is the Choles
 S the Schur complement. No view is coupled to another view and no dot to another dot, so D is block
 diagonal if d are the dots, or the views if that leaves fewer unknowns (Triggs et al., Bundle
 Adjustment, 1999, section 6). The two dots of a known distance are coupled and are kept. The blocks
-are the ones that GTSAM gets (`telerig.factors.projection.image_columns`). They are summed over a
+are the ones that GTSAM gets (`telerig.factors.calibration.image_columns`). They are summed over a
 few thousand dots at a time.
 """
 
@@ -25,7 +25,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.system import System, images_of
-from telerig.factors.projection import State, dot_columns
+from telerig.factors.calibration import State, dot_columns
 
 CHUNK = 4000
 """Approximate number of measured dots that are evaluated at once. With fewer, the function calls

@@ -1,7 +1,7 @@
 """Computes the whitened residuals of a problem and their derivatives, at any state.
 
-All solvers use the same arrays: those of `telerig.factors.projection.image_columns` for the images,
-and those of `Priors` for all other residuals.
+All solvers use the same arrays: those of `factors.calibration.image_columns` for the images, and
+those of `Priors` for all other residuals.
 """
 
 from __future__ import annotations
@@ -18,8 +18,14 @@ from telerig.estimator.calibration.solver.problem import (
     parameter_unit,
     prior_sigma,
 )
-from telerig.factors.priors import depth_gauge_residual, distance_residual, place_residual
-from telerig.factors.projection import Observations, State, image_columns
+from telerig.factors.calibration import (
+    Observations,
+    State,
+    depth_gauge_residual,
+    distance_residual,
+    image_columns,
+    place_residual,
+)
 from telerig.io.machine.parallel import keep_freed_memory
 from telerig.rig.pose import rotation_from_rotvec
 

@@ -17,7 +17,7 @@ from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 from telerig.rig.pose import nearest_rotation
 from telerig.rig.projection import INDEX
 

@@ -16,7 +16,7 @@ from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust import robust_solve
 from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
-from telerig.factors.projection import State, whitened_residuals
+from telerig.factors.calibration import State, whitened_residuals
 from telerig.rig.pose import nearest_rotation, rotation_from_rotvec
 from telerig.rig.target import Target
 

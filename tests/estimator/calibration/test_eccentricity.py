@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.solver.eccentricity import eccentricity_px
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.measurements import eccentricity_px, problem_from_dots
 from telerig.estimator.calibration.solver.problem import cameras_from_state
 from telerig.estimator.calibration.start import known_target
 from telerig.rig.pose import Pose

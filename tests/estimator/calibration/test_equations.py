@@ -29,7 +29,7 @@ from telerig.estimator.calibration.solver.problem import (
 )
 from telerig.estimator.calibration.solver.system import System, images_of, slots
 from telerig.estimator.calibration.start import known_target
-from telerig.factors.projection import State, whitened_error, whitened_residuals
+from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.target import Target

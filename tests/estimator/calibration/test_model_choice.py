@@ -12,8 +12,7 @@ import pytest
 
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.lens import choice as model_choice
-from telerig.estimator.calibration.lens.choice import model_start
-from telerig.estimator.calibration.lens.cross_validation import FOLDS, held_out_chi2, pose_only
+from telerig.estimator.calibration.lens.choice import FOLDS, held_out_chi2, model_start, pose_only
 from telerig.estimator.calibration.lens.search import (
     UNDETERMINED,
     Lens,
@@ -27,7 +26,7 @@ from telerig.estimator.calibration.self_calibration import choose_model
 from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
-from telerig.factors.projection import whitened_error
+from telerig.factors.calibration import whitened_error
 from telerig.io.simulation.presets import preset
 from telerig.rig.lens_models import GROUPS, name_of
 

@@ -25,7 +25,7 @@ from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
 from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import cameras_from_state, held_at_nominal
-from telerig.factors.projection import State, pixels
+from telerig.factors.calibration import State, pixels
 from telerig.io.report.calibration.report import write_calibration_report
 from telerig.io.report.calibration.results import read_results
 from telerig.io.report.calibration.rig import next_pictures

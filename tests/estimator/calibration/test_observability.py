@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 
 from telerig.estimator.calibration.start.mirror_ambiguity import mirrored_state
-from telerig.factors.priors import depth_gauge_residual, distance_residual
-from telerig.factors.projection import Observations, State, whitened_error, whitened_residuals
+from telerig.factors.calibration import (
+    Observations,
+    State,
+    depth_gauge_residual,
+    distance_residual,
+    whitened_error,
+    whitened_residuals,
+)
 from telerig.rig.pose import rotation_from_rotvec
 from telerig.rig.projection import INDEX
 

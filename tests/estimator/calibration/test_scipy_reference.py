@@ -19,7 +19,7 @@ from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.start import known_target
-from telerig.factors.projection import State
+from telerig.factors.calibration import State
 
 GAUGE_MM = 1e-4
 PRIOR = {"scale": 0.5, "kappa": 0.5, "k1": 0.5, "k2": 0.5, "p1": 0.2, "p2": 0.2}

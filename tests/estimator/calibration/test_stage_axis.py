@@ -11,8 +11,13 @@ import pytest
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.stage.fit import Dots, State, derivatives
-from telerig.estimator.calibration.stage.stage_axis import StageAxis, stage_axis_of
+from telerig.estimator.calibration.stage_axis import (
+    Dots,
+    StageAxis,
+    State,
+    derivatives,
+    stage_axis_of,
+)
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 

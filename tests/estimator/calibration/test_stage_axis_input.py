@@ -14,7 +14,7 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result.imported import calibration_from_cameras
-from telerig.estimator.calibration.stage.stage_axis import stage_axis_from
+from telerig.estimator.calibration.stage_axis import stage_axis_from
 from telerig.io.dataset.dataset import Dataset
 from telerig.io.rig_file.description import StageDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml

@@ -11,7 +11,7 @@ from places import REAL
 from scipy.ndimage import gaussian_filter
 
 from telerig.errors import DetectionError, InputError
-from telerig.estimator.dots.detect_target import (
+from telerig.estimator.dots.dataset_dots import (
     MEASURED,
     TargetDetection,
     detect_target,

@@ -23,7 +23,7 @@ import pandas as pd
 from track_score import FullScore, full_score
 
 import telerig
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 

@@ -11,8 +11,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.estimator.calibration.calibrate import nominal_cameras
-from telerig.estimator.calibration.solver.measurements import eccentricity_px, problem_from_dots
-from telerig.estimator.calibration.solver.problem import Problem, nominal_state
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    eccentricity_px,
+    nominal_state,
+    problem_from_dots,
+)
 from telerig.factors.calibration import State
 from telerig.io.simulation.calibration.scene import (
     TrueTarget,

@@ -23,8 +23,8 @@ from calibration_scene import Scene, make_scene
 
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.self_calibration import best_start, with_plate
-from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
+from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start import mirror_ambiguity
 from telerig.estimator.calibration.start.known_target import angle_between
 from telerig.factors.calibration import State

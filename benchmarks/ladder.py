@@ -32,13 +32,13 @@ from numpy.typing import NDArray
 
 from telerig.estimator.calibration.lens.choice import model_start
 from telerig.estimator.calibration.self_calibration import choose_model
-from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import (
     Problem,
     cameras_from_state,
     held_at_nominal,
     parameter_unit,
 )
+from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.factors.calibration import State
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
 from telerig.rig.lens_models import name_of

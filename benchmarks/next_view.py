@@ -23,14 +23,13 @@ from numpy.typing import NDArray
 from rig_truth import without_advice
 
 from telerig.estimator.calibration.quality.truth import space_error
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.estimator.calibration.solver.covariance import aligned_covariance
 from telerig.io.simulation.calibration.scene import View, hand_held_views, true_cameras, true_target
 from telerig.io.simulation.config import SimulationConfig
 from telerig.io.simulation.presets import preset
 from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.triangulation import aligned_covariance, working_volume
 
 Array = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ import pandas as pd
 import telerig
 from telerig.estimator.calibration.calibrate import nominal_cameras, run_calibration
 from telerig.estimator.calibration.quality.truth import space_error, true_cameras
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.rig.triangulation import working_volume
 
 
 def main() -> None:

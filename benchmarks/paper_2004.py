@@ -24,7 +24,6 @@ from calibration_scene import make_scene
 
 import telerig
 from telerig.estimator.calibration.calibrate import run_calibration
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
 from telerig.estimator.smoothing.truth import motion_error
@@ -32,6 +31,7 @@ from telerig.estimator.tracking.truth import score_tracks
 from telerig.io.simulation.presets import preset, run_preset
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation
+from telerig.rig.triangulation import working_volume
 
 Array = NDArray[np.float64]
 

@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 from telerig.estimator.calibration import self_calibration
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import with_plate
-from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
-from telerig.estimator.calibration.solver.levenberg_marquardt import linearisation, solve
-from telerig.estimator.calibration.solver.measurements import eccentricity_px
-from telerig.estimator.calibration.solver.problem import held_at_nominal
+from telerig.estimator.calibration.solver.covariance import joint_covariance
+from telerig.estimator.calibration.solver.problem import eccentricity_px, held_at_nominal
+from telerig.estimator.calibration.solver.robust_least_squares import linearisation, solve
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import SimulationConfig
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.projection import PARAMETERS
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import aligned_covariance, triangulate
 
 Array = NDArray[np.float64]
 

@@ -36,9 +36,9 @@ from typing import Any
 import numpy as np
 from solver_problem import make_problem
 
-from telerig.estimator.calibration.solver.levenberg_marquardt import linearisation, solve
 from telerig.estimator.calibration.solver.nonlinear_graph import nonlinear_graph
 from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.robust_least_squares import linearisation, solve
 from telerig.factors.calibration import State
 
 SIZES = ("12x15", "12x100", "50x400", "200x400", "200x2000")

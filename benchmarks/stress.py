@@ -34,11 +34,10 @@ from telerig.errors import TelerigError
 from telerig.estimator.calibration.quality.truth import space_error, true_cameras
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.estimator.calibration.solver.covariance import aligned_shift
 from telerig.io.simulation.config import SimulationConfig
 from telerig.io.simulation.presets import preset
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import aligned_shift, triangulate
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

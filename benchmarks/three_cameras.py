@@ -42,7 +42,6 @@ import telerig
 from telerig.estimator.calibration.calibrate import detect, nominal_cameras
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.self_calibration import self_calibrate
-from telerig.estimator.calibration.solver.covariance import aligned_covariance, rig_jacobian
 from telerig.io.simulation.calibration.scene import (
     TrueTarget,
     View,
@@ -54,7 +53,12 @@ from telerig.io.simulation.images.plates import pixel_from_plate
 from telerig.io.simulation.presets import preset
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec, rotvec_from_rotation
-from telerig.rig.triangulation import stacked_jacobian, triangulate_any
+from telerig.rig.triangulation import (
+    aligned_covariance,
+    rig_jacobian,
+    stacked_jacobian,
+    triangulate_any,
+)
 
 Array = NDArray[np.float64]
 

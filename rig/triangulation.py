@@ -3,6 +3,10 @@ likelihood.
 
 `triangulate` takes two cameras that both see every point. `triangulate_views` takes any number of
 cameras, and each point may be seen by only some of them.
+
+The *rig block* of a calibration's covariance holds P parameters of the cameras: the free intrinsics
+of all cameras, then the pose (6) of each camera but the first. `rig_jacobian` and
+`point_shift_jacobian` are their effect on pixels and on triangulated points.
 """
 
 from __future__ import annotations
@@ -17,9 +21,13 @@ from telerig.arrays import Array
 from telerig.errors import GeometryError, InputError
 from telerig.rig import distortion, projection
 from telerig.rig.camera import Camera
+from telerig.rig.pose import hat
 from telerig.rig.projection import INDEX
 from telerig.rig.windows import affine_map
 
+POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
+VOLUME_SHARE = 0.6
+"""Edge of the working volume, as a share of the smallest field of view of the cameras."""
 _STEPS = 20
 _BLOCK = 4096
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -390,3 +398,87 @@ def _midpoint_covariance(
     total = np.linalg.inv(sum(projectors[1:], projectors[0]))
     spread = sum(g @ c @ g.mT for g, c in zip(gains, covariances))
     return np.asarray(total @ spread @ total.mT)
+
+
+def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
+    """Return points (steps^3, 3) in mm of a cubic grid round the rig's origin: the working volume.
+
+    steps : number of points along each edge.
+    """
+    field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
+    axis = np.linspace(-0.5, 0.5, steps) * VOLUME_SHARE * field
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+
+def rig_jacobian(
+    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
+) -> Array:
+    """Return the derivative (..., 2C, P) of the pixels in C cameras with respect to the rig block.
+
+    free : for each camera the names of its free intrinsics.
+    points_mm : (..., 3) rig points.
+    """
+    lens = np.cumsum([0, *map(len, free)])
+    out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), lens[-1] + 6 * (len(cameras) - 1)))
+    for c, camera in enumerate(cameras):
+        rows = out[..., 2 * c : 2 * c + 2, :]
+        in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
+        names = [INDEX[name] for name in free[c]]
+        _, by_point, rows[..., lens[c] : lens[c + 1]] = camera.pixel_jacobians(in_camera, names)
+        if c:
+            at = lens[-1] + 6 * (c - 1)
+            rows[..., at : at + 6] = np.concatenate([by_point @ hat(in_camera), -by_point], -1)
+    return out
+
+
+def aligned_covariance(
+    cameras: tuple[Camera, ...],
+    free: tuple[tuple[str, ...], ...],
+    covariance: Array,
+    points_mm: Array,
+) -> Array:
+    """Return the covariance (3 N, 3 N) of N rig points due to the calibration, without rigid
+    motion.
+
+    A rigid motion that is common to all points is projected out; see `aligned_shift`.
+
+    covariance : (P, P) of the rig block.
+    """
+    inner = aligned_shift(cameras, free, points_mm)
+    return np.asarray(inner @ covariance @ inner.T)
+
+
+def aligned_shift(
+    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
+) -> Array:
+    """Return the derivative (3 N, P) of N triangulated points with respect to the rig block,
+    without rigid motion.
+
+    A rigid motion that is common to all points is projected out, because the place of the rig frame
+    is a matter of definition (Baarda's S-transformation to the points' own frame). The result
+    describes errors of shapes, distances and motions inside the rig.
+    """
+    rows = 2 * len(cameras)
+    information = np.broadcast_to(np.eye(rows), (len(points_mm), rows, rows))
+    shift = point_shift_jacobian(cameras, free, points_mm, information)
+    shift = shift.reshape(-1, shift.shape[-1])
+    centred = points_mm - points_mm.mean(0)
+    motion = np.concatenate([np.tile(np.eye(3), (len(points_mm), 1, 1)), -hat(centred)], -1)
+    basis, _ = np.linalg.qr(motion.reshape(-1, 6))
+    return np.asarray(shift - basis @ (basis.T @ shift))
+
+
+def point_shift_jacobian(
+    cameras: tuple[Camera, ...],
+    free: tuple[tuple[str, ...], ...],
+    points_mm: Array,
+    information_px: Array,
+) -> Array:
+    """Return the derivative (..., 3, P) of triangulated points with respect to the rig block.
+
+    information_px : (..., 2C, 2C) inverse covariance of the pixels.
+    """
+    _, by_point = stacked_jacobian(cameras, points_mm)
+    weighted = np.swapaxes(by_point, -1, -2) @ information_px
+    by_rig = rig_jacobian(cameras, free, points_mm)
+    return np.asarray(-np.linalg.solve(weighted @ by_point, weighted @ by_rig), np.float64)

@@ -153,7 +153,7 @@ def _import_cameras(
     name: str, files: list[Path], out: Path, sigma_px: float, **offered: Any
 ) -> None:
     """Write calibration.json (cameras held fixed) and nominal.toml (a start for a calibration)."""
-    from telerig.estimator.calibration.result.imported import calibration_from_cameras
+    from telerig.estimator.calibration.result.calibration import calibration_from_cameras
     from telerig.io.exchange.importing.pinhole import nominal_toml
     from telerig.io.files.atomic import write_text_atomic
     from telerig.io.rig_file.description import MOST_CAMERAS

@@ -44,9 +44,9 @@ def smooth(
 
     Exit code 0: smoothed, whatever the verdict. 2: the input cannot be used. 130: interrupted.
     """
+    from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.smoothing.results_folder import smooth_run
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
-    from telerig.estimator.tracking.calibration_of_run import calibration_for
     from telerig.io.dataset.run import load_run
     from telerig.scripts.track import cameras_without_rig, default_folder
 

@@ -40,7 +40,7 @@ def track(
     130: interrupted.
     """
     from telerig.estimator.batch.jobs import check_run_name
-    from telerig.estimator.tracking.calibration_of_run import calibration_for
+    from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.tracking.results_folder import write_tracking
     from telerig.estimator.tracking.track import TrackOptions
     from telerig.estimator.tracking.tracks import tracking_words

@@ -178,7 +178,7 @@ def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
     """Track a run and write its results."""
-    from telerig.estimator.tracking.calibration_of_run import calibration_for
+    from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.tracking.results_folder import write_tracking
     from telerig.estimator.tracking.track import TrackOptions
     from telerig.estimator.tracking.tracks import tracking_words
@@ -203,9 +203,9 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
 
 def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
     """Smooth a tracked run and write its results."""
+    from telerig.estimator.calibration.result.calibration import calibration_for
     from telerig.estimator.smoothing.results_folder import smooth_run
     from telerig.estimator.smoothing.terminal_summary import smoothing_words
-    from telerig.estimator.tracking.calibration_of_run import calibration_for
     from telerig.io.dataset.run import load_run
 
     run = Path(job.dataset) / "runs" / job.run

@@ -155,22 +155,18 @@ def run_calibration(
     table = dataset.dots() if detected is None else detected.dots
     notes = [*dataset.notes, *(() if detected is None else detected.notes)]
 
-    from telerig.estimator.calibration.refractive_windows import (
-        behind_windows,
-        stated_windows,
-        window_notes,
-    )
-
-    rig, walls = dataset.rig, stated_windows(dataset.rig)
     calibration = solve_dots(
         dataset, table, model=model, solver=solver, medium=medium, dots_free=dots_free,
         outlier_sd=outlier_sd, stage=stage, notes=notes,
     )  # fmt: skip
     calibration = replace(calibration, stage=_stage(dataset, calibration, stage), medium=medium)
-    if medium == "air":
-        calibration = behind_windows(calibration, walls)
-    words = window_notes(calibration, rig)
-    calibration = replace(calibration, notes=(*calibration.notes, *words))
+    if dataset.rig.walls or medium == "water":
+        from telerig.estimator.calibration.refractive_windows import behind_windows, window_notes
+
+        if medium == "air":
+            calibration = behind_windows(calibration, dataset.rig.windows)
+        words = window_notes(calibration, dataset.rig)
+        calibration = replace(calibration, notes=(*calibration.notes, *words))
     return CalibrationRun(_with_measured(calibration, table, seed), detected)
 
 
@@ -195,14 +191,14 @@ def solve_dots(
 
     The refractive windows are part of the model only if ``medium`` is "water".
     """
-    from telerig.estimator.calibration.refractive_windows import stated_windows, with_windows
     from telerig.estimator.calibration.self_calibration import self_calibrate
 
     rig = dataset.rig
-    cameras = nominal_cameras(rig)
+    windows = rig.windows if medium == "water" else {}
+    cameras = tuple(replace(c, wall=windows.get(c.name)) for c in nominal_cameras(rig))
     return self_calibrate(
         table,
-        with_windows(cameras, stated_windows(rig)) if medium == "water" else cameras,
+        cameras,
         dataset.target,
         nominal_rotvec_deg=rig.rotvec_from_first_deg,
         model=model,

@@ -18,10 +18,10 @@ import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.calibration.quality.checks import RECOMMENDED_VIEWS
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
-from telerig.estimator.calibration.solver.covariance import JointCovariance, aligned_shift
+from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
 from telerig.factors.calibration import Observations, State, pixels, whitened_residuals
+from telerig.rig.triangulation import aligned_shift, working_volume
 
 ENOUGH_SHARE = 0.05
 """A view that lowers the standard deviation by less is not worth taking."""

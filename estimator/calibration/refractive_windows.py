@@ -13,25 +13,18 @@ from typing import Any
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.solver.covariance import aligned_covariance
 from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freedom
 from telerig.estimator.calibration.start.mirror_ambiguity import ENTOCENTRIC
 from telerig.io.rig_file.description import RigDescription
 from telerig.rig.camera import Camera
 from telerig.rig.projection import INDEX, turned_wall
-from telerig.rig.triangulation import triangulate_any
+from telerig.rig.triangulation import aligned_covariance, triangulate_any, working_volume
 from telerig.rig.windows import Wall
 
 _NOTABLE_UM = 0.1
 _STEP_MM = 10.0
 _LEANING_DEG = 30.0
-
-
-def stated_windows(rig: RigDescription) -> dict[str, Wall]:
-    """The windows that `[walls]` of rig.toml states, by camera."""
-    return {name: wall.wall() for name, wall in rig.walls.items()}
 
 
 def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
@@ -252,7 +245,7 @@ def window_warnings(rig: RigDescription | None, calibration: Calibration) -> lis
     """
     if rig is None:
         return []
-    stated = stated_windows(rig)
+    stated = rig.windows
     have = {c.name: c.wall for c in calibration.cameras}
     gone = [name for name, wall in have.items() if wall is not None and name not in stated]
     if gone:

@@ -12,9 +12,9 @@ from telerig.arrays import Array
 from telerig.estimator.calibration.lens.choice import Choice, Step
 from telerig.estimator.calibration.quality.checks import Note
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.solver.covariance import JointCovariance, aligned_covariance
+from telerig.estimator.calibration.solver.covariance import JointCovariance
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
-from telerig.estimator.calibration.solver.robust import (
+from telerig.estimator.calibration.solver.robust_least_squares import (
     RobustFit,
     lost_views,
     pixel_residuals,
@@ -25,7 +25,7 @@ from telerig.factors.calibration import State
 from telerig.rig.lens_models import joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
 from telerig.rig.projection import INDEX
-from telerig.rig.triangulation import triangulate_any
+from telerig.rig.triangulation import aligned_covariance, triangulate_any
 
 GAUGE = (
     "rig frame = first camera's frame, its origin where the {two} optical axes come closest; image "

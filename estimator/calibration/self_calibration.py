@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.lens import choice as model_choice
-from telerig.estimator.calibration.lens import considered_parameters
-from telerig.estimator.calibration.lens.choice import Choice, model_start
+from telerig.estimator.calibration.lens.choice import (
+    Choice,
+    considered_covariance,
+    considered_groups,
+    considered_words,
+    model_start,
+)
 from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
@@ -22,17 +27,23 @@ from telerig.estimator.calibration.quality.split_half import split_half_check
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
-from telerig.estimator.calibration.solver.levenberg_marquardt import Progress, Solution, solve
-from telerig.estimator.calibration.solver.measurements import eccentricity_px, problem_from_dots
 from telerig.estimator.calibration.solver.problem import (
     OUTLIER_SD,
     SOLVERS,
     Problem,
     checked_outlier_sd,
+    eccentricity_px,
     held_at_nominal,
     parameter_unit,
+    problem_from_dots,
 )
-from telerig.estimator.calibration.solver.robust import RobustFit, robust_solve
+from telerig.estimator.calibration.solver.robust_least_squares import (
+    Progress,
+    RobustFit,
+    Solution,
+    robust_solve,
+    solve,
+)
 from telerig.estimator.calibration.start import (
     known_target,
     mirror_ambiguity,
@@ -113,17 +124,15 @@ def self_calibrate(
     if len(cameras) > 1 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
         fit, mirror = _on_the_right_side(fit, nominal)
     final, solution = fit.robust.problem, fit.robust.solution
-    considered = considered_parameters.considered_groups(fit.choice, len(cameras))
-    added = considered_parameters.considered_words(considered, [c.name for c in cameras])
+    considered = considered_groups(fit.choice, len(cameras))
+    added = considered_words(considered, [c.name for c in cameras])
     other_cost = mirror_ambiguity.mirrored_cost(final, solution.state, solution.cost)
     fit = replace(
         fit, mirror=mirror, mirrored_cost=other_cost, tilts_deg=pre.tilts_deg,
         notes=tuple(found_notes), model_words=fit.model_words + added,
     )  # fmt: skip
     own = joint_covariance(final, solution)
-    free, joint = considered_parameters.considered_covariance(
-        final, solution, own, fit.models, considered
-    )
+    free, joint = considered_covariance(final, solution, own, fit.models, considered)
     weak = checks.weak_parameters(final, own)
     found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
     checked = _trust(fit.robust, joint, free)

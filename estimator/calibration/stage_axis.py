@@ -18,7 +18,6 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError, suggestion
-from telerig.estimator.calibration.solver.covariance import rig_jacobian
 from telerig.factors.linear_factors import add_linear_factors
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.dataset.tables import read_dots_csv
@@ -26,7 +25,7 @@ from telerig.io.files.csv_table import Column, read_table
 from telerig.io.images.read import list_images, natural
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, across, hat, nearest_rotation, rotation_from_rotvec
-from telerig.rig.triangulation import triangulate_any
+from telerig.rig.triangulation import rig_jacobian, triangulate_any
 from telerig.statistics import robust_sd
 
 if TYPE_CHECKING:

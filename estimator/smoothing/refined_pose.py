@@ -15,15 +15,16 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.rig_drift.drift import (
+from telerig.estimator.rig_drift import (
+    LEAST_PAIRS,
     DriftPrior,
     RigChange,
     drift_covariance,
     drift_posterior,
     moved_pose,
+    rig_change,
     rig_change_from,
 )
-from telerig.estimator.rig_drift.from_pairs import LEAST_PAIRS, rig_change
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
 from telerig.estimator.calibration.refractive_windows import window_warnings
+from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.smooth import smooth
-from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.estimator.tracking.detect_run import read_batch
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
 from telerig.io.files.atomic import atomic_folder, write_json_atomic

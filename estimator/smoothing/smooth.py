@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
@@ -44,12 +45,11 @@ from telerig.estimator.smoothing.refined_pose import (
 from telerig.estimator.smoothing.result import Smoothing, summary_of, trajectories
 from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.verdict.judge import judge
-from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
-    from telerig.estimator.rig_drift.drift import DriftPrior
+    from telerig.estimator.rig_drift import DriftPrior
     from telerig.io.rig_file.description import StageDescription
 
 Learn = Callable[[SmoothingProblem], ShakeModel]

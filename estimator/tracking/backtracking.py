@@ -22,14 +22,14 @@ import pandas as pd
 from telerig.arrays import Array, Bools, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
 from telerig.estimator.bubbles.pairing.matching import Prediction
-from telerig.estimator.tracking.association.likelihoods import (
+from telerig.estimator.tracking.association import (
     gate2,
     pair_pixels,
     projected,
     px_per_mm,
     size_score,
 )
-from telerig.estimator.tracking.filter.motion import POSITION, birth_covariance
+from telerig.estimator.tracking.filter.kalman import POSITION, birth_covariance
 from telerig.estimator.tracking.filter.types import (
     NO_PARTICLE,
     FrameIds,

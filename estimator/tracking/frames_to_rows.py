@@ -13,7 +13,7 @@ from telerig.arrays import Array, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
 from telerig.estimator.bubbles.pairing.matching import PairModel, Prediction, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
-from telerig.estimator.tracking.association.likelihoods import px_per_mm
+from telerig.estimator.tracking.association import px_per_mm
 from telerig.estimator.tracking.backtracking import (
     CENTRE_PX,
     COVARIANCE_MM2,

@@ -16,7 +16,7 @@ import pandas as pd
 
 from telerig.errors import InputError
 from telerig.estimator.bubbles.detect import find_bubbles, outline_points
-from telerig.estimator.tracking.calibration_of_run import pair_of_run
+from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.tracking.detect_run import Progress, Scene, make_scene
 from telerig.estimator.tracking.frames_to_rows import Linked
 from telerig.estimator.tracking.track import (

@@ -19,11 +19,9 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
 from telerig.estimator.bubbles.shape.volume_centroid import estimate_shape_sigma
-from telerig.estimator.calibration.refractive_windows import window_warnings
-from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.rig_drift.from_pairs import PairCollector, with_change
+from telerig.estimator.calibration.result.calibration import Calibration, pair_of_run
+from telerig.estimator.rig_drift import PairCollector, with_change
 from telerig.estimator.tracking.backtracking import Tables
-from telerig.estimator.tracking.calibration_of_run import pair_of_run
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
     FollowedMarks,
@@ -135,7 +133,7 @@ class TrackingStream:
             "shape_sigma": self.linker.shape_sigma,
             "covariance": "Of the measurement. The calibration's share, common to all points, is "
             "not in tracks.csv.",
-            "warnings": window_warnings(run.rig, self.calibration),
+            "warnings": _window_warnings(run, self.calibration),
             "notes": list(run.notes),
         }
         if change is not None:
@@ -143,6 +141,14 @@ class TrackingStream:
         if self.marks is not None:
             content["references"] = self.marks.summary
         return content
+
+
+def _window_warnings(run: RunData, calibration: Calibration) -> list[str]:
+    if not ((run.rig and run.rig.walls) or any(camera.wall for camera in calibration.cameras)):
+        return []
+    from telerig.estimator.calibration.refractive_windows import window_warnings
+
+    return window_warnings(run.rig, calibration)
 
 
 def track(

@@ -15,34 +15,34 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.estimator.bubbles.pairing.matching import Prediction
-from telerig.estimator.tracking.association.hypotheses import (
+from telerig.estimator.tracking.association import (
     Cluster,
     Decision,
     Scan,
     advance,
+    assigned_with_shift,
+    best_assignment,
     continue_track,
     decide,
     follow_labelled,
-)
-from telerig.estimator.tracking.association.likelihoods import (
-    assigned_with_shift,
-    best_assignment,
     gated_pairs,
     pair_pixels,
     projected,
     unrivalled,
     update_pixels,
 )
-from telerig.estimator.tracking.filter.motion import (
+from telerig.estimator.tracking.filter.kalman import (
     POSITION,
     STATES,
     VELOCITY,
+    Common,
     StageMotion,
+    Track,
     Transition,
     birth_covariance,
+    new_filter,
     transition,
 )
-from telerig.estimator.tracking.filter.state import Common, Track, new_filter
 from telerig.estimator.tracking.filter.types import (
     NO_PARTICLE,
     FrameIds,

@@ -249,6 +249,11 @@ class RigDescription:
         """Names of the two cameras that tracking uses; one name for a rig of one camera."""
         return self.tracking or tuple(self.cameras)[:2]
 
+    @property
+    def windows(self) -> dict[str, Wall]:
+        """The windows that `[walls]` states, by camera."""
+        return {name: wall.wall() for name, wall in self.walls.items()}
+
     def camera_name(self, camera: str | int) -> str:
         """The camera's name from its name or its index. Raises InputError for an unknown one."""
         return camera_named(camera, list(self.cameras), where="rig.toml")

@@ -10,11 +10,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.solver import levenberg_marquardt as graph
-from telerig.estimator.calibration.solver.levenberg_marquardt import linearisation
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver import robust_least_squares as graph
 from telerig.estimator.calibration.solver.nonlinear_graph import nonlinear_graph
-from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem, prior_sigma
+from telerig.estimator.calibration.solver.problem import (
+    GAUGE_SIGMA_MM,
+    Problem,
+    prior_sigma,
+    problem_from_dots,
+)
+from telerig.estimator.calibration.solver.robust_least_squares import linearisation
 from telerig.estimator.calibration.start import known_target
 from telerig.factors.calibration import (
     Observations,

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import telerig
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset
 

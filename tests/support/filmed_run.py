@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pandas as pd
 
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.triangulation import triangulate

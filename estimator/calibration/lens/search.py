@@ -20,8 +20,8 @@ from itertools import product
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.calibration.solver.levenberg_marquardt import Solution
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit, prior_sigma
+from telerig.estimator.calibration.solver.robust_least_squares import Solution
 from telerig.factors.calibration import whitened_error
 from telerig.rig.lens_models import GROUPS, ordered
 from telerig.rig.projection import INDEX

@@ -17,13 +17,11 @@ from scipy.special import chdtrc
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.solver.covariance import aligned_shift
 from telerig.io.report.page.number_format import number, with_sd
 from telerig.rig.camera import Camera
 from telerig.rig.pose import nearest_rotation, rotvec_from_rotation
-from telerig.rig.triangulation import triangulate_any
+from telerig.rig.triangulation import aligned_shift, triangulate_any, working_volume
 
 UNLIKELY = 1e-3
 """A difference with a smaller probability under chance alone is called a movement."""

@@ -22,9 +22,8 @@ from telerig.estimator.calibration.quality.comparison import (
     field_difference,
 )
 from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem, cameras_from_state
-from telerig.estimator.calibration.solver.robust import LEAST_DOTS
+from telerig.estimator.calibration.solver.robust_least_squares import LEAST_DOTS, solve
 from telerig.estimator.calibration.start.known_target import overlap_tree
 from telerig.factors.calibration import State
 from telerig.io.report.page.number_format import number

@@ -13,13 +13,11 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.estimator.calibration.quality.comparison import after_rigid_motion
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.solver.covariance import aligned_covariance
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import intrinsics_from
-from telerig.rig.triangulation import triangulate_any
+from telerig.rig.triangulation import aligned_covariance, triangulate_any, working_volume
 
 MANY_SD = 4.0
 

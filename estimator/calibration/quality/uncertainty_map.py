@@ -1,31 +1,15 @@
-"""The working volume, and how well points in it are known: the calibration's share, the pixels'."""
+"""Maps the uncertainty of triangulated points over the working volume."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from telerig.arrays import Array
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.rig.camera import Camera
+from telerig.rig.triangulation import working_volume
 
 STEPS = 7
-VOLUME_SHARE = 0.6
-"""The working volume: a cube of this share of the smaller field of view, round the rig's origin."""
-
-
-def working_volume(cameras: tuple[Camera, ...], steps: int = 5) -> Array:
-    """Return a cubic grid of points in the rig frame that all cameras see.
-
-    steps : number of points along each edge.
-
-    Returns (steps^3, 3) points, in mm.
-    """
-    field = min(min(c.image_size_px) / c["scale_px_per_mm"] for c in cameras)
-    axis = np.linspace(-0.5, 0.5, steps) * VOLUME_SHARE * field
-    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)

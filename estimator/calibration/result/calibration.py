@@ -1,8 +1,11 @@
-"""The result of a self-calibration: cameras, target, poses, covariance, and what can be done."""
+"""The result of a self-calibration: cameras, target, poses, covariance, and what can be done.
+
+A calibration is also read from its folder, chosen for a run, or made from imported cameras.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.summary import summary
-from telerig.estimator.calibration.solver.covariance import (
-    POSE_COMPONENTS,
-    point_shift_jacobian,
-    rig_jacobian,
-)
 from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
 from telerig.io.results.calibration import (
@@ -31,8 +29,11 @@ from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 from telerig.rig.projection import PARAMETERS
 from telerig.rig.triangulation import (
+    POSE_COMPONENTS,
     Triangulation,
     pixel_covariance,
+    point_shift_jacobian,
+    rig_jacobian,
     seen_covariance,
     triangulate,
     triangulate_views,
@@ -401,4 +402,111 @@ def load_calibration(path: str | Path) -> Calibration:
         medium=record.medium,
         joint_names=names,
         joint_covariance=joint,
+    )
+
+
+def pair_of_run(calibration: Calibration, names: Sequence[str]) -> Calibration:
+    """Return the calibration of the two cameras that recorded a run.
+
+    calibration : the calibration of two or more cameras.
+    names : names of the run's cameras.
+
+    The calibration is returned unchanged if it has fewer than three cameras, or if ``names`` are
+    not two of its cameras; `check_calibration` then reports the error.
+    """
+    known = [camera.name for camera in calibration.cameras]
+    if len(known) < 3 or len(names) != 2 or not set(names) <= set(known):
+        return calibration
+    first, second = sorted(names, key=known.index)
+    return calibration.pair(first, second)
+
+
+def calibration_for(run: Path, files: Sequence[Path] | None) -> tuple[Calibration, list[Path]]:
+    """Read the calibration for a run.
+
+    run : folder of the run.
+    files : None to read results/calibration/calibration.json of the run's dataset; one
+        calibration.json or its folder; or the two camera files of OpenLPT (.txt), first camera
+        first.
+
+    Returns the calibration and the files that were read. Raises InputError when there is no
+    calibration, or when the files do not belong together.
+    """
+    if not files:
+        default = run.resolve().parent.parent / "results" / "calibration" / "calibration.json"
+        if not default.is_file():
+            raise InputError(
+                "there is no calibration",
+                where=str(default),
+                todo="run `telerig calibrate` on the dataset, or give one with --calibration",
+            )
+        return load_calibration(default), [default]
+    if len(files) == 1 and files[0].suffix != ".txt":
+        return load_calibration(files[0]), [p for p in files if p.is_file()]
+    if len(files) == 2 and all(p.suffix == ".txt" for p in files):
+        from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
+
+        cameras, *_ = read_openlpt_cameras(list(files))
+        return calibration_from_cameras(cameras, name="OpenLPT"), list(files)
+    raise InputError(
+        f"--calibration was given {len(files)} times: {', '.join(p.name for p in files)}",
+        todo="give one calibration.json, or two OpenLPT camera files (.txt)",
+    )
+
+
+NO_COVARIANCE = (
+    "imported: the calibration's own uncertainty is unknown and counted as none, so covariances "
+    "of points hold the measurement's share only"
+)
+
+
+def calibration_from_cameras(
+    cameras: Sequence[Camera],
+    *,
+    name: str = "imported",
+    sigma_px: float = 0.1,
+    notes: Sequence[str] = (),
+) -> Calibration:
+    """Make a `Calibration` from cameras that are taken as exactly known.
+
+    cameras : one or more cameras. The frame of the first has to be the rig frame.
+    name : name of the rig.
+    sigma_px : standard deviation of the pixels (px) that `Calibration.triangulate` assumes if none
+        is given.
+    notes : further sentences to keep with the calibration, for example the names of its files.
+
+    The result has no free intrinsics, and the covariance of its poses is zero; its first note says
+    that the uncertainty is unknown.
+    Raises CalibrationError if there is no camera, if two cameras have the same name, if the first
+    camera's frame is not the rig frame, or if sigma_px is not positive.
+    """
+    names = [c.name for c in cameras]
+    if not names or len(set(names)) != len(names):
+        raise CalibrationError(
+            f"cameras named {names}", todo="give at least one camera, no two of one name"
+        )
+    first = cameras[0].camera_from_rig
+    if not np.allclose(np.c_[first.rotation, first.translation_mm], np.eye(3, 4), atol=1e-12):
+        raise CalibrationError(
+            "the first camera's frame is not the rig frame",
+            where=names[0],
+            todo="express all poses in the first camera's frame",
+        )
+    if not sigma_px > 0:
+        raise CalibrationError(f"sigma_px is {sigma_px}", todo="give the pixel noise, > 0 px")
+    pose_names = tuple(f"{n}.{component}" for n in names[1:] for component in POSE_COMPONENTS)
+    return Calibration(
+        cameras=(replace(cameras[0], camera_from_rig=Pose.identity()), *cameras[1:]),
+        dot_ids=np.zeros(0, np.int64),
+        target_points_mm=np.zeros((0, 3)),
+        target_poses={},
+        covariance=np.zeros((len(pose_names), len(pose_names))),
+        covariance_names=pose_names,
+        free=tuple(() for _ in cameras),
+        name=name,
+        verdict={"status": "IMPORTED", "reasons": [NO_COVARIANCE]},
+        model={"words": "imported and held fixed"},
+        diagnostics={"gauge": "as imported", "weak": []},
+        statistics={"scatter_px": float(sigma_px)},
+        notes=(NO_COVARIANCE, *notes),
     )

@@ -2,5 +2,5 @@
 covariance.
 
 In: a ``Problem`` and a start. Out: the fitted state, the weights of the dots and the joint
-covariance. Read ``problem``, then ``system`` and ``levenberg_marquardt``.
+covariance. Read ``problem``, then ``system`` and ``robust_least_squares``.
 """

@@ -1,8 +1,5 @@
-"""Computes the joint covariance of a self-calibration, and its effect on triangulated points.
-
-The *rig block* of the covariance holds the P parameters of the cameras: the free intrinsics of all
-cameras, then the pose (6) of each camera but the first.
-"""
+"""Computes the joint covariance of a self-calibration; its first P parameters are the rig block of
+`telerig.rig.triangulation`."""
 
 from __future__ import annotations
 
@@ -11,16 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.calibration.solver.levenberg_marquardt import Solution
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
+from telerig.estimator.calibration.solver.robust_least_squares import Solution
 from telerig.estimator.calibration.solver.schur import Posterior
 from telerig.estimator.calibration.solver.system import System, images_of, slots
-from telerig.rig.camera import Camera
-from telerig.rig.pose import hat
-from telerig.rig.projection import INDEX
-from telerig.rig.triangulation import stacked_jacobian
+from telerig.rig.triangulation import POSE_COMPONENTS
 
-POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 FULL_COVARIANCE_UP_TO = 4000
 """Up to this number of parameters, the covariance of all parameters with all others is kept."""
 
@@ -166,77 +159,3 @@ def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior
             rows = system.rows[c][first:last]
             out[rows] = alone + mixed + np.swapaxes(mixed, -1, -2) + of_dots
     return out
-
-
-def rig_jacobian(
-    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
-) -> Array:
-    """Return the derivative (..., 2C, P) of the pixels in C cameras with respect to the rig block.
-
-    free : for each camera the names of its free intrinsics.
-    points_mm : (..., 3) rig points.
-    """
-    lens = np.cumsum([0, *map(len, free)])
-    out = np.zeros((*points_mm.shape[:-1], 2 * len(cameras), lens[-1] + 6 * (len(cameras) - 1)))
-    for c, camera in enumerate(cameras):
-        rows = out[..., 2 * c : 2 * c + 2, :]
-        in_camera = camera.camera_from_rig.apply(points_mm.reshape(-1, 3)).reshape(points_mm.shape)
-        names = [INDEX[name] for name in free[c]]
-        _, by_point, rows[..., lens[c] : lens[c + 1]] = camera.pixel_jacobians(in_camera, names)
-        if c:
-            at = lens[-1] + 6 * (c - 1)
-            rows[..., at : at + 6] = np.concatenate([by_point @ hat(in_camera), -by_point], -1)
-    return out
-
-
-def aligned_covariance(
-    cameras: tuple[Camera, ...],
-    free: tuple[tuple[str, ...], ...],
-    covariance: Array,
-    points_mm: Array,
-) -> Array:
-    """Return the covariance (3 N, 3 N) of N rig points due to the calibration, without rigid
-    motion.
-
-    A rigid motion that is common to all points is projected out; see `aligned_shift`.
-
-    covariance : (P, P) of the rig block.
-    """
-    inner = aligned_shift(cameras, free, points_mm)
-    return np.asarray(inner @ covariance @ inner.T)
-
-
-def aligned_shift(
-    cameras: tuple[Camera, ...], free: tuple[tuple[str, ...], ...], points_mm: Array
-) -> Array:
-    """Return the derivative (3 N, P) of N triangulated points with respect to the rig block,
-    without rigid motion.
-
-    A rigid motion that is common to all points is projected out, because the place of the rig frame
-    is a matter of definition (Baarda's S-transformation to the points' own frame). The result
-    describes errors of shapes, distances and motions inside the rig.
-    """
-    rows = 2 * len(cameras)
-    information = np.broadcast_to(np.eye(rows), (len(points_mm), rows, rows))
-    shift = point_shift_jacobian(cameras, free, points_mm, information)
-    shift = shift.reshape(-1, shift.shape[-1])
-    centred = points_mm - points_mm.mean(0)
-    motion = np.concatenate([np.tile(np.eye(3), (len(points_mm), 1, 1)), -hat(centred)], -1)
-    basis, _ = np.linalg.qr(motion.reshape(-1, 6))
-    return np.asarray(shift - basis @ (basis.T @ shift))
-
-
-def point_shift_jacobian(
-    cameras: tuple[Camera, ...],
-    free: tuple[tuple[str, ...], ...],
-    points_mm: Array,
-    information_px: Array,
-) -> Array:
-    """Return the derivative (..., 3, P) of triangulated points with respect to the rig block.
-
-    information_px : (..., 2C, 2C) inverse covariance of the pixels.
-    """
-    _, by_point = stacked_jacobian(cameras, points_mm)
-    weighted = np.swapaxes(by_point, -1, -2) @ information_px
-    by_rig = rig_jacobian(cameras, free, points_mm)
-    return np.asarray(-np.linalg.solve(weighted @ by_point, weighted @ by_rig), np.float64)

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.lens.choice import pose_only
-from telerig.estimator.calibration.solver.levenberg_marquardt import solve
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.estimator.calibration.solver.robust import robust_solve
+from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
 from telerig.rig.projection import INDEX

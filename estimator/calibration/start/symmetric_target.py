@@ -13,7 +13,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem
-from telerig.estimator.calibration.solver.robust import robust_solve
+from telerig.estimator.calibration.solver.robust_least_squares import robust_solve
 from telerig.estimator.calibration.start import known_target
 from telerig.estimator.calibration.start.mirror_ambiguity import Nominal
 from telerig.factors.calibration import State, whitened_residuals

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.calibration.solver.covariance import rig_jacobian
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
 from telerig.factors import measurements
 from telerig.factors.linear_factors import LinearFactors, prior_factors
 from telerig.factors.motion import start_factors
 from telerig.factors.state_space import log_det_of, whitener_of
+from telerig.rig.triangulation import rig_jacobian
 
 _SLOPE_S = 2e-3
 """Width of the filter that takes the readings' rate of change for the delay."""

@@ -218,8 +218,8 @@ def calibration_share(
     A direction whose effect stays far below the noise of a mean over the run is left out.
     drift : (6, 6) prior of a movement of the second camera since the calibration.
     """
-    from telerig.estimator.calibration.solver.covariance import rig_jacobian
-    from telerig.estimator.rig_drift.drift import rig_block, with_drift
+    from telerig.estimator.rig_drift import rig_block, with_drift
+    from telerig.rig.triangulation import rig_jacobian
 
     covariance, free = calibration.covariance, calibration.free
     if drift is not None:

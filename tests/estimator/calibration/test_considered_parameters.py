@@ -8,22 +8,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.lens.choice import Choice, FittedModel, Step
-from telerig.estimator.calibration.lens.considered_parameters import (
+from telerig.estimator.calibration.lens.choice import (
     CONSIDERED_P_VALUE,
+    Choice,
+    FittedModel,
+    Step,
     considered_covariance,
     considered_groups,
     considered_words,
 )
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.solver import covariance
-from telerig.estimator.calibration.solver.covariance import aligned_shift, joint_covariance
-from telerig.estimator.calibration.solver.levenberg_marquardt import solve
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
+from telerig.estimator.calibration.solver.covariance import joint_covariance
+from telerig.estimator.calibration.solver.problem import problem_from_dots
+from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start.known_target import stereo_states
 from telerig.io.simulation.presets import preset
 from telerig.rig.lens_models import GROUPS
-from telerig.rig.triangulation import triangulate
+from telerig.rig.triangulation import aligned_shift, triangulate
 
 NONE: frozenset[str] = frozenset()
 STRETCH = frozenset({"affine"})

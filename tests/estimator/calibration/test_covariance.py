@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 from telerig.estimator.calibration.self_calibration import with_plate
-from telerig.estimator.calibration.solver import levenberg_marquardt as graph
+from telerig.estimator.calibration.solver import robust_least_squares as graph
 from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.nonlinear_graph import nonlinear_graph
-from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal, parameter_unit
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    held_at_nominal,
+    parameter_unit,
+    problem_from_dots,
+)
 from telerig.estimator.calibration.start import known_target
 from telerig.io.simulation.presets import preset
 

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from telerig.estimator.calibration.solver.measurements import eccentricity_px, problem_from_dots
-from telerig.estimator.calibration.solver.problem import cameras_from_state
+from telerig.estimator.calibration.solver.problem import (
+    cameras_from_state,
+    eccentricity_px,
+    problem_from_dots,
+)
 from telerig.estimator.calibration.start import known_target
 from telerig.rig.pose import Pose
 from telerig.rig.projection import INDEX

@@ -16,15 +16,15 @@ import pytest
 
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver import covariance, schur
-from telerig.estimator.calibration.solver import levenberg_marquardt as lm
+from telerig.estimator.calibration.solver import robust_least_squares as lm
 from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
 from telerig.estimator.calibration.solver.problem import (
     GAUGE_SIGMA_MM,
     Problem,
     nominal_state,
     parameter_unit,
     prior_sigma,
+    problem_from_dots,
     whitening,
 )
 from telerig.estimator.calibration.solver.system import System, images_of, slots

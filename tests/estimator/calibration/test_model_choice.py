@@ -23,9 +23,8 @@ from telerig.estimator.calibration.lens.search import (
     steps_to,
 )
 from telerig.estimator.calibration.self_calibration import choose_model
-from telerig.estimator.calibration.solver.levenberg_marquardt import solve
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
-from telerig.estimator.calibration.solver.problem import Problem, nominal_state
+from telerig.estimator.calibration.solver.problem import Problem, nominal_state, problem_from_dots
+from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.factors.calibration import whitened_error
 from telerig.io.simulation.presets import preset
 from telerig.rig.lens_models import GROUPS, name_of

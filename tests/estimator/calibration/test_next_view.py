@@ -21,10 +21,9 @@ from telerig.estimator.calibration.next_view import (
     hold_words,
     next_view,
 )
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
-from telerig.estimator.calibration.solver.covariance import aligned_covariance, joint_covariance
-from telerig.estimator.calibration.solver.levenberg_marquardt import solve
+from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.problem import cameras_from_state, held_at_nominal
+from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.factors.calibration import State, pixels
 from telerig.io.report.calibration.report import write_calibration_report
 from telerig.io.report.calibration.results import read_results
@@ -32,12 +31,13 @@ from telerig.io.report.calibration.rig import next_pictures
 from telerig.io.simulation.images.plates import Plate, pixel_from_plate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.triangulation import aligned_covariance, working_volume
 
 
 def fitted(scene: Any, model: str = "radial") -> tuple[Any, Any, Any]:
     """Problem, state and covariance of a scene, without the search for a model."""
     from telerig.estimator.calibration.self_calibration import best_start, with_plate
-    from telerig.estimator.calibration.solver.measurements import problem_from_dots
+    from telerig.estimator.calibration.solver.problem import problem_from_dots
 
     problem = problem_from_dots(scene.dots, scene.cameras, scene.target)
     start = best_start(problem, problem.nominal_mm)

@@ -27,7 +27,6 @@ from telerig.estimator.calibration.quality.truth import true_cameras
 from telerig.estimator.calibration.refractive_windows import (
     behind_windows,
     model_error_um,
-    stated_windows,
     window_notes,
     window_warnings,
     with_windows,
@@ -333,7 +332,7 @@ def test_rig_toml_states_the_wall(tank: Path, tmp_path: Path) -> None:
     write_rig_toml(replace(rig, walls=walls), tmp_path / "rig.toml")
     again = read_rig_toml(tmp_path / "rig.toml")
     assert again.walls == walls
-    stated = stated_windows(again)["left"]
+    stated = again.windows["left"]
     assert stated.normal_sigma_rad == pytest.approx(np.radians(0.25))
     assert stated.distance_mm == -60.0
     text = (tmp_path / "rig.toml").read_text(encoding="utf-8").replace("= 0.25", "= -0.25")

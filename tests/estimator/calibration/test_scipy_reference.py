@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from telerig.estimator.calibration.solver import levenberg_marquardt as graph
+from telerig.estimator.calibration.solver import robust_least_squares as graph
 from telerig.estimator.calibration.solver.covariance import joint_covariance
-from telerig.estimator.calibration.solver.measurements import problem_from_dots
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import Problem, problem_from_dots
 from telerig.estimator.calibration.start import known_target
 from telerig.factors.calibration import State
 

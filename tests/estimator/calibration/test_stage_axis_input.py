@@ -12,8 +12,7 @@ import tifffile
 
 import telerig
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.calibration.stage_axis import stage_axis_from
 from telerig.io.dataset.dataset import Dataset
 from telerig.io.rig_file.description import StageDescription

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from telerig.errors import CalibrationError
 from telerig.estimator.calibration.quality.comparison import compare_calibrations
 from telerig.estimator.calibration.quality.truth import space_error
-from telerig.estimator.calibration.quality.uncertainty_map import working_volume
 from telerig.estimator.calibration.result.calibration import load_calibration
 from telerig.io.results.calibration import CalibrationFile
 from telerig.io.simulation.config import CameraConfig
+from telerig.rig.triangulation import working_volume
 from telerig.scripts.main import app
 
 PAIRS = (("left", "middle"), ("middle", "right"))

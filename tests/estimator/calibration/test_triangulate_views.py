@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 import telerig
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.marks.following import HIDDEN, StripInImages, TankView
 from telerig.estimator.marks.strip_dots import find_dots, learn_look
 from telerig.estimator.smoothing.results_folder import smooth_run

@@ -15,18 +15,22 @@ from telerig.errors import CalibrationError, InputError
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.rig_drift.drift import (
+from telerig.estimator.rig_drift import (
     DriftPrior,
+    Noise,
+    PairCollector,
     RigChange,
+    Series,
     covariance_root,
     drift_covariance,
     drift_posterior,
+    learned_noise,
     moved_pose,
     offset_roll_pitch,
     ray_misses,
+    rig_change,
+    with_change,
 )
-from telerig.estimator.rig_drift.from_pairs import PairCollector, rig_change, with_change
-from telerig.estimator.rig_drift.ray_miss_noise import Noise, Series, learned_noise
 from telerig.estimator.smoothing.problem.problem import RigMode, ShakeModel
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset

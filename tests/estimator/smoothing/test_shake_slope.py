@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from shake_learning_data import run, true_model
 
 from telerig.estimator.smoothing.learning.attribution import moved_to_bubble
-from telerig.estimator.smoothing.learning.block_tridiagonal import eliminated
-from telerig.estimator.smoothing.learning.evidence import signal_evidence, signal_gradient
+from telerig.estimator.smoothing.learning.evidence import (
+    eliminated,
+    signal_evidence,
+    signal_gradient,
+)
 from telerig.estimator.smoothing.learning.likelihood import (
     evidence,
     evidence_gradient,

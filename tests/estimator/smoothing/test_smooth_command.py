@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import telerig
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.estimator.smoothing.truth import motion_error
 from telerig.io.simulation.calibration.scene import true_cameras
 from telerig.io.simulation.presets import run_preset

@@ -13,8 +13,7 @@ import pytest
 
 import telerig
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.smooth import smooth

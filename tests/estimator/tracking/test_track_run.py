@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 import telerig
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.tracking import detect_run
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions

@@ -15,8 +15,7 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.calibrate import calibrate
 from telerig.estimator.calibration.quality.truth import true_cameras
-from telerig.estimator.calibration.result.calibration import Calibration
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.smoothing.results_folder import smooth_run
 from telerig.estimator.tracking.results_folder import write_tracking
 from telerig.estimator.tracking.track import TrackOptions

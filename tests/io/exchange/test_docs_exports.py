@@ -17,7 +17,7 @@ from scipy.io import loadmat, wavfile
 from typer.testing import CliRunner
 
 import telerig
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.dataset.tables import read_accelerometer_csv
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from telerig.errors import InputError
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.exchange.importing.opencv import read_opencv_cameras
 from telerig.io.exchange.importing.openptv import Sensor, read_openptv_cameras, read_ptv_par
 from telerig.io.exchange.importing.pinhole import nominal_toml

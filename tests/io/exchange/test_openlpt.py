@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from places import REAL
 
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.result.calibration import load_calibration
-from telerig.estimator.calibration.result.imported import NO_COVARIANCE, calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import (
+    NO_COVARIANCE,
+    calibration_from_cameras,
+    load_calibration,
+)
 from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from filmed_run import (
 from PIL import Image
 
 from telerig.errors import GeometryError, InputError
-from telerig.estimator.calibration.result.imported import calibration_from_cameras
+from telerig.estimator.calibration.result.calibration import calibration_from_cameras
 from telerig.io.report.film import path as film_path
 from telerig.io.report.film.path import (
     FilmPath,

@@ -1,0 +1,836 @@
+"""Estimates how the cameras have moved relative to each other since the calibration, from the ray
+misses of the pairs of a tracked run.
+
+The two rays of a pair miss each other along the common perpendicular n of both lines of sight. If
+the second camera has moved by v and rotated by w, the ray miss at a rig point p is n . (v + w x p),
+which is a constant plus a slope along both lines of sight. Ray misses therefore identify three of
+the six components of the pose between two telecentric cameras, at any angle between them: the shift
+along n, and the two rotations about axes perpendicular to n (roll about the second camera's own
+axis, and pitch about the axis perpendicular to that). Shifts in the plane of the lines of sight and
+the angle between the cameras (rotation about n) move the triangulated point but cause no ray miss;
+they keep their calibrated values. With perspective lenses more components are identifiable, and
+these are estimated too.
+
+The noise of ray misses comes from pixels, differential shake and bubbles that change shape. It is a
+Gaussian process in time, whose hyper-parameters are learned from the ray misses themselves: white
+noise of each pair, damped oscillations that are common to all pairs of a frame (shake), and an
+Ornstein-Uhlenbeck process for each bubble, because the centre of its outline wanders about its
+centre of volume. Only the spectral density near 0 Hz limits the estimate of a constant, and an
+oscillation has little density there. The usual standard error of a mean would be too large or too
+small, because ray misses are correlated in time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky
+from scipy.optimize import minimize
+from scipy.special import chdtrc
+
+from telerig.arrays import Array, Bools, Ints
+from telerig.errors import CalibrationError, InputError
+from telerig.estimator.bubbles.pairing.matching import Finding
+from telerig.rig.camera import Camera
+from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.triangulation import (
+    POSE_COMPONENTS,
+    midpoint,
+    rig_jacobian,
+    stacked_jacobian,
+)
+from telerig.statistics import robust_sd
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.estimator.bubbles.pairing.matching import PairModel
+    from telerig.estimator.calibration.result.calibration import Calibration
+
+
+Prior = tuple[Array, Array]
+
+_PEAKS = 3
+_MOST_MODES = 2
+_LEAST_LOG_RATIO = 3.0
+_WANDER_S = 0.1
+_CYCLES = 5.0
+_FACTOR_3, _FACTOR_10 = np.log(3.0), np.log(10.0)
+_INDEPENDENT = 0.5
+"""Weight of each bin of a spectrum, because neighbouring bins of a tapered spectrum are
+correlated."""
+
+_FIRST_BIN = 2
+_LEAST_FRAMES = 16
+_LEAST_CYCLES = 4.0
+"""An oscillation with fewer cycles in a stretch cannot be distinguished from a slow wander."""
+
+_MOST_APART = 4
+
+
+@dataclass(frozen=True)
+class Series:
+    """Holds M ray misses in time, which are linear in K unknowns of unit prior variance.
+
+    frame, bubble : (M,) index of each frame and of each bubble.
+    t_s, miss_mm : (M,).
+    relative : (M,) variance of each ray miss divided by the median variance.
+    by_unknowns : (M, K) derivative of each ray miss with respect to the unknowns.
+    """
+
+    frame: Ints
+    bubble: Ints
+    t_s: Array
+    miss_mm: Array
+    relative: Array
+    by_unknowns: Array
+
+    def __len__(self) -> int:
+        return len(self.miss_mm)
+
+    def of(self, keep: Bools) -> Series:
+        return Series(*(getattr(self, column.name)[keep] for column in fields(self)))
+
+    def residuals(self) -> Array:
+        """Return the ray misses (M,) minus their least-squares fit by the unknowns."""
+        fit = np.linalg.lstsq(self.by_unknowns, self.miss_mm, rcond=None)[0]
+        return np.asarray(self.miss_mm - self.by_unknowns @ fit)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Holds the hyper-parameters of the noise of ray misses.
+
+    white_mm : standard deviation of the white noise of a pair.
+    wander_mm, wander_s : standard deviation and correlation time of each bubble's
+        Ornstein-Uhlenbeck process.
+    shake : RMS (mm), decay time (s) and frequency (Hz) of each oscillation that all pairs share.
+    """
+
+    white_mm: float
+    wander_mm: float
+    wander_s: float
+    shake: tuple[tuple[float, float, float], ...] = ()
+
+    def own(self, lag_s: Array) -> Array:
+        """Return the autocovariance of a bubble's wander at the lags, in mm^2."""
+        return np.asarray(self.wander_mm**2 * np.exp(-np.abs(lag_s) / self.wander_s))
+
+    def common(self, lag_s: Array) -> Array:
+        """Return the autocovariance of the shake at the lags, in mm^2: damped resonators driven by
+        white noise."""
+        out = np.zeros_like(lag_s)
+        for rms, decay, hz in self.shake:
+            lag, turn = np.abs(lag_s), 2 * np.pi * hz
+            wave = np.cos(turn * lag) + np.sin(turn * lag) / (turn * decay)
+            out += rms**2 * np.exp(-lag / decay) * wave
+        return out
+
+    def covariance(self, series: Series) -> Array:
+        """Return the covariance (M, M) of the ray misses, with the unknowns held fixed."""
+        t, index = np.unique(series.t_s, return_inverse=True)
+        at = np.ix_(index, index)
+        lag = t[:, None] - t
+        same = series.bubble[:, None] == series.bubble
+        out = self.common(lag)[at] + np.where(same, self.own(lag)[at], 0.0)
+        out[np.diag_indices(len(out))] += self.white_mm**2 * series.relative
+        return np.asarray(out)
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """Holds a tapered periodogram, and what is needed for its expectation.
+
+    power : periodogram from bin `_FIRST_BIN` on.
+    step_s : interval of the samples.
+    overlap : autocorrelation of the taper.
+    common, single : shares of the shake's variance and of a single bubble's variance in the series.
+    """
+
+    power: Array
+    step_s: float
+    overlap: Array
+    common: float
+    single: float
+
+    def expected(self, noise: Noise) -> Array:
+        """Return the expectation of the periodogram, which includes leakage and aliasing."""
+        lag = np.asarray(np.arange(len(self.overlap)) * self.step_s, np.float64)
+        covariance = self.common * noise.common(lag) + self.single * noise.own(lag)
+        covariance[0] += self.single * noise.white_mm**2
+        turned = covariance * self.overlap
+        both = np.concatenate([turned, [0.0], turned[:0:-1]])
+        density = np.fft.fft(both).real[: len(self.overlap) + 1 : 2]
+        return np.asarray(density[_FIRST_BIN : _FIRST_BIN + len(self.power)].clip(1e-18))
+
+    def cost(self, noise: Noise) -> float:
+        """Return the negative debiased Whittle log-likelihood (Sykulski et al., Biometrika 106:251,
+        2019)."""
+        density = self.expected(noise)
+        return float(_INDEPENDENT * (np.log(density) + self.power / density).sum())
+
+
+def learned_noise(parts: list[Series]) -> Noise:
+    """Return the noise model with the largest posterior, from the spectra of the residuals of
+    stretches.
+
+    Oscillations are added as long as each raises the log posterior by `_LEAST_LOG_RATIO`, at most
+    two (one for the arm of each camera).
+    """
+    spread = max(float(np.concatenate([p.residuals() for p in parts]).std()), 1e-7)
+    start = np.log([spread / 2, spread / 4, _WANDER_S])
+    spectra = [s for p in parts for s in _spectra(p)]
+    if not spectra:
+        return Noise(spread, spread / 4, _WANDER_S)
+    prior: Prior = (start, np.array([_FACTOR_10, _FACTOR_10, _FACTOR_3]))
+    best, score = _fitted(spectra, start, prior)
+    for _ in range(_MOST_MODES):
+        trials = []
+        for hz in _peaks(spectra[0], _noise(best)):
+            mode = np.log([spread / 2, _CYCLES / hz, hz])
+            richer = (
+                np.concatenate([prior[0], mode]),
+                np.concatenate([prior[1], [_FACTOR_10, _FACTOR_3, 0.1]]),
+            )
+            trials.append((*_fitted(spectra, np.concatenate([best, mode]), richer), richer))
+        found = min(trials, key=lambda t: t[1], default=None)
+        if found is None or found[1] > score - _LEAST_LOG_RATIO:
+            break
+        best, score, prior = found
+    return _noise(best)
+
+
+def _fitted(spectra: list[_Spectrum], start: Array, prior: Prior) -> tuple[Array, float]:
+    """Return the logarithms of the hyper-parameters, and the negative log posterior there."""
+
+    def cost(log: Array) -> float:
+        noise = _noise(log)
+        pull = 0.5 * float((((log - prior[0]) / prior[1]) ** 2).sum())
+        return pull + sum(s.cost(noise) for s in spectra)
+
+    box = [(s - 8.0, s + 4.0) for s in start]
+    found = minimize(cost, start, method="L-BFGS-B", bounds=box, options={"maxiter": 60})
+    return np.asarray(found.x), float(found.fun)
+
+
+def _noise(log: Array) -> Noise:
+    white, wander, tau, *rest = (float(v) for v in np.exp(log))
+    return Noise(white, wander, tau, tuple(zip(rest[0::3], rest[1::3], rest[2::3])))
+
+
+def _spectra(part: Series) -> list[_Spectrum]:
+    """Return the spectrum of each frame's mean ray miss, and those of single bubbles' deviations
+    from it."""
+    left = part.residuals()
+    t, index = np.unique(part.t_s, return_inverse=True)
+    if len(t) < _LEAST_FRAMES:
+        return []
+    count = np.bincount(index)
+    mean = np.bincount(index, left) / count
+    share = float((1 / count).mean())
+    out = [_spectrum(t, mean, 1.0, share)]
+    apart = left - mean[index]
+    bubbles, seen = np.unique(part.bubble, return_counts=True)
+    for bubble in bubbles[np.argsort(-seen)][:_MOST_APART] if share < 1 else ():
+        mine = (part.bubble == bubble) & (count[index] > 1)
+        if mine.sum() >= _LEAST_FRAMES:
+            rest = float((1 - 1 / count[index[mine]]).mean())
+            out.append(_spectrum(part.t_s[mine], apart[mine], 0.0, rest))
+    return out
+
+
+def _spectrum(t_s: Array, values: Array, common: float, single: float) -> _Spectrum:
+    step = float(np.median(np.diff(t_s)))
+    even = np.arange(t_s[0], t_s[-1] + step / 2, step)
+    series = np.interp(even, t_s, values)
+    taper = np.hanning(len(even) + 2)[1:-1]
+    taper /= np.sqrt((taper**2).sum())
+    power = np.abs(np.fft.rfft(series * taper)) ** 2
+    overlap = np.correlate(taper, taper, "full")[len(taper) - 1 :]
+    last = (len(even) - 1) // 2
+    return _Spectrum(power[_FIRST_BIN : last + 1], step, np.asarray(overlap), common, single)
+
+
+def _peaks(spectrum: _Spectrum, noise: Noise) -> list[float]:
+    """Return frequencies (Hz) that exceed the noise model's spectrum most and are not close
+    together.
+    """
+    ratio = spectrum.power / spectrum.expected(noise)
+    length = len(spectrum.overlap) * spectrum.step_s
+    hz = np.arange(_FIRST_BIN, _FIRST_BIN + len(ratio)) / length
+    picked: list[float] = []
+    for i in np.argsort(-ratio * spectrum.power):
+        if hz[i] * length >= _LEAST_CYCLES and all(abs(hz[i] - p) > 0.15 * p for p in picked):
+            picked.append(float(hz[i]))
+        if len(picked) == _PEAKS:
+            break
+    return picked
+
+
+def information(series: Series, noise: Noise) -> tuple[Array, Array, Array]:
+    """Return the information on the unknowns, and the leave-one-out residuals.
+
+    Returns the matrix (K, K) and the vector (K,) of the normal equations without prior, and the
+    residuals (M,) in standard deviations. The residuals are computed at the best unknowns of this
+    stretch; the uncertainty of these is neglected.
+    """
+    lower = cholesky(noise.covariance(series), lower=True, check_finite=False)
+    inverse = cho_solve((lower, True), np.eye(len(lower)), check_finite=False)
+    matrix = series.by_unknowns.T @ inverse @ series.by_unknowns
+    right = series.by_unknowns.T @ (inverse @ series.miss_mm)
+    best = np.linalg.solve(matrix + np.eye(len(matrix)), right)
+    off = inverse @ (series.miss_mm - series.by_unknowns @ best)
+    return matrix, right, off / np.sqrt(np.diagonal(inverse))
+
+
+Free = tuple[tuple[str, ...], ...]
+Pair = tuple[Camera, Camera]
+
+POSE = len(POSE_COMPONENTS)
+FALSE_ALARM = 1e-4
+"""Probability of reporting a movement if there is none."""
+
+_LEAST_EFFECT = 0.02
+"""A direction of movement is estimated if its ray misses are larger than this share of those of the
+direction with the largest ray misses."""
+
+_NOT_IDENTIFIED = 0.5
+"""A rotation is not reported if its posterior standard deviation is larger than this share of the
+prior one."""
+
+_GRID = 0.7
+_SINGULAR = 1e-10
+_LEAST_SINE = 0.05
+
+
+@dataclass(frozen=True)
+class DriftPrior:
+    """Holds the prior standard deviations of each component of a movement.
+
+    They are wide, so that the data of the run decide. Components without effect on ray misses are
+    held at 0. Raises InputError for values that are not positive.
+    """
+
+    rotation_rad: float = 5e-3
+    translation_mm: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not (self.rotation_rad > 0 and self.translation_mm > 0):
+            raise InputError(
+                f"a drift prior of {self.rotation_rad} rad and {self.translation_mm} mm",
+                todo="give positive standard deviations",
+            )
+
+
+@dataclass(frozen=True)
+class RigChange:
+    """Describes the movement of the second camera relative to the first since the calibration.
+
+    camera : name of the second camera.
+    tangent, covariance : (6,) and (6, 6) of rig_from_<second camera> with the components
+        `POSE_COMPONENTS`. They are 0 in the directions that ray misses do not identify.
+    place_mm : (3,) mean position of the bubbles in the rig frame. The offset refers to this point.
+    values, sigmas : (3,) offset along n (mm), roll and pitch (rad), and their standard deviations.
+    prior_sigmas : (3,) their prior standard deviations.
+    chance : p-value, the probability of such ray misses if nothing has moved.
+    pairs : number of pairs from which the movement was estimated.
+    refined : pose rig_from_<second camera> that calibration and run give together; None if it was
+        not estimated.
+    """
+
+    camera: str
+    tangent: Array
+    covariance: Array
+    place_mm: Array
+    values: Array
+    sigmas: Array
+    prior_sigmas: Array
+    chance: float
+    pairs: int
+    refined: Pose | None = None
+
+    @property
+    def moved(self) -> bool:
+        """Whether calibration errors, shake and bubble shapes do not explain the ray misses."""
+        return self.chance < FALSE_ALARM
+
+    def size_words(self) -> str:
+        """Return the identifiable part of the movement in words, with standard deviations."""
+        offset, *turns = zip(1e6 * self.values, 1e6 * self.sigmas)
+        text = f"by {_rounded(offset[0] / 1000, offset[1] / 1000)} µm along the shared coordinate"
+        identified = self.sigmas[1:] < _NOT_IDENTIFIED * self.prior_sigmas[1:]
+        each = zip(("rolled", "pitched"), turns, identified)
+        turned = [f"{name} by {_rounded(*turn)} µrad" for name, turn, known in each if known]
+        return (
+            ", ".join([text, *turned]) if turned else f"{text} (its rotations cannot be determined)"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of ``rig_change`` in smoothing.json and tracking.json."""
+        names = ("offset_mm", "roll_rad", "pitch_rad")
+        out: dict[str, Any] = {"camera": self.camera, "moved": self.moved, "chance": self.chance}
+        out |= {n: float(v) for n, v in zip(names, self.values)}
+        out |= {f"s{n}": float(s) for n, s in zip(names, self.sigmas)}
+        out |= {
+            "place_mm": self.place_mm.tolist(),
+            "components": list(POSE_COMPONENTS),
+            "tangent": self.tangent.tolist(),
+            "covariance": self.covariance.tolist(),
+            "pairs": self.pairs,
+            "not_seen": "Shifts in the plane of both lines of sight and the angle between them "
+            "cause no ray miss. They keep their calibrated values.",
+        }
+        if self.refined is not None:
+            out["rig_from_camera"] = {
+                "rotation": self.refined.rotation.tolist(),
+                "translation_mm": self.refined.translation_mm.tolist(),
+            }
+        return out
+
+
+def _rounded(value: float, sd: float) -> str:
+    """Return value and standard deviation as text, rounded to two digits of the standard
+    deviation."""
+    digits = max(0, 1 - math.floor(math.log10(sd))) if sd > 0 else 2
+    return f"{value:+.{digits}f} ± {sd:.{digits}f}"
+
+
+def common_perpendicular(cameras: Pair) -> tuple[Array, Array]:
+    """Return the common perpendicular of both lines of sight, and the rig point where these are
+    closest.
+
+    The first is the unit vector n (3,) along first line of sight x second line of sight, the other
+    a point (3,) in mm. Raises CalibrationError for cameras that look along one line.
+    """
+    rays = [c.unproject((np.array(c.image_size_px, float)[None] - 1) / 2) for c in cameras]
+    cross = np.cross(rays[0][1], rays[1][1])[0]
+    sine = float(np.linalg.norm(cross))
+    if sine < _LEAST_SINE:
+        raise CalibrationError(
+            "both cameras look along one line",
+            todo="a movement can be found only between cameras with different lines of sight",
+        )
+    middle, _ = midpoint(*rays[0], *rays[1])
+    return cross / sine, middle[0]
+
+
+@dataclass(frozen=True)
+class RayMisses:
+    """Holds the ray misses of M pairs in mm along n.
+
+    miss_mm : (M,).
+    variance_mm2 : (M,) variance due to the noise of the pixels.
+    by_rig : (M, P) derivative with respect to the P parameters of the cameras.
+    """
+
+    miss_mm: Array
+    variance_mm2: Array
+    by_rig: Array
+
+
+def ray_misses(
+    cameras: Pair,
+    free: Free,
+    points_mm: Array,
+    uv_px: Array | None = None,
+    covariance_px2: Array | None = None,
+) -> RayMisses:
+    """Return the ray misses of M pairs, linearised at rig points near them.
+
+    One combination of the four pixel coordinates of a pair does not change with the point; it is
+    given by the left null vector of the projection's Jacobian. This combination is the ray miss. It
+    is scaled to the shift of the second camera along n that would explain it.
+
+    free : for each camera the names of its free intrinsics.
+    points_mm : (M, 3) rig points.
+    uv_px : (M, 2, 2) pixels of each pair in the two cameras; without them the ray misses are 0.
+    covariance_px2 : (M, 2, 2, 2) their covariances; without them the variances are 0.
+    """
+    n, _ = common_perpendicular(cameras)
+    predicted, by_point = stacked_jacobian(cameras, points_mm)
+    null = np.linalg.svd(by_point)[0][..., :, 3]
+    scale = -np.einsum("mi,mij,j->m", null[:, 2:], by_point[:, 2:], n)
+    null = null / scale[:, None]
+    by_rig = np.einsum("mi,mip->mp", null, rig_jacobian(cameras, free, points_mm))
+    miss, variance = np.zeros(len(points_mm)), np.zeros(len(points_mm))
+    if uv_px is not None:
+        miss = np.einsum("mi,mi->m", null, uv_px.reshape(-1, 4) - predicted)
+    if covariance_px2 is not None:
+        by_camera = null.reshape(-1, 2, 2)
+        variance = np.einsum("mci,mcij,mcj->m", by_camera, covariance_px2, by_camera)
+    return RayMisses(miss, variance, by_rig)
+
+
+def drift_covariance(cameras: Pair, prior: DriftPrior) -> Array:
+    """Return the prior covariance (6, 6) of a movement, restricted to directions that cause ray
+    misses.
+
+    The ray misses of different directions are compared over the volume that both cameras see.
+    """
+    _, middle = common_perpendicular(cameras)
+    reach = min(min(c.image_size_px) / c["scale_px_per_mm"] / 2 for c in cameras)
+    steps = _GRID * reach * np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), -1).reshape(-1, 3)
+    rows = ray_misses(cameras, ((), ()), middle + steps).by_rig
+    sigma = np.repeat([prior.rotation_rad, prior.translation_mm], 3)
+    _, strength, directions = np.linalg.svd(rows * sigma)
+    seen = directions[: len(strength)][strength > _LEAST_EFFECT * strength[0]]
+    return np.asarray(sigma[:, None] * (seen.T @ seen) * sigma)
+
+
+def rig_change_from(
+    cameras: Pair,
+    tangent: Array,
+    covariance: Array,
+    prior: Array,
+    place_mm: Array,
+    pairs: int,
+    refined: Pose | None = None,
+) -> RigChange:
+    """Return a movement with its offset, roll and pitch.
+
+    tangent : (6,) estimate, as in `RigChange`.
+    covariance, prior : (6, 6) posterior and prior covariance.
+    place_mm : (3,) rig point to which the offset refers.
+    """
+    rows = offset_roll_pitch(cameras, place_mm)
+    sigmas, priors = (np.sqrt(np.diagonal(rows @ c @ rows.T).clip(0)) for c in (covariance, prior))
+    return RigChange(
+        cameras[1].name, tangent, covariance, place_mm, rows @ tangent, sigmas, priors,
+        p_value_of(tangent, covariance, prior), pairs, refined,
+    )  # fmt: skip
+
+
+def offset_roll_pitch(cameras: Pair, place_mm: Array) -> Array:
+    """Return the matrix (3, 6) that maps the tangent of rig_from_second to offset, roll and pitch.
+
+    The offset is the shift along n at the rig point ``place_mm`` (3,).
+    """
+    n, _ = common_perpendicular(cameras)
+    pose = cameras[1].camera_from_rig
+    across = pose.rotation @ n
+    at = pose.apply(place_mm[None])[0]
+    pitch = np.cross([0.0, 0.0, 1.0], across)
+    offset = np.concatenate([np.cross(at, across), across])
+    roll = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    return np.stack([offset, roll, np.concatenate([pitch / np.linalg.norm(pitch), np.zeros(3)])])
+
+
+def p_value_of(tangent: Array, covariance: Array, prior: Array) -> float:
+    """Return the p-value of an estimate under the hypothesis of no movement.
+
+    It is a chi-square test over the directions that the prior leaves free. The prior shrinks the
+    estimate towards 0, so the true p-value is smaller than the returned one.
+    """
+    basis = covariance_root(prior)
+    if not basis.shape[1]:
+        return 1.0
+    inverse = np.linalg.pinv(basis)
+    value, spread = inverse @ tangent, inverse @ covariance @ inverse.T
+    return float(chdtrc(len(value), value @ np.linalg.solve(spread, value)))
+
+
+def covariance_root(covariance: Array, singular: float = _SINGULAR) -> Array:
+    """Return a square root (P, k) of a covariance (P, P): its k directions of non-zero variance.
+
+    singular : eigenvalues of the correlation matrix below this share of the largest one count as 0.
+    """
+    unit = _scale(covariance)
+    values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
+    kept = values > singular * max(float(values[-1]), singular)
+    return np.asarray(unit[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def _scale(covariance: Array) -> Array:
+    """Return the standard deviations (P,) of a covariance (P, P), with 1 in place of 0."""
+    sd = np.sqrt(np.diagonal(covariance).clip(0))
+    return np.where(sd > 0, sd, 1.0)
+
+
+def rig_block(calibration: Calibration) -> tuple[Array, Free]:
+    """Return the covariance of the cameras' parameters, and each camera's free intrinsics.
+
+    The covariance is zero for a calibration that states none.
+    """
+    if calibration.covariance.size:
+        return calibration.covariance, calibration.free
+    return np.zeros((POSE, POSE)), ((), ())
+
+
+def with_drift(covariance: Array, drift: Array) -> Array:
+    """Return the covariance (P, P) of the cameras' parameters with that of a movement added.
+
+    drift : (6, 6) covariance of a movement of the second camera.
+    """
+    total = covariance.copy()
+    total[-POSE:, -POSE:] += drift
+    return total
+
+
+def drift_posterior(
+    rig: Array, rig_covariance: Array, prior_rig: Array, drift: Array
+) -> tuple[Array, Array]:
+    """Return the movement's part of an estimated error of the cameras' parameters.
+
+    By Gaussian conditioning, the movement is a gain matrix times the sum of calibration error and
+    movement.
+
+    rig, rig_covariance : (P,) and (P, P) posterior of the sum of calibration error and movement.
+    prior_rig : (P, P) covariance of the calibration.
+    drift : (6, 6) prior covariance of the movement.
+
+    Returns the movement (6,) and its covariance (6, 6).
+    """
+    total = with_drift(prior_rig, drift)
+    unit = _scale(total)
+    inverse = np.linalg.pinv(total / unit[:, None] / unit, rcond=1e-13, hermitian=True)
+    gain = np.zeros((POSE, len(total)))
+    gain[:, -POSE:] = drift
+    gain = (gain / unit) @ inverse / unit
+    left = drift - gain @ total @ gain.T
+    return gain @ rig, left + gain @ rig_covariance @ gain.T
+
+
+def moved_pose(rig_from_camera: Pose, tangent: Array) -> Pose:
+    """Return the pose after a small step (6,) (rotation, translation), applied as a right
+    perturbation."""
+    return rig_from_camera @ Pose(rotation_from_rotvec(tangent[:3]), tangent[3:])
+
+
+LEAST_PAIRS = 20
+LEAST_SEEN_S = 0.5
+"""Least total duration of all tracks for a verdict. In a shorter time, wander of the outlines'
+centres cannot be distinguished from a movement."""
+
+_LEAST_CONFIDENCE = 0.9
+_DOUBTFUL = "shared|ambiguous|merged|border"
+_FAR_SIGMAS = 6.0
+_OUTLIER_SIGMAS = 4.5
+_LEAST = 4
+"""With fewer frames in a run, or fewer pairs in a stretch, nothing is estimated."""
+_MOST_ROWS = 520
+_MOST_STRETCHES = 10
+_STRETCH_S = 2.0
+_LEARNED_FROM = 2
+_PASSES = 3
+_SHAPE_PX = 0.02
+"""Constant error of each bubble's centre in each view that its outline does not reveal."""
+
+
+class PairCollector:
+    """Collects the reliable pairs of a run while it is tracked, and estimates a movement at its
+    end.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.parts: list[pd.DataFrame] = []
+
+    def add(self, tracks: pd.DataFrame) -> None:
+        """Add the reliable pairs of a part of the tracks."""
+        names = pair_columns([c.name for c in self.calibration.cameras])
+        self.parts.append(tracks.loc[_reliable(tracks), [n for n in names if n in tracks]])
+
+    def found(self) -> RigChange | None:
+        """Return the movement that all collected pairs give, or None if there are too few of
+        them."""
+        import pandas as pd
+
+        filled = [p for p in self.parts if len(p)]
+        found = rig_change(pd.concat(filled, ignore_index=True), self.calibration) if filled else ()
+        return found[0] if found else None
+
+
+def pair_columns(cameras: Sequence[str]) -> list[str]:
+    """Return the names of the columns of tracks.csv that the estimate needs."""
+    pixels = ("u_px", "v_px", "du_px", "dv_px", "suu_px2", "suv_px2", "svv_px2")
+    base = ["frame", "particle", "t_s", "x_mm", "y_mm", "z_mm", "ray_miss_mm"]
+    return base + [f"{c}_{p}" for c in cameras for p in pixels]
+
+
+def rig_change(
+    tracks: pd.DataFrame, calibration: Calibration, prior: DriftPrior | None = None
+) -> tuple[RigChange, Noise] | None:
+    """Return the movement estimated from a table of tracks, and the noise model of its ray misses.
+
+    Returns None if there are fewer than `LEAST_PAIRS` reliable pairs, or not exactly two cameras.
+    """
+    if len(calibration.cameras) != 2 or len(tracks) < LEAST_PAIRS:
+        return None
+    cameras = (calibration.cameras[0], calibration.cameras[1])
+    table = _without_outliers(tracks.loc[_reliable(tracks)])
+    if len(table) < LEAST_PAIRS or table["frame"].nunique() < _LEAST:
+        return None
+    drift = drift_covariance(cameras, prior or DriftPrior())
+    covariance, free = rig_block(calibration)
+    root = covariance_root(with_drift(covariance, drift), singular=1e-12)
+
+    def series_of(part: pd.DataFrame) -> Series:
+        misses = ray_misses(cameras, free, _points(part), *_pixels(part, [c.name for c in cameras]))
+        return Series(
+            part["frame"].to_numpy(np.int64),
+            part["particle"].to_numpy(np.int64),
+            part["t_s"].to_numpy(float),
+            misses.miss_mm,
+            misses.variance_mm2 / float(np.median(misses.variance_mm2)),
+            misses.by_rig @ root,
+        )
+
+    scale = min(c["scale_px_per_mm"] for c in cameras)
+    found = _estimate(table, series_of, np.sqrt(2) * _SHAPE_PX / scale)
+    if found is None:
+        return None
+    unit, spreads, noise, used = found
+    rig = root @ unit
+    (tangent, own), (_, with_shapes) = (
+        drift_posterior(rig, root @ spread @ root.T, covariance, drift) for spread in spreads
+    )
+    change = rig_change_from(cameras, tangent, own, drift, _points(table).mean(0), used)
+    t = np.unique(table["t_s"].to_numpy(float))
+    seen_s = float(np.median(np.diff(t)) * len(table))
+    chance = p_value_of(tangent, with_shapes, drift) if seen_s >= LEAST_SEEN_S else 1.0
+    return replace(change, chance=chance), noise
+
+
+def _reliable(tracks: pd.DataFrame) -> Bools:
+    """Return which rows have pixels measured in both views, high confidence and no flag of a
+    doubtful pair."""
+    keep = np.isfinite(tracks["ray_miss_mm"].to_numpy(float))
+    if "confidence" in tracks:
+        keep &= ~(tracks["confidence"].to_numpy(float) < _LEAST_CONFIDENCE)
+    if "flags" in tracks:
+        keep &= ~tracks["flags"].fillna("").astype(str).str.contains(_DOUBTFUL).to_numpy()
+    return np.asarray(keep)
+
+
+def _without_outliers(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows whose ray miss is not far from those of all others, with particles numbered
+    from 0."""
+    miss = table["ray_miss_mm"].to_numpy(float)
+    if not len(miss):
+        return table
+    middle = np.median(miss)
+    spread = float(robust_sd(miss - middle))
+    near = np.abs(miss - middle) <= _FAR_SIGMAS * max(spread, 1e-6)
+    bubble = np.unique(table["particle"], return_inverse=True)[1].astype(np.int64)
+    kept: pd.DataFrame = table.assign(particle=bubble).loc[near]
+    return kept
+
+
+def _points(table: pd.DataFrame) -> Array:
+    return table[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+
+
+def _pixels(table: pd.DataFrame, cameras: list[str]) -> tuple[Array, Array]:
+    """Return the centres (M, 2, 2) of M pairs in two cameras, and their covariances (M, 2, 2, 2).
+
+    The centres contain the correction from outline centre to centre of volume if it is known.
+    """
+    uv, spread = [], []
+    for name in cameras:
+        centre = table[[f"{name}_u_px", f"{name}_v_px"]].to_numpy(float)
+        shift = [f"{name}_du_px", f"{name}_dv_px"]
+        if shift[0] in table:
+            centre = centre + np.nan_to_num(table[shift].to_numpy(float))
+        names = [f"{name}_{c}" for c in ("suu_px2", "suv_px2", "suv_px2", "svv_px2")]
+        uv.append(centre)
+        spread.append(table[names].to_numpy(float).reshape(-1, 2, 2))
+    return np.stack(uv, 1), np.stack(spread, 1)
+
+
+def with_change(
+    model: PairModel, change: RigChange | None, calibration: Calibration
+) -> dict[str, Any]:
+    """Return the part ``pairs`` of tracking.json.
+
+    If the cameras have moved, a sentence on this replaces the one on an offset of the calibration.
+    """
+    words, moved = model.sentences(), change is not None and change.moved
+    if change is not None and moved:
+        words = model.sentences(without=[Finding.CALIBRATION_OFFSET])
+        first = calibration.cameras[0].name
+        unsure = "" if np.any(calibration.covariance) else " (or the calibration was never right)"
+        words.append(
+            f"Camera {change.camera!r} has moved against {first!r} since the calibration{unsure}, "
+            f"{change.size_words()}. All positions are off by this movement. Calibrate again, or "
+            "smooth the run with --refine-rig."
+        )
+    return {
+        "bias_px": model.bias_px,
+        "scatter_px": model.scatter_px,
+        "frame_px": model.frame_px,
+        "rms_px": model.rms_px,
+        "calibration_problem": model.calibration_problem or moved,
+        "words": words,
+    }
+
+
+def stretches(table: pd.DataFrame) -> list[pd.DataFrame]:
+    """Return stretches of a run with at most about 520 pairs each, spread evenly over the run.
+
+    Each stretch uses every frame if few bubbles are seen, and every second, third, ... frame if
+    many are.
+    """
+    frames, counts = np.unique(table["frame"].to_numpy(np.int64), return_counts=True)
+    most = max(4, int(_MOST_ROWS / float(counts.mean())))
+    first = table.drop_duplicates("frame").sort_values("frame")["t_s"].to_numpy(float)
+    step = float(np.median(np.diff(first)))
+    thin = max(1, int(np.ceil(min(_STRETCH_S, float(np.ptp(first))) / step / most)))
+    used = frames[::thin]
+    parts = min(max(1, round(len(used) / most)), _MOST_STRETCHES)
+    length = min(most, len(used) // parts)
+    starts = np.linspace(0, len(used) - length, parts).astype(int)
+    by_frame = table.set_index("frame", drop=False)
+    by_frame.index.name = None
+    return [by_frame.loc[used[s : s + length]].reset_index(drop=True) for s in starts]
+
+
+def _estimate(
+    table: pd.DataFrame, series_of: Callable[[Any], Series], shape_mm: float
+) -> tuple[Array, tuple[Array, Array], Noise, int] | None:
+    """Return the estimate of K unknowns, which have unit prior variance, from stretches of the run.
+
+    series_of : function that returns the ray misses of a part of the table.
+    shape_mm : standard deviation of the constant ray miss of each bubble due to its shape.
+
+    Returns the unknowns (K,), two covariances (K, K), the noise model and the number of used pairs.
+    The second covariance includes the constant shape error of each bubble. Returns None if too few
+    pairs remain without outliers.
+    """
+    parts = [series_of(part) for part in stretches(table)]
+    some = np.unique(np.linspace(0, len(parts) - 1, _LEARNED_FROM).astype(int))
+    noise = learned_noise([parts[i] for i in some])
+    size = parts[0].by_unknowns.shape[1]
+    for last in range(_PASSES):
+        matrix, right = np.eye(size), np.zeros(size)
+        kept = []
+        for part in parts:
+            added, value, sigmas = information(part, noise)
+            matrix, right = matrix + added, right + value
+            kept.append(part.of(np.abs(sigmas) < _OUTLIER_SIGMAS))
+        if last == _PASSES - 1 or list(map(len, kept)) == list(map(len, parts)):
+            break
+        parts = [p for p in kept if len(p) >= _LEAST]
+        if not parts:
+            return None
+        noise = learned_noise(parts[:_LEARNED_FROM])
+    covariance: Array = np.asarray(np.linalg.inv(matrix), np.float64)
+    bubbles = len(np.unique(np.concatenate([p.bubble for p in parts])))
+    with_shapes = covariance + _shape_share(parts, covariance, noise, shape_mm) / bubbles
+    pairs = sum(map(len, parts))
+    return np.asarray(covariance @ right), (covariance, with_shapes), noise, pairs
+
+
+def _shape_share(parts: list[Series], covariance: Array, noise: Noise, shape_mm: float) -> Array:
+    """Return the covariance (K, K) due to a constant ray miss, as if the whole run showed one
+    bubble.
+    """
+    response = np.zeros(len(covariance))
+    for part in parts:
+        constant = replace(part, miss_mm=np.full(len(part), shape_mm))
+        response = response + information(constant, noise)[1]
+    shift = covariance @ response
+    return np.outer(shift, shift)

@@ -25,9 +25,14 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from telerig.estimator.bubbles.detect import detect_bubbles
-from telerig.estimator.bubbles.pairing.geometry import pair_geometry, shared_axis, view_of
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
-from telerig.estimator.bubbles.pairing.matching import Matches, match_pairs
+from telerig.estimator.bubbles.pairing.matching import (
+    Matches,
+    match_pairs,
+    pair_geometry,
+    shared_axis,
+    view_of,
+)
 from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
 from telerig.io.images.read import read_image
 from telerig.rig.camera import Camera

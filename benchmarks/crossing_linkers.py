@@ -11,7 +11,7 @@ from crossing_scenes import Scene
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from telerig.estimator.tracking.filter.types import FrameMeasurements, TrackerSettings
+from telerig.estimator.tracking.filter import FrameMeasurements, TrackerSettings
 from telerig.estimator.tracking.tracker import Tracker
 
 Ids = list[NDArray[np.int64]]

@@ -41,7 +41,7 @@ from telerig.estimator.calibration.solver.problem import (
 from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.factors.calibration import State
 from telerig.io.simulation.config import CameraConfig, SimulationConfig
-from telerig.rig.lens_models import name_of
+from telerig.rig.lens_parameters import name_of
 from telerig.rig.target import Target
 from telerig.rig.triangulation import triangulate
 

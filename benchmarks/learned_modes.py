@@ -26,7 +26,7 @@ from shake_learning_data import ARM_HZ, COMMON_HZ, run, true_model
 from shake_scene import cases, simulate
 
 from telerig.estimator.smoothing.graph.solve import Options, solve
-from telerig.estimator.smoothing.learning import attribution
+from telerig.estimator.smoothing.learning import spectral_lines
 from telerig.estimator.smoothing.learning.likelihood import maximise
 from telerig.estimator.smoothing.learning.lines_of_sight import pooled, signals_of
 from telerig.estimator.smoothing.learning.parameters import FORCE
@@ -39,7 +39,7 @@ RIG_HZ, RIG_MM = 30.0, 0.5
 HIDDEN_MM = (0.0, 0.08, 0.15)
 LINE = "bubble.zigzags.1."
 PRIORS = {
-    "as it is": attribution.hidden_mode_weights,
+    "as it is": spectral_lines.hidden_mode_weights,
     "all sizes alike": lambda line, own: np.ones(6),
 }
 
@@ -58,8 +58,8 @@ def hidden(hidden_mm: float, seed: int) -> Iterable[tuple[str, float, float, flo
     names = [LINE + last for last in ("frequency_hz", "damping", "rms_mm")]
     found = maximise(heights, told, names, steps=8).model
     for prior, weights in PRIORS.items():
-        with patch.object(attribution, "hidden_mode_weights", weights):
-            model = attribution.with_hidden_modes(heights, found, (0.0, 1.0, 0.0), problem.up)
+        with patch.object(spectral_lines, "hidden_mode_weights", weights):
+            model = spectral_lines.with_hidden_modes(heights, found, (0.0, 1.0, 0.0), problem.up)
         yield prior, *_heights(problem, model, lab)
 
 

@@ -20,8 +20,8 @@ from telerig.estimator.calibration.solver.robust_least_squares import linearisat
 from telerig.io.simulation.calibration_files import exact_dots
 from telerig.io.simulation.config import SimulationConfig
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose, rotation_from_rotvec
-from telerig.rig.projection import PARAMETERS
 from telerig.rig.triangulation import aligned_covariance, triangulate
 
 Array = NDArray[np.float64]

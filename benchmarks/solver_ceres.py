@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from solver_scipy import right_jacobian
 
-from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem
-from telerig.estimator.calibration.solver.system import System
+from telerig.estimator.calibration.solver.problem import GAUGE_SIGMA_MM, Problem, System
 from telerig.factors.calibration import State, depth_gauge_residual, distance_residual
+from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import rotation_from_rotvec
-from telerig.rig.projection import INDEX
 
 Array = NDArray[np.float64]
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Ints
 from telerig.rig import projection
+from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import hat
 from telerig.rig.windows import Wall
 
@@ -23,7 +24,7 @@ from telerig.rig.windows import Wall
 class State:
     """Holds all quantities that a calibration estimates, for C cameras, V views and N dots.
 
-    intrinsics : (C, 20) in the order of `telerig.rig.projection.PARAMETERS`.
+    intrinsics : (C, 20) in the order of `telerig.rig.lens_parameters.PARAMETERS`.
     rig_from_camera : (C, 4, 4); the first is the identity.
     rig_from_target : (V, 4, 4).
     dots_mm : (N, 3) in the target frame.
@@ -239,7 +240,7 @@ def whitened_residuals(state: State, obs: Observations, rho_mm: Sequence[float])
     """Return `image_columns` of all cameras, in the order of the measurements, with all
     derivatives.
     """
-    every = range(len(projection.PARAMETERS))
+    every = range(len(PARAMETERS))
     first = len(every)
     columns = np.zeros((first + 13, 2, len(obs)))
     for c, rho in enumerate(rho_mm):

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import GeometryError
 from telerig.rig import projection, windows
+from telerig.rig.lens_parameters import INDEX, PARAMETERS, Scales
 from telerig.rig.pose import Pose
-from telerig.rig.projection import INDEX, PARAMETERS
 from telerig.rig.windows import Wall
 
 
@@ -22,7 +22,7 @@ class Camera:
     """Describes one camera of the rig.
 
     intrinsics : (20,) parameters of the lens and the sensor, in the order of
-        `telerig.rig.projection.PARAMETERS`.
+        `telerig.rig.lens_parameters.PARAMETERS`.
     rho_mm : half the diagonal of the image, measured in object space at the nominal scale.
         Coordinates are divided by this length before the distortion is computed.
     camera_from_rig : pose that maps rig coordinates to camera coordinates. It is the identity for
@@ -50,8 +50,8 @@ class Camera:
     ) -> Camera:
         """Return a camera with the given parameters; all others are those of an ideal centred lens.
 
-        parameters : intrinsics by name, see `telerig.rig.projection.PARAMETERS`. A parameter that
-            is not given is 0, the aspect ratio is 1, and the centre is the middle of the image.
+        parameters : intrinsics by name, see `telerig.rig.lens_parameters`. One that is not given
+            is 0, the aspect ratio is 1, and the centre is the middle of the image.
         rho_mm : see `Camera`; by default it follows from the image size and the scale.
 
         Raises GeometryError for an unknown parameter.
@@ -87,6 +87,10 @@ class Camera:
         for name, value in parameters.items():
             intrinsics[INDEX[name]] = value
         return replace(self, intrinsics=intrinsics)
+
+    @property
+    def scales(self) -> Scales:
+        return Scales(self["scale_px_per_mm"], self.rho_mm, self.image_size_px[0])
 
     @property
     def rig_from_camera(self) -> Pose:

@@ -5,6 +5,8 @@ coordinates (x, y) to distorted ones (x', y'), with r2 = x^2 + y^2, r4 = r2^2 an
 
     x' = x (1 + k1 r2 + k2 r4 + k3 r6) + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r4
     y' = y (1 + k1 r2 + k2 r4 + k3 r6) + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r4
+
+The radial polynomial has as many terms as `telerig.rig.lens_parameters` has radial parameters.
 """
 
 from __future__ import annotations
@@ -15,8 +17,12 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import GeometryError
+from telerig.rig.lens_parameters import COEFFICIENTS, LENS_PARAMETERS
 
-COEFFICIENTS = ("k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4")
+_RADIAL, _TANGENTIAL, _PRISM = (
+    [i for i, name in enumerate(COEFFICIENTS) if LENS_PARAMETERS[name].term == term]
+    for term in ("radial", "tangential", "prism")
+)
 _NEWTON_STEPS = 40
 
 
@@ -29,28 +35,37 @@ def components_first(batch: tuple[int, ...], *components: int) -> Array:
     return np.zeros((*components, *batch)).transpose(*range(first, last), *range(first))
 
 
-def _split(coefficients: Array) -> list[Array]:
-    return [coefficients[..., i] for i in range(len(COEFFICIENTS))]
+def _split(coefficients: Array) -> tuple[list[Array], list[Array], list[Array]]:
+    """Return the coefficients (...) of the radial, the tangential and the prism terms; [] for terms
+    whose coefficients are all 0."""
+    return tuple(  # type: ignore[return-value]
+        [coefficients[..., i] for i in which] if np.any(coefficients[..., which]) else []
+        for which in (_RADIAL, _TANGENTIAL, _PRISM)
+    )
 
 
 def distort(xy: Array, coefficients: Array) -> Array:
     """Return the distorted coordinates (..., 2) of ideal coordinates (..., 2), both normalised.
 
-    coefficients : (..., 9) in the order of `COEFFICIENTS`. Terms whose coefficients are all zero
-        are skipped.
+    coefficients : (..., 9) in the order of `COEFFICIENTS`.
     """
     x, y = xy[..., 0], xy[..., 1]
-    k1, k2, k3, p1, p2, s1, s2, s3, s4 = _split(coefficients)
+    radial, tangential, prism = _split(coefficients)
     r2 = x * x + y * y
     xd, yd = x, y
-    if np.any(coefficients[..., :3]):
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd, yd = x * radial, y * radial
-    if np.any(coefficients[..., 3:5]):
+    if radial:
+        total = radial[-1]
+        for k in radial[-2::-1]:
+            total = k + r2 * total
+        factor = 1 + r2 * total
+        xd, yd = x * factor, y * factor
+    if tangential:
+        p1, p2 = tangential
         cross = 2 * x * y
         xd = xd + p1 * cross + p2 * (r2 + 2 * x * x)
         yd = yd + p1 * (r2 + 2 * y * y) + p2 * cross
-    if np.any(coefficients[..., 5:]):
+    if prism:
+        s1, s2, s3, s4 = prism
         xd = xd + r2 * (s1 + s2 * r2)
         yd = yd + r2 * (s3 + s4 * r2)
     out = components_first(np.broadcast_shapes(xd.shape, yd.shape), 2)
@@ -61,25 +76,30 @@ def distort(xy: Array, coefficients: Array) -> Array:
 def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
     """Return the derivative (..., 2, 2) of `distort` with respect to the ideal coordinates."""
     x, y = xy[..., 0], xy[..., 1]
-    k1, k2, k3, p1, p2, s1, s2, s3, s4 = _split(coefficients)
+    radial, tangential, prism = _split(coefficients)
     r2 = x * x + y * y
-    out = components_first(np.broadcast_shapes(x.shape, k1.shape), 2, 2)
+    out = components_first(np.broadcast_shapes(x.shape, coefficients.shape[:-1]), 2, 2)
     out[..., 0, 0] = out[..., 1, 1] = 1
-    if np.any(coefficients[..., :3]):
-        radial = r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-        cross = slope * x * y
-        out[..., 0, 0] += radial + slope * x * x
+    if radial:
+        total, rise = radial[-1], r2 * len(radial) * radial[-1]
+        for power, k in reversed(list(enumerate(radial[:-1], 1))):
+            total = k + r2 * total
+            rise = power * k + rise if power == 1 else r2 * (power * k + rise)
+        slope = 2 * rise
+        total, cross = r2 * total, slope * x * y
+        out[..., 0, 0] += total + slope * x * x
         out[..., 0, 1] += cross
         out[..., 1, 0] += cross
-        out[..., 1, 1] += radial + slope * y * y
-    if np.any(coefficients[..., 3:5]):
+        out[..., 1, 1] += total + slope * y * y
+    if tangential:
+        p1, p2 = tangential
         cross = 2 * (p1 * x + p2 * y)
         out[..., 0, 0] += 2 * p1 * y + 6 * p2 * x
         out[..., 0, 1] += cross
         out[..., 1, 0] += cross
         out[..., 1, 1] += 6 * p1 * y + 2 * p2 * x
-    if np.any(coefficients[..., 5:]):
+    if prism:
+        s1, s2, s3, s4 = prism
         prism_x, prism_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
         out[..., 0, 0] += prism_x * x
         out[..., 0, 1] += prism_x * y
@@ -88,7 +108,7 @@ def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
     return out
 
 
-def coefficient_jacobian(xy: Array, which: Sequence[int] = range(9)) -> Array:
+def coefficient_jacobian(xy: Array, which: Sequence[int] = range(len(COEFFICIENTS))) -> Array:
     """Return the derivative (..., 2, k) of `distort` with respect to k of its coefficients.
 
     `distort` is linear in its coefficients, so the derivative does not depend on their values.
@@ -100,15 +120,17 @@ def coefficient_jacobian(xy: Array, which: Sequence[int] = range(9)) -> Array:
     r2 = x * x + y * y
     out = components_first(r2.shape, 2, len(which))
     for column, i in enumerate(which):
-        if i < 3:
-            power = r2 ** (i + 1)
+        if i in _RADIAL:
+            power = r2 ** (1 + _RADIAL.index(i))
             out[..., 0, column], out[..., 1, column] = x * power, y * power
-        elif i < 5:
-            square = x if i == 4 else y
-            out[..., i - 3, column] = 2 * x * y
-            out[..., 4 - i, column] = r2 + 2 * square * square
+        elif i in _TANGENTIAL:
+            axis = _TANGENTIAL.index(i)
+            square = x if axis else y
+            out[..., axis, column] = 2 * x * y
+            out[..., 1 - axis, column] = r2 + 2 * square * square
         else:
-            out[..., (i - 5) // 2, column] = r2 if i % 2 else r2 * r2
+            axis, power_of_two = divmod(_PRISM.index(i), 2)
+            out[..., axis, column] = r2 * r2 if power_of_two else r2
     return out
 
 

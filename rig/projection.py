@@ -24,27 +24,25 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.rig import distortion, windows
 from telerig.rig.distortion import components_first
+from telerig.rig.lens_parameters import COEFFICIENTS, INDEX, LENS_PARAMETERS, PARAMETERS
 from telerig.rig.windows import Wall
 
-PARAMETERS = (
-    "scale_px_per_mm", "aspect", "skew", "centre_u_px", "centre_v_px", "kappa_per_mm",
-    "k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4",
-    "tilt_x", "tilt_y", "image_convergence_per_mm", "wall_x_rad", "wall_y_rad",
-)  # fmt: skip
-INDEX = {name: i for i, name in enumerate(PARAMETERS)}
-_SCALE, _ASPECT, _SKEW, _CU, _CV, _KAPPA = range(6)
-_DISTORTION = slice(6, 15)
-_TX, _TY, _W = 15, 16, 17
-_WALL = slice(18, 20)
+_SCALE, _ASPECT, _SKEW, _KAPPA = (
+    INDEX[name] for name in ("scale_px_per_mm", "aspect", "skew", "kappa_per_mm")
+)
+_CU, _CV = INDEX["centre_u_px"], INDEX["centre_v_px"]
+_DISTORTION = slice(INDEX[COEFFICIENTS[0]], INDEX[COEFFICIENTS[-1]] + 1)
+_TX, _TY, _W = (INDEX[name] for name in ("tilt_x", "tilt_y", "image_convergence_per_mm"))
+_WALL = slice(INDEX["wall_x_rad"], INDEX["wall_y_rad"] + 1)
 
 
 def intrinsics_from(parameters: Mapping[str, float]) -> Array:
     """Return the intrinsics (20,) in the order of `PARAMETERS`, from a mapping from name to value.
 
-    wall_x_rad and wall_y_rad are 0 if they are missing. Raises KeyError if another one is missing.
+    Raises KeyError if a parameter is missing that is not optional.
     """
-    wall = dict.fromkeys(PARAMETERS[_WALL], 0.0)
-    return np.array([(wall | dict(parameters))[name] for name in PARAMETERS], float)
+    missing = {name: 0.0 for name, known in LENS_PARAMETERS.items() if known.optional}
+    return np.array([(missing | dict(parameters))[name] for name in PARAMETERS], float)
 
 
 def turned_wall(intrinsics: Array, wall: Wall) -> Wall:

@@ -21,8 +21,8 @@ from telerig.arrays import Array
 from telerig.errors import GeometryError, InputError
 from telerig.rig import distortion, projection
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import hat
-from telerig.rig.projection import INDEX
 from telerig.rig.windows import affine_map
 
 POSE_COMPONENTS = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")

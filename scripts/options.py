@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from telerig.errors import InputError
+from telerig.rig.lens_parameters import NAMES
 
 Dataset = Annotated[
     Path, typer.Argument(help="Dataset folder, with rig.toml and the views in calibration/.")
@@ -31,8 +32,8 @@ GivenCalibration = Annotated[
 Model = Annotated[
     str,
     typer.Option(
-        help="Lens model: auto chooses one per camera. Others: none, radial, tangential, brown, "
-        "prism, kappa, affine, tilt, k1, k2, p, s, centre, or several joined by + (k1+k2). "
+        help=f"Lens model: auto chooses one per camera. Others: {', '.join(NAMES)}, or several "
+        "joined by + (k1+k2). "
         "left=brown,right=auto gives each camera its own."
     ),
 ]

@@ -181,7 +181,7 @@ def check_options(calibration: Path | None, model: str, medium: str = "air") -> 
     """
     from telerig.errors import CalibrationError
     from telerig.estimator.calibration.calibrate import checked_medium
-    from telerig.rig.lens_models import checked_model
+    from telerig.rig.lens_parameters import checked_model
 
     if calibration is not None and not Path(calibration).exists():
         raise InputError(

@@ -14,7 +14,7 @@ from telerig.estimator.calibration.solver.problem import (
     checked_outlier_sd,
 )
 from telerig.rig.camera import Camera
-from telerig.rig.lens_models import AUTO, Model, checked_model, models_by_camera
+from telerig.rig.lens_parameters import AUTO, Model, checked_model, models_by_camera
 
 if TYPE_CHECKING:
     import pandas as pd

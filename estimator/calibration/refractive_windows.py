@@ -18,7 +18,8 @@ from telerig.estimator.calibration.solver.problem import prior_sigma, wall_freed
 from telerig.estimator.calibration.start.mirror_ambiguity import ENTOCENTRIC
 from telerig.io.rig_file.description import RigDescription
 from telerig.rig.camera import Camera
-from telerig.rig.projection import INDEX, turned_wall
+from telerig.rig.lens_parameters import INDEX
+from telerig.rig.projection import turned_wall
 from telerig.rig.triangulation import aligned_covariance, triangulate_any, working_volume
 from telerig.rig.windows import Wall
 

@@ -22,9 +22,8 @@ from telerig.estimator.calibration.solver.robust_least_squares import (
 )
 from telerig.estimator.calibration.start.mirror_ambiguity import MirrorChoice, Nominal
 from telerig.factors.calibration import State
-from telerig.rig.lens_models import joint_name, name_of
+from telerig.rig.lens_parameters import INDEX, joint_name, name_of
 from telerig.rig.pose import Pose, rotvec_from_rotation
-from telerig.rig.projection import INDEX
 from telerig.rig.triangulation import aligned_covariance, triangulate_any
 
 GAUGE = (

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
-from telerig.estimator.calibration.lens import choice as model_choice
 from telerig.estimator.calibration.lens.choice import (
     Choice,
+    choose,
     considered_covariance,
     considered_groups,
     considered_words,
@@ -53,15 +53,16 @@ from telerig.estimator.calibration.start.unknown_target import dots_from_images
 from telerig.factors.calibration import State, whitened_error
 from telerig.io.rig_file.description import MOST_CAMERAS
 from telerig.rig.camera import Camera
-from telerig.rig.lens_models import (
+from telerig.rig.lens_parameters import (
     AUTO,
+    INDEX,
     Model,
     groups_of,
     joint_name,
     models_by_camera,
     name_of,
+    rich_groups,
 )
-from telerig.rig.projection import INDEX
 from telerig.rig.target import Target
 
 SURE_SD = 5.0
@@ -90,7 +91,7 @@ def self_calibrate(
     cameras : nominal, the first defines the rig frame.
     nominal_rotvec_deg : nominal <camera>_from_<first> rotation vectors by camera, or the second
         camera's alone; they resolve the mirror ambiguity.
-    model : a name of `telerig.rig.lens_models`, or "auto"; for all cameras, or by camera.
+    model : a name of `telerig.rig.lens_parameters`, or "auto"; for all cameras, or by camera.
     dots_free : "3d" (priors of the target), "plane" (flatness exact) or "nominal" (both exact).
     solver : "gtsam", "schur" (the same minimum, for many dots) or "auto".
     outlier_sd : standard deviations from the model beyond which a dot is left out.
@@ -280,7 +281,7 @@ def choose_model(
     models : per camera, "auto" or a model that stays.
     """
     first = _rich(problem, start, models, progress)
-    return first, model_choice.choose(first.problem, first.solution, models)
+    return first, choose(first.problem, first.solution, models)
 
 
 def _rich(
@@ -289,13 +290,13 @@ def _rich(
     """Outliers and noise floor from the richest model, so that no lens is taken for either."""
     mono = len(problem.cameras) == 1
     auto = np.array([m == AUTO for m in models])
-    plain = name_of(model_choice.rich_lens(mono=mono, strong=False))
+    plain = name_of(rich_groups(mono=mono, strong=False))
     whole = problem.with_model([plain if m == AUTO else m for m in models])
     first = robust_solve(whole, model_start(whole, start), progress=progress)
     strong = auto & _strong(first)
     if mono or not strong.any():
         return first
-    perspective = name_of(model_choice.rich_lens(mono=mono, strong=True))
+    perspective = name_of(rich_groups(mono=mono, strong=True))
     names = [perspective if s else plain if m == AUTO else m for s, m in zip(strong, models)]
     whole = problem.with_model(names)
     return robust_solve(whole, model_start(whole, first.solution.state), progress=progress)

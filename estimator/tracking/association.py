@@ -27,8 +27,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.estimator.tracking.filter.kalman import POSITION, Common, Track
-from telerig.estimator.tracking.filter.types import FrameMeasurements, TrackerSettings
+from telerig.estimator.tracking.filter import (
+    POSITION,
+    Common,
+    FrameMeasurements,
+    Track,
+    TrackerSettings,
+)
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
 

@@ -29,13 +29,14 @@ from telerig.estimator.tracking.association import (
     px_per_mm,
     size_score,
 )
-from telerig.estimator.tracking.filter.kalman import POSITION, birth_covariance
-from telerig.estimator.tracking.filter.types import (
+from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
+    POSITION,
     FrameIds,
     Motion,
     SeenAlone,
     TrackerSettings,
+    birth_covariance,
 )
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian, triangulate

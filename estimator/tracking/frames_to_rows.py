@@ -27,7 +27,7 @@ from telerig.estimator.tracking.backtracking import (
     given_ids,
     shared_rows,
 )
-from telerig.estimator.tracking.filter.types import (
+from telerig.estimator.tracking.filter import (
     NO_PARTICLE,
     FrameMeasurements,
     FrameResult,

@@ -24,16 +24,14 @@ from telerig.estimator.rig_drift import PairCollector, with_change
 from telerig.estimator.tracking.backtracking import Tables
 from telerig.estimator.tracking.detect_run import (
     DetectionStore,
-    FollowedMarks,
     Progress,
     Scene,
     described_strip,
     detect_missing,
     fingerprint,
-    follow_references,
     make_scene,
 )
-from telerig.estimator.tracking.filter.types import NO_PARTICLE, TrackerSettings
+from telerig.estimator.tracking.filter import NO_PARTICLE, TrackerSettings
 from telerig.estimator.tracking.frames_to_rows import Linked, RowMaker
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.estimator.tracking.tracks import Tracks, events_table
@@ -42,7 +40,8 @@ from telerig.io.machine.parallel import cores
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
-    from telerig.estimator.tracking.filter.types import TrackEvent
+    from telerig.estimator.tracking.filter import TrackEvent
+    from telerig.estimator.tracking.follow_marks import FollowedMarks
 
 
 MODEL_FRAMES = 60
@@ -213,7 +212,10 @@ def tracking_stream(
         if strip is not None:
             inputs |= {"references": repr(strip), "axis": repr(axis)}
         store = DetectionStore(work, fingerprint(run, inputs), run.frame_count, cores())
-        marks = follow_references(run, cameras, axis, store, stage)
+        if strip is not None:
+            from telerig.estimator.tracking.follow_marks import follow_references
+
+            marks = follow_references(run, cameras, axis, strip, store, stage)
         if store.missing():
             strips = marks.strips if marks is not None else None
             scene = make_scene(run, cameras, axis, chosen.min_diameter_px, stage, strips)

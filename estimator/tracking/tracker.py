@@ -31,27 +31,25 @@ from telerig.estimator.tracking.association import (
     unrivalled,
     update_pixels,
 )
-from telerig.estimator.tracking.filter.kalman import (
+from telerig.estimator.tracking.filter import (
+    NO_PARTICLE,
     POSITION,
     STATES,
     VELOCITY,
     Common,
-    StageMotion,
-    Track,
-    Transition,
-    birth_covariance,
-    new_filter,
-    transition,
-)
-from telerig.estimator.tracking.filter.types import (
-    NO_PARTICLE,
     FrameIds,
     FrameMeasurements,
     FrameResult,
     Motion,
     SeenAlone,
+    StageMotion,
+    Track,
     TrackerSettings,
     TrackEvent,
+    Transition,
+    birth_covariance,
+    new_filter,
+    transition,
 )
 from telerig.rig.camera import Camera
 

@@ -14,7 +14,7 @@ from telerig.estimator.tracking.detect_run import read_batch
 from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:
-    from telerig.estimator.tracking.filter.types import TrackEvent
+    from telerig.estimator.tracking.filter import TrackEvent
 
 EVENT_COLUMNS = ["frame", "t_s", "kind", "particles", "reason"]
 

@@ -27,8 +27,8 @@ from telerig.io.simulation.config import SimulationConfig
 from telerig.io.simulation.images.plates import Light, pixel_from_plate, render
 from telerig.io.simulation.images.sensor import digitise
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose
-from telerig.rig.projection import PARAMETERS
 
 TRUTH_SCHEMA = 1
 

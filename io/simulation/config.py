@@ -30,7 +30,7 @@ class CameraConfig:
 
     scale_px_per_mm : true; nominal_scale_px_per_mm : in `rig.toml`.
     centre_offset_px : of the optical axis from the image's centre.
-    parameters : further true parameters by their names in `telerig.rig.projection.PARAMETERS`.
+    parameters : further true parameters by their names in `telerig.rig.lens_parameters.PARAMETERS`.
     nominal_telecentricity_per_mm : in `rig.toml`; None leaves it out.
     """
 

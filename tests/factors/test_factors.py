@@ -30,8 +30,11 @@ from telerig.factors.calibration import (
     whitened_residuals,
 )
 from telerig.factors.custom_factors import Keys, custom_factor
+from telerig.rig.lens_parameters import (
+    INDEX,
+    PARAMETERS,
+)
 from telerig.rig.pose import rotation_from_rotvec
-from telerig.rig.projection import INDEX, PARAMETERS
 
 RHO_MM = (30.0, 28.0)
 RICH = {

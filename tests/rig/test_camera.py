@@ -9,8 +9,11 @@ import pytest
 from telerig.errors import GeometryError
 from telerig.rig import distortion, projection
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import (
+    INDEX,
+    PARAMETERS,
+)
 from telerig.rig.pose import Pose, rotation_from_rotvec
-from telerig.rig.projection import INDEX, PARAMETERS
 
 MODELS = {
     "ideal": {},

@@ -14,8 +14,8 @@ from ray_tracer import trace_pixels
 from telerig.errors import GeometryError
 from telerig.rig import projection, windows
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import Pose, rotation_from_rotvec
-from telerig.rig.projection import INDEX
 from telerig.rig.triangulation import triangulate
 from telerig.rig.windows import Wall
 

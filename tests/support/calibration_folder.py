@@ -13,8 +13,8 @@ import pandas as pd
 from report_page import edit
 
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose, rotation_from_rotvec
-from telerig.rig.projection import PARAMETERS
 
 SIGMA_PX, BUMP_MM = 0.01, 0.05
 SECTIONS = [

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.estimator.bubbles.pairing.geometry import pair_geometry, shared_axis, view_of
+from telerig.estimator.bubbles.pairing.matching import pair_geometry, shared_axis, view_of
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 

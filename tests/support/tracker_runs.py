@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.estimator.tracking.filter.types import (
+from telerig.estimator.tracking.filter import (
     FrameMeasurements,
     FrameResult,
     TrackerSettings,

@@ -17,20 +17,18 @@ import pandas as pd
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.bubbles.pairing.geometry import (
-    PairGeometry,
-    View,
-    pair_geometry,
-    shared_axis,
-    view_of,
-)
 from telerig.estimator.bubbles.pairing.matching import (
     Finding,
     LogRatioModel,
+    PairGeometry,
     PairModel,
+    View,
     appearance_log_odds,
     common_shift,
     marginals,
+    pair_geometry,
+    shared_axis,
+    view_of,
 )
 from telerig.rig.camera import Camera
 from telerig.statistics import robust_sd

@@ -39,13 +39,17 @@ from telerig.estimator.calibration.lens.search import (
     steps_to,
 )
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
-from telerig.estimator.calibration.solver.problem import Problem, held_at_nominal
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    System,
+    held_at_nominal,
+    images_of,
+    retracted,
+)
 from telerig.estimator.calibration.solver.robust_least_squares import Solution, linearisation, solve
-from telerig.estimator.calibration.solver.system import System, images_of, retracted
 from telerig.factors.calibration import State, pixels, whitened_error
 from telerig.io.machine.parallel import ordered_map, quick_workers
-from telerig.rig.lens_models import AUTO, GROUPS, groups_of, joint_name, name_of, ordered
-from telerig.rig.projection import INDEX
+from telerig.rig.lens_parameters import AUTO, GROUPS, INDEX, groups_of, joint_name, name_of, ordered
 
 DOTS_FOR_WORKERS = 500
 """Number of measured dots below which no worker processes are used: four fits then take 0.1 s, and
@@ -139,20 +143,6 @@ class Choice:
     steps: tuple[Step, ...]
     chosen: FittedModel
     words: str
-
-
-def rich_lens(*, mono: bool, strong: bool) -> Lens:
-    """Return the parameter groups that are tried for a camera.
-
-    mono : whether the rig has this camera only; kappa is then not tried.
-    strong : whether the lens has strong perspective. Then kappa and the image centre are always
-        free. A free centre makes the image on a tilted sensor equal to that of a rotated camera, so
-        s or a tilt cannot be distinguished from a rotation, and aspect and skew hardly from a
-        stretch of the target (docs/decisions/014).
-    """
-    if strong:
-        return Lens({"kappa", "k1", "k2", "p", "centre"})
-    return Lens({"affine", "k1", "k2", "p", "s"} | (set() if mono else {"kappa"}))
 
 
 def choose(problem: Problem, rich: Solution, models: Sequence[str]) -> Choice:

@@ -23,8 +23,7 @@ from telerig.arrays import Array
 from telerig.estimator.calibration.solver.problem import Problem, parameter_unit, prior_sigma
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
 from telerig.factors.calibration import whitened_error
-from telerig.rig.lens_models import GROUPS, ordered
-from telerig.rig.projection import INDEX
+from telerig.rig.lens_parameters import GROUPS, INDEX, PLAIN_GROUPS, ordered
 
 Lens = frozenset[str]
 """The parameter groups of one camera's lens model."""
@@ -38,7 +37,6 @@ _HOMOGRAPHY = (("p1", "s3"), ("p2", "s1"))
 """The homography of a tilted sensor is, to first order, p1 = -s3 and p2 = -s1, so these sums
 vanish.
 """
-_PLAIN = ("kappa", "affine", "k1", "k2", "p", "s")
 UNDETERMINED = 0.5
 """A parameter counts as undetermined if its posterior standard deviation is more than this share of
 the prior one."""
@@ -104,7 +102,7 @@ class QuadraticCost:
         extend = np.eye(size + len(more), size)
         for row, (_, a, b) in enumerate(more, size):
             extend[row, [a, b]] = 1.0
-        groups = sum(1 for c in range(len(problem.cameras)) for g in _PLAIN
+        groups = sum(1 for c in range(len(problem.cameras)) for g in PLAIN_GROUPS
                      if (c, GROUPS[g][0]) in names)  # fmt: skip
         variance = _variance(problem, solution, posterior.common, posterior.dots)
         rows = 2 * int(np.sum(problem.weight > 0))
@@ -170,7 +168,7 @@ def _also(lens: Lens) -> Lens:
 def _held_by(lens: Lens) -> frozenset[str]:
     """Return the coordinates of the quadratic form that a lens model holds at nominal."""
     free = {p for g in lens for p in GROUPS[g]}
-    held = {p for g in (*_PLAIN, "centre") for p in GROUPS[g]} - free
+    held = {p for g in (*PLAIN_GROUPS, "centre") for p in GROUPS[g]} - free
     if "tilt" in lens:
         held -= {p for g in ("affine", "p", "s") for p in GROUPS[g]}
         if "p" not in lens:

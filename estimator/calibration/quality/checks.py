@@ -13,7 +13,7 @@ from telerig.estimator.calibration.solver.problem import Problem, prior_sigma
 from telerig.estimator.calibration.start.known_target import ImageMap, image_maps, overlap_tree
 from telerig.estimator.dots.grid.numbering import check_handedness
 from telerig.factors.calibration import State
-from telerig.rig.projection import INDEX
+from telerig.rig.lens_parameters import INDEX
 
 RECOMMENDED_VIEWS = 6
 MINIMUM_DOTS = 4

@@ -26,8 +26,8 @@ from telerig.io.results.calibration import (
     write_joint_covariance,
 )
 from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose
-from telerig.rig.projection import PARAMETERS
 from telerig.rig.triangulation import (
     POSE_COMPONENTS,
     Triangulation,

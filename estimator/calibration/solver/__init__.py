@@ -2,5 +2,5 @@
 covariance.
 
 In: a ``Problem`` and a start. Out: the fitted state, the weights of the dots and the joint
-covariance. Read ``problem``, then ``system`` and ``robust_least_squares``.
+covariance. Read ``problem``, then ``robust_least_squares``.
 """

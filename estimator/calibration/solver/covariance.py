@@ -8,10 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
+from telerig.estimator.calibration.solver.problem import (
+    Problem,
+    System,
+    images_of,
+    parameter_unit,
+    slots,
+)
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
 from telerig.estimator.calibration.solver.schur import Posterior
-from telerig.estimator.calibration.solver.system import System, images_of, slots
 from telerig.rig.triangulation import POSE_COMPONENTS
 
 FULL_COVARIANCE_UP_TO = 4000

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.linalg.lapack import dpotri
 
 from telerig.arrays import Array, Ints
+from telerig.estimator.calibration.solver.problem import System
 from telerig.estimator.calibration.solver.schur import Posterior, undetermined
-from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State
 from telerig.factors.linear_factors import add_linear_factors
 

@@ -12,10 +12,11 @@ import numpy as np
 from telerig.estimator.calibration.solver.problem import (
     GAUGE_SIGMA_MM,
     Problem,
+    System,
+    images_of,
     parameter_unit,
     prior_sigma,
 )
-from telerig.estimator.calibration.solver.system import System, images_of
 from telerig.factors.calibration import State
 from telerig.factors.custom_factors import (
     Keys,

@@ -21,9 +21,8 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, GeometryError
 from telerig.estimator.calibration.solver.elimination import GraphEquations, GraphLayout
-from telerig.estimator.calibration.solver.problem import Problem
+from telerig.estimator.calibration.solver.problem import Problem, System
 from telerig.estimator.calibration.solver.schur import NormalEquations
-from telerig.estimator.calibration.solver.system import System
 from telerig.factors.calibration import State, pixels
 
 MANY_DOTS = 5000

@@ -24,7 +24,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.solver.system import System, images_of
+from telerig.estimator.calibration.solver.problem import System, images_of
 from telerig.factors.calibration import State, dot_columns
 
 CHUNK = 4000

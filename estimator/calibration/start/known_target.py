@@ -18,8 +18,8 @@ from telerig.errors import CalibrationError
 from telerig.estimator.calibration.solver.problem import Problem, nominal_state
 from telerig.estimator.dots.grid.lattice import apply_homography, fit_homography
 from telerig.factors.calibration import State
+from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import nearest_rotation
-from telerig.rig.projection import INDEX
 
 STRONG_PERSPECTIVE = 0.01
 """kappa * rho above which the start takes the perspective that the views show."""

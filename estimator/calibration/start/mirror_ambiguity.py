@@ -24,8 +24,8 @@ from telerig.estimator.calibration.lens.choice import pose_only
 from telerig.estimator.calibration.solver.problem import Problem
 from telerig.estimator.calibration.solver.robust_least_squares import robust_solve, solve
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
+from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import rotation_from_rotvec, rotvec_from_rotation
-from telerig.rig.projection import INDEX
 
 _KAPPA = INDEX["kappa_per_mm"]
 _D = np.diag([1.0, 1.0, -1.0, 1.0])

@@ -25,7 +25,7 @@ from telerig.estimator.smoothing.graph.layout import (
 from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.factors.linear_factors import LinearFactors
-from telerig.rig.projection import INDEX
+from telerig.rig.lens_parameters import INDEX
 
 Progress = Callable[[str, float], None]
 T = TypeVar("T")

@@ -17,13 +17,6 @@ from functools import cached_property
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.smoothing.learning.attribution import (
-    Attribution,
-    attributions,
-    is_zigzag,
-    with_hidden_modes,
-    with_split_lines,
-)
 from telerig.estimator.smoothing.learning.likelihood import (
     Fit,
     evidence,
@@ -38,12 +31,17 @@ from telerig.estimator.smoothing.learning.parameters import (
     with_low_pass_force,
     with_values,
 )
-from telerig.estimator.smoothing.learning.spectrum import (
+from telerig.estimator.smoothing.learning.spectral_lines import (
+    Attribution,
     Line,
+    attributions,
     averaged,
     averaging_factor,
     averaging_loss,
+    is_zigzag,
     unexplained,
+    with_hidden_modes,
+    with_split_lines,
 )
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,

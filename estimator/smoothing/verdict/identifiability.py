@@ -2,7 +2,7 @@
 
 Per axis of the rig: q, by how much not knowing the shake widens the bubbles' positions; eta, by
 how much the data reduce the shake's variance; and whether a spectral line could be the bubble's as
-well as the rig's (see `telerig.estimator.smoothing.learning.attribution`).
+well as the rig's (see `telerig.estimator.smoothing.learning.spectral_lines`).
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
-from telerig.estimator.smoothing.learning.attribution import Attribution, attributions
 from telerig.estimator.smoothing.learning.learn import Learning, groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
+from telerig.estimator.smoothing.learning.spectral_lines import Attribution, attributions
 from telerig.estimator.smoothing.problem.problem import (
     Bubble,
     CarriageModel,

@@ -44,11 +44,11 @@ from telerig.io.files.atomic import atomic_folder
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.distortion import (
-    COEFFICIENTS,
     coefficient_jacobian,
     distortion_jacobian,
     undistort,
 )
+from telerig.rig.lens_parameters import COEFFICIENTS
 from telerig.rig.pose import Pose
 
 PERSPECTIVE_PX = 0.5

@@ -25,7 +25,7 @@ from telerig.io.exchange.export.volume import (
 )
 from telerig.io.files.atomic import atomic_path
 from telerig.rig.camera import Camera
-from telerig.rig.distortion import COEFFICIENTS
+from telerig.rig.lens_parameters import COEFFICIENTS
 from telerig.rig.projection import turned_wall
 from telerig.rig.windows import ideal_jacobians
 

@@ -15,7 +15,7 @@ from telerig.io.exchange.export.run_results import RunResults, facts, identifier
 from telerig.io.files.atomic import atomic_path
 from telerig.io.files.csv_table import write_table
 from telerig.rig.camera import Camera
-from telerig.rig.projection import PARAMETERS
+from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.windows import Wall
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.rig.camera import Camera
-from telerig.rig.projection import PARAMETERS
+from telerig.rig.lens_parameters import PARAMETERS
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, came
 from telerig.io.files.text import read_text
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.distortion import COEFFICIENTS, distort
+from telerig.rig.distortion import distort
+from telerig.rig.lens_parameters import COEFFICIENTS
 from telerig.rig.pose import Pose, rotation_from_rotvec
 
 WORST_FIT_PX = 0.5

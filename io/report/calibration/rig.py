@@ -22,7 +22,7 @@ from telerig.io.report.page.figures import (
 from telerig.io.report.page.number_format import short_names
 from telerig.io.report.page.page import Trace, lines, scene_text, xyz
 from telerig.rig.camera import Camera
-from telerig.rig.projection import PARAMETERS
+from telerig.rig.lens_parameters import PARAMETERS
 
 _BEFORE, _BEHIND = 1.7, 1.2
 """How far a drawn field reaches before and behind the poses, in radii of the poses."""

@@ -15,32 +15,10 @@ from telerig.io.report.page.page import Figure, Row
 from telerig.io.results.calibration import CameraRecord, LadderStep
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.projection import PARAMETERS
+from telerig.rig.lens_parameters import LENS_PARAMETERS, PARAMETERS
 
 WORST = 15
 _MANY_SD = 3.0
-_WORDS = {
-    "scale_px_per_mm": "scale, px/mm",
-    "aspect": "aspect, v scale over u scale",
-    "skew": "skew",
-    "centre_u_px": "image centre u, px",
-    "centre_v_px": "image centre v, px",
-    "kappa_per_mm": "residual perspective κ, 1/mm",
-    "k1": "radial distortion 1",
-    "k2": "radial distortion 2",
-    "k3": "radial distortion 3",
-    "p1": "tangential distortion 1",
-    "p2": "tangential distortion 2",
-    "s1": "thin prism 1",
-    "s2": "thin prism 2",
-    "s3": "thin prism 3",
-    "s4": "thin prism 4",
-    "tilt_x": "sensor tilt about v, tangent",
-    "tilt_y": "sensor tilt about u, tangent",
-    "image_convergence_per_mm": "image-side convergence, 1/mm",
-    "wall_x_rad": "wall's normal from the stated one, x",
-    "wall_y_rad": "wall's normal from the stated one, y",
-}
 
 
 def key_numbers(results: CalibrationResults) -> list[Figure]:
@@ -92,7 +70,7 @@ def parameter_rows(results: CalibrationResults) -> list[Row]:
             continue
         cells = [_parameter_cell(camera, name) for camera in cameras]
         free = any(name in camera.free for camera in cameras)
-        rows.append(Row((f"{_WORDS.get(name, name)} ({name})", *cells), faint=not free))
+        rows.append(Row((f"{LENS_PARAMETERS[name].label} ({name})", *cells), faint=not free))
     largest = [_largest_distortion(camera) for camera in results.cameras]
     perspective = [f"{number(1e6 * c['kappa_per_mm'])} ppm" for c in results.cameras]
     return [

@@ -9,8 +9,7 @@ import pytest
 from matching_scenes import Array, geometry, rig, table
 
 from telerig.estimator.bubbles.outline.ellipse_geometry import HARMONIC_COLUMNS, HARMONICS
-from telerig.estimator.bubbles.pairing.geometry import outline_extent
-from telerig.estimator.bubbles.pairing.matching import marginals
+from telerig.estimator.bubbles.pairing.matching import marginals, outline_extent
 from telerig.rig.pose import Pose
 
 # Geometry

@@ -24,7 +24,7 @@ from telerig.estimator.calibration.solver.problem import problem_from_dots
 from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.estimator.calibration.start.known_target import stereo_states
 from telerig.io.simulation.presets import preset
-from telerig.rig.lens_models import GROUPS
+from telerig.rig.lens_parameters import GROUPS
 from telerig.rig.triangulation import aligned_shift, triangulate
 
 NONE: frozenset[str] = frozenset()

@@ -14,8 +14,8 @@ from telerig.estimator.calibration.solver.problem import (
     problem_from_dots,
 )
 from telerig.estimator.calibration.start import known_target
+from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import Pose
-from telerig.rig.projection import INDEX
 
 
 def polygon_centroid(rim: Any) -> Any:

@@ -21,13 +21,15 @@ from telerig.estimator.calibration.solver.covariance import joint_covariance
 from telerig.estimator.calibration.solver.problem import (
     GAUGE_SIGMA_MM,
     Problem,
+    System,
+    images_of,
     nominal_state,
     parameter_unit,
     prior_sigma,
     problem_from_dots,
+    slots,
     whitening,
 )
-from telerig.estimator.calibration.solver.system import System, images_of, slots
 from telerig.estimator.calibration.start import known_target
 from telerig.factors.calibration import State, whitened_error, whitened_residuals
 from telerig.rig.camera import Camera

@@ -27,9 +27,9 @@ from telerig.estimator.calibration.solver.problem import Problem, nominal_state,
 from telerig.estimator.calibration.solver.robust_least_squares import solve
 from telerig.factors.calibration import whitened_error
 from telerig.io.simulation.presets import preset
-from telerig.rig.lens_models import GROUPS, name_of
+from telerig.rig.lens_parameters import GROUPS, name_of, rich_groups
 
-RICH = model_choice.rich_lens(mono=False, strong=False)
+RICH = rich_groups(mono=False, strong=False)
 LENS: dict[str, dict[str, float]] = {
     "none": {},
     "radial": {"k1": -1e-3},

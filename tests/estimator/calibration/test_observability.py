@@ -17,8 +17,8 @@ from telerig.factors.calibration import (
     whitened_error,
     whitened_residuals,
 )
+from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import rotation_from_rotvec
-from telerig.rig.projection import INDEX
 
 RHO_MM = (36.0, 36.0)
 TABLE = ("scale_px_per_mm", "centre_u_px", "centre_v_px")

@@ -42,7 +42,8 @@ from telerig.io.results.calibration import CalibrationFile
 from telerig.io.rig_file.description import WallDescription
 from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
 from telerig.rig.camera import Camera
-from telerig.rig.projection import PARAMETERS, turned_wall
+from telerig.rig.lens_parameters import PARAMETERS
+from telerig.rig.projection import turned_wall
 from telerig.rig.windows import Wall
 from telerig.scripts.main import app
 

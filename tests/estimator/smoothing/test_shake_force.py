@@ -10,12 +10,6 @@ from scipy.stats import norm
 from shake_learning_data import BUBBLE_HZ, COMMON_HZ, run, true_model
 
 from telerig.errors import InputError
-from telerig.estimator.smoothing.learning.attribution import (
-    Attribution,
-    hidden_mode_weights,
-    with_hidden_modes,
-    with_split_lines,
-)
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.learning.learn import (
     Learning,
@@ -34,6 +28,12 @@ from telerig.estimator.smoothing.learning.parameters import (
     value_of,
     with_low_pass_force,
     with_values,
+)
+from telerig.estimator.smoothing.learning.spectral_lines import (
+    Attribution,
+    hidden_mode_weights,
+    with_hidden_modes,
+    with_split_lines,
 )
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
 from telerig.factors.bubble_motion import Zigzag

@@ -10,12 +10,6 @@ from shake_learning_data import ARM_HZ, BUBBLE_HZ, COMMON_HZ, SWING_HZ, run, tru
 
 from telerig.errors import InputError
 from telerig.estimator.smoothing.graph.solve import Options, solve
-from telerig.estimator.smoothing.learning.attribution import (
-    attributions,
-    moved_to_bubble,
-    moved_to_rig,
-    with_hidden_modes,
-)
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.learning.evidence import (
     position_sigma,
@@ -37,12 +31,16 @@ from telerig.estimator.smoothing.learning.parameters import (
     with_low_pass_force,
     with_values,
 )
-from telerig.estimator.smoothing.learning.spectrum import (
+from telerig.estimator.smoothing.learning.spectral_lines import (
+    attributions,
     averaged,
     averaging_factor,
     averaging_loss,
     density,
+    moved_to_bubble,
+    moved_to_rig,
     unexplained,
+    with_hidden_modes,
 )
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, BroadBand, ShakeModel
 from telerig.factors.bubble_motion import Zigzag

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from shake_learning_data import run, true_model
 
-from telerig.estimator.smoothing.learning.attribution import moved_to_bubble
 from telerig.estimator.smoothing.learning.evidence import (
     eliminated,
     signal_evidence,
@@ -29,6 +28,7 @@ from telerig.estimator.smoothing.learning.parameters import (
     with_low_pass_force,
     with_values,
 )
+from telerig.estimator.smoothing.learning.spectral_lines import moved_to_bubble
 from telerig.estimator.smoothing.problem.problem import BroadBand, ShakeModel
 
 Array = NDArray[np.float64]

@@ -7,8 +7,13 @@ import pytest
 from tracker_runs import SIGMA_MM, STILL, UP, Array, cameras, frame_of
 
 from telerig.estimator.tracking.association import projected, update_pixels
-from telerig.estimator.tracking.filter.kalman import DRIFT, birth_covariance, transition
-from telerig.estimator.tracking.filter.types import FrameMeasurements, TrackerSettings
+from telerig.estimator.tracking.filter import (
+    DRIFT,
+    FrameMeasurements,
+    TrackerSettings,
+    birth_covariance,
+    transition,
+)
 from telerig.estimator.tracking.tracker import Tracker
 from telerig.factors.state_space import exact_step
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from telerig.estimator.tracking.backtracking import Readings, smooth_points
-from telerig.estimator.tracking.filter.kalman import birth_covariance, transition
-from telerig.estimator.tracking.filter.types import Motion, TrackerSettings
+from telerig.estimator.tracking.filter import Motion, TrackerSettings, birth_covariance, transition
 
 Reading = tuple[np.ndarray, np.ndarray, np.ndarray]
 

@@ -10,7 +10,7 @@ import pytest
 from tracker_runs import STILL, UP, Array, cameras, frame_of, kinds, run
 
 from telerig.errors import InputError
-from telerig.estimator.tracking.filter.types import SingleMeasurements, TrackerSettings
+from telerig.estimator.tracking.filter import SingleMeasurements, TrackerSettings
 from telerig.estimator.tracking.tracker import Tracker
 
 # --- association

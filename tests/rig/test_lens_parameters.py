@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from telerig.errors import CalibrationError
-from telerig.estimator.calibration.lens.choice import rich_lens
 from telerig.estimator.calibration.lens.search import possible
-from telerig.rig.lens_models import (
+from telerig.rig.lens_parameters import (
     GROUPS,
+    INDEX,
     checked_model,
     groups_of,
     joint_name,
     models_by_camera,
     name_of,
     parameters_of,
+    rich_groups,
 )
-from telerig.rig.projection import INDEX
 
 CAMERAS = ("left", "right")
 
@@ -48,8 +48,8 @@ def test_what_a_name_frees(name: str, free: tuple[str, ...]) -> None:
 
 
 def test_every_lens_of_the_ladder_has_one_name() -> None:
-    lenses = [*possible(rich_lens(mono=False, strong=False)),
-              *possible(rich_lens(mono=False, strong=True))]  # fmt: skip
+    lenses = [*possible(rich_groups(mono=False, strong=False)),
+              *possible(rich_groups(mono=False, strong=True))]  # fmt: skip
     names = [name_of(lens) for lens in lenses]
     assert len(names) == 60 + 6 and len(set(names)) == len(names)
     for lens, name in zip(lenses, names):
@@ -58,11 +58,11 @@ def test_every_lens_of_the_ladder_has_one_name() -> None:
 
 
 def test_what_no_lens_of_the_ladder_is() -> None:
-    plain = possible(rich_lens(mono=False, strong=False))
+    plain = possible(rich_groups(mono=False, strong=False))
     assert not any({"affine", "tilt"} <= lens or {"tilt", "s"} <= lens for lens in plain)
     assert not any("k2" in lens and "k1" not in lens for lens in plain)
-    assert not any("kappa" in lens for lens in possible(rich_lens(mono=True, strong=False)))
-    strong = possible(rich_lens(mono=False, strong=True))
+    assert not any("kappa" in lens for lens in possible(rich_groups(mono=True, strong=False)))
+    strong = possible(rich_groups(mono=False, strong=True))
     assert all({"kappa", "centre"} <= lens and not lens & {"s", "tilt", "affine"}
                for lens in strong)  # fmt: skip
 

@@ -50,8 +50,8 @@ EDGE_S = 0.06
 
 
 def clean_devices() -> list[SimulatedDevice]:
-    encoder = DeviceDescription("encoder", "encoder", "", counts_per_mm=1000.0)
-    arms = [DeviceDescription(f"arm_{side}", "accelerometer", "") for side in ("left", "right")]
+    encoder = DeviceDescription("encoder", "encoder", "x", counts_per_mm=1000.0)
+    arms = [DeviceDescription(f"arm_{side}", "accelerometer", "x") for side in ("left", "right")]
     return [
         SimulatedDevice(encoder, 1000.0, drift_ppm=40.0, start_ticks=2**32 - 20_000_000),
         SimulatedDevice(arms[0], 2000.0, drift_ppm=-60.0),
@@ -210,7 +210,7 @@ def power_loss(folder: Path, seed: int) -> float:
 def polled(protocol: str, seconds: float, seed: int, folder: Path) -> tuple[int, float, float]:
     """Readings, half of question to answer (ms), and RMS of the time's error (ms)."""
     device = DeviceDescription(
-        "stage", "encoder", "", protocol=protocol, counts_per_mm=20000.0, poll_hz=50.0
+        "stage", "encoder", "x", protocol=protocol, counts_per_mm=20000.0, poll_hz=50.0
     )  # type: ignore[arg-type]
     with SimulatedPorts(
         [SimulatedDevice(device, 50.0)], folder, np.random.default_rng(seed)

@@ -13,7 +13,13 @@ import typer
 
 from telerig.errors import InputError
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, run_file, say, stopped_by_signals
+from telerig.scripts.console import (
+    EXIT_BAD_INPUT,
+    errors_in_words,
+    run_file,
+    say,
+    stopped_by_signals,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -40,7 +46,11 @@ def record(
         ),
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option(help="The rig file [default: DATASET/rig.toml].")
+        Path | None,
+        typer.Option(
+            help="The rig file [default: DATASET/rig.toml]; with --replay, its devices replace "
+            "those in the recording."
+        ),
     ] = None,
     replay: Annotated[
         Path | None,
@@ -57,7 +67,8 @@ def record(
     them again. If a device is unplugged, the recording waits for it and goes on. To practise
     without hardware: telerig simulate --devices --out practice.
 
-    Exit code 0: recorded. 2: a device, port or file cannot be used; the message says what to do.
+    Exit code 0: recorded. 2: a device, port or file cannot be used; the message says what to do,
+    and what the other devices sent is written.
     """
     if ports:
         from telerig.io.recording.ports import known_ports
@@ -79,13 +90,18 @@ def record(
         log = replay / "recording.raw" if replay.is_dir() else replay
         if not ((out or log.parent) / "recording.json").exists():
             refuse_existing(out or log.parent)
-        done = write_tables(log, out)
+        devices = _devices(_description(rig), []) if rig is not None else []
+        done = write_tables(log, out, {device.name: device for device in devices})
     else:
         place = out or run
         if place is not None:
             refuse_existing(place)
         done = write_tables(_recorded(run, seconds, port or [], rig, quiet), out)
     say(recording_words(done))
+    for error in done.errors.values():
+        typer.echo(f"telerig: {error}", err=True)
+    if done.errors:
+        raise typer.Exit(EXIT_BAD_INPUT)
 
 
 def _recorded(
@@ -97,8 +113,6 @@ def _recorded(
         raise InputError(
             "no run is given", todo="name a new folder: telerig record DATASET/runs/NAME"
         )
-    from telerig.io.rig_file.rig_file import read_rig_toml
-
     file = rig or run.resolve().parent.parent / "rig.toml"
     if rig is None and not file.is_file():
         raise InputError(
@@ -106,6 +120,17 @@ def _recorded(
             where=str(run),
             todo="record into DATASET/runs/NAME, or give the file (--rig FILE)",
         )
+    description = _description(file)
+    devices = _devices(description, ports)
+    cameras = list(description.cameras)
+    with stopped_by_signals() as stop, _display(quiet) as tell:
+        return record_run(devices, run, cameras=cameras, seconds=seconds, stop=stop, tell=tell)
+
+
+def _description(file: Path) -> RigDescription:
+    """The content of a rig.toml that names devices."""
+    from telerig.io.rig_file.rig_file import read_rig_toml
+
     description = read_rig_toml(file)
     if not description.devices:
         raise InputError(
@@ -114,10 +139,7 @@ def _recorded(
             todo='add a table [devices.encoder] with kind = "encoder", port and counts_per_mm; '
             "see docs/recording.md",
         )
-    devices = _devices(description, ports)
-    cameras = list(description.cameras)
-    with stopped_by_signals() as stop, _display(quiet) as tell:
-        return record_run(devices, run, cameras=cameras, seconds=seconds, stop=stop, tell=tell)
+    return description
 
 
 def _devices(rig: RigDescription, ports: list[str]) -> list[DeviceDescription]:
@@ -207,7 +229,10 @@ def recording_words(done: Recording) -> str:
     if not s["closed"]:
         lines.append("the recording was cut off: nothing that came after its last entry is in it")
     if s["log_damaged_bytes"]:
-        lines.append(f"{s['log_damaged_bytes']} bytes of the log are damaged and are not used")
+        lines.append(
+            f"{s['log_damaged_bytes']} bytes of the log are damaged, or of another recording, and "
+            "are not used"
+        )
     for name, device in s["devices"].items():
         lines += [f"{name}: " + ", ".join(_device_words(device))]
         lines += [f"  {line}" for line in _clock_words(device)]
@@ -250,8 +275,11 @@ def _clock_words(device: dict[str, Any]) -> Iterator[str]:
             f"{clock['sd_offset_us']:.2g} µs, apart from the least delay of the line; readings "
             f"arrive {clock['delay_median_ms']:.2g} ms later than that (median)"
         )
-    if device["time_from"] == "arrival" and device["readings"]:
-        yield "it sends no time stamps: its times are those of arrival, up to 16 ms late"
+    if device["time_sd_ms"] is not None and device["readings"]:
+        yield (
+            f"it sends no time stamps: its times are from {device['time_from']}, with a standard "
+            f"deviation of {device['time_sd_ms']:.2g} ms, apart from the least delay of the line"
+        )
     if device["half_question_to_answer_ms"]:
         half = device["half_question_to_answer_ms"]
         yield (

@@ -15,11 +15,14 @@ line becomes a piecewise linear curve, by the same linear programme with a value
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from telerig.arrays import Array, Bools, Ints
+from telerig.errors import InputError
+from telerig.io.rig_file.description import DeviceDescription
 from telerig.statistics import robust_sd
 
 RESTART_S = 0.5
@@ -34,6 +37,16 @@ _LEAST_WANDER_S = 100e-6
 _CURVE_WINDOW_S = 3.0
 _KNOT_S = 30.0
 _WINDOWS_PER_KNOT = 8
+_LEAST_SPAN_S = 0.2
+"""Within a shorter time arrivals do not determine a clock's rate: its nominal one is assumed."""
+_MOST_DRIFT = 0.1
+"""No clock that counts in the stated unit is wrong by a larger share of the time."""
+_RATE_READINGS = 16
+"""Fewer readings do not show in which unit a clock counts."""
+_RATE_S = 0.05
+"""The rate of a clock is that between readings so far apart: several times the adapter's delay."""
+_WRONG_UNIT = 0.5
+"""A clock whose rate differs from the host's by a larger share counts in another unit."""
 _TREND = 0.5
 """Mean squared step between neighbours over the variance: 2 for noise, near 0 for a slow change."""
 
@@ -113,12 +126,50 @@ def host_times(host_s: Array, device_s: Array, wrap_s: float = 0.0) -> ClockReco
     unwrapped = unwrap(host_s[kept], device_s[kept], wrap_s)
     number = np.cumsum(_breaks(host_s[kept], unwrapped)) - 1
     wraps = int(np.sum(np.diff(device_s[kept]) < -wrap_s / 2)) if wrap_s else 0
-    fits = _fits(host_s[kept], unwrapped, number)
+    fits = fit_counts(host_s[kept], unwrapped, number)
     for k, fit in enumerate(fits):
         own = number == k
         t_s[kept[own]] = fit.host_s(unwrapped[own])
     segment[kept] = number
     return ClockRecord(t_s, segment, fits, wraps, len(host_s) - len(kept))
+
+
+def stamp_rate(host_s: Array, device_s: Array) -> float | None:
+    """Compute how many of its stamps' seconds a device counts in a second of the host.
+
+    Arguments are as in `host_times`. Returns None for too few readings. The rate is that of most
+    readings: wraps, restarts, lost readings and wrong stamps do not matter.
+    """
+    lag = 1
+    while 2 * lag + _RATE_READINGS <= len(host_s):
+        apart = host_s[lag:] - host_s[:-lag]
+        if np.median(apart) > _RATE_S:
+            counted = device_s[lag:] - device_s[:-lag]
+            valid = (counted > 0) & (apart > _RATE_S / 2)
+            return float(np.median(counted[valid] / apart[valid])) if valid.any() else None
+        lag *= 2
+    return None
+
+
+def check_unit(host_s: Array, stamps: Array, device: DeviceDescription) -> None:
+    """Raise InputError when a device's stamps count in another unit than its description states.
+
+    host_s : (readings,) times of arrival in s. stamps : (readings,) as sent.
+    """
+    rate = stamp_rate(host_s, stamps * device.time_unit_s)
+    if rate is None or 1 - _WRONG_UNIT < rate < 1 / (1 - _WRONG_UNIT):
+        return
+    power = 10.0 ** round(np.log10(rate))
+    decimal = abs(rate / power - 1) < _MOST_DRIFT
+    unit = device.time_unit_s / (power if decimal else rate)
+    shown = f"{power if decimal else rate:.3g}"
+    raise InputError(
+        f"its time stamps run {shown} times as fast as the host's clock",
+        where=f"devices.{device.name}",
+        todo=f"set time_unit_s = {unit:.3g} in [devices.{device.name}] of rig.toml (now "
+        f"{device.time_unit_s:g}); what was recorded can be read with `telerig record --replay RUN "
+        "--rig rig.toml`",
+    )
 
 
 def unwrap(host_s: Array, device_s: Array, wrap_s: float) -> Array:
@@ -200,9 +251,13 @@ def _in_order(u: Array, part: Ints) -> Bools:
     return good
 
 
-def _fits(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, ...]:
-    """One fit for each count; short ones take the drift of the longest."""
-    parts = [number == k for k in range(int(number[-1]) + 1)]
+def fit_counts(host_s: Array, device_s: Array, number: Ints) -> tuple[ClockFit, ...]:
+    """Fit each uninterrupted count of a clock; short ones take the drift of the longest.
+
+    host_s, device_s : (readings,) as in `fit_clock`. number : (readings,) of the count, from 0.
+    """
+    edges = np.searchsorted(number, np.arange(int(number[-1]) + 2))
+    parts = [slice(begin, end) for begin, end in pairwise(edges.tolist())]
     spans = [float(np.ptp(device_s[p])) for p in parts]
     longest = int(np.argmax(spans))
     best = fit_clock(host_s[parts[longest]], device_s[parts[longest]])
@@ -224,10 +279,14 @@ def fit_clock(host_s: Array, device_s: Array, drift_ppm: float | None = None) ->
     x, late = device_s - x_mean, (host_s - y_mean) - (device_s - x_mean)
     edge, least = _least_delays(x, late)
     used = np.flatnonzero(~_too_early(x, late, edge, least))
-    if drift_ppm is None and len(used) > 1:
+    if drift_ppm is None and np.ptp(x) > _LEAST_SPAN_S:
         at_mean, slope = _lower_line_of_many(x[used], late[used])
+        if not abs(slope) < _MOST_DRIFT:
+            drift_ppm = 0.0
     else:
-        slope = 1 / (1 + 1e-6 * (drift_ppm or 0.0)) - 1
+        drift_ppm = drift_ppm or 0.0
+    if drift_ppm is not None:
+        slope = 1 / (1 + 1e-6 * drift_ppm) - 1
         at_mean = float(np.min(late[used] - slope * x[used]))
     delay = late[used] - at_mean - slope * x[used]
     curve = None if drift_ppm is not None else _curve(x[used], delay)

@@ -10,13 +10,18 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.rig_file.description import DeviceDescription
 
@@ -26,6 +31,8 @@ _HEAD = struct.Struct("<BBqI")
 _CRC = struct.Struct("<I")
 _LEAST = len(MARKER) + _HEAD.size + _CRC.size
 _BLOCK = 1 << 22
+_EARLIEST_NS = 60 * 10**9
+"""An entry that is older than the recording by more than this time in ns is of another one."""
 
 RECEIVED, SENT, LOST, FOUND, END = 1, 2, 3, 4, 5
 """Kinds of entry: bytes in, bytes out, port lost, port found again, recording ended."""
@@ -67,33 +74,40 @@ class RawLog:
 
     def __init__(self, path: Path, header: LogHeader) -> None:
         self.path = path
-        try:
-            _make(path.parent)
-            self._file: BinaryIO = path.open("xb", buffering=0)
-        except FileExistsError as error:
-            raise InputError(
-                "exists, and a recording is never written over",
-                where=str(path),
-                todo="give the new run another name, or move this one away",
-            ) from error
-        except OSError as error:
-            raise log_error(path, error) from error
         text = json.dumps(asdict(header), ensure_ascii=False).encode()
         self._waiting = [MAGIC + _CRC.pack(len(text)) + text + _CRC.pack(zlib.crc32(text))]
         self.bytes = 0
-        self.flush()
-        # Bring the folder's list of files to the disk: a power cut could lose the new one.
-        handle = os.open(path.parent, os.O_RDONLY)
         try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: BinaryIO = path.open("x+b", buffering=0)
+        except FileExistsError as error:
+            if path.parent.is_dir():
+                raise InputError(
+                    "exists, and a recording is never written over",
+                    where=str(path),
+                    todo="give the new run another name, or move this one away",
+                ) from error
+            what = "is a file, and a folder is needed"
+            raise InputError(what, where=str(path.parent), todo="give another name") from error
+        except OSError as error:
+            raise log_error(path, error) from error
+        try:
+            self.flush()
+            _sync_folder(path.parent)
+        except (InputError, OSError) as error:
+            self._file.close()
+            path.unlink(missing_ok=True)
+            raise _nothing_recorded(path, error) from error
 
     def append(self, entry: Entry) -> None:
         self._waiting.append(packed(entry))
 
     def flush(self) -> None:
-        """Write the entries in memory and wait until they are on the disk. Raises InputError."""
+        """Write the entries in memory and wait until they are on the disk.
+
+        Raises InputError when they cannot be written, or when somebody has deleted the file; then
+        the file is made again with everything that was recorded.
+        """
         if not self._waiting:
             return
         data, self._waiting = b"".join(self._waiting), []
@@ -102,9 +116,30 @@ class RawLog:
             while written < len(data):
                 written += self._file.write(memoryview(data)[written:])
             os.fsync(self._file.fileno())
+            deleted = os.fstat(self._file.fileno()).st_nlink == 0
         except OSError as error:
             raise log_error(self.path, error) from error
         self.bytes += len(data)
+        if deleted:
+            self._write_again()
+            raise InputError(
+                "was deleted while it was being recorded, so the recording ends here",
+                where=str(self.path),
+                todo=f"everything until now has been written to it again; `telerig record --replay "
+                f"{self.path}` makes the tables",
+            )
+
+    def _write_again(self) -> None:
+        """Write the content of the deleted file, which its handle still holds, to its old place."""
+        self._file.seek(0)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("xb") as copy:
+                shutil.copyfileobj(self._file, copy)
+                copy.flush()
+                os.fsync(copy.fileno())
+        except OSError as error:
+            raise log_error(self.path, error) from error
 
     def close(self) -> None:
         self._file.close()
@@ -116,13 +151,22 @@ class RawLog:
         self.close()
 
 
-def _make(folder: Path) -> None:
+def _sync_folder(folder: Path) -> None:
+    """Bring the folder's list of files to the disk: a power cut could lose the new one."""
+    handle = os.open(folder, os.O_RDONLY)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:
-        raise InputError(
-            "is a file, and a folder is needed", where=str(folder), todo="give another name"
-        ) from error
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _nothing_recorded(path: Path, error: Exception) -> InputError:
+    full = isinstance(error, InputError) and error.what.startswith("the disk is full")
+    return InputError(
+        "the disk is full: nothing was recorded" if full else f"cannot be written: {error}",
+        where=str(path),
+        todo="make room, then run again" if full else "choose a folder that can be written",
+    )
 
 
 def packed(entry: Entry) -> bytes:
@@ -152,21 +196,98 @@ def read_header(path: Path) -> LogHeader:
     return _open(path)[0]
 
 
-def read_log(path: Path) -> Iterator[Entry]:
-    """Read a raw log and yield every undamaged entry, in the order of writing.
+@dataclass(frozen=True)
+class LogScan:
+    """Hold what a first look at a raw log has found.
 
-    Raises InputError for a file that is no log. Damaged parts are skipped (see `damaged_bytes`).
+    header : its header. damaged_bytes : number of bytes that belong to no undamaged entry of this
+    recording. ordered : whether the entries of each device are in the order of time, each once.
+    end_ns : time in ns of the entry that closed the recording; None if there is none.
     """
+
+    header: LogHeader
+    damaged_bytes: int
+    ordered: bool
+    end_ns: int | None
+
+
+def scan_log(path: Path) -> LogScan:
+    """Read a raw log once to see what is damaged in it. Raises InputError for a file that is no
+    log."""
     header, start = _open(path)
+    damaged, ordered, end_ns = 0, True, None
+    latest: dict[tuple[int, int], int] = {}
+    late: list[tuple[int, int]] = []
     for piece in _pieces(path, start):
-        if isinstance(piece, Entry) and piece.device < max(len(header.devices), 1):
-            yield piece
+        if isinstance(piece, int) or not _belongs(piece, header):
+            damaged += piece if isinstance(piece, int) else len(packed(piece))
+            continue
+        if piece.kind == END:
+            end_ns = min(piece.time_ns, end_ns or piece.time_ns)
+            continue
+        key = (piece.device, piece.kind)
+        ordered = ordered and end_ns is None and piece.time_ns > latest.get(key, -(1 << 63))
+        latest[key] = piece.time_ns
+        if end_ns is not None:
+            late.append((piece.time_ns, len(packed(piece))))
+    damaged += sum(size for time_ns, size in late if time_ns > (end_ns or 0))
+    return LogScan(header, damaged, ordered, end_ns)
+
+
+def _belongs(entry: Entry, header: LogHeader) -> bool:
+    """Whether an entry can be of this recording and not of another log, joined to it."""
+    known = entry.kind == END or (
+        RECEIVED <= entry.kind < END and entry.device < len(header.devices)
+    )
+    return known and entry.time_ns > header.start_ns - _EARLIEST_NS
+
+
+def read_log(path: Path, scan: LogScan | None = None) -> Iterator[Entry]:
+    """Read a raw log and yield every undamaged entry of the recording, in the order of time.
+
+    scan : the result of `scan_log`, if it is known. Damaged parts are skipped, and what comes after
+    the end of the recording. A log whose parts were exchanged or doubled is put in order, for which
+    it is held in memory. Raises InputError for a file that is no log.
+    """
+    scan = scan or scan_log(path)
+    _, start = _open(path)
+    found = (
+        piece
+        for piece in _pieces(path, start)
+        if isinstance(piece, Entry) and _belongs(piece, scan.header)
+    )
+    if scan.ordered:
+        yield from found
+        return
+    once = dict.fromkeys(e for e in found if scan.end_ns is None or e.time_ns <= scan.end_ns)
+    yield from sorted(once, key=lambda entry: entry.time_ns)
 
 
 def damaged_bytes(path: Path) -> int:
     """Read a raw log and return the number of bytes that belong to no undamaged entry."""
-    _, start = _open(path)
-    return sum(p for p in _pieces(path, start) if isinstance(p, int))
+    return scan_log(path).damaged_bytes
+
+
+def received_bytes(path: Path, scan: LogScan, spans: Sequence[Ints]) -> list[list[bytes]]:
+    """Read parts of what each device sent out of a raw log.
+
+    spans : for each device (N, 2): first byte and number of bytes, counted over all bytes that were
+    received from it, in increasing order. Returns the N pieces of each device.
+    """
+    found: list[list[bytes]] = [[] for _ in spans]
+    waiting = [[tuple(span) for span in np.asarray(s).tolist()][::-1] for s in spans]
+    kept, begin = [b""] * len(spans), [0] * len(spans)
+    for entry in read_log(path, scan):
+        if entry.kind != RECEIVED or not waiting[entry.device]:
+            continue
+        k = entry.device
+        data = kept[k] + entry.data
+        while waiting[k] and sum(waiting[k][-1]) <= begin[k] + len(data):
+            first, length = waiting[k].pop()
+            found[k].append(data[first - begin[k] : first - begin[k] + length])
+        done = min((waiting[k][-1][0] if waiting[k] else begin[k]) - begin[k], len(data))
+        kept[k], begin[k] = data[done:], begin[k] + done
+    return found
 
 
 def _open(path: Path) -> tuple[LogHeader, int]:
@@ -185,13 +306,12 @@ def _open(path: Path) -> tuple[LogHeader, int]:
     if len(crc) < _CRC.size or _CRC.unpack(crc)[0] != zlib.crc32(text):
         raise _no_log(path, "has a damaged header, so its devices are not known")
     try:
-        raw = json.loads(text)
-        devices = tuple(DeviceDescription(**d) for d in raw["devices"])
-        devices = tuple(replace(d, cameras=tuple(d.cameras)) for d in devices)
-        header = LogHeader(raw["start_ns"], raw["started"], tuple(raw["cameras"]), devices)
-    except (ValueError, KeyError, TypeError) as error:
+        header = TypeAdapter(LogHeader).validate_json(text)
+    except ValidationError as error:
+        fault = error.errors(include_url=False, include_input=False)[0]
+        what = f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}"
         raise InputError(
-            f"has a header that this version of telerig does not know ({error})",
+            f"has a header that this version of telerig does not know ({what:.200})",
             where=str(path),
             todo="replay it with the version of telerig that recorded it, or a newer one",
         ) from error

@@ -13,6 +13,7 @@ from telerig.errors import InputError
 from telerig.io.recording.log import FOUND, LOST, RECEIVED, SENT, Entry
 from telerig.io.recording.protocols import poll_command
 from telerig.io.rig_file.description import DeviceDescription
+from telerig.io.rig_file.devices import port_fault
 
 WAIT_S = 0.1
 """Longest wait in s for a byte before a reader checks whether it has to stop."""
@@ -20,6 +21,9 @@ WRITE_S = 1.0
 """A port that does not accept a written byte for this time in s counts as lost."""
 NO_PERMISSION = "sudo usermod -a -G dialout $USER (uucp on some systems), then log in again"
 """The remedy for a port that may not be opened."""
+
+
+_PORTS_TODO = "give a device file like /dev/ttyUSB0; `telerig record --ports` lists those there are"
 
 
 def found_ports() -> list[tuple[str, str]]:
@@ -44,13 +48,19 @@ def open_port(device: DeviceDescription) -> Any:
     """
     import serial
 
+    place = f"devices.{device.name} port {device.port:.200}"
+    if fault := port_fault(device.port):
+        raise InputError(fault[0], where=place, todo=fault[1])
+    if Path(device.port).is_file() or Path(device.port).is_dir():
+        what = "is a folder" if Path(device.port).is_dir() else "is a file"
+        raise InputError(f"{what}, not a serial port", where=place, todo=_PORTS_TODO)
     try:
         port = serial.serial_for_url(
             device.port, baudrate=device.baud, timeout=WAIT_S, write_timeout=WRITE_S, exclusive=True
         )
         port.reset_input_buffer()
         return port
-    except (serial.SerialException, OSError, ValueError) as error:
+    except Exception as error:
         raise _cannot_open(device, error) from error
 
 
@@ -105,7 +115,6 @@ class Reader(threading.Thread):
 
     index : the device's index in the log. device : its description. port : the open port.
     emit : is called in this thread with every entry.
-    The attribute ``fault`` is the exception that ended the thread; None if there was none.
     """
 
     def __init__(
@@ -114,7 +123,6 @@ class Reader(threading.Thread):
         super().__init__(name=f"read {device.name}", daemon=True)
         self.device = device
         self.connected = True
-        self.fault: Exception | None = None
         self._index, self._port, self._emit = index, port, emit
         self._command = poll_command(device)
         self._stop_asked = threading.Event()
@@ -127,15 +135,13 @@ class Reader(threading.Thread):
             while not self._stop_asked.is_set():
                 try:
                     self._listen()
-                except (OSError, TypeError) as error:
+                except Exception as error:  # noqa: BLE001
                     self._lost(error)
-        except Exception as error:  # noqa: BLE001
-            self.fault = error
         finally:
             self._close()
 
     def _listen(self) -> None:
-        """Read until `stop`; on an unplug pyserial raises OSError, or TypeError within a read."""
+        """Read until `stop`; on an unplug pyserial raises OSError, TypeError or termios.error."""
         if self._command is None:
             while not self._stop_asked.is_set():
                 self._receive()
@@ -180,5 +186,5 @@ class Reader(threading.Thread):
     def _close(self) -> None:
         try:
             self._port.close()
-        except OSError:
+        except Exception:  # noqa: BLE001
             self.connected = False

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol as Interface
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.io.rig_file.description import DeviceDescription, Kind
+from telerig.io.rig_file.devices import LinePattern
 
 LONGEST_LINE = 4096
 """More bytes than this without an end of line are malformed."""
 
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_TEXT = bytes(range(32, 127)) + b"\t\r"
+_NUMBER = r"[+-]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][+-]?+\d++)?+"
+"""Possessive: what has matched is not tried again, so that a long run of digits costs no time."""
 _STREAMS: dict[Kind, str] = {
     "encoder": r"(?P<t>\d+),(?P<counts>[+-]?\d+)(?:,\w*)?",
     "accelerometer": rf"(?P<t>\d+),(?P<ax>{_NUMBER}),(?P<ay>{_NUMBER}),(?P<az>{_NUMBER})",
@@ -35,17 +39,41 @@ PACKETS: dict[Kind, list[tuple[str, str]]] = {
 
 @dataclass(frozen=True)
 class Readings:
-    """values : (N,) each, by the name of the group. arrived_ns : (N,) of each reading's last byte.
+    """Hold the readings of some bytes of a line, and the bytes that are no reading.
 
-    malformed : arrival (ns) of each line or run of bytes that is no reading.
-    malformed_bytes : number of bytes in these. samples : the first of them, for messages.
+    arrived_ns : (N,) the host's time in ns of each reading's last byte.
+    values : by the name of the group, (N,) numbers each.
+    spans : (N, 2) place of each reading in all bytes of the line: first byte, number of bytes.
+    malformed : (M,) arrival in ns of each line, or run of bytes, that is no reading.
+    malformed_spans : (M, 2) its place. garbage : (M,) False for text that a device may send between
+    its readings. samples : the first of the malformed bytes, for messages.
     """
 
     arrived_ns: Ints
     values: dict[str, Array]
+    spans: Ints
     malformed: Ints
-    malformed_bytes: int = 0
+    malformed_spans: Ints
+    garbage: Bools
     samples: tuple[bytes, ...] = ()
+
+    @property
+    def malformed_bytes(self) -> int:
+        """Number of bytes that belong to no reading."""
+        return int(self.malformed_spans[:, 1].sum())
+
+
+def joined(parts: Sequence[Readings]) -> Readings:
+    """Join the readings of successive parts of a line, at least one part."""
+    return Readings(
+        np.concatenate([p.arrived_ns for p in parts]),
+        {name: np.concatenate([p.values[name] for p in parts]) for name in parts[0].values},
+        np.concatenate([p.spans for p in parts]),
+        np.concatenate([p.malformed for p in parts]),
+        np.concatenate([p.malformed_spans for p in parts]),
+        np.concatenate([p.garbage for p in parts]),
+        tuple(sample for p in parts for sample in p.samples),
+    )
 
 
 class Parser(Interface):
@@ -62,7 +90,7 @@ def parser(device: DeviceDescription) -> Parser:
     """The parser of a device, at the start of a connection."""
     if device.protocol == "packets":
         return PacketParser(PACKETS[device.kind])
-    return LineParser(line_pattern(device), xor=device.checksum == "xor")
+    return LineParser(device)
 
 
 def poll_command(device: DeviceDescription) -> bytes | None:
@@ -73,9 +101,7 @@ def poll_command(device: DeviceDescription) -> bytes | None:
 
 
 def line_pattern(device: DeviceDescription) -> str:
-    """The regular expression that one whole line, without its end, must match."""
-    if device.protocol == "regex":
-        return device.pattern or ""
+    """The regular expression of a known protocol, which a whole line without its end matches."""
     if device.protocol == "zaber":
         return _ZABER
     if device.protocol == "grbl":
@@ -93,10 +119,11 @@ def xor_checksum(line: bytes) -> bytes:
 
 
 class _Joined:
-    """Joins received pieces; incomplete readings stay in `_tail`."""
+    """Joins received pieces; incomplete readings stay in `_tail`, which begins at byte `_begin`."""
 
     def __init__(self) -> None:
         self._tail = b""
+        self._begin = 0
         self._begun = False
 
     def _join(self, chunks: Sequence[tuple[int, bytes]]) -> tuple[bytes, Ints, Ints]:
@@ -105,62 +132,80 @@ class _Joined:
         ends = np.cumsum([len(self._tail), *(len(piece) for _, piece in chunks)])[1:]
         return data, ends, np.array([stamp for stamp, _ in chunks], np.int64)
 
+    def _keep(self, tail: bytes, parsed: int) -> int:
+        """Keep the tail of bytes of which ``parsed`` are done; the place of the first of them."""
+        begin, self._begin, self._tail = self._begin, self._begin + parsed, tail
+        return begin
+
     def cut(self) -> int:
-        dropped, self._tail, self._begun = len(self._tail), b"", False
+        dropped = len(self._tail)
+        self._keep(b"", dropped)
+        self._begun = False
         return dropped
 
 
 class LineParser(_Joined):
     """Lines that end in LF or CR LF, each of which must match an expression as a whole."""
 
-    def __init__(self, pattern: str, *, xor: bool = False) -> None:
+    def __init__(self, device: DeviceDescription) -> None:
         super().__init__()
-        expression = re.compile(pattern.encode())
-        self._match, self._groups = expression.fullmatch, list(expression.groupindex)
-        self._xor = xor
+        self._xor = device.checksum == "xor"
+        self._only_readings = device.protocol == "stream"
+        self._cells: Callable[[bytes], tuple[bytes | None, ...] | None]
+        if device.protocol == "regex":
+            own = LinePattern(device.pattern or "")
+            self._cells, self._groups = own.cells, list(own.names)
+        else:
+            known = re.compile(line_pattern(device).encode())
+            self._groups = list(known.groupindex)
+            self._cells = partial(_cells, known, self._groups)
 
     def feed(self, chunks: Sequence[tuple[int, bytes]]) -> Readings:
         data, ends, stamps = self._join(chunks)
         lines = data.split(b"\n")
-        self._tail = lines.pop()
-        if len(self._tail) > LONGEST_LINE:
-            lines.append(self._tail)
-            self._tail = b""
-        if not lines:
-            return self._readings([], np.zeros(0, np.int64), [])
-        last = np.cumsum([len(line) + 1 for line in lines]) - 1
-        arrived = _arrival(last, ends, stamps)
-        if not self._begun:
-            self._begun, lines, arrived = True, *self._first(lines, arrived)
-        return self._readings(lines, arrived, [self._found(line) for line in lines])
+        tail = lines.pop()
+        if len(tail) > LONGEST_LINE:
+            lines.append(tail)
+            tail = b""
+        begin = self._keep(tail, len(data) - len(tail))
+        length = np.array([len(line) for line in lines], np.int64)
+        start = np.cumsum(length + 1) - length - 1
+        found = [self._found(line) for line in lines]
+        good = np.array([cells is not None for cells in found], bool)
+        bad = np.array([bool(line.strip(b"\r")) for line in lines], bool) & ~good
+        if lines and not self._begun:
+            self._begun, bad[0] = True, False  # the connection may have begun within this line
+        arrived = _arrival(np.minimum(start + length, len(data) - 1), ends, stamps)
+        spans = np.column_stack([begin + start, length])
+        columns = list(zip(*(c for c in found if c is not None))) or [()] * len(self._groups)
+        return Readings(
+            arrived[good],
+            {name: _numbers(column) for name, column in zip(self._groups, columns)},
+            spans[good],
+            arrived[bad],
+            spans[bad],
+            np.array([self._garbage(lines[i]) for i in np.flatnonzero(bad)], bool),
+            tuple(lines[i] for i in np.flatnonzero(bad)[:3]),
+        )
 
-    def _first(self, lines: list[bytes], arrived: Ints) -> tuple[list[bytes], Ints]:
-        """Without the first line, if the connection began in the middle of it."""
-        return (lines, arrived) if self._found(lines[0]) else (lines[1:], arrived[1:])
+    def _garbage(self, line: bytes) -> bool:
+        """Whether a malformed line cannot be text of another kind that the device sends."""
+        return self._only_readings or bool(line.translate(None, _TEXT))
 
-    def _found(self, line: bytes) -> re.Match[bytes] | None:
+    def _found(self, line: bytes) -> tuple[bytes | None, ...] | None:
         line = line.rstrip(b"\r")
         if self._xor:
             line, check = line[:-3], line[-3:]
             if check != xor_checksum(line):
                 return None
-        return self._match(line)
+        return self._cells(line)
 
-    def _readings(
-        self, lines: list[bytes], arrived: Ints, found: list[re.Match[bytes] | None]
-    ) -> Readings:
-        good = np.array([m is not None for m in found], bool)
-        cells = [m.group(*self._groups, 0) for m in found if m]
-        columns = list(zip(*cells)) or [()] * len(self._groups)
-        bad = [line for line, m in zip(lines, found) if m is None and line.strip(b"\r")]
-        empty = np.array([not line.strip(b"\r") for line in lines], bool)
-        return Readings(
-            arrived[good],
-            {name: _numbers(column) for name, column in zip(self._groups, columns)},
-            arrived[~good & ~empty],
-            sum(map(len, bad)),
-            tuple(bad[:3]),
-        )
+
+def _cells(
+    expression: re.Pattern[bytes], groups: list[str], line: bytes
+) -> tuple[bytes | None, ...] | None:
+    found = expression.fullmatch(line)
+    return found.group(*groups, 0)[:-1] if found else None
 
 
 def _numbers(cells: Sequence[bytes | None]) -> Array:
@@ -191,20 +236,22 @@ class PacketParser(_Joined):
         starts = self._packets(data)
         done = max(int(starts[-1]) + size if starts.size else 0, len(data) - size + 1)
         done = min(done, len(data))
-        self._tail = data[done:]
+        begin = self._keep(data[done:], done)
         rows = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(size)]
         table = np.ascontiguousarray(rows).view(self._type)[:, 0]
         names = [n for n in self._type.names or () if n not in ("sync", "sum")]
         gaps = _between(starts, size, done)
-        if gaps and gaps[0][0] == 0 and not self._begun:
+        if len(gaps) and gaps[0, 0] == 0 and not self._begun:
             gaps = gaps[1:]
         self._begun = self._begun or bool(starts.size)
         return Readings(
             _arrival(starts + size - 1, ends, stamps),
             {name: table[name].astype(float) for name in names},
-            _arrival(np.array([b - 1 for _, b in gaps], np.int64), ends, stamps),
-            sum(b - a for a, b in gaps),
-            tuple(data[a:b] for a, b in gaps[:3]),
+            np.column_stack([begin + starts, np.full(len(starts), size)]),
+            _arrival(gaps.sum(axis=1) - 1, ends, stamps),
+            gaps + np.array([begin, 0]),
+            np.ones(len(gaps), bool),
+            tuple(data[a : a + n] for a, n in gaps[:3].tolist()),
         )
 
     def _packets(self, data: bytes) -> Ints:
@@ -225,10 +272,10 @@ class PacketParser(_Joined):
         return np.array(kept, np.int64)
 
 
-def _between(starts: Ints, size: int, done: int) -> list[tuple[int, int]]:
-    """The (begin, end) of the bytes before ``done`` that belong to no packet."""
-    begin, end = [0, *(starts + size).tolist()], [*starts.tolist(), done]
-    return [(a, b) for a, b in zip(begin, end) if b > a]
+def _between(starts: Ints, size: int, done: int) -> Ints:
+    """(gaps, 2) begin and length of the bytes before ``done`` that belong to no packet."""
+    begin, end = np.append(0, starts + size), np.append(starts, done)
+    return np.column_stack([begin, end - begin])[end > begin].astype(np.int64)
 
 
 def _arrival(position: Ints, ends: Ints, stamps: Ints) -> Ints:

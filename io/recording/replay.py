@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.io.recording.clock import ClockFit, host_times
+from telerig.errors import InputError
+from telerig.io.recording.clock import ClockFit, check_unit, host_times
+from telerig.io.recording.judgement import amid_garbage, far_from_neighbours, mostly_garbage
 from telerig.io.recording.log import (
     END,
     FOUND,
@@ -19,30 +21,56 @@ from telerig.io.recording.log import (
     SENT,
     Entry,
     LogHeader,
-    read_header,
     read_log,
+    received_bytes,
+    scan_log,
 )
-from telerig.io.recording.protocols import Readings, parser
+from telerig.io.recording.protocols import Readings, joined, parser
+from telerig.io.recording.unstamped import spread_arrivals
 from telerig.io.rig_file.description import DeviceDescription
 
 GAP_INTERVALS = 1.5
 """A step longer than so many usual ones is a gap."""
-_NEIGHBOURS = 8
-_FAR_RESIDUALS = 5.0
-"""Far from a parabola through the neighbours: more than so many times their largest residual."""
 _BLOCK_BYTES = 1 << 19
+REPLAY_WITH_RIG = "run `telerig record --replay RUN --rig rig.toml`"
+"""The advice for a recording whose devices were described wrongly."""
 TIME_DIGITS = 7
 """Decimals of t_s in the tables: a tenth of a microsecond."""
+_LARGEST = 1e15
+"""A larger number is no reading: neither a stamp nor a value has so many digits."""
+MALFORMED = "malformed"
+REGULAR_CLOCK = "arrival, by a regular clock"
+_ACCELERATION_MM_S2 = 5000.0
+"""A stage accelerates less, so that an encoder's reading beyond it is doubtful."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Hold the lines of a device that are in no table.
+
+    spans : (R, 2) first byte and number of bytes, counted over all bytes of the device.
+    t_s : (R,) time in s, NaN where it is not known. arrived_s : (R,) when the host received them.
+    reason : (R,) why each was refused. lines : the R lines.
+    """
+
+    spans: Ints
+    t_s: Array
+    arrived_s: Array
+    reason: NDArray[np.object_]
+    lines: tuple[bytes, ...] = ()
 
 
 @dataclass(frozen=True)
 class DeviceRecord:
-    """The readings of one device, in the order of time.
+    """Hold the readings of one device, in the order of time.
 
     t_s : (N,) since the beginning of the recording, strictly increasing. arrived_s : (N,) when the
     host received it. values : (N,) each, as sent. malformed_s : arrival of what could not be read.
     away_s : (lost, found) of each unplug; found is NaN if it never came back. faults : number of
     readings left out, by the reason. half_width_s : half the time from question to answer.
+    time_sd_s : standard deviation in s of the times, apart from the least delay of the line; None
+    where the clock fits state it. refused : the lines that are in no table.
+    error : why the readings cannot be used, or cannot be used as described; None if they can.
     """
 
     device: DeviceDescription
@@ -59,35 +87,51 @@ class DeviceRecord:
     faults: dict[str, int]
     time_from: str
     half_width_s: float
+    time_sd_s: float | None
+    refused: Refused
+    error: InputError | None
 
 
 @dataclass(frozen=True)
 class Replay:
-    """end_s : time of the last entry. ended : whether the recording was closed, not cut off."""
+    """end_s : time of the last entry. ended : whether the recording was closed, not cut off.
+
+    damaged_bytes : number of bytes of the log that belong to no undamaged entry of this recording.
+    """
 
     header: LogHeader
     records: tuple[DeviceRecord, ...]
     end_s: float
     ended: bool
+    damaged_bytes: int
 
 
 @dataclass
 class _Line:
-    """The entries of one device while the log is read."""
+    """The entries of one device while the log is read; ``error`` if they cannot be parsed."""
 
     device: DeviceDescription
     chunks: list[tuple[int, bytes]] = field(default_factory=list)
     waiting: int = 0
     found: list[Readings] = field(default_factory=list)
     sent_ns: list[int] = field(default_factory=list)
-    lost_ns: list[int] = field(default_factory=list)
-    found_ns: list[int] = field(default_factory=list)
+    away_ns: list[tuple[int, int | None]] = field(default_factory=list)
     partial_bytes: int = 0
+    error: InputError | None = None
 
     def __post_init__(self) -> None:
-        self._parser = parser(self.device)
+        try:
+            self._parser = parser(self.device)
+        except (ValueError, KeyError) as error:
+            self.error = InputError(
+                f"has a protocol or pattern that cannot be used: {error}",
+                where=_place(self.device),
+                todo=f"correct [devices.{self.device.name}] in rig.toml, then {REPLAY_WITH_RIG}",
+            )
 
     def take(self, entry: Entry) -> None:
+        if self.error is not None:
+            return
         if entry.kind == RECEIVED:
             self.chunks.append((entry.time_ns, entry.data))
             self.waiting += len(entry.data)
@@ -97,9 +141,9 @@ class _Line:
             self.sent_ns.append(entry.time_ns)
         elif entry.kind == LOST:
             self.cut()
-            self.lost_ns.append(entry.time_ns)
-        elif entry.kind == FOUND:
-            self.found_ns.append(entry.time_ns)
+            self.away_ns.append((entry.time_ns, None))
+        elif entry.kind == FOUND and self.away_ns and self.away_ns[-1][1] is None:
+            self.away_ns[-1] = self.away_ns[-1][0], entry.time_ns
 
     def parse(self) -> None:
         self.found.append(self._parser.feed(self.chunks))
@@ -110,71 +154,182 @@ class _Line:
         self.partial_bytes += self._parser.cut()
 
 
-def replay(path: Path) -> Replay:
+def replay(path: Path, devices: Mapping[str, DeviceDescription] | None = None) -> Replay:
     """The readings of a raw log. The same log gives the same numbers, to the last bit.
 
+    devices : descriptions by name that replace those in the log, for a recording that was made with
+    wrong ones. What is wrong with one device is stated in its record and does not affect others.
     Raises InputError for a file that is no log.
     """
-    header = read_header(path)
+    scan = scan_log(path)
+    named = devices or {}
+    header = replace(scan.header, devices=tuple(named.get(d.name, d) for d in scan.header.devices))
     lines = [_Line(device) for device in header.devices]
     end_ns, ended = header.start_ns, False
-    for entry in read_log(path):
-        end_ns, ended = entry.time_ns, entry.kind == END
-        if not ended:
+    for entry in read_log(path, scan):
+        end_ns, ended = max(end_ns, entry.time_ns), ended or entry.kind == END
+        if entry.kind != END:
             lines[entry.device].take(entry)
-    for line in lines:
-        line.cut()
-    records = tuple(_record(line, header.start_ns) for line in lines)
-    return Replay(header, records, (end_ns - header.start_ns) * 1e-9, ended)
+    records = [_record(line, header.start_ns) for line in lines]
+    texts = received_bytes(path, scan, [record.refused.spans for record in records])
+    records = [
+        replace(record, refused=replace(record.refused, lines=tuple(text)))
+        for record, text in zip(records, texts)
+    ]
+    end_s = (end_ns - header.start_ns) * 1e-9
+    return Replay(header, tuple(records), end_s, ended, scan.damaged_bytes)
+
+
+def _place(device: DeviceDescription) -> str:
+    return f"devices.{device.name}"
 
 
 def _record(line: _Line, start_ns: int) -> DeviceRecord:
-    device = line.device
-    arrived = _seconds(np.concatenate([r.arrived_ns for r in line.found]), start_ns)
-    names = line.found[0].values
-    values = {name: np.concatenate([r.values[name] for r in line.found]) for name in names}
-    good = np.all([np.isfinite(v) for v in values.values()], axis=0) & np.isfinite(arrived)
-    faults = {"not a number": int(np.sum(~good))}
-    arrived, values = arrived[good], {name: v[good] for name, v in values.items()}
+    """The record of one device, whatever is wrong with it."""
+    if line.error is not None:
+        return _without_readings(line, line.error)
+    line.cut()
+    try:
+        return _judged(line, start_ns, _times)
+    except InputError as error:
+        return _without_readings(line, error)
+    except Exception as error:  # noqa: BLE001
+        fault = InputError(
+            f"its clock could not be fitted ({error!r:.200}); its times are those of arrival",
+            where=_place(line.device),
+            todo="this is a fault of telerig: report it with the recording.raw",
+        )
+    return replace(_judged(line, start_ns, _arrival_times), error=fault)
+
+
+def _without_readings(line: _Line, error: InputError) -> DeviceRecord:
+    none, no_lines = np.zeros(0), np.zeros((0, 2), np.int64)
+    refused = Refused(no_lines, none, none, np.zeros(0, np.object_))
+    found = joined(line.found) if line.found else None
+    return DeviceRecord(
+        device=line.device, t_s=none, arrived_s=none, values={}, malformed_s=none,
+        malformed_bytes=found.malformed_bytes if found else 0, samples=_samples(line),
+        partial_bytes=line.partial_bytes, away_s=(), clocks=(), wraps=0, faults={},
+        time_from="nothing", half_width_s=0.0, time_sd_s=None, refused=refused, error=error,
+    )  # fmt: skip
+
+
+def _samples(line: _Line) -> tuple[str, ...]:
+    return tuple(repr(s[:60]) for r in line.found for s in r.samples)[:5]
+
+
+@dataclass(frozen=True)
+class _Timed:
+    """The times of readings. t_s : (N,) NaN for a reading that is refused for the ``reason``."""
+
+    t_s: Array
+    time_from: str
+    reason: str = ""
     clocks: tuple[ClockFit, ...] = ()
-    wraps, half = 0, 0.0
-    if "t" in values:
+    wraps: int = 0
+    half_width_s: float = 0.0
+    sd_s: float | None = None
+
+
+def _times(line: _Line, arrived_s: Array, t: Array | None, slot: Ints, start_ns: int) -> _Timed:
+    """Times of a device's readings from its stamps ``t``, its polls, or the arrivals."""
+    device = line.device
+    if t is not None:
         wrap_s = 2.0**device.time_bits * device.time_unit_s if device.time_bits else 0.0
-        clock = host_times(arrived, values["t"] * device.time_unit_s, wrap_s)
-        t_s, time_from = clock.t_s - device.latency_s, "device"
-        clocks, wraps = clock.fits, clock.wraps
-        faults["wrong or repeated stamp"] = clock.wrong
-    elif line.sent_ns:
-        t_s, half = _between(arrived, _seconds(np.array(line.sent_ns), start_ns))
-        time_from = "middle of question and answer"
-        faults["which question it answers is not known"] = int(np.sum(np.isnan(t_s)))
-        faults["question without answer"] = len(line.sent_ns) - len(arrived)
-    else:
-        t_s, time_from = arrived - device.latency_s, "arrival"
-    t_s = np.round(t_s, TIME_DIGITS)
-    kept = _in_order(t_s, faults)
-    if "t" in values and device.kind != "frames" and device.checksum == "none":
-        sound = beside_gaps(t_s[kept], [v[kept] for k, v in values.items() if k != "t"])
-        faults["far from its neighbours, beside lost bytes"] = int(np.sum(~sound))
-        kept = kept[sound]
-    lost = _seconds(np.array(line.lost_ns), start_ns)
-    back = _seconds(np.array(line.found_ns), start_ns)
-    back = np.append(back, np.full(len(lost) - len(back), np.nan))
+        check_unit(arrived_s, t, device)
+        clock = host_times(arrived_s, t * device.time_unit_s, wrap_s)
+        return _Timed(
+            clock.t_s - device.latency_s, "device", "wrong or repeated stamp", clock.fits,
+            clock.wraps,
+        )  # fmt: skip
+    if line.sent_ns:
+        t_s, half = _between(arrived_s, _seconds(np.array(line.sent_ns), start_ns))
+        reason = "which question it answers is not known"
+        return _Timed(t_s, "middle of question and answer", reason, half_width_s=half)
+    return _arrival_times(line, arrived_s, None, slot, start_ns)
+
+
+def _arrival_times(line: _Line, arrived_s: Array, _: Array | None, slot: Ints, __: int) -> _Timed:
+    """Times of a device's readings from their arrivals alone."""
+    spread = spread_arrivals(arrived_s, slot)
+    how = REGULAR_CLOCK if spread.regular else "arrival, spread evenly"
+    return _Timed(spread.t_s - line.device.latency_s, how, sd_s=spread.sd_s)
+
+
+def _judged(line: _Line, start_ns: int, times: Callable[..., _Timed]) -> DeviceRecord:
+    """The readings of a device without those that cannot be right.
+
+    Raises InputError for a device whose bytes are garbage, or whose stamps have another unit.
+    """
+    device, found = line.device, joined(line.found)
+    count = len(found.arrived_ns)
+    arrived = _seconds(found.arrived_ns, start_ns)
+    kept, t_s = np.arange(count), np.full(count, np.nan)
+    reason = np.full(count, None, np.object_)
+
+    def refuse(bad: Bools, why: str) -> None:
+        nonlocal kept
+        reason[kept[bad]] = why
+        kept = kept[~bad]
+
+    numbers = np.column_stack([*found.values.values(), np.zeros(count)])
+    refuse(~np.all(np.abs(numbers) < _LARGEST, axis=1), "not a number")
+    garbage = found.malformed_spans[found.garbage]
+    refuse(amid_garbage(found.spans[kept], garbage), "amid garbage")
+    error = mostly_garbage(device, found)
+    if error is not None and not len(kept):
+        raise error
+    slot = kept + np.searchsorted(found.malformed_spans[:, 0], found.spans[kept, 0])
+    stamps = found.values["t"][kept] if "t" in found.values else None
+    timed = times(line, arrived[kept], stamps, slot, start_ns)
+    t_s[kept] = np.round(timed.t_s, TIME_DIGITS)
+    refuse(np.isnan(t_s[kept]), timed.reason)
+    refuse(~_later(t_s[kept]), "not later than the one before")
+    if device.kind != "frames" and device.checksum == "none":
+        unit = device.counts_per_mm or 1.0 if "counts" in found.values else 1.0
+        most = _ACCELERATION_MM_S2 * abs(unit) if device.kind == "encoder" else 0.0
+        measured = [v[kept] for name, v in found.values.items() if name != "t"]
+        refuse(far_from_neighbours(t_s[kept], measured, most), "far from its neighbours")
+    faults = {str(why): int(np.sum(reason == why)) for why in dict.fromkeys(reason) if why}
+    if line.sent_ns and len(line.sent_ns) > count:
+        faults["question without answer"] = len(line.sent_ns) - count
+    malformed = _seconds(found.malformed, start_ns)
     return DeviceRecord(
         device=device,
         t_s=t_s[kept],
         arrived_s=arrived[kept],
-        values={name: v[kept] for name, v in values.items()},
-        malformed_s=_seconds(np.concatenate([r.malformed for r in line.found]), start_ns),
-        malformed_bytes=sum(r.malformed_bytes for r in line.found),
-        samples=tuple(repr(s[:60]) for r in line.found for s in r.samples)[:5],
+        values={name: v[kept] for name, v in found.values.items()},
+        malformed_s=malformed,
+        malformed_bytes=found.malformed_bytes,
+        samples=_samples(line),
         partial_bytes=line.partial_bytes,
-        away_s=tuple(zip(lost.tolist(), back.tolist())),
-        clocks=clocks,
-        wraps=wraps,
-        faults={reason: count for reason, count in faults.items() if count > 0},
-        time_from=time_from,
-        half_width_s=half,
+        away_s=tuple(
+            ((lost - start_ns) * 1e-9, np.nan if back is None else (back - start_ns) * 1e-9)
+            for lost, back in line.away_ns
+        ),
+        clocks=timed.clocks,
+        wraps=timed.wraps,
+        faults=faults,
+        time_from=timed.time_from,
+        half_width_s=timed.half_width_s,
+        time_sd_s=timed.sd_s,
+        refused=_refused(found, reason, t_s, arrived, malformed),
+        error=error,
+    )
+
+
+def _refused(
+    found: Readings, reason: NDArray[np.object_], t_s: Array, arrived: Array, malformed: Array
+) -> Refused:
+    """The refused readings and the malformed lines, in the order of their bytes."""
+    out = np.flatnonzero(reason != None)  # noqa: E711
+    spans = np.concatenate([found.spans[out], found.malformed_spans])
+    order = np.argsort(spans[:, 0], kind="stable")
+    return Refused(
+        spans[order],
+        np.append(t_s[out], np.full(len(malformed), np.nan))[order],
+        np.append(arrived[out], malformed)[order],
+        np.append(reason[out], np.full(len(malformed), MALFORMED, np.object_))[order],
     )
 
 
@@ -192,44 +347,6 @@ def _between(arrived: Array, sent: Array) -> tuple[Array, float]:
     return t_s, float(np.median(half[clear])) if clear.any() else 0.0
 
 
-def _in_order(t_s: Array, faults: dict[str, int]) -> Ints:
-    """Indices of the readings that have a time later than all before them."""
-    timed = np.flatnonzero(np.isfinite(t_s))
-    later = np.ones(len(timed), bool)
-    later[1:] = t_s[timed][1:] > np.maximum.accumulate(t_s[timed])[:-1]
-    faults["not later than the one before"] = int(np.sum(~later))
-    return timed[later]
-
-
-def beside_gaps(t_s: Array, values: Sequence[Array]) -> Bools:
-    """(N,) False for a reading beside a gap whose value is far from what its neighbours predict.
-
-    Where bytes are lost, two lines may become one that reads like a line: its stamp is right, its
-    value is wrong, and the next reading is missing. Only readings beside a gap are tested.
-    """
-    sound = np.ones(len(t_s), bool)
-    step = np.diff(t_s)
-    if step.size < 4 * _NEIGHBOURS:
-        return sound
-    wide = np.flatnonzero(step > GAP_INTERVALS * np.median(step))
-    suspects = np.unique(np.concatenate([wide, wide + 1]))
-    plain = np.ones(len(t_s), bool)
-    plain[suspects] = False
-    for i in suspects:
-        window = np.arange(max(i - 2 * _NEIGHBOURS, 0), min(i + 2 * _NEIGHBOURS + 1, len(t_s)))
-        near = window[plain[window]]
-        near = near[np.argsort(np.abs(t_s[near] - t_s[i]), kind="stable")[: 2 * _NEIGHBOURS]]
-        if len(near) > _NEIGHBOURS:
-            sound[i] = not any(_far(t_s[near] - t_s[i], v[near] - v[i]) for v in values)
-    return sound
-
-
-def _far(t_s: Array, value: Array) -> bool:
-    """Whether 0 at 0 s is far from a parabola through these neighbours."""
-    scale = float(np.max(np.abs(t_s)))
-    powers = np.vander(t_s / scale, 3)
-    found, *_ = np.linalg.lstsq(powers, value, rcond=None)
-    residual = float(np.max(np.abs(powers @ found - value)))
-    steps = np.diff(np.unique(value))
-    resolution = float(np.min(steps)) if steps.size else 0.0
-    return bool(abs(found[-1]) > _FAR_RESIDUALS * max(residual, resolution) + 1e-9)
+def _later(t_s: Array) -> Bools:
+    """(N,) whether a time is later than all before it."""
+    return np.asarray(t_s > np.maximum.accumulate(np.append(-np.inf, t_s[:-1])))

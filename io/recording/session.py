@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,9 +17,11 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.io.recording.clock import check_unit
+from telerig.io.recording.judgement import mostly_garbage
 from telerig.io.recording.log import END, LOST, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.ports import Reader, open_port
-from telerig.io.recording.protocols import Readings, parser
+from telerig.io.recording.protocols import Readings, joined, parser
 from telerig.io.recording.replay import GAP_INTERVALS
 from telerig.io.rig_file.description import DeviceDescription
 
@@ -31,7 +34,7 @@ GARBAGE_S = 2.0
 
 
 class GarbageError(InputError):
-    """Bytes come over a line, but no reading."""
+    """The first bytes of a device are not the readings that its description states."""
 
 
 @dataclass
@@ -96,7 +99,8 @@ def record(
 
     Returns the path of the log, from which `telerig.io.recording.tables.write_tables` makes the
     tables of the run. Raises InputError for a port that cannot be opened, a log that cannot be
-    written, and a device that sends bytes but no reading in the first `GARBAGE_S`.
+    written, and a device that sends something else in the first `GARBAGE_S` than its description
+    states. Later nothing that one device does ends the recording of the others.
     """
     if not devices:
         raise InputError("no device to record", todo="add a table [devices.<name>] to rig.toml")
@@ -120,7 +124,8 @@ def record(
         try:
             _Session(header, ports, log).run(seconds, stop, tell)
         except GarbageError:
-            log_path.rename(folder / FAILED_NAME)
+            with suppress(OSError):
+                log_path.rename(folder / FAILED_NAME)
             raise
     return log_path
 
@@ -141,7 +146,8 @@ class _Session:
         ]
         self._parsers = [parser(device) for device in self._devices]
         self._status = [DeviceStatus(device.name) for device in self._devices]
-        self._unread = set(range(len(self._devices)))
+        self._first: list[list[Readings]] = [[] for _ in self._devices]
+        self._checked = False
         self._drained = time.monotonic()
 
     def run(
@@ -175,42 +181,64 @@ class _Session:
 
     def _drain(self) -> None:
         """Bring what has come to the disk, then count the readings in it."""
-        chunks: list[list[tuple[int, bytes]]] = [[] for _ in self._devices]
-        before = [status.readings for status in self._status]
+        came: list[list[Entry]] = [[] for _ in self._devices]
         now = time.monotonic()
         elapsed_s, self._drained = max(now - self._drained, 1e-3), now
         while not self._queue.empty():
             entry = self._queue.get()
             self._log.append(entry)
-            if entry.kind == RECEIVED:
-                chunks[entry.device].append((entry.time_ns, entry.data))
-            elif entry.kind == LOST:
-                self._count(entry.device, chunks[entry.device])
-                chunks[entry.device] = []
-                self._parsers[entry.device].cut()
-                self._status[entry.device].unplugged += 1
+            came[entry.device].append(entry)
         self._log.flush()
         for i, status in enumerate(self._status):
-            self._count(i, chunks[i])
-            status.rate_hz = (status.readings - before[i]) / elapsed_s
+            before = status.readings
+            self._count(i, came[i])
+            status.rate_hz = (status.readings - before) / elapsed_s
             status.connected = self._readers[i].connected
 
-    def _count(self, i: int, chunks: list[tuple[int, bytes]]) -> None:
-        self._status[i].byte_count += sum(len(data) for _, data in chunks)
-        self._status[i].add(self._devices[i], self._parsers[i].feed(chunks))
+    def _count(self, i: int, entries: list[Entry]) -> None:
+        """Count the readings in these entries, only for the screen: no error in it matters."""
+        status, reader = self._status[i], self._parsers[i]
+        chunks: list[tuple[int, bytes]] = []
+        try:
+            for entry in entries:
+                if entry.kind == RECEIVED:
+                    chunks.append((entry.time_ns, entry.data))
+                    status.byte_count += len(entry.data)
+                elif entry.kind == LOST:
+                    self._add(i, reader.feed(chunks))
+                    chunks = []
+                    reader.cut()
+                    status.unplugged += 1
+            self._add(i, reader.feed(chunks))
+        except Exception:  # noqa: BLE001
+            self._parsers[i] = parser(self._devices[i])
+
+    def _add(self, i: int, found: Readings) -> None:
+        self._status[i].add(self._devices[i], found)
+        if not self._checked:
+            self._first[i].append(found)
 
     def _check(self, elapsed_s: float) -> None:
-        """Raises what ended a reader, and InputError for a line on which no reading has come."""
-        for reader in self._readers:
-            if reader.fault is not None:
-                raise reader.fault
-        self._unread = {i for i in self._unread if not self._status[i].readings}
-        if elapsed_s < GARBAGE_S:
+        """Raise GarbageError for a device whose first bytes are not what its description states."""
+        if elapsed_s < GARBAGE_S or self._checked:
             return
-        for i in sorted(self._unread):
-            if self._status[i].byte_count:
-                raise _no_reading(self._devices[i], self._status[i])
-        self._unread = set()
+        self._checked = True
+        for device, status, first in zip(self._devices, self._status, self._first):
+            if not status.byte_count:
+                continue
+            found = joined(first)
+            if not status.readings:
+                raise _no_reading(device, status)
+            error = mostly_garbage(device, found)
+            try:
+                if "t" in found.values and error is None:
+                    arrived_s = np.asarray(found.arrived_ns * 1e-9, np.float64)
+                    check_unit(arrived_s, found.values["t"], device)
+            except InputError as wrong_unit:
+                error = wrong_unit
+            if error is not None:
+                raise GarbageError(error.what, where=error.where, todo=error.todo)
+        self._first = [[] for _ in self._devices]
 
     def _report(self) -> Status:
         seconds = (time.monotonic_ns() - self._start_ns) * 1e-9

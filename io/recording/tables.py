@@ -5,7 +5,7 @@ Frames come from trigger or frame-counter lines: their times, and which are miss
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
 from os import PathLike
@@ -17,44 +17,74 @@ import numpy as np
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import atomic_folder, write_json_atomic
-from telerig.io.recording.log import damaged_bytes
-from telerig.io.recording.replay import GAP_INTERVALS, TIME_DIGITS, DeviceRecord, replay
+from telerig.io.recording.replay import (
+    GAP_INTERVALS,
+    REGULAR_CLOCK,
+    TIME_DIGITS,
+    DeviceRecord,
+    replay,
+)
+from telerig.io.rig_file.description import DeviceDescription
 
 _ROWS = 20_000
 _LISTED_GAPS = 200
+_LONGEST_LINE = 200
+_MOST_FRAMES = 100
+"""More frames than so many for each line that reports one cannot be right."""
+REFUSED_NAME = "refused.csv"
 
 
 @dataclass(frozen=True)
 class Recording:
-    """The tables of a log: the content of recording.json, and the rows of each table by name."""
+    """The tables of a log: the content of recording.json, and the rows of each table by name.
+
+    errors : by device, why its readings could not be used, or not as described.
+    """
 
     folder: Path
     summary: dict[str, Any]
     rows: dict[str, int]
+    errors: dict[str, InputError]
 
 
-def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = None) -> Recording:
+def write_tables(
+    log: str | PathLike[str],
+    folder: str | PathLike[str] | None = None,
+    devices: Mapping[str, DeviceDescription] | None = None,
+) -> Recording:
     """Write the tables of the log's devices into ``folder`` (by default the folder of the log).
 
+    devices : descriptions by name that replace those in the log, as in `replay`.
     All are written to temporary files and renamed at the end. Imported sensors in
-    `accelerometer.csv` (`telerig import`) stay in it. Raises InputError for a file that is no log,
-    or a folder that cannot be written.
+    `accelerometer.csv` (`telerig import`) stay in it. What is wrong with one device is stated in
+    recording.json and in `Recording.errors`, and all that can be had from it and from the others is
+    written. Raises InputError for a file that is no log, or a folder that cannot be written.
     """
     path = Path(log)
     out = Path(folder) if folder is not None else path.parent
-    found = replay(path)
-    of = {k: [r for r in found.records if r.device.kind == k] for k in _WRITERS}
-    frames = frame_times(of["frames"])
+    found = replay(path, devices)
+    of = {k: [r for r in found.records if r.device.kind == k] for k in _TABLES}
+    errors = {r.device.name: r.error for r in found.records if r.error is not None}
+    encoder, others = of["encoder"][:1], of["encoder"][1:]
+    errors |= {r.device.name: _second_encoder(r, encoder[0]) for r in others}
+    try:
+        frames = frame_times(of["frames"])
+    except InputError as error:
+        frames = frame_times([])
+        errors |= {r.device.name: error for r in of["frames"]}
+    accelerometers = chain(
+        _accelerometers(of["accelerometer"]),
+        _of_others(out / "accelerometer.csv", {r.device.name for r in of["accelerometer"]}),
+    )
+    text = {"encoder": _stage(encoder), "accelerometer": accelerometers, "frames": _frames(frames)}
     rows: dict[str, int] = {}
     with atomic_folder(out) as beside:
-        for kind, records in of.items():
-            if not records:
-                continue
-            name, write = _WRITERS[kind]
-            text = write(records, frames)
-            if kind == "accelerometer":
-                text = chain(text, _of_others(out / name, {r.device.name for r in records}))
-            rows[name] = _write(beside / name, text, out / name)
+        for kind, name in _TABLES.items():
+            if of[kind]:
+                rows[name] = _write(beside / name, text[kind], out / name)
+        if any(len(r.refused.reason) for r in found.records) or (out / REFUSED_NAME).exists():
+            refused = _refused(found.records)
+            rows[REFUSED_NAME] = _write(beside / REFUSED_NAME, refused, out / REFUSED_NAME)
         header = found.header
         summary = {
             "schema": 1,
@@ -63,18 +93,28 @@ def write_tables(log: str | PathLike[str], folder: str | PathLike[str] | None = 
             "clock": "t_s is the host's monotonic clock since the begin of the recording",
             "closed": found.ended,
             "log_bytes": path.stat().st_size,
-            "log_damaged_bytes": damaged_bytes(path),
+            "log_damaged_bytes": found.damaged_bytes,
             "rows": rows,
-            "devices": {r.device.name: _device_summary(r) for r in found.records},
+            "devices": {
+                r.device.name: _device_summary(r, errors.get(r.device.name)) for r in found.records
+            },
             "frames": _frames_summary(frames) if "frames.csv" in rows else None,
         }
         write_json_atomic(beside / "recording.json", summary)
-    return Recording(out, summary, rows)
+    return Recording(out, summary, rows, errors)
+
+
+def _second_encoder(record: DeviceRecord, first: DeviceRecord) -> InputError:
+    return InputError(
+        f"a run has one stage.csv, which has the readings of {first.device.name}",
+        where=f"devices.{record.device.name}",
+        todo="keep one encoder in rig.toml",
+    )
 
 
 def refuse_existing(folder: str | PathLike[str]) -> None:
     """Raise InputError where ``folder`` holds a table that a recording would replace."""
-    for name in (*(name for name, _ in _WRITERS.values()), "recording.json"):
+    for name in (*_TABLES.values(), REFUSED_NAME, "recording.json"):
         file = Path(folder) / name
         if file.exists():
             raise InputError(
@@ -84,19 +124,21 @@ def refuse_existing(folder: str | PathLike[str]) -> None:
             )
 
 
-def _stage(records: Sequence[DeviceRecord], _: FrameTimes) -> Iterator[str]:
+def _stage(records: Sequence[DeviceRecord]) -> Iterator[str]:
     yield "t_s,position_mm\n"
-    (record,) = records
-    yield from _rows(f"%.{TIME_DIGITS}f,%.9g\n", [record.t_s, position_mm(record)])
+    for record in records:
+        if len(record.t_s):
+            yield from _rows(f"%.{TIME_DIGITS}f,%.9g\n", [record.t_s, position_mm(record)])
 
 
-def _accelerometers(records: Sequence[DeviceRecord], _: FrameTimes) -> Iterator[str]:
+def _accelerometers(records: Sequence[DeviceRecord]) -> Iterator[str]:
     yield "t_s,sensor,ax_m_s2,ay_m_s2,az_m_s2\n"
     for record in records:
-        unit = record.device.unit_m_s2
-        name = record.device.name.replace("%", "%%")
-        columns = [record.t_s, *(unit * record.values[axis] for axis in ("ax", "ay", "az"))]
-        yield from _rows(f"%.{TIME_DIGITS}f,{name},%.9g,%.9g,%.9g\n", columns)
+        if len(record.t_s):
+            unit = record.device.unit_m_s2
+            name = record.device.name.replace("%", "%%")
+            columns = [record.t_s, *(unit * record.values[axis] for axis in ("ax", "ay", "az"))]
+            yield from _rows(f"%.{TIME_DIGITS}f,{name},%.9g,%.9g,%.9g\n", columns)
 
 
 def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
@@ -113,18 +155,26 @@ def _of_others(file: Path, recorded: set[str]) -> Iterator[str]:
                 yield line if line.endswith("\n") else line + "\n"
 
 
-def _frames(_: Sequence[DeviceRecord], frames: FrameTimes) -> Iterator[str]:
+def _frames(frames: FrameTimes) -> Iterator[str]:
     any_missing = any(frames.missing)
     yield "frame,t_s,missing\n" if any_missing else "frame,t_s\n"
     for frame, (t_s, missing) in enumerate(zip(frames.t_s, frames.missing)):
         yield f"{frame},{t_s:.{TIME_DIGITS}f}" + (f",{missing}\n" if any_missing else "\n")
 
 
-_WRITERS = {
-    "encoder": ("stage.csv", _stage),
-    "accelerometer": ("accelerometer.csv", _accelerometers),
-    "frames": ("frames.csv", _frames),
-}
+def _refused(records: Sequence[DeviceRecord]) -> Iterator[str]:
+    """The lines that are in no table; bytes that are no text are written as in Python, \\x00."""
+    yield "device,t_s,arrived_s,reason,line\n"
+    for record in records:
+        name, refused = record.device.name, record.refused
+        times = zip(refused.t_s.tolist(), refused.arrived_s.tolist())
+        for (t_s, arrived_s), reason, line in zip(times, refused.reason.tolist(), refused.lines):
+            made = "" if np.isnan(t_s) else f"{t_s:.{TIME_DIGITS}f}"
+            shown = repr(line.rstrip(b"\r")[:_LONGEST_LINE])[2:-1].replace('"', '""')
+            yield f'{name},{made},{arrived_s:.{TIME_DIGITS}f},"{reason}","{shown}"\n'
+
+
+_TABLES = {"encoder": "stage.csv", "accelerometer": "accelerometer.csv", "frames": "frames.csv"}
 
 
 def position_mm(record: DeviceRecord) -> Array:
@@ -156,15 +206,17 @@ def _write(path: Path, text: Iterable[str], final: Path) -> int:
     return lines
 
 
-def _device_summary(record: DeviceRecord) -> dict[str, Any]:
+def _device_summary(record: DeviceRecord, error: InputError | None) -> dict[str, Any]:
     gaps = list(gaps_of(record))
     return {
+        "error": None if error is None else str(error),
         "kind": record.device.kind,
         "protocol": record.device.protocol,
         "readings": len(record.t_s),
         "rate_hz": _rate_hz(record.t_s),
         "time_from": record.time_from,
         "half_question_to_answer_ms": 1e3 * record.half_width_s or None,
+        "time_sd_ms": None if record.time_sd_s is None else 1e3 * record.time_sd_s,
         "malformed": len(record.malformed_s),
         "malformed_bytes": record.malformed_bytes,
         "malformed_like": record.samples,
@@ -185,7 +237,8 @@ def gaps_of(record: DeviceRecord) -> Iterator[dict[str, Any]]:
     if record.device.kind == "frames" or step.size < 8:
         return
     median_s = float(np.median(step))
-    limit = GAP_INTERVALS if record.time_from == "device" else 10.0
+    regular = record.time_from in ("device", REGULAR_CLOCK)
+    limit = GAP_INTERVALS if regular else 10.0
     for i in np.flatnonzero(step > limit * median_s):
         begin, end = float(record.t_s[i]), float(record.t_s[i + 1])
         lost = round(float(step[i]) / median_s) - 1
@@ -234,6 +287,13 @@ def frame_times(records: list[DeviceRecord]) -> FrameTimes:
         return FrameTimes(np.zeros(0), (), np.zeros(0, bool))
     numbers = _aligned(records)
     count = 1 + max(int(n[-1]) for n in numbers)
+    reported = sum(len(r.t_s) for r in records)
+    if count > _MOST_FRAMES * reported + _ROWS:
+        raise InputError(
+            f"{reported} lines count {count} frames, so its counter or its times are wrong",
+            where=", ".join(f"devices.{r.device.name}" for r in records),
+            todo="check the counter; frames.csv is empty, the lines are in recording.raw",
+        )
     t_s = np.full(count, np.nan)
     missing: list[list[str]] = [[] for _ in range(count)]
     for record, number in zip(reversed(records), reversed(numbers)):

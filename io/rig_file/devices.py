@@ -13,6 +13,60 @@ from telerig.io.rig_file.tables import Problem, Problems, read_table, subtables
 
 Devices = dict[str, DeviceDescription]
 
+PORT_SCHEMES = ("socket", "rfc2217", "loop")
+"""Schemes of pyserial's URLs that a port may have: a serial server, and a line back to itself."""
+_PORT_OPTIONS = re.compile(r"ign_set_control|poll_modem|timeout=\d+(?:\.\d+)?")
+
+
+class LinePattern:
+    """A regular expression of a user, matched in a time that is linear in the length of a line.
+
+    Python's own ``re`` may need years for one line (docs/decisions/023-linear-expressions.md).
+    names : the names of its groups, sorted. Raises ValueError for a text that is no expression.
+    """
+
+    def __init__(self, pattern: str) -> None:
+        import re2
+
+        options = re2.Options()
+        options.encoding = re2.Options.Encoding.LATIN1
+        options.log_errors = False
+        try:
+            self._expression = re2.compile(pattern.encode(), options)
+        except re2.error as error:
+            raise ValueError(error.args[0].decode(errors="replace")) from error
+        index = {name.decode(): i for name, i in self._expression.groupindex.items()}
+        self.names = tuple(sorted(index))
+        self._groups = [index[name] for name in self.names]
+
+    def cells(self, line: bytes) -> tuple[bytes | None, ...] | None:
+        """Return the bytes of each group if the whole line matches, otherwise None."""
+        found = self._expression.fullmatch(line)
+        return found.group(*self._groups, 0)[:-1] if found else None
+
+
+def port_fault(port: str) -> tuple[str, str] | None:
+    """Return what is wrong with the text of a port and what to do, or None.
+
+    Allowed are device files, port names, and URLs of the schemes `PORT_SCHEMES`. Other schemes of
+    pyserial are refused: ``spy://...?file=PATH`` writes over PATH.
+    """
+    if any(ord(c) < 32 for c in port):
+        return "contains a control character", 'write a device file like "/dev/ttyUSB0"'
+    scheme, url, place = port.partition("://")
+    if not url:
+        return None
+    if scheme.lower() not in PORT_SCHEMES:
+        allowed = ", ".join(f"{name}://" for name in PORT_SCHEMES)
+        return f"has the scheme {scheme[:40]}://", f"use a device file, or one of {allowed}"
+    _, _, options = place.partition("?")
+    for option in filter(None, options.split("&")):
+        if scheme.lower() != "rfc2217" or not _PORT_OPTIONS.fullmatch(option):
+            todo = "remove it; rfc2217:// takes ign_set_control, poll_modem and timeout=SECONDS"
+            return f"has the option {option[:40]!r}", todo
+    return None
+
+
 _VALUES = {
     "encoder": ({"counts"}, {"position_mm"}),
     "accelerometer": ({"ax", "ay", "az"},),
@@ -47,6 +101,8 @@ def devices_from_tables(raw: Any, cameras: list[str], problems: Problems) -> Dev
 
 
 def _own_problems(place: str, device: DeviceDescription) -> Iterator[Problem]:
+    if fault := port_fault(device.port):
+        yield Problem(place, "port", *fault)
     allowed = _PROTOCOLS[device.kind]
     if device.protocol not in allowed:
         what = f"is {device.protocol!r}, which is no protocol for the kind {device.kind}"
@@ -69,8 +125,8 @@ def _own_problems(place: str, device: DeviceDescription) -> Iterator[Problem]:
 
 def _groups(pattern: str | None) -> set[str]:
     try:
-        return set(re.compile(pattern or "").groupindex)
-    except re.error:
+        return set(LinePattern(pattern).names) if pattern else set()
+    except ValueError:
         return set()
 
 
@@ -82,10 +138,10 @@ def pattern_problems(place: str, kind: str, pattern: str | None) -> Iterator[Pro
         yield Problem(place, "pattern", "is missing", f"add a regular expression with {words}")
         return
     try:
-        groups = set(re.compile(pattern.encode()).groupindex)
-    except re.error as error:
-        what = f"is no regular expression: {error}"
-        yield Problem(place, "pattern", what, "write it in 'single quotes', as Python's re")
+        groups = set(LinePattern(pattern).names)
+    except ValueError as error:
+        todo = "write it in 'single quotes', as Python's re without look-around, back-references"
+        yield Problem(place, "pattern", f"is no regular expression: {error}", todo)
         return
     known = {"t"}.union(*needed)
     for name in sorted(groups - known):

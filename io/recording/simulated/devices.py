@@ -329,6 +329,8 @@ def _at(sim: SimulatedDevice, folder: Path) -> SimulatedDevice:
 
 
 WRAP_AFTER_S = 10.0
+UNPLACED = "not placed"
+"""The port of a simulated device until `SimulatedPorts` opens one for it."""
 
 
 def practice_devices() -> list[SimulatedDevice]:
@@ -337,10 +339,12 @@ def practice_devices() -> list[SimulatedDevice]:
     Their clocks drift, and the encoder's counter wraps after `WRAP_AFTER_S`.
     """
     before_wrap = 2**32 - int(WRAP_AFTER_S * 1e6)
-    encoder = DeviceDescription("encoder", "encoder", "", counts_per_mm=1000.0)
-    left = DeviceDescription("arm_left", "accelerometer", "")
-    right = DeviceDescription("arm_right", "accelerometer", "", protocol="packets", unit_m_s2=1e-3)
-    frames = DeviceDescription("frame_counter", "frames", "", cameras=("left", "right"))
+    encoder = DeviceDescription("encoder", "encoder", UNPLACED, counts_per_mm=1000.0)
+    left = DeviceDescription("arm_left", "accelerometer", UNPLACED)
+    right = DeviceDescription(
+        "arm_right", "accelerometer", UNPLACED, protocol="packets", unit_m_s2=1e-3
+    )
+    frames = DeviceDescription("frame_counter", "frames", UNPLACED, cameras=("left", "right"))
     return [
         SimulatedDevice(encoder, 1000.0, drift_ppm=40.0, start_ticks=before_wrap),
         SimulatedDevice(left, 2000.0, drift_ppm=-60.0),

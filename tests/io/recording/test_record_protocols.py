@@ -9,7 +9,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from telerig.io.recording.protocols import Parser, Readings, parser, poll_command, xor_checksum
+from telerig.io.recording.protocols import (
+    Parser,
+    Readings,
+    joined,
+    parser,
+    poll_command,
+    xor_checksum,
+)
 from telerig.io.rig_file.description import DeviceDescription
 
 ENCODER = DeviceDescription("encoder", "encoder", "x", counts_per_mm=1.0)
@@ -17,21 +24,12 @@ ACCELEROMETER = DeviceDescription("arm", "accelerometer", "x")
 PACKETS = replace(ACCELEROMETER, protocol="packets")
 
 
-def merged(parts: list[Readings]) -> Readings:
-    return Readings(
-        np.concatenate([p.arrived_ns for p in parts]),
-        {k: np.concatenate([p.values[k] for p in parts]) for k in parts[0].values},
-        np.concatenate([p.malformed for p in parts]),
-        sum(p.malformed_bytes for p in parts),
-    )
-
-
 def fed(parser: Parser, data: bytes, cuts: list[int], together: int = 1) -> Readings:
     """Feed ``data`` cut at places, the k-th piece at time k; so many pieces at a time."""
     edges = [0, *sorted(cuts), len(data)]
     pieces = [(k, data[a:b]) for k, (a, b) in enumerate(pairwise(edges))]
     groups = [pieces[i : i + together] for i in range(0, len(pieces), together)]
-    return merged([parser.feed(group) for group in groups])
+    return joined([parser.feed(group) for group in groups])
 
 
 def packet(t: int, *axes: int) -> bytes:

@@ -84,7 +84,7 @@ def test_unplugged_and_plugged_in_again(tmp_path: Path, rng: np.random.Generator
 @pytest.mark.parametrize("protocol", ["zaber", "grbl"])
 def test_a_polled_stage(tmp_path: Path, rng: np.random.Generator, protocol: str) -> None:
     device = DeviceDescription(
-        "stage", "encoder", "", protocol=protocol, counts_per_mm=1e4, poll_hz=50.0  # type: ignore[arg-type]
+        "stage", "encoder", "x", protocol=protocol, counts_per_mm=1e4, poll_hz=50.0  # type: ignore[arg-type]
     )  # fmt: skip
     sim = SimulatedDevice(device, 50.0, jitter_s=0.004)
     with SimulatedPorts([sim], tmp_path / "ports", rng) as ports:

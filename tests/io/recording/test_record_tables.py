@@ -23,13 +23,12 @@ from telerig.io.recording.log import (
     RawLog,
     read_log,
 )
-from telerig.io.recording.replay import beside_gaps, replay
+from telerig.io.recording.replay import replay
 from telerig.io.recording.simulated.devices import (
     Faults,
     SimulatedDevice,
     Truth,
     practice_devices,
-    stage_position_mm,
     true_values,
 )
 from telerig.io.recording.tables import frame_numbers, write_tables
@@ -154,7 +153,7 @@ def test_a_replay_in_place_keeps_sensors_that_were_imported(
 
 @pytest.mark.parametrize("protocol", ["stream", "packets"])
 def test_bad_bytes_cost_what_they_touch_and_nothing_else(tmp_path: Path, protocol: str) -> None:
-    device = DeviceDescription("e", "encoder", "", counts_per_mm=1000.0, protocol=protocol)  # type: ignore[arg-type]
+    device = DeviceDescription("e", "encoder", "x", counts_per_mm=1000.0, protocol=protocol)  # type: ignore[arg-type]
     faults = Faults(garbage_hz=5.0, cut_hz=5.0)
     sim = SimulatedDevice(device, 1000.0, drift_ppm=-30.0, faults=faults)
     log = tmp_path / "recording.raw"
@@ -172,7 +171,7 @@ def test_bad_bytes_cost_what_they_touch_and_nothing_else(tmp_path: Path, protoco
 
 
 def test_a_checksum_lets_no_wrong_value_through(tmp_path: Path) -> None:
-    device = DeviceDescription("e", "encoder", "", counts_per_mm=1000.0, checksum="xor")
+    device = DeviceDescription("e", "encoder", "x", counts_per_mm=1000.0, checksum="xor")
     sim = SimulatedDevice(device, 1000.0, faults=Faults(garbage_hz=10.0, cut_hz=10.0))
     simulated_log(tmp_path / "recording.raw", [sim], 20.0, np.random.default_rng(4))
     (record,) = replay(tmp_path / "recording.raw").records
@@ -181,7 +180,7 @@ def test_a_checksum_lets_no_wrong_value_through(tmp_path: Path) -> None:
 
 
 def test_an_unplug_is_a_gap_with_its_reason(tmp_path: Path) -> None:
-    device = DeviceDescription("e", "encoder", "", counts_per_mm=1.0)
+    device = DeviceDescription("e", "encoder", "x", counts_per_mm=1.0)
     lines = [(k, f"{1000 * k},{k}\r\n".encode()) for k in range(10_000)]
     entries = [Entry(RECEIVED, 0, 10**6 * k + 500, line) for k, line in lines]
     entries[3000:5000] = [
@@ -199,7 +198,7 @@ def test_an_unplug_is_a_gap_with_its_reason(tmp_path: Path) -> None:
 
 
 def test_gaps_that_nothing_explains(tmp_path: Path) -> None:
-    device = DeviceDescription("e", "encoder", "", counts_per_mm=1.0)
+    device = DeviceDescription("e", "encoder", "x", counts_per_mm=1.0)
     kept = [k for k in range(1000) if not 400 <= k < 405]
     entries = [Entry(RECEIVED, 0, 10**6 * k, f"{1000 * k},{k}\n".encode()) for k in kept]
     done = write_tables(written(tmp_path / "recording.raw", entries, device))
@@ -208,7 +207,7 @@ def test_gaps_that_nothing_explains(tmp_path: Path) -> None:
 
 
 def test_polled_readings_are_timed_between_question_and_answer(tmp_path: Path) -> None:
-    device = DeviceDescription("z", "encoder", "", protocol="zaber", counts_per_mm=10.0)
+    device = DeviceDescription("z", "encoder", "x", protocol="zaber", counts_per_mm=10.0)
     entries = []
     for k in range(50):
         asked = 20_000_000 * k
@@ -230,15 +229,15 @@ def test_polled_readings_are_timed_between_question_and_answer(tmp_path: Path) -
 
 
 def test_a_known_latency_is_subtracted(tmp_path: Path) -> None:
-    device = DeviceDescription("e", "encoder", "", counts_per_mm=1.0, latency_s=0.25)
+    device = DeviceDescription("e", "encoder", "x", counts_per_mm=1.0, latency_s=0.25)
     entries = [Entry(RECEIVED, 0, 10**7 * k, f"{10**4 * k},{k}\n".encode()) for k in range(100)]
     (record,) = replay(written(tmp_path / "recording.raw", entries, device)).records
     assert np.allclose(record.t_s, np.arange(100) / 100 - 0.25, atol=1e-6)
 
 
 def test_two_counters_agree_on_the_frames_and_name_their_own_cameras(tmp_path: Path) -> None:
-    left = DeviceDescription("l", "frames", "", cameras=("left",))
-    right = DeviceDescription("r", "frames", "", cameras=("right",))
+    left = DeviceDescription("l", "frames", "x", cameras=("left",))
+    right = DeviceDescription("r", "frames", "x", cameras=("right",))
     entries = []
     for k in range(300):
         text = f"{10_000 * k},{k + 5}\n".encode()
@@ -256,7 +255,7 @@ def test_two_counters_agree_on_the_frames_and_name_their_own_cameras(tmp_path: P
 
 
 def test_a_damaged_counter_line_is_no_missing_frame(tmp_path: Path) -> None:
-    device = DeviceDescription("f", "frames", "", cameras=("left", "right"))
+    device = DeviceDescription("f", "frames", "x", cameras=("left", "right"))
     lines = [f"{10_000 * k},{k}\n".encode() for k in range(100)]
     lines[50] = b"500\x00\xff,50\n"
     entries = [Entry(RECEIVED, 0, 10**7 * k, line) for k, line in enumerate(lines)]
@@ -281,15 +280,6 @@ def test_frame_numbers(counter: list[int] | None, expected: list[int]) -> None:
     t_s = np.array([0, 1, 2, 3, 4, 7]) * 0.01
     given = None if counter is None else np.array(counter, float)
     assert frame_numbers(t_s, given).tolist() == expected
-
-
-def test_only_readings_beside_a_gap_are_ever_doubted() -> None:
-    t_s = np.arange(1000) / 1000
-    place = np.round(1000 * stage_position_mm(t_s))
-    place[300] += 5000.0
-    assert beside_gaps(t_s, [place]).all(), "without a gap nothing speaks against it"
-    t_s, place = np.delete(t_s, 301), np.delete(place, 301)
-    assert np.flatnonzero(~beside_gaps(t_s, [place])).tolist() == [300]
 
 
 def test_nothing_came_at_all(tmp_path: Path) -> None:

@@ -1,0 +1,147 @@
+"""Readings that cannot be right: those amid garbage, and values far from those of their neighbours.
+
+A line that has lost bytes may still read like a line. Its value is then wrong, often by a factor of
+ten; a value that the device measured is near what the readings around it predict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from telerig.arrays import Array, Bools, Ints
+from telerig.errors import InputError
+from telerig.io.recording.protocols import Readings
+from telerig.io.rig_file.description import DeviceDescription
+
+_GAP_INTERVALS = 1.5
+_NEIGHBOURS = 8
+"""Readings on each side from which a value is predicted."""
+_FAR_RESIDUALS = 5.0
+"""Far from a parabola through the neighbours: more than so many times their largest residual."""
+_PAIRS = 5
+_BLOCK = 32
+_QUANTILE = 0.8
+_MOTION = 3
+"""So many suspected readings in a row are motion: damage affects lines one by one."""
+_AROUND = 16
+"""Garbage is looked for in so many readings' lengths on each side."""
+
+
+def amid_garbage(spans: Ints, garbage: Ints) -> Bools:
+    """(N,) True for a reading around which more than half of the bytes are garbage.
+
+    spans, garbage : (N, 2) and (M, 2) first byte and number of bytes of the readings and of the
+    garbage, in increasing order.
+    """
+    if not len(spans) or not len(garbage):
+        return np.zeros(len(spans), bool)
+    reach = _AROUND * float(np.median(spans[:, 1]) + 1)
+    first = min(spans[0, 0], garbage[0, 0])
+    last = max(spans[-1].sum(), garbage[-1].sum())
+    begin = np.maximum(spans[:, 0] - reach, first)
+    end = np.minimum(spans.sum(axis=1) + reach, last)
+    edges = np.ravel(np.column_stack([garbage[:, 0], garbage.sum(axis=1)]))
+    until = np.cumsum(np.ravel(np.column_stack([0 * garbage[:, 1], garbage[:, 1]])))
+    amount = np.interp(end, edges, until) - np.interp(begin, edges, until)
+    return np.asarray(amount > 0.5 * (end - begin))
+
+
+def mostly_garbage(device: DeviceDescription, found: Readings) -> InputError | None:
+    """Return the error for a device most of whose readings are amid garbage, otherwise None."""
+    garbage = found.malformed_spans[found.garbage]
+    usable = int(np.sum(~amid_garbage(found.spans, garbage)))
+    if not len(garbage) or 2 * usable > len(found.spans):
+        return None
+    shown = f", like {found.samples[0][:40]!r}" if found.samples else ""
+    return InputError(
+        f"most of what it sent is garbage ({int(garbage[:, 1].sum())} bytes{shown}): only {usable} "
+        f"of its {len(found.spans)} readings can be used",
+        where=f"devices.{device.name} port {device.port}",
+        todo=f"set baud in rig.toml to the device's baud rate (now {device.baud}), check the "
+        f"protocol (now {device.protocol}) and the cable",
+    )
+
+
+def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) -> Bools:
+    """(N,) True for a reading with a value that is far from what its neighbours predict.
+
+    t_s : (N,) increasing times in s. values : (N,) each. most : the largest second derivative in
+    time that the values can have (an encoder's acceleration), which allows a value to differ.
+    A value is far if it is off a parabola through its neighbours by more than `_FAR_RESIDUALS`
+    times their largest residual and times the resolution of the values. Only readings are tested
+    that differ from those around them much more than these do, and those beside a gap or an end.
+    """
+    far = np.zeros(len(t_s), bool)
+    step = np.diff(t_s)
+    if step.size < 4 * _NEIGHBOURS:
+        return far
+    wide = np.flatnonzero(step > _GAP_INTERVALS * np.median(step))
+    beside = np.zeros(len(t_s), bool)
+    if len(wide) < len(t_s) / 10:
+        beside[wide] = beside[wide + 1] = True
+    before, after = np.append(step[0], step), np.append(step, step[-1])
+    allowed = most / 2 * before * after
+    for value in values:
+        rough = np.abs(_off_pairs(t_s, value))
+        differences = np.abs(np.diff(value))
+        resolution = float(np.min(differences, where=differences > 0, initial=np.inf))
+        if not np.isfinite(resolution):
+            continue
+        limit = np.maximum(_FAR_RESIDUALS * _scale(rough) + 2 * resolution, allowed)
+        suspected = _few_in_a_row(rough > limit)
+        plain = ~(suspected | beside)
+        tested = suspected | beside
+        tested[:_PAIRS] = tested[-_PAIRS:] = True
+        for i in np.flatnonzero(tested & ~far).tolist():
+            off, residual = _off_parabola(t_s, value, plain, i)
+            far[i] = abs(off) > max(_FAR_RESIDUALS * max(residual, resolution), allowed[i])
+    return far
+
+
+def _off_pairs(t_s: Array, value: Array) -> Array:
+    """(N,) each value minus the median of what the pairs of readings around it predict."""
+    out = np.zeros(len(value))
+    inner = slice(_PAIRS, len(value) - _PAIRS)
+    predicted = []
+    for k in range(1, _PAIRS + 1):
+        left, right = slice(_PAIRS - k, -_PAIRS - k), slice(_PAIRS + k, len(value) - _PAIRS + k)
+        share = (t_s[inner] - t_s[left]) / (t_s[right] - t_s[left])
+        predicted.append(value[left] + share * (value[right] - value[left]))
+    out[inner] = value[inner] - np.median(predicted, axis=0)
+    return out
+
+
+def _scale(size: Array) -> Array:
+    """(N,) a high quantile of the sizes in the block of each and the two beside it."""
+    count = -(-len(size) // _BLOCK)
+    blocks = np.pad(size, (0, count * _BLOCK - len(size)), mode="reflect").reshape(count, _BLOCK)
+    place = int(_QUANTILE * _BLOCK)
+    high = np.partition(blocks, place, axis=1)[:, place]
+    padded = np.concatenate([high[:1], high, high[-1:]])
+    most = np.maximum(np.maximum(padded[:-2], high), padded[2:])
+    return np.repeat(most, _BLOCK)[: len(size)]
+
+
+def _few_in_a_row(suspected: Bools) -> Bools:
+    """Without the suspected readings that stand `_MOTION` or more in a row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], suspected.astype(np.int8), [0]])))
+    out = suspected.copy()
+    for begin, end in edges.reshape(-1, 2).tolist():
+        if end - begin >= _MOTION:
+            out[begin:end] = False
+    return out
+
+
+def _off_parabola(t_s: Array, value: Array, plain: Bools, i: int) -> tuple[float, float]:
+    """Value i minus that of a parabola through its plain neighbours; their largest residual."""
+    window = np.arange(max(i - 2 * _NEIGHBOURS, 0), min(i + 2 * _NEIGHBOURS + 1, len(t_s)))
+    near = window[plain[window] & (window != i)]
+    near = near[np.argsort(np.abs(t_s[near] - t_s[i]), kind="stable")[: 2 * _NEIGHBOURS]]
+    if len(near) <= _NEIGHBOURS:
+        return 0.0, 0.0
+    x, y = t_s[near] - t_s[i], value[near] - value[i]
+    powers = np.vander(x / np.max(np.abs(x)), 3)
+    found, *_ = np.linalg.lstsq(powers, y, rcond=None)
+    return -float(found[-1]), float(np.max(np.abs(powers @ found - y)))

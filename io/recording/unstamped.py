@@ -1,0 +1,128 @@
+"""Times of readings that carry no stamps, from arrivals that come in bunches.
+
+An adapter keeps bytes for up to 16 ms and then passes them on together. A device that samples
+regularly makes reading k at a + T k; the line below all (k, arrival) gives a and T, as it gives
+offset and drift of a stamped clock (`clock`). Lines that are missing shift k: where the least delay
+of the readings before and after differs by more than half of T, a new count begins.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import minimum_filter1d
+
+from telerig.arrays import Array, Ints
+from telerig.io.recording.clock import fit_counts
+
+ADAPTER_S = 0.016
+"""Longest time in s for which a USB adapter keeps bytes."""
+_FEWEST = 50
+_SHORTEST_S = 0.5
+_WINDOW = 200
+"""Among so many readings there is one that hardly waited."""
+_LONGEST_WAIT_S = 0.1
+_SEGMENT = 20
+"""A regular device gives at least so many readings, on average, between two that are missing."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Hold the times of readings without stamps.
+
+    t_s : (N,) times in s, strictly increasing. sd_s : their standard deviation in s, apart from
+    the least delay of the line. regular : whether the device samples regularly; if not, the
+    readings are spread evenly over the time since the arrival before.
+    """
+
+    t_s: Array
+    sd_s: float
+    regular: bool
+
+
+def spread_arrivals(arrived_s: Array, slot: Ints) -> Spread:
+    """Compute when readings were made that arrive in bunches.
+
+    arrived_s : (N,) arrival of each in s, not decreasing. slot : (N,) number of the line that it
+    came in, increasing; malformed lines are counted, too.
+    """
+    regular = _by_regular_clock(arrived_s, slot)
+    return regular or _evenly(arrived_s)
+
+
+def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
+    """The times of a device that samples regularly; None where the arrivals do not say so."""
+    if len(slot) < _FEWEST or np.ptp(arrived_s) < _SHORTEST_S:
+        return None
+    period_s = _period_s(arrived_s, slot)
+    if not period_s > 0:
+        return None
+    count = np.cumsum(_begins(arrived_s - period_s * slot, period_s)) - 1
+    device_s = np.asarray(period_s * slot, np.float64)
+    clocks = fit_counts(arrived_s, device_s, count)
+    parts = np.split(device_s, np.flatnonzero(np.diff(count)) + 1)
+    t_s = np.concatenate([clock.host_s(part) for clock, part in zip(clocks, parts)])
+    waited = float(np.quantile(arrived_s - t_s, 0.95))
+    if len(clocks) > 1 + len(slot) // _SEGMENT or not waited < max(_LONGEST_WAIT_S, 2 * period_s):
+        return None
+    variance = np.average(
+        [clock.sd_offset_us**2 for clock in clocks], weights=[clock.readings for clock in clocks]
+    )
+    return Spread(_increasing(t_s), 1e-6 * float(np.sqrt(variance)), True)
+
+
+def _period_s(arrived_s: Array, slot: Ints) -> float:
+    """Time from one line to the next, from the least delays in parts of the record."""
+    lag = max(len(slot) // 3, 1)
+    rate = (arrived_s[lag:] - arrived_s[:-lag]) / (slot[lag:] - slot[:-lag])
+    period_s = float(np.median(rate))
+    for _ in range(2):
+        late = arrived_s - period_s * slot
+        parts = np.array_split(np.arange(len(slot)), max(len(slot) // _WINDOW, 3))
+        edge = np.array([part[np.argmin(late[part])] for part in parts])
+        period_s += float(np.median(np.diff(late[edge]) / np.diff(slot[edge])))
+    return period_s
+
+
+def _begins(late_s: Array, period_s: float) -> Ints:
+    """(N,) 1 where a count begins.
+
+    late_s : (N,) arrival minus the period times the line's number: a constant in each count, plus
+    the delay. Missing lines raise the constant, surplus ones lower it.
+    """
+    begins = np.zeros(len(late_s), np.int64)
+    begins[0] = 1
+    size = min(_WINDOW, len(late_s))
+    ahead = minimum_filter1d(late_s, size, origin=-((size - 1) // 2), mode="nearest").tolist()
+    least: deque[tuple[int, float]] = deque()
+    for i, late in enumerate(late_s.tolist()):
+        if least:
+            before = least[0][1]
+            if ahead[i] - before > period_s / 2 or late - before < -period_s / 2:
+                begins[i] = 1
+                least.clear()
+        while least and least[-1][1] >= late:
+            least.pop()
+        least.append((i, late))
+        if least[0][0] <= i - _WINDOW:
+            least.popleft()
+    return begins
+
+
+def _evenly(arrived_s: Array) -> Spread:
+    """Readings of one arrival spread over the time since the arrival before, at most 16 ms."""
+    if not len(arrived_s):
+        return Spread(arrived_s, 0.0, False)
+    arrivals, which, size = np.unique(arrived_s, return_inverse=True, return_counts=True)
+    width = np.minimum(np.diff(arrivals, prepend=arrivals[0] - ADAPTER_S), ADAPTER_S)
+    place = np.arange(len(arrived_s)) - (np.cumsum(size) - size)[which]
+    t_s = arrived_s - width[which] * (1 - (place + 1) / size[which])
+    return Spread(_increasing(t_s), float(np.sqrt(np.mean(width[which] ** 2) / 12)), False)
+
+
+def _increasing(t_s: Array) -> Array:
+    """The times, each at least a microsecond after the one before."""
+    ramp = 1e-6 * np.arange(len(t_s))
+    return np.asarray(np.maximum.accumulate(t_s - ramp) + ramp)

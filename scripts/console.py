@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import _thread
+import errno
 import os
 import signal
 import sys
@@ -11,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 import typer
 
@@ -61,6 +63,12 @@ def errors_in_words() -> Iterator[None]:
     except Exception as error:
         if os.environ.get("TELERIG_DEBUG"):
             raise
+        if _interrupted.is_set():
+            _leave_interrupted()
+        words = _words_of_system(error)
+        if words:
+            typer.echo(f"telerig: {words}", err=True)
+            raise typer.Exit(EXIT_BAD_INPUT) from error
         typer.echo(
             f"telerig: this is a fault of telerig, not of your data: {error!r:.500}\n"
             "  -> run the command again with TELERIG_DEBUG=1 and report what it prints",
@@ -68,8 +76,72 @@ def errors_in_words() -> Iterator[None]:
         )
         raise typer.Exit(EXIT_FAULT) from error
     except KeyboardInterrupt:
-        typer.echo("telerig: interrupted; no file is half-written", err=True)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+        _leave_interrupted()
+
+
+_interrupted = threading.Event()
+"""Whether Ctrl-C was pressed. Libraries may turn the interrupt into another error."""
+_AGAIN_S = 0.01
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt, also where Python would only print it.
+
+    Python prints and drops an exception that is raised while an object is deleted; the interrupt is
+    then raised once more. After an interrupt the process ends with this context.
+    """
+
+    def interrupt(_: int, __: FrameType | None) -> None:
+        _interrupted.set()
+        raise KeyboardInterrupt
+
+    def again(dropped: sys.UnraisableHookArgs) -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
+        else:
+            sys.__unraisablehook__(dropped)
+
+    signal.signal(signal.SIGINT, interrupt)
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        if _interrupted.is_set():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(EXIT_INTERRUPTED)  # threads of libraries may abort at an orderly end
+
+
+def _leave_interrupted() -> NoReturn:
+    typer.echo("telerig: interrupted; no file is half-written", err=True)
+    raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+_TODO_OF_SYSTEM = {
+    errno.ENOSPC: "make room on the disk, then run the command again",
+    errno.EDQUOT: "make room in your quota of the disk, then run the command again",
+    errno.EFBIG: "a larger file is not allowed here: choose another disk, then run again",
+    errno.EROFS: "choose a folder that can be written (--out)",
+    errno.EACCES: "change the permissions, or choose another folder",
+    errno.EIO: "the disk reports a fault: copy the data to another disk, then run again",
+    errno.EMFILE: "close other programs, or raise the limit of open files (`ulimit -n`)",
+}
+"""What a user can do about errors of the operating system, which no command can avoid."""
+
+
+def _words_of_system(error: Exception) -> str:
+    """Return the message for an error that the operating system caused; "" for any other error."""
+    if isinstance(error, MemoryError):
+        return (
+            "this computer has not enough free memory for the command\n"
+            "  -> close other programs, or give the command a smaller part of the data"
+        )
+    if not isinstance(error, OSError) or error.errno not in _TODO_OF_SYSTEM:
+        return ""
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror}\n  -> {_TODO_OF_SYSTEM[error.errno]}"
 
 
 def _leave_closed_pipe() -> None:

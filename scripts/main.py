@@ -13,6 +13,7 @@ import typer
 from telerig import __version__
 from telerig.scripts.batch import batch
 from telerig.scripts.calibrate import calibrate
+from telerig.scripts.console import interruptible
 from telerig.scripts.demo import demo
 from telerig.scripts.detect import detect
 from telerig.scripts.doctor import doctor
@@ -65,7 +66,7 @@ libraries are loaded, and finds none."""
 
 
 def run() -> None:
-    """Entry point of the installed command."""
+    """Run the command line; `telerig.scripts.start` is the entry point of the installed program."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # for a pipe without a plus-minus sign
@@ -75,4 +76,5 @@ def run() -> None:
 
 
 if __name__ == "__main__":
-    run()
+    with interruptible():
+        run()

@@ -195,13 +195,11 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
 
     The file's attribute ``rows`` explains how positions and velocities follow from the states.
     """
-    import h5py
-
-    from telerig.io.files.atomic import atomic_path
+    from telerig.io.files.hdf5 import hdf5_file
 
     solution = smoothing.solution
     layout = solution.graph
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with hdf5_file(path) as file:
         for name, table in (("trajectories", smoothing.trajectories), ("shake", smoothing.shake)):
             group = file.create_group(name)
             for column in table.columns:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -17,7 +18,9 @@ import numpy as np
 
 from telerig.errors import InputError
 
-WRITE_TODO = "choose a folder that can be written (--out) or make room on the disk"
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_WRITE_ERRORS = _FULL | {errno.EROFS, errno.EIO}
+"""Errors of the system that only writing can cause."""
 
 
 @contextmanager
@@ -26,7 +29,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Missing parent folders are made. On an exception the temporary file is removed, and a file that
     was at ``path`` before stays.
-    Raises InputError when the place cannot be written.
+    Raises InputError when the place cannot be written, also when the disk is full or the folder
+    disappears while the file is being written.
     """
     final = Path(path)
     if final.is_dir():
@@ -38,7 +42,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     _make_parent(final)
     temporary = _beside(final, final.suffix)
     try:
-        yield temporary
+        with _write_errors_in_words(final, temporary):
+            yield temporary
         _rename(temporary, final)
     finally:
         temporary.unlink(missing_ok=True)
@@ -50,7 +55,8 @@ def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
     Until then ``folder`` is as before, so an interrupted command leaves the old results unchanged.
     Files that are already in ``folder`` and are not written again stay.
-    Raises InputError when the place cannot be written.
+    Raises InputError when the place cannot be written, also when the disk is full or the temporary
+    folder disappears meanwhile.
     """
     final = Path(folder)
     if final.exists() and not final.is_dir():
@@ -66,7 +72,8 @@ def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.mkdir()
         except OSError as error:
             raise _unwritable(temporary, error) from error
-        yield temporary
+        with _write_errors_in_words(final, temporary):
+            yield temporary
         for staged in sorted(p for p in temporary.rglob("*") if p.is_file()):
             target = final / staged.relative_to(temporary)
             _make_parent(target)
@@ -81,10 +88,7 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     Raises InputError when it cannot be written.
     """
     with atomic_path(path) as temporary:
-        try:
-            temporary.write_bytes(text.encode("utf-8"))
-        except OSError as error:
-            raise _unwritable(Path(path), error) from error
+        temporary.write_bytes(text.encode("utf-8"))
 
 
 def write_json_atomic(path: str | os.PathLike[str], content: Any) -> None:
@@ -139,7 +143,32 @@ def _rename(source: Path, target: Path) -> None:
         raise _unwritable(target, error) from error
 
 
+@contextmanager
+def _write_errors_in_words(final: Path, temporary: Path) -> Iterator[None]:
+    """Raise InputError that names ``final`` for an error of the system in writing ``temporary``.
+
+    Errors of the system that have another cause, such as reading elsewhere, are left alone.
+    """
+    try:
+        yield
+    except InputError as error:
+        if not error.where.startswith(str(temporary)):
+            raise
+        where = error.where.replace(str(temporary), str(final), 1)
+        raise InputError(error.what, where=where, todo=error.todo) from error
+    except OSError as error:
+        gone = not temporary.parent.is_dir()
+        named = str(error.filename or "").startswith(str(temporary))
+        if gone or named or error.errno in _WRITE_ERRORS:
+            raise _unwritable(final, error) from error
+        raise
+
+
 def _unwritable(path: Path, error: OSError) -> InputError:
-    return InputError(
-        f"cannot be written: {error.strerror or error}", where=str(path), todo=WRITE_TODO
-    )
+    if error.errno in _FULL:
+        todo = "make room on the disk, then run the command again"
+    elif error.errno == errno.ENOENT or error.errno is None:
+        todo = "the folder was removed meanwhile: run the command again"
+    else:
+        todo = "choose a folder that can be written (--out), or change its permissions"
+    return InputError(f"cannot be written: {error.strerror or error}", where=str(path), todo=todo)

@@ -7,6 +7,7 @@ numbers of 32 bits only.
 
 from __future__ import annotations
 
+import io
 from os import PathLike
 from typing import Any
 
@@ -42,7 +43,8 @@ def write_netcdf(results: RunResults, path: str | PathLike[str]) -> None:
     points = results.points
     numbers, names = numbered(points)
     starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
-    with atomic_path(path) as temporary, netcdf_file(temporary, "w", version=2) as handle:
+    memory = io.BytesIO()
+    with netcdf_file(memory, "w", version=2) as handle:
         file: Any = handle
         file.Conventions, file.featureType = "CF-1.8", "trajectory"
         file.title = f"Bubble trajectories of run {results.name}"
@@ -61,6 +63,10 @@ def write_netcdf(results: RunResults, path: str | PathLike[str]) -> None:
             if column != "particle":
                 values = points[column].to_numpy()
                 _put(file, _NAMES.get(column, column), ("obs",), values, _attributes(column))
+        file.flush()
+        content = memory.getvalue()
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def _attributes(column: str) -> dict[str, Any]:

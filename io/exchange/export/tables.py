@@ -14,6 +14,7 @@ from telerig.io.exchange.export.opencv import undistorted_matrix
 from telerig.io.exchange.export.run_results import RunResults, facts, identifier, numbered, unit_of
 from telerig.io.files.atomic import atomic_path
 from telerig.io.files.csv_table import write_table
+from telerig.io.files.hdf5 import hdf5_file
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.windows import Wall
@@ -30,7 +31,7 @@ def write_hdf5(
     """
     import h5py
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with hdf5_file(path) as file:
         file.attrs.update(facts(results))
         for name, table in (("trajectories", results.points), ("shake", results.shake)):
             if table is None:

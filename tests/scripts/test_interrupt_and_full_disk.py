@@ -1,0 +1,146 @@
+"""Commands that are interrupted, or that the operating system does not let write."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from telerig.errors import InputError
+from telerig.io.files.atomic import atomic_folder, atomic_path
+from telerig.scripts.main import app
+
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def smoothed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset without images, with all of its results."""
+    data = tmp_path_factory.mktemp("disk") / "set"
+    options = ("--quiet", "--no-report")
+    for command in (
+        ("simulate", "S1", "--frames", "30", "--no-images", "--seed", "3", "--out", data),
+        ("calibrate", data, "--model", "radial", *options),
+        ("track", data / "runs/S1", *options),
+        ("smooth", data / "runs/S1", *options),
+    ):
+        done = runner.invoke(app, [str(part) for part in command])
+        assert done.exit_code == 0, done.output
+    return data
+
+
+@contextmanager
+def largest_file(size_bytes: int) -> Iterator[None]:
+    """Let the operating system refuse to write more into any file."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = [p for p in folder.rglob("*") if p.is_file()]
+    return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+COMMANDS = {
+    "calibrate": ("calibrate", "{set}", "--model", "radial", "--quiet"),
+    "track": ("track", "{set}/runs/S1", "--quiet"),
+    "smooth": ("smooth", "{set}/runs/S1", "--quiet"),
+    "hdf5": ("export", "{set}/results/S1", "--to", "hdf5", "--out", "{set}/out.h5"),
+    "netcdf": ("export", "{set}/results/S1", "--to", "netcdf", "--out", "{set}/out.nc"),
+    "matlab": ("export", "{set}/results/S1", "--to", "mat", "--out", "{set}/out.mat"),
+    "trackpy": ("export", "{set}/results/S1", "--to", "trackpy", "--out", "{set}/out.csv"),
+    "opencv": ("export", "{set}/results/calibration", "--to", "opencv", "--out", "{set}/o.yaml"),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("size_bytes", [100, 6_000])
+def test_a_full_disk_leaves_the_old_results_and_says_what_to_do(
+    name: str, size_bytes: int, smoothed: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "set"
+    shutil.copytree(smoothed, data)
+    before = contents(data)
+    with largest_file(size_bytes):
+        done = runner.invoke(app, [part.format(set=data) for part in COMMANDS[name]])
+    text = done.output + done.stderr
+    if done.exit_code == 0:  # so small a file
+        assert name in ("opencv", "trackpy")
+        return
+    assert done.exit_code == 2, text
+    assert "make room on the disk, then run the command again" in text
+    assert ".part" not in text
+    assert contents(data) == before
+
+
+def test_a_folder_that_disappears_while_it_is_written_is_named(tmp_path: Path) -> None:
+    again = pytest.raises(InputError, match="run the command again")
+    with again as caught, atomic_folder(tmp_path / "results") as staged:
+        shutil.rmtree(staged)
+        (staged / "tracks.csv").write_text("frame\n", encoding="utf-8")
+    assert caught.value.where == str(tmp_path / "results")
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"), [(errno.EDQUOT, "make room"), (errno.EROFS, "can be written")]
+)
+def test_errors_of_the_system_in_writing_are_told_apart(
+    number: int, advice: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=advice), atomic_path(tmp_path / "a.csv"):
+        raise OSError(number, os.strerror(number))
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_error_of_reading_is_not_taken_for_one_of_writing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "a.csv"):
+        (tmp_path / "elsewhere" / "b.csv").read_text(encoding="utf-8")
+
+
+def interrupted(arguments: list[str], after_s: float) -> tuple[int, str]:
+    """Exit code and output of a command whose process group gets Ctrl-C."""
+    command = [sys.executable, "-m", "telerig.scripts.start", *arguments]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        time.sleep(after_s)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=120)
+    return process.returncode, out + err
+
+
+def check_interrupts(moments_s: list[float], smoothed: Path, tmp_path: Path) -> None:
+    for k, after_s in enumerate(moments_s):
+        out = tmp_path / f"out{k}"
+        code, text = interrupted(["calibrate", str(smoothed), "--out", str(out)], after_s)
+        assert code in (0, 130, -signal.SIGINT), (after_s, code, text)
+        for word in ("Traceback", "Exception", "fault of telerig", "terminate called"):
+            assert word not in text, (after_s, text)
+        assert code == 0 or not out.exists() or (out / "report.html").is_file()
+
+
+def test_ctrl_c_at_any_moment_prints_no_traceback(smoothed: Path, tmp_path: Path) -> None:
+    check_interrupts([0.15, 0.5, 1.0, 2.0], smoothed, tmp_path)
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_a_hundred_moments(smoothed: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    check_interrupts(list(rng.uniform(0.1, 5.0, 100)), smoothed, tmp_path)

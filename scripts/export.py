@@ -11,6 +11,8 @@ from telerig.io.exchange.formats import CAMERA_EXPORTS, RUN_EXPORTS, described
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, run_file, say
 
+_FOLDERS = " and ".join(n for n, f in (CAMERA_EXPORTS | RUN_EXPORTS).items() if not f.suffix)
+
 
 @errors_in_words()
 def export(
@@ -36,9 +38,7 @@ def export(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="File to write, or the folder for halcon and soloff [DATASET/results/export]."
-        ),
+        typer.Option(help=f"File to write, or the folder for {_FOLDERS} [DATASET/results/export]."),
     ] = None,
     volume: Annotated[
         str | None,
@@ -57,7 +57,7 @@ def export(
         ),
     ] = 0.0,
 ) -> None:
-    """Write a calibration or a run for HALCON, OpenCV, PIV programs, MATLAB, Python, NetCDF tools.
+    """Write a calibration or a run in a format of other programs.
 
     Prints how far the exported cameras are from the calibrated ones over the working volume.
     docs/exports.md says what each format holds.

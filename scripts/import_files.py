@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from telerig.errors import InputError
-from telerig.io.exchange.formats import CAMERA_IMPORTERS, SENSOR_IMPORTERS
+from telerig.io.exchange.formats import CAMERA_IMPORTERS, recording_words
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, say
 
@@ -80,15 +80,12 @@ def openptv(
     _import_cameras("openptv", files, out, sigma_px, names=chosen, sensor=sensor)
 
 
-@app.command(help=SENSOR_IMPORTERS["accelerometer"].description)
+@app.command(help="Add the recording of an accelerometer to a run's accelerometer.csv.")
 @errors_in_words()
 def accelerometer(
     file: Annotated[
         Path,
-        typer.Argument(
-            help=f"{SENSOR_IMPORTERS['accelerometer'].program} file; TDMS needs "
-            f"pip install 'telerig[{SENSOR_IMPORTERS['accelerometer'].extra}]'."
-        ),
+        typer.Argument(help=f"{recording_words()}."),
     ],
     run: Annotated[
         Path, typer.Option(help="DATASET/runs/NAME, whose accelerometer.csv is written.")
@@ -118,7 +115,11 @@ def accelerometer(
     ] = None,
     group: Annotated[str | None, typer.Option(help="Group of a TDMS file.")] = None,
 ) -> None:
-    from telerig.io.exchange.importing.accelerometer import layout_from, merge_accelerations
+    from telerig.io.exchange.importing.accelerometer import (
+        layout_from,
+        merge_accelerations,
+        read_accelerations,
+    )
 
     if not run.is_dir():
         raise InputError("there is no such run", where=str(run), todo="check --run")
@@ -128,7 +129,7 @@ def accelerometer(
             "unit": unit, "scale_m_s2": scale, "group": group,
         }
     )  # fmt: skip
-    table = SENSOR_IMPORTERS["accelerometer"](file, sensor, layout)
+    table = read_accelerations(file, sensor, layout)
     replaced = merge_accelerations(table, run / "accelerometer.csv")
     first, last = table["t_s"].iloc[0], table["t_s"].iloc[-1]
     say(f"{sensor}: {len(table)} readings from {first:.6g} to {last:.6g} s")

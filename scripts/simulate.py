@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from telerig.errors import InputError
+from telerig.io.simulation.presets import PRESETS, RUN_PRESETS, any_preset, run_preset
 from telerig.scripts.console import errors_in_words, run_file, say, stopped_by_signals
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ def simulate(
     preset: Annotated[
         str | None,
         typer.Argument(
-            help="A calibration (paper, dense, scheimpflug, near_telecentric, symmetric, "
-            "unbounded, two_sided, three), or a run of bubbles (rise, swarm, crossing, S0 to S6)."
+            help=f"A calibration ({', '.join(PRESETS)}), or a run of bubbles "
+            f"({', '.join(RUN_PRESETS)})."
         ),
     ] = None,
     out: Annotated[
@@ -102,8 +103,6 @@ def simulate(
 def _settings(
     name: str, run: dict[str, int | None], stage: dict[str, Any]
 ) -> SimulationConfig | RunConfig:
-    from telerig.io.simulation.presets import RUN_PRESETS, any_preset, run_preset
-
     changes: dict[str, Any] = {key: value for key, value in run.items() if value is not None}
     stage_changes = {key: value for key, value in stage.items() if value is not None}
     if not changes and not stage_changes:
@@ -134,8 +133,6 @@ def _with_strip(
 
 
 def _needs_run(name: str, given: str) -> InputError:
-    from telerig.io.simulation.presets import RUN_PRESETS
-
     return InputError(
         f"{name} is a calibration without a run, so {given} have no effect",
         todo=f"leave them out, or choose one of {', '.join(RUN_PRESETS)}",

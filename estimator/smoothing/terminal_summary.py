@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from telerig.io.results.verdict_words import to_resolve
+
 if TYPE_CHECKING:
     from telerig.estimator.smoothing.result import Smoothing
 
@@ -29,7 +31,7 @@ def smoothing_words(found: Smoothing) -> str:
         lines.append(verdict["verdict"] + (f" ({flags})" if flags else ""))
         lines += [f"  {axis['words']}" for axis in verdict["axes"].values()]
         if verdict["remedy"]:
-            lines.append(f"  To resolve it, {verdict['remedy']}.")
+            lines.append(f"  {to_resolve(verdict['remedy'])}")
     bubbles = "1 bubble" if summary["bubbles"] == 1 else f"{summary['bubbles']} bubbles"
     lines.append(f"{bubbles} in {summary['frames']} frames; priors: {found.model.name}")
     if len(table) and "sx_mm" in table:

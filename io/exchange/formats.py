@@ -90,14 +90,27 @@ CAMERA_IMPORTERS = {
         options=("names", "sensor"),
     ),
 }
-SENSOR_IMPORTERS = {
-    "accelerometer": Format(
-        "CSV, WAV, MAT or TDMS",
-        "importing.accelerometer:read_accelerations",
-        "Add the recording of an accelerometer to a run's accelerometer.csv.",
-        extra="tdms",
+_ACCELEROMETER = "importing.accelerometer"
+RECORDINGS = {
+    ".csv": Format("CSV", f"{_ACCELEROMETER}:read_csv", "readings in columns"),
+    ".wav": Format("WAV", f"{_ACCELEROMETER}:read_wav", "channels of a sound file"),
+    ".mat": Format("MAT", f"{_ACCELEROMETER}:read_mat", "vectors of MATLAB"),
+    ".tdms": Format(
+        "TDMS", f"{_ACCELEROMETER}:read_tdms", "LabVIEW", options=("group",), extra="tdms"
     ),
 }
+"""Recordings of accelerometers by the ending of the file. A reader takes the path, and returns a
+`Recording`."""
+RECORDINGS |= dict.fromkeys((".txt", ".tsv"), RECORDINGS[".csv"])
+
+
+def recording_words() -> str:
+    """Return the programs whose recordings can be read, with the packages that they need."""
+    known = {one.program: one.extra for one in RECORDINGS.values()}
+    need = "".join(
+        f"; {name} needs pip install 'telerig[{extra}]'" for name, extra in known.items() if extra
+    )
+    return f"{', '.join(known)} file{need}"
 
 
 def described(formats: dict[str, Format]) -> str:

@@ -35,6 +35,23 @@ class Flag(StrEnum):
     SHAKE_BELOW_NOISE = "SHAKE_BELOW_NOISE"
 
 
+class Remedy(StrEnum):
+    """Name the measurements that would separate the shake better."""
+
+    STRIP = "strip"
+    ARMS = "arms"
+    LONGER = "longer"
+
+
+class Place(StrEnum):
+    """Name what a vibration moves. A line that one camera alone sees may be an arm's or common."""
+
+    COMMON = "common"
+    ARM = "arm"
+    ONE_VIEW = "seen only by"
+    SERVO = "servo"
+
+
 class AttributedLine(Part):
     """Hold a spectral line and whose motion it is: the bubbles' or the rig's.
 
@@ -81,9 +98,12 @@ class Mode(Part):
     damping : damping ratio; None where it is not known.
     rms_mm : RMS of the displacement in mm, in total or for each axis; None where it is not known.
     source, remedy : the probable cause and what helps against it, in words.
+    place, camera : ``where`` as a code and the name of a camera; None in older files.
     """
 
     where: str
+    place: Place | None = None
+    camera: str = ""
     frequency_hz: float
     damping: float | None = None
     rms_mm: tuple[float, ...] | float | None = None
@@ -109,6 +129,8 @@ class SmoothingFile(Record):
 
     verdict, flags, axes : the verdict of the run, what qualifies it, and the verdict by axis.
     words, remedy : the verdict as a sentence, and what to do about it.
+    vertical, remedies : the axis nearest to the vertical, and the remedy as codes; "" and () in
+    older files.
     frames, bubbles : how many were smoothed. modes : the vibrations of the rig.
     log_evidence : logarithm of the model's probability density for the data; None if not computed.
     depth_axes : by camera, unit vector (3,) in rig axes along which that camera cannot measure.
@@ -124,6 +146,8 @@ class SmoothingFile(Record):
     axes: dict[str, AxisVerdict] = Field(default_factory=dict)
     words: str = ""
     remedy: str = ""
+    remedies: tuple[Remedy, ...] = ()
+    vertical: str = ""
     left_out: tuple[str, ...] = ()
     modes: tuple[Mode, ...] = ()
     schema_: int = Field(1, alias="schema")

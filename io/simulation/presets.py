@@ -1,7 +1,6 @@
 """Named examples of simulated calibrations and runs.
 
-Every command knows a preset that is added here. Add its name to the help of `scripts/simulate.py`
-too.
+Every command and its help know a preset that is added here.
 """
 
 from __future__ import annotations

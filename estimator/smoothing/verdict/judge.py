@@ -1,7 +1,7 @@
-"""The verdict part of smoothing.json: numbers and codes, and the sentences made from them.
+"""Makes the verdict part of smoothing.json: numbers and codes, and the sentences made from them.
 
-A smoother that always answers is wrong: where shake and bubble motion cannot be separated, the
-remedy is a mark fixed to the tank or an accelerometer on each camera arm.
+Where shake and bubble motion cannot be separated, the verdict says so and names the measurement
+that would separate them.
 """
 
 from __future__ import annotations
@@ -13,25 +13,16 @@ import numpy as np
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.identifiability import AxisVerdict, verdicts
-from telerig.estimator.smoothing.verdict.modes import Place, ShakeMode, shake_modes
-from telerig.io.results.smoothing import AXES, Flag, Verdict
-from telerig.io.results.verdict_words import VERDICT_WORDS
-from telerig.rig.camera import Camera
-
-_STRIP = "fix a strip of dots to the tank inside both views"
-_ARMS = "mount one accelerometer on each camera arm"
-_LONGER = "take a longer record, or one with more bubbles in view"
-_REMEDIES = {
-    Place.SERVO: "Tune the stage's controller: more damping, a softer ramp, less gain at this "
-    "frequency.",
-    Place.ONE_VIEW: "Only one camera sees this axis, so it is unknown whether its arm or the whole "
-    "rig swings. An accelerometer on the carriage would show it.",
-    Place.COMMON: "All cameras move alike: stiffen the mount between carriage and camera bridge, "
-    "or lighten what hangs on it.",
-    Place.ARM: "The arm of camera {camera} swings by itself: shorten or brace it, or counterweight "
-    "its camera.",
-}
-_WEAK_DAMPING, _SLOW_HZ = 0.02, 5.0
+from telerig.estimator.smoothing.verdict.modes import ShakeMode, shake_modes
+from telerig.io.results.smoothing import AXES, Flag, Mode, Remedy, Verdict
+from telerig.io.results.smoothing import AxisVerdict as AxisRecord
+from telerig.io.results.verdict_words import (
+    mode_remedy,
+    remedy_words,
+    to_resolve,
+    unseen_words,
+    words_of_axis,
+)
 
 
 def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> dict[str, Any]:
@@ -46,18 +37,23 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
     modes = [_mode_json(mode) for mode in shake_modes(solution)]
     if not found:
         return {"modes": modes}
-    upright = AXES[int(np.abs(problem.up).argmax())]
-    sentences = {name: _of_axis(name, axis, name == upright) for name, axis in found.items()}
+    vertical = AXES[int(np.abs(problem.up).argmax())]
+    axes = {name: _with_words(name, axis, vertical) for name, axis in found.items()}
     worst = max((a.verdict for a in found.values()), key=list(Verdict).index)
+    remedies = () if worst == Verdict.RESOLVED else remedies_of(problem)
+    words = [axis["words"] for axis in axes.values()]
+    words += [to_resolve(remedy_words(remedies))] if remedies else []
+    words += ["The shake's modes were learned from this run."] if model.name == "learned" else []
+    depths = {camera.name: camera.camera_from_rig.rotation[2] for camera in problem.cameras}
     return {
         "verdict": str(worst),
         "flags": [str(flag) for flag in _flags(found)],
-        "axes": {
-            name: _axis_json(axis) | {"words": sentences[name]} for name, axis in found.items()
-        },
-        "words": " ".join([*sentences.values(), *_advice(problem, model, found)]),
-        "remedy": "" if worst == Verdict.RESOLVED else remedy_of_verdict(problem),
-        "left_out": [_unseen(camera) for camera in problem.cameras],
+        "axes": axes,
+        "words": " ".join(words),
+        "remedy": remedy_words(remedies),
+        "remedies": [str(remedy) for remedy in remedies],
+        "vertical": vertical,
+        "left_out": [unseen_words(name, axis) for name, axis in depths.items()],
         "modes": modes,
     }
 
@@ -70,6 +66,12 @@ def _flags(found: dict[str, AxisVerdict]) -> list[Flag]:
     if all(Flag.SHAKE_BELOW_NOISE in axis.flags for axis in found.values()):
         flags.append(Flag.SHAKE_BELOW_NOISE)
     return flags
+
+
+def _with_words(name: str, axis: AxisVerdict, vertical: str) -> dict[str, Any]:
+    content = _axis_json(axis)
+    stored = AxisRecord.model_validate(content)
+    return content | {"words": words_of_axis(name, stored, vertical=name == vertical)}
 
 
 def _axis_json(axis: AxisVerdict) -> dict[str, Any]:
@@ -93,63 +95,22 @@ def _axis_json(axis: AxisVerdict) -> dict[str, Any]:
 
 
 def _mode_json(mode: ShakeMode) -> dict[str, Any]:
-    return {
+    content = {
         "where": mode.where,
+        "place": str(mode.place),
+        "camera": mode.camera,
         "frequency_hz": mode.frequency_hz,
         "damping": mode.damping,
         "rms_mm": mode.rms_mm,
         "source": mode.source,
-        "remedy": remedy_of_mode(mode),
     }
+    return content | {"remedy": mode_remedy(Mode.model_validate(content))}
 
 
-def _advice(
-    problem: SmoothingProblem, model: ShakeModel, found: dict[str, AxisVerdict]
-) -> list[str]:
-    parts = []
-    if any(axis.verdict != Verdict.RESOLVED for axis in found.values()):
-        parts.append(f"To resolve it, {remedy_of_verdict(problem)}.")
-    if model.name == "learned":
-        parts.append("The shake's modes were learned from this run.")
-    return parts
-
-
-def _of_axis(name: str, axis: AxisVerdict, upright: bool) -> str:
-    title = f"{name} (vertical)" if upright else name
-    meaning = VERDICT_WORDS[axis.verdict].of_axis.format(q=axis.q)
-    text = (
-        f"{title}: {meaning} (standard deviation of a position "
-        f"{1e3 * axis.sigma_mm:.3g} µm; {1e3 * axis.sigma_shake_known_mm:.3g} µm if the shake were "
-        "known)."
-    )
-    if Flag.SHAKE_BELOW_NOISE in axis.flags:
-        text += f" The shake ({1e3 * axis.shake_rms_mm:.3g} µm RMS) is below the noise."
-    if Flag.LABEL_AMBIGUOUS in axis.flags:
-        which = ", ".join(sorted({f"{x.frequency_hz:.3g} Hz" for x in axis.ambiguous_lines}))
-        text += f" The oscillation at {which} could be the bubble's as well as the rig's."
-    return text
-
-
-def remedy_of_verdict(problem: SmoothingProblem) -> str:
-    """The measurement that would separate shake and motion better, of those that the run lacks."""
+def remedies_of(problem: SmoothingProblem) -> tuple[Remedy, ...]:
+    """Return the measurements that would separate shake and motion better, of those that the run
+    lacks."""
     has_arms = len(problem.arms_with_sensor) == len(problem.cameras)
     if len(problem.references):
-        return _LONGER if has_arms else _ARMS
-    return _STRIP if has_arms else f"{_STRIP}, or {_ARMS}"
-
-
-def remedy_of_mode(mode: ShakeMode) -> str:
-    """What would make this mode smaller."""
-    text = _REMEDIES[mode.place].format(camera=mode.camera)
-    if mode.place == Place.SERVO:
-        return text
-    if mode.damping < _WEAK_DAMPING:
-        text += " It rings: a layer of damping helps as much as stiffness."
-    if mode.frequency_hz < _SLOW_HZ:
-        text += " So slow a swing is also driven by the travel: ramp the stage up more softly."
-    return text
-
-
-def _unseen(camera: Camera) -> str:
-    depth = ", ".join(f"{v:.2f}" for v in camera.camera_from_rig.rotation[2])
-    return f"Shake of camera {camera.name} along its own depth ({depth}) cannot be seen."
+        return (Remedy.LONGER,) if has_arms else (Remedy.ARMS,)
+    return (Remedy.STRIP,) if has_arms else (Remedy.STRIP, Remedy.ARMS)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, RigMode
+from telerig.io.results.smoothing import Place
 
 _LOWEST_HZ = 2.0
 _MOST_PEAKS = 3
@@ -22,16 +22,6 @@ _BLUR = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
 _BLUR_HALF = 1.0
 _ALIKE = 0.7
 _STRONGER = 2.0
-
-
-class Place(StrEnum):
-    """What a mode moves."""
-
-    COMMON = "common"
-    ARM = "arm"
-    ONE_VIEW = "seen only by"
-    """A line on an axis that one camera alone sees: its arm's, or common to all."""
-    SERVO = "servo"
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.io.exchange.formats import RECORDINGS
 from telerig.io.files.csv_table import write_table
 from telerig.io.files.text import read_text
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
@@ -234,27 +235,25 @@ class Recording:
 
 
 def open_recording(path: Path, group: str | None = None) -> Recording:
-    """Read a file according to its extension: .csv, .txt, .tsv, .wav, .tdms or .mat.
+    """Read a file according to its ending, one of `RECORDINGS`.
 
     group : the group of a TDMS file that has several; None where there is only one.
     Raises InputError for a file that does not exist or cannot be read.
     """
-    readers = {".csv": _csv, ".txt": _csv, ".tsv": _csv, ".wav": _wav, ".mat": _mat}
     ending = path.suffix.lower()
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), todo="check the path")
-    if ending == ".tdms":
-        return _tdms(path, group)
-    if ending not in readers:
+    if ending not in RECORDINGS:
         raise InputError(
             f"recordings that end in {ending or 'nothing'} cannot be read",
             where=str(path),
-            todo="give a .csv, .wav, .tdms or .mat file",
+            todo=f"give a file that ends in one of: {', '.join(RECORDINGS)}",
         )
-    return readers[ending](path)
+    recording: Recording = RECORDINGS[ending](path, group=group)
+    return recording
 
 
-def _csv(path: Path) -> Recording:
+def read_csv(path: Path) -> Recording:
     """The header is the last line before the numbers; lines above it (from a logger) are skipped.
 
     Cells are separated by commas, semicolons (also with decimal commas) or tabs.
@@ -302,7 +301,7 @@ def _cells(line: str) -> tuple[str, list[float]] | None:
         return None
 
 
-def _wav(path: Path) -> Recording:
+def read_wav(path: Path) -> Recording:
     """Channels and rate of a WAV file; whole numbers are scaled so that ±1 is full scale."""
     from scipy.io import wavfile
 
@@ -321,7 +320,7 @@ def _wav(path: Path) -> Recording:
     return Recording(str(path), channels, rate_hz=float(rate))
 
 
-def _mat(path: Path) -> Recording:
+def read_mat(path: Path) -> Recording:
     """Vectors by their names; the columns of an (N, k) matrix as name_0, name_1, ..."""
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
@@ -351,7 +350,7 @@ def _mat(path: Path) -> Recording:
     return Recording(str(path), channels)
 
 
-def _tdms(path: Path, group: str | None) -> Recording:
+def read_tdms(path: Path, group: str | None = None) -> Recording:
     try:
         nptdms = import_module("nptdms")
     except ModuleNotFoundError as error:

@@ -17,8 +17,10 @@ from telerig.estimator.smoothing.verdict.identifiability import (
     window_of,
     without_sensors,
 )
-from telerig.estimator.smoothing.verdict.judge import judge, remedy_of_mode, remedy_of_verdict
-from telerig.estimator.smoothing.verdict.modes import Place, ShakeMode, shake_modes
+from telerig.estimator.smoothing.verdict.judge import judge, remedies_of
+from telerig.estimator.smoothing.verdict.modes import shake_modes
+from telerig.io.results.smoothing import Mode, Place
+from telerig.io.results.verdict_words import mode_remedy, remedy_words
 
 QUIET = Options(robust=False)
 BANDS = replace(
@@ -80,7 +82,7 @@ def test_the_remedy_is_never_what_the_run_already_has() -> None:
         (replace(alone, accelerometers=sensors[:1]), (strip, arms), ()),
         (replace(marked, accelerometers=sensors), ("longer record",), (strip, arms)),
     ):
-        words = remedy_of_verdict(problem)
+        words = remedy_words(remedies_of(problem))
         assert all(word in words for word in said)
         assert not any(word in words for word in unsaid)
 
@@ -150,11 +152,11 @@ def test_table_of_modes_names_places_and_remedies() -> None:
     rows = shake_modes(solve(problem, true_model(), QUIET))
     assert [r.where for r in rows] == ["common", "arm left", "arm right"]
     assert rows[0].frequency_hz == COMMON_HZ
-    assert "shorten" in remedy_of_mode(rows[1])
-    slow = ShakeMode(Place.COMMON, "", 3.0, 0.1, [0.0, 0.1, 0.0], "model")
-    assert "ramp" in remedy_of_mode(slow)
-    ringing = ShakeMode(Place.ARM, "left", 20.0, 0.01, [0.0, 0.1, 0.0], "model")
-    assert "damping" in remedy_of_mode(ringing)
+    arm = Mode(where="arm left", place=Place.ARM, camera="left", frequency_hz=20.0, damping=0.01)
+    assert "camera left" in mode_remedy(arm) and "damping" in mode_remedy(arm)
+    slow = Mode(where="common", place=Place.COMMON, frequency_hz=3.0, damping=0.1)
+    assert "ramp" in mode_remedy(slow)
+    assert mode_remedy(Mode(where="common", frequency_hz=3.0, remedy="brace it")) == "brace it"
 
 
 def test_modes_are_read_from_estimated_shake_and_encoder_when_the_model_has_none() -> None:

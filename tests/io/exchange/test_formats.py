@@ -9,12 +9,12 @@ import pytest
 from telerig.io.exchange.formats import (
     CAMERA_EXPORTS,
     CAMERA_IMPORTERS,
+    RECORDINGS,
     RUN_EXPORTS,
-    SENSOR_IMPORTERS,
     Format,
 )
 
-REGISTRIES = (CAMERA_EXPORTS, RUN_EXPORTS, CAMERA_IMPORTERS, SENSOR_IMPORTERS)
+REGISTRIES = (CAMERA_EXPORTS, RUN_EXPORTS, CAMERA_IMPORTERS, RECORDINGS)
 
 
 @pytest.mark.parametrize("known", [f for registry in REGISTRIES for f in registry.values()])

@@ -122,9 +122,24 @@ def test_the_remedy_of_the_file_is_said_once(folder: Path) -> None:
     axes = {"x": {"verdict": "UNRESOLVED", "words": "x: cannot be told apart."}}
     changed(folder, verdict="UNRESOLVED", remedy=remedy, words=whole, axes=axes)
     told = _judged(folder)
-    assert told.sentences[1:] == ("x: cannot be told apart.", f"To resolve it, {remedy}")
+    assert told.sentences[1:] == ("x: cannot be told apart.", f"To resolve it, {remedy}.")
     changed(folder, "axes")  # a file from before
     assert _judged(folder).sentences[1:] == (whole,)
+
+
+def test_the_page_makes_its_sentences_from_codes_and_numbers(folder: Path) -> None:
+    numbers = {"verdict": "PARTIAL", "q": 1.7, "sigma_mm": 0.034, "sigma_shake_known_mm": 0.02,
+               "shake_rms_mm": 0.1}  # fmt: skip
+    axes = {"y": numbers | {"words": "y: as it was said then."}}
+    changed(folder, verdict="PARTIAL", axes=axes, vertical="y", remedies=["arms"], remedy="old")
+    told = _judged(folder)
+    assert told.sentences[1:] == (
+        "y (vertical): shake widens the positions 1.7 times (standard deviation of a position "
+        "34 µm; 20 µm if the shake were known).",
+        "To resolve it, mount one accelerometer on each camera arm.",
+    )
+    changed(folder, axes={"y": {"verdict": "PARTIAL", "words": "y: as it was said then."}})
+    assert _judged(folder).sentences[1] == "y: as it was said then."
 
 
 def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> None:

@@ -31,7 +31,15 @@ from telerig.io.report.run.smoothing.results import (
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.report.run.tracking.tables import Headline
 from telerig.io.results.smoothing import AttributedLine, Flag, Mode, Verdict
-from telerig.io.results.verdict_words import FLAG_WORDS, NOT_JUDGED, REMEDY, VERDICT_WORDS
+from telerig.io.results.verdict_words import (
+    FLAG_WORDS,
+    NOT_JUDGED,
+    VERDICT_WORDS,
+    mode_remedy,
+    remedy_words,
+    to_resolve,
+    words_of_axes,
+)
 
 
 def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str, Any]:
@@ -82,13 +90,13 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headli
     if file.verdict is not None:
         colour = _COLOURS[file.verdict]
         headline, meaning, _ = VERDICT_WORDS[file.verdict]
-    of_axes = [axis.words for axis in file.axes.values() if axis.words]
+    of_axes = words_of_axes(file)
     sentences = [meaning, *(of_axes or [file.words])]
     if file.rig_change is not None and file.rig_change.words:
         sentences.append(f"Rig: {file.rig_change.words}.")
     in_words = file.words and not of_axes  # files from before hold the remedy in their words
     if file.verdict in (Verdict.PARTIAL, Verdict.UNRESOLVED) and not in_words:
-        sentences.append(f"To resolve it, {file.remedy or REMEDY}")
+        sentences.append(to_resolve(remedy_words(file.remedies) or file.remedy))
     flags = {
         flag: f"{flag}: {FLAG_WORDS.get(flag, flag.replace('_', ' ').lower())}"
         for flag in file.flags
@@ -307,8 +315,13 @@ def _merged(modes: Sequence[Mode]) -> list[Mode]:
 
 
 def _mode(mode: Mode, cameras: Sequence[str]) -> Row:
-    cells = (number(mode.frequency_hz), number(mode.damping), _rms_um(mode.rms_mm), mode.remedy)
-    return Row((_place(mode.where, cameras), *cells))
+    cells = (
+        number(mode.frequency_hz),
+        number(mode.damping),
+        _rms_um(mode.rms_mm),
+        mode_remedy(mode),
+    )
+    return Row((_place(mode.where, cameras), *numbers, mode_remedy(mode)))
 
 
 def _place(camera: Any, cameras: Sequence[str]) -> str:

@@ -99,8 +99,7 @@ def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
     if Flag.LABEL_AMBIGUOUS in axis.flags:
         lines = sorted({f"{x.frequency_hz:.3g} Hz" for x in axis.lines if x.ambiguous})
         text += (
-            f" The oscillation at {', '.join(lines)} could be the bubble's "
-        text += "as well as the rig's."
+            f" The oscillation at {', '.join(lines)} could be the bubble's as well as the rig's."
         )
     return text
 

@@ -315,12 +315,7 @@ def _merged(modes: Sequence[Mode]) -> list[Mode]:
 
 
 def _mode(mode: Mode, cameras: Sequence[str]) -> Row:
-    cells = (
-        number(mode.frequency_hz),
-        number(mode.damping),
-        _rms_um(mode.rms_mm),
-        mode_remedy(mode),
-    )
+    numbers = (number(mode.frequency_hz), number(mode.damping), _rms_um(mode.rms_mm))
     return Row((_place(mode.where, cameras), *numbers, mode_remedy(mode)))
 
 

@@ -24,7 +24,7 @@ _PAIRS = 5
 _BLOCK = 32
 _QUANTILE = 0.8
 _MOTION = 3
-"""So many suspected readings in a row are motion: damage affects lines one by one."""
+"""So many far readings in a row are motion: damage affects lines one by one."""
 _AROUND = 16
 """Garbage is looked for in so many readings' lengths on each side."""
 
@@ -90,13 +90,15 @@ def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) 
         if not np.isfinite(resolution):
             continue
         limit = np.maximum(_FAR_RESIDUALS * _scale(rough) + 2 * resolution, allowed)
-        suspected = _few_in_a_row(rough > limit)
+        suspected = rough > limit
+        off_value = np.zeros(len(t_s), bool)
         plain = ~(suspected | beside)
         tested = suspected | beside
         tested[:_PAIRS] = tested[-_PAIRS:] = True
-        for i in np.flatnonzero(tested & ~far).tolist():
+        for i in np.flatnonzero(tested).tolist():
             off, residual = _off_parabola(t_s, value, plain, i)
-            far[i] = abs(off) > max(_FAR_RESIDUALS * max(residual, resolution), allowed[i])
+            off_value[i] = abs(off) > max(_FAR_RESIDUALS * max(residual, resolution), allowed[i])
+        far |= _few_in_a_row(off_value)
     return far
 
 
@@ -124,10 +126,10 @@ def _scale(size: Array) -> Array:
     return np.repeat(most, _BLOCK)[: len(size)]
 
 
-def _few_in_a_row(suspected: Bools) -> Bools:
-    """Without the suspected readings that stand `_MOTION` or more in a row."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], suspected.astype(np.int8), [0]])))
-    out = suspected.copy()
+def _few_in_a_row(far: Bools) -> Bools:
+    """Without the far readings that stand `_MOTION` or more in a row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(np.int8), [0]])))
+    out = far.copy()
     for begin, end in edges.reshape(-1, 2).tolist():
         if end - begin >= _MOTION:
             out[begin:end] = False

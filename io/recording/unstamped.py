@@ -48,8 +48,8 @@ def spread_arrivals(arrived_s: Array, slot: Ints) -> Spread:
     arrived_s : (N,) arrival of each in s, not decreasing. slot : (N,) number of the line that it
     came in, increasing; malformed lines are counted, too.
     """
-    regular = _by_regular_clock(arrived_s, slot)
-    return regular or _evenly(arrived_s)
+    regular, even = _by_regular_clock(arrived_s, slot), _evenly(arrived_s)
+    return regular if regular is not None and regular.sd_s < even.sd_s else even
 
 
 def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
@@ -94,20 +94,29 @@ def _begins(late_s: Array, period_s: float) -> Ints:
     """
     begins = np.zeros(len(late_s), np.int64)
     begins[0] = 1
-    size = min(_WINDOW, len(late_s))
-    ahead = minimum_filter1d(late_s, size, origin=-((size - 1) // 2), mode="nearest").tolist()
-    least: deque[tuple[int, float]] = deque()
-    for i, late in enumerate(late_s.tolist()):
-        if least:
-            before = least[0][1]
-            if ahead[i] - before > period_s / 2 or late - before < -period_s / 2:
-                begins[i] = 1
-                least.clear()
-        while least and least[-1][1] >= late:
+    flush = int(2 * ADAPTER_S / period_s) + 1
+    window = min(max(_WINDOW, 4 * flush), len(late_s) - 1)
+    ahead = minimum_filter1d(late_s, 2 * window + 1, origin=-window, mode="nearest")
+    late, least = late_s.tolist(), deque([0])
+    begin, i, last = 0, 1, len(late) - flush
+    while i < len(late):
+        before = late[least[0]]
+        raised = i < last and ahead[i] - before > period_s / 2
+        known = i > begin + flush  # since then a reading has come that hardly waited
+        if raised or (known and late[i] - before < -period_s / 2):
+            if raised:
+                # What came with a delay just before the missing lines is still of the old count.
+                level = ahead[min(i + flush, last)] - period_s / 4
+                i += int(np.max(np.flatnonzero(late_s[i : i + flush] < level), initial=-1)) + 1
+            begin = i
+            begins[i] = 1
+            least.clear()
+        while least and late[least[-1]] >= late[i]:
             least.pop()
-        least.append((i, late))
-        if least[0][0] <= i - _WINDOW:
+        least.append(i)
+        if least[0] <= i - window:
             least.popleft()
+        i += 1
     return begins
 
 

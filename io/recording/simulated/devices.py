@@ -39,12 +39,17 @@ _GARBAGE_BYTES = 40
 class Faults:
     """garbage_hz, cut_hz : mean number per second of random bytes inserted, and of bytes lost.
 
+    lost_byte : the share of readings that lose one byte each.
+    flood_s : when the line carries ``flood_bytes`` random bytes at once, in s from its start.
     unplug_s : when the device is unplugged, in s from its start, for ``away_s`` each time.
     skip : frames for which a frame counter sends no line.
     """
 
     garbage_hz: float = 0.0
     cut_hz: float = 0.0
+    lost_byte: float = 0.0
+    flood_s: tuple[float, ...] = ()
+    flood_bytes: int = 20_000
     unplug_s: tuple[float, ...] = ()
     away_s: float = 1.0
     skip: tuple[int, ...] = ()
@@ -52,7 +57,9 @@ class Faults:
 
 @dataclass(frozen=True)
 class SimulatedDevice:
-    """drift_ppm : how much faster its clock runs than the host's. start_ticks : of its counter.
+    """One device; with the protocol "regex" its lines carry no stamps.
+
+    drift_ppm : how much faster its clock runs than the host's. start_ticks : of its counter.
 
     jitter_s : readings wait in the adapter for a random time up to this, then arrive together.
     """
@@ -114,8 +121,11 @@ def messages(sim: SimulatedDevice, number: Ints) -> list[bytes]:
     if sim.device.protocol == "packets":
         form = "<Ii" if sim.device.kind == "encoder" else "<Ihhh"
         return [_packet(struct.pack(form, t, *map(int, row))) for t, row in zip(stamps, rows)]
-    line = "%d,%.4f,%.4f,%.4f" if sim.device.kind == "accelerometer" else "%d,%d"
-    lines = [(line % (t, *row)).encode() for t, row in zip(stamps, rows)]
+    line = "%.4f,%.4f,%.4f" if sim.device.kind == "accelerometer" else "%d"
+    if sim.device.protocol == "regex":
+        lines = [(line % row).encode() for row in rows]
+    else:
+        lines = [(f"%d,{line}" % (t, *row)).encode() for t, row in zip(stamps, rows)]
     if sim.device.checksum == "xor":
         lines = [text + xor_checksum(text) for text in lines]
     return [text + b"\r\n" for text in lines]
@@ -139,10 +149,14 @@ def damage(
     pieces: list[bytes], faults: Faults, per_reading_s: float, rng: Generator
 ) -> tuple[bytes, list[int]]:
     """The bytes that arrive over a line with faults, and the indices of the damaged pieces."""
-    if not faults.garbage_hz and not faults.cut_hz:
+    if not faults.garbage_hz and not faults.cut_hz and not faults.lost_byte:
         return b"".join(pieces), []
     out, spoilt = list(pieces), set()
     for i, piece in enumerate(pieces):
+        if faults.lost_byte and rng.random() < faults.lost_byte:
+            at = int(rng.integers(0, len(piece)))
+            out[i] = piece = piece[:at] + piece[at + 1 :]
+            spoilt.add(i)
         if rng.random() < faults.garbage_hz * per_reading_s:
             at = int(rng.integers(0, len(piece)))
             noise = rng.integers(0, 256, int(rng.integers(1, _GARBAGE_BYTES)), np.uint8).tobytes()
@@ -179,6 +193,7 @@ class Truth:
     sent: int = 0
     spoilt: list[int] = field(default_factory=list)
     overrun: list[int] = field(default_factory=list)
+    floods: int = 0
     away_s: list[tuple[float, float]] = field(default_factory=list)
 
 
@@ -321,6 +336,11 @@ def made_since_last(
     pieces = messages(sim, number)
     data, spoilt = damage(pieces, sim.faults, 1 / sim.rate_hz, rng)
     truth.spoilt += number[spoilt].tolist()
+    floods = sum(flood_s <= host_s for flood_s in sim.faults.flood_s)
+    if floods > truth.floods:
+        truth.floods = floods
+        truth.spoilt += [until, until - 1]  # the flood ends within the line that follows
+        data += rng.integers(0, 256, sim.faults.flood_bytes, np.uint8).tobytes()
     return number, pieces, data
 
 

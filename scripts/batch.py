@@ -9,7 +9,14 @@ import typer
 
 from telerig.errors import InputError
 from telerig.scripts import options
-from telerig.scripts.console import EXIT_REJECTED, errors_in_words, run_file, say, say_written
+from telerig.scripts.console import (
+    EXIT_REJECTED,
+    errors_in_words,
+    run_file,
+    say,
+    say_written,
+    typed_command,
+)
 
 if TYPE_CHECKING:
     from telerig.estimator.batch.jobs import Job
@@ -81,7 +88,7 @@ def batch(
     with chosen as executor:
         records = run_batch(mine, executor, Journal(out), tell=None if quiet else tell)
     if of == 1:
-        write_batch(records, out, report=report)
+        write_batch(records, out, report=report, again=typed_command())
     say(batch_words(records))
     say_written(out, report and of == 1)
     if any(r["status"] != DONE for r in records):

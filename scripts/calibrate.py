@@ -19,6 +19,7 @@ from telerig.scripts.console import (
     say,
     say_written,
     stopped_by_signals,
+    typed_command,
 )
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.dots.dataset_dots import DatasetDots
     from telerig.io.dataset.dataset import Dataset
+
+
+_SOURCES = ("images", "dots")
 
 
 @errors_in_words()
@@ -99,7 +103,9 @@ def calibrate(
     """
     from telerig.estimator.calibration.calibrate import check_options
     from telerig.estimator.calibration.quality.comparison import compare_calibrations
-    from telerig.estimator.calibration.results_folder import report_beside, write_results
+    from telerig.estimator.calibration.results_folder import report_beside, sources, write_results
+    from telerig.io.dataset.dataset import load_dataset
+    from telerig.io.results.inputs import fingerprints
 
     begun = time.perf_counter()
     settings: dict[str, Any] = {
@@ -115,6 +121,7 @@ def calibrate(
         earlier = None if compare is None else _earlier(compare, dataset)
         if watch:
             data, run = _watched(dataset, source, until_um, poll, settings)
+            used = None
             record |= {"watch": True, "until_um": until_um}
         else:
             if until_um is not None:
@@ -122,12 +129,15 @@ def calibrate(
                     "--until-um goes with --watch", todo="add --watch, or leave it out"
                 )
             begin = None if write_report is None else write_report.begin
-            data, run = _at_once(dataset, source, quiet, settings, begin)
+            data = load_dataset(dataset, source=options.chosen("--from", source, _SOURCES))
+            used = fingerprints(out or data.results / "calibration", sources(data))
+            run = _at_once(data, quiet, settings, begin)
         folder = out or data.results / "calibration"
         change = None if earlier is None else compare_calibrations(earlier, run.calibration)
         write_results(
             data, run, folder, command="calibrate", options=record,
             seconds={"calibrate": time.perf_counter() - begun}, change=change, report=write_report,
+            used=used, again=typed_command(),
         )  # fmt: skip
     say(run.calibration.report())
     if change is not None:
@@ -138,23 +148,20 @@ def calibrate(
 
 
 def _at_once(
-    dataset: Path,
-    source: str | None,
+    data: Dataset,
     quiet: bool,
     settings: dict[str, Any],
     on_dots: Callable[[DatasetDots], object] | None,
-) -> tuple[Dataset, CalibrationRun]:
-    """The dataset as it is now, and its calibration. on_dots : called when dots are detected."""
+) -> CalibrationRun:
+    """Calibrate the dataset as it is now. on_dots : called when dots are detected."""
     from telerig.estimator.calibration.calibrate import check_options, detect, run_calibration
-    from telerig.io.dataset.dataset import load_dataset
 
-    data = load_dataset(dataset, source=options.chosen("--from", source, ("images", "dots")))
     check_options(**settings, cameras=list(data.rig.cameras))
     with progress(quiet) as stage:
         detected = detect(data, stage=stage, pictures=True)
         if detected is not None and on_dots is not None:
             on_dots(detected)
-        return data, run_calibration(data, **settings, stage=stage, detected=detected)
+        return run_calibration(data, **settings, stage=stage, detected=detected)
 
 
 def _earlier(path: Path, dataset: Path) -> Calibration:

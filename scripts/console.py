@@ -5,10 +5,12 @@ from __future__ import annotations
 import _thread
 import errno
 import os
+import shlex
 import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +19,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from telerig.errors import TelerigError
+from telerig.errors import TelerigError, TelerigWarning
 
 EXIT_REJECTED = 1
 EXIT_BAD_INPUT = 2
@@ -39,6 +41,14 @@ def say(text: str) -> None:
     typer.echo(text)
 
 
+def typed_command() -> str:
+    """Return the command line as it was typed; "" when another program called the command."""
+    program = Path(sys.argv[0])
+    if program.stem == "telerig" or program.resolve().parent == Path(__file__).resolve().parent:
+        return shlex.join(["telerig", *sys.argv[1:]])
+    return ""
+
+
 def say_written(folder: Path, report: bool) -> None:
     """Where the results are, or their report if there is one."""
     say(f"written: {folder}" + ("/report.html" if report else ""))
@@ -51,7 +61,9 @@ def errors_in_words() -> Iterator[None]:
     Every command has it as a decorator.
     """
     try:
-        yield
+        with warnings.catch_warnings():
+            _say_warnings()
+            yield
     except TelerigError as error:
         typer.echo(f"telerig: {error}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from error
@@ -142,6 +154,21 @@ def _words_of_system(error: Exception) -> str:
         return ""
     where = f"{error.filename}: " if error.filename else ""
     return f"{where}{error.strerror}\n  -> {_TODO_OF_SYSTEM[error.errno]}"
+
+
+def _say_warnings() -> None:
+    """Print telerig's warnings as messages, each once, and leave other warnings as they are."""
+    python_shows, said = warnings.showwarning, set()
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if not issubclass(category, TelerigWarning):
+            python_shows(message, category, *place, **more)
+        elif str(message) not in said:
+            said.add(str(message))
+            typer.echo(f"telerig: warning: {message}", err=True)
+
+    warnings.simplefilter("always", TelerigWarning)
+    warnings.showwarning = show
 
 
 def _leave_closed_pipe() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, progress, run_file, say
+from telerig.scripts.console import errors_in_words, progress, run_file, say, typed_command
 
 
 @errors_in_words()
@@ -20,14 +20,15 @@ def detect(
     from telerig.estimator.calibration.results_folder import write_detections
     from telerig.estimator.dots.dataset_dots import detect_dataset
     from telerig.io.dataset.dataset import load_dataset
-    from telerig.io.files.atomic import atomic_folder
     from telerig.io.files.csv_table import write_table
+    from telerig.io.results.manifest import replaced_results
 
     data = load_dataset(dataset, source="images")
     with progress(quiet) as stage:
         found = detect_dataset(data, progress=lambda i, n: stage("images", i, n), overlays=True)
     folder = out or data.results / "calibration"
-    with atomic_folder(folder) as staged:
+    again = typed_command() or f"telerig detect {data.path}"
+    with replaced_results(folder, "detect", again=again, inputs={}) as staged:
         write_table(found.dots, staged / "dots.csv")
         write_detections(found, staged)
     for image in found.images:

@@ -49,6 +49,13 @@ def export(
     full_cubic: Annotated[
         bool, typer.Option("--full-cubic", help="For soloff: add the term z^3, 20 terms in all.")
     ] = False,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Export although: stale (the inputs have changed since the results were made). "
+            "Can be given several times."
+        ),
+    ] = None,
     first_pixel: Annotated[
         float,
         typer.Option(
@@ -74,7 +81,7 @@ def export(
         box = volume_of([bounds[0:2], bounds[2:4], bounds[4:6]])
     for line in export_results(
         source, to, run=run, calibration=calibration, out=out, volume=box, full_cubic=full_cubic,
-        first_pixel=first_pixel,
+        first_pixel=first_pixel, accept=accept or (),
     ):  # fmt: skip
         say(line)
 

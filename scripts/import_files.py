@@ -10,7 +10,7 @@ import typer
 from telerig.errors import InputError
 from telerig.io.exchange.formats import CAMERA_IMPORTERS, recording_words
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, say
+from telerig.scripts.console import errors_in_words, say, typed_command
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -157,6 +157,8 @@ def _import_cameras(
     from telerig.estimator.calibration.result.calibration import calibration_from_cameras
     from telerig.io.exchange.importing.pinhole import nominal_toml
     from telerig.io.files.atomic import write_text_atomic
+    from telerig.io.results.inputs import fingerprints
+    from telerig.io.results.manifest import replaced_results
     from telerig.io.rig_file.description import MOST_CAMERAS
 
     importer = CAMERA_IMPORTERS[name]
@@ -165,9 +167,11 @@ def _import_cameras(
     calibration = calibration_from_cameras(
         cameras, name=importer.program, sigma_px=sigma_px, notes=[source, *notes]
     )
-    calibration.save(out)
-    if len(cameras) <= MOST_CAMERAS:
-        write_text_atomic(out / "nominal.toml", nominal_toml(cameras))
+    again, inputs = typed_command() or f"telerig import {name}", fingerprints(out, files)
+    with replaced_results(out, "calibrate", again=again, inputs=inputs) as staged:
+        calibration.write_files(staged)
+        if len(cameras) <= MOST_CAMERAS:
+            write_text_atomic(staged / "nominal.toml", nominal_toml(cameras))
     for camera in cameras:
         say(
             f"{camera.name}: {camera['scale_px_per_mm']:.5g} px/mm at a working distance of "

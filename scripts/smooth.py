@@ -8,7 +8,14 @@ from typing import Annotated
 import typer
 
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, progress, run_file, say, say_written
+from telerig.scripts.console import (
+    errors_in_words,
+    progress,
+    run_file,
+    say,
+    say_written,
+    typed_command,
+)
 
 
 @errors_in_words()
@@ -60,7 +67,7 @@ def smooth(
     with progress(quiet) as stage:
         found = smooth_run(
             data, calibrated, tracks or folder, folder, model=model, inputs=files,
-            refine_rig=refine_rig, report=report, stage=stage,
+            refine_rig=refine_rig, report=report, stage=stage, again=typed_command(),
         )  # fmt: skip
     say(smoothing_words(found))
     say_written(folder, report)

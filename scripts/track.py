@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from telerig.scripts import options
-from telerig.scripts.console import errors_in_words, progress, run_file, say, say_written
+from telerig.scripts.console import (
+    errors_in_words,
+    progress,
+    run_file,
+    say,
+    say_written,
+    typed_command,
+)
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -57,6 +64,7 @@ def track(
         "command": "track",
         "options": {"from": source, "min_diameter_px": min_diameter},
         "inputs": files,
+        "again": typed_command(),
     }
     with progress(quiet) as stage:
         summary = write_tracking(

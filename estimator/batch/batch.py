@@ -32,6 +32,7 @@ from telerig.estimator.batch.jobs import Job, check_run_name, fingerprint
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
+from telerig.io.results.manifest import is_whole, replaced_results
 
 Stage = Callable[[str, int, int], None]
 
@@ -154,18 +155,20 @@ def failure(status: str, words: str) -> dict[str, Any]:
 def _calibrate(job: Job, stage: Stage | None) -> dict[str, Any]:
     """Calibrate a dataset and write its results."""
     from telerig.estimator.calibration.calibrate import run_calibration
-    from telerig.estimator.calibration.results_folder import write_report, write_results
+    from telerig.estimator.calibration.results_folder import sources, write_report, write_results
     from telerig.io.dataset.dataset import load_dataset
+    from telerig.io.results.inputs import fingerprints
 
     begun = time.perf_counter()
     data = load_dataset(Path(job.dataset))
+    used = fingerprints(job.results, sources(data))
     run = run_calibration(data, model=job.model, medium=job.medium, stage=stage, pictures=True)
     found = run.calibration
     write_results(
         data, run, job.results, command="run",
         options={"model": job.model, "medium": job.medium},
         seconds={"calibrate": time.perf_counter() - begun},
-        report=write_report if job.report else None,
+        report=write_report if job.report else None, used=used, again=job.command,
     )  # fmt: skip
     figures = {
         "verdict": found.verdict["status"],
@@ -191,6 +194,7 @@ def _track(job: Job, stage: Stage | None) -> dict[str, Any]:
     options = TrackOptions()
     record = {
         "command": "run", "options": {"min_diameter_px": options.min_diameter_px}, "inputs": files,
+        "again": job.command,
     }  # fmt: skip
     summary = write_tracking(
         load_run(run), calibration, job.results, options=options, record=record,
@@ -212,7 +216,7 @@ def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
     calibration, files = calibration_for(run, [Path(job.calibration)] if job.calibration else None)
     found = smooth_run(
         load_run(run), calibration, job.results, job.results, inputs=files, report=job.report,
-        stage=stage,
+        stage=stage, again=job.command,
     )  # fmt: skip
     table = found.trajectories
     figures: dict[str, Any] = {
@@ -260,7 +264,7 @@ class Journal:
         """Return the record of the job if it was done with the same inputs, options and version,
         else None."""
         record = self.read(job)
-        if record is None or record.get("status") != DONE or not job.result.is_file():
+        if record is None or record.get("status") != DONE or not is_whole(job.result):
             return None
         return record if record.get("fingerprint") == fingerprint(job) else None
 
@@ -309,18 +313,22 @@ def _first_line(words: object) -> str:
 
 
 def write_batch(
-    records: Sequence[Mapping[str, Any]], folder: Path, *, report: bool = True
+    records: Sequence[Mapping[str, Any]], folder: Path, *, report: bool = True, again: str = ""
 ) -> pd.DataFrame:
-    """Write batch.csv, batch.json and report.html to ``folder`` and return the table of
-    `table_of`."""
-    table = table_of(records)
-    write_table(table, folder / "batch.csv")
-    content = {"schema": 1, "kind": "telerig batch", "jobs": list(records)}
-    write_json_atomic(folder / "batch.json", content)
-    if report:
-        from telerig.io.report.batch.report import write_batch_report
+    """Write batch.csv, batch.json and report.html to ``folder`` and return the table of `table_of`.
 
-        write_batch_report(folder)
+    again : the command line that makes them again; "" for `telerig batch`.
+    """
+    table = table_of(records)
+    name = Path(folder).resolve().name
+    content = {"schema": 1, "kind": "telerig batch", "name": name, "jobs": list(records)}
+    with replaced_results(folder, "batch", again=again or "telerig batch", inputs={}) as staged:
+        write_table(table, staged / "batch.csv")
+        write_json_atomic(staged / "batch.json", content)
+        if report:
+            from telerig.io.report.batch.report import write_batch_report
+
+            write_batch_report(staged)
     return table
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -64,6 +65,16 @@ class Job:
     def result(self) -> Path:
         """The file that exists when the job is done."""
         return self.results / MAIN_RESULT[self.kind]
+
+    @property
+    def command(self) -> str:
+        """The command line that does the same as the job."""
+        words = ["telerig", self.kind, self.where]
+        if self.calibration:
+            words += ["--calibration", self.calibration]
+        if self.kind == "calibrate":
+            words += [f"--model={self.model}", f"--medium={self.medium}"]
+        return shlex.join(words if self.report else [*words, "--no-report"])
 
     def as_json(self) -> str:
         """Return the job as one line of JSON."""

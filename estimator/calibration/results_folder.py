@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from telerig.estimator.calibration.calibrate import CalibrationRun
-from telerig.io.files.atomic import atomic_folder, plain, write_json_atomic
+from telerig.io.files.atomic import plain, write_json_atomic
 from telerig.io.machine.parallel import Assistant, assistant
 from telerig.io.results.calibration import ComparisonFile
+from telerig.io.results.inputs import Input, Source, fingerprints
+from telerig.io.results.manifest import replaced_results
 from telerig.io.results.record import run_record
 
 if TYPE_CHECKING:
@@ -30,6 +33,24 @@ def input_files(dataset: Dataset) -> list[Path]:
     if dataset.source == "dots":
         return [*files, dataset.path / "calibration" / "dots.csv"]
     return files + [path for view in dataset.views for path in view.image_paths.values()]
+
+
+_RIG_TABLES = ("cameras", "stereo", "target", "stage", "walls")
+"""The tables of rig.toml on which a calibration depends."""
+
+
+def sources(dataset: Dataset) -> list[Path | Source]:
+    """Return the inputs whose change makes the calibration of a dataset stale."""
+    views, stops = dataset.path / "calibration", dataset.path / "stage_axis"
+    cameras = tuple(dataset.rig.cameras)
+    from_table = dataset.source == "dots"
+    return [
+        Source(dataset.path / "rig.toml", tables=_RIG_TABLES),
+        views / "dots.csv" if from_table else Source(views, cameras=cameras),
+        stops / "positions.csv",
+        stops / "dots.csv",
+        Source(stops, cameras=cameras),
+    ]
 
 
 def write_report(folder: Path, dot: list[Picture] | None = None) -> Path:
@@ -102,6 +123,8 @@ def write_results(
     seconds: Mapping[str, float],
     change: RigComparison | None = None,
     report: Callable[[Path], object] | None = write_report,
+    used: Mapping[str, Input] | None = None,
+    again: str = "",
 ) -> Path:
     """Write the results folder of a calibration; `docs/files.md` lists its files.
 
@@ -113,12 +136,16 @@ def write_results(
         took, by name, for `run.json`.
     change : comparison with an earlier calibration, for `comparison.json`; None writes none.
     report : function that writes the report of a folder; None writes no report.
+    used : the fingerprints of `sources` from before the dataset was read; None takes them now.
+    again : the command line that makes the folder again; "" for `telerig calibrate` of the dataset.
 
     Returns the path at which the report is, if there is one.
     """
     record = run_record(command, dataset.path, input_files(dataset), options, seconds)
-    with atomic_folder(folder) as staged:
-        run.calibration.save(staged)
+    again = again or f"telerig calibrate {shlex.quote(str(dataset.path))}"
+    inputs = fingerprints(folder, sources(dataset)) if used is None else used
+    with replaced_results(folder, "calibrate", again=again, inputs=inputs) as staged:
+        run.calibration.write_files(staged)
         write_json_atomic(staged / "run.json", record)
         if change is not None:
             compared = {"earlier": options.get("compare"), **change.as_dict()}

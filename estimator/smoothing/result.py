@@ -22,6 +22,7 @@ from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
 from telerig.factors.bubble_motion import BubbleModel, bubble_processes
 from telerig.factors.state_space import discretise, distinct_steps
+from telerig.io.results.manifest import replaced_results
 from telerig.io.results.smoothing import SmoothingFile
 
 if TYPE_CHECKING:
@@ -49,10 +50,18 @@ class Smoothing:
     solution: Solution = field(repr=False)
 
     def save(self, folder: str | Path) -> None:
-        """Write trajectories.csv, shake.csv, smoothing.json and results.h5 (HDF5) into a folder."""
+        """Write trajectories.csv, shake.csv, smoothing.json and results.h5 (HDF5) into a folder.
+
+        All files appear together.
+        """
+        place = Path(folder)
+        with replaced_results(place, "smooth", again="Smoothing.save", inputs={}) as staged:
+            self.write_files(staged)
+
+    def write_files(self, out: Path) -> None:
+        """Write the files of `save` into an existing folder, one after the other."""
         from telerig.io.files.csv_table import write_table
 
-        out = Path(folder)
         write_table(self.trajectories, out / "trajectories.csv")
         write_table(self.shake, out / "shake.csv")
         file = out / "smoothing.json"

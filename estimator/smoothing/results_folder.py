@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -16,8 +17,11 @@ from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.tracking.detect_run import read_batch
 from telerig.estimator.tracking.tracks import Tracks, load_tracks
-from telerig.io.files.atomic import atomic_folder, write_json_atomic
+from telerig.io.files.atomic import write_json_atomic
+from telerig.io.results.inputs import Source, fingerprints
+from telerig.io.results.manifest import reading, replaced_results
 from telerig.io.results.record import RunFile, run_record
+from telerig.io.results.stale import stale
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
@@ -26,6 +30,10 @@ if TYPE_CHECKING:
 
 Stage = Callable[[str, int, int], None]
 
+_RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "accelerometers")
+"""The tables of rig.toml on which smoothing depends."""
+_USED = ("tracks.csv", "detections.csv", "tracking.json")
+"""The files of a tracked run on which smoothing depends."""
 _TRACKED = ("tracks.csv", "detections.csv", "events.csv", "references.csv", "tracking.json")
 
 
@@ -40,11 +48,14 @@ def smooth_run(
     inputs: Sequence[Path] = (),
     report: bool = True,
     stage: Stage | None = None,
+    again: str = "",
 ) -> Smoothing:
     """Smooth and write trajectories.csv, shake.csv, smoothing.json, results.h5, run.json, report.
 
     tracks : `tracks.csv`, or the folder that `telerig track` wrote.
     refine_rig : see `telerig.smooth`.
+    inputs : the files of the calibration.
+    again : the command line that makes the files again; "" for `telerig smooth` of the run.
     Files appear together at the end. Raises InputError when there are no tracks, or
     not all of their cameras are in the calibration.
     """
@@ -53,7 +64,12 @@ def smooth_run(
     _check_cameras(followed, calibration)
     calibration = pair_of_run(calibration, run.cameras)
     run, marks = with_followed_references(run, source.parent)
+    of_tracks = [source.parent / name for name in _USED] if tracks.is_dir() else [source]
+    used = [*of_tracks, *marks, *inputs]
+    fingerprint = fingerprints(folder, [*_sources(run), *used])
+    tracked = RunFile.read_if_there(source.parent / "run.json")
     warnings = [
+        *dict.fromkeys(s for file in used for s in stale(file.parent, [file.name])),
         *window_warnings(run.rig, calibration),
         *([] if refine_rig else _moved(followed)),
         *check_sensors(run, tracks=followed, calibration=calibration),
@@ -69,16 +85,25 @@ def smooth_run(
         {"model": model, "refine_rig": refine_rig},
         {"smooth": time.perf_counter() - begun},
     )  # fmt: skip
-    tracked = source.parent / "run.json"
-    if tracked.is_file():
-        before = RunFile.read(tracked)
-        record["tracks"] = before.tracks or before.content()
-    with atomic_folder(folder) as staged:
-        found.save(staged)
+    if tracked.content():
+        record["tracks"] = tracked.tracks or tracked.content()
+    again = again or f"telerig smooth {shlex.quote(str(run.path))}"
+    with replaced_results(folder, "smooth", again=again, inputs=fingerprint) as staged:
+        found.write_files(staged)
         write_json_atomic(staged / "run.json", record)
         if report:
             _report(staged, folder, source.parent)
     return found
+
+
+def _sources(run: RunData) -> list[Path | Source]:
+    """The inputs of the run's folder whose change makes its smoothing stale."""
+    rig = run.path.parent.parent / "rig.toml"
+    names = ("frames.csv", "run.toml", "stage.csv", "accelerometer.csv", "references.csv")
+    return [
+        *([] if run.rig is None else [Source(rig, tables=_RIG_TABLES)]),
+        *(run.path / name for name in names),
+    ]
 
 
 def _check_cameras(tracks: Tracks | Any, calibration: Calibration) -> None:
@@ -115,7 +140,8 @@ def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:
         return load_tracks(path), path / "tracks.csv"
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), todo="give tracks.csv")
-    return read_batch(path), path
+    with reading(path.parent, [path.name]):
+        return read_batch(path), path
 
 
 def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list[Path]]:
@@ -127,7 +153,8 @@ def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list
     from telerig.io.dataset.tables import read_references_csv
 
     sizes = dict(run.image_sizes_px)
-    table = read_references_csv(file, list(run.cameras), sizes, run.frame_count)
+    with reading(tracked, [file.name]):
+        table = read_references_csv(file, list(run.cameras), sizes, run.frame_count)
     return replace(run, references=table), [file]
 
 

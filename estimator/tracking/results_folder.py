@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import heapq
+import shlex
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -28,10 +29,13 @@ from telerig.estimator.tracking.track import (
     tracking_stream,
 )
 from telerig.estimator.tracking.tracks import events_table
-from telerig.io.files.atomic import atomic_folder, write_json_atomic
+from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import ordered_map, quick_workers
+from telerig.io.results.inputs import Source, fingerprints
+from telerig.io.results.manifest import replaced_results
 from telerig.io.results.record import run_record
+from telerig.io.results.stale import stale
 from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:
@@ -40,6 +44,8 @@ if TYPE_CHECKING:
 
 WORST_FRAMES = 8
 _OUTLINE_POINTS = 72
+_RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking")
+"""The tables of rig.toml on which tracking depends."""
 _GREEN, _ORANGE = (40, 200, 70), (255, 140, 40)
 
 
@@ -91,7 +97,8 @@ def write_tracking(
     Detections made before an interruption are read from ``.<folder>.work`` beside the folder. All
     files of results appear together at the end.
 
-    record : command, inputs, options and times for run.json.
+    record : command, inputs, options and times for run.json; ``again``, the command line that makes
+        the folder again.
     report : whether the HTML report is written.
     stage : function that is called with the name of the step, the number done and the total; or
         None.
@@ -102,11 +109,14 @@ def write_tracking(
     if report and run.detections is not None:
         _check_ids(run.detections)
     work = folder.parent / f".{folder.name}.work"
-    with atomic_folder(folder) as staged:
+    again = str(record.get("again") or f"telerig track {shlex.quote(str(run.path))}")
+    inputs = fingerprints(folder, [*_sources(run), *record.get("inputs", [])])
+    with replaced_results(folder, "track", again=again, inputs=inputs) as staged:
         stream = tracking_stream(run, calibration, work, options, stage)
         worst = _write_rows(stream, staged)
         summary = stream.summary()
         summary["worst_frames"] = worst.frames()
+        summary["warnings"] = [*_stale_inputs(record.get("inputs", [])), *summary["warnings"]]
         TrackingFile.of(summary, folder / "tracking.json").write(staged / "tracking.json")
         write_table(events_table(stream.events), staged / "events.csv")
         table = stream.marks.table if stream.marks is not None else None
@@ -125,10 +135,23 @@ def write_tracking(
             from telerig.io.report.run.report import write_track_report
 
             write_track_report(staged)
-    if table is None:
-        (folder / "references.csv").unlink(missing_ok=True)
     shutil.rmtree(work, ignore_errors=True)
     return summary
+
+
+def _sources(run: RunData) -> list[Path | Source]:
+    """The inputs whose change makes the tracks of a run stale, besides the calibration."""
+    rig = run.path.parent.parent / "rig.toml"
+    images = Source(run.path, cameras=run.cameras)
+    return [
+        *([] if run.rig is None else [Source(rig, tables=_RIG_TABLES)]),
+        *(run.path / name for name in ("frames.csv", "run.toml", "stage.csv", "references.csv")),
+        run.path / "detections.csv" if run.detections is not None else images,
+    ]
+
+
+def _stale_inputs(files: Sequence[Path]) -> list[str]:
+    return [sentence for file in files for sentence in stale(file.parent, [file.name])]
 
 
 def _check_ids(detections: pd.DataFrame) -> None:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from telerig.errors import InputError
 from telerig.estimator.tracking.detect_run import read_batch
+from telerig.io.results.manifest import reading, replaced_results
 from telerig.io.results.tracking import TrackingFile
 
 if TYPE_CHECKING:
@@ -48,19 +49,19 @@ class Tracks:
     def save(self, folder: str | Path) -> None:
         """Write detections.csv, tracks.csv, events.csv and tracking.json into a folder.
 
-        references.csv is written too if the tracks have references.
+        references.csv is written too if the tracks have references. All files appear together.
         """
         from telerig.io.files.csv_table import write_table
 
-        out = Path(folder)
-        for name in ("detections", "tracks", "events"):
-            write_table(
-                self.table if name == "tracks" else getattr(self, name), out / f"{name}.csv"
-            )
-        if self.references is not None:
-            write_table(self.references, out / "references.csv")
-        file = out / "tracking.json"
-        TrackingFile.of(self.summary, file).write(file)
+        place = Path(folder)
+        record = TrackingFile.of(self.summary, place / "tracking.json")
+        with replaced_results(place, "track", again="Tracks.save", inputs={}) as out:
+            for name in ("detections", "tracks", "events"):
+                table = self.table if name == "tracks" else getattr(self, name)
+                write_table(table, out / f"{name}.csv")
+            if self.references is not None:
+                write_table(self.references, out / "references.csv")
+            record.write(out / "tracking.json")
 
 
 def events_table(events: Sequence[TrackEvent]) -> pd.DataFrame:
@@ -83,10 +84,11 @@ def load_tracks(folder: str | Path) -> Tracks:
     for file in files:
         if not file.is_file():
             raise InputError(f"there is no {file.name}", where=str(place), todo="run telerig track")
-    summary = TrackingFile.read(files[3]).content()
-    detections, table, events = (read_batch(file) for file in files[:3])
     marks = place / "references.csv"
-    references = read_batch(marks) if marks.is_file() else None
+    with reading(place, [file.name for file in (*files, marks)]):
+        summary = TrackingFile.read(files[3]).content()
+        detections, table, events = (read_batch(file) for file in files[:3])
+        references = read_batch(marks) if marks.is_file() else None
     return Tracks(
         str(summary.get("run", place.name)), detections, table, events, summary, references
     )

@@ -6,7 +6,7 @@ export`, `telerig import` and their help read these tables.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -54,13 +54,20 @@ class Format:
 
 
 CAMERA_EXPORTS = {
-    "halcon": Format("HALCON", "export.halcon:export_halcon", "HDevelop lines and .dat files"),
-    "opencv": Format("OpenCV", "export.opencv:export_opencv", "3 x 4 matrices in YAML", ".yml"),
+    "halcon": Format(
+        "HALCON",
+        "export.halcon:export_halcon",
+        "HDevelop lines and .dat files",
+        options=("remarks",),
+    ),
+    "opencv": Format(
+        "OpenCV", "export.opencv:export_opencv", "3 x 4 matrices in YAML", ".yml", ("remarks",)
+    ),
     "soloff": Format(
         "Soloff",
         "export.soloff:export_soloff",
         "polynomials for PIV programs",
-        options=("full_cubic", "first_pixel"),
+        options=("full_cubic", "first_pixel", "remarks"),
     ),
 }
 RUN_EXPORTS = {
@@ -125,6 +132,7 @@ def export_results(
     run: str | None = None,
     calibration: Path | None = None,
     out: Path | None = None,
+    accept: Collection[str] = (),
     **options: Any,
 ) -> list[str]:
     """Write cameras or a run in the format ``to``.
@@ -134,9 +142,11 @@ def export_results(
     run : the run's name; None takes the only one with results.
     calibration : a calibration that is used in place of the dataset's own; None uses that one.
     out : the file or folder that is written; None writes into the dataset's results/export.
+    accept : ("stale",) also exports results whose inputs have changed since they were made.
     options : as for `export_cameras`.
     Returns lines of text that say what was written and where.
-    Raises InputError for an unknown format, and for results that are missing or cannot be used.
+    Raises InputError for an unknown format, and for results that are missing, stale or cannot be
+    used.
     """
     from telerig.io.exchange.export.run_results import (
         cameras_of,
@@ -148,24 +158,34 @@ def export_results(
     known = CAMERA_EXPORTS | RUN_EXPORTS
     if to not in known:
         raise InputError(f"--to {to}", todo=f"use one of: {', '.join(known)}")
-    cameras = cameras_of(source, calibration, required=to in CAMERA_EXPORTS)
-    results = None if to in CAMERA_EXPORTS else read_results(run_folder(source, run))
+    rig = cameras_of(source, calibration, required=to in CAMERA_EXPORTS, accept=accept)
+    results = None
+    if to in RUN_EXPORTS:
+        results = read_results(run_folder(source, run), accept=accept)
     name = to if results is None else results.name
     place = out or results_root(source) / "export" / f"{name}{known[to].suffix}"
     if results is None:
-        lines = export_cameras(cameras, to, place, **options)
+        lines = export_cameras(rig.cameras, to, place, remarks=rig.accepted, **options)
     else:
-        lines = export_run(results, to, place, cameras)
-    return [*lines, f"written: {place}"]
+        lines = export_run(results, to, place, rig.cameras)
+    accepted = rig.accepted if results is None else results.accepted
+    return [*lines, *(f"accepted: {words}" for words in accepted), f"written: {place}"]
 
 
 def export_cameras(
-    cameras: Sequence[Camera], to: str, out: Path, *, volume: Volume | None = None, **options: Any
+    cameras: Sequence[Camera],
+    to: str,
+    out: Path,
+    *,
+    volume: Volume | None = None,
+    remarks: Sequence[str] = (),
+    **options: Any,
 ) -> list[str]:
     """Write the cameras in one of the formats `CAMERA_EXPORTS`.
 
     out : the file or folder that is written.
     volume : where errors are measured and polynomials fitted; None takes `working_volume`.
+    remarks : sentences that the file keeps as comments.
     options : those that the format takes.
     Returns lines of text with the volume and each camera's error.
     Raises InputError for a volume that the cameras do not see, and when ``out`` cannot be written.
@@ -173,7 +193,10 @@ def export_cameras(
     from telerig.io.exchange.export.volume import working_volume
 
     box = volume or working_volume(cameras)
-    lines = [f"working volume: {box.words()}", *CAMERA_EXPORTS[to](cameras, out, box, **options)]
+    lines = [
+        f"working volume: {box.words()}",
+        *CAMERA_EXPORTS[to](cameras, out, box, remarks=remarks, **options),
+    ]
     walled = ", ".join(camera.name for camera in cameras if camera.wall is not None)
     if walled and to != "halcon":
         lines.append(

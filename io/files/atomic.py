@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
+import platform
+import re
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +26,10 @@ from telerig.errors import InputError
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _WRITE_ERRORS = _FULL | {errno.EROFS, errno.EIO}
 """Errors of the system that only writing can cause."""
+_LEFTOVER = re.compile(
+    r"\..+?\.(?:(?P<machine>[0-9a-f]{6})-)?(?P<pid>[0-9]+)-[0-9a-f]{8}\.part(?:\..*)?", re.DOTALL
+)
+_OLD_S = 7 * 24 * 3600.0
 
 
 @contextmanager
@@ -39,12 +48,13 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             where=str(final),
             todo="rename the folder or choose another file name",
         )
-    _make_parent(final)
+    make_parent(final)
+    _remove_leftovers_once(final.parent.absolute())
     temporary = _beside(final, final.suffix)
     try:
         with _write_errors_in_words(final, temporary):
             yield temporary
-        _rename(temporary, final)
+        rename(temporary, final)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -53,31 +63,42 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield an empty temporary folder; its files are renamed into ``folder`` at the very end.
 
-    Until then ``folder`` is as before, so an interrupted command leaves the old results unchanged.
+    Until then ``folder`` is as before, so an interrupted command leaves the old files unchanged.
     Files that are already in ``folder`` and are not written again stay.
     Raises InputError when the place cannot be written, also when the disk is full or the temporary
     folder disappears meanwhile.
     """
     final = Path(folder)
+    with staged_folder(final) as temporary:
+        yield temporary
+        for staged in sorted(p for p in temporary.rglob("*") if p.is_file()):
+            target = final / staged.relative_to(temporary)
+            make_parent(target)
+            rename(staged, target)
+
+
+@contextmanager
+def staged_folder(final: Path) -> Iterator[Path]:
+    """Yield an empty temporary folder beside ``final``, and remove it at the end.
+
+    Raises InputError when the place cannot be written.
+    """
     if final.exists() and not final.is_dir():
         raise InputError(
             "is a file, a folder of results must be written there",
             where=str(final),
             todo="choose another --out",
         )
-    _make_parent(final)
+    make_parent(final)
+    remove_leftovers(final.parent)
     temporary = _beside(final, "")
     try:
         try:
             temporary.mkdir()
         except OSError as error:
-            raise _unwritable(temporary, error) from error
+            raise unwritable(temporary, error) from error
         with _write_errors_in_words(final, temporary):
             yield temporary
-        for staged in sorted(p for p in temporary.rglob("*") if p.is_file()):
-            target = final / staged.relative_to(temporary)
-            _make_parent(target)
-            _rename(staged, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -126,21 +147,67 @@ def plain(content: Any) -> Any:
 
 
 def _beside(final: Path, suffix: str) -> Path:
-    return final.with_name(f".{final.name}.{os.getpid()}-{secrets.token_hex(4)}.part{suffix}")
+    mark = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    return final.with_name(f".{final.name}.{mark}.part{suffix}")
 
 
-def _make_parent(path: Path) -> None:
+@cache
+def _machine() -> str:
+    """Return a short mark of this computer: a folder may be shared by several."""
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files and folders of commands that were killed.
+
+    They are removed if their process on this computer has ended. Those of other computers, whose
+    processes cannot be seen, are removed after a week.
+    """
+    try:
+        entries = [entry for entry in folder.iterdir() if entry.name.startswith(".")]
+    except OSError:
+        return
+    for entry in entries:
+        mark = _LEFTOVER.fullmatch(entry.name)
+        if mark is None or not _is_dead(entry, mark["machine"], int(mark["pid"])):
+            continue
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                entry.unlink()
+
+
+_remove_leftovers_once = cache(remove_leftovers)
+"""For single files: a folder that gets thousands of them is listed once per process."""
+
+
+def _is_dead(entry: Path, machine: str | None, pid: int) -> bool:
+    try:
+        if machine != _machine():
+            return time.time() - entry.stat().st_mtime > _OLD_S
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def make_parent(path: Path) -> None:
+    """Make the folder in which ``path`` lies. Raises InputError when that fails."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(path.parent, error) from error
+        raise unwritable(path.parent, error) from error
 
 
-def _rename(source: Path, target: Path) -> None:
+def rename(source: Path, target: Path) -> None:
+    """Rename a file, over an existing one. Raises InputError when that fails."""
     try:
         os.replace(source, target)  # noqa: PTH105
     except OSError as error:
-        raise _unwritable(target, error) from error
+        raise unwritable(target, error) from error
 
 
 @contextmanager
@@ -160,11 +227,12 @@ def _write_errors_in_words(final: Path, temporary: Path) -> Iterator[None]:
         gone = not temporary.parent.is_dir()
         named = str(error.filename or "").startswith(str(temporary))
         if gone or named or error.errno in _WRITE_ERRORS:
-            raise _unwritable(final, error) from error
+            raise unwritable(final, error) from error
         raise
 
 
-def _unwritable(path: Path, error: OSError) -> InputError:
+def unwritable(path: Path, error: OSError) -> InputError:
+    """Return the error that says that ``path`` cannot be written, why, and what to do."""
     if error.errno in _FULL:
         todo = "make room on the disk, then run the command again"
     elif error.errno == errno.ENOENT or error.errno is None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from telerig.errors import InputError
+from telerig.io.results.manifest import replaced_results
 
 Kind = Literal["calibration", "run", "batch"]
 
@@ -52,6 +54,14 @@ def remake_report(results: ResultsFolder, out: Path | None = None) -> Path:
 
     Raises InputError for results that cannot be read.
     """
+    if out is not None:
+        return _write_page(results, out)
+    again = f"telerig report {shlex.quote(str(results.folder))}"
+    with replaced_results(results.folder, "report", again=again, inputs={}) as staged:
+        return results.folder / _write_page(results, staged).name
+
+
+def _write_page(results: ResultsFolder, out: Path) -> Path:
     if results.kind == "calibration":
         from telerig.io.report.calibration.report import write_calibration_report
 

@@ -7,7 +7,6 @@ with a stated shape.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 from collections.abc import Callable, Iterable, Mapping
@@ -23,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidat
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import plain, write_json_atomic
+from telerig.io.files.hashing import hashed
 
 _LONGEST_MESSAGE = 400
 
@@ -184,12 +184,6 @@ class RunFile(Record):
     tracks: dict[str, Any] = Field(default_factory=dict)
 
 
-def sha256(path: Path) -> str:
-    """Read a file and return the SHA-256 hash of its bytes, in hexadecimal digits."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 def run_record(
     command: str,
     dataset: Path,
@@ -212,7 +206,7 @@ def run_record(
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": {name: round(float(s), 3) for name, s in seconds.items()},
         "options": dict(options),
-        "inputs_sha256": {_relative(p, dataset): sha256(p) for p in inputs},
+        "inputs_sha256": {_relative(p, dataset): hashed(p).sha256 for p in inputs},
     }
 
 

@@ -44,6 +44,10 @@ class GeometryError(TelerigError):
     """A point lies outside the region in which a camera model can be evaluated or inverted."""
 
 
+class TelerigWarning(UserWarning):
+    """Something is used although it may not be what the user expects."""
+
+
 def nearest(word: str, known: list[str]) -> str | None:
     """Return the name in ``known`` that is spelled most like ``word``, or None if no name is
     similar.

@@ -25,6 +25,7 @@ from telerig.io.results.calibration import (
     read_joint_covariance,
     write_joint_covariance,
 )
+from telerig.io.results.manifest import reading, replaced_results
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose
@@ -344,21 +345,31 @@ class Calibration:
             file is written, and `covariance.npz` beside it.
 
         What is not known (``joint_names`` empty, ``dots`` or ``residuals`` None) is not written;
-        an old `covariance.npz` is then deleted.
+        an old `covariance.npz` is then deleted. All files of a folder appear together.
         """
         place = Path(path)
-        alone = place.suffix == ".json"
-        folder = place.parent if alone else place
-        folder.mkdir(parents=True, exist_ok=True)
-        self.record().write(place if alone else folder / "calibration.json")
+        if place.suffix == ".json":
+            self.record().write(place)
+            self._write_covariance(place.parent)
+            return
+        again = "Calibration.save"
+        with replaced_results(place, "calibrate", again=again, inputs={}) as staged:
+            self.write_files(staged)
+
+    def write_files(self, folder: Path) -> None:
+        """Write the files of `save` into an existing folder, one after the other."""
+        self.record().write(folder / "calibration.json")
+        self._write_covariance(folder)
+        for name, table in (("dots.csv", self.dots), ("residuals.csv", self.residuals)):
+            if table is not None:
+                write_table(table, folder / name)
+
+    def _write_covariance(self, folder: Path) -> None:
         if self.joint_names:
             with atomic_path(folder / "covariance.npz") as temporary:
                 write_joint_covariance(temporary, self.joint_names, self.joint_covariance)
         else:
             (folder / "covariance.npz").unlink(missing_ok=True)
-        for name, table in (("dots.csv", self.dots), ("residuals.csv", self.residuals)):
-            if table is not None and not alone:
-                write_table(table, folder / name)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -372,10 +383,11 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     place = Path(path)
     file = place / "calibration.json" if place.is_dir() else place
-    record = CalibrationFile.read(file)
-    if record.covariance is None:
-        raise InputError("has no covariance", where=str(file), todo=CalibrationFile.AGAIN)
-    names, joint = read_joint_covariance(file.parent / "covariance.npz")
+    with reading(file.parent, (file.name, "covariance.npz")):
+        record = CalibrationFile.read(file)
+        if record.covariance is None:
+            raise InputError("has no covariance", where=str(file), todo=CalibrationFile.AGAIN)
+        names, joint = read_joint_covariance(file.parent / "covariance.npz")
     rig = record.covariance.matrix
     if names and not np.allclose(joint[: len(rig), : len(rig)], rig, rtol=1e-9, atol=0):
         raise InputError(

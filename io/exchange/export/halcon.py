@@ -92,15 +92,17 @@ class HalconCamera:
         return _pixel_from_camera(points, self.parameters).reshape(*np.shape(points_mm)[:-1], 2)
 
 
-def export_halcon(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[str]:
+def export_halcon(
+    cameras: Sequence[Camera], out: Path, volume: Volume, *, remarks: Sequence[str] = ()
+) -> list[str]:
     """Write the HALCON files of all cameras into the folder ``out``.
 
-    volume : the box over which errors are measured.
+    volume : the box over which errors are measured. remarks : see `hdevelop_lines`.
     Returns one line of text per camera with its type, notes and misfit. Raises InputError as
     `halcon_cameras` and `write_halcon` do.
     """
     exported = halcon_cameras(cameras, volume)
-    write_halcon(exported, out)
+    write_halcon(exported, out, remarks)
     return [
         f"{c.camera}: {c.kind}; {'; '.join(c.notes) or 'exact'}; {c.misfit.words()}"
         for c in exported
@@ -265,9 +267,12 @@ _DAT = {
 }
 
 
-def write_halcon(cameras: Sequence[HalconCamera], folder: str | PathLike[str]) -> list[str]:
+def write_halcon(
+    cameras: Sequence[HalconCamera], folder: str | PathLike[str], remarks: Sequence[str] = ()
+) -> list[str]:
     """Write cameras.hdev.txt, and <camera>.dat and <camera>_pose.dat for each camera, in a folder.
 
+    remarks : see `hdevelop_lines`.
     Returns the names of the files. A camera with a tilted sensor gets no `.dat` file, because its
     layout is not documented. Raises InputError when the folder cannot be written.
     """
@@ -277,13 +282,17 @@ def write_halcon(cameras: Sequence[HalconCamera], folder: str | PathLike[str]) -
             if "tilt" not in camera.parameters:
                 names.append(_write(place / f"{camera.camera}.dat", _parameters_text(camera)))
             names.append(_write(place / f"{camera.camera}_pose.dat", _pose_text(camera)))
-        names.append(_write(place / "cameras.hdev.txt", hdevelop_lines(cameras)))
+        names.append(_write(place / "cameras.hdev.txt", hdevelop_lines(cameras, remarks)))
     return names
 
 
-def hdevelop_lines(cameras: Sequence[HalconCamera]) -> str:
-    """Return assignments to paste into HDevelop: CamParam<i> (camera type first) and Pose<i>."""
+def hdevelop_lines(cameras: Sequence[HalconCamera], remarks: Sequence[str] = ()) -> str:
+    """Return assignments to paste into HDevelop: CamParam<i> (camera type first) and Pose<i>.
+
+    remarks : sentences of one line each that become comments at the top.
+    """
     lines = [
+        *(f"* {remark}" for remark in remarks),
         "* World: telerig's rig frame, the first camera's.",
         "* Pixels: the centre of the top-left pixel is (0, 0).",
         "* CamParam: camera type, then its parameters in HALCON's order (m, px, degrees).",

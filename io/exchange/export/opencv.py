@@ -55,15 +55,18 @@ class Matrices:
     distortion: Array | None
 
 
-def export_opencv(cameras: Sequence[Camera], out: Path, volume: Volume) -> list[str]:
+def export_opencv(
+    cameras: Sequence[Camera], out: Path, volume: Volume, *, remarks: Sequence[str] = ()
+) -> list[str]:
     """Write the matrices of all cameras into the YAML file ``out``.
 
     volume : the box over which errors are measured and the affine matrices fitted.
+    remarks : sentences for the file's entry ``remarks``.
     Returns one line of text per camera with the errors of its matrices.
     Raises InputError as `camera_matrices` and `write_opencv` do.
     """
     matrices = camera_matrices(cameras, volume)
-    write_opencv(matrices, out)
+    write_opencv(matrices, out, remarks)
     return [
         f"{m.camera}: affine matrix, {m.affine_misfit.words()}; "
         f"matrix without the distortion, {m.undistorted_misfit.words()}"
@@ -165,9 +168,12 @@ def _opencv_distortion(camera: Camera) -> tuple[Array | None, Array | None]:
     return matrix, np.array([camera[name] if name else 0.0 for name in _OPENCV_ORDER])
 
 
-def write_opencv(matrices: Sequence[Matrices], path: str | PathLike[str]) -> None:
+def write_opencv(
+    matrices: Sequence[Matrices], path: str | PathLike[str], remarks: Sequence[str] = ()
+) -> None:
     """Write one YAML file for OpenCV with an entry for each camera; floats keep all their digits.
 
+    remarks : sentences for the entry ``remarks``; without one there is no such entry.
     Raises InputError when it cannot be written.
     """
     import cv2
@@ -178,6 +184,8 @@ def write_opencv(matrices: Sequence[Matrices], path: str | PathLike[str]) -> Non
         try:
             storage.write("frame", "rig: the first camera's frame, mm")
             storage.write("pixel_origin", "centre of the top-left pixel is (0, 0)")
+            if remarks:
+                storage.write("remarks", " ".join(remarks))
             storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
             for one in matrices:
                 storage.startWriteStruct("", cv2.FILE_NODE_MAP)

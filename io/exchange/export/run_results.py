@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
@@ -16,7 +16,9 @@ from telerig.arrays import Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Column, read_table
 from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import SmoothingFile
+from telerig.io.results.stale import refuse_stale
 from telerig.rig.camera import Camera
 
 _TRAJECTORIES = ("trajectories.csv", "tracks.csv")
@@ -44,6 +46,7 @@ class RunResults:
     shake : the table of shake.csv, the cameras' shake; None where the run was not smoothed.
     verdict : verdict of the smoothing with its flags; "" where the run was not smoothed.
     source : the name of the file from which ``points`` was read.
+    accepted : why the results are stale, if they were read although they are.
     """
 
     name: str
@@ -52,12 +55,15 @@ class RunResults:
     shake: pd.DataFrame | None = None
     verdict: str = ""
     source: str = ""
+    accepted: tuple[str, ...] = ()
 
 
-def read_results(folder: str | PathLike[str]) -> RunResults:
+def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -> RunResults:
     """Read `trajectories.csv` of a smoothed run, or else `tracks.csv`, from its results folder.
 
-    Raises InputError when the folder has neither, or when a table cannot be read.
+    accept : ("stale",) also reads results whose inputs have changed since they were made.
+    Raises InputError when the folder has neither, when the results are stale, or when a table
+    cannot be read.
     """
     place = Path(folder)
     names = [n for n in _TRAJECTORIES if (place / n).is_file()]
@@ -67,19 +73,28 @@ def read_results(folder: str | PathLike[str]) -> RunResults:
             where=str(place),
             todo="run `telerig track`, then `telerig smooth`, or name the run with --run",
         )
+    smoothed = names[0] == "trajectories.csv"
+    files = (names[0], "shake.csv", "smoothing.json") if smoothed else names[:1]
+    with reading(place, files):
+        accepted = refuse_stale(place, files, accept)
+        return _read_results(place, names[0], accepted)
+
+
+def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunResults:
     required = [Column("frame", "whole"), Column("particle", "text"), Column("t_s")]
     required += [Column(f"{axis}_mm") for axis in "xyz"]
-    points = _whole_particles(read_table(place / names[0], required, extra=True))
-    shake = place / "shake.csv"
+    points = _whole_particles(read_table(place / source, required, extra=True))
+    shake, smoothed = place / "shake.csv", source == "trajectories.csv"
     return RunResults(
         name=place.name,
-        frame=LAB if names[0] == "trajectories.csv" else RIG,
+        frame=LAB if smoothed else RIG,
         points=points.sort_values(["particle", "frame"], kind="stable").reset_index(drop=True),
         shake=read_table(shake, [Column("frame", "whole")], extra=True)
-        if shake.is_file() and names[0] == "trajectories.csv"
+        if shake.is_file() and smoothed
         else None,
-        verdict=_verdict(place / "smoothing.json") if names[0] == "trajectories.csv" else "",
-        source=names[0],
+        verdict=_verdict(place / "smoothing.json") if smoothed else "",
+        source=source,
+        accepted=accepted,
     )
 
 
@@ -134,6 +149,7 @@ def facts(results: RunResults) -> dict[str, str]:
         "frame": results.frame,
         "source": f"{made_by}, {results.source}",
         "verdict": results.verdict or "none: tracked, not smoothed",
+        **({"accepted": "stale: " + " ".join(results.accepted)} if results.accepted else {}),
     }
 
 
@@ -167,12 +183,27 @@ def results_root(source: Path) -> Path:
     return place.parent
 
 
-def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Sequence[Camera]:
-    """Read the calibrated cameras, which include their refractive windows.
+@dataclass(frozen=True)
+class CalibratedCameras:
+    """Hold calibrated cameras, which include their refractive windows.
+
+    accepted : why the calibration is stale, if it was read although it is.
+    """
+
+    cameras: tuple[Camera, ...] = ()
+    accepted: tuple[str, ...] = ()
+
+
+def cameras_of(
+    source: Path, calibration: Path | None, *, required: bool, accept: Collection[str] = ()
+) -> CalibratedCameras:
+    """Read the calibrated cameras.
 
     They come from ``calibration`` (a calibration.json or its folder), or else from ``source``, or
     else from the dataset of ``source``.
-    required : True raises InputError when no calibration is found; False then returns ().
+    required : True raises InputError when no calibration is found; False then returns no camera.
+    accept : ("stale",) also reads a calibration whose inputs have changed since it was made.
+    Raises InputError for a calibration that is stale or cannot be read.
     """
     trials = [results_root(source) / "calibration" / "calibration.json"]
     if source.suffix == ".json":
@@ -182,14 +213,17 @@ def cameras_of(source: Path, calibration: Path | None, *, required: bool) -> Seq
     place = calibration or next((p for p in trials if p.is_file()), None)
     if place is not None:
         file = place / "calibration.json" if place.is_dir() else place
-        return CalibrationFile.read(file).rig_cameras(behind_walls=True)
+        with reading(file.parent, [file.name]):
+            accepted = refuse_stale(file.parent, [file.name], accept)
+            cameras = CalibrationFile.read(file).rig_cameras(behind_walls=True)
+        return CalibratedCameras(cameras, accepted)
     if required:
         raise InputError(
             "there is no calibration",
             where=str(trials[0]),
             todo="run `telerig calibrate` first, or give one with --calibration",
         )
-    return ()
+    return CalibratedCameras()
 
 
 def run_folder(source: Path, run: str | None) -> Path:

@@ -58,18 +58,19 @@ def export_soloff(
     *,
     full_cubic: bool = False,
     first_pixel: float = 0.0,
+    remarks: Sequence[str] = (),
 ) -> list[str]:
     """Fit a polynomial to each camera and write it to soloff_<camera>.csv in the folder ``out``.
 
-    volume : the box over which it is fitted. full_cubic : see `fit_soloff`. first_pixel : see
-    `write_soloff`.
+    volume : the box over which it is fitted. full_cubic : see `fit_soloff`. first_pixel, remarks :
+    see `write_soloff`.
     Returns one line of text per camera with the number of terms and the misfit.
     Raises InputError when the cameras do not see the volume, and when a file cannot be written.
     """
     fits = fit_soloff(cameras, volume, full_cubic=full_cubic)
     with atomic_folder(out) as folder:
         for fit in fits:
-            write_soloff(fit, folder / f"soloff_{fit.camera}.csv", first_pixel)
+            write_soloff(fit, folder / f"soloff_{fit.camera}.csv", first_pixel, remarks)
     return [f"{f.camera}: {len(f.coefficients)} terms, {f.misfit.words()}" for f in fits]
 
 
@@ -109,12 +110,18 @@ def fit_soloff(
     return tuple(out)
 
 
-def write_soloff(fit: Soloff, path: str | PathLike[str], first_pixel: float = 0.0) -> None:
+def write_soloff(
+    fit: Soloff,
+    path: str | PathLike[str],
+    first_pixel: float = 0.0,
+    remarks: Sequence[str] = (),
+) -> None:
     """Write a CSV file of the polynomial's terms below a header in words.
 
     The header states volume, units, pixel origin and misfit.
     first_pixel : the coordinate in px that the other program gives to the centre of the top-left
     pixel: 0 as in telerig, 0.5 where it counts from the pixel's corner, 1 in MATLAB.
+    remarks : sentences of one line each for the header.
     Raises InputError when the file cannot be written.
     """
     shifted = fit.coefficients.copy()
@@ -127,6 +134,7 @@ def write_soloff(fit: Soloff, path: str | PathLike[str], first_pixel: float = 0.
         f"fitted over {fit.volume.words()}, as far as every camera sees it; not valid outside",
         f"error against the calibrated camera: rms_px = {fit.misfit.rms_px!r}, "
         f"max_px = {fit.misfit.max_px!r} at {fit.misfit.points} points that were not fitted",
+        *remarks,
     ]
     rows = [
         f"{i},{j},{k},{float(u)!r},{float(v)!r}"

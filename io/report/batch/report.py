@@ -25,6 +25,7 @@ from telerig.io.report.page.figures import (
 )
 from telerig.io.report.page.number_format import ABSENT, is_number, number
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
+from telerig.io.results.manifest import reading
 
 Job = Mapping[str, Any]
 
@@ -51,14 +52,17 @@ def write_batch_report(folder: Path, out: Path | None = None) -> Path:
     """
     file = Path(folder) / "batch.json"
     try:
-        jobs = [_checked(job) for job in json.loads(file.read_bytes())["jobs"]]
+        with reading(file.parent, [file.name]):
+            content = json.loads(file.read_bytes())
+        jobs = [_checked(job) for job in content["jobs"]]
+        name = str(content.get("name") or Path(folder).resolve().name)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"holds no batch that can be read: {error}", where=str(file),
             todo="run `telerig batch` with --out of this folder",
         ) from error  # fmt: skip
     place = Path(folder) if out is None else Path(out)
-    write_text_atomic(place / "report.html", render(jobs, place))
+    write_text_atomic(place / "report.html", render(jobs, place, name))
     return place / "report.html"
 
 
@@ -71,8 +75,8 @@ def _checked(job: Any) -> Job:
     return dict(job)
 
 
-def render(jobs: Sequence[Job], folder: Path) -> str:
-    """The page as text. folder : where it will lie, for the links."""
+def render(jobs: Sequence[Job], folder: Path, name: str) -> str:
+    """The page as text. folder : where it will lie, for the links. name : of the batch."""
     failed = [j for j in jobs if j["status"] != _DONE]
     runs = {(j["dataset"], j["run"]) for j in jobs if j["run"]}
     lost = {(j["dataset"], j["run"]) for j in failed if j["run"]}
@@ -83,7 +87,7 @@ def render(jobs: Sequence[Job], folder: Path) -> str:
         if job["run"]:
             lines.setdefault((job["dataset"], job["run"]), {})[job["kind"]] = job
     context = {
-        "name": Path(folder).resolve().name,
+        "name": name,
         "headline": f"{words}, {datasets} dataset" + ("s" if datasets != 1 else ""),
         "colour": "good" if not failed else ("rejected" if len(failed) == len(jobs) else "usable"),
         "figures": _key_numbers(jobs),

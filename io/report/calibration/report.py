@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from telerig.io.report.page.figures import Picture
 from telerig.io.report.page.number_format import ABSENT, flat_rows
 from telerig.io.report.page.page import drawn_over_cores, render_page
 from telerig.io.results.calibration import Status
+from telerig.io.results.manifest import reading
+from telerig.io.results.stale import stale
 
 _COLOURS = {
     Status.GOOD: "good",
@@ -52,15 +54,21 @@ def write_calibration_report(
     dot : what `dot_pictures` made of that dot_example.npz before; None draws it now.
     """
     folder = Path(results_folder)
-    page = render(read_results(folder), dot)
+    with reading(folder, ()):
+        page = render(read_results(folder), dot, stale(folder))
     file = (folder if out is None else Path(out)) / "report.html"
     write_text_atomic(file, page)
     return file
 
 
-def render(results: CalibrationResults, dot: list[Picture] | None = None) -> str:
-    """The page as text. dot : as for `write_calibration_report`."""
-    context = _words(results) | _tables(results) | _pictures(results, dot)
+def render(
+    results: CalibrationResults, dot: list[Picture] | None = None, outdated: Sequence[str] = ()
+) -> str:
+    """The page as text.
+
+    dot : as for `write_calibration_report`. outdated : what `stale` found.
+    """
+    context = {"stale": outdated} | _words(results) | _tables(results) | _pictures(results, dot)
     return render_page("template_calibration.html", context, scene_json(results))
 
 

@@ -23,12 +23,19 @@ from telerig.io.results.calibration import (
     read_joint_covariance,
     read_uncertainty,
 )
+from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
 KEPT_WEIGHT = 0.5
 """A dot counts as kept above this weight."""
+
+
+_FILES = (
+    "calibration.json", "residuals.csv", "dots.csv", "covariance.npz", "run.json",
+    "uncertainty.npz", "comparison.json", "dot_example.npz",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -93,6 +100,11 @@ def read_results(folder: Path) -> CalibrationResults:
     when they are there.
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
+    with reading(folder, _FILES):
+        return _read_results(folder)
+
+
+def _read_results(folder: Path) -> CalibrationResults:
     file = CalibrationFile.read(folder / "calibration.json")
     cameras = file.rig_cameras(behind_walls=file.medium == "water")
     views = {name: pose.pose() for name, pose in file.views.items()}

@@ -19,6 +19,7 @@ from telerig.io.report.film.files import Picture, Progress, write_film
 from telerig.io.report.run.smoothing.results import read_smoothing_results
 from telerig.io.report.run.tracking.results import TrackResults, read_track_results, run_cameras
 from telerig.io.report.run.tracking.scene import thinned, track_colour
+from telerig.io.results.manifest import reading
 from telerig.rig.camera import Camera
 
 STEP_DEG = 2
@@ -108,8 +109,9 @@ def read_film_path(folder: Path, cameras: tuple[Camera, Camera] | None) -> FilmP
     cameras : for the bubbles' bodies from both outlines; without them they are spheres.
     Raises InputError for a folder that cannot be read, or holds no point.
     """
-    results = read_track_results(folder)
-    smoothing = read_smoothing_results(folder, results.up)
+    with reading(folder, ()):
+        results = read_track_results(folder)
+        smoothing = read_smoothing_results(folder, results.up)
     table, title = _table(results, None if smoothing is None else smoothing.trajectories)
     found = int(np.isfinite(table[_PLACE].to_numpy(float)).all(1).sum())
     if not found:

@@ -18,6 +18,7 @@ from telerig.io.files.csv_table import Column, read_columns
 from telerig.io.machine.parallel import ordered_map, quick_workers
 from telerig.io.report.film.files import Progress, write_film
 from telerig.io.report.overlays import INK, PAPER, draw_line, in_grey, shrunk, write_label
+from telerig.io.results.manifest import reading
 
 Picture = NDArray[np.uint8]
 Images = Callable[[str, int], NDArray[Any] | None]
@@ -77,7 +78,9 @@ def write_views_film(
     for a folder without detections.csv, and files that cannot be written.
     """
     cameras = tuple(image_sizes_px)
-    table = read_outlines(Path(results_folder) / "detections.csv", cameras)
+    folder = Path(results_folder)
+    with reading(folder, ["detections.csv"]):
+        table = read_outlines(folder / "detections.csv", cameras)
     step = -(-frame_count // MOST_FRAMES)
     frames = list(view_frames(table, cameras, range(0, frame_count, step), t_s))
     shades = {name: _shades(images, name, frame_count) for name in cameras}

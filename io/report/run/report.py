@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,8 @@ from telerig.io.report.run.tracking.results import (
 )
 from telerig.io.report.run.tracking.scene import scene_widening, track_plans, track_scene_json
 from telerig.io.report.run.tracking.two_rays import two_rays
+from telerig.io.results.manifest import reading
+from telerig.io.results.stale import stale
 from telerig.rig.camera import Camera
 
 PAGE_BYTES = 7_600_000
@@ -59,9 +61,11 @@ def write_track_report(results_folder: Path, out: Path | None = None) -> Path:
     folder that holds no tracks, or files that cannot be read or do not fit together.
     """
     folder = Path(results_folder)
-    tracks = read_track_results(folder)
-    rig = run_cameras(folder, tracks)
-    page = render(tracks, read_smoothing_results(folder, tracks.up), rig)
+    with reading(folder, ()):
+        tracks = read_track_results(folder)
+        rig = run_cameras(folder, tracks)
+        smoothing = read_smoothing_results(folder, tracks.up)
+        page = render(tracks, smoothing, rig, stale(folder))
     file = (folder if out is None else Path(out)) / "report.html"
     write_text_atomic(file, page)
     return file
@@ -71,13 +75,17 @@ def render(
     results: TrackResults,
     smoothing: SmoothingResults | None = None,
     rig: tuple[tuple[Camera, Camera] | None, str] = (None, ""),
+    outdated: Sequence[str] = (),
 ) -> str:
-    """The page as text. rig : the two cameras, or None and why they are not known."""
+    """The page as text.
+
+    rig : the two cameras, or None and why they are not known. outdated : what `stale` found.
+    """
     in_space = _in_space(results, smoothing)
     scene = track_scene_json(in_space)
     context = _words(results) | _pictures(results, smoothing, rig[0])
     context["plans"] = track_plans(in_space)
-    context |= {"no_rays": rig[1], "in_lab": in_space is not results}
+    context |= {"stale": outdated, "no_rays": rig[1], "in_lab": in_space is not results}
     context["widened"] = scene_widening(in_space)
     if smoothing is not None:
         context["smoothing"] = smoothing_words(smoothing, results)

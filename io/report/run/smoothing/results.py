@@ -17,6 +17,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.files.csv_table import header_of, read_columns
 from telerig.io.report.run.tracking.results import median, rms
+from telerig.io.results.manifest import reading
 from telerig.io.results.smoothing import (
     AXES,
     STATE,
@@ -29,6 +30,7 @@ from telerig.io.results.smoothing import VELOCITY as SPEED
 
 __all__ = ["AXES", "PLACE", "SPEED", "SmoothingResults", "read_smoothing_results"]
 
+_FILES = ("smoothing.json", "shake.csv", "trajectories.csv")
 _ALONG = 0.9
 
 
@@ -98,6 +100,11 @@ def read_smoothing_results(folder: Path, up: Array) -> SmoothingResults | None:
     """
     if not (folder / "smoothing.json").is_file():
         return None
+    with reading(folder, _FILES):
+        return _read_smoothing_results(folder, up)
+
+
+def _read_smoothing_results(folder: Path, up: Array) -> SmoothingResults:
     stated = SmoothingFile.read(folder / "smoothing.json")
     file = folder / "shake.csv"
     header = header_of(file, SmoothingFile.AGAIN)

@@ -18,6 +18,7 @@ from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.csv_table import Rows, header_of, read_columns
 from telerig.io.results.calibration import CalibrationFile
+from telerig.io.results.manifest import reading
 from telerig.io.results.record import RunFile
 from telerig.io.results.tracking import (
     DETECTIONS,
@@ -32,6 +33,9 @@ from telerig.io.results.tracking import (
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import midpoint
 
+_FILES = (
+    "tracking.json", "tracks.csv", "detections.csv", "events.csv", "references.csv", "run.json"
+)  # fmt: skip
 UP = (0.0, -1.0, 0.0)
 """In the rig frame, where tracking.json has no ``up``."""
 
@@ -100,6 +104,11 @@ def read_track_results(folder: Path) -> TrackResults:
     overlays/<camera>/<frame>.jpg and binary/<camera>/<frame>.png are used when they are there.
     Raises InputError for what is missing, cannot be read or does not fit together.
     """
+    with reading(folder, _FILES):
+        return _read_track_results(folder)
+
+
+def _read_track_results(folder: Path) -> TrackResults:
     stated = TrackingFile.read(folder / "tracking.json")
     file = folder / "tracks.csv"
     header = header_of(file, TrackingFile.AGAIN)
@@ -293,7 +302,8 @@ def run_cameras(folder: Path, results: TrackResults) -> tuple[tuple[Camera, Came
     )
     if file is None:
         return None, "calibration.json is neither in this folder nor in calibration/ beside it"
-    stated = CalibrationFile.read(file)
+    with reading(file.parent, [file.name]):
+        stated = CalibrationFile.read(file)
     known = {camera.name: camera for camera in stated.rig_cameras(behind_walls=True)}
     if len(results.cameras) != 2 or not set(results.cameras) <= set(known):
         return None, f"calibration.json beside it has cameras {', '.join(known)}, not the run's"

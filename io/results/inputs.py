@@ -1,0 +1,102 @@
+"""Fingerprints of the files from which results were made, to notice that these have changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tomllib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from telerig.io.files.hashing import hash_if_there
+from telerig.io.results.record import Part
+
+
+class Input(Part):
+    """Hold the fingerprint of one input.
+
+    sha256 : the hash of the file; None where there was no such file.
+    tables : the tables of a TOML file of which ``sha256`` is the hash; empty for the whole file.
+    cameras : for a folder of images, the cameras whose images count; ``files`` and ``bytes`` are
+    their number and their size.
+    """
+
+    sha256: str | None = None
+    tables: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()
+    files: int | None = None
+    bytes: int | None = None
+
+    def change(self, path: Path) -> str:
+        """Return how ``path`` differs from the fingerprint, in words; "" where it does not.
+
+        An input that is no longer there is no change: a results folder may be copied alone.
+        """
+        if not path.exists():
+            return ""
+        if self.sha256 is None and not self.cameras:
+            return "was added after they were made"
+        now = Source(path, self.tables, self.cameras).fingerprint()
+        return "" if now == self else "has changed since they were made"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Name an input: a file, the tables of a TOML file, or the images of cameras in a folder."""
+
+    path: Path
+    tables: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()
+
+    def fingerprint(self) -> Input:
+        """Read the input and return its fingerprint. Raises OSError when it cannot be read."""
+        if self.cameras:
+            sizes = [file.stat().st_size for file in _recorded(self.path, self.cameras)]
+            return Input(cameras=self.cameras, files=len(sizes), bytes=sum(sizes))
+        if self.tables and self.path.is_file():
+            return Input(sha256=_hash_of_tables(self.path, self.tables), tables=self.tables)
+        return Input(sha256=hash_if_there(self.path), tables=self.tables)
+
+
+def fingerprints(folder: Path, sources: Iterable[Path | Source]) -> dict[str, Input]:
+    """Return the fingerprint of each input by its path relative to the results folder.
+
+    A path stands for the whole file; a file that does not exist is recorded as absent.
+    Raises OSError when a file cannot be read.
+    """
+    found = {}
+    for source in sources:
+        named = Source(source) if isinstance(source, Path) else source
+        found[_relative(named.path, folder)] = named.fingerprint()
+    return found
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return path.resolve().as_posix()
+
+
+def _recorded(folder: Path, cameras: Sequence[str]) -> Iterator[Path]:
+    """Yield the images of the cameras: files in ``folder/camera``, and files ``camera.*``."""
+    if not folder.is_dir():
+        return
+    for entry in folder.iterdir():
+        if entry.name in cameras and entry.is_dir():
+            yield from (p for p in entry.iterdir() if p.is_file() and p.name[0] != ".")
+        elif entry.stem in cameras and entry.is_file():
+            yield entry
+
+
+def _hash_of_tables(file: Path, tables: Sequence[str]) -> str:
+    """Hash the content of some tables, so that comments and other tables do not count."""
+    content = file.read_bytes()
+    try:
+        parsed = tomllib.loads(content.decode("utf-8-sig"))
+        content = json.dumps([parsed.get(t) for t in tables], default=str).encode()
+    except ValueError:
+        pass
+    return hashlib.sha256(content).hexdigest()

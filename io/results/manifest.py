@@ -1,0 +1,395 @@
+"""Write and read results folders so that nobody uses files of two different results together.
+
+Each results folder has a manifest.json with one section per command that writes there: the files
+of the command with their hashes, and the fingerprint of its inputs. `replaced_results` writes a
+section: it marks the section before it renames the first file and writes the final manifest last.
+`reading` is what every reader of a results folder uses: it gets all old files or all new files, or
+refuses and names the command that has to run again.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any, ClassVar
+
+from pydantic import Field, field_validator
+
+from telerig.errors import InputError, TelerigWarning
+from telerig.io.files.atomic import (
+    make_parent,
+    remove_leftovers,
+    rename,
+    staged_folder,
+    unwritable,
+)
+from telerig.io.files.hashing import hash_if_there, hashed
+from telerig.io.results.inputs import Input
+from telerig.io.results.record import Part, Record
+from telerig.version import VERSION
+
+NAME = "manifest.json"
+RUN_RECORD = "run.json"
+LONGEST_COMMAND = 300
+"""Characters of a command line that are kept; a batch may name thousands of datasets."""
+_LOCK_WITHIN_S = 30.0
+_PAGES = (RUN_RECORD, "report.html")
+"""Files that every command writes about itself. Another command may replace them."""
+
+
+class Written(Part):
+    """Hold the fingerprint of one written file; ``rows`` of a CSV table is without its header."""
+
+    sha256: str
+    bytes: int
+    rows: int | None = None
+
+
+class Section(Part):
+    """Hold what one command wrote into a results folder.
+
+    again : the command line that makes the files again.
+    telerig, finished : the version of telerig and the time (UTC).
+    files : the written files by their path relative to the folder.
+    inputs : the files that the command used, by their path relative to the folder.
+    overwritten : files of this section that another command has replaced by different ones, with
+    the name of that command.
+
+    The following keys are set only while files are being renamed, so they remain if the command is
+    killed at that moment.
+    found : the hash of every file that changes, as it was before; None where there was none.
+    replaces : the section before; None where there was none.
+    found_whole : whether the files before were one whole result.
+
+    unfinished : whether the command is still preparing its files; only in its temporary folder.
+    """
+
+    again: str = ""
+    telerig: str = ""
+    finished: str = ""
+    files: dict[str, Written] = Field(default_factory=dict)
+    inputs: dict[str, Input] = Field(default_factory=dict)
+    overwritten: dict[str, str] = Field(default_factory=dict)
+    found: dict[str, str | None] | None = None
+    replaces: Section | None = None
+    found_whole: bool = True
+    unfinished: bool = False
+
+    @field_validator("files", "found", mode="before")
+    @classmethod
+    def _names_are_inside(cls, names: Any) -> Any:
+        for name in names if isinstance(names, dict) else ():
+            parts = PurePosixPath(str(name)).parts
+            if not parts or ".." in parts or parts[0] == "/" or str(name) == NAME:
+                raise ValueError(f"names a file outside the folder: {str(name)[:60]!r}")
+        return names
+
+    def changing(self) -> set[str]:
+        """Return the names of the files that are being renamed or removed."""
+        return set(self.found or ())
+
+    def settled(self, folder: Path) -> Section:
+        """Return the section to which the files in ``folder`` belong, the new one or the old one.
+
+        Raises InputError when some of the files are old and some are new.
+        """
+        if self.found is None:
+            return self
+        now = {name: hash_if_there(folder / name) for name in self.found}
+        if now == {name: _hash_of(self.files.get(name)) for name in self.found}:
+            return self.model_copy(update={"found": None, "replaces": None})
+        if self.found_whole and now == self.found:
+            return self.replaces or Section()
+        raise InputError(
+            "holds files of two different results, because a command was stopped while it replaced "
+            "them",
+            where=str(folder),
+            todo=f"run `{self.again[:LONGEST_COMMAND]}` again",
+        )
+
+
+class Manifest(Record):
+    """Hold the content of manifest.json: the sections by the name of the command."""
+
+    KIND: ClassVar[str] = "telerig results"
+    AGAIN: ClassVar[str] = (
+        "run the command again that made this folder, or delete manifest.json to use the files "
+        "without this check"
+    )
+
+    schema_: int = Field(1, alias="schema")
+    kind: str = KIND
+    sections: dict[str, Section] = Field(default_factory=dict)
+
+    @classmethod
+    def of_sections(cls, sections: Mapping[str, Section]) -> Manifest:
+        """Return the manifest that holds these sections."""
+        return cls(schema=cls.SCHEMA, kind=cls.KIND, sections=dict(sections))
+
+    def settled(self, folder: Path) -> Manifest:
+        """Return the manifest with `Section.settled` of every section whose files are whole."""
+        sections = {}
+        for name, section in self.sections.items():
+            try:
+                sections[name] = section.settled(folder)
+            except InputError:
+                continue
+        return Manifest.of_sections(sections)
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """Read the manifest of a results folder; returns None when there is none.
+
+    Waits while another command is renaming its files. Raises InputError for a manifest that cannot
+    be read.
+    """
+    file = folder / NAME
+    if not file.is_file():
+        return None
+    manifest = Manifest.read(file)
+    if any(section.found is not None for section in manifest.sections.values()):
+        with _locked(folder, fcntl.LOCK_SH):
+            manifest = Manifest.read(file)
+    return manifest
+
+
+@contextmanager
+def reading(folder: Path, names: Collection[str]) -> Iterator[None]:
+    """Check the files ``names`` of a results folder while the body reads them.
+
+    Files that do not exist are left out. A file that differs from what telerig wrote, or that
+    telerig did not write, gives a `TelerigWarning`, and so does a whole results folder without a
+    manifest. A folder that holds single files only gives none.
+    Raises InputError when the files are of two different results, or when a command replaces them
+    while they are read.
+    """
+    manifest = read_manifest(folder)
+    before = _content(folder)
+    if manifest is not None:
+        _check(folder, manifest, names)
+    elif (folder / RUN_RECORD).is_file():
+        _warn(
+            f"{folder}: there is no manifest.json, so nobody can check that the files belong "
+            "together; run the command again that made this folder"
+        )
+    try:
+        yield
+    finally:
+        if _content(folder) != before:
+            raise InputError(
+                "was written again while it was being read",
+                where=str(folder),
+                todo="run the command again",
+            )
+
+
+def is_whole(file: Path) -> bool:
+    """Return whether a results file exists and is not part of a mixture of two results."""
+    if not file.is_file():
+        return False
+    try:
+        manifest = read_manifest(file.parent)
+        for section in () if manifest is None else manifest.sections.values():
+            if file.name in section.changing():
+                section.settled(file.parent)
+    except InputError:
+        return False
+    return True
+
+
+def _check(folder: Path, manifest: Manifest, names: Collection[str]) -> None:
+    sections = manifest.sections.values()
+    if any(section.unfinished for section in sections):
+        return
+    wanted = set(names)
+    settled = [s.settled(folder) if s.changing() & wanted else s for s in sections]
+    for name in sorted(name for name in wanted if (folder / name).is_file()):
+        entry = next((s.files[name] for s in settled if name in s.files), None)
+        if entry is None:
+            _warn(f"{folder / name}: was not written into this folder by telerig; it is used")
+        elif hashed(folder / name).sha256 != entry.sha256:
+            _warn(f"{folder / name}: {_difference(folder / name, entry)}; it is used as it is now")
+
+
+def _difference(file: Path, entry: Written) -> str:
+    rows = hashed(file).rows
+    if rows is None or entry.rows is None or rows == entry.rows:
+        return "was changed after telerig wrote it"
+    if rows < entry.rows:
+        return f"has {rows} of the {entry.rows} rows that telerig wrote"
+    return f"has {rows} rows, telerig wrote {entry.rows}"
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, TelerigWarning, stacklevel=4)
+
+
+@contextmanager
+def replaced_results(
+    folder: Path, command: str, *, again: str, inputs: Mapping[str, Input]
+) -> Iterator[Path]:
+    """Yield an empty temporary folder whose files replace those of ``command`` in ``folder``.
+
+    Until the body ends, ``folder`` is as before. Then the new files are renamed into it, the files
+    that the command wrote earlier and did not write again are removed, and all other files stay.
+    Whoever reads the folder gets the old result or the new one, also after a kill at any moment.
+
+    command : the name of the section. again : the command line that makes the files again.
+    inputs : the fingerprints of the inputs by path relative to ``folder``, see `fingerprints`.
+    Raises InputError when the folder cannot be written.
+    """
+    again = again if len(again) <= LONGEST_COMMAND else again[:LONGEST_COMMAND] + " ..."
+    section = Section(again=again, telerig=VERSION, inputs=dict(inputs))
+    with staged_folder(folder) as staged:
+        sections = {
+            **_old(folder).sections,
+            command: section.model_copy(update={"unfinished": True}),
+        }
+        Manifest.of_sections(sections).write(staged / NAME)
+        yield staged
+        (staged / NAME).unlink()
+        paths = sorted(path for path in staged.rglob("*") if path.is_file())
+        files = {path.relative_to(staged).as_posix(): _entry(path) for path in paths}
+        _refuse_folders(folder, files)
+        make_parent(folder / NAME)
+        remove_leftovers(folder)
+        done = datetime.now(UTC).isoformat(timespec="seconds")
+        new = section.model_copy(update={"files": files, "finished": done})
+        with _locked(folder, fcntl.LOCK_EX):
+            _replace(staged, folder, command, new)
+
+
+def _old(folder: Path) -> Manifest:
+    """Return the manifest of the folder; an empty one where there is none that can be read."""
+    with suppress(InputError):
+        if (folder / NAME).is_file():
+            return Manifest.read(folder / NAME)
+    return Manifest.of_sections({})
+
+
+def _refuse_folders(folder: Path, names: Iterable[str]) -> None:
+    for name in names:
+        if (folder / name).is_dir():
+            raise InputError(
+                "is a folder, a file must be written there",
+                where=str(folder / name),
+                todo="rename the folder or choose another --out",
+            )
+
+
+def _replace(staged: Path, folder: Path, command: str, new: Section) -> None:
+    """Rename the staged files into ``folder`` between two versions of its manifest."""
+    sections = dict(_old(folder).sections)
+    before, whole = sections.pop(command, None), True
+    changing = set(new.files)
+    if before is not None:
+        changing |= set(before.files) | before.changing()
+        try:
+            before = before.settled(folder)
+        except InputError:
+            before, whole = None, False
+    sections = {name: _without(s, command, new) for name, s in sections.items()}
+    sections = {name: s for name, s in sections.items() if s.files}
+    kept = {name for s in sections.values() for name in s.files}
+    changing -= kept
+    taken = {"found": {name: hash_if_there(folder / name) for name in sorted(changing)}}
+    moving = new.model_copy(update={**taken, "replaces": before, "found_whole": whole})
+    Manifest.of_sections({**sections, command: moving}).write(folder / NAME)
+    mine = _content(folder)
+    for name in new.files:
+        make_parent(folder / name)
+        rename(staged / name, folder / name)
+    for name in sorted(changing - set(new.files)):
+        _remove(folder, name)
+    if _content(folder) != mine:
+        raise InputError(
+            "another command wrote into this folder at the same time",
+            where=str(folder),
+            todo=f"run `{new.again}` again when the other one has ended",
+        )
+    Manifest.of_sections({**sections, command: new}).write(folder / NAME)
+
+
+def _without(section: Section, command: str, new: Section) -> Section:
+    """Return a section of another command without the files that ``new`` takes over."""
+    overwritten = dict(section.overwritten)
+    for name, entry in section.files.items():
+        if name in new.files and name not in _PAGES and entry.sha256 != new.files[name].sha256:
+            overwritten[name] = command
+    found = section.found
+    return section.model_copy(
+        update={
+            "files": {n: entry for n, entry in section.files.items() if n not in new.files},
+            "overwritten": overwritten,
+            "found": None
+            if found is None
+            else {n: h for n, h in found.items() if n not in new.files},
+        }
+    )
+
+
+def _remove(folder: Path, name: str) -> None:
+    """Remove a file and the folders inside ``folder`` that become empty by it."""
+    try:
+        (folder / name).unlink(missing_ok=True)
+        for parent in list(Path(name).parents)[:-1]:
+            (folder / parent).rmdir()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        if (folder / name).exists():
+            raise unwritable(folder / name, error) from error
+
+
+@contextmanager
+def _locked(folder: Path, kind: int) -> Iterator[None]:
+    """Hold a lock on a folder. File systems without locks, such as some network disks, give none.
+
+    The system releases the lock when the process ends, however it ends.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        yield
+        return
+    try:
+        _lock(handle, kind)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int, kind: int) -> None:
+    """Wait for a lock for `_LOCK_WITHIN_S` seconds, then go on without it."""
+    end = time.monotonic() + _LOCK_WITHIN_S
+    while time.monotonic() < end:
+        try:
+            fcntl.flock(handle, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(0.02)
+        except OSError:
+            return
+        else:
+            return
+
+
+def _entry(file: Path) -> Written:
+    found = hashed(file)
+    return Written(sha256=found.sha256, bytes=found.bytes, rows=found.rows)
+
+
+def _hash_of(entry: Written | None) -> str | None:
+    return None if entry is None else entry.sha256
+
+
+def _content(folder: Path) -> bytes:
+    try:
+        return (folder / NAME).read_bytes()
+    except OSError:
+        return b""

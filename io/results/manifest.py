@@ -13,7 +13,7 @@ import fcntl
 import os
 import time
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -256,8 +256,8 @@ def replaced_results(
         (staged / NAME).unlink()
         paths = sorted(path for path in staged.rglob("*") if path.is_file())
         files = {path.relative_to(staged).as_posix(): _entry(path) for path in paths}
-        _refuse_folders(folder, files)
-        make_parent(folder / NAME)
+        for name in (NAME, *files):
+            _make_room(folder / name)
         remove_leftovers(folder)
         done = datetime.now(UTC).isoformat(timespec="seconds")
         new = section.model_copy(update={"files": files, "finished": done})
@@ -273,14 +273,15 @@ def _old(folder: Path) -> Manifest:
     return Manifest.of_sections({})
 
 
-def _refuse_folders(folder: Path, names: Iterable[str]) -> None:
-    for name in names:
-        if (folder / name).is_dir():
-            raise InputError(
-                "is a folder, a file must be written there",
-                where=str(folder / name),
-                todo="rename the folder or choose another --out",
-            )
+def _make_room(file: Path) -> None:
+    """Make the folder of a file, before anything is replaced."""
+    if file.is_dir():
+        raise InputError(
+            "is a folder, a file must be written there",
+            where=str(file),
+            todo="rename the folder or choose another --out",
+        )
+    make_parent(file)
 
 
 def _replace(staged: Path, folder: Path, command: str, new: Section) -> None:
@@ -303,7 +304,6 @@ def _replace(staged: Path, folder: Path, command: str, new: Section) -> None:
     Manifest.of_sections({**sections, command: moving}).write(folder / NAME)
     mine = _content(folder)
     for name in new.files:
-        make_parent(folder / name)
         rename(staged / name, folder / name)
     for name in sorted(changing - set(new.files)):
         _remove(folder, name)
@@ -322,16 +322,13 @@ def _without(section: Section, command: str, new: Section) -> Section:
     for name, entry in section.files.items():
         if name in new.files and name not in _PAGES and entry.sha256 != new.files[name].sha256:
             overwritten[name] = command
-    found = section.found
-    return section.model_copy(
-        update={
-            "files": {n: entry for n, entry in section.files.items() if n not in new.files},
-            "overwritten": overwritten,
-            "found": None
-            if found is None
-            else {n: h for n, h in found.items() if n not in new.files},
-        }
-    )
+    kept: dict[str, Any] = {
+        "files": {n: entry for n, entry in section.files.items() if n not in new.files},
+        "overwritten": overwritten,
+    }
+    if section.found is not None:
+        kept["found"] = {n: h for n, h in section.found.items() if n not in new.files}
+    return section.model_copy(update=kept)
 
 
 def _remove(folder: Path, name: str) -> None:

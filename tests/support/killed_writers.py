@@ -1,4 +1,4 @@
-"""Kill a command that writes results at every step of the replacement."""
+"""What is on the disk if a command is killed at any step of the replacement of its results."""
 
 from __future__ import annotations
 
@@ -9,65 +9,54 @@ from pathlib import Path
 
 import pytest
 
-from telerig.io.files import atomic
 from telerig.io.results import manifest
-
-
-class Killed(BaseException):
-    """Stands for the end of the process: nothing catches it."""
 
 
 def killed_at_every_rename(
     folder: Path, old: Callable[[], object], new: Callable[[], object]
 ) -> Iterator[int]:
-    """Write the old results, kill the new ones before step k, and yield k, for every k.
+    """Write old and new results, and put the folder into the state before step k, for every k.
 
     A step is a rename into ``folder`` or the removal of a file there; renames inside temporary
-    folders do not count. Afterwards nothing more is written, as after a kill. The last k is the
-    one at which ``new`` ends undisturbed. The old results are copied, not written again.
+    folders do not count. A kill before a step leaves what is on the disk at that moment, so the
+    folder is copied before each step of a single run. The last k is the finished command.
     """
-    kept = folder.with_name(f"{folder.name} kept")
+    kept = folder.parent / f"{folder.name} kept"
     shutil.rmtree(folder, ignore_errors=True)
     old()
-    if folder.exists():
-        shutil.copytree(folder, kept)
-    step = 0
-    while True:
+    steps = _states(folder, kept, new)
+    for step in range(steps):
         shutil.rmtree(folder, ignore_errors=True)
-        if kept.exists():
-            shutil.copytree(kept, folder)
-        done = _kill_at(step, folder, new)
+        if (kept / str(step)).exists():
+            shutil.copytree(kept / str(step), folder)
         yield step
-        if done:
-            shutil.rmtree(kept, ignore_errors=True)
-            return
-        step += 1
+    shutil.rmtree(kept)
 
 
-def _kill_at(step: int, folder: Path, write: Callable[[], object]) -> bool:
-    """Write until before the given step; returns whether the command has ended by itself."""
-    count = iter(range(step + 1))
+def _states(folder: Path, kept: Path, write: Callable[[], object]) -> int:
+    """Copy the folder to ``kept``/k before each step of ``write`` and at its end; returns k + 1."""
+    steps = 0
+    kept.mkdir()
 
-    def counted(real: Callable[..., None], place: int) -> Callable[..., None]:
-        def call(*paths: Path) -> None:
-            inside = paths[0].resolve() if place == 0 else Path(paths[1]).resolve()
-            if inside.is_relative_to(folder.resolve()) and next(count) == step:
-                raise Killed
-            real(*paths)
+    def keep() -> None:
+        nonlocal steps
+        if folder.exists():
+            shutil.copytree(folder, kept / str(steps))
+        steps += 1
 
-        return call
+    def replace(source: Path, target: Path) -> None:
+        if Path(target).resolve().is_relative_to(folder.resolve()):
+            keep()
+        real_replace(source, target)
 
+    def remove(place: Path, name: str) -> None:
+        keep()
+        real_remove(place, name)
+
+    real_replace, real_remove = os.replace, manifest._remove
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "replace", counted(os.replace, 1))
-        removed = manifest._remove
-        patch.setattr(
-            manifest, "_remove",
-            lambda place, name: counted(lambda _: removed(place, name), 0)(place / name),
-        )  # fmt: skip
-        try:
-            write()
-        except Killed:
-            return False
-        finally:
-            assert atomic.os.replace is os.replace
-        return True
+        patch.setattr(os, "replace", replace)
+        patch.setattr(manifest, "_remove", remove)
+        write()
+    keep()
+    return steps

@@ -63,6 +63,50 @@ class BubbleModel:
 
 
 @dataclass(frozen=True)
+class Prior:
+    """Describes the log-normal prior of a positive number within bounds.
+
+    step : change of the number's logarithm that the optimiser takes as 1.
+    """
+
+    low: float
+    high: float
+    median: float
+    log_sigma: float
+    step: float
+
+    def log_density(self, value: float) -> float:
+        """Return the log density up to a constant."""
+        return float(-0.5 * (np.log(value / self.median) / self.log_sigma) ** 2)
+
+    def density(self, value: float) -> float:
+        """Return the probability per unit of the value's logarithm."""
+        return float(np.exp(self.log_density(value)) / (self.log_sigma * np.sqrt(2 * np.pi)))
+
+    def log_gradient(self, value: float) -> float:
+        """Return the derivative of the log density by the number's logarithm."""
+        return float(-np.log(value / self.median) / self.log_sigma**2)
+
+
+BUBBLE_PRIORS = {
+    "bubble.zigzags.*.frequency_hz": Prior(1.0, 60.0, 8.0, 1.0, 0.02),
+    "bubble.zigzags.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
+    "bubble.zigzags.*.rms_mm": Prior(1e-3, 20.0, 0.3, 2.0, 0.2),
+    "bubble.velocity_sigma_mm_s": Prior(0.5, 200.0, 10.0, 0.5, 0.2),
+    "bubble.velocity_tau_s": Prior(0.02, 5.0, 0.3, 0.5, 0.3),
+}
+"""Priors of the hyper-parameters of `BubbleModel` that are learned from a run, by pattern of the
+name."""
+
+
+def learned_names(model: BubbleModel) -> list[str]:
+    """Return the names of all hyper-parameters that `BUBBLE_PRIORS` covers, in a fixed order."""
+    of_zigzags = [name for name in BUBBLE_PRIORS if "*" in name]
+    found = [name.replace("*", str(i)) for i in range(len(model.zigzags)) for name in of_zigzags]
+    return [*found, *(name for name in BUBBLE_PRIORS if "*" not in name)]
+
+
+@dataclass(frozen=True)
 class Process:
     """Describes one stochastic process along one direction, with the hyper-parameters that define
     it.
@@ -109,6 +153,8 @@ def bubble_processes(
     model: BubbleModel, direction: Array, *, bubbles: int = 1, mean_known: bool = False
 ) -> list[Process]:
     """Return the processes that move a bubble along a direction: the path, then the zigzags.
+
+    The states of the path begin with position and velocity.
 
     direction : (3,) unit vector in rig axes.
     bubbles : number of bubbles whose mean position is described. Their deviations are independent,

@@ -124,7 +124,7 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
         return None
     few, many = spread_dots(problem), spread_dots(problem, _MANY_DOTS)
     gain = ViewGain.of(problem, state, joint, np.union1d(few, many))
-    kept = problem.weight > 0
+    kept = problem.kept
     images = np.unique(np.stack([problem.view[kept], problem.camera[kept]], 1), axis=0)
     views = int((np.bincount(images[:, 0]) > 1).sum())
     found = candidates(problem, state)
@@ -243,7 +243,7 @@ def field_mm(problem: Problem) -> float:
 
 def volume_centre_mm(problem: Problem, state: State) -> Array:
     """(3,) the rig's origin; where the target was, when the optical axes meet far from there."""
-    seen = np.unique(problem.view[problem.weight > 0])
+    seen = np.unique(problem.view[problem.kept])
     poses = state.rig_from_target[seen]
     mean = np.mean(poses[:, :3, :3] @ middle_mm(state) + poses[:, :3, 3], 0)
     return mean if np.linalg.norm(mean) > field_mm(problem) / 2 else np.zeros(3)
@@ -310,7 +310,7 @@ def _normals(problem: Problem, state: State) -> tuple[Array, Array, Bools, Ints]
 
 def _sides_seen(problem: Problem, state: State) -> Array:
     """(C,) which side of the plate each camera has seen most: +1 that of negative z, else -1."""
-    used = problem.weight > 0
+    used = problem.kept
     signs = np.sign(np.einsum("ci,vi->vc", optical_axes(state), state.rig_from_target[:, :3, 2]))
     cameras = range(len(problem.cameras))
     total = [signs[problem.view[used & (problem.camera == c)], c].sum() for c in cameras]
@@ -380,7 +380,7 @@ def _enough_seen(problem: Problem, state: State, poses: Candidates) -> Bools:
 
     The two between which the plate is held; what others see of it is used as it is.
     """
-    image = (len(problem.cameras) * problem.view + problem.camera)[problem.weight > 0]
+    image = (len(problem.cameras) * problem.view + problem.camera)[problem.kept]
     counts = np.bincount(image)
     share = SEEN_SHARE * np.median(counts[counts > 0]) / len(problem.dot_ids)
     some = spread_dots(problem)
@@ -399,7 +399,7 @@ def new_cells(problem: Problem, visible: Bools, uv_px: Array) -> Bools:
     out = []
     for c, camera in enumerate(problem.cameras):
         edges = [np.linspace(-0.5, size - 0.5, CELLS + 1) for size in camera.image_size_px]
-        mine = (problem.weight > 0.5) & (problem.camera == c)
+        mine = problem.kept & (problem.camera == c)
         before, then = (
             np.histogram2d(uv[:, 0], uv[:, 1], bins=edges)[0] > 0
             for uv in (problem.uv_px[mine], uv_px[c][visible[c]])
@@ -501,7 +501,7 @@ class ViewGain:
 
 
 def _noise_px(problem: Problem, camera: int) -> float:
-    kept = (problem.weight > 0.5) & (problem.camera == camera)
+    kept = problem.kept & (problem.camera == camera)
     rows = problem.covariance_px2[kept if kept.any() else slice(None)]
     return float(np.sqrt(np.median(np.trace(rows, axis1=-2, axis2=-1)) / 2))
 
@@ -589,7 +589,7 @@ def _place_words(problem: Problem, state: State, rig_from_target: Array) -> str:
 def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, ...]:
     """What a pose has that the views so far have not."""
     out = []
-    seen = np.unique(problem.view[problem.weight > 0])
+    seen = np.unique(problem.view[problem.kept])
     cosine = np.abs(optical_axes(state) @ state.rig_from_target[seen, :3, 2].T)
     then = np.abs(optical_axes(state) @ one.rig_from_target[0, :3, 2])
     visible, uv = dots_seen(problem, state, one, np.arange(len(state.dots_mm)))

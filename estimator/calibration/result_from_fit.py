@@ -171,7 +171,7 @@ def odd_views(problem: Problem) -> list[str]:
     The cause may be wrong numbers of the dots, or a target that moved between the cameras' images.
     """
     measured = np.bincount(problem.view, minlength=len(problem.views))
-    kept = np.bincount(problem.view[problem.weight > 0.5], minlength=len(problem.views))
+    kept = np.bincount(problem.view[problem.kept], minlength=len(problem.views))
     return [
         f"view {name!r}: only {k} of {n} dots agree with the others; is it numbered wrongly, or "
         "did the target move between the cameras' images?"
@@ -182,7 +182,7 @@ def odd_views(problem: Problem) -> list[str]:
 
 def _statistics(fit: Fit, joint: JointCovariance, residuals: pd.DataFrame) -> dict[str, Any]:
     problem = fit.robust.problem
-    kept = problem.weight > 0.5
+    kept = problem.kept
     values = residuals[["du_px", "dv_px"]].to_numpy()
     squares = squared_distance(values, problem.covariance_px2)[kept].sum()
     out: dict[str, Any] = {
@@ -315,10 +315,10 @@ def _seen_in_space(problem: Problem, state: State) -> tuple[Array, Array]:
     """Return the pixels and the fitted positions of the dots that two or more cameras see.
 
     Returns (C, K, 2) pixels in C cameras of K dots, NaN where a camera does not see the dot, and
-    (K, 3) positions in the rig frame, in mm. Only dots with a weight above 0.5 are used.
+    (K, 3) positions in the rig frame, in mm. Only dots that were kept are used.
     """
     key = problem.view * len(problem.dot_ids) + problem.dot
-    kept = problem.weight > 0.5
+    kept = problem.kept
     found, row = np.unique(key[kept], return_inverse=True)
     pixels = np.full((len(problem.cameras), len(found), 2), np.nan)
     pixels[problem.camera[kept], row] = problem.uv_px[kept]

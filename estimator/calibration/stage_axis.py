@@ -19,6 +19,7 @@ import numpy as np
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.factors.linear_factors import add_linear_factors
+from telerig.factors.robust_loss import next_limit, travel_weights
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.dataset.tables import read_dots_csv
 from telerig.io.files.csv_table import Column, read_table
@@ -485,9 +486,7 @@ def fit(
     free : for each camera the names of its free intrinsics.
     sigma_mm : standard deviations of the carriage's position along and across the axis.
 
-    A dot or a reading at z > 3.5 standard deviations gets the weight (3.5 / z)^4. The limit begins
-    above the largest z and is halved in every iteration, so that the largest outliers lose their
-    weight first (graduated non-convexity).
+    A dot or a reading beyond 3.5 standard deviations loses its weight by `travel_weights`.
 
     Raises CalibrationError if the fit does not converge.
     """
@@ -502,8 +501,10 @@ def fit(
         )
         scores = _scores(system, state, sigma_mm[0])
         highest = float(np.sqrt(max(s.max() for s in scores)))
-        limit = max(_SUSPECT, min(limit, highest) / 2)
-        fresh = _reweighted(scores, limit) if turn < _REWEIGHTED else weights
+        limit = next_limit(limit, highest, _SUSPECT)
+        fresh = weights
+        if turn < _REWEIGHTED:
+            fresh = Weights(*(travel_weights(score, limit) for score in scores))
         moved = np.ptp(fresh.dots - weights.dots) + np.ptp(fresh.views - weights.views)
         weights = fresh
         system = linearised(cameras, free, dots, state, sigma_mm, weights)
@@ -530,13 +531,6 @@ def _scores(system: StageEquations, state: State, sigma_mm: float) -> tuple[Arra
     stated = float(np.sqrt(np.median(own) + sigma_mm**2))
     variance = own + sigma_mm**2 if spread < 2 * stated else own + spread**2
     return system.dot_score, off**2 / variance
-
-
-def _reweighted(scores: tuple[Array, Array], limit: float) -> Weights:
-    """Return the weights (limit / z)^4 for distances z beyond ``limit`` standard deviations,
-    otherwise 1."""
-    cut = [np.minimum(1.0, limit**4 / np.maximum(score, 1.0) ** 2) for score in scores]
-    return Weights(cut[0], cut[1])
 
 
 def linearised(

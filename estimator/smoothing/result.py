@@ -20,8 +20,8 @@ from telerig.estimator.smoothing.graph.stage_travel import (
 )
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
-from telerig.factors.bubble_motion import BubbleModel, bubble_processes
-from telerig.factors.state_space import discretise, distinct_steps
+from telerig.factors.bubble_motion import BubbleModel
+from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
 from telerig.io.results.manifest import replaced_results
 from telerig.io.results.smoothing import SmoothingFile
 
@@ -359,8 +359,12 @@ def _rts(
 
     seen = np.asarray(np.isfinite(position_mm).all(1))
     lengths, index = distinct_steps(np.diff(t_s))
-    path = bubble_processes(model, np.zeros(3))[0]
-    steps = discretise([path.component], lengths)[0]
+    path = ou_velocity(
+        sigma_mm_s=model.velocity_sigma_mm_s,
+        tau_s=model.velocity_tau_s,
+        start_sigma_mm=model.start_sigma_mm,
+    )
+    steps = discretise([path], lengths)[0]
     # of one axis: position, velocity, mean velocity
     transition, noise = np.tile(np.eye(3), (len(t_s), 1, 1)), np.zeros((len(t_s), 3, 3))
     transition[1:, :2, :2] = steps.transition[0, index]

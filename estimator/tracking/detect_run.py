@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array
 from telerig.errors import InputError
-from telerig.estimator.bubbles.background.from_run import Background, estimate_background
+from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.detect import detect_bubbles
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
@@ -50,15 +50,13 @@ _LARGEST_BATCH = 64
 class Scene:
     """Hold what the detections of all F frames have in common.
 
-    backgrounds : background image of each camera, by name.
-    shift_px : (F, 2) travel of the rig in px of each camera, by name; see `lab_shift_px`.
+    backgrounds : background of each camera, by name.
     min_diameter_px : dark spots that are smaller count as dirt.
     strips : by camera name, the dots fixed to the tank, which are erased from the images.
     """
 
     run: RunData
-    backgrounds: dict[str, Background]
-    shift_px: dict[str, Array]
+    backgrounds: dict[str, methods.RunBackground]
     min_diameter_px: float
     strips: Mapping[str, StripInImages] = field(default_factory=dict)
 
@@ -76,22 +74,25 @@ def make_scene(
     min_diameter_px: float,
     progress: Progress | None = None,
     strips: Mapping[str, StripInImages] | None = None,
+    method: str = methods.DEFAULT,
 ) -> Scene:
     """Estimate each camera's background from the images of the run.
 
     axis_rig : (3,) unit vector of the stage's travel in the rig frame.
     progress : function that is called with the name of the step, the number done and the total.
     strips : dots to erase, by camera name; None for none.
+    method : a name in `METHODS` of `bubbles.background.methods`.
     """
+    estimator = methods.method(method)
     shifts = {c.name: lab_shift_px(c, axis_rig, run.position_mm, run.frame_count) for c in cameras}
     names = [c.name for c in cameras]
-    estimate = partial(_background, run, shifts, strips or {})
+    estimate = partial(_background, run, estimator, shifts, strips or {})
     backgrounds = {}
     for name, found in zip(names, ordered_map(estimate, names, quick_workers(len(names)))):
         backgrounds[name] = found
         if progress is not None:
             progress("background", len(backgrounds), len(names))
-    return Scene(run, backgrounds, shifts, min_diameter_px, strips or {})
+    return Scene(run, backgrounds, min_diameter_px, strips or {})
 
 
 def _image(
@@ -102,10 +103,14 @@ def _image(
 
 
 def _background(
-    run: RunData, shifts: dict[str, Array], strips: Mapping[str, StripInImages], camera: str
-) -> Background:
+    run: RunData,
+    method: methods.Method,
+    shifts: dict[str, Array],
+    strips: Mapping[str, StripInImages],
+    camera: str,
+) -> methods.RunBackground:
     images = partial(_image, run, strips, camera)
-    return estimate_background(images, run.frame_count, shift_px=shifts[camera])
+    return method(images, run.frame_count, shift_px=shifts[camera])
 
 
 def lab_shift_px(
@@ -231,7 +236,7 @@ def _detect(scene: Scene, camera: str, frame: int) -> pd.DataFrame:
     if image is None:
         found, reason = pd.DataFrame(columns=DETECTION_COLUMNS), "no image"
     else:
-        level = scene.backgrounds[camera].at(tuple(scene.shift_px[camera][frame]))
+        level = scene.backgrounds[camera].of_frame(frame)
         try:
             found = detect_bubbles(image, background=level, min_diameter_px=scene.min_diameter_px)
         except InputError as error:

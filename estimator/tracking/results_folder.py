@@ -128,8 +128,9 @@ def write_tracking(
             axis = stage_axis(run, calibration)
             strips = stream.marks.strips if stream.marks is not None else None
             scene = stream.scene or make_scene(
-                run, cameras, axis, options.min_diameter_px, strips=strips
-            )
+                run, cameras, axis, options.min_diameter_px, strips=strips,
+                method=options.background,
+            )  # fmt: skip
             _write_pictures(scene, summary, staged)
         if report:
             from telerig.io.report.run.report import write_track_report
@@ -217,7 +218,7 @@ def _draw(scene: Scene, staged: Path, task: tuple[str, int, pd.DataFrame]) -> No
     image, plain = scene.run.image(camera, frame), scene.image(camera, frame)
     if image is None or plain is None:
         return
-    level = scene.backgrounds[camera].at(tuple(scene.shift_px[camera][frame]))
+    level = scene.backgrounds[camera].of_frame(frame)
     bubbles = find_bubbles(plain, background=level, min_diameter_px=scene.min_diameter_px)
     found, rejected = bubbles.accepted, bubbles.rejected
     outlines = [outline_points(row, _OUTLINE_POINTS) for _, row in found.iterrows()]

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator.bubbles.background import methods
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.estimator.bubbles.pairing.learning import estimate_pair_model
 from telerig.estimator.bubbles.pairing.matching import PairModel, match_pairs
@@ -55,10 +56,12 @@ class TrackOptions:
     """Hold the options of tracking.
 
     min_diameter_px : dark spots that are smaller count as dirt.
+    background : method that estimates the background, by its name in `bubbles.background.methods`.
     tracker : settings of the tracker.
     """
 
     min_diameter_px: float = 8.0
+    background: str = methods.DEFAULT
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
 
 
@@ -218,7 +221,9 @@ def tracking_stream(
             marks = follow_references(run, cameras, axis, strip, store, stage)
         if store.missing():
             strips = marks.strips if marks is not None else None
-            scene = make_scene(run, cameras, axis, chosen.min_diameter_px, stage, strips)
+            scene = make_scene(
+                run, cameras, axis, chosen.min_diameter_px, stage, strips, chosen.background
+            )
             detect_missing(scene, store, stage)
         batches = store.tables
     without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}

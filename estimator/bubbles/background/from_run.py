@@ -501,13 +501,15 @@ LEAST_TRAVEL_PX = 2.0
 
 @dataclass(frozen=True)
 class Background:
-    """rig_level : (H, W) level of what is fixed in the image, in grey values.
+    """Holds the background of a run in two layers.
 
+    rig_level : (H, W) level of what is fixed in the image, in grey values.
     lab_factor : (Hl, Wl) what multiplies it, fixed in the lab; None without one. Its pixel (0, 0)
     is seen at image pixel (0, 0) when the shift is ``lab_origin_px``.
     covered : (H, W) True where a bubble hid the screen all the time, so that the level there is
     interpolated. frames : those it was made of.
     noise : relative standard deviation of a pixel at the median level.
+    shift_px : (F, 2) travel of the rig as seen in the image, for every frame; None if it is 0.
     """
 
     rig_level: Float32
@@ -516,6 +518,11 @@ class Background:
     lab_origin_px: tuple[int, int] = (0, 0)
     frames: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     noise: float = 0.0
+    shift_px: Array | None = None
+
+    def of_frame(self, frame: int) -> Float32:
+        """Return the level (H, W) in a frame, at the median brightness."""
+        return self.at(tuple(self.shift_px[frame])) if self.shift_px is not None else self.at()
 
     def at(self, frame_shift_px: Shift = (0.0, 0.0)) -> Float32:
         """(H, W) level at the median brightness, with the lab displaced by (u, v) px.
@@ -556,12 +563,13 @@ def estimate_background(
         )
     frames, stack = _sample(images, np.flatnonzero(np.isfinite(shifts).all(1)), max_frames)
     if len(frames) < LEAST_FRAMES:
-        return Background(*level_of_image(stack.max(0)), frames=frames)
+        return Background(*level_of_image(stack.max(0)), frames=frames, shift_px=shift_px)
     travel = shifts[frames]
     moving = bool(np.ptp(travel, axis=0).max() >= LEAST_TRAVEL_PX)
     layers, covered, noise = fit_layers(stack, travel if moving else None)
     lab = None if layers.lab is None else np.exp(layers.lab)
-    return Background(np.exp(layers.rig), covered, lab, layers.lab_origin_px, frames, noise)
+    rig = np.exp(layers.rig)
+    return Background(rig, covered, lab, layers.lab_origin_px, frames, noise, shift_px)
 
 
 def _sample(

@@ -105,7 +105,7 @@ class QuadraticCost:
         groups = sum(1 for c in range(len(problem.cameras)) for g in PLAIN_GROUPS
                      if (c, GROUPS[g][0]) in names)  # fmt: skip
         variance = _variance(problem, solution, posterior.common, posterior.dots)
-        rows = 2 * int(np.sum(problem.weight > 0))
+        rows = 2 * int(np.sum(problem.kept))
         return QuadraticCost(
             (*names, *(m[0] for m in more)), extend @ offset, extend @ covariance @ extend.T,
             np.r_[prior / unit, np.ones(len(more))],
@@ -191,7 +191,7 @@ def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) 
     ])  # fmt: skip
     by_prior = (np.diag(common)[:shared] * weight**2).sum()
     by_prior += (np.diagonal(dots, 0, 1, 2) / problem.dot_sigma_mm**2).sum()
-    seen = len(np.unique(problem.view[problem.weight > 0]))
+    seen = len(np.unique(problem.view[problem.kept]))
     numbers = shared + 4 * (len(problem.cameras) - 1) + 6 * seen + 3 * len(problem.dot_ids)
     dof = max(error.size - numbers + by_prior, 0.0)
     return float(((error**2).sum() + NOISE_DOF) / (dof + NOISE_DOF))

@@ -181,7 +181,7 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
         free[c, :, 2 * c - 3 : 2 * c - 1] = np.eye(2)
     normal = np.zeros((free.shape[-1],) * 2)
     for v in range(len(problem.views)):
-        mine = (problem.view == v) & (problem.weight > 0)
+        mine = (problem.view == v) & problem.kept
         seen = np.flatnonzero(np.bincount(problem.camera[mine], minlength=count) >= MINIMUM_DOTS)
         if len(seen) > 1:
             place, rows = np.concatenate(turns[seen, :2]), np.concatenate(free[seen])

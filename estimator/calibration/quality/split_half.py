@@ -79,7 +79,7 @@ def _size(
 ) -> tuple[tuple[int, int], float, float] | None:
     """Return two dots far apart that both halves see, their estimated distance (mm), and 0 for
     its standard deviation (mm); None if the halves share fewer than two dots."""
-    weighed = problem.weight > 0
+    weighed = problem.kept
     one, other = (problem.dot[weighed & np.isin(problem.view, views)] for views in parts)
     both = np.intersect1d(one, other)
     if len(both) < 2:
@@ -92,7 +92,7 @@ def _size(
 
 
 def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
-    half = problem.subset(np.isin(problem.view, views) & (problem.weight > 0))
+    half = problem.subset(np.isin(problem.view, views) & problem.kept)
     half = replace(half, solver="schur")
     overlap_tree(half, _images(half))
     if half.scale is not None:
@@ -114,7 +114,7 @@ def _in_turn(problem: Problem) -> NDArray[np.int64]:
     With three or more cameras, views that the same cameras see stand together, so that each half
     gets equally many of each kind.
     """
-    used = np.unique(problem.view[problem.weight > 0])
+    used = np.unique(problem.view[problem.kept])
     if len(problem.cameras) == 2:
         return used
     images = _images(problem)
@@ -124,7 +124,7 @@ def _in_turn(problem: Problem) -> NDArray[np.int64]:
 
 def _images(problem: Problem) -> set[tuple[int, int]]:
     """Return (view, camera) of each image with enough dots to determine the target's pose."""
-    kept = problem.weight > 0
+    kept = problem.kept
     images, counts = np.unique(
         np.stack([problem.view[kept], problem.camera[kept]], 1), axis=0, return_counts=True
     )

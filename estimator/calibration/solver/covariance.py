@@ -150,7 +150,7 @@ def hat_matrix_blocks(problem: Problem, solution: Solution, posterior: Posterior
     """Return J C J^T (M, 2, 2) of each used measurement: the share of its noise that the fit
     absorbs.
     """
-    system, out = System(problem), np.empty((int(np.sum(problem.weight > 0)), 2, 2))
+    system, out = System(problem), np.empty((int(np.sum(problem.kept)), 2, 2))
     for c, obs in enumerate(system.images):
         columns = system.columns(solution.state, c)[:-1].transpose(2, 1, 0)
         for view, first, last in images_of(obs):

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError, InputError
 from telerig.factors.calibration import (
     Observations,
@@ -111,11 +111,16 @@ class Problem:
     def rho_mm(self) -> tuple[float, ...]:
         return tuple(c.rho_mm for c in self.cameras)
 
+    @property
+    def kept(self) -> Bools:
+        """(M,) which measurements are used: those of positive weight."""
+        return self.weight > 0
+
     def observations(self) -> Observations:
         """Return the measurements of positive weight, whitened with the square root of their
         weight.
         """
-        keep = self.weight > 0
+        keep = self.kept
         whitener = whitening(self.covariance_px2[keep])
         whitener = whitener * np.sqrt(self.weight[keep])[:, None, None]
         return self._rows(keep, whitener)

@@ -24,6 +24,7 @@ from telerig.estimator.calibration.solver.elimination import GraphEquations, Gra
 from telerig.estimator.calibration.solver.problem import Problem, System
 from telerig.estimator.calibration.solver.schur import NormalEquations
 from telerig.factors.calibration import State, pixels
+from telerig.factors.robust_loss import calibration_weights, next_limit
 
 MANY_DOTS = 5000
 """With more measured dots than this, the Schur complement solves the problem
@@ -193,7 +194,7 @@ def noise_floor_px(residual_px: Array, covariance_px2: Array, dof_per_row: float
 
 def dof_per_row(problem: Problem) -> float:
     """Return the approximate number of degrees of freedom per measured coordinate."""
-    rows = int(2 * np.sum(problem.weight > 0))
+    rows = int(2 * np.sum(problem.kept))
     used = sum(len(f) for f in problem.free) + 4 * (len(problem.cameras) - 1)
     used += 6 * len(problem.views) + 3 * len(problem.dot_ids)
     return float(max(0.3, 1 - used / max(rows, 1)))
@@ -216,37 +217,25 @@ def robust_solve(
     limit, floor = np.inf, 0.0
     for _ in range(rounds):
         residual = pixel_residuals(problem, solution.state)
-        sound = problem.weight > 0
+        sound = problem.kept
         floor = noise_floor_px(residual[sound], base[sound], dof_per_row(problem))
         covariance = base + floor**2 * np.eye(2)
         distance = np.sqrt(squared_distance(residual, covariance))
         worst = float(distance.max())
         previous = problem
-        limit = max(least, min(limit / 2, worst / 2))
-        if limit > least:
-            weight = (limit**2 / (limit**2 + distance**2)) ** 2
-        else:
-            weight = _without_lost_views(problem, _truncated(distance, problem.weight, least))
+        limit = next_limit(limit, worst, least)
+        weight = calibration_weights(distance, problem.weight, limit, least)
+        if limit == least:
+            weight = _without_lost_views(problem, weight)
         problem = replace(problem, weight=weight, covariance_px2=covariance)
-        unchanged = np.array_equal(weight, previous.weight) and np.allclose(
+        unchanged = np.allclose(weight, previous.weight, rtol=1e-3) and np.allclose(
             covariance, previous.covariance_px2, rtol=1e-3
         )
-        if unchanged:
+        if limit == least and unchanged:
             break
         steps = 4 if limit > least else 60
         solution = solve(problem, solution.state, max_iterations=steps, progress=progress)
     return RobustFit(problem, solution, floor)
-
-
-def _truncated(distance: Array, before: Array, limit: float) -> Array:
-    """Return weights 0 or 1 (M,) by the distances (M,).
-
-    A dot that was left out is taken back only well inside the limit, so that no dot alternates.
-
-    before : (M,) weights of the round before.
-    """
-    bar = np.where(before < 0.01, 0.9 * limit, limit)
-    return (distance <= bar).astype(float)
 
 
 def _without_lost_views(problem: Problem, weight: Array) -> Array:

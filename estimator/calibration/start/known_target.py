@@ -50,7 +50,7 @@ def image_maps(problem: Problem, dots_mm: Array) -> dict[tuple[int, int], ImageM
     out = {}
     for v in range(len(problem.views)):
         for c, camera in enumerate(problem.cameras):
-            rows = (problem.view == v) & (problem.camera == c) & (problem.weight > 0)
+            rows = (problem.view == v) & (problem.camera == c) & problem.kept
             if np.sum(rows) >= 4:
                 centre = (np.array(camera.image_size_px) - 1) / 2
                 out[v, c] = _image_map(dots_mm[problem.dot[rows], :2], problem.uv_px[rows] - centre)

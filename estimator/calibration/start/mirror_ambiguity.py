@@ -238,7 +238,7 @@ _ROUNDS = 6
 def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
     """Views with dots in exactly one camera, and that camera."""
     counts = np.zeros((len(problem.views), len(problem.cameras)), int)
-    np.add.at(counts, (problem.view, problem.camera), problem.weight > 0)
+    np.add.at(counts, (problem.view, problem.camera), problem.kept)
     alone = np.flatnonzero((counts > 0).sum(1) == 1)
     return alone, counts[alone].argmax(1)
 

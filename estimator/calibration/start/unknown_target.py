@@ -48,7 +48,7 @@ def _factorise(problem: Problem) -> tuple[dict[tuple[int, int], Array], Array]:
     images = {}
     for v in range(len(problem.views)):
         for c in range(len(problem.cameras)):
-            rows = (problem.view == v) & (problem.camera == c) & (problem.weight > 0)
+            rows = (problem.view == v) & (problem.camera == c) & problem.kept
             if rows.sum() >= 4:
                 images[v, c] = (problem.dot[rows], problem.uv_px[rows])
     plane = problem.nominal_mm[:, :2].copy()

@@ -25,6 +25,7 @@ from telerig.estimator.smoothing.graph.layout import (
 from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.factors.linear_factors import LinearFactors
+from telerig.factors.robust_loss import truncation_weights
 from telerig.rig.lens_parameters import INDEX
 
 Progress = Callable[[str, float], None]
@@ -319,22 +320,13 @@ class Truncation:
             self.control = bound / max(2 * largest - bound, bound)
         else:
             self.control *= 4
-        fresh = tuple(_truncated(s, bound, self.control) for s in squares)
+        fresh = tuple(truncation_weights(s, bound, self.control) for s in squares)
         if self.control > 1 and any(len(w) and w.mean() < _LEAST_KEPT for w in fresh):
             # so many cannot be outliers: it is the motion that the priors do not allow
             self.wanted = False
             fresh = tuple(np.ones_like(w) for w in weights)
         change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fresh, weights))
         return (fresh[0], fresh[1]), change > 1e-3
-
-
-def _truncated(squares: Array, bound: float, control: float) -> Array:
-    """(M,) weights; control grows from near 0 (convex) to infinity (truncated)."""
-    low, high = control / (control + 1) * bound, (control + 1) / control * bound
-    if control > 1e3:
-        return (squares <= bound).astype(float)
-    between = np.sqrt(bound * control * (control + 1) / np.maximum(squares, 1e-12)) - control
-    return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, np.clip(between, 0, 1)))
 
 
 def delays_have_moved(graph: GraphLayout, state: State) -> bool:

@@ -8,7 +8,7 @@ low-pass cut-off of the modes' force is one for all, ``modes.force_hz``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatch
 from functools import lru_cache
 from typing import Any
@@ -18,32 +18,15 @@ import numpy as np
 from telerig.errors import InputError
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
 from telerig.estimator.smoothing.problem.problem import CARRIAGE, ShakeModel
-from telerig.factors.bubble_motion import Process, bubble_processes, line_process
+from telerig.factors.bubble_motion import (
+    BUBBLE_PRIORS,
+    Prior,
+    Process,
+    bubble_processes,
+    learned_names,
+    line_process,
+)
 from telerig.factors.state_space import Component, broad_band, slow_ou
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Log-normal prior of a positive number within bounds; step is what the optimiser calls 1."""
-
-    low: float
-    high: float
-    median: float
-    log_sigma: float
-    step: float
-
-    def log_density(self, value: float) -> float:
-        """Up to a constant."""
-        return float(-0.5 * (np.log(value / self.median) / self.log_sigma) ** 2)
-
-    def density(self, value: float) -> float:
-        """Probability per unit of the value's logarithm."""
-        return float(np.exp(self.log_density(value)) / (self.log_sigma * np.sqrt(2 * np.pi)))
-
-    def log_gradient(self, value: float) -> float:
-        """Derivative of the log density by the number's logarithm."""
-        return float(-np.log(value / self.median) / self.log_sigma**2)
-
 
 FORCE = "modes.force_hz"
 """Low-pass cut-off of the force that drives the modes, one for all."""
@@ -54,11 +37,7 @@ PRIORS: dict[str, Prior] = {
     "modes.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
     "modes.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
     "broad_bands.*.rms_mm": Prior(1e-4, 5.0, 0.1, 1.5, 0.2),
-    "bubble.zigzags.*.frequency_hz": Prior(1.0, 60.0, 8.0, 1.0, 0.02),
-    "bubble.zigzags.*.damping": Prior(0.003, 0.5, 0.04, 0.8, 0.4),
-    "bubble.zigzags.*.rms_mm": Prior(1e-3, 20.0, 0.3, 2.0, 0.2),
-    "bubble.velocity_sigma_mm_s": Prior(0.5, 200.0, 10.0, 0.5, 0.2),
-    "bubble.velocity_tau_s": Prior(0.02, 5.0, 0.3, 0.5, 0.3),
+    **BUBBLE_PRIORS,
     "pixel_inflation": Prior(0.3, 5.0, 1.0, 0.3, 0.02),
 }
 """Priors by pattern of the name."""
@@ -138,8 +117,7 @@ def names_of(model: ShakeModel) -> list[str]:
     if model.force_hz is not None:
         out.append(FORCE)
     out += [f"broad_bands.{i}.rms_mm" for i in range(len(model.broad_bands))]
-    out += [f"bubble.zigzags.{i}.{f}" for i in range(len(model.bubble.zigzags)) for f in fields]
-    return [*out, "bubble.velocity_sigma_mm_s", "bubble.velocity_tau_s", "pixel_inflation"]
+    return [*out, *learned_names(model.bubble), "pixel_inflation"]
 
 
 def log_prior(model: ShakeModel, names: Sequence[str]) -> float:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array
 from telerig.errors import GeometryError, InputError
-from telerig.rig import distortion, projection
+from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import hat
@@ -361,9 +361,9 @@ def _point_jacobian(camera: Camera, points: Array) -> tuple[Array, Array]:
     coefficients = camera.intrinsics[INDEX["k1"] : INDEX["tilt_x"]]
     if np.any(coefficients):
         normal = np.stack([x, y], -1) / camera.rho_mm
-        x, y = distortion.distort(normal, coefficients).T * camera.rho_mm
+        x, y = projection.distort(normal, coefficients).T * camera.rho_mm
         (xx, xy), (yx, yy) = np.moveaxis(
-            distortion.distortion_jacobian(normal, coefficients), 0, -1
+            projection.distortion_jacobian(normal, coefficients), 0, -1
         )
         by_x, by_y = xx * by_x + xy * by_y, yx * by_x + yy * by_y
     scale, skew, aspect = camera["scale_px_per_mm"], camera["skew"], camera["aspect"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from telerig.errors import GeometryError
-from telerig.rig import distortion, projection
+from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import (
     INDEX,
@@ -85,7 +85,7 @@ def test_distortion_is_opencv_s():
     expected, _ = cv2.projectPoints(
         np.c_[xy, np.ones(20)], np.zeros(3), np.zeros(3), np.eye(3), cv_order
     )
-    np.testing.assert_allclose(distortion.distort(xy, c), expected.reshape(-1, 2), atol=1e-13)
+    np.testing.assert_allclose(projection.distort(xy, c), expected.reshape(-1, 2), atol=1e-13)
 
 
 def test_perspective_limit_is_opencv_s_pinhole():
@@ -149,7 +149,7 @@ def test_mirror_twin_has_the_same_pixels(model):
 
 def test_undistort_refuses_beyond_the_fold():
     with pytest.raises(GeometryError, match="cannot be inverted for 1 of 2 points"):
-        distortion.undistort(np.array([[0.1, 0.1], [0.9, 0.9]]), np.array([-0.4] + [0.0] * 8))
+        projection.undistort(np.array([[0.1, 0.1], [0.9, 0.9]]), np.array([-0.4] + [0.0] * 8))
 
 
 def test_project_refuses_points_behind_the_centre():

@@ -43,13 +43,13 @@ from telerig.io.exchange.export.volume import (
 from telerig.io.files.atomic import atomic_folder
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.distortion import (
+from telerig.rig.lens_parameters import COEFFICIENTS
+from telerig.rig.pose import Pose
+from telerig.rig.projection import (
     coefficient_jacobian,
     distortion_jacobian,
     undistort,
 )
-from telerig.rig.lens_parameters import COEFFICIENTS
-from telerig.rig.pose import Pose
 
 PERSPECTIVE_PX = 0.5
 """The largest error (px) that exporting a lens as telecentric may cause in the volume.

@@ -22,9 +22,9 @@ from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, came
 from telerig.io.files.text import read_text
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.distortion import distort
 from telerig.rig.lens_parameters import COEFFICIENTS
 from telerig.rig.pose import Pose, rotation_from_rotvec
+from telerig.rig.projection import distort
 
 WORST_FIT_PX = 0.5
 """A camera whose distortion cannot be fitted better than this is refused."""

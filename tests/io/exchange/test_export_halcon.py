@@ -14,7 +14,7 @@ from telerig.errors import GeometryError
 from telerig.io.exchange.export import halcon
 from telerig.io.exchange.export.halcon import halcon_cameras, hdevelop_lines, write_halcon
 from telerig.io.exchange.export.volume import seen_points, working_volume
-from telerig.rig import distortion
+from telerig.rig import projection
 from telerig.rig.pose import Pose
 
 # ------------------------------------------------------------------------------------- HALCON
@@ -150,15 +150,15 @@ def test_halcon_takes_the_coefficients_by_name(monkeypatch: pytest.MonkeyPatch) 
     """Another order of the coefficients in the distortion module must not change the export."""
     cameras = pair(**DISTORTED)
     usual = halcon_cameras(cameras)
-    last = len(distortion.COEFFICIENTS) - 1
-    monkeypatch.setattr(halcon, "COEFFICIENTS", distortion.COEFFICIENTS[::-1])
+    last = len(projection.COEFFICIENTS) - 1
+    monkeypatch.setattr(halcon, "COEFFICIENTS", projection.COEFFICIENTS[::-1])
     monkeypatch.setattr(
         halcon,
         "coefficient_jacobian",
-        lambda xy, which: distortion.coefficient_jacobian(xy, [last - i for i in which]),
+        lambda xy, which: projection.coefficient_jacobian(xy, [last - i for i in which]),
     )
     for name in ("undistort", "distortion_jacobian"):
-        function = getattr(distortion, name)
+        function = getattr(projection, name)
         monkeypatch.setattr(halcon, name, lambda xy, c, f=function: f(xy, c[::-1]))
     for before, after in zip(usual, halcon_cameras(cameras)):
         assert after.parameters == before.parameters and after.misfit == before.misfit

@@ -161,10 +161,10 @@ def check_unit(host_s: Array, stamps: Array, device: DeviceDescription) -> None:
         return
     power = 10.0 ** round(np.log10(rate))
     decimal = abs(rate / power - 1) < _MOST_DRIFT
+    times = power if decimal else float(f"{rate:.3g}")
     unit = device.time_unit_s / (power if decimal else rate)
-    shown = f"{power if decimal else rate:.3g}"
     raise InputError(
-        f"its time stamps run {shown} times as fast as the host's clock",
+        f"its time stamps run {times:g} times as fast as the host's clock",
         where=f"devices.{device.name}",
         todo=f"set time_unit_s = {unit:.3g} in [devices.{device.name}] of rig.toml (now "
         f"{device.time_unit_s:g}); what was recorded can be read with `telerig record --replay RUN "

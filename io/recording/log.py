@@ -75,7 +75,8 @@ class RawLog:
     def __init__(self, path: Path, header: LogHeader) -> None:
         self.path = path
         text = json.dumps(asdict(header), ensure_ascii=False).encode()
-        self._waiting = [MAGIC + _CRC.pack(len(text)) + text + _CRC.pack(zlib.crc32(text))]
+        head = MAGIC + _CRC.pack(len(text)) + text + _CRC.pack(zlib.crc32(text))
+        self._waiting: list[bytes] = []
         self.bytes = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -90,14 +91,14 @@ class RawLog:
             what = "is a file, and a folder is needed"
             raise InputError(what, where=str(path.parent), todo="give another name") from error
         except OSError as error:
-            raise log_error(path, error) from error
+            raise log_error(path, error, recorded=False) from error
         try:
-            self.flush()
+            self._write(head)
             _sync_folder(path.parent)
-        except (InputError, OSError) as error:
+        except OSError as error:
             self._file.close()
             path.unlink(missing_ok=True)
-            raise _nothing_recorded(path, error) from error
+            raise log_error(path, error, recorded=False) from error
 
     def append(self, entry: Entry) -> None:
         self._waiting.append(packed(entry))
@@ -112,14 +113,10 @@ class RawLog:
             return
         data, self._waiting = b"".join(self._waiting), []
         try:
-            written = 0
-            while written < len(data):
-                written += self._file.write(memoryview(data)[written:])
-            os.fsync(self._file.fileno())
+            self._write(data)
             deleted = os.fstat(self._file.fileno()).st_nlink == 0
         except OSError as error:
             raise log_error(self.path, error) from error
-        self.bytes += len(data)
         if deleted:
             self._write_again()
             raise InputError(
@@ -128,6 +125,13 @@ class RawLog:
                 todo=f"everything until now has been written to it again; `telerig record --replay "
                 f"{self.path}` makes the tables",
             )
+
+    def _write(self, data: bytes) -> None:
+        written = 0
+        while written < len(data):
+            written += self._file.write(memoryview(data)[written:])
+        os.fsync(self._file.fileno())
+        self.bytes += len(data)
 
     def _write_again(self) -> None:
         """Write the content of the deleted file, which its handle still holds, to its old place."""
@@ -160,15 +164,6 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def _nothing_recorded(path: Path, error: Exception) -> InputError:
-    full = isinstance(error, InputError) and error.what.startswith("the disk is full")
-    return InputError(
-        "the disk is full: nothing was recorded" if full else f"cannot be written: {error}",
-        where=str(path),
-        todo="make room, then run again" if full else "choose a folder that can be written",
-    )
-
-
 def packed(entry: Entry) -> bytes:
     """Return the bytes of one entry as they stand in the file."""
     head = _HEAD.pack(entry.kind, entry.device, entry.time_ns, len(entry.data))
@@ -176,13 +171,18 @@ def packed(entry: Entry) -> bytes:
     return b"".join((MARKER, head, entry.data, _CRC.pack(crc)))
 
 
-def log_error(path: Path, error: OSError) -> InputError:
-    """Return the error for a log that cannot be written."""
+def log_error(path: Path, error: OSError, *, recorded: bool = True) -> InputError:
+    """Return the error for a log that cannot be written.
+
+    recorded : whether a part of the recording is in the file already.
+    """
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return InputError(
-            "the disk is full: the recording ends here",
+            "the disk is full: " + ("the recording ends here" if recorded else "nothing recorded"),
             where=str(path),
-            todo=f"make room; `telerig record --replay {path}` reads what was recorded until now",
+            todo=f"make room; `telerig record --replay {path}` reads what was recorded until now"
+            if recorded
+            else "make room, then run again",
         )
     return InputError(
         f"cannot be written: {error.strerror or error}",

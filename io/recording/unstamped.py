@@ -59,7 +59,7 @@ def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
     period_s = _period_s(arrived_s, slot)
     if not period_s > 0:
         return None
-    count = np.cumsum(_begins(arrived_s - period_s * slot, period_s)) - 1
+    count = np.cumsum(_begins(arrived_s - period_s * slot, slot, period_s)) - 1
     device_s = np.asarray(period_s * slot, np.float64)
     clocks = fit_counts(arrived_s, device_s, count)
     parts = np.split(device_s, np.flatnonzero(np.diff(count)) + 1)
@@ -86,12 +86,13 @@ def _period_s(arrived_s: Array, slot: Ints) -> float:
     return period_s
 
 
-def _begins(late_s: Array, period_s: float) -> Ints:
+def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
     """(N,) 1 where a count begins.
 
     late_s : (N,) arrival minus the period times the line's number: a constant in each count, plus
-    the delay. Missing lines raise the constant, surplus ones lower it.
+    the delay. Missing lines raise the constant; malformed ones that were no line lower it.
     """
+    surplus = (slot - np.arange(len(slot))).tolist()
     begins = np.zeros(len(late_s), np.int64)
     begins[0] = 1
     flush = int(2 * ADAPTER_S / period_s) + 1
@@ -102,12 +103,14 @@ def _begins(late_s: Array, period_s: float) -> Ints:
     while i < len(late):
         before = late[least[0]]
         raised = i < last and ahead[i] - before > period_s / 2
-        known = i > begin + flush  # since then a reading has come that hardly waited
-        if raised or (known and late[i] - before < -period_s / 2):
+        lowered = surplus[i] > surplus[max(i - window, begin)]
+        if raised or (lowered and late[i] - before < -period_s / 2):
             if raised:
                 # What came with a delay just before the missing lines is still of the old count.
                 level = ahead[min(i + flush, last)] - period_s / 4
                 i += int(np.max(np.flatnonzero(late_s[i : i + flush] < level), initial=-1)) + 1
+            if begin > 0 and i - begin < flush:
+                begins[begin] = 0  # too short to contain a reading that hardly waited
             begin = i
             begins[i] = 1
             least.clear()

@@ -151,6 +151,69 @@ def test_only_garbage_is_said_after_two_seconds(
     assert not (tmp_path / "run" / LOG_NAME).exists()
 
 
+def test_stamps_in_another_unit_are_said_after_two_seconds(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    with SimulatedPorts(practice_devices()[:2], tmp_path / "ports", rng) as ports:
+        wrong = [ports.devices[0], replace(ports.devices[1], time_unit_s=1e-3)]
+        with pytest.raises(InputError, match=r"1000 times as fast(.|\n)*time_unit_s = 1e-06"):
+            record(wrong, tmp_path / "run", seconds=30.0)
+    found = replay(tmp_path / "run" / FAILED_NAME, {d.name: d for d in ports.devices})
+    assert all(len(one.t_s) > 1500 for one in found.records), "nothing of it is lost"
+
+
+def test_a_pattern_cannot_stop_the_other_devices(tmp_path: Path) -> None:
+    class Line(NoisyPort):
+        def __init__(self, text: bytes) -> None:
+            super().__init__()
+            self.text, self.sent = text, 0
+
+        def read(self, size: int) -> bytes:
+            time.sleep(0.002)
+            self.sent += 1
+            return b"%d,5\n1\n" % (2000 * self.sent) if self.text == b"stream" else self.text
+
+    own = DeviceDescription(
+        "own", "encoder", "/dev/y", protocol="regex", pattern=r"(?P<counts>(1+)+)"
+    )
+    stream = DeviceDescription("stream", "frames", "/dev/x", protocol="stream", cameras=("left",))
+    lines = {"own": Line(b"1" * 3000 + b"x\n1\n"), "stream": Line(b"stream")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("telerig.io.recording.session.open_port", lambda d: lines[d.name])
+        begun = time.monotonic()
+        log = record([own, stream], tmp_path / "run", seconds=1.0)
+    assert time.monotonic() - begun < 4.0
+    own_record, other = replay(log).records
+    assert len(own_record.malformed_s) > 50 and len(other.t_s) > 50
+
+
+class BreakingPort(NoisyPort):
+    """A port whose driver raises what nobody expects, each time after a few readings."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent = 0
+
+    def read(self, size: int) -> bytes:
+        time.sleep(0.01)
+        self.sent += 1
+        if self.sent % 20 == 0:
+            raise RuntimeError("a fault of the driver")
+        return b"%d,5\n" % (10_000 * self.sent)
+
+
+def test_a_reader_that_breaks_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = BreakingPort()
+    monkeypatch.setattr("telerig.io.recording.session.open_port", lambda _: port)
+    monkeypatch.setattr("telerig.io.recording.ports.open_port", lambda _: port)
+    device = DeviceDescription("encoder", "encoder", "/dev/x", counts_per_mm=1.0)
+    log = record([device], tmp_path / "run", seconds=1.5)
+    (one,) = replay(log).records
+    assert len(one.away_s) >= 2 and len(one.t_s) + len(one.away_s) * 2 >= port.sent - 2
+
+
 def test_a_missing_port_names_those_that_exist(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,13 +10,21 @@ from numpy.random import Generator
 
 from telerig.io.recording.log import END, RECEIVED, Entry, LogHeader, RawLog
 from telerig.io.recording.simulated.devices import SimulatedDevice, Truth, made_since_last
+from telerig.io.rig_file.description import DeviceDescription
 
 
 def simulated_log(
-    path: Path, sims: Sequence[SimulatedDevice], seconds: float, rng: Generator
+    path: Path,
+    sims: Sequence[SimulatedDevice],
+    seconds: float,
+    rng: Generator,
+    described: Sequence[DeviceDescription] | None = None,
 ) -> list[Truth]:
-    """The raw log that streaming devices would give, made at once; least delay is near 0."""
-    header = LogHeader(0, "simulated", (), tuple(sim.device for sim in sims))
+    """The raw log that streaming devices would give, made at once; least delay is near 0.
+
+    described : what the log's header states about the devices; None states what they are.
+    """
+    header = LogHeader(0, "simulated", (), tuple(described or (sim.device for sim in sims)))
     truths, entries = [], []
     for index, sim in enumerate(sims):
         truth = Truth()

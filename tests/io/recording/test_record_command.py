@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -173,6 +174,23 @@ def test_a_replay_replaces_nothing_but_tables_of_a_recording(dataset: Path) -> N
     run(*again, "--out", dataset / "new")
 
 
+def test_one_device_described_wrongly_costs_its_own_table_and_the_exit_code(
+    tmp_path: Path,
+) -> None:
+    sims = practice_devices()[:2]
+    told = [sims[0], replace(sims[1], device=replace(sims[1].device, time_unit_s=1e-3))]
+    stamps_as_sent = replace(sims[1].device, port="x")
+    rng = np.random.default_rng(2)
+    simulated_log(tmp_path / "recording.raw", sims, 3.0, rng, [sim.device for sim in told])
+    said = run("record", "--replay", tmp_path, code=2)
+    assert "times as fast as the host's clock" in said and "time_unit_s = 1e-06" in said
+    assert len(pd.read_csv(tmp_path / "stage.csv")) > 2900
+    devices = with_ports([sims[0], replace(sims[1], device=stamps_as_sent)])
+    write_rig_toml(practice_rig([sim.device for sim in devices]), tmp_path / "rig.toml")
+    said = run("record", "--replay", tmp_path, "--rig", tmp_path / "rig.toml")
+    assert len(pd.read_csv(tmp_path / "accelerometer.csv")) > 5900
+
+
 def test_a_device_that_stays_away_is_told() -> None:
     device = {
         "readings": 3, "rate_hz": 1.0, "lost": 0, "malformed": 0, "left_out": {},
@@ -195,8 +213,6 @@ def test_devices_of_a_rig_file_round_trip(tmp_path: Path) -> None:
 
 
 def with_ports(sims: list[SimulatedDevice]) -> list[SimulatedDevice]:
-    from dataclasses import replace
-
     return [
         replace(sim, device=replace(sim.device, port=f"/dev/tty{k}")) for k, sim in enumerate(sims)
     ]
@@ -260,6 +276,15 @@ def with_ports(sims: list[SimulatedDevice]) -> list[SimulatedDevice]:
         ),
         ('[devices.e]\nkind = "encoder"\nport = "x"\npoll = "?"', r"poll: is given(.|\n)*regex"),
         ('[device.e]\nkind = "encoder"', r"did you mean devices\?"),
+        (
+            '[devices.e]\nkind = "encoder"\nport = "spy:///dev/x?file=y"\ncounts_per_mm = 1.0',
+            r"port(.|\n)*scheme spy://(.|\n)*socket://",
+        ),
+        (
+            '[devices.e]\nkind = "encoder"\nport = "x"\nprotocol = "regex"\n'
+            "pattern = '(?=x)(?P<position_mm>.)'",
+            r"is no regular expression(.|\n)*look-around",
+        ),
     ],
 )
 def test_what_a_rig_file_may_not_say(devices: str, expected: str) -> None:

@@ -30,7 +30,7 @@ from telerig.io.files.atomic import (
     unwritable,
 )
 from telerig.io.files.hashing import hash_if_there, hashed
-from telerig.io.results.inputs import Input
+from telerig.io.results.inputs import Input, fingerprints
 from telerig.io.results.record import Part, Record
 from telerig.version import VERSION
 
@@ -38,6 +38,7 @@ NAME = "manifest.json"
 RUN_RECORD = "run.json"
 LONGEST_COMMAND = 300
 """Characters of a command line that are kept; a batch may name thousands of datasets."""
+_SMOOTHED = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
 _LOCK_WITHIN_S = 30.0
 _PAGES = (RUN_RECORD, "report.html")
 """Files that every command writes about itself. Another command may replace them."""
@@ -266,11 +267,21 @@ def replaced_results(
 
 
 def _old(folder: Path) -> Manifest:
-    """Return the manifest of the folder; an empty one where there is none that can be read."""
+    """Return the manifest of the folder, or what can be known where there is none to be read.
+
+    A smoothing in a folder without a manifest counts as made from the tracks that lie beside it, so
+    that it becomes stale when the run is tracked again.
+    """
     with suppress(InputError):
         if (folder / NAME).is_file():
             return Manifest.read(folder / NAME)
-    return Manifest.of_sections({})
+    files = {n: _entry(folder / n) for n in _SMOOTHED if (folder / n).is_file()}
+    if not files:
+        return Manifest.of_sections({})
+    inputs = fingerprints(folder, [folder / "tracks.csv"])
+    return Manifest.of_sections(
+        {"smooth": Section(again="telerig smooth RUN", files=files, inputs=inputs)}
+    )
 
 
 def _make_room(file: Path) -> None:

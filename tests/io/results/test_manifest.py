@@ -198,6 +198,21 @@ def test_files_that_telerig_did_not_write_here(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.parametrize("manifest", [None, "{"])
+def test_a_smoothing_of_before_becomes_stale(tmp_path: Path, manifest: str | None) -> None:
+    folder = tmp_path / "rise"
+    folder.mkdir()
+    for name in ("tracks.csv", "trajectories.csv", "smoothing.json"):
+        (folder / name).write_text("old")
+    if manifest is not None:
+        (folder / "manifest.json").write_text(manifest)
+    write(folder, "track", tracks_csv="old")
+    assert stale(folder) == ()
+    write(folder, "track", tracks_csv="new")
+    (words,) = stale(folder, ["trajectories.csv"])
+    assert "`telerig smooth RUN` are stale (tracks.csv has changed" in words
+
+
 def test_a_reader_notices_that_the_folder_is_written_while_it_reads(tmp_path: Path) -> None:
     write(tmp_path / "rise", "track", tracks_csv="old")
     with (

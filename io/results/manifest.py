@@ -40,8 +40,6 @@ LONGEST_COMMAND = 300
 """Characters of a command line that are kept; a batch may name thousands of datasets."""
 _SMOOTHED = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
 _LOCK_WITHIN_S = 30.0
-_PAGES = (RUN_RECORD, "report.html")
-"""Files that every command writes about itself. Another command may replace them."""
 
 
 class Written(Part):
@@ -59,8 +57,6 @@ class Section(Part):
     telerig, finished : the version of telerig and the time (UTC).
     files : the written files by their path relative to the folder.
     inputs : the files that the command used, by their path relative to the folder.
-    overwritten : files of this section that another command has replaced by different ones, with
-    the name of that command.
 
     The following keys are set only while files are being renamed, so they remain if the command is
     killed at that moment.
@@ -76,7 +72,6 @@ class Section(Part):
     finished: str = ""
     files: dict[str, Written] = Field(default_factory=dict)
     inputs: dict[str, Input] = Field(default_factory=dict)
-    overwritten: dict[str, str] = Field(default_factory=dict)
     found: dict[str, str | None] | None = None
     replaces: Section | None = None
     found_whole: bool = True
@@ -306,7 +301,7 @@ def _replace(staged: Path, folder: Path, command: str, new: Section) -> None:
             before = before.settled(folder)
         except InputError:
             before, whole = None, False
-    sections = {name: _without(s, command, new) for name, s in sections.items()}
+    sections = {name: _without(s, new.files) for name, s in sections.items()}
     sections = {name: s for name, s in sections.items() if s.files}
     kept = {name for s in sections.values() for name in s.files}
     changing -= kept
@@ -327,18 +322,11 @@ def _replace(staged: Path, folder: Path, command: str, new: Section) -> None:
     Manifest.of_sections({**sections, command: new}).write(folder / NAME)
 
 
-def _without(section: Section, command: str, new: Section) -> Section:
-    """Return a section of another command without the files that ``new`` takes over."""
-    overwritten = dict(section.overwritten)
-    for name, entry in section.files.items():
-        if name in new.files and name not in _PAGES and entry.sha256 != new.files[name].sha256:
-            overwritten[name] = command
-    kept: dict[str, Any] = {
-        "files": {n: entry for n, entry in section.files.items() if n not in new.files},
-        "overwritten": overwritten,
-    }
+def _without(section: Section, names: Collection[str]) -> Section:
+    """Return a section of another command without the files that are taken over from it."""
+    kept: dict[str, Any] = {"files": {n: e for n, e in section.files.items() if n not in names}}
     if section.found is not None:
-        kept["found"] = {n: h for n, h in section.found.items() if n not in new.files}
+        kept["found"] = {n: h for n, h in section.found.items() if n not in names}
     return section.model_copy(update=kept)
 
 

@@ -78,10 +78,7 @@ def _search(
 
 
 def _sentence(folder: Path, section: Section, found: dict[tuple[Path, str], str]) -> str:
-    reasons = [
-        f"{name[-_LONGEST_NAME:]} was replaced by `telerig {by[:_LONGEST_NAME]}`"
-        for name, by in section.overwritten.items()
-    ]
+    reasons = []
     for name, recorded in section.inputs.items():
         path = folder / name
         shown = name.lstrip("./")[-_LONGEST_NAME:]

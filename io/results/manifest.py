@@ -159,9 +159,9 @@ def read_manifest(folder: Path) -> Manifest | None:
 def reading(folder: Path, names: Collection[str]) -> Iterator[None]:
     """Check the files ``names`` of a results folder while the body reads them.
 
-    Files that do not exist are left out. A file that differs from what telerig wrote, or that
-    telerig did not write, gives a `TelerigWarning`, and so does a whole results folder without a
-    manifest. A folder that holds single files only gives none.
+    A file that differs from what telerig wrote, that telerig did not write, or that was removed
+    gives a `TelerigWarning`, and so does a whole results folder without a manifest. A folder that
+    holds single files only gives none.
     Raises InputError when the files are of two different results, or when a command replaces them
     while they are read.
     """
@@ -205,9 +205,12 @@ def _check(folder: Path, manifest: Manifest, names: Collection[str]) -> None:
         return
     wanted = set(names)
     settled = [s.settled(folder) if s.changing() & wanted else s for s in sections]
-    for name in sorted(name for name in wanted if (folder / name).is_file()):
+    for name in sorted(wanted):
         entry = next((s.files[name] for s in settled if name in s.files), None)
-        if entry is None:
+        if not (folder / name).is_file():
+            if entry is not None:
+                _warn(f"{folder / name}: is no longer there; the results are used without it")
+        elif entry is None:
             _warn(f"{folder / name}: was not written into this folder by telerig; it is used")
         elif hashed(folder / name).sha256 != entry.sha256:
             _warn(f"{folder / name}: {_difference(folder / name, entry)}; it is used as it is now")

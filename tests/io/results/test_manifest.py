@@ -169,6 +169,12 @@ def test_a_table_cut_at_the_end_of_a_line_is_noticed(tmp_path: Path) -> None:
         reading(file.parent, [file.name]),
     ):
         pass
+    file.unlink()
+    with (
+        pytest.warns(TelerigWarning, match=r"tracks\.csv: is no longer there"),
+        reading(file.parent, [file.name]),
+    ):
+        pass
     file.write_text("frame,x\n0,1\n1,2\n2,4\n")
     with (
         pytest.warns(TelerigWarning, match="was changed after telerig wrote it"),

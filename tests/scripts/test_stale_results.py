@@ -29,7 +29,7 @@ def calibrated_again(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset that was smoothed, and then calibrated with another lens model."""
     data = make_dataset(tmp_path_factory.mktemp("stale") / "my data", 5)
     quiet = ("--quiet", "--no-report")
-    assert telerig("calibrate", data, *quiet)[0] == 0
+    assert telerig("calibrate", data, "--model", "k1", *quiet)[0] == 0
     for command in ("track", "smooth"):
         assert again(command, data)[0] == 0
     assert telerig("export", data, "--to", "hdf5")[0] == 0, "nothing is stale yet"

@@ -24,6 +24,8 @@ _SHORTEST_S = 0.5
 _WINDOW = 200
 """Among so many readings there is one that hardly waited."""
 _LONGEST_WAIT_S = 0.1
+_MOST = 0.8
+"""The share of the record that decides: at other times the host may have been too busy to read."""
 _SEGMENT = 20
 """A regular device gives at least so many readings, on average, between two that are missing."""
 
@@ -64,13 +66,12 @@ def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
     clocks = fit_counts(arrived_s, device_s, count)
     parts = np.split(device_s, np.flatnonzero(np.diff(count)) + 1)
     t_s = np.concatenate([clock.host_s(part) for clock, part in zip(clocks, parts)])
-    waited = float(np.quantile(arrived_s - t_s, 0.95))
-    if len(clocks) > 1 + len(slot) // _SEGMENT or not waited < max(_LONGEST_WAIT_S, 2 * period_s):
+    waited_s = arrived_s - t_s
+    often_s = float(np.quantile(waited_s, _MOST))
+    if len(clocks) > 1 + len(slot) // _SEGMENT or not often_s < max(_LONGEST_WAIT_S, 2 * period_s):
         return None
-    variance = np.average(
-        [clock.sd_offset_us**2 for clock in clocks], weights=[clock.readings for clock in clocks]
-    )
-    return Spread(_increasing(t_s), 1e-6 * float(np.sqrt(variance)), True)
+    least_s = [float(np.min(part)) for part in np.array_split(waited_s, len(slot) // _FEWEST)]
+    return Spread(_increasing(t_s), float(np.quantile(np.abs(least_s), _MOST)), True)
 
 
 def _period_s(arrived_s: Array, slot: Ints) -> float:
@@ -99,8 +100,11 @@ def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
     window = min(max(_WINDOW, 4 * flush), len(late_s) - 1)
     ahead = minimum_filter1d(late_s, 2 * window + 1, origin=-window, mode="nearest")
     late, least = late_s.tolist(), deque([0])
-    begin, i, last = 0, 1, len(late) - flush
+    begin, i, last, previous = 0, 1, len(late) - flush, -np.inf
     while i < len(late):
+        if late[i] < previous + period_s / 2:
+            # Nothing was missing: the host was too busy to read for a while, and has caught up.
+            begins[begin], previous = 0, -np.inf
         before = late[least[0]]
         raised = i < last and ahead[i] - before > period_s / 2
         lowered = surplus[i] > surplus[max(i - window, begin)]
@@ -111,7 +115,7 @@ def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
                 i += int(np.max(np.flatnonzero(late_s[i : i + flush] < level), initial=-1)) + 1
             if begin > 0 and i - begin < flush:
                 begins[begin] = 0  # too short to contain a reading that hardly waited
-            begin = i
+            begin, previous = i, before if raised else -np.inf
             begins[i] = 1
             least.clear()
         while least and late[least[-1]] >= late[i]:
@@ -124,11 +128,16 @@ def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
 
 
 def _evenly(arrived_s: Array) -> Spread:
-    """Readings of one arrival spread over the time since the arrival before, at most 16 ms."""
+    """Readings of one arrival spread over the time since the arrival before.
+
+    They are spread over at most 16 ms, or as long as so many readings take on average.
+    """
     if not len(arrived_s):
         return Spread(arrived_s, 0.0, False)
+    usual_s = float(np.ptp(arrived_s)) / max(len(arrived_s) - 1, 1)
     arrivals, which, size = np.unique(arrived_s, return_inverse=True, return_counts=True)
-    width = np.minimum(np.diff(arrivals, prepend=arrivals[0] - ADAPTER_S), ADAPTER_S)
+    most = np.maximum(ADAPTER_S, usual_s * size)
+    width = np.minimum(np.diff(arrivals, prepend=arrivals[0] - most[0]), most)
     place = np.arange(len(arrived_s)) - (np.cumsum(size) - size)[which]
     t_s = arrived_s - width[which] * (1 - (place + 1) / size[which])
     return Spread(_increasing(t_s), float(np.sqrt(np.mean(width[which] ** 2) / 12)), False)

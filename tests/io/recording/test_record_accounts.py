@@ -18,6 +18,7 @@ from fault_recordings import (
     table,
 )
 
+from telerig.errors import InputError
 from telerig.io.recording.simulated.devices import Faults, SimulatedDevice
 
 SCENARIOS = {
@@ -62,12 +63,18 @@ def test_a_kill_costs_the_last_second_of_every_device(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_hundred_recordings_with_faults(tmp_path: Path) -> None:
     """About 12 minutes; TELERIG_ACCOUNTS=FILE writes the table of the benchmark results."""
-    accounts = []
+    accounts, failed = [], []
     for seed in range(100):
-        rng = np.random.default_rng(seed)
+        rng, kill = np.random.default_rng(seed), seed % 5 == 4
         sims = faulty_devices(rng, 5.0)
-        folder = tmp_path / str(seed)
-        accounts += recorded_with_faults(sims, folder, rng, 5.0, kill=seed % 5 == 4)
-        check(accounts[-len(sims) :])
+        if kill:  # the command takes a while to start, in which nothing may be unplugged
+            sims = [replace(s, faults=replace(s.faults, unplug_s=(), flood_s=())) for s in sims]
+        try:
+            found = recorded_with_faults(sims, tmp_path / str(seed), rng, 5.0, kill=kill)
+            accounts += found
+            check(found)
+        except (AssertionError, InputError) as error:
+            failed.append(f"{seed}: {error}")
     if file := os.environ.get("TELERIG_ACCOUNTS"):
-        Path(file).write_text(table(accounts), encoding="utf-8")
+        Path(file).write_text("\n".join([table(accounts), *failed]), encoding="utf-8")
+    assert not failed, "\n".join(failed)

@@ -87,3 +87,12 @@ def test_an_unstamped_stream_that_loses_bytes(tmp_path: Path) -> None:
     assert len(table) > 0.97 * truth.sent and not done.errors
     true = 20 * (1 - np.cos(2 * np.pi * table[:, 0] / 10))
     assert np.max(np.abs(table[:, 1] - true)) < 0.05, "12.6 mm/s, and some times are 2 ms off"
+
+
+def test_a_host_that_reads_nothing_for_a_while_is_no_gap() -> None:
+    rng = np.random.default_rng(5)
+    made = np.arange(6000) / 1000
+    arrived = bunched(made, rng)
+    arrived[(arrived > 2.0) & (arrived < 2.6)] = 2.6
+    found = spread_arrivals(arrived, np.arange(6000))
+    assert found.regular and np.max(np.abs(found.t_s - made)) < 0.3e-3

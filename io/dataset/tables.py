@@ -5,7 +5,6 @@ Every error names the file, the row (the header is row 1), the column, and what 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
@@ -17,7 +16,7 @@ import pandas as pd
 from telerig.arrays import Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.files.csv_table import Column, Rows, read_table, rows_of
-from telerig.io.files.text import read_text
+from telerig.io.files.toml import read_toml
 from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.target import FARTHEST
 from telerig.rig.target import Target
@@ -318,12 +317,7 @@ def read_run_toml(path: Path) -> tuple[float, float]:
     Returns the frame rate in Hz and the time of frame 0 in s (0 when the file does not state it).
     Raises InputError when the file is no TOML, has an unknown key, or has no positive frame rate.
     """
-    try:
-        raw = tomllib.loads(read_text(path, "write frame_rate_hz = 500.0"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"is not valid TOML: {error}", where=str(path), todo="write frame_rate_hz = 500.0"
-        ) from error
+    raw = read_toml(path, "write frame_rate_hz = 500.0")
     for key in raw:
         if key not in _RUN_KEYS:
             raise InputError("unknown key", where=f"{path} {key}", todo=suggestion(key, _RUN_KEYS))

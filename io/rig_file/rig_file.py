@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from dataclasses import dataclass, make_dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,6 +14,7 @@ from pydantic import Field
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.files.atomic import write_text_atomic
 from telerig.io.files.text import read_text
+from telerig.io.files.toml import toml_content
 from telerig.io.rig_file.description import (
     CARRIAGE,
     MOST_CAMERAS,
@@ -40,6 +40,10 @@ TOP_LEVEL = [
     *("stage", "accelerometers", "devices", "references", "walls", "tracking"),
 ]
 
+_CORRECT = (
+    "correct that line: strings need quotes, each key stands once, keys follow their [table]"
+)
+_LISTED_PROBLEMS = 15
 _GRAZING = np.cos(np.deg2rad(85.0))
 
 _HOMES = {
@@ -98,15 +102,7 @@ def description_from_toml(text: str, *, where: str, name: str = "rig") -> RigDes
     where : the file that errors name. name : the rig's name, used when the text states none.
     Raises one InputError that lists every fault.
     """
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"is not valid TOML: {error}",
-            where=where,
-            todo="correct that line: strings need quotes, each key stands once, "
-            "keys follow their [table]",
-        ) from error
+    raw = toml_content(text, where, _CORRECT)
     _check_schema(raw, where)
     problems = Problems()
     _check_top_level(raw, problems)
@@ -140,7 +136,10 @@ def _as_error(problems: list[Problem], where: str) -> InputError:
         only = problems[0]
         return InputError(only.what, where=f"{where} {only.place}", todo=only.todo)
     lines = [f"{len(problems)} problems"]
-    lines += [f"  {p.place}: {p.what}\n    -> {p.todo}" for p in problems]
+    listed = problems[:_LISTED_PROBLEMS]
+    lines += [f"  {p.place}: {p.what}\n    -> {p.todo}" for p in listed]
+    if len(problems) > len(listed):
+        lines.append(f"  and {len(problems) - len(listed)} more")
     return InputError("\n".join(lines), where=where, todo="correct them all, then try again")
 
 

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
+from unicodedata import category
+
+LONGEST_BYTES = {"where": 600, "what": 2000, "todo": 900}
+"""The longest parts of a message in bytes: together they fill a terminal's screen.
+
+A file can hold a name of any length, and a message repeats what it found."""
 
 
 class TelerigError(Exception):
@@ -11,17 +17,35 @@ class TelerigError(Exception):
     what : the fault.
     where : the file, row, camera, view, frame or dot in which it is.
     todo : what the user can do about it.
+
+    Parts longer than `LONGEST_BYTES` are cut, and control characters are shown as escapes, because
+    a terminal would obey them.
     """
 
     def __init__(self, what: str, *, where: str = "", todo: str = "") -> None:
-        self.what, self.where, self.todo = what, where, todo
-        parts = [f"{where}: {what}" if where else what]
+        self.what, self.where = _printable(what, "what"), _printable(where, "where")
+        self.todo = _printable(todo, "todo")
+        parts = [f"{self.where}: {self.what}" if where else self.what]
         if todo:
-            parts.append(todo)
+            parts.append(self.todo)
         super().__init__("\n  -> ".join(parts))
 
     def __reduce__(self) -> tuple[object, ...]:
         return (_rebuild, (type(self), self.what, self.where, self.todo))
+
+
+def _printable(text: str, part: str) -> str:
+    """Return the text without control characters, cut to the length of its part of a message."""
+    longest = LONGEST_BYTES[part]
+    start = text[: longest + 1]
+    shown = "".join(
+        c if c == "\n" or category(c) not in ("Cc", "Cf", "Cs") else ascii(c)[1:-1] for c in start
+    )
+    encoded = shown.encode("utf-8")
+    if len(text) == len(start) and len(encoded) <= longest:
+        return shown
+    end = f" ... ({len(text)} characters)"
+    return encoded[: longest - len(end)].decode("utf-8", "ignore") + end
 
 
 def _rebuild(kind: type[TelerigError], what: str, where: str, todo: str) -> TelerigError:

@@ -1,0 +1,48 @@
+"""The rule for names: of cameras, views, runs, sensors, marks and bubbles.
+
+A name becomes a file name, a line of another program's script or a cell of a table, so it must be
+harmless in each of them. Letters of any language, digits, spaces and most signs are allowed.
+"""
+
+from __future__ import annotations
+
+from unicodedata import category
+
+from telerig.errors import InputError
+
+LONGEST_BYTES = 120
+"""File systems allow 255, and a name gets an ending."""
+
+ADVICE = (
+    "use letters, digits, spaces, _ and -; a name becomes part of file names, so it has no / or \\, "
+    f"begins with none of . = @ and has at most {LONGEST_BYTES} bytes"
+)
+_FORBIDDEN = {"Cc": "a control character", "Cf": "an invisible character",
+              "Cs": "half a character", "Zl": "a line break", "Zp": "a line break"}  # fmt: skip
+
+
+def fault_of_name(name: str) -> str:
+    """Return what is wrong with a name, in words that complete "the name ..."; "" if nothing is."""
+    if not name.strip():
+        return "is empty"
+    if len(name.encode("utf-8", "surrogatepass")) > LONGEST_BYTES:
+        return f"has {len(name)} characters"
+    for sign in name:
+        if sign in "/\\":
+            return f"has a {sign}"
+        if category(sign) in _FORBIDDEN:
+            return f"has {_FORBIDDEN[category(sign)]} ({ascii(sign)})"
+    if name[0] in ".=@":
+        return f"begins with {name[0]}"
+    return ""
+
+
+def check_name(name: str, where: str, thing: str = "name") -> str:
+    """Return a name that follows the rule.
+
+    where : the place that the error names. thing : what has the name, for example "camera".
+    Raises InputError for any other name.
+    """
+    if fault := fault_of_name(name):
+        raise InputError(f"the {thing} {name!r:.80} {fault}", where=where, todo=ADVICE)
+    return name

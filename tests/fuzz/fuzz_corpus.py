@@ -1,0 +1,206 @@
+"""Write sound files of every kind that telerig reads, by telerig's simulator and writers."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pandas as pd
+import tifffile
+from scipy.io import savemat, wavfile
+from simulated_log import simulated_log
+
+import telerig
+from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.io.files.csv_table import write_table
+from telerig.io.recording.simulated.devices import practice_devices
+from telerig.io.simulation.presets import run_preset
+
+SIZE_PX = (48, 32)
+_SENSOR_ROWS = 60
+
+
+def write_corpus(folder: Path) -> None:
+    """Write a dataset with results, images, videos, cameras and sensor files of other programs."""
+    rng = np.random.default_rng(1)
+    _dataset(folder / "set", rng)
+    _images(folder / "images", rng)
+    _run_of_images(folder / "film", rng)
+    _foreign(folder / "foreign", rng)
+    _recording(folder / "recording", rng)
+    _batch(folder / "batch")
+
+
+def _dataset(folder: Path, rng: np.random.Generator) -> None:
+    dataset = telerig.simulate(run_preset("S2", frames=12), rng=rng, out=folder, images=False)
+    _extend_rig(folder / "rig.toml")
+    dataset = telerig.load_dataset(folder)
+    results = folder / "results"
+    calibration = telerig.calibrate(dataset, model="radial")
+    calibration.save(results / "calibration" / "calibration.json")
+    for name, table in (("dots", calibration.dots), ("residuals", calibration.residuals)):
+        write_table(table, results / "calibration" / f"{name}.csv")
+    comparison = {"verdict": "unchanged", "words": ["same"], "earlier": "before.json", "changes": [
+        {"quantity": "left.k1", "unit": "1", "change": 0.1, "sd": 0.2, "deviations": 0.5}]}  # fmt: skip
+    (results / "calibration" / "comparison.json").write_text(json.dumps(comparison))
+    run = telerig.load_run(folder / "runs" / "S2")
+    tracks = telerig.track(run, calibration)
+    tracks.save(results / "S2")
+    telerig.smooth(tracks, calibration, stage=run.stage).save(results / "S2")
+    (results / "S2" / "results.h5").unlink()
+    record = {"command": "track", "telerig": "1", "seconds": {"all": 1.0}, "options": {},
+              "inputs_sha256": {"runs/S2/frames.csv": "0" * 64}}  # fmt: skip
+    (results / "S2" / "run.json").write_text(json.dumps(record))
+    (folder / "runs" / "S2" / "run.toml").write_text("frame_rate_hz = 500.0\nstart_s = 0.0\n")
+    _stage_axis(folder, calibration)
+    for manifest in folder.rglob("manifest.json"):
+        manifest.unlink()  # it would refuse every changed file before that is read
+
+
+def _extend_rig(file: Path) -> None:
+    """Give the rig file the tables that the simulator leaves out."""
+    text = file.read_text()
+    for header, rows in (
+        ("[walls.left]", 'normal = [0.0, 0.0, 1.0]\nindices = [1.0, 1.5, 1.33]\nthickness_mm = 9.0'),
+        ("[tracking]", 'cameras = ["left", "right"]'),
+        ("[devices.encoder]", 'kind = "encoder"\nport = "/dev/ttyUSB0"\ncounts_per_mm = 100.0'),
+        ("[devices.clock]", 'kind = "frames"\nport = "/dev/ttyUSB1"\nprotocol = "regex"\n'
+                            "pattern = '(?P<t>\\d+),(?P<frame>\\d+)'"),
+    ):  # fmt: skip
+        if header not in text:
+            text += f"\n{header}\n{rows}\n"
+    file.write_text(text)
+
+
+def _stage_axis(folder: Path, calibration: Calibration) -> None:
+    """A target at rest, seen from five positions of the stage along the rig's y axis."""
+    place = folder / "stage_axis"
+    place.mkdir()
+    positions_mm = np.linspace(0, 4, 5)
+    pose = next(iter(calibration.target_poses.values()))
+    rows = []
+    for view, position_mm in enumerate(positions_mm):
+        points = pose.apply(calibration.target_points_mm) + [0, position_mm, 0]
+        for camera in calibration.cameras:
+            pixels = camera.project(points)
+            rows += [(view, camera.name, d, *uv) for d, uv in zip(calibration.dot_ids, pixels)]
+    dots = pd.DataFrame(rows, columns=["view", "camera", "dot", "u_px", "v_px"])
+    dots[["u_px", "v_px"]] += np.random.default_rng(2).normal(0, 0.01, (len(dots), 2))
+    write_table(dots, place / "dots.csv")
+    moved = pd.DataFrame({"view": range(len(positions_mm)), "position_mm": positions_mm})
+    write_table(moved, place / "positions.csv")
+
+
+def _picture(rng: np.random.Generator, kind: Any = np.uint8) -> Any:
+    width, height = SIZE_PX
+    return rng.integers(1, np.iinfo(kind).max, (height, width)).astype(kind)
+
+
+def _images(folder: Path, rng: np.random.Generator) -> None:
+    folder.mkdir()
+    for name, image, options in (
+        ("grey8.tif", _picture(rng), {}),
+        ("grey16.tif", _picture(rng, np.uint16), {}),
+        ("packed.tif", _picture(rng), {"compression": "zlib"}),
+        ("tiles.tif", _picture(rng), {"tile": (16, 16)}),
+        ("big.tif", _picture(rng), {"bigtiff": True}),
+        ("float.tif", _picture(rng).astype(np.float32), {}),
+    ):
+        tifffile.imwrite(folder / name, image, **options)
+    for name in ("grey.png", "grey.bmp", "grey.jpg"):
+        iio.imwrite(folder / name, _picture(rng))
+    iio.imwrite(folder / "grey16.png", _picture(rng, np.uint16))
+
+
+def _run_of_images(folder: Path, rng: np.random.Generator) -> None:
+    folder.mkdir()
+    pages = np.stack([_picture(rng) for _ in range(4)])
+    with tifffile.TiffWriter(folder / "pages.tif") as tiff:
+        for page in pages:
+            tiff.write(page, contiguous=False, metadata=None)
+    tifffile.imwrite(folder / "stack.tif", pages, imagej=True)
+    _video(folder / "raw.avi", pages, "rawvideo", "gray")
+    _video(folder / "film.mp4", pages, "mpeg4", "yuv420p")
+    _video(folder / "wide.mkv", pages, "ffv1", "gray")
+
+
+def _video(file: Path, frames: Any, codec: str, pixels: str) -> None:
+    import av
+
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(100))
+        stream.width, stream.height, stream.pix_fmt = *SIZE_PX, pixels
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+        container.mux(stream.encode())
+
+
+def _foreign(folder: Path, rng: np.random.Generator) -> None:
+    import cv2
+
+    folder.mkdir()
+    t_s = np.arange(_SENSOR_ROWS) / 1000
+    axes = rng.normal(0, 1, (_SENSOR_ROWS, 3))
+    rows = [",".join(repr(float(v)) for v in row) for row in np.c_[t_s, axes]]
+    (folder / "arm.csv").write_text("logger 7\nt_s,ax_m_s2,ay_m_s2,az_m_s2\n" + "\n".join(rows))
+    wavfile.write(folder / "arm.wav", 1000, (axes * 1000).astype(np.int16))
+    savemat(folder / "arm.mat", {"t": t_s, "ax": axes[:, 0], "ay": axes[:, 1], "az": axes[:, 2]})
+    _tdms(folder / "arm.tdms", axes)
+    matrices = {f"M{i}": np.array([[9000.0, 0, 650], [0, 9010, 395], [0, 0, 1]]) for i in (1, 2)}
+    turned = cv2.Rodrigues(np.array([0.02, -1.2, 0.03]))[0]
+    content = matrices | {"R": turned, "T": np.array([420.0, 5, 280]), "D1": np.zeros(5)}
+    for name in ("pair.yml", "pair.xml", "pair.json"):
+        storage = cv2.FileStorage(str(folder / name), cv2.FILE_STORAGE_WRITE)
+        for key, value in (content | {"image_width": 1280, "image_height": 800}).items():
+            storage.write(key, value)
+        storage.release()
+    _openptv(folder)
+    _openlpt(folder)
+
+
+def _tdms(file: Path, axes: Any) -> None:
+    try:
+        from nptdms import ChannelObject, TdmsWriter
+    except ImportError:
+        return
+    facts = {"unit_string": "g", "wf_increment": 0.001}
+    with TdmsWriter(file) as writer:
+        writer.write_segment(
+            [ChannelObject("arm", name, axes[:, i], facts) for i, name in enumerate(("x", "y", "z"))]
+        )
+
+
+def _openptv(folder: Path) -> None:
+    (folder / "cam.ori").write_text(
+        "2.0 1.0 480.0\n0.004 -0.006 0.02\n\n1 0 0\n0 1 0\n0 0 1\n\n0.0 0.0\n60.0\n\n0.0 0.0 10.0\n"
+    )
+    (folder / "cam.addpar").write_text("0 0 0 0 0 1 0\n")
+    (folder / "ptv.par").write_text(
+        "1\nimg/cam\ncal/cam.tif\n1\n0\n1\n1280\n1024\n0.012\n0.0125\n0\n1\n1\n1\n1\n"
+    )
+
+
+def _openlpt(folder: Path) -> None:
+    unit = "1.0,0.0,0.0\n0.0,1.0,0.0\n0.0,0.0,1.0"
+    parts = ["PINHOLE", "None", "None", "800,1280", "20000.0,0,640\n0,20000.0,400\n0,0,1",
+             "0,0,0,0,0", "0,0,0", unit, unit, "0.0,0.0,500.0", "0.0,0.0,-500.0"]  # fmt: skip
+    (folder / "cam1.txt").write_text("".join(f"# part\n{part}\n" for part in parts))
+
+
+def _recording(folder: Path, rng: np.random.Generator) -> None:
+    folder.mkdir()
+    simulated_log(folder / "recording.raw", practice_devices(), 0.2, rng)
+
+
+def _batch(folder: Path) -> None:
+    folder.mkdir()
+    jobs = [
+        {"kind": kind, "dataset": "/data/tank", "run": run, "status": "done", "words": "",
+         "figures": {"verdict": "GOOD", "views": 12, "rms_px": 0.01}, "seconds": 3.0, "host": "a"}
+        for kind, run in (("calibrate", ""), ("track", "rise"), ("smooth", "rise"))
+    ]  # fmt: skip
+    (folder / "batch.json").write_text(json.dumps({"jobs": jobs}))

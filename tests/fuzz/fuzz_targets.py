@@ -1,0 +1,281 @@
+"""List every file that telerig reads, with a function that reads it through public names.
+
+A function returns what was read; every number in it must be finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_MOST_FRAMES = 12
+_POINTS_MM = np.random.default_rng(0).uniform(-5, 5, (7, 3))
+
+
+@dataclass(frozen=True)
+class Target:
+    """Describe a file of the corpus and the function that reads it.
+
+    file : its path in the corpus. kind : how `mutators.mutated` changes it.
+    read : takes the file's path; the files of the corpus lie beside it.
+    share : how often it is chosen, relative to the others.
+    """
+
+    file: str
+    kind: str
+    read: Callable[[Path], Any]
+    share: float = 1.0
+
+
+def _rig_toml(file: Path) -> Any:
+    """What is read must also be written and read back without a change."""
+    from telerig.io.rig_file.rig_file import read_rig_toml, write_rig_toml
+
+    rig = read_rig_toml(file)
+    copy = file.with_name("written.toml")
+    try:
+        write_rig_toml(rig, copy)
+        assert repr(read_rig_toml(copy)) == repr(rig), "rig.toml is not read back as written"
+    finally:
+        copy.unlink(missing_ok=True)
+    return [camera.scale_px_per_mm for camera in rig.cameras.values()]
+
+
+def _dots(file: Path) -> Any:
+    import telerig
+
+    return telerig.load_dataset(file.parents[1]).dots()
+
+
+def _truth(file: Path) -> Any:
+    import telerig
+
+    return telerig.load_dataset(file.parents[1]).truth
+
+
+def _stage_axis(file: Path) -> Any:
+    import telerig
+    from telerig.estimator.calibration.stage.stage_axis import stage_axis_from
+
+    folder = file.parents[1]
+    calibration = telerig.load_calibration(folder / "results" / "calibration")
+    found = stage_axis_from(telerig.load_dataset(folder), calibration)
+    return None if found is None else found.axis_rig
+
+
+def _run(file: Path) -> Any:
+    import telerig
+
+    run = telerig.load_run(file.parent)
+    sure = ["frame", "u_px", "v_px", "suu_px2", "svv_px2"]
+    return [
+        run.t_s,
+        run.detections[sure],
+        None if run.references is None else run.references[sure],
+        None if run.stage is None else run.stage[["t_s", "position_mm"]],
+        None if run.accelerometers is None else run.accelerometers[["t_s", "ax_m_s2"]],
+    ]
+
+
+def _run_toml(file: Path) -> Any:
+    from telerig.io.dataset.tables import read_run_toml
+
+    return read_run_toml(file)
+
+
+def _image(file: Path) -> Any:
+    from telerig.io.images.read import read_image
+
+    return read_image(file)
+
+
+def _frames(file: Path) -> Any:
+    """All frames are tried before the first error is raised."""
+    from telerig.errors import InputError
+    from telerig.io.images.frames import open_frames
+
+    source = open_frames(file.parent, file.stem)
+    assert source is not None
+    found, errors = [], []
+    for position in range(min(len(source), _MOST_FRAMES)):
+        try:
+            found.append(source.read(position))
+        except InputError as error:
+            errors.append(error)
+    for error in errors:
+        raise error
+    return found
+
+
+def _calibration(file: Path) -> Any:
+    import telerig
+
+    calibration = telerig.load_calibration(file.parent)
+    first, second = calibration.cameras[0].name, calibration.cameras[-1].name
+    pixels = [calibration.project(name, _POINTS_MM) for name in (first, second)]
+    found = calibration.triangulate(*pixels, sigma_px=0.02)
+    return [*pixels, found.points_mm, calibration.covariance]
+
+
+def _cameras_to(to: str) -> Callable[[Path], Any]:
+    def export(file: Path) -> Any:
+        from telerig.io.exchange.formats import export_results
+
+        export_results(file, to, out=_exported(file, to))
+        return None
+
+    return export
+
+
+def _exported(file: Path, to: str) -> Path:
+    """The only place where an export may write."""
+    return next(p for p in file.parents if p.name == "case") / "exported" / to
+
+
+def _calibration_folder(file: Path) -> Any:
+    from telerig.io.report.calibration.results import read_results
+
+    found = read_results(file.parent)
+    return [found.points_mm, found.joint, found.residuals[["u_px", "v_px", "du_px", "dv_px"]]]
+
+
+def _tracks(file: Path) -> Any:
+    import telerig
+
+    tracks = telerig.load_tracks(file.parent)
+    return tracks.table[["frame", "particle", "t_s", "x_mm", "y_mm", "z_mm"]]
+
+
+def _track_report(file: Path) -> Any:
+    from telerig.io.report.run.tracking.results import read_track_results
+
+    return read_track_results(file.parent).up
+
+
+def _smoothing_report(file: Path) -> Any:
+    from telerig.io.report.run.smoothing.results import read_smoothing_results
+
+    found = read_smoothing_results(file.parent, np.array([0.0, -1.0, 0.0]))
+    return None if found is None else found.trajectories[["t_s", "x_mm", "vx_mm_s"]]
+
+
+def _run_to(to: str) -> Callable[[Path], Any]:
+    def export(file: Path) -> Any:
+        from telerig.io.exchange.formats import export_results
+
+        export_results(file.parent, to, out=_exported(file, to).with_suffix(f".{to}"))
+        return None
+
+    return export
+
+
+def _batch(file: Path) -> Any:
+    from telerig.io.report.batch.report import write_batch_report
+
+    write_batch_report(file.parent, _exported(file, "batch"))
+
+
+def _accelerometer(file: Path) -> Any:
+    from telerig.io.exchange.importing.accelerometer import Layout, read_accelerations
+
+    unit = {".wav": {"scale_m_s2": 20.0}, ".tdms": {}, ".csv": {}}.get(file.suffix, {"unit": "g"})
+    more = {"time": "t", "channels": ("ax", "ay", "az")} if file.suffix == ".mat" else {}
+    return read_accelerations(file, "arm", Layout(**unit, **more))
+
+
+def _opencv(file: Path) -> Any:
+    from telerig.io.exchange.importing.opencv import read_opencv_cameras
+
+    return _pixels(read_opencv_cameras([file]))
+
+
+def _openptv(file: Path) -> Any:
+    from telerig.io.exchange.importing.openptv import read_openptv_cameras, read_ptv_par
+
+    sensor = read_ptv_par(file.with_name("ptv.par"))
+    return _pixels(read_openptv_cameras([file.with_name("cam.ori")], sensor))
+
+
+def _openlpt(file: Path) -> Any:
+    from telerig.io.exchange.importing.openlpt import read_openlpt_cameras
+
+    return _pixels(read_openlpt_cameras([file]))
+
+
+def _pixels(imported: Any) -> Any:
+    from telerig.io.exchange.importing.pinhole import nominal_toml
+
+    nominal_toml(imported.cameras)
+    return [camera.project(_POINTS_MM) for camera in imported.cameras]
+
+
+def _recording(file: Path) -> Any:
+    from telerig.io.recording.tables import write_tables
+
+    return write_tables(file, _exported(file, "recording")).rows
+
+
+_RUN = "set/runs/S2"
+_TRACKED = "set/results/S2"
+_CALIBRATED = "set/results/calibration"
+_IMAGES = ("grey8.tif", "grey16.tif", "packed.tif", "tiles.tif", "big.tif", "float.tif", "grey.png",
+           "grey16.png", "grey.bmp", "grey.jpg")  # fmt: skip
+
+TARGETS = {
+    "rig": Target("set/rig.toml", "toml", _rig_toml, 3),
+    "dots": Target("set/calibration/dots.csv", "csv", _dots, 2),
+    "truth": Target("set/truth/truth.json", "json", _truth),
+    "stage positions": Target("set/stage_axis/positions.csv", "csv", _stage_axis, 0.5),
+    "stage dots": Target("set/stage_axis/dots.csv", "csv", _stage_axis, 0.5),
+    "run.toml": Target(f"{_RUN}/run.toml", "toml", _run_toml),
+    "frames": Target(f"{_RUN}/frames.csv", "csv", _run),
+    "stage": Target(f"{_RUN}/stage.csv", "csv", _run),
+    "accelerometer": Target(f"{_RUN}/accelerometer.csv", "csv", _run),
+    "detections": Target(f"{_RUN}/detections.csv", "csv", _run, 2),
+    "references": Target(f"{_RUN}/references.csv", "csv", _run),
+    **{name: Target(f"images/{name}", "binary", _image) for name in _IMAGES},
+    "pages": Target("film/pages.tif", "binary", _frames, 2),
+    "stack": Target("film/stack.tif", "binary", _frames, 2),
+    "avi": Target("film/raw.avi", "binary", _frames),
+    "mp4": Target("film/film.mp4", "binary", _frames),
+    "mkv": Target("film/wide.mkv", "binary", _frames),
+    "calibration": Target(f"{_CALIBRATED}/calibration.json", "json", _calibration, 4),
+    "to HALCON": Target(f"{_CALIBRATED}/calibration.json", "json", _cameras_to("halcon"), 0.5),
+    "to OpenCV": Target(f"{_CALIBRATED}/calibration.json", "json", _cameras_to("opencv"), 0.5),
+    "covariance": Target(f"{_CALIBRATED}/covariance.npz", "binary", _calibration, 2),
+    "calibration report": Target(f"{_CALIBRATED}/calibration.json", "json", _calibration_folder),
+    "measured dots": Target(f"{_CALIBRATED}/dots.csv", "csv", _calibration_folder),
+    "residuals": Target(f"{_CALIBRATED}/residuals.csv", "csv", _calibration_folder),
+    "comparison": Target(f"{_CALIBRATED}/comparison.json", "json", _calibration_folder),
+    "tracking": Target(f"{_TRACKED}/tracking.json", "json", _track_report, 2),
+    "run.json": Target(f"{_TRACKED}/run.json", "json", _track_report),
+    "tracks": Target(f"{_TRACKED}/tracks.csv", "csv", _tracks, 2),
+    "tracks report": Target(f"{_TRACKED}/tracks.csv", "csv", _track_report),
+    "found bubbles": Target(f"{_TRACKED}/detections.csv", "csv", _tracks),
+    "bubbles report": Target(f"{_TRACKED}/detections.csv", "csv", _track_report),
+    "events": Target(f"{_TRACKED}/events.csv", "csv", _tracks),
+    "events report": Target(f"{_TRACKED}/events.csv", "csv", _track_report),
+    "smoothing": Target(f"{_TRACKED}/smoothing.json", "json", _smoothing_report, 2),
+    "trajectories": Target(f"{_TRACKED}/trajectories.csv", "csv", _smoothing_report),
+    "shake": Target(f"{_TRACKED}/shake.csv", "csv", _smoothing_report),
+    "to HDF5": Target(f"{_TRACKED}/trajectories.csv", "csv", _run_to("hdf5"), 0.5),
+    "to MATLAB": Target(f"{_TRACKED}/smoothing.json", "json", _run_to("mat"), 0.3),
+    "to trackpy": Target(f"{_TRACKED}/trajectories.csv", "csv", _run_to("trackpy"), 0.5),
+    "batch": Target("batch/batch.json", "json", _batch, 0.3),
+    "arm.csv": Target("foreign/arm.csv", "csv", _accelerometer),
+    "arm.wav": Target("foreign/arm.wav", "binary", _accelerometer, 2),
+    "arm.mat": Target("foreign/arm.mat", "binary", _accelerometer),
+    "arm.tdms": Target("foreign/arm.tdms", "binary", _accelerometer),
+    "OpenCV YAML": Target("foreign/pair.yml", "text", _opencv),
+    "OpenCV XML": Target("foreign/pair.xml", "text", _opencv),
+    "OpenCV JSON": Target("foreign/pair.json", "json", _opencv),
+    "OpenPTV": Target("foreign/cam.ori", "text", _openptv),
+    "OpenPTV distortion": Target("foreign/cam.addpar", "text", _openptv),
+    "OpenPTV sensor": Target("foreign/ptv.par", "text", _openptv),
+    "OpenLPT": Target("foreign/cam1.txt", "text", _openlpt),
+    "recording": Target("recording/recording.raw", "binary", _recording, 0.5),
+}

@@ -124,7 +124,7 @@ def _positions(folder: Path) -> pd.DataFrame:
         raise InputError(
             f"there is no {_POSITIONS}", where=str(folder), todo="write view,position_mm"
         )
-    return read_table(file, [Column("view", "text"), Column("position_mm")])
+    return read_table(file, [Column("view", "name"), Column("position_mm")])
 
 
 def _measured(dataset: Dataset, folder: Path) -> pd.DataFrame:

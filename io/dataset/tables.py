@@ -98,8 +98,8 @@ def _columns(target: Target) -> list[Column]:
     """Return the columns that a dots.csv for this target may have."""
     unbounded = not target.bounded
     return [
-        Column("view", "text"),
-        Column("camera", "text"),
+        Column("view", "name"),
+        Column("camera", "name"),
         Column("dot", "text" if unbounded else "whole", blank=unbounded),
         Column("u_px"),
         Column("v_px"),
@@ -370,7 +370,7 @@ def read_accelerometer_csv(path: Path, sensors: list[str] | None) -> pd.DataFram
     Raises InputError for an unknown sensor and for times of a sensor that do not increase.
     """
     axes = [Column(f"a{axis}_m_s2") for axis in "xyz"]
-    table = read_table(path, [Column("t_s"), Column("sensor", "text"), *axes], extra=True)
+    table = read_table(path, [Column("t_s"), Column("sensor", "name"), *axes], extra=True)
     if sensors is not None:
         check_names(table, "sensor", "accelerometer", sensors, path)
     for _, one in table.groupby("sensor"):
@@ -402,7 +402,7 @@ def read_references_csv(
     follows from sigma_px, or else from `REFERENCE_SIGMA_PX`, where the file has no such columns.
     Raises InputError, with the row and the column, for values that are not possible.
     """
-    table = _pixel_table(path, [Column("mark", "text")], cameras, sizes_px, frame_count)
+    table = _pixel_table(path, [Column("mark", "name")], cameras, sizes_px, frame_count)
     _check_named_once(table, "mark", path)
     known = fill_covariance(table, path, REFERENCE_SIGMA_PX, of="the mark's place")
     return _finished(table, known)
@@ -427,7 +427,7 @@ def read_detections_csv(
     Raises InputError, with the row and the column, for values that are not possible.
     """
     own = [
-        Column("particle", "text", required=False, blank=True),
+        Column("particle", "name", required=False, blank=True),
         *(Column(name, required=False, blank=True) for name in ("a_px", "b_px", "angle_rad")),
         Column("flags", "text", required=False, blank=True),
     ]
@@ -449,7 +449,7 @@ def _pixel_table(
     """
     columns = [
         Column("frame", "whole"),
-        Column("camera", "text"),
+        Column("camera", "name"),
         Column("u_px"),
         Column("v_px"),
         Column("sigma_px", required=False),

@@ -7,6 +7,7 @@ is row 1.
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError, suggestion
 from telerig.io.files.atomic import atomic_path
+from telerig.io.files.names import ADVICE, fault_of_name
 from telerig.io.files.text import read_text
 
 _EVERY_DIGIT: dict[str, Any] = (
@@ -30,18 +32,23 @@ _EVERY_DIGIT: dict[str, Any] = (
 """An option for `pandas.read_csv`, whose default parser rounds correctly from pandas 3.1 on."""
 _EXPORT = "export the table as comma-separated UTF-8 with one header line"
 
+MOST_COLUMNS = 1000
+LARGEST_NUMBER = 1e15
+"""The largest number in a column of numbers; whole numbers up to it are exact as floats."""
+
 
 @dataclass(frozen=True)
 class Column:
     """Describe a column that a table may have.
 
-    kind : "number" (float), "whole" (whole number) or "text".
+    kind : "number" (float), "whole" (whole number), "text" or "name" (text that follows the rule
+    of `telerig.io.files.names`).
     required : whether the table must have the column.
     blank : whether cells may be empty; they are read as NaN (number, whole) or "" (text).
     """
 
     name: str
-    kind: Literal["number", "whole", "text"] = "number"
+    kind: Literal["number", "whole", "text", "name"] = "number"
     required: bool = True
     blank: bool = False
 
@@ -56,8 +63,9 @@ def read_table(
     them.
     Returns the columns that the file has, in the file's order. The index is the row in the file
     (the header is row 1). "whole" columns are int64, or float64 where cells may be blank.
-    Raises InputError for a missing or unknown column, a cell that is not a finite number, a row
-    with too few or too many cells, and an empty table.
+    Raises InputError for a missing or unknown column, more than `MOST_COLUMNS`, a cell that is no
+    number up to `LARGEST_NUMBER`, a text with control characters, a row with too few or too many
+    cells, and an empty table.
     """
     file = Path(path)
     table = _sound_table(file, columns, "keep" if extra else "refuse")
@@ -93,7 +101,7 @@ def read_columns(file: Path, columns: Sequence[Column], *, optional: bool = Fals
     else:
         sound = _sound_table(file, columns, "leave out")
         table = read_table(file, columns, extra=True) if sound is None else sound
-    missing = {c.name: "" for c in columns if c.kind == "text" and c.name not in table}
+    missing = {c.name: "" for c in columns if c.kind in _TEXTS and c.name not in table}
     table = table.reset_index(drop=True).assign(**missing)
     kinds = {c.name: _DTYPES[c.kind, c.blank] for c in columns if c.name in table}
     return table[list(kinds)].astype(kinds)
@@ -158,11 +166,14 @@ def _sound_table(
         header = content.split(b"\n", 1)[0].decode("utf-8-sig").rstrip("\r").split(",")
     except (OSError, UnicodeDecodeError):
         return None
+    if len(header) > MOST_COLUMNS:
+        return None
     known = {column.name: column for column in columns}
     names = header if others != "leave out" else [name for name in header if name in known]
     lines = content.count(b"\n") + (not content.endswith(b"\n"))
     if (
         b'"' in content
+        or _CONTROL.search(content)
         or content.count(b",") != lines * (len(header) - 1)
         or len(set(header)) < len(header)
         or any(column.required and column.name not in header for column in columns)
@@ -172,29 +183,33 @@ def _sound_table(
     kinds = {n: _DTYPES[known[n].kind, known[n].blank] if n in known else str for n in names}
     numeric = [name for name, kind in kinds.items() if kind is not str]
     try:
-        table: pd.DataFrame = pd.read_csv(
-            BytesIO(content), usecols=names, dtype=kinds, keep_default_na=False,
-            na_values={name: [""] for name in numeric}, skip_blank_lines=False,
-            encoding="utf-8-sig", **_EVERY_DIGIT,
-        )  # fmt: skip
-    except (ValueError, pd.errors.ParserError):
+        with np.errstate(invalid="ignore"):  # a number too large for a whole one; found below
+            table: pd.DataFrame = pd.read_csv(
+                BytesIO(content), usecols=names, dtype=kinds, keep_default_na=False,
+                na_values={name: [""] for name in numeric}, skip_blank_lines=False,
+                encoding="utf-8-sig", **_EVERY_DIGIT,
+            )  # fmt: skip
+    except (ValueError, OverflowError, pd.errors.ParserError):
         return None
     rows = Rows(file, pd.RangeIndex(2, len(table) + 2, name="file_row"))
+    values: dict[str, Any] = {}
     for name in names:
         cells, column = table[name], known.get(name)
         if column is None:
-            table[name] = _extra(cells.tolist(), Column(name), rows)
+            values[name] = _extra(cells.tolist(), Column(name), rows)
             continue
         if name not in numeric:
-            table[name] = cells = cells.str.strip()
+            cells = cells.str.strip()
             bad = (cells == "") & (not column.blank)
+            if column.kind == "name":
+                bad |= cells.isin([one for one in cells.unique() if one and fault_of_name(one)])
         else:
-            bad = ~np.isfinite(cells) & ~(cells.isna() & column.blank)
+            bad = ~(cells.abs() <= LARGEST_NUMBER) & ~(cells.isna() & column.blank)
             bad |= (cells % 1 > 0) & (column.kind == "whole")
         if bad.any():
             return None
-    table.index = rows.numbers
-    return table
+        values[name] = cells
+    return pd.DataFrame(values, index=table.index).set_index(rows.numbers)
 
 
 def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
@@ -208,11 +223,14 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
     if not numbers:
         raise InputError("is empty", where=str(file), todo=_EXPORT)
     first = lines[numbers[0] - 1]
+    if first.count(",") >= MOST_COLUMNS:
+        what = f"has {first.count(',') + 1} columns; {MOST_COLUMNS} are read at most"
+        raise InputError(what, where=f"{file} row {numbers[0]}", todo=_EXPORT)
     for mark, word in ((";", "semicolons"), ("\t", "tabs")):
         if mark in first and "," not in first:
             what = f"the columns are separated by {word}"
             raise InputError(what, where=f"{file} row {numbers[0]}", todo=_EXPORT)
-    header, *rows = (next(csv.reader([lines[i - 1]]), []) for i in numbers)
+    header, *rows = (_split(lines[i - 1], f"{file} row {i}") for i in numbers)
     Rows(file, numbers[1:]).refuse(
         np.array([len(row) != len(header) for row in rows], bool),
         "",
@@ -221,6 +239,16 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
     )
     content = list(zip(*rows)) or [()] * len(header)
     return [name.strip() for name in header], content, numbers[1:]
+
+
+def _split(line: str, where: str) -> list[str]:
+    """Return the cells of a line. Raises InputError for quotes without end and control characters."""
+    if _CONTROL.search(line.encode("utf-8")):
+        raise InputError("has a control character", where=where, todo="remove it")
+    try:
+        return next(csv.reader([line]), [])
+    except csv.Error as error:
+        raise InputError(f"cannot be read as cells: {error}", where=where, todo=_EXPORT) from error
 
 
 def header_of(file: Path, todo: str) -> list[str]:
@@ -257,15 +285,31 @@ def _text(cells: Sequence[str], column: Column, rows: Rows) -> Any:
     return np.array([cell.strip() for cell in cells], dtype=object)
 
 
+def _name(cells: Sequence[str], column: Column, rows: Rows) -> Any:
+    found = _text(cells, column, rows)
+    faults = [fault_of_name(name) if name else "" for name in found]
+    what = "is {!r:.80}; the name {}"
+    rows.refuse(
+        np.array([bool(fault) for fault in faults], bool),
+        column.name,
+        lambda i: what.format(found[i], faults[i]),
+        ADVICE,
+    )
+    return found
+
+
 def _number(cells: Sequence[str], column: Column, rows: Rows) -> Array:
     values = _floats(cells)
-    bad = ~np.isfinite(values)
+    bad = ~(np.abs(values) <= LARGEST_NUMBER)
     if column.blank and bad.any():
         bad &= np.array([bool(cell.strip()) for cell in cells], bool)
+    words = {True: f"not a number up to {LARGEST_NUMBER:g}", False: "not a finite number"}
     rows.refuse(
         bad,
         column.name,
-        lambda i: f"is {cells[i]!r}, not a finite number" if cells[i] else "is blank",
+        lambda i: f"is {cells[i]!r:.80}, {words[bool(np.isfinite(values[i]))]}"
+        if cells[i]
+        else "is blank",
         "correct the cell, or remove the row if there was no measurement",
     )
     return values
@@ -274,22 +318,27 @@ def _number(cells: Sequence[str], column: Column, rows: Rows) -> Array:
 def _whole(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
     values = _number(cells, column, rows)
     broken = (values % 1 != 0) & ~np.isnan(values)
-    what = "is {!r}, not a whole number"
+    what = "is {!r:.80}, not a whole number"
     rows.refuse(broken, column.name, lambda i: what.format(cells[i]), "correct the cell")
     return values if column.blank else values.astype(np.int64)
 
 
-_CONVERT: dict[str, Callable[..., Any]] = {"number": _number, "whole": _whole, "text": _text}
+_TEXTS = ("text", "name")
+_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+_CONVERT: dict[str, Callable[..., Any]] = {
+    "number": _number, "whole": _whole, "text": _text, "name": _name,
+}  # fmt: skip
 _DTYPES: dict[tuple[str, bool], Any] = {
     ("number", False): np.float64, ("number", True): np.float64,
     ("whole", False): np.int64, ("whole", True): np.float64,
-    ("text", False): str, ("text", True): str,
+    ("text", False): str, ("text", True): str, ("name", False): str, ("name", True): str,
 }  # fmt: skip
 
 
 def _extra(cells: Sequence[str], column: Column, rows: Rows) -> NDArray[Any]:
     values = _floats(cells)
-    unreadable = [cell.strip().lower() not in ("", "nan") for cell in cells] & np.isnan(values)
+    words = np.array([cell.strip().lower() not in ("", "nan") for cell in cells], bool)
+    unreadable = words & np.isnan(values)
     return np.array(cells, dtype=object) if np.any(unreadable) else values
 
 

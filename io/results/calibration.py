@@ -317,14 +317,14 @@ class ComparisonFile(Record):
 
 
 RESIDUALS = [
-    *(Column(name, "text") for name in ("view", "camera")),
+    *(Column(name, "name") for name in ("view", "camera")),
     *(Column(name, "whole") for name in ("dot", "row", "column")),
     *(Column(name) for name in ("u_px", "v_px", "du_px", "dv_px", "weight")),
     Column("reason", "text", blank=True),
 ]
 DOT_COVARIANCE = ("suu_px2", "suv_px2", "svv_px2")
 DOTS = [
-    *(Column(name, "text") for name in ("view", "camera")),
+    *(Column(name, "name") for name in ("view", "camera")),
     Column("dot", "whole"),
     *(Column(name, required=False) for name in DOT_COVARIANCE),
 ]

@@ -125,7 +125,7 @@ def tracks_columns(cameras: Sequence[str]) -> list[Column]:
 
 DETECTIONS = [
     Column("frame", "whole"),
-    Column("camera", "text"),
+    Column("camera", "name"),
     Column("particle", "whole", blank=True),
     *_numbers(["u_px", "v_px"]),
     *_numbers(["a_px", "b_px", "d_eq_px", "edge_px", "chi2_dof"], required=False),
@@ -133,8 +133,8 @@ DETECTIONS = [
 ]
 REFERENCES = [
     Column("frame", "whole"),
-    Column("camera", "text"),
-    Column("mark", "text"),
+    Column("camera", "name"),
+    Column("mark", "name"),
     *_numbers(["u_px", "v_px"]),
     *_numbers(["sigma_px"], required=False),
 ]

@@ -81,7 +81,7 @@ def read_results(folder: str | PathLike[str], *, accept: Collection[str] = ()) -
 
 
 def _read_results(place: Path, source: str, accepted: tuple[str, ...]) -> RunResults:
-    required = [Column("frame", "whole"), Column("particle", "text"), Column("t_s")]
+    required = [Column("frame", "whole"), Column("particle", "name"), Column("t_s")]
     required += [Column(f"{axis}_mm") for axis in "xyz"]
     points = _whole_particles(read_table(place / source, required, extra=True))
     shake, smoothed = place / "shake.csv", source == "trajectories.csv"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,6 +15,7 @@ from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import choose_source, read_dots_csv
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
 from telerig.io.rig_file.description import RigDescription
+from telerig.io.results.record import read_object
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.rig.target import Target
 
@@ -136,13 +136,7 @@ class Dataset:
         file = self.path / "truth" / "truth.json"
         if not file.is_file():
             return None
-        try:
-            content = json.loads(file.read_bytes())
-        except ValueError as error:
-            raise InputError(
-                f"is not valid JSON: {error}", where=str(file), todo="simulate the dataset again"
-            ) from error
-        return dict(content)
+        return dict(read_object(file, "simulate the dataset again"))
 
 
 def load_dataset(

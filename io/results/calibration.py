@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, field_serializer, model_validator
+from pydantic import BeforeValidator, Field, PositiveInt, field_serializer, field_validator, model_validator
 
 from telerig.arrays import Array
 from telerig.errors import InputError, TelerigError
@@ -18,6 +17,7 @@ from telerig.io.results.record import (
     Matrix2,
     Matrix3,
     Matrix3x2,
+    Name,
     Numbers,
     Part,
     Points3,
@@ -31,6 +31,8 @@ from telerig.rig.pose import Pose
 from telerig.rig.projection import intrinsics_from
 from telerig.rig.windows import Wall
 
+_ROUNDED = 1e-6
+"""How far rounded digits may take a matrix from being a rotation or symmetric."""
 _AGAIN = "calibrate again (`telerig calibrate`), or name the right results folder"
 
 
@@ -61,6 +63,13 @@ class PoseRecord(Part):
     rotvec_deg: Vector3 | None = None
     translation_mm: Vector3
 
+    @model_validator(mode="after")
+    def _is_rotation(self) -> Self:
+        r = self.rotation
+        if np.abs(r @ r.T - np.eye(3)).max() > _ROUNDED or np.linalg.det(r) < 0:
+            raise ValueError("the matrix is not a rotation")
+        return self
+
     @classmethod
     def of_pose(cls, pose: Pose) -> Self:
         """Make the record of a pose."""
@@ -86,7 +95,7 @@ class CameraRecord(Part):
     camera_from_rig : the camera's pose in the rig frame.
     """
 
-    image_size_px: tuple[int, int]
+    image_size_px: tuple[PositiveInt, PositiveInt]
     rho_mm: float = Field(gt=0)
     parameters: dict[str, float]
     free: tuple[str, ...] = ()
@@ -121,6 +130,9 @@ class Covariance(Part):
     def _fit_together(self) -> Self:
         if self.matrix.shape != (len(self.names),) * 2:
             raise ValueError(f"{len(self.names)} names, but a matrix of {self.matrix.shape}")
+        sd = np.sqrt(np.clip(np.diag(self.matrix), 0, None))
+        if np.any(np.abs(self.matrix - self.matrix.T) > _ROUNDED * np.outer(sd, sd)):
+            raise ValueError("the matrix is not symmetric, or has a negative variance")
         return self
 
 
@@ -250,10 +262,10 @@ class CalibrationFile(Record):
     gauge: str = ""
     medium: str = "air"
     verdict: Verdict
-    cameras: dict[str, CameraRecord] = Field(min_length=1)
+    cameras: dict[Name, CameraRecord] = Field(min_length=1)
     walls: dict[str, dict[str, Any]] = Field(default_factory=dict)
     target: Target
-    views: dict[str, PoseRecord]
+    views: dict[Name, PoseRecord]
     covariance: Covariance | None = None
     model: LensModel = LensModel()
     stage: Annotated[Stage | None, BeforeValidator(lambda stage: stage or None)] = None
@@ -269,6 +281,14 @@ class CalibrationFile(Record):
         except (KeyError, TypeError, TelerigError) as error:
             raise ValueError(f"lacks or garbles {error}"[:200]) from error
         return self
+
+    @field_validator("statistics")
+    @classmethod
+    def _are_numbers(cls, statistics: dict[str, Any]) -> dict[str, Any]:
+        for name in ("noise_floor_px", "scatter_px"):
+            if not isinstance(statistics.get(name), float | int | None):
+                raise ValueError(f"{name} is not a number")
+        return statistics
 
     @field_serializer("stage")
     def _stage_or_empty(self, stage: Stage | None) -> dict[str, Any]:
@@ -403,12 +423,13 @@ def _floats(file: Path, names: tuple[str, ...]) -> dict[str, Array]:
 def _arrays(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
     """Read the named arrays of an .npz file. Raises InputError when the file lacks one."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in names}
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            found = {name: archive[name] for name in names}
     except KeyError as error:
         raise _broken(file, f"lacks an array: {error.args[0]}") from error
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except Exception as error:  # zipfile, zlib and NumPy raise errors of many kinds
         raise _broken(file, f"cannot be read: {error}") from error
+    return found
 
 
 def _broken(file: Path, what: str) -> InputError:

@@ -17,14 +17,19 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
 from telerig.io.files.atomic import plain, write_json_atomic
 from telerig.io.files.hashing import hashed
+from telerig.io.files.names import fault_of_name
+from telerig.io.files.text import read_bytes
 
 _LONGEST_MESSAGE = 400
+_DEEPEST = 64
+"""Objects and lists inside each other in a JSON file; the deepest that telerig writes has 12."""
+_LARGEST_NUMBER = 1e30
 
 
 def _checked_array(*shape: int | None, kind: type = float) -> Callable[[Any], NDArray[Any]]:
@@ -62,6 +67,15 @@ Matrix3x2 = Annotated[_Floats, PlainValidator(_checked_array(3, 2)), _as_list]
 Square = Annotated[_Floats, PlainValidator(_checked_array(None, None)), _as_list]
 Numbers = Annotated[_Floats, PlainValidator(_checked_array(None)), _as_list]
 Wholes = Annotated[Ints, PlainValidator(_checked_array(None, kind=np.int64)), _as_list]
+
+
+def _checked_name(name: str) -> str:
+    if fault := fault_of_name(name):
+        raise ValueError(f"the name {name!r:.80} {fault}")
+    return name
+
+
+Name = Annotated[str, AfterValidator(_checked_name)]
 
 
 class Part(BaseModel):
@@ -150,16 +164,32 @@ def _fault(error: ValidationError) -> str:
 def read_object(file: Path, todo: str) -> Mapping[str, Any]:
     """Read a JSON file whose content is an object, and return it as a dictionary.
 
-    todo : the advice in an error. Raises InputError for a file that holds no JSON object.
+    Numbers that are not finite become None, as `write_json_atomic` writes them.
+    todo : the advice in an error. Raises InputError for a file that holds no JSON object, nests more
+    than 64 objects and lists, or has a number beyond 1e30.
     """
+    data = read_bytes(file)
     try:
-        content = json.loads(file.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        content = json.loads(data, parse_constant=lambda _: None)
+        _check_size(content, 0)
+    except (ValueError, RecursionError) as error:
         what = str(error)[:_LONGEST_MESSAGE]
         raise InputError(f"cannot be read as JSON: {what}", where=str(file), todo=todo) from error
     if not isinstance(content, dict):
         raise InputError("is JSON, but not an object", where=str(file), todo=todo)
     return content
+
+
+def _check_size(value: Any, depth: int) -> None:
+    """Raise ValueError for a value that is nested too deep or a number that is too large."""
+    if depth > _DEEPEST:
+        raise ValueError(f"more than {_DEEPEST} objects and lists inside each other")
+    if isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            if not isinstance(inner, str):
+                _check_size(inner, depth + 1)
+    elif isinstance(value, int | float) and not abs(value) <= _LARGEST_NUMBER:
+        raise ValueError(f"a number larger than {_LARGEST_NUMBER:g}")
 
 
 PACKAGES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "scikit-image", "pandas")

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from telerig.io.files.csv_table import Column
-from telerig.io.results.record import Part, Record, Vector3
+from telerig.io.results.record import Name, Part, Record, Vector3
 from telerig.io.results.tracking import RigChange
 
 AXES = ("x", "y", "z")
@@ -151,7 +151,7 @@ class SmoothingFile(Record):
     left_out: tuple[str, ...] = ()
     modes: tuple[Mode, ...] = ()
     schema_: int = Field(1, alias="schema")
-    cameras: tuple[str, ...] = ()
+    cameras: tuple[Name, ...] = ()
     frames: int | None = None
     bubbles: int | None = None
     model: dict[str, Any] = Field(default_factory=dict)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from telerig.io.files.csv_table import Column
-from telerig.io.results.record import Part, Record, Vector3
+from telerig.io.results.record import Name, Part, Record, Vector3
 
 POINT = ("x_mm", "y_mm", "z_mm")
 SILHOUETTES = ("silhouettes_x_mm", "silhouettes_y_mm", "silhouettes_z_mm")
@@ -81,13 +81,13 @@ class TrackingFile(Record):
     run: str = ""
     pixel_origin: str = "centre"
     frame_of_reference: str = ""
-    image_size_px: dict[str, tuple[int, int] | None] = Field(default_factory=dict)
+    image_size_px: dict[Name, tuple[int, int] | None] = Field(default_factory=dict)
     frames: int | None = None
     detections: int | None = None
     points: int | None = None
     tracks: int | None = None
     detections_without_partner_or_track: int | None = None
-    frames_without_bubbles: dict[str, dict[str, int]] = Field(default_factory=dict)
+    frames_without_bubbles: dict[Name, dict[str, int]] = Field(default_factory=dict)
     events: dict[str, int] = Field(default_factory=dict)
     pairs: Pairs | None = None
     shape_sigma: Any = None

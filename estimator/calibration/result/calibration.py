@@ -387,9 +387,15 @@ def load_calibration(path: str | Path) -> Calibration:
         record = CalibrationFile.read(file)
         if record.covariance is None:
             raise InputError("has no covariance", where=str(file), todo=CalibrationFile.AGAIN)
+        poses = len(record.cameras) - 1
+        free = sum(len(camera.free) for camera in record.cameras.values())
+        if len(record.covariance.names) != free + len(POSE_COMPONENTS) * poses:
+            what = "the size of its covariance is not the number of its parameters"
+            raise InputError(what, where=str(file), todo=CalibrationFile.AGAIN)
         names, joint = read_joint_covariance(file.parent / "covariance.npz")
     rig = record.covariance.matrix
-    if names and not np.allclose(joint[: len(rig), : len(rig)], rig, rtol=1e-9, atol=0):
+    block = joint[: len(rig), : len(rig)]
+    if names and not (block.shape == rig.shape and np.allclose(block, rig, rtol=1e-9, atol=0)):
         raise InputError(
             "this covariance belongs to another calibration than the calibration.json beside it",
             where=str(file.parent / "covariance.npz"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +25,7 @@ from telerig.io.report.page.figures import (
 from telerig.io.report.page.number_format import ABSENT, is_number, number
 from telerig.io.report.page.page import Figure, Row, drawn_over_cores, render_page
 from telerig.io.results.manifest import reading
+from telerig.io.results.record import read_object
 
 Job = Mapping[str, Any]
 
@@ -50,17 +50,15 @@ def write_batch_report(folder: Path, out: Path | None = None) -> Path:
 
     Raises InputError for a folder without a batch, or one that cannot be read.
     """
-    file = Path(folder) / "batch.json"
+    file, todo = Path(folder) / "batch.json", "run `telerig batch` with --out of this folder"
+    with reading(file.parent, [file.name]):
+        content = read_object(file, todo)
     try:
-        with reading(file.parent, [file.name]):
-            content = json.loads(file.read_bytes())
         jobs = [_checked(job) for job in content["jobs"]]
         name = str(content.get("name") or Path(folder).resolve().name)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"holds no batch that can be read: {error}", where=str(file),
-            todo="run `telerig batch` with --out of this folder",
-        ) from error  # fmt: skip
+    except (ValueError, KeyError, TypeError) as error:
+        what = f"holds no batch that can be read: {error}"
+        raise InputError(what, where=str(file), todo=todo) from error
     place = Path(folder) if out is None else Path(out)
     write_text_atomic(place / "report.html", render(jobs, place, name))
     return place / "report.html"

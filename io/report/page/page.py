@@ -129,8 +129,15 @@ def scene_text(
         layout["scene"] |= {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio))}
         for name in ("xaxis", "yaxis", "zaxis"):
             layout["scene"][name] |= {"nticks": _FEW_TICKS}
-    text = json.dumps({"data": traces, "layout": layout}, allow_nan=False)
-    return text.replace("</", "<\\/")
+    return script_data({"data": traces, "layout": layout})
+
+
+def script_data(content: Any) -> str:
+    """Return data as JSON that is safe inside a script element of a page.
+
+    There a browser looks for ``</script`` and ``<!--<script`` before it reads the data.
+    """
+    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
 
 
 def xyz(kind: str, points_mm: Array) -> Trace:

@@ -54,9 +54,9 @@ def test_the_page_says_what_was_done_and_what_failed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (None, "No such file"),
+        (None, "does not exist"),
         ("{", "Expecting"),
-        ("[]", "indices"),
+        ("[]", "not an object"),
         ('{"jobs": 3}', "not iterable"),
         ('{"jobs": [3]}', "not subscriptable"),
         ('{"jobs": [{"dataset": "a"}]}', "'run'"),

@@ -103,11 +103,13 @@ def test_one_camera_and_nothing_optional(tmp_path: Path) -> None:
 
 
 def test_hostile_names_stay_text(folder: Path) -> None:
-    evil = "</script><b>x"
+    evil, begun = "</script><b>x", "<!--<script>"
     views = json.loads((folder / "calibration.json").read_text())["views"]
-    _edit(folder, name=evil, views=views | {evil: views["view00"]})
+    _edit(folder, name=evil, views=views | {begun: views["view00"]})
     html = write_calibration_report(folder).read_text(encoding="utf-8")
     assert evil not in html and "&lt;/script&gt;&lt;b&gt;x" in html
+    scene = html.split("var scene = ")[1]
+    assert begun not in scene and "\\u003c!--" in scene
 
 
 def test_importing_the_report_draws_in_no_plotting_library() -> None:

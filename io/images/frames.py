@@ -21,10 +21,13 @@ from telerig.errors import InputError
 from telerig.io.images.read import (
     Image,
     damaged,
+    decoding,
     image_from_pixels,
     list_images,
     page_pixels,
     read_image,
+    refuse_too_large,
+    tiff_reader,
 )
 
 PAGE_EXTENSIONS = (".tif", ".tiff")
@@ -99,8 +102,8 @@ class PageFrames:
         self.path = path
         self._size = path.stat().st_size
         self._offsets, self.cut_short = _page_offsets(path)
-        with self._opened() as tiff:
-            self._stack = _contiguous_stack(tiff, len(self._offsets))
+        with decoding(path), self._opened() as tiff:
+            self._stack = _contiguous_stack(tiff, len(self._offsets), path)
         self._length = len(self._offsets)
         if self._stack is not None:
             self._length = self._stack.count
@@ -124,31 +127,23 @@ class PageFrames:
             raise InputError(error.what, where=self.where(position), todo=error.todo) from error
 
     def _opened(self) -> Any:
-        import tifffile
-
-        try:
-            return tifffile.TiffFile(self.path)
-        except Exception as error:
-            raise damaged(self.path, str(error)) from error
+        with decoding(self.path):
+            return tiff_reader().TiffFile(self.path)
 
     def _page(self, position: int) -> NDArray[Any]:
-        import tifffile
-
         if position >= len(self._offsets):
             raise damaged(self.path, f"it ends after {len(self._offsets)} pages")
-        with self._opened() as tiff:
-            tiff.filehandle.seek(int(self._offsets[position]))
-            try:
-                page = tifffile.TiffPage(tiff, index=position)
+        try:
+            with decoding(self.path), self._opened() as tiff:
+                tiff.filehandle.seek(int(self._offsets[position]))
+                page = tiff_reader().TiffPage(tiff, index=position)
                 return page_pixels(page, self._size, self.path)
-            except InputError:
-                raise
-            except Exception as error:
-                if "imagecodecs" in str(error):
-                    todo = "save it without compression, or `pip install imagecodecs`"
-                    what = f"cannot be read: {error}"
-                    raise InputError(what, where=str(self.path), todo=todo) from error
-                raise damaged(self.path, str(error)) from error
+        except InputError as error:
+            if "imagecodecs" in str(error.__cause__):
+                todo = "save it without compression, or `pip install imagecodecs`"
+                what = f"cannot be read: {error.__cause__}"
+                raise InputError(what, where=str(self.path), todo=todo) from error
+            raise
 
     def _from_stack(self, position: int) -> NDArray[Any]:
         assert self._stack is not None
@@ -179,7 +174,7 @@ class _Stack:
         return start, start + size
 
 
-def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
+def _contiguous_stack(tiff: Any, pages: int, path: Path) -> _Stack | None:
     """Return the stack if the file's description counts more frames than there are page headers.
 
     Returns None for any other file.
@@ -192,6 +187,7 @@ def _contiguous_stack(tiff: Any, pages: int) -> _Stack | None:
     if count <= pages or not page.is_contiguous:
         return None
     dtype = np.dtype(tiff.byteorder + np.dtype(page.dtype).char)
+    refuse_too_large(page.imagewidth, page.imagelength, dtype.itemsize, path)
     return _Stack(int(page.dataoffsets[0]), count, (page.imagelength, page.imagewidth), dtype)
 
 
@@ -336,10 +332,11 @@ class VideoFrames:
         if self._decoder is None or self._decoder.process != os.getpid():
             self._decoder = _Decoder(self.path)
         try:
-            frame = self._decoder.frame(int(self._times[position]))
-        except _av().error.FFmpegError as error:
+            with decoding(self.path, "a frame cannot be decoded: "):
+                frame = self._decoder.frame(int(self._times[position]))
+        except InputError:
             self._decoder = None
-            raise _damaged(self.path, f"a frame cannot be decoded: {error.strerror}") from error
+            raise
         if frame is None or frame.is_corrupt:
             self._decoder = None
             raise _damaged(self.path, "a frame is missing or damaged")
@@ -432,13 +429,15 @@ def _av() -> Any:
 
 def _opened(path: Path) -> Any:
     av = _av()
-    try:
-        container = av.open(str(path))
-    except (av.error.FFmpegError, OSError) as error:
-        raise _damaged(path, f"it cannot be opened as a video ({error})") from error
-    if not container.streams.video:
-        container.close()
-        raise InputError("holds no video stream", where=str(path), todo=_COPY)
+    with decoding(path, "it cannot be opened as a video: "):
+        container = av.open(str(path), metadata_errors="replace")
+        if not container.streams.video:
+            container.close()
+            raise InputError("holds no video stream", where=str(path), todo=_COPY)
+        stream = container.streams.video[0]
+        refuse_too_large(stream.width, stream.height, 1, path)
+        if not stream.average_rate:
+            raise _damaged(path, "it states no frame rate")
     return container
 
 

@@ -7,9 +7,12 @@ and says nothing, so each format is checked here before, or by another decoder.
 from __future__ import annotations
 
 import io
+import logging
 import re
 import struct
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,8 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | Float32
 EXTENSIONS = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 _FORMATS = "telerig reads TIFF, PNG, BMP and JPEG"
+MOST_BYTES = 400_000_000
+"""The largest size of a decoded image: 400 million pixels of 8 bits, 200 million of 16 bits."""
 _COPY = "copy or record it again, or leave it out (in a run with skip_unreadable)"
 _MONO = "save it with one grey channel; set a colour camera to a mono mode"
 
@@ -94,26 +99,60 @@ def damaged(path: Path, detail: str) -> InputError:
     return InputError(f"is truncated or damaged: {detail}", where=str(path), todo=_COPY)
 
 
+def refuse_too_large(width: int, height: int, bytes_per_pixel: int, file: Path) -> None:
+    """Raise InputError if an image would need more than `MOST_BYTES` when it is decoded.
+
+    The size is that of the file's header, so a file that states a wrong one costs no memory.
+    """
+    needed = width * height * bytes_per_pixel
+    if needed > MOST_BYTES:
+        what = f"is {width} x {height} px, {needed / 1e9:.3g} GB when it is decoded"
+        todo = f"images up to {MOST_BYTES / 1e9:g} GB are read: cut it out, or save it again"
+        raise InputError(what, where=str(file), todo=todo)
+
+
+@contextmanager
+def decoding(file: Path, what: str = "") -> Iterator[None]:
+    """Turn every error of a decoder into the InputError of a damaged file.
+
+    Decoders raise errors of many kinds for damaged files, and warn in addition.
+    what : words before the decoder's own.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise damaged(file, what + (str(error) or type(error).__name__)) from error
+
+
 def _opencv(data: bytes, file: Path) -> NDArray[Any]:
     import cv2
 
-    try:
+    with decoding(file):
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise damaged(file, "it cannot be decoded") from error
     if pixels is None:
         raise damaged(file, "it cannot be decoded")
     return np.asarray(pixels)
 
 
-def _png(data: bytes, file: Path) -> NDArray[Any]:
-    """Pillow compares the checksums of all chunks, which OpenCV does not."""
+def _header(data: bytes, kind: str, file: Path) -> Any:
+    """Return the image that Pillow opened but did not decode, after its size was checked."""
     from PIL import Image as Pillow
 
-    try:
-        Pillow.open(io.BytesIO(data), formats=["PNG"]).verify()
-    except Exception as error:
-        raise damaged(file, str(error)) from error
+    with decoding(file):
+        image = Pillow.open(io.BytesIO(data), formats=[kind])
+        bytes_per_pixel = len(image.getbands()) * (2 if ";16" in image.mode else 1)
+        refuse_too_large(*image.size, bytes_per_pixel, file)
+    return image
+
+
+def _png(data: bytes, file: Path) -> NDArray[Any]:
+    """Pillow compares the checksums of all chunks, which OpenCV does not."""
+    with decoding(file):
+        _header(data, "PNG", file).verify()
     return _opencv(data, file)
 
 
@@ -121,6 +160,7 @@ def _bmp(data: bytes, file: Path) -> NDArray[Any]:
     if len(data) < 54:
         raise damaged(file, "the BMP header is incomplete")
     offset, _, width, height, _, depth, packed = struct.unpack_from("<IIiiHHI", data, 10)
+    refuse_too_large(abs(width), abs(height), max(depth // 8, 1), file)
     needed = offset + (width * depth + 31) // 32 * 4 * abs(height)
     if packed in (0, 3) and len(data) < needed:
         raise damaged(file, f"it has {len(data)} bytes, its header asks for {needed}")
@@ -128,22 +168,16 @@ def _bmp(data: bytes, file: Path) -> NDArray[Any]:
 
 
 def _jpeg(data: bytes, file: Path) -> NDArray[Any]:
-    import imageio.v3 as iio
-
     if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         raise damaged(file, "the JPEG has no end marker")
-    try:
-        return np.asarray(iio.imread(data, plugin="pillow", extension=".jpg"))
-    except Exception as error:
-        raise damaged(file, str(error)) from error
+    with decoding(file):
+        return np.asarray(_header(data, "JPEG", file))
 
 
 def _tiff(data: bytes, file: Path) -> NDArray[Any]:
     """What tifffile needs imagecodecs for (LZW, 12 packed bits), OpenCV reads as well."""
-    import tifffile
-
     try:
-        with tifffile.TiffFile(file) as tiff:
+        with decoding(file), tiff_reader().TiffFile(file) as tiff:
             if len(tiff.pages) == 0:
                 raise damaged(file, "the TIFF has no page")
             page = tiff.pages[0]
@@ -156,12 +190,18 @@ def _tiff(data: bytes, file: Path) -> NDArray[Any]:
                     todo="save one image per file here; multi-page files belong in runs/",
                 )
             return page_pixels(page, len(data), file)
-    except InputError:
-        raise
-    except Exception as error:
-        if "imagecodecs" in str(error):
+    except InputError as error:
+        if "imagecodecs" in str(error.__cause__):
             return _opencv(data, file)
-        raise damaged(file, str(error)) from error
+        raise
+
+
+def tiff_reader() -> Any:
+    """Import and return tifffile; what it logs about damaged files is in our errors."""
+    import tifffile
+
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)
+    return tifffile
 
 
 def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
@@ -170,6 +210,9 @@ def page_pixels(page: Any, file_size: int, file: Path) -> NDArray[Any]:
     file_size : bytes. Raises InputError when the file ends before the page does, or white is 0;
     and what tifffile raises.
     """
+    bits = np.max(page.bitspersample)
+    bytes_per_pixel = max(int(bits) // 8, 1) * page.samplesperpixel * page.imagedepth
+    refuse_too_large(page.imagewidth, page.imagelength, bytes_per_pixel, file)
     end = max((o + n for o, n in zip(page.dataoffsets, page.databytecounts)), default=0)
     if end > file_size or 0 in page.databytecounts:
         raise damaged(file, f"it has {file_size} bytes, its tags ask for {end}")

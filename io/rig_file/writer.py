@@ -38,7 +38,7 @@ _NAMES = ("name", "camera")
 def rig_toml(rig: RigDescription) -> str:
     """The text of the rig file; keys whose value is None are left out."""
     blocks = [_lines([("schema", SCHEMA, ""), ("name", rig.name, "")])]
-    blocks += [_block(f"cameras.{_key(c.name)}", _all_fields(c)) for c in rig.cameras.values()]
+    blocks += [_block(f"cameras.{toml_key(c.name)}", _all_fields(c)) for c in rig.cameras.values()]
     if rig.rotvec_from_first_deg:
         comment = "nominal; decides the mirror ambiguity"
         lines = [
@@ -52,15 +52,15 @@ def rig_toml(rig: RigDescription) -> str:
         lines = [(keys.get(key, key), *rest) for key, *rest in _all_fields(rig.stage)]
         blocks.append(_block("stage", lines))
     for sensor in rig.accelerometers.values():
-        blocks.append(_block(f"accelerometers.{_key(sensor.name)}", _all_fields(sensor)))
-    blocks += [_block(f"devices.{_key(d.name)}", _changed_fields(d)) for d in rig.devices.values()]
+        blocks.append(_block(f"accelerometers.{toml_key(sensor.name)}", _all_fields(sensor)))
+    blocks += [_block(f"devices.{toml_key(d.name)}", _changed_fields(d)) for d in rig.devices.values()]
     if rig.references is not None:
         blocks.append(_block("references", _all_fields(rig.references)))
     if rig.tracking is not None:
         blocks.append(_block("tracking", [("cameras", rig.tracking, "whose images are paired")]))
     for wall in rig.walls.values():
         lines = [line for line in _all_fields(wall) if line[:2] != ("normal_sigma_deg", 0.0)]
-        blocks.append(_block(f"walls.{_key(wall.camera)}", lines))
+        blocks.append(_block(f"walls.{toml_key(wall.camera)}", lines))
     return "\n".join(blocks)
 
 
@@ -118,11 +118,11 @@ def _lines(lines: list[Line]) -> str:
     text = ""
     for key, value, comment in lines:
         if value is not None:
-            text += f"{_key(key)} = {_value(value)}" + (f"  # {comment}\n" if comment else "\n")
+            text += f"{toml_key(key)} = {_value(value)}" + (f"  # {comment}\n" if comment else "\n")
     return text
 
 
-def _key(key: str) -> str:
+def toml_key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -193,7 +194,11 @@ def _openlpt(folder: Path) -> None:
 
 def _recording(folder: Path, rng: np.random.Generator) -> None:
     folder.mkdir()
-    simulated_log(folder / "recording.raw", practice_devices(), 0.2, rng)
+    sims = [
+        replace(sim, device=replace(sim.device, port=f"/dev/ttyUSB{i}"))
+        for i, sim in enumerate(practice_devices())
+    ]
+    simulated_log(folder / "recording.raw", sims, 0.2, rng)
 
 
 def _batch(folder: Path) -> None:

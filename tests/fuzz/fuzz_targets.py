@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+EXPORTED = "exported"
+"""The folder of the corpus into which targets write."""
 _MOST_FRAMES = 12
 _POINTS_MM = np.random.default_rng(0).uniform(-5, 5, (7, 3))
 
@@ -59,7 +61,7 @@ def _truth(file: Path) -> Any:
 
 def _stage_axis(file: Path) -> Any:
     import telerig
-    from telerig.estimator.calibration.stage.stage_axis import stage_axis_from
+    from telerig.estimator.calibration.stage_axis import stage_axis_from
 
     folder = file.parents[1]
     calibration = telerig.load_calibration(folder / "results" / "calibration")
@@ -133,7 +135,7 @@ def _cameras_to(to: str) -> Callable[[Path], Any]:
 
 def _exported(file: Path, to: str) -> Path:
     """The only place where an export may write."""
-    return next(p for p in file.parents if p.name == "case") / "exported" / to
+    return next(p for p in file.parents if p.name == "case") / EXPORTED / to
 
 
 def _calibration_folder(file: Path) -> Any:

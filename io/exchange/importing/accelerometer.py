@@ -7,7 +7,10 @@ they lie in the rig.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from os import PathLike
@@ -21,7 +24,7 @@ from numpy.typing import NDArray
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.formats import RECORDINGS
-from telerig.io.files.csv_table import write_table
+from telerig.io.files.csv_table import LARGEST_NUMBER, write_table
 from telerig.io.files.text import read_text
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
@@ -68,19 +71,24 @@ def read_accelerations(
     layout = layout or Layout()
     recording = open_recording(Path(path), layout.group)
     names = _channels(recording, layout.channels)
-    raw = np.stack([_values(recording, name) for name in names], -1)
+    columns = [_values(recording, name) for name in names]
+    if len({len(column) for column in columns}) > 1:
+        lengths = ", ".join(f"{name} {len(column)}" for name, column in zip(names, columns))
+        raise recording.error(f"its channels differ in length: {lengths}", _EXPORT_AGAIN)
+    raw = np.stack(columns, -1)
     t_s = _times(recording, layout, len(raw)) + layout.start_s
     if len(raw) != len(t_s) or not len(raw):
         raise recording.error(
             f"has {len(raw)} readings and {len(t_s)} times",
             "give as many times as readings, at least one",
         )
-    bad = np.argwhere(~np.isfinite(np.c_[raw, t_s]))
+    bad = np.argwhere(~(np.abs(np.c_[raw, t_s]) <= LARGEST_NUMBER))
     if len(bad):
         row, column = bad[0]
         name = [*names, "time"][column]
         raise recording.error(
-            f"reading {row} of {name!r} is no finite number ({len(bad)} such)",
+            f"reading {row} of {name!r} is no finite number up to {LARGEST_NUMBER:g} "
+            f"({len(bad)} such)",
             "cut it out, or export the recording again",
         )
     late = np.flatnonzero(np.diff(t_s) <= 0)
@@ -301,16 +309,31 @@ def _cells(line: str) -> tuple[str, list[float]] | None:
         return None
 
 
+@contextmanager
+def _reading(path: Path, kind: str) -> Iterator[list[warnings.WarningMessage]]:
+    """Turn every error of a library that reads a damaged file into InputError.
+
+    Yields the list to which the library's warnings are added.
+    """
+    try:
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            yield warned
+    except InputError:
+        raise
+    except Exception as error:
+        what = f"is no {kind} file that can be read ({error or type(error).__name__})"
+        raise InputError(what, where=str(path), todo=_EXPORT_AGAIN) from error
+
+
 def read_wav(path: Path) -> Recording:
     """Channels and rate of a WAV file; whole numbers are scaled so that ±1 is full scale."""
     from scipy.io import wavfile
 
-    try:
+    with _reading(path, "WAV") as warned:
         rate, samples = wavfile.read(path)
-    except (ValueError, OSError) as error:
-        raise InputError(
-            f"is no WAV file that can be read ({error})", where=str(path), todo=_EXPORT_AGAIN
-        ) from error
+    if any("EOF" in str(one.message) for one in warned):
+        raise InputError("ends too early", where=str(path), todo=_EXPORT_AGAIN)
     values = samples.reshape(len(samples), -1).astype(float)
     if samples.dtype == np.uint8:
         values = (values - 128) / 128
@@ -323,20 +346,16 @@ def read_wav(path: Path) -> Recording:
 def read_mat(path: Path) -> Recording:
     """Vectors by their names; the columns of an (N, k) matrix as name_0, name_1, ..."""
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
-    try:
-        content = loadmat(path, squeeze_me=True)
-    except NotImplementedError as error:
-        raise InputError(
-            "is a MATLAB 7.3 file, which cannot be read",
-            where=str(path),
-            todo="in MATLAB, save it with the option -v7",
-        ) from error
-    except (ValueError, OSError, TypeError, MatReadError) as error:
-        raise InputError(
-            f"is no MAT file that can be read ({error})", where=str(path), todo=_EXPORT_AGAIN
-        ) from error
+    with _reading(path, "MAT"):
+        try:
+            content = loadmat(path, squeeze_me=True)
+        except NotImplementedError as error:
+            raise InputError(
+                "is a MATLAB 7.3 file, which cannot be read",
+                where=str(path),
+                todo="in MATLAB, save it with the option -v7",
+            ) from error
     channels: dict[str, NDArray[Any]] = {}
     for name, value in content.items():
         array = np.asarray(value)
@@ -357,12 +376,12 @@ def read_tdms(path: Path, group: str | None = None) -> Recording:
         raise InputError(
             "TDMS files need nptdms", where=str(path), todo="pip install 'telerig[tdms]'"
         ) from error
-    try:
-        file = nptdms.TdmsFile.read(path)
-    except (ValueError, OSError, KeyError) as error:
-        raise InputError(
-            f"is no TDMS file that can be read ({error})", where=str(path), todo=_EXPORT_AGAIN
-        ) from error
+    nptdms.log.log_manager.set_level(logging.CRITICAL)  # what it finds is in our errors
+    with _reading(path, "TDMS"):
+        return _of_tdms(nptdms.TdmsFile.read(path), path, group)
+
+
+def _of_tdms(file: Any, path: Path, group: str | None) -> Recording:
     groups = [g for g in file.groups() if g.channels()]
     chosen = [g for g in groups if group in (None, g.name)]
     if len(chosen) != 1:

@@ -16,6 +16,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
+from telerig.io.files.csv_table import LARGEST_NUMBER
 from telerig.rig.pose import rotation_from_rotvec
 
 _MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "camera_matrix{}", "mtx{}")
@@ -94,12 +95,16 @@ def _content(file: Path) -> dict[str, Array]:
             elif node.isSeq():
                 out[name] = np.array([node.at(i).real() for i in range(node.size())])
         storage.release()
-    except (cv2.error, SystemError) as error:
+    except Exception as error:  # cv2.error, and what Python makes of it
         raise InputError(
             f"OpenCV cannot read it ({error})",
             where=str(file),
             todo="write it with cv2.FileStorage: YAML, XML or JSON",
         ) from error
+    for name, values in out.items():
+        if not (np.abs(values) <= LARGEST_NUMBER).all():
+            what = f"{name!r} holds what is no number up to {LARGEST_NUMBER:g}"
+            raise InputError(what, where=str(file), todo="correct it, or calibrate again")
     return out
 
 
@@ -130,7 +135,9 @@ def _size(content: dict[str, Array], where: str) -> tuple[int, int]:
             width, height = content[name].reshape(-1)
             return int(width), int(height)
     if {"image_width", "image_height"} <= set(content):
-        return int(content["image_width"]), int(content["image_height"])
+        width, height = (content[name].reshape(-1) for name in ("image_width", "image_height"))
+        if width.size == height.size == 1:
+            return int(width[0]), int(height[0])
     raise InputError(
         "does not state the image size",
         where=where,

@@ -15,6 +15,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
+from telerig.io.files.csv_table import LARGEST_NUMBER
 from telerig.io.files.text import read_text
 
 _LINES = ("calibration error", "pose error", "image size", "camera matrix", "camera matrix",
@@ -86,7 +87,7 @@ def _numbers(line: str, what: str, where: str) -> Array:
         values = np.array([float(word) for word in line.split(",")])
     except ValueError:
         values = np.array([np.nan])
-    if not np.isfinite(values).all() or len(values) != _WIDTHS.get(what, len(values)):
+    if not (np.abs(values) <= LARGEST_NUMBER).all() or len(values) != _WIDTHS.get(what, len(values)):
         raise InputError(
             f"{line[:60]!r} is not the {what}: {_WIDTHS.get(what, 'some')} numbers with commas "
             "between them",

@@ -19,6 +19,7 @@ import numpy as np
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
+from telerig.io.files.csv_table import LARGEST_NUMBER
 from telerig.io.files.text import read_text
 from telerig.rig import projection
 from telerig.rig.camera import Camera
@@ -101,6 +102,8 @@ def read_ptv_par(path: str | PathLike[str]) -> Sensor:
         values = [float(line) for line in lines[1 + 2 * count :] if line.strip()]
         width, height, pixel_x, pixel_y = values[3:7]
         interlaced, *indices = values[7:11]
+        if not np.all(np.abs(values) <= LARGEST_NUMBER):
+            raise ValueError("a number is not finite or too large")
     except (ValueError, IndexError) as error:
         raise InputError(
             f"is not a ptv.par of OpenPTV ({error})",
@@ -143,7 +146,7 @@ def _numbers(path: Path, least: int) -> Array:
         raise InputError(
             f"holds something that is no number ({error})", where=str(path), todo="export it again"
         ) from error
-    if len(values) < least or not np.isfinite(values).all():
+    if len(values) < least or not (np.abs(values) <= LARGEST_NUMBER).all():
         raise InputError(
             f"holds {len(values)} numbers, {least} are needed",
             where=str(path),

@@ -20,7 +20,9 @@ import numpy as np
 
 from telerig.arrays import Array
 from telerig.errors import InputError
+from telerig.io.files.names import check_name
 from telerig.io.rig_file.description import MOST_CAMERAS, rotvec_key
+from telerig.io.rig_file.writer import toml_key
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, nearest_rotation
 
@@ -76,6 +78,8 @@ def cameras_from_pinholes(pinholes: Sequence[Pinhole], names: Sequence[str]) -> 
             f"the files hold {len(pinholes)} cameras, but the names are {list(names)}",
             todo=f"give {len(pinholes)} names, one for each camera, all different",
         )
+    for name, one in zip(names, pinholes):
+        check_name(name, one.where, "camera")
     mirror = np.diag([1.0, 1.0, -1.0 if pinholes[0].mirrored else 1.0])
     for one in pinholes:
         _check(one)
@@ -205,7 +209,7 @@ def nominal_toml(cameras: Sequence[Camera]) -> str:
     for camera in cameras:
         width, height = camera.image_size_px
         lines += [
-            f"[cameras.{camera.name}]",
+            f"[cameras.{toml_key(camera.name)}]",
             f"image_size_px = [{width}, {height}]",
             f"scale_px_per_mm = {camera['scale_px_per_mm']:.9g}",
             f"telecentricity_per_mm = {camera['kappa_per_mm']:.9g}",
@@ -214,5 +218,5 @@ def nominal_toml(cameras: Sequence[Camera]) -> str:
     for camera in cameras[1:]:
         rotvec_deg = np.degrees(camera.camera_from_rig.rotvec_rad)
         numbers = ", ".join(f"{value:.6f}" for value in rotvec_deg)
-        lines.append(f"{rotvec_key(camera.name, cameras[0].name)} = [{numbers}]")
+        lines.append(f"{toml_key(rotvec_key(camera.name, cameras[0].name))} = [{numbers}]")
     return "\n".join(lines) + "\n"

@@ -15,8 +15,7 @@ from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.smooth import smooth
-from telerig.estimator.tracking.detect_run import read_batch
-from telerig.estimator.tracking.tracks import Tracks, load_tracks
+from telerig.estimator.tracking.tracks import Tracks, load_tracks, read_track_table
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import reading, replaced_results
@@ -141,7 +140,7 @@ def read_tracks(path: Path, run: Path) -> tuple[Tracks | Any, Path]:
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), todo="give tracks.csv")
     with reading(path.parent, [path.name]):
-        return read_batch(path), path
+        return read_track_table(path), path
 
 
 def with_followed_references(run: RunData, tracked: Path) -> tuple[RunData, list[Path]]:

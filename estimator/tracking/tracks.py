@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from telerig.errors import InputError
-from telerig.estimator.tracking.detect_run import read_batch
+from telerig.io.files.csv_table import Column, read_table
 from telerig.io.results.manifest import reading, replaced_results
-from telerig.io.results.tracking import TrackingFile
+from telerig.io.results.tracking import EVENTS, POINT, REFERENCES, TrackingFile
 
 if TYPE_CHECKING:
     from telerig.estimator.tracking.filter import TrackEvent
@@ -87,11 +88,41 @@ def load_tracks(folder: str | Path) -> Tracks:
     marks = place / "references.csv"
     with reading(place, [file.name for file in (*files, marks)]):
         summary = TrackingFile.read(files[3]).content()
-        detections, table, events = (read_batch(file) for file in files[:3])
-        references = read_batch(marks) if marks.is_file() else None
+        detections = _read(files[0], [_FRAME, Column("camera", "name"), *_PIXEL])
+        table = read_track_table(files[1])
+        events = _read(files[2], EVENTS)
+        references = _read(marks, REFERENCES) if marks.is_file() else None
     return Tracks(
         str(summary.get("run", place.name)), detections, table, events, summary, references
     )
+
+
+_FRAME = Column("frame", "whole")
+_PIXEL = [Column("u_px", blank=True), Column("v_px", blank=True)]
+
+
+def read_track_table(file: Path) -> pd.DataFrame:
+    """Read tracks.csv, or a table of tracks that another program made.
+
+    Returns all columns of the file. Raises InputError for a table without frame, particle, t_s and
+    the position (mm), and for cells that are not what their column says.
+    """
+    columns = [_FRAME, Column("particle", "name"), Column("t_s"), *map(Column, POINT)]
+    return _read(file, columns)
+
+
+def _read(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
+    """Read a table with all its columns; ids of bubbles that are whole numbers become such."""
+    texts = [Column(name, "text", required=False, blank=True) for name in ("flags", "reason")]
+    named = {column.name for column in columns}
+    more = [column for column in texts if column.name not in named]
+    table = read_table(file, [*columns, *more], extra=True, empty=True).reset_index(drop=True)
+    if "particle" in table:
+        ids = pd.to_numeric(table["particle"].replace("", np.nan), errors="coerce")
+        if ids.notna().equals(table["particle"].replace("", np.nan).notna()):
+            whole = bool(len(ids)) and bool((ids % 1 == 0).all())
+            table["particle"] = ids.astype(np.int64) if whole else ids
+    return table
 
 
 def tracking_words(summary: Mapping[str, Any], seconds: float) -> str:

@@ -14,8 +14,8 @@ import pandas as pd
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import choose_source, read_dots_csv
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
-from telerig.io.rig_file.description import RigDescription
 from telerig.io.results.record import read_object
+from telerig.io.rig_file.description import RigDescription
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.rig.target import Target
 

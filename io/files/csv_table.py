@@ -54,13 +54,18 @@ class Column:
 
 
 def read_table(
-    path: str | PathLike[str], columns: Sequence[Column], *, extra: bool = False
+    path: str | PathLike[str],
+    columns: Sequence[Column],
+    *,
+    extra: bool = False,
+    empty: bool = False,
 ) -> pd.DataFrame:
     """Read a CSV table and check its header and its cells.
 
     columns : the columns that the table may have or must have.
     extra : True keeps further columns, as numbers if all their cells are numbers; False refuses
     them.
+    empty : whether the table may have no rows.
     Returns the columns that the file has, in the file's order. The index is the row in the file
     (the header is row 1). "whole" columns are int64, or float64 where cells may be blank.
     Raises InputError for a missing or unknown column, more than `MOST_COLUMNS`, a cell that is no
@@ -69,11 +74,11 @@ def read_table(
     """
     file = Path(path)
     table = _sound_table(file, columns, "keep" if extra else "refuse")
-    if table is not None and len(table):
+    if table is not None and (empty or len(table)):
         return table
     header, content, numbers = _cells(file)
     _check_header(header, columns, extra, file)
-    if not numbers:
+    if not numbers and not empty:
         raise InputError(
             "has no rows below its header",
             where=str(file),
@@ -242,7 +247,10 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
 
 
 def _split(line: str, where: str) -> list[str]:
-    """Return the cells of a line. Raises InputError for quotes without end and control characters."""
+    """Return the cells of a line.
+
+    Raises InputError for control characters and for cells that are too long.
+    """
     if _CONTROL.search(line.encode("utf-8")):
         raise InputError("has a control character", where=where, todo="remove it")
     try:
@@ -307,9 +315,11 @@ def _number(cells: Sequence[str], column: Column, rows: Rows) -> Array:
     rows.refuse(
         bad,
         column.name,
-        lambda i: f"is {cells[i]!r:.80}, {words[bool(np.isfinite(values[i]))]}"
-        if cells[i]
-        else "is blank",
+        lambda i: (
+            f"is {cells[i]!r:.80}, {words[bool(np.isfinite(values[i]))]}"
+            if cells[i]
+            else "is blank"
+        ),
         "correct the cell, or remove the row if there was no measurement",
     )
     return values

@@ -14,8 +14,8 @@ LONGEST_BYTES = 120
 """File systems allow 255, and a name gets an ending."""
 
 ADVICE = (
-    "use letters, digits, spaces, _ and -; a name becomes part of file names, so it has no / or \\, "
-    f"begins with none of . = @ and has at most {LONGEST_BYTES} bytes"
+    "use letters, digits, spaces, _ and -; a name becomes part of file names, so it has no / and "
+    f"no \\, begins with none of . = @ and has at most {LONGEST_BYTES} bytes"
 )
 _FORBIDDEN = {"Cc": "a control character", "Cf": "an invisible character",
               "Cs": "half a character", "Zl": "a line break", "Zp": "a line break"}  # fmt: skip
@@ -31,7 +31,7 @@ def fault_of_name(name: str) -> str:
         if sign in "/\\":
             return f"has a {sign}"
         if category(sign) in _FORBIDDEN:
-            return f"has {_FORBIDDEN[category(sign)]} ({ascii(sign)})"
+            return f"has {_FORBIDDEN[category(sign)]} ({sign!a})"
     if name[0] in ".=@":
         return f"begins with {name[0]}"
     return ""

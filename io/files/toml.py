@@ -30,8 +30,8 @@ def toml_content(text: str, where: str, todo: str) -> dict[str, Any]:
     """Return the content of a TOML text.
 
     where, todo : the place and the advice in errors.
-    Raises InputError for a text that is no TOML or is longer than `LONGEST`, for more than `DEEPEST`
-    tables or lists inside each other, and for a finite number beyond `LARGEST_NUMBER`.
+    Raises InputError for a text that is no TOML or is longer than `LONGEST`, for more than
+    `DEEPEST` tables or lists inside each other, and for a finite number beyond `LARGEST_NUMBER`.
     """
     if len(text) > LONGEST:
         what = f"has {len(text)} characters, more than the {LONGEST} that are read"

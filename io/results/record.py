@@ -17,7 +17,15 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+)
 
 from telerig.arrays import Array, Ints
 from telerig.errors import InputError
@@ -165,8 +173,8 @@ def read_object(file: Path, todo: str) -> Mapping[str, Any]:
     """Read a JSON file whose content is an object, and return it as a dictionary.
 
     Numbers that are not finite become None, as `write_json_atomic` writes them.
-    todo : the advice in an error. Raises InputError for a file that holds no JSON object, nests more
-    than 64 objects and lists, or has a number beyond 1e30.
+    todo : the advice in an error. Raises InputError for a file that holds no JSON object, nests
+    more than 64 objects and lists, or has a number beyond 1e30.
     """
     data = read_bytes(file)
     try:

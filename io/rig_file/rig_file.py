@@ -40,9 +40,7 @@ TOP_LEVEL = [
     *("stage", "accelerometers", "devices", "references", "walls", "tracking"),
 ]
 
-_CORRECT = (
-    "correct that line: strings need quotes, each key stands once, keys follow their [table]"
-)
+_CORRECT = "correct that line: strings need quotes, each key stands once, keys follow their [table]"
 _LISTED_PROBLEMS = 15
 _GRAZING = np.cos(np.deg2rad(85.0))
 

@@ -53,7 +53,9 @@ def rig_toml(rig: RigDescription) -> str:
         blocks.append(_block("stage", lines))
     for sensor in rig.accelerometers.values():
         blocks.append(_block(f"accelerometers.{toml_key(sensor.name)}", _all_fields(sensor)))
-    blocks += [_block(f"devices.{toml_key(d.name)}", _changed_fields(d)) for d in rig.devices.values()]
+    blocks += [
+        _block(f"devices.{toml_key(d.name)}", _changed_fields(d)) for d in rig.devices.values()
+    ]
     if rig.references is not None:
         blocks.append(_block("references", _all_fields(rig.references)))
     if rig.tracking is not None:

@@ -46,7 +46,7 @@ def _dataset(folder: Path, rng: np.random.Generator) -> None:
     for name, table in (("dots", calibration.dots), ("residuals", calibration.residuals)):
         write_table(table, results / "calibration" / f"{name}.csv")
     comparison = {"verdict": "unchanged", "words": ["same"], "earlier": "before.json", "changes": [
-        {"quantity": "left.k1", "unit": "1", "change": 0.1, "sd": 0.2, "deviations": 0.5}]}  # fmt: skip
+        {"quantity": "left.k1", "unit": "1", "change": 0.1, "sd": 0.2}]}  # fmt: skip
     (results / "calibration" / "comparison.json").write_text(json.dumps(comparison))
     run = telerig.load_run(folder / "runs" / "S2")
     tracks = telerig.track(run, calibration)
@@ -66,7 +66,8 @@ def _extend_rig(file: Path) -> None:
     """Give the rig file the tables that the simulator leaves out."""
     text = file.read_text()
     for header, rows in (
-        ("[walls.left]", 'normal = [0.0, 0.0, 1.0]\nindices = [1.0, 1.5, 1.33]\nthickness_mm = 9.0'),
+        ("[walls.left]", "normal = [0.0, 0.0, 1.0]\nindices = [1.0, 1.5, 1.33]\n"
+                         "thickness_mm = 9.0"),
         ("[tracking]", 'cameras = ["left", "right"]'),
         ("[devices.encoder]", 'kind = "encoder"\nport = "/dev/ttyUSB0"\ncounts_per_mm = 100.0'),
         ("[devices.clock]", 'kind = "frames"\nport = "/dev/ttyUSB1"\nprotocol = "regex"\n'
@@ -171,7 +172,10 @@ def _tdms(file: Path, axes: Any) -> None:
     facts = {"unit_string": "g", "wf_increment": 0.001}
     with TdmsWriter(file) as writer:
         writer.write_segment(
-            [ChannelObject("arm", name, axes[:, i], facts) for i, name in enumerate(("x", "y", "z"))]
+            [
+                ChannelObject("arm", name, axes[:, i], facts)
+                for i, name in enumerate(("x", "y", "z"))
+            ]
         )
 
 

@@ -69,9 +69,19 @@ def run_cases(corpus: Path, begin: int, end: int, only: str = "") -> Outcome:
 
 def _answers(corpus: Path, begin: int, end: int, only: str) -> Iterator[dict[str, Any]]:
     """The records of one worker; the last lacks "result" if the worker hung or crashed in it."""
-    with tempfile.TemporaryDirectory(prefix="telerig-fuzz-") as work, tempfile.TemporaryFile() as noise:
-        command = [sys.executable, str(_HERE / "fuzz_worker.py"), corpus, work, str(begin), str(end)]
-        # glibc gives each thread 64 MB of addresses, which are no memory but count against the limit
+    with (
+        tempfile.TemporaryDirectory(prefix="telerig-fuzz-") as work,
+        tempfile.TemporaryFile() as noise,
+    ):
+        command = [
+            sys.executable,
+            str(_HERE / "fuzz_worker.py"),
+            corpus,
+            work,
+            str(begin),
+            str(end),
+        ]
+        # glibc gives each thread 64 MB of addresses, which are no memory but count as such
         environment = os.environ | {"MALLOC_ARENA_MAX": "2", "OPENBLAS_NUM_THREADS": "1"}
         environment["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
         process = subprocess.Popen(

@@ -1,8 +1,8 @@
 """Read hostile files one after another, in a process of its own with little memory.
 
 `python fuzz_worker.py CORPUS WORK BEGIN END [TARGET]` reads the cases BEGIN to END - 1 and prints
-one line of JSON before and one after each. TARGET: one or more, with commas. It runs in a process of its own, so that a crash of a
-decoder or a loop without end ends one case and not the test.
+one line of JSON before and one after each. TARGET: one or more, with commas. It runs in a process
+of its own, so that a crash of a decoder or a loop without end ends one case and not the test.
 """
 
 from __future__ import annotations
@@ -68,12 +68,16 @@ def outcome(target: Target, file: Path, work: Path) -> tuple[str, str]:
             raise Fault(f"{len(warned)} warnings: {one.message} {one.filename}:{one.lineno}")
         if len(words.encode("utf-8", "surrogatepass")) > LONGEST_MESSAGE:
             raise Fault(f"a message of {len(words)} characters: {words[:300]}")
-        if result == "refused" and isinstance(refusal, InputError) and not {file.name, file.parent.name} & set(_words(words)):
+        if (
+            result == "refused"
+            and isinstance(refusal, InputError)
+            and not {file.name, file.parent.name} & set(_words(words))
+        ):
             raise Fault(f"a message that does not name the file: {words[:300]}")
         if _noise() - noise > LONGEST_NOISE:
             raise Fault(f"{_noise() - noise} bytes on standard error")
         shutil.rmtree(work / "case" / EXPORTED, ignore_errors=True)
-        if (strange := _tree(work) ^ before):
+        if strange := _tree(work) ^ before:
             raise Fault(f"files were written: {sorted(strange)[:5]}")
     except BaseException as error:  # noqa: BLE001 - whatever is raised is what is looked for
         shutil.rmtree(work / "case" / EXPORTED, ignore_errors=True)
@@ -88,7 +92,11 @@ def _words(message: str) -> list[str]:
 
 
 def _brief(error: BaseException) -> str:
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).parent.name != "fuzz"]
+    frames = [
+        f
+        for f in traceback.extract_tb(error.__traceback__)
+        if Path(f.filename).parent.name != "fuzz"
+    ]
     ours = [f"{Path(f.filename).name}:{f.lineno}" for f in frames][-4:]
     return f"{type(error).__name__}: {str(error)[:400]} [{' '.join(ours)}]"
 
@@ -147,7 +155,9 @@ def main(corpus: Path, work: Path, begin: int, end: int, only: str = "") -> None
             continue
         answers.write(json.dumps({"case": case, "target": name}) + "\n")
         sound = (corpus / target.file).read_bytes()
-        content = mutated(sound, target.kind, np.random.default_rng([case, zlib.crc32(name.encode())]))
+        content = mutated(
+            sound, target.kind, np.random.default_rng([case, zlib.crc32(name.encode())])
+        )
         file.write_bytes(content)
         started = time.monotonic()
         result, words = outcome(target, file, work)

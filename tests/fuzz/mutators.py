@@ -20,12 +20,12 @@ NUMBERS = (
 NAMES = (
     "/abs/path", "../../x", "..", ".hidden", "a/b", "a\\b", "C:\\x", "a\nb", "a\r\nb", 'a"b', "a'b",
     "a\x00b", "a\x1b[2J", "\u202etfel", "\u2028", "\ufeff", "", " ", "x" * 300, "x" * 60_000,
-    "<!--<script>", "</script><b>", "=cmd|' /C calc'!A0", "@SUM(1)", "Zähler 1", "名前", "con", "%s%n",
+    "<!--<script>", "</script><b>", "=cmd|' /C calc'!A0", "@SUM(1)", "Zähler 1", "名前", "con",
     "{0}", "$(x)", "`x`", "-rf", "~", "a:b", "a|b", "spy://x?file=y",
 )  # fmt: skip
 VALUES: tuple[Any, ...] = (
-    None, True, False, "", "text", "9" * 400, 0, -1, 10**400, -(10**30), 2**63, 1e308, -1e308, 1e-320,
-    float("nan"), float("inf"), 1.5, [], {}, [[]], [None], [[1, 2], [3]], {"a": 1}, "\x00", "\ud800",
+    None, True, False, "", "text", "9" * 400, 0, -1, 10**400, -(10**30), 2**63, 1e308, 1e-320,
+    float("nan"), float("inf"), 1.5, [], {}, [[]], [None], [[1, 2], [3]], {"a": 1}, "\ud800",
     [1, "2", None], [[0.0] * 3] * 3, [0.0] * 3, "x" * 60_000, [0] * 20_000,
 )  # fmt: skip
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
@@ -158,7 +158,8 @@ def _replace(pattern: re.Pattern[str], hostile: tuple[str, ...]) -> Callable[[st
 
 def _insert_text(text: str, rng: Generator) -> str:
     place = int(rng.integers(len(text) + 1))
-    return text[:place] + _pick((*NAMES, *NUMBERS, '"', "'", "[", "]", "{", "=", "#"), rng) + text[place:]  # fmt: skip
+    extra = _pick((*NAMES, *NUMBERS, '"', "'", "[", "]", "{", "=", "#"), rng)
+    return text[:place] + extra + text[place:]
 
 
 def _rename_everywhere(text: str, rng: Generator) -> str:

@@ -101,9 +101,9 @@ def _content(file: Path) -> dict[str, Array]:
             where=str(file),
             todo="write it with cv2.FileStorage: YAML, XML or JSON",
         ) from error
-    for name, values in out.items():
+    for key, values in out.items():
         if not (np.abs(values) <= LARGEST_NUMBER).all():
-            what = f"{name!r} holds what is no number up to {LARGEST_NUMBER:g}"
+            what = f"{key!r} holds what is no number up to {LARGEST_NUMBER:g}"
             raise InputError(what, where=str(file), todo="correct it, or calibrate again")
     return out
 
@@ -135,9 +135,9 @@ def _size(content: dict[str, Array], where: str) -> tuple[int, int]:
             width, height = content[name].reshape(-1)
             return int(width), int(height)
     if {"image_width", "image_height"} <= set(content):
-        width, height = (content[name].reshape(-1) for name in ("image_width", "image_height"))
-        if width.size == height.size == 1:
-            return int(width[0]), int(height[0])
+        stated = [content[name].reshape(-1) for name in ("image_width", "image_height")]
+        if all(one.size == 1 for one in stated):
+            return int(stated[0][0]), int(stated[1][0])
     raise InputError(
         "does not state the image size",
         where=where,

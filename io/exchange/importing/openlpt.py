@@ -87,7 +87,9 @@ def _numbers(line: str, what: str, where: str) -> Array:
         values = np.array([float(word) for word in line.split(",")])
     except ValueError:
         values = np.array([np.nan])
-    if not (np.abs(values) <= LARGEST_NUMBER).all() or len(values) != _WIDTHS.get(what, len(values)):
+    if not (np.abs(values) <= LARGEST_NUMBER).all() or len(values) != _WIDTHS.get(
+        what, len(values)
+    ):
         raise InputError(
             f"{line[:60]!r} is not the {what}: {_WIDTHS.get(what, 'some')} numbers with commas "
             "between them",

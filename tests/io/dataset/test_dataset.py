@@ -225,7 +225,7 @@ def test_truth_is_read_when_it_is_asked_for(folder: Path) -> None:
     (folder / "truth").mkdir()
     (folder / "truth" / "truth.json").write_text("{")
     dataset = load_dataset(folder)
-    assert "is not valid JSON" in error_of(lambda: dataset.truth)
+    assert "cannot be read as JSON" in error_of(lambda: dataset.truth)
     write_json_atomic(folder / "truth" / "truth.json", {"kappa": np.float64(1e-3)})
     assert load_dataset(folder).truth == {"kappa": 1e-3}
 

@@ -13,6 +13,7 @@ import pandas as pd
 
 from telerig.errors import InputError, nearest, suggestion
 from telerig.io.dataset.tables import choose_source, read_dots_csv
+from telerig.io.files.names import check_name
 from telerig.io.images.read import EXTENSIONS, Image, list_images, natural, read_image
 from telerig.io.results.record import read_object
 from telerig.io.rig_file.description import RigDescription
@@ -291,6 +292,7 @@ def _stems(folder: Path, notes: list[str]) -> dict[str, Path]:
         )
     stems: dict[str, Path] = {}
     for file in images:
+        check_name(file.stem, str(folder), "view")
         if file.stem in stems:
             raise InputError(
                 f"{stems[file.stem].name} and {file.name} are the same view twice",

@@ -25,6 +25,7 @@ from telerig.io.dataset.tables import (
     read_run_toml,
     read_stage_csv,
 )
+from telerig.io.files.names import check_name
 from telerig.io.images.frames import PAGE_EXTENSIONS, VIDEO_EXTENSIONS, FrameSource, open_frames
 from telerig.io.images.read import Image, check_size, list_images
 from telerig.io.rig_file.description import RigDescription, camera_named
@@ -149,6 +150,7 @@ def load_run(
     Raises InputError, with the file, the row or frame, and what to do.
     """
     folder = _run_folder(Path(path))
+    check_name(folder.resolve().name, str(folder), "run")
     rig = rig or _rig_above(folder)
     names = list(cameras) if cameras else _cameras_of(rig, folder)
     every = list(rig.cameras) if rig and not set(names) - set(rig.cameras) else names

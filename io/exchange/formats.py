@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from telerig.errors import InputError
+from telerig.io.files.names import check_name
 
 if TYPE_CHECKING:
     from telerig.io.exchange.export.run_results import RunResults
@@ -192,6 +193,8 @@ def export_cameras(
     """
     from telerig.io.exchange.export.volume import working_volume
 
+    for camera in cameras:
+        check_name(camera.name, "cameras", "camera")
     box = volume or working_volume(cameras)
     lines = [
         f"working volume: {box.words()}",

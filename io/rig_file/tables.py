@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from telerig.errors import nearest, suggestion
+from telerig.io.files.names import ADVICE, fault_of_name
 from telerig.io.rig_file.description import Table
 
 AnyTable = TypeVar("AnyTable", bound=Table)
@@ -107,6 +108,9 @@ def subtables(raw: dict[str, Any], table: str, problems: Problems) -> dict[str, 
         what = f"holds {', '.join(stray)}, but must hold a table for each name"
         todo = f"write [{table}.<name>] above them, with the name filled in"
         problems.add(table, "", what, todo)
+    for name in content:
+        if fault := fault_of_name(name):
+            problems.add(table, "", f"the name {name!r:.80} {fault}", ADVICE)
     return {name: inner for name, inner in content.items() if name not in stray}
 
 

@@ -41,6 +41,7 @@ from telerig.io.exchange.export.volume import (
     working_volume,
 )
 from telerig.io.files.atomic import atomic_folder
+from telerig.io.files.names import check_name
 from telerig.rig import projection
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import COEFFICIENTS
@@ -277,6 +278,8 @@ def write_halcon(
     layout is not documented. Raises InputError when the folder cannot be written.
     """
     names = []
+    for camera in cameras:
+        check_name(camera.camera, str(folder), "camera")
     with atomic_folder(folder) as place:
         for camera in cameras:
             if "tilt" not in camera.parameters:

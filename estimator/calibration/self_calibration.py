@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from telerig.arrays import Array
-from telerig.errors import CalibrationError, InputError
+from telerig.errors import CalibrationError, GeometryError, InputError
 from telerig.estimator.calibration.lens.choice import (
     Choice,
     choose,
@@ -24,6 +24,7 @@ from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.split_half import split_half_check
+from telerig.estimator.calibration.quality.view_pairing import refuse_copies, wrong_pairs
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit
 from telerig.estimator.calibration.solver.covariance import JointCovariance, joint_covariance
@@ -106,8 +107,8 @@ def self_calibrate(
         raise CalibrationError(f"unknown solver {solver!r}", todo=f"known: {', '.join(SOLVERS)}")
     nominal = _nominal(nominal_rotvec_deg, cameras)
     problem = hold_dots(problem_from_dots(dots, cameras, target), dots_free)
-    problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd))
-    problem = replace(problem, solver="schur" if solver == "auto" else solver)
+    problem = replace(problem, outlier_sd=checked_outlier_sd(outlier_sd), solver=solver)
+    refuse_copies(problem)
     unknown = dots_unknown(problem)
     start_dots = dots_from_images(problem) if unknown else problem.nominal_mm
     pre = checks.pre_check(problem, start_dots, unknown_dots=unknown)
@@ -117,20 +118,46 @@ def self_calibrate(
         found_notes += [checks.Note("symmetric target", w) for w in words]
         start_dots = problem.nominal_mm
     problem = with_plate(problem, nominal)
+    try:
+        found = _solved(problem, start_dots, nominal, models, pre, found_notes, name, progress)
+    except (CalibrationError, GeometryError) as error:
+        _refuse_wrong_pairs(problem, start_dots, error)
+        raise
+    if found.verdict["status"] == "REJECTED":
+        _refuse_wrong_pairs(problem, start_dots)
+    return found
+
+
+def _solved(
+    problem: Problem,
+    start_dots: Array,
+    nominal: mirror_ambiguity.Nominal,
+    models: tuple[str, ...],
+    pre: checks.PreCheck,
+    notes: Sequence[checks.Note],
+    name: str,
+    progress: Progress | None,
+) -> Calibration:
+    """Start, fit, covariance, verdict and checks of a problem whose views belong together."""
+    cameras = problem.cameras
     start = best_start(problem, start_dots, nominal)
     mirror = mirror_ambiguity.choose_start(start, problem, nominal)
     start = mirror_ambiguity.with_tilt_signs(problem, mirror.state)
-    found_notes += checks.position_notes(problem, start)
-    fit = _fit(problem, start, models, solver, progress)
+    fit = _fit(problem, start, models, progress)
     if len(cameras) > 1 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
         fit, mirror = _on_the_right_side(fit, nominal)
     final, solution = fit.robust.problem, fit.robust.solution
+    notes = (
+        *notes,
+        *checks.position_notes(problem, start),
+        *checks.exchanged_notes(final, solution.state),
+    )
     considered = considered_groups(fit.choice, len(cameras))
     added = considered_words(considered, [c.name for c in cameras])
     other_cost = mirror_ambiguity.mirrored_cost(final, solution.state, solution.cost)
     fit = replace(
         fit, mirror=mirror, mirrored_cost=other_cost, tilts_deg=pre.tilts_deg,
-        notes=tuple(found_notes), model_words=fit.model_words + added,
+        notes=notes, model_words=fit.model_words + added,
     )  # fmt: skip
     own = joint_covariance(final, solution)
     free, joint = considered_covariance(final, solution, own, fit.models, considered)
@@ -138,6 +165,15 @@ def self_calibrate(
     found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
     checked = _trust(fit.robust, joint, free)
     return replace(found, diagnostics={**found.diagnostics, **checked})
+
+
+def _refuse_wrong_pairs(problem: Problem, dots_mm: Array, cause: Exception | None = None) -> None:
+    """Raise CalibrationError if images of different views were paired; otherwise do nothing."""
+    words = wrong_pairs(problem, dots_mm)
+    if words:
+        raise CalibrationError(
+            words, todo="give images that were taken at the same time the same file name"
+        ) from cause
 
 
 def _nominal(
@@ -237,13 +273,9 @@ def _fit(
     problem: Problem,
     start: State,
     models: tuple[str, ...],
-    solver: str,
     progress: Progress | None,
 ) -> Fit:
-    """Outliers and noise floor with a rich model, the choice, then the chosen model to the end.
-
-    solver : of the last fit; the trials before it take ``problem.solver``.
-    """
+    """Outliers and noise floor with a rich model, the choice, then the chosen model to the end."""
     choice, held = None, None
     weighed = problem
     words = f"{joint_name(models, [c.name for c in problem.cameras])}: as asked"
@@ -266,7 +298,7 @@ def _fit(
         begin = solve(sound, start, max_iterations=15, relative=1e-5).state
     shift = eccentricity_px(final, begin)
     final = replace(final, uv_px=final.uv_px - shift)
-    robust = robust_solve(replace(final, solver=solver), begin, progress=progress)
+    robust = robust_solve(final, begin, progress=progress)
     return Fit(robust, models, words, choice, held)
 
 

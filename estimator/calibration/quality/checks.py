@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -25,6 +26,8 @@ the diagonal of the field of view, in mm."""
 LOOSE = 0.03
 """An offset is undetermined if the views determine it less well than the best one by this factor
 or more."""
+OTHER_SCALE = 0.05
+"""Cameras whose nominal scales differ by less than this share cannot be told apart by them."""
 CLEAR_MISFIT = 0.1
 """Largest misfit of an image's map that is accepted, as a share of the spread of its dots."""
 
@@ -202,6 +205,31 @@ def position_notes(problem: Problem, state: State) -> tuple[Note, ...]:
         )
         for c in cameras
     )
+
+
+def exchanged_notes(problem: Problem, state: State) -> tuple[Note, ...]:
+    """Return a note for two cameras whose estimated scales fit each other's nominal scale better.
+
+    This is a sign that the folders of the cameras were exchanged. Nominal scales that differ by
+    less than `OTHER_SCALE` tell nothing.
+    """
+    estimated = np.log(state.intrinsics[:, INDEX["scale_px_per_mm"]])
+    nominal = np.log([camera["scale_px_per_mm"] for camera in problem.cameras])
+    notes = []
+    for a, b in combinations(range(len(problem.cameras)), 2):
+        own = abs(estimated[a] - nominal[a]) + abs(estimated[b] - nominal[b])
+        crossed = abs(estimated[a] - nominal[b]) + abs(estimated[b] - nominal[a])
+        if own > OTHER_SCALE and crossed < own / 4:
+            first, second = (problem.cameras[c] for c in (a, b))
+            scales = [np.exp(logarithm[c]) for logarithm in (estimated, nominal) for c in (a, b)]
+            words = (
+                f"cameras {first.name!r} and {second.name!r} seem to be exchanged: their scales "
+                f"are {scales[0]:.3f} and {scales[1]:.3f} px/mm, rig.toml says {scales[2]:g} and "
+                f"{scales[3]:g}. Check which folder holds the images of which camera: exchanged "
+                "cameras mirror every depth"
+            )
+            notes.append(Note("exchanged cameras", words, affects_verdict=True))
+    return tuple(notes)
 
 
 def _mirrored_note(problem: Problem, maps: dict[tuple[int, int], ImageMap]) -> list[Note]:

@@ -93,7 +93,6 @@ def _size(
 
 def _rig(problem: Problem, state: State, views: NDArray[np.int64]) -> Rig:
     half = problem.subset(np.isin(problem.view, views) & problem.kept)
-    half = replace(half, solver="schur")
     overlap_tree(half, _images(half))
     if half.scale is not None:
         pair, distance, _ = half.scale

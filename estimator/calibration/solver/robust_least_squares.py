@@ -31,6 +31,9 @@ MANY_DOTS = 5000
 (docs/decisions/020)."""
 MANY_PARAMETERS = 4000
 """With more parameters of views and dots than this, the full covariance matrix is too large."""
+LINEAR = 0.9
+"""After a step that gains at least this share of its predicted gain, the damping falls a
+thousandfold rather than tenfold."""
 NEARLY_UNDAMPED = 1e-6
 """With less damping than this, the predicted gain of a step is what Gauss-Newton could still
 gain."""
@@ -111,7 +114,9 @@ def solve(
         trial = _at(linearised, moved)
         if trial is not None and cost - trial.cost >= -1e-13 * cost:
             done = promised <= relative * cost and cost - trial.cost <= relative * cost
-            point, equations, damping = moved, trial, max(damping / 10, 1e-12)
+            as_promised = cost - trial.cost > LINEAR * promised
+            point, equations = moved, trial
+            damping = max(damping / (1000 if as_promised else 10), 1e-12)
             if progress is not None:
                 progress(iteration, equations.cost)
             if done:

@@ -195,9 +195,15 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
                 f"lenses on the other ({words}); farther dots are smaller only in the solution "
                 "that the nominal rotation rejects",
                 where="rig.toml [stereo]",
-                todo=f"check the sign of {' and '.join(stated)}",
+                todo=f"check the sign of {' and '.join(stated)}, and that the cameras' folders are "
+                "not exchanged",
             )
         if not perspective:
+            words += (
+                ". If the folders of the cameras were exchanged, the images would fit as well and "
+                "every depth would be mirrored: make sure once that each folder holds the images "
+                "of its own camera"
+            )
             return MirrorChoice((state, other)[nearest], "nominal rotation", words)
     if perspective:
         kept = state if perspective > 0 else other

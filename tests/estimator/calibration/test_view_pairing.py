@@ -1,0 +1,99 @@
+"""Wrong data that would fit well, or fail for another stated reason: copies, pairs, exchange."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from telerig.errors import CalibrationError
+
+
+@pytest.fixture(scope="module")
+def paper(scene: Any) -> Any:
+    return scene("paper", 3)
+
+
+def offset(dots: pd.DataFrame, camera: str, first: int, by: int) -> pd.DataFrame:
+    """From a view on, the camera's images have the name of the view that is ``by`` later."""
+    views = sorted(dots["view"].unique())
+    index = dots["view"].map(views.index).to_numpy()
+    moved = ((dots["camera"] == camera) & (index >= first)).to_numpy()
+    index = index + np.where(moved, by, 0)
+    inside = (index >= 0) & (index < len(views))
+    out = dots[inside].assign(view=[views[i] for i in index[inside]])
+    return out.drop_duplicates(["view", "camera", "dot"], keep="last", ignore_index=True)
+
+
+@pytest.mark.parametrize(("first", "by"), [(0, -1), (5, 2), (9, -1)])
+def test_images_under_the_names_of_other_views_are_refused(first: int, by: int, paper: Any) -> None:
+    made = paper.changed(lambda dots: offset(dots, "right", first, by))
+    with pytest.raises(CalibrationError) as caught:
+        made.calibrate("radial")
+    text = str(caught.value)
+    assert "images of camera 'right' do not belong to the views" in text
+    assert f"those {abs(by)} {'later' if by > 0 else 'earlier'} fit" in text
+    assert "same file name" in text
+
+
+def copied(dots: pd.DataFrame, camera: str | None, noise_px: float) -> pd.DataFrame:
+    """The first view of a camera, or of all, once more as the last view."""
+    views = sorted(dots["view"].unique())
+    again = dots[(dots["view"] == views[0]) & (dots["camera"].eq(camera) | (camera is None))]
+    again = again.assign(view="copy")
+    rng = np.random.default_rng(0)
+    for column in ("u_px", "v_px"):
+        again[column] += noise_px * rng.standard_normal(len(again))
+    others = dots[(dots["view"] == views[1]) & (dots["camera"] != camera) & (camera is not None)]
+    return pd.concat([dots, again, others.assign(view="copy")], ignore_index=True)
+
+
+@pytest.mark.parametrize("camera", [None, "left"])
+@pytest.mark.parametrize("noise_px", [0.0, 1e-4])
+def test_a_copied_image_is_refused(camera: str | None, noise_px: float, paper: Any) -> None:
+    made = paper.changed(lambda dots: copied(dots, camera, noise_px))
+    with pytest.raises(CalibrationError, match=r"camera 'left' view .* copies of one image"):
+        made.calibrate("radial")
+
+
+def test_one_image_in_both_cameras_is_refused(paper: Any) -> None:
+    def same(dots: pd.DataFrame) -> pd.DataFrame:
+        left = dots[dots["camera"] == "left"]
+        return pd.concat([left, left.assign(camera="right")], ignore_index=True)
+
+    with pytest.raises(CalibrationError, match="copies of one image"):
+        paper.changed(same).calibrate("radial")
+
+
+def test_two_photographs_of_a_target_at_rest_are_no_copies(paper: Any) -> None:
+    sigma = float(np.sqrt(paper.dots["suu_px2"].median() * 2))
+    made = paper.changed(lambda dots: copied(dots, None, sigma))
+    assert made.calibrate("radial").verdict["status"] == "GOOD"
+
+
+def exchanged(dots: pd.DataFrame) -> pd.DataFrame:
+    return dots.assign(camera=dots["camera"].map({"left": "right", "right": "left"}))
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_exchanged_cameras_are_seen_where_their_nominal_scales_differ(
+    swapped: bool, paper: Any
+) -> None:
+    """Two telecentric cameras that are exchanged fit as well: only their scales differ."""
+    left = paper.cameras[0].with_parameters(scale_px_per_mm=10.6)
+    made = replace(paper, cameras=(left, *paper.cameras[1:]))
+    factor = {"left": 1.06, "right": 1.0}
+
+    def scaled(dots: pd.DataFrame) -> pd.DataFrame:
+        times = dots["camera"].map(factor)
+        return dots.assign(u_px=dots["u_px"] * times, v_px=dots["v_px"] * times)
+
+    made = made.changed(scaled)
+    made = made.changed(exchanged) if swapped else made
+    calibration = made.calibrate("radial")
+    said = any("exchanged" in reason for reason in calibration.verdict["reasons"])
+    assert said == swapped
+    assert "folders of the cameras were exchanged" in str(calibration.twin)

@@ -40,6 +40,11 @@ LONGEST_COMMAND = 300
 """Characters of a command line that are kept; a batch may name thousands of datasets."""
 _SMOOTHED = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
 _LOCK_WITHIN_S = 30.0
+_MOST_TRIES = 20
+_NO_MANIFEST = (
+    "{}: there is no manifest.json, so nobody can check that the files belong together; run the "
+    "command again that made this folder"
+)
 
 
 class Written(Part):
@@ -165,24 +170,12 @@ def reading(folder: Path, names: Collection[str]) -> Iterator[None]:
     Raises InputError when the files are of two different results, or when a command replaces them
     while they are read.
     """
-    manifest = read_manifest(folder)
-    before = _content(folder)
-    if manifest is not None:
-        _check(folder, manifest, names)
-    elif (folder / RUN_RECORD).is_file():
-        _warn(
-            f"{folder}: there is no manifest.json, so nobody can check that the files belong "
-            "together; run the command again that made this folder"
-        )
+    before = _checked(folder, names)
     try:
         yield
     finally:
         if _content(folder) != before:
-            raise InputError(
-                "was written again while it was being read",
-                where=str(folder),
-                todo="run the command again",
-            )
+            raise _replaced(folder)
 
 
 def is_whole(file: Path) -> bool:
@@ -199,21 +192,53 @@ def is_whole(file: Path) -> bool:
     return True
 
 
-def _check(folder: Path, manifest: Manifest, names: Collection[str]) -> None:
+def _checked(folder: Path, names: Collection[str]) -> bytes:
+    """Check files and return the manifest by which they were checked.
+
+    The check is repeated when a command replaced the manifest meanwhile.
+    """
+    for _ in range(_MOST_TRIES):
+        before = _content(folder)
+        try:
+            doubts = _doubts(folder, read_manifest(folder), set(names))
+        except (InputError, OSError):
+            if _content(folder) == before:
+                raise
+            continue
+        if _content(folder) == before:
+            for words in doubts:
+                warnings.warn(words, TelerigWarning, stacklevel=4)
+            return before
+    raise _replaced(folder)
+
+
+def _replaced(folder: Path) -> InputError:
+    return InputError(
+        "was written again while it was being read",
+        where=str(folder),
+        todo="run the command again",
+    )
+
+
+def _doubts(folder: Path, manifest: Manifest | None, names: set[str]) -> list[str]:
+    """Return what a user has to know of the files, one sentence each."""
+    if manifest is None:
+        return [_NO_MANIFEST.format(folder)] if (folder / RUN_RECORD).is_file() else []
     sections = manifest.sections.values()
     if any(section.unfinished for section in sections):
-        return
-    wanted = set(names)
-    settled = [s.settled(folder) if s.changing() & wanted else s for s in sections]
-    for name in sorted(wanted):
-        entry = next((s.files[name] for s in settled if name in s.files), None)
-        if not (folder / name).is_file():
+        return []
+    settled = [s.settled(folder) if s.changing() & names else s for s in sections]
+    doubts = []
+    for name in sorted(names):
+        file, entry = folder / name, next((s.files[name] for s in settled if name in s.files), None)
+        if not file.is_file():
             if entry is not None:
-                _warn(f"{folder / name}: is no longer there; the results are used without it")
+                doubts.append(f"{file}: is no longer there; the results are used without it")
         elif entry is None:
-            _warn(f"{folder / name}: was not written into this folder by telerig; it is used")
-        elif hashed(folder / name).sha256 != entry.sha256:
-            _warn(f"{folder / name}: {_difference(folder / name, entry)}; it is used as it is now")
+            doubts.append(f"{file}: was not written into this folder by telerig; it is used")
+        elif hashed(file).sha256 != entry.sha256:
+            doubts.append(f"{file}: {_difference(file, entry)}; it is used as it is now")
+    return doubts
 
 
 def _difference(file: Path, entry: Written) -> str:
@@ -223,10 +248,6 @@ def _difference(file: Path, entry: Written) -> str:
     if rows < entry.rows:
         return f"has {rows} of the {entry.rows} rows that telerig wrote"
     return f"has {rows} rows, telerig wrote {entry.rows}"
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, TelerigWarning, stacklevel=4)
 
 
 @contextmanager

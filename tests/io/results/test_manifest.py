@@ -16,6 +16,7 @@ from killed_writers import killed_at_every_rename
 
 from telerig.errors import InputError, TelerigWarning
 from telerig.io.files import atomic
+from telerig.io.results import manifest
 from telerig.io.results.inputs import Source, fingerprints
 from telerig.io.results.manifest import is_whole, read_manifest, reading, replaced_results
 from telerig.io.results.stale import refuse_stale, stale
@@ -106,9 +107,9 @@ def test_tracking_again_takes_over_shared_files_only(tmp_path: Path) -> None:
     (folder / "mine.txt").write_text("mine")
     assert stale(folder) == ()
     write(folder, "track", tracks_csv="2", run_json="track 2")
-    manifest = read_manifest(folder)
-    assert manifest is not None
-    assert {name: set(s.files) for name, s in manifest.sections.items()} == {
+    found = read_manifest(folder)
+    assert found is not None
+    assert {name: set(s.files) for name, s in found.sections.items()} == {
         "track": {"tracks.csv", "run.json"},
         "smooth": {"shake.csv"},
     }
@@ -204,14 +205,14 @@ def test_files_that_telerig_did_not_write_here(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("manifest", [None, "{"])
-def test_a_smoothing_of_before_becomes_stale(tmp_path: Path, manifest: str | None) -> None:
+@pytest.mark.parametrize("before", [None, "{"])
+def test_a_smoothing_of_before_becomes_stale(tmp_path: Path, before: str | None) -> None:
     folder = tmp_path / "rise"
     folder.mkdir()
     for name in ("tracks.csv", "trajectories.csv", "smoothing.json"):
         (folder / name).write_text("old")
-    if manifest is not None:
-        (folder / "manifest.json").write_text(manifest)
+    if before is not None:
+        (folder / "manifest.json").write_text(before)
     write(folder, "track", tracks_csv="old")
     assert stale(folder) == ()
     write(folder, "track", tracks_csv="new")
@@ -226,6 +227,23 @@ def test_a_reader_notices_that_the_folder_is_written_while_it_reads(tmp_path: Pa
         reading(tmp_path / "rise", ["tracks.csv"]),
     ):
         write(tmp_path / "rise", "track", tracks_csv="new")
+
+
+def test_a_folder_that_is_written_during_the_check_is_checked_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "rise"
+    write(folder, "track", tracks_csv="old", tracking_json="old")
+    texts = iter(["new", "newer"])
+
+    def written_meanwhile(place: Path) -> manifest.Manifest | None:
+        found = read_manifest(place)
+        if text := next(texts, ""):
+            write(folder, "track", tracks_csv=text, tracking_json=text)
+        return found
+
+    monkeypatch.setattr(manifest, "read_manifest", written_meanwhile)
+    assert read(folder, *TRACKS) == ["newer", "newer"]
 
 
 def chain(folder: Path) -> tuple[Path, Path]:

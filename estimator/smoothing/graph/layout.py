@@ -212,30 +212,30 @@ def _unseen(cameras: Sequence[Camera], model: ShakeModel) -> Array:
 
 
 def bubble_layout(model: BubbleModel, cameras: int) -> BubbleLayout:
-    """The same for all bubbles."""
+    """Return the layout, which is the same for all bubbles. Each axis begins with its path."""
     processes = [
-        (process, axis)
+        (process, axis, number == 0)
         for axis, direction in enumerate(np.eye(3))
-        for process in bubble_processes(model, direction)
+        for number, process in enumerate(bubble_processes(model, direction))
     ]
     processes.sort(key=lambda one: one[0].stem)
-    parts = [(process.component, axis) for process, axis in processes]
-    motion = sum(c.size for c, _ in parts)
+    parts = [(process.component, axis, is_path) for process, axis, is_path in processes]
+    motion = sum(c.size for c, *_ in parts)
     extra: list[Component] = []
     if model.wander_px > 0:
         extra = [slow_ou(model.wander_px, model.wander_tau_s)] * (2 * cameras)
     size = motion + len(extra)
     position, velocity = np.zeros((3, size)), np.zeros((3, size))
-    at = 0
-    for part, axis in parts:
+    at, path = 0, np.zeros(3, int)
+    for part, axis, is_path in parts:
+        path[axis] = at if is_path else path[axis]
         position[axis, at : at + part.size] = part.position
         velocity[axis, at : at + part.size] = part.velocity
         at += part.size
     shifts = np.zeros((cameras, 2, size))
     for i in range(len(extra)):
         shifts[i // 2, i % 2, motion + i] = 1.0
-    components = tuple(c for c, _ in parts) + tuple(extra)
-    path = np.arange(3) * parts[0][0].size
+    components = tuple(c for c, *_ in parts) + tuple(extra)
     return BubbleLayout(components, position, velocity, shifts, path, path + 1)
 
 

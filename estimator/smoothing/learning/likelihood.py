@@ -149,15 +149,17 @@ _Triple = tuple[Array, Array, Array]
 
 
 def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
-    """The solution with the spread by its model's ``learned`` parameters in its covariances.
+    """Return the solution with the spread by its model's ``learned`` parameters in its covariances.
 
-    Bubbles beyond those that learning looks at get the mean spread of those. Unchanged without
-    covariances or learned parameters.
+    Bubbles beyond those that learning looks at get the mean spread of those. The solution is
+    unchanged without covariances, learned parameters or measurements of positive weight.
     """
     found, model, problem = solution.covariances, solution.graph.model, solution.graph.problem
     if found is None or not model.learned or not problem.bubbles:
         return solution
     signals = [c for c in signals_of(problem, solution.weights) if c.samples]
+    if not signals:
+        return solution
     directions = np.array([c.direction for c in signals])
     spreads = [_spread(c, model) for c in signals]
     # coordinates along the signals, which need not be at right angles, back into the lab

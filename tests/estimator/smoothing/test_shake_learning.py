@@ -250,6 +250,9 @@ def test_learned_parameters_widen_the_covariances_by_what_they_move() -> None:
     np.testing.assert_allclose(np.einsum("d,nde,e->n", offset, added, offset), step**2, atol=1e-9)
     plain = solve(problem, true_model(), Options(robust=False))
     assert with_hyperparameter_uncertainty(plain) is plain
+    nothing = (np.zeros_like(solution.weights[0]), np.zeros_like(solution.weights[1]))
+    unused = replace(solution, weights=nothing)
+    assert with_hyperparameter_uncertainty(unused) is unused
 
 
 def test_a_line_of_several_bubbles_leaves_room_for_the_rigs() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from telerig.estimator.smoothing.graph import layout
 from telerig.estimator.smoothing.graph.layout import graph_layout
 from telerig.estimator.smoothing.graph.solve import Options, solve
 from telerig.estimator.smoothing.problem.problem import (
@@ -23,8 +24,8 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
     Stage,
 )
-from telerig.factors.bubble_motion import BubbleModel, Zigzag
-from telerig.factors.state_space import Component
+from telerig.factors.bubble_motion import BubbleModel, Process, Zigzag, bubble_processes
+from telerig.factors.state_space import Component, slow_ou
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
 
@@ -346,3 +347,17 @@ def test_accelerometers_equal_the_dense_posterior(rng: np.random.Generator) -> N
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20260101)
+
+
+def test_the_path_is_found_among_other_processes_of_a_bubble(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def more(model: BubbleModel, direction: np.ndarray) -> list[Process]:
+        drift = {"rms": ("rms", 0.1), "tau_s": ("tau_s", 0.5)}
+        return [*bubble_processes(model, direction), Process("bubble", slow_ou, drift)]
+
+    monkeypatch.setattr(layout, "bubble_processes", more)
+    found = layout.bubble_layout(BubbleModel(), 2)
+    np.testing.assert_array_equal(found.path_position, [0, 3, 6])
+    assert all(found.position[axis, 3 * axis] == 1 for axis in range(3))
+    np.testing.assert_array_equal(found.velocity[:, found.path_velocity], np.eye(3))

@@ -184,7 +184,7 @@ class _Session:
         came: list[list[Entry]] = [[] for _ in self._devices]
         now = time.monotonic()
         elapsed_s, self._drained = max(now - self._drained, 1e-3), now
-        while not self._queue.empty():
+        for _ in range(self._queue.qsize()):
             entry = self._queue.get()
             self._log.append(entry)
             came[entry.device].append(entry)

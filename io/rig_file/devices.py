@@ -15,6 +15,7 @@ Devices = dict[str, DeviceDescription]
 
 PORT_SCHEMES = ("socket", "rfc2217", "loop")
 """Schemes of pyserial's URLs that a port may have: a serial server, and a line back to itself."""
+_LONGEST_PORT = 255
 _PORT_OPTIONS = re.compile(r"ign_set_control|poll_modem|timeout=\d+(?:\.\d+)?")
 
 
@@ -53,6 +54,8 @@ def port_fault(port: str) -> tuple[str, str] | None:
     """
     if any(ord(c) < 32 for c in port):
         return "contains a control character", 'write a device file like "/dev/ttyUSB0"'
+    if len(port) > _LONGEST_PORT:
+        return f"has {len(port)} characters", 'write a device file like "/dev/ttyUSB0"'
     scheme, url, place = port.partition("://")
     if not url:
         return None

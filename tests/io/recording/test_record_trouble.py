@@ -266,6 +266,7 @@ def test_a_header_with_wrong_values_is_refused(tmp_path: Path, change: dict[str,
         ("rfc2217://localhost:1?file={victim}", "has the option"),
         ("{victim}", "is a file, not a serial port"),
         ("/dev/x\n", "control character"),
+        ("/dev/" + 5000 * "x", "has 5005 characters"),
     ],
 )
 def test_a_port_that_is_no_port_touches_nothing(tmp_path: Path, port: str, words: str) -> None:

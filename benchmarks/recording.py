@@ -261,8 +261,8 @@ def bad_text(judged: Sequence[Judged], costs: dict[str, float]) -> Iterator[str]
     for j in judged:
         yield f"| {j.name} | {j.came} | {j.spoilt} | {j.missing} | {j.malformed} | {j.wrong} "
         yield f"| {j.gaps} | {j.unplugged} | {j.drift_error_ppm:+.3f} | {j.worst_time_us:.0f} |\n"
-    yield f"\nCPU: {costs['cpu']:.1f} %. A damaged line that reads like a line is told from a sound "
-    yield "one by its neighbours, unless it is wrong by less than motion can be.\n\n"
+    yield f"\nCPU: {costs['cpu']:.1f} %. A damaged line that reads like a line is told from a "
+    yield "sound one by its neighbours, unless it is wrong by less than motion can be.\n\n"
 
 
 def main() -> None:

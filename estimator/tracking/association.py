@@ -66,7 +66,7 @@ class Pairs:
         return len(self.row)
 
     def distance2(self, shift_mm: Array) -> Array:
-        """(E,) squared Mahalanobis distances, the common shift removed."""
+        """Return the squared Mahalanobis distances (E,) without the common shift."""
         left = self.innovation_mm - shift_mm
         return np.asarray(np.einsum("ei,eij,ej->e", left, self.information, left))
 
@@ -76,7 +76,7 @@ class Pairs:
 
 @lru_cache(maxsize=64)
 def gate2(settings: TrackerSettings, dimensions: int = 3) -> float:
-    """Largest squared Mahalanobis distance inside the gate."""
+    """Return the largest squared Mahalanobis distance inside the gate."""
     return float(chdtri(dimensions, 1 - settings.gate_probability))
 
 
@@ -87,8 +87,8 @@ def gated_pairs(
     common: Common,
     settings: TrackerSettings,
 ) -> Pairs:
-    """Pairings of tracks with the measurements ``columns`` inside the gate, the common shift
-    unknown."""
+    """Return the pairings of tracks with the measurements ``columns`` inside the gate, for an
+    unknown common shift."""
     if not len(tracks) or not len(columns):
         none = np.zeros(0, np.int64)
         return Pairs(none, none, *(np.zeros((0, 3, 3)[:k]) for k in (2, 3, 3, 1)))
@@ -117,7 +117,7 @@ def gated_pairs(
 
 
 def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
-    """(K,) log probability that a track not seen for so many frames is only missed, not gone."""
+    """Return the log probability (K,) that a track unseen for so many frames is not gone."""
     missed = (1 - settings.detection_probability) * settings.missed_again_probability ** (
         np.maximum(misses, 1) - 1.0
     )
@@ -125,7 +125,7 @@ def _alive_score(misses: Ints, settings: TrackerSettings) -> Array:
 
 
 def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings) -> Array:
-    """Log-likelihood ratio of sizes against a uniform density over 5 mm; 0 for an unknown size."""
+    """Return the log-likelihood ratio of sizes against a uniform density; 0 if unknown."""
     sigma = settings.size_scatter * expected_mm
     off = np.minimum(((measured_mm - expected_mm) / sigma) ** 2 / 2, settings.size_cap_log_ratio)
     score = np.log(_SIZE_SPAN_MM / sigma) - _LOG_2PI / 2 - off
@@ -133,7 +133,7 @@ def size_score(expected_mm: Array, measured_mm: Array, settings: TrackerSettings
 
 
 def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
-    """(rows,) column of each row, -1 for none, with the largest total score."""
+    """Return the assignment with the largest total score: columns (rows,), -1 for none."""
     out = np.full(rows, -1)
     if not len(row):
         return out
@@ -148,7 +148,7 @@ def best_assignment(rows: int, row: Ints, column: Ints, score: Array) -> Ints:
 def assigned_with_shift(
     pairs: Pairs, rows: int, best_rows: Bools, common: Common
 ) -> tuple[Common, Ints]:
-    """The common shift and the assignment (rows,), estimated by turns.
+    """Return the common shift and the assignment (rows,), estimated in turn.
 
     best_rows : (rows,) which tracks take part.
     """
@@ -174,7 +174,7 @@ def assigned_with_shift(
 def unrivalled(
     row: Ints, column: Ints, score: Array, chosen: Ints, margin_log_ratio: float
 ) -> Ints:
-    """(K,) chosen, and no other pairing of its track or its measurement is within the margin."""
+    """Return (K,) whether no other pairing of a track or its measurement is within the margin."""
     out = chosen >= 0
     for r in np.flatnonzero(out):
         mine = (row == r) & (column == chosen[r])
@@ -185,7 +185,7 @@ def unrivalled(
 
 
 def joint_score(pairs: Pairs, edges: Ints, common: Common) -> float:
-    """Log-likelihood ratio of some pairings together, the common shift integrated out."""
+    """Return the joint log-likelihood ratio of some pairings, marginal over the common shift."""
     if not len(edges):
         return 0.0
     left = pairs.innovation_mm[edges] - common.shift_mm
@@ -200,7 +200,7 @@ def joint_score(pairs: Pairs, edges: Ints, common: Common) -> float:
 def alternatives(
     options: Sequence[Sequence[tuple[int, float]]], within_log_ratio: float
 ) -> list[tuple[tuple[int, ...], float]]:
-    """Every way to give each row one of its (column, score) options or none, near the best.
+    """Return every way to give each row one of its (column, score) options or none, near the best.
 
     Depth-first branch and bound; the columns of each row (-1: none) and the total score.
     """
@@ -264,7 +264,7 @@ def pair_pixels(
     size_score: ArrayLike = 0.0,
     allowed: ArrayLike = True,
 ) -> list[int]:
-    """For each expected track the detection that continues it, -1 for none or with a rival.
+    """Return the detection that continues each expected track; -1 for none or a rival.
 
     uv_px (L, 2), covariance_px2 (L, 2, 2) : the detections.
     size_score, allowed : (K, L) or less, log-likelihood ratio of the sizes, and pairings to try.
@@ -285,7 +285,7 @@ def pair_pixels(
 def update_pixels(
     track: Track, uv_px: Array, covariance_px2: Array, expected_px: Array, by_point: Array
 ) -> None:
-    """filterpy's update with a pixel (2,), linearised where the track is expected."""
+    """Update the filter with a pixel (2,), linearised where the track is expected."""
     h = np.zeros((2, len(track.filter.x)))
     h[:, POSITION] = by_point
     linear = uv_px - expected_px + h @ track.filter.x
@@ -300,7 +300,10 @@ History = dict[int, list[tuple[int, int]]]
 
 @dataclass
 class Branch:
-    """weight : log, 0 for the best of a cluster; tracks : in the same order in every branch."""
+    """Holds one way to continue the tracks of a cluster.
+
+    weight : logarithm, 0 for the best branch.  tracks : in the same order in every branch.
+    """
 
     weight: float
     tracks: list[Track]
@@ -309,7 +312,7 @@ class Branch:
 
 @dataclass
 class Cluster:
-    """branches : best first; a track without conflict is a cluster of one branch, no history."""
+    """Holds the branches, best first. A track without conflict has one branch and no history."""
 
     branches: list[Branch]
 
@@ -354,7 +357,7 @@ class Decision:
 
 
 def recent(entries: Sequence[tuple[int, int]], depth: int) -> list[tuple[int, int]]:
-    """The last ``depth`` entries in which the track was seen."""
+    """Return the last ``depth`` entries in which the track was seen."""
     return [e for e in entries if e[1] >= 0][-depth:]
 
 
@@ -381,12 +384,12 @@ def merged(
 
 
 def merge_key(histories: Iterable[Sequence[tuple[int, int]]]) -> tuple[object, ...]:
-    """The recent pairings, by which branches are merged."""
+    """Return the recent pairings, by which branches are merged."""
     return tuple(tuple(h[-_MERGE_FRAMES:]) for h in histories)
 
 
 def disputed(branches: Sequence[Branch], depth: int) -> set[int]:
-    """Particles that two branches give different measurements, or one measurement in turn."""
+    """Return the particles that two branches give different measurements, or the same one."""
     columns: dict[tuple[int, int], set[int]] = {}
     claims: dict[tuple[int, int], set[int]] = {}
     for branch in branches:
@@ -401,7 +404,7 @@ def disputed(branches: Sequence[Branch], depth: int) -> set[int]:
 def decide(
     cluster: Cluster, frame: int, settings: TrackerSettings, *, at_once: bool = False
 ) -> Decision:
-    """Which tracks leave the cluster in this frame; at_once: all, as if its window were over."""
+    """Decide which tracks leave the cluster in this frame; all of them if ``at_once``."""
     branches = cluster.branches
     if not cluster.open:
         return Decision(None, _leave(branches[0], cluster.tracks), [], np.inf)

@@ -79,7 +79,7 @@ def first_masks(stack: NDArray[np.generic], shifts_px: Array | None, gains: Arra
 
 
 def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
-    """(H, W) pixels at the border of what is always hidden that hardly change: dirt beside it.
+    """Return the pixels (H, W) beside what is always hidden that hardly change: dirt.
 
     A bubble's own border moves, if only by a pixel, and parts its still inside from the outside.
     """
@@ -94,7 +94,7 @@ def _fringe(stack: NDArray[np.generic], gains: Array, masks: Bools) -> Bools:
 
 
 def _still(share: Array, known: Bools, margin: int) -> Bools:
-    """Things dark in nearly all frames, grown by ``margin`` cells, beyond which few are dark."""
+    """Return things dark in nearly all frames, grown by ``margin`` cells."""
     core = (share >= _STILL) & known
     count, labels = cv2.connectedComponents(core.astype(np.uint8))
     still = np.zeros(share.shape, np.uint8)
@@ -108,7 +108,7 @@ def _still(share: Array, known: Bools, margin: int) -> Bools:
 
 
 def _lab_places(shifts_px: Array | None, shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
-    """Where each frame's cells lie on a canvas of the lab; empty when nothing moves."""
+    """Return where each frame's cells lie on a canvas of the lab; [] if nothing moves."""
     if shifts_px is None:
         return []
     shifts = np.rint(shifts_px / _CELL_PX).astype(int)
@@ -116,7 +116,7 @@ def _lab_places(shifts_px: Array | None, shape: tuple[int, ...]) -> list[tuple[s
 
 
 def _share_in_lab(marks: Bools, places: list[tuple[slice, slice]]) -> tuple[Array, Array]:
-    """On the canvas: the share of the frames that see a cell which mark it, and their number."""
+    """Return the share of the frames that mark a cell of the canvas, and how many see it."""
     size = [max(place[axis].stop for place in places) for axis in (0, 1)]
     total, seen = np.zeros(size), np.zeros(size)
     for mask, place in zip(marks, places):
@@ -525,7 +525,7 @@ class Background:
         return self.at(tuple(self.shift_px[frame])) if self.shift_px is not None else self.at()
 
     def at(self, frame_shift_px: Shift = (0.0, 0.0)) -> Float32:
-        """(H, W) level at the median brightness, with the lab displaced by (u, v) px.
+        """Return the level (H, W) at the median brightness, with the lab displaced by (u, v) px.
 
         What is fixed in the lab and seen at pixel p at shift 0 is seen at p - shift. A shift that
         is not finite, or outside the lab seen in the run, gives the rig layer alone.
@@ -545,7 +545,7 @@ def estimate_background(
     shift_px: Array | None = None,
     max_frames: int = 41,
 ) -> Background:
-    """The background from a sample of at most ``max_frames`` frames spread over the run.
+    """Return the background from at most ``max_frames`` frames spread over the run.
 
     images : gives a frame's (H, W) image, or None where it is missing.
     shift_px : (F, 2) travel of the rig as seen in the image, (u, v): what is fixed in the lab is
@@ -577,7 +577,7 @@ def _sample(
     candidates: Ints,
     max_frames: int,
 ) -> tuple[Ints, NDArray[np.generic]]:
-    """Frames and their (n, H, W) images, unevenly spread.
+    """Return frames (n,), unevenly spread, and their images (n, H, W).
 
     Even spacing at even speed would make every texture whose period is the spacing look the same
     in both layers; the golden ratio's multiples avoid all periods.

@@ -45,7 +45,7 @@ BY_PLATE = "refraction in the plate"
 
 @dataclass(frozen=True)
 class MirrorChoice:
-    """The solution that is kept of the two; decided_by, words : for calibration.json."""
+    """Holds the solution that is kept; decided_by and words say why, for calibration.json."""
 
     state: State
     decided_by: str
@@ -53,7 +53,7 @@ class MirrorChoice:
 
 
 def mirrored_state(state: State) -> State:
-    """D R D and D t for every pose, D X for every dot, -kappa for every camera."""
+    """Return the mirror image: D R D and D t for poses, D X for dots, -kappa for cameras."""
     intrinsics = state.intrinsics.copy()
     intrinsics[:, _KAPPA] *= -1
     cameras, views = (_D @ m @ _D for m in (state.rig_from_camera, state.rig_from_target))
@@ -61,7 +61,7 @@ def mirrored_state(state: State) -> State:
 
 
 def angle_to_nominal_deg(state: State, nominal_rotvec_deg: Nominal) -> float:
-    """Angle between the inter-camera rotations of a state and the nominal ones: the largest."""
+    """Return the largest angle between the inter-camera rotations and the nominal ones."""
     return max(
         _angle_deg(state.rig_from_camera[c, :3, :3].T, rotvec_deg)
         for c, rotvec_deg in nominal_rotvec_deg.items()
@@ -76,7 +76,7 @@ def _angle_deg(rotation: Array, nominal_rotvec_deg: Array) -> float:
 def consistent_start(
     states: Sequence[State], costs: Sequence[float], problem: Problem, nominal: Nominal
 ) -> State:
-    """Of starts that were fitted roughly, the one to go on with; its own mirror image stays open.
+    """Return the best of several roughly fitted starts, up to its own mirror image.
 
     costs : of the fits. Of those that fit alike, the one nearest to the nominal rotations, itself
     or its mirror image.
@@ -120,7 +120,7 @@ def consistent_start(
 
 
 def _apart_deg(a: State, b: State, cameras: Sequence[int] | range) -> float:
-    """The largest angle between the cameras of two states, one of them mirrored if nearer."""
+    """Return the largest angle between the cameras of two states, one mirrored if nearer."""
 
     def largest(other: State) -> float:
         turns = [other.rig_from_camera[c, :3, :3].T @ a.rig_from_camera[c, :3, :3] for c in cameras]
@@ -130,13 +130,13 @@ def _apart_deg(a: State, b: State, cameras: Sequence[int] | range) -> float:
 
 
 def _lines(problem: Problem, cameras: Sequence[int]) -> str:
-    """The lines of `[stereo]` that give the nominal rotations of some cameras."""
+    """Return the lines of `[stereo]` that give the nominal rotations of some cameras."""
     first, names = problem.cameras[0].name, [problem.cameras[c].name for c in cameras]
     return " and ".join(f"{n}_from_{first}_rotvec_deg = [0.0, 90.0, 0.0]" for n in names)
 
 
 def perspective_sign(state: State, problem: Problem) -> int:
-    """+1 or -1 when perspective is so strong that only one sign of kappa is possible, else 0."""
+    """Return the sign of kappa if perspective is so strong that only one is possible, else 0."""
     strength = state.intrinsics[:, _KAPPA] * np.array(problem.rho_mm)
     if np.all(strength > ENTOCENTRIC):
         return 1
@@ -146,7 +146,7 @@ def perspective_sign(state: State, problem: Problem) -> int:
 
 
 def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
-    """The solution to go on with before the final fit.
+    """Return the solution with which the final fit starts.
 
     One camera: undecided. The plate's refraction decides where no nominal rotation is given.
     Raises CalibrationError as `choose_solution` does.
@@ -163,7 +163,7 @@ def choose_start(state: State, problem: Problem, nominal_rotvec_deg: Nominal) ->
 
 
 def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal) -> MirrorChoice:
-    """The solution on the right side, by the nominal rotations or by strong perspective.
+    """Return the solution that the nominal rotations or strong perspective decide for.
 
     Raises CalibrationError when both solutions are alike far from the nominal rotation, when
     nothing decides, or when nominal rotation and perspective contradict each other.
@@ -218,7 +218,7 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
 
 
 def mirrored_cost(problem: Problem, state: State, cost: float) -> float:
-    """The cost of the solution that was not kept; state, cost : of the one that was.
+    """Return the cost of the mirror image of a solution with this state and cost.
 
     Raises CalibrationError when it is far lower: the plate's refraction decides against the side
     that the nominal rotation names.
@@ -242,7 +242,7 @@ _ROUNDS = 6
 
 
 def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
-    """Views with dots in exactly one camera, and that camera."""
+    """Return the views with dots in exactly one camera, and the index of that camera."""
     counts = np.zeros((len(problem.views), len(problem.cameras)), int)
     np.add.at(counts, (problem.view, problem.camera), problem.kept)
     alone = np.flatnonzero((counts > 0).sum(1) == 1)
@@ -250,7 +250,7 @@ def views_seen_alone(problem: Problem) -> tuple[Ints, Ints]:
 
 
 def with_tilt_signs(problem: Problem, state: State) -> State:
-    """The state with the tilts of views seen alone that agree with the dots' relief.
+    """Return the state in which views seen alone have the tilts that agree with the relief.
 
     With one camera every view is of this kind: the signs come out right up to the mirror
     ambiguity of the whole. First all at once, from the reliefs that the views show
@@ -280,7 +280,7 @@ def with_tilt_signs(problem: Problem, state: State) -> State:
 
 
 def _tolerant(problem: Problem, views: Ints) -> Problem:
-    """Covariances of some views enlarged by what the dots' relief can move: no sign is wrong."""
+    """Return the problem with covariances of some views enlarged by the effect of the relief."""
     scale = np.array([c["scale_px_per_mm"] for c in problem.cameras])[problem.camera]
     relief_px = 2 * scale * problem.dot_sigma_mm[:, 2].max() * np.isin(problem.view, views)
     extra = relief_px[:, None, None] ** 2 * np.eye(2)
@@ -288,7 +288,7 @@ def _tolerant(problem: Problem, views: Ints) -> Problem:
 
 
 def _from_relief(problem: Problem, state: State, alone: Ints) -> Array:
-    """(len(alone),) +-1: the signs under which the reliefs seen in all views are most alike.
+    """Return the signs (len(alone),) that make the reliefs seen in all views most alike.
 
     Fitted with flat dots, view v leaves residuals of the relief s_v z_i: a matrix of rank one.
     """
@@ -309,7 +309,7 @@ def _from_relief(problem: Problem, state: State, alone: Ints) -> Array:
 
 
 def _without_plane(relief: Array, seen: NDArray[np.bool_], nominal_mm: Array) -> Array:
-    """(V, N) reliefs less the plane through each view's dots, which is that view's pose."""
+    """Return the reliefs (V, N) minus the plane through each view's dots, which is its pose."""
     plane = np.c_[nominal_mm[:, :2], np.ones(len(nominal_mm))]
     out = np.zeros_like(relief)
     for row, values, mine in zip(out, relief, seen):
@@ -319,7 +319,7 @@ def _without_plane(relief: Array, seen: NDArray[np.bool_], nominal_mm: Array) ->
 
 
 def _flipped(state: State, views: Ints, camera: int) -> State:
-    """Some views in their mirrored pose, as one camera sees it."""
+    """Return the state with some views in the pose that is mirrored for one camera."""
     rig_from_camera = state.rig_from_camera[camera]
     mirror = rig_from_camera @ _D @ np.linalg.inv(rig_from_camera)
     poses = state.rig_from_target.copy()
@@ -334,7 +334,7 @@ def _with_views(state: State, other: State, views: Ints) -> State:
 
 
 def _view_costs(problem: Problem, state: State) -> Array:
-    """(V,) sum of squared residuals over each view."""
+    """Return the sum of squared residuals (V,) of each view."""
     obs = problem.observations()
     squares = (whitened_error(state, obs, problem.rho_mm) ** 2).sum(-1)
     return np.asarray(np.bincount(obs.view, squares, minlength=len(problem.views)), float)

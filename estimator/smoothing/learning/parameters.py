@@ -44,7 +44,7 @@ PRIORS: dict[str, Prior] = {
 
 
 def prior_of(name: str) -> Prior:
-    """Raises InputError for a name that no pattern covers."""
+    """Return the prior of a hyper-parameter. Raises InputError for an unknown name."""
     for pattern, prior in PRIORS.items():
         if fnmatch(name, pattern):
             return prior
@@ -55,7 +55,7 @@ def prior_of(name: str) -> Prior:
 
 
 def value_of(model: ShakeModel, name: str) -> float:
-    """The number under that name. Raises InputError for an unknown one."""
+    """Return the number with that name. Raises InputError for an unknown name."""
     found: Any = model
     if name == FORCE and model.force_hz is not None:
         return model.force_hz
@@ -71,7 +71,7 @@ def value_of(model: ShakeModel, name: str) -> float:
 
 
 def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]) -> ShakeModel:
-    """The model with these numbers replaced."""
+    """Return the model with these numbers replaced."""
     out: Any = model
     for name, value in zip(names, values):
         if name == FORCE:
@@ -83,7 +83,7 @@ def with_values(model: ShakeModel, names: Sequence[str], values: Sequence[float]
 
 
 def with_cutoff(model: ShakeModel, force_hz: float) -> ShakeModel:
-    """The model with that low-pass cut-off of all forces that have one."""
+    """Return the model with another cut-off of all low-pass filtered forces."""
     modes = tuple(m if m.force_hz is None else replace(m, force_hz=force_hz) for m in model.modes)
     zigzags = tuple(
         z if z.force_hz is None else replace(z, force_hz=force_hz) for z in model.bubble.zigzags
@@ -92,7 +92,7 @@ def with_cutoff(model: ShakeModel, force_hz: float) -> ShakeModel:
 
 
 def with_low_pass_force(model: ShakeModel, force_hz: float | None) -> ShakeModel:
-    """The model with that low-pass cut-off of all modes' forces, None: all white."""
+    """Return the model with another cut-off of all modes' forces; None makes them white noise."""
     return replace(model, modes=tuple(replace(m, force_hz=force_hz) for m in model.modes))
 
 
@@ -110,7 +110,7 @@ def _replaced(node: Any, path: list[str], value: float) -> Any:
 
 
 def names_of(model: ShakeModel) -> list[str]:
-    """Every hyper-parameter of the model that can be learned."""
+    """Return the names of all hyper-parameters that can be learned."""
     out: list[str] = []
     fields = ("frequency_hz", "damping", "rms_mm")
     out += [f"modes.{i}.{f}" for i in range(len(model.modes)) for f in fields]
@@ -121,7 +121,7 @@ def names_of(model: ShakeModel) -> list[str]:
 
 
 def log_prior(model: ShakeModel, names: Sequence[str]) -> float:
-    """Sum of the named parameters' log prior densities, up to a constant."""
+    """Return the sum of the log prior densities, up to a constant."""
     return sum(prior_of(n).log_density(value_of(model, n)) for n in names)
 
 
@@ -129,12 +129,12 @@ _broad_band, _slow_ou = lru_cache(maxsize=512)(broad_band), lru_cache(maxsize=51
 
 
 def names_of_process(process: Process) -> dict[str, str]:
-    """The hyper-parameters' names, with their last parts."""
+    """Return the hyper-parameters' names, mapped to their last parts."""
     return {FORCE if n == "force_hz" else f"{process.stem}.{n}": n for n in process.learned}
 
 
 def shake_processes(signal: Signal, model: ShakeModel) -> list[Process]:
-    """The shake's, along the signal's direction."""
+    """Return the processes of the shake along the signal's direction."""
     out: list[Process] = []
     if not signal.shaken:
         return out
@@ -162,7 +162,7 @@ def _along(signal: Signal, rms_mm: tuple[float, float, float], camera: int) -> f
 
 
 def moving_processes(signal: Signal, model: ShakeModel) -> list[Process]:
-    """Of one bubble, along the signal's direction; none where nothing moves.
+    """Return the processes of one bubble along the signal's direction; none if nothing moves.
 
     The mean velocity is a constant of the signal, no input of the states.
     """
@@ -172,13 +172,13 @@ def moving_processes(signal: Signal, model: ShakeModel) -> list[Process]:
 
 
 def processes(signal: Signal, model: ShakeModel) -> list[Component]:
-    """Of the shake, then of one bubble. Processes that two models share are the same object."""
+    """Return all processes, the shake's first. Those that two models share are the same object."""
     found = shake_processes(signal, model) + moving_processes(signal, model)
     return [p.component for p in found]
 
 
 def depends_on(signal: Signal, model: ShakeModel, names: Sequence[str]) -> bool:
-    """Whether the signal's evidence depends on any of these hyper-parameters."""
+    """Return whether the signal's evidence depends on any of these hyper-parameters."""
     found = shake_processes(signal, model) + moving_processes(signal, model)
     known = {name for p in found for name in names_of_process(p)}
     return "pixel_inflation" in names or not known.isdisjoint(names)

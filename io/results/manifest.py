@@ -41,6 +41,7 @@ LONGEST_COMMAND = 300
 _SMOOTHED = ("trajectories.csv", "shake.csv", "smoothing.json", "results.h5")
 _LOCK_WITHIN_S = 30.0
 _MOST_TRIES = 20
+_LONGEST_NAME, _LONGEST_PATH = 255, 3000
 _NO_MANIFEST = (
     "{}: there is no manifest.json, so nobody can check that the files belong together; run the "
     "command again that made this folder"
@@ -89,6 +90,15 @@ class Section(Part):
             parts = PurePosixPath(str(name)).parts
             if not parts or ".." in parts or parts[0] == "/" or str(name) == NAME:
                 raise ValueError(f"names a file outside the folder: {str(name)[:60]!r}")
+        return names
+
+    @field_validator("files", "found", "inputs", mode="before")
+    @classmethod
+    def _names_are_names(cls, names: Any) -> Any:
+        for name in map(str, names if isinstance(names, dict) else ()):
+            longest = max(map(len, PurePosixPath(name).parts), default=0)
+            if longest > _LONGEST_NAME or len(name) > _LONGEST_PATH or "\0" in name:
+                raise ValueError(f"names no file: {name[:60]!r}")
         return names
 
     def changing(self) -> set[str]:

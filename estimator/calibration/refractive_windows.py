@@ -29,12 +29,12 @@ _LEANING_DEG = 30.0
 
 
 def with_windows(cameras: Sequence[Camera], walls: Mapping[str, Wall]) -> tuple[Camera, ...]:
-    """The cameras, each behind its window if it has one."""
+    """Return the cameras, each behind its window if it has one."""
     return tuple(replace(c, wall=walls.get(c.name, c.wall)) for c in cameras)
 
 
 def behind_windows(calibration: Calibration, walls: Mapping[str, Wall]) -> Calibration:
-    """A calibration made in air, for use in the water behind windows.
+    """Return a calibration that was made in air, for use in the water behind windows.
 
     The prior covariance of each window's orientation joins the covariance, so it reaches every
     projected and triangulated point.
@@ -55,7 +55,7 @@ def behind_windows(calibration: Calibration, walls: Mapping[str, Wall]) -> Calib
 
 
 def _with_windows_share(behind: Calibration, in_air: Calibration) -> dict[str, Any]:
-    """The statistics with what the windows' uncertain orientation adds to the errors in space."""
+    """Return the statistics with the share of the windows' uncertain orientation added."""
     statistics = dict(in_air.statistics)
     if "space_sd_um" not in statistics or behind.free == in_air.free:
         return statistics
@@ -68,7 +68,7 @@ def _with_windows_share(behind: Calibration, in_air: Calibration) -> dict[str, A
 
 
 def _space_variance_um2(calibration: Calibration, points_mm: Array) -> float:
-    """Of the calibration's share, per axis; a common rigid motion of all points is set aside."""
+    """Return the calibration's variance per axis, without a common rigid motion of all points."""
     cameras, free = calibration.cameras, calibration.free
     shared = aligned_covariance(cameras, free, calibration.covariance, points_mm)
     return float(1e6 * np.trace(shared) / len(shared))
@@ -95,7 +95,7 @@ def _with_priors(
 
 
 def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
-    """Largest error of points over the working volume (um) when ``used`` stands for ``true``.
+    """Return the largest error (um) of points if ``used`` replaces the ``true`` cameras.
 
     A common shift of all points is set aside: the rig's origin is a matter of definition. With one
     camera, its error across its own axis.
@@ -111,7 +111,7 @@ def model_error_um(used: Sequence[Camera], true: Sequence[Camera]) -> float:
 
 
 def window_notes(calibration: Calibration, rig: RigDescription) -> list[str]:
-    """Notes for the user: what the windows do, and what is not known of them."""
+    """Return notes for the user on the windows' effect and on what is not known of them."""
     cameras = [c for c in calibration.cameras if c.wall is not None]
     if not cameras:
         return _without_windows(calibration)
@@ -146,7 +146,7 @@ def _rounded(value: float) -> str:
 
 
 def _without_windows(calibration: Calibration) -> list[str]:
-    """Of a target in the water when `rig.toml` states no windows."""
+    """Return the note on a target in the water if `rig.toml` states no windows."""
     if calibration.medium == "air":
         return []
     words = "calibrated in the water without [walls]: scales and axes hold in the water only"
@@ -156,7 +156,7 @@ def _without_windows(calibration: Calibration) -> list[str]:
 
 
 def _implausible(camera: Camera) -> list[str]:
-    """Probable mistakes: media in the wrong order, a window that hardly faces the camera."""
+    """Return notes on probable mistakes: the order of the media, the direction of the normal."""
     wall, words = camera.wall, []
     if wall is None:
         return []
@@ -175,7 +175,7 @@ def _implausible(camera: Camera) -> list[str]:
 
 
 def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
-    """The effect of one standard deviation of a window's orientation."""
+    """Return the note on the effect of one standard deviation of a window's orientation."""
     sd = max((calibration.sd(f"{camera.name}.{n}") for n in wall_freedom(camera)), default=0.0)
     if sd == 0 or camera.wall is None:
         return []
@@ -194,7 +194,7 @@ def _uncertain(calibration: Calibration, camera: Camera) -> list[str]:
 
 
 def _tilt_sign_ambiguous(calibration: Calibration, camera: Camera) -> list[str]:
-    """Where a window that leans as much to the other side fits as well, and was as likely before.
+    """Return the note on a window that may as well lean to the other side.
 
     Without perspective a target in the water shows the square of the tilt only.
     """
@@ -220,7 +220,7 @@ def _angle_rad(a: Array, b: Array) -> float:
 
 
 def _without_distance(camera: Camera) -> list[str]:
-    """What 10 mm of a window's unknown distance would do."""
+    """Return the note on the effect of 10 mm of a window's unknown distance."""
     if camera.wall is None:
         return []
     farther = replace(camera.wall, distance_mm=camera.wall.distance_mm + _STEP_MM)
@@ -239,7 +239,7 @@ def _without_distance(camera: Camera) -> list[str]:
 
 
 def window_warnings(rig: RigDescription | None, calibration: Calibration) -> list[str]:
-    """Warnings where rig.toml has windows that the calibration does not model, or the reverse.
+    """Return warnings if the windows of rig.toml and of the calibration differ.
 
     A calibration made in water without windows has their effect in its scales and axes, all but
     that on perspective.
@@ -269,7 +269,7 @@ def window_warnings(rig: RigDescription | None, calibration: Calibration) -> lis
 
 
 def _same(one: Wall | None, other: Wall) -> bool:
-    """Alike to what a file keeps of them."""
+    """Return whether two windows are equal to the digits that a file keeps."""
     if one is None:
         return False
     a, b = (

@@ -138,7 +138,7 @@ def _solved(
     name: str,
     progress: Progress | None,
 ) -> Calibration:
-    """Start, fit, covariance, verdict and checks of a problem whose views belong together."""
+    """Solve a problem whose views belong together: start, fit, covariance, checks, verdict."""
     cameras = problem.cameras
     start = best_start(problem, start_dots, nominal)
     mirror = mirror_ambiguity.choose_start(start, problem, nominal)
@@ -179,7 +179,7 @@ def _refuse_wrong_pairs(problem: Problem, dots_mm: Array, cause: Exception | Non
 def _nominal(
     given: Mapping[str, Sequence[float]] | Sequence[float] | None, cameras: Sequence[Camera]
 ) -> dict[int, Array]:
-    """Nominal rotation vectors (degrees) by the camera's index, of those that are given."""
+    """Return the given nominal rotation vectors (degrees) by the camera's index."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):
@@ -220,7 +220,7 @@ def dots_unknown(problem: Problem) -> bool:
 
 
 def hold_dots(problem: Problem, dots_free: str) -> Problem:
-    """The problem with its dots free in 3-D, in the plane, or not at all."""
+    """Return the problem with its dots free in 3-D, in the plane, or not at all."""
     held = 1e-6
     sigma = problem.dot_sigma_mm.copy()
     if dots_free not in ("3d", "plane", "nominal"):
@@ -233,7 +233,7 @@ def hold_dots(problem: Problem, dots_free: str) -> Problem:
 
 
 def with_plate(problem: Problem, nominal: mirror_ambiguity.Nominal | None = None) -> Problem:
-    """Where a two-sided plate is seen from behind, the side that fits the pixels better."""
+    """Return the problem with the views of a two-sided plate from behind, as fits better."""
     target = problem.target
     if not target.two_sided or target.plate_thickness_mm == 0 or len(problem.cameras) < 2:
         return problem
@@ -251,7 +251,7 @@ def with_plate(problem: Problem, nominal: mirror_ambiguity.Nominal | None = None
 def best_start(
     problem: Problem, dots_mm: Array, nominal: mirror_ambiguity.Nominal | None = None
 ) -> State:
-    """Of the closed-form starts, the one of least cost after a short solve.
+    """Return the closed-form start of least cost after a short solve.
 
     nominal : decides between starts that fit alike (`mirror_ambiguity.consistent_start`).
     """
@@ -275,7 +275,7 @@ def _fit(
     models: tuple[str, ...],
     progress: Progress | None,
 ) -> Fit:
-    """Outliers and noise floor with a rich model, the choice, then the chosen model to the end."""
+    """Fit a rich model robustly, choose the lens model, and fit that to convergence."""
     choice, held = None, None
     weighed = problem
     words = f"{joint_name(models, [c.name for c in problem.cameras])}: as asked"
@@ -308,7 +308,7 @@ def choose_model(
     models: tuple[str, ...],
     progress: Progress | None = None,
 ) -> tuple[RobustFit, Choice]:
-    """The robust fit of the richest model, and what of it each camera needs.
+    """Return the robust fit of the richest model, and the choice of what each camera needs.
 
     models : per camera, "auto" or a model that stays.
     """
@@ -319,7 +319,7 @@ def choose_model(
 def _rich(
     problem: Problem, start: State, models: tuple[str, ...], progress: Progress | None
 ) -> RobustFit:
-    """Outliers and noise floor from the richest model, so that no lens is taken for either."""
+    """Fit the richest model robustly, so that no lens error is taken for outliers or noise."""
     mono = len(problem.cameras) == 1
     auto = np.array([m == AUTO for m in models])
     plain = name_of(rich_groups(mono=mono, strong=False))
@@ -335,7 +335,7 @@ def _rich(
 
 
 def _strong(fit: RobustFit) -> NDArray[np.bool_]:
-    """(C,) whether a camera's perspective is that of no telecentric lens."""
+    """Return (C,) whether a camera's perspective is too strong for a telecentric lens."""
     problem, kappa = fit.problem, INDEX["kappa_per_mm"]
     strength = np.abs(fit.solution.state.intrinsics[:, kappa]) * np.array(problem.rho_mm)
     out = np.asarray(strength > mirror_ambiguity.ENTOCENTRIC)
@@ -351,7 +351,7 @@ def _strong(fit: RobustFit) -> NDArray[np.bool_]:
 
 
 def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Array:
-    """(C, 4, 4) rig_from_camera of the same models with the image centres held."""
+    """Return the poses (C, 4, 4) rig_from_camera of the same models with image centres held."""
     held = problem.with_model([name_of(set(groups_of(m)) - {"centre"}) for m in models])
     return solve(held, held_at_nominal(held, state), relative=1e-7).state.rig_from_camera
 
@@ -359,7 +359,7 @@ def _centre_held(problem: Problem, state: State, models: tuple[str, ...]) -> Arr
 def _on_the_right_side(
     fit: Fit, nominal: mirror_ambiguity.Nominal
 ) -> tuple[Fit, mirror_ambiguity.MirrorChoice]:
-    """The final fit may know the sign of kappa that the start did not."""
+    """Decide the mirror ambiguity again: the final fit may show the sign of kappa."""
     problem, solution = fit.robust.problem, fit.robust.solution
     mirror = mirror_ambiguity.choose_solution(solution.state, problem, nominal)
     if mirror.state is not solution.state:

@@ -62,11 +62,11 @@ class Chain:
     following: Array
 
     def log_det(self) -> float:
-        """Half the logarithm of the precision's determinant."""
+        """Return half the logarithm of the precision's determinant."""
         return float(np.log(np.diagonal(self.upper, axis1=-2, axis2=-1)).sum())
 
     def means(self, sides: Array) -> Array:
-        """(F, K, D) solutions for right sides (F, K, D) as in ``sides``."""
+        """Return the solutions (F, K, D) for right sides (F, K, D) as in ``sides``."""
         inverse = inverses(self.upper)
         turned = np.swapaxes(inverse, -1, -2)
         out, gain = sides @ turned, self.following @ turned[:-1]
@@ -77,7 +77,7 @@ class Chain:
         return np.asarray(out)
 
     def moments(self, sides: Array) -> tuple[Array, Array, Array]:
-        """As `means`, and covariances (F, D, D), (F - 1, D, D) of states with the ones before."""
+        """Return `means`, and covariances (F, D, D) and (F - 1, D, D) with the state before."""
         inverse = inverses(self.upper)
         turned = np.swapaxes(inverse, -1, -2)
         size = self.upper.shape[-1]
@@ -130,7 +130,7 @@ def eliminate_forward(own: Array, joined: Array) -> None:
 
 
 def inverses(upper: Array) -> Array:
-    """(F, D, D) inverses of upper triangular blocks (F, D, D)."""
+    """Return the inverses (F, D, D) of upper triangular blocks (F, D, D)."""
     out = upper.copy()
     for block in out:
         dtrtri(block.T, lower=1, overwrite_c=1)
@@ -173,17 +173,17 @@ class _System:
 
 
 def signal_evidence(signal: Signal, model: ShakeModel) -> float:
-    """Natural log of the density of the signal's measurements."""
+    """Return the natural logarithm of the density of the signal's measurements."""
     return Factor(signal, model).log_evidence()
 
 
 def signal_posterior(signal: Signal, model: ShakeModel) -> SignalPosterior:
-    """Evidence and means."""
+    """Return the evidence and the posterior means."""
     return Factor(signal, model).posterior()
 
 
 def position_sigma(signal: Signal, model: ShakeModel, frames: Ints) -> Array:
-    """(B, n) standard deviation of the moving items' positions at some frames."""
+    """Return the standard deviation (B, n) of the moving items' positions at some frames."""
     return Factor(signal, model).position_sigma(frames)
 
 
@@ -322,7 +322,7 @@ class Factor:
 
 
 def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:
-    """Each value of an index with where it stands, as a slice where that is one stretch."""
+    """Yield each value of an index and where it stands, as a slice if that is one stretch."""
     order = np.argsort(index, kind="stable")
     values, first = np.unique(index[order], return_index=True)
     for value, mine in zip(values.tolist(), np.split(order, first[1:])):
@@ -331,7 +331,7 @@ def runs(index: Ints) -> Iterator[tuple[int, slice | Ints]]:
 
 
 def _replicates(signal: Signal) -> Array:
-    """(F, P, R) the measurements, R replicates that differ in their values only."""
+    """Return the measurements (F, P, R) of R replicates that differ in their values only."""
     values = signal.value_mm
     return values if values.ndim == 3 else values[..., None]
 
@@ -405,7 +405,7 @@ class _Change:
 
 
 def signal_gradient(signal: Signal, model: ShakeModel, names: Sequence[str]) -> tuple[float, Array]:
-    """The log evidence, as `signal_evidence`, and (n,) its derivatives by log-parameters."""
+    """Return the log evidence and its derivatives (n,) by the log-parameters."""
     factor = Factor(signal, model)
     moments = _moments(factor)
     slope = np.zeros(len(names))

@@ -50,7 +50,7 @@ class Fit:
 
 
 def evidence(signals: Sequence[Signal], model: ShakeModel) -> float:
-    """Sum over the signals; very low where a model is not numerically sound."""
+    """Return the sum over the signals; a very low value if a model is numerically unsound."""
     try:
         total = sum(signal_evidence(c, model) for c in signals)
     except np.linalg.LinAlgError:
@@ -61,7 +61,7 @@ def evidence(signals: Sequence[Signal], model: ShakeModel) -> float:
 def evidence_gradient(
     signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """The evidence, and (n,) its derivatives by the logarithms of the named parameters."""
+    """Return the evidence and its derivatives (n,) by the logarithms of the named parameters."""
     try:
         each = [signal_gradient(c, model, names) for c in signals]
     except np.linalg.LinAlgError:
@@ -75,7 +75,7 @@ def evidence_gradient(
 def _posterior_gradient(
     signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """As `evidence_gradient`, the parameters' priors added."""
+    """Return `evidence_gradient` with the parameters' priors added."""
     found, slope = evidence_gradient(signals, model, names)
     priors = [prior_of(n) for n in names]
     of_prior = [p.log_gradient(value_of(model, n)) for n, p in zip(names, priors)]
@@ -85,7 +85,7 @@ def _posterior_gradient(
 def maximise(
     signals: Sequence[Signal], model: ShakeModel, names: Sequence[str], *, steps: int = 25
 ) -> Fit:
-    """Quasi-Newton on the logarithms of the named parameters, within their bounds."""
+    """Maximise over the logarithms of the named parameters within bounds (quasi-Newton)."""
     from scipy.optimize import minimize
 
     if not names:
@@ -117,7 +117,7 @@ def maximise(
 
 
 def laplace_covariance(signals: Sequence[Signal], model: ShakeModel, names: Sequence[str]) -> Array:
-    """(n, n) covariance of the log-parameters: the inverse curvature of the log posterior.
+    """Return the covariance (n, n) of the log-parameters by Laplace's approximation.
 
     Curvature that is not positive (a flat or bounded direction) is filled up by the prior's.
     """
@@ -174,7 +174,7 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
 
 
 def _spread(signal: Signal, model: ShakeModel) -> _Triple:
-    """Variances (B, F) of positions and velocities, (J, F) of offsets, by the parameters."""
+    """Return the variances (B, F) of positions and velocities, and (J, F) of offsets."""
     parts = pooled(signal)
     total = [np.zeros((1, len(signal.t_s)))] * 3
     for name, sigma in model.learned.items():
@@ -195,7 +195,7 @@ def _same(signal: Signal, one: ShakeModel, two: ShakeModel) -> bool:
 
 
 def _moved(signal: Signal, up: ShakeModel, down: ShakeModel) -> _Triple:
-    """Posterior means under one model less those under the other."""
+    """Return the posterior means under one model minus those under the other."""
     one, two = signal_posterior(signal, up), signal_posterior(signal, down)
     return (
         one.position_mm - two.position_mm,
@@ -235,7 +235,7 @@ def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
 def _shaken(
     solution: Solution, signals: list[Signal], spreads: list[Array], found: Covariances
 ) -> Array:
-    """(F, D, D) covariance of the shake's states, offsets widened along what the cameras see."""
+    """Return the covariance (F, D, D) of the shake, widened along what the cameras see."""
     layout, out = solution.graph.shake, found.shake.copy()
     for signal, variance in zip(signals, spreads):
         rows = np.einsum("i,cid->cd", signal.direction, layout.offset[list(signal.cameras)])

@@ -34,7 +34,7 @@ _ENOUGH = 500
 
 @dataclass(frozen=True)
 class Line:
-    """A peak of the spectrum. excess : its height over the model."""
+    """Holds a peak of the spectrum; ``excess`` is its height over the model's."""
 
     frequency_hz: float
     rms_mm: float
@@ -42,7 +42,7 @@ class Line:
 
 
 def density(components: Iterable[Component], frequency_hz: Array) -> Array:
-    """(n,) mm^2 / Hz, one-sided, of the sum of independent processes' positions."""
+    """Return the one-sided density (n,) in mm^2/Hz of the sum of independent processes."""
     s = 2j * np.pi * frequency_hz
     total = np.zeros(len(frequency_hz))
     for part in components:
@@ -53,7 +53,7 @@ def density(components: Iterable[Component], frequency_hz: Array) -> Array:
 
 
 def averaged(signal: Signal, factor: int) -> Signal:
-    """Means over ``factor`` frames, which keep all of the noise and blur fast lines a little."""
+    """Return means over ``factor`` frames. They keep all noise and blur fast lines a little."""
     if factor < 2 or len(signal.t_s) < 8 * factor:
         return signal
     count = len(signal.t_s) // factor
@@ -69,7 +69,7 @@ def averaged(signal: Signal, factor: int) -> Signal:
 
 
 def averaging_factor(t_s: Array, highest_hz: float) -> int:
-    """How many frames may be averaged before a line of that frequency fades by 2 %.
+    """Return how many frames may be averaged before a line of that frequency fades by 2 %.
 
     By 8 % while more than `_ENOUGH` frames are left.
     """
@@ -79,14 +79,14 @@ def averaging_factor(t_s: Array, highest_hz: float) -> int:
 
 
 def averaging_loss(frequency_hz: float, factor: int, t_s: Array) -> float:
-    """By how much a mean over ``factor`` frames shrinks a line's amplitude."""
+    """Return the factor by which a mean over ``factor`` frames shrinks a line's amplitude."""
     step = float(np.median(np.diff(t_s)))
     fine = np.sinc(frequency_hz * step)
     return float(np.sinc(frequency_hz * step * factor) / fine)
 
 
 def unexplained(signal: Signal, model: ShakeModel, where: int | str, count: int = 3) -> list[Line]:
-    """The highest peaks of a spectrum over the model's.
+    """Return the highest peaks of a spectrum over the model's.
 
     where : CARRIAGE: the mean of all items and cameras; "bubble": bubbles less their mean (of one
     bubble: the same as CARRIAGE); a camera: its difference from the mean of the cameras.
@@ -106,7 +106,7 @@ def unexplained(signal: Signal, model: ShakeModel, where: int | str, count: int 
 
 
 def _spectra(signal: Signal, model: ShakeModel, where: int | str) -> tuple[Array, Array, Array]:
-    """Frequencies, density found (Hann windows, mean over independent series), and expected."""
+    """Return frequencies, the observed density (Hann windows), and the expected density."""
     from scipy.signal import periodogram
 
     t = signal.t_s
@@ -150,7 +150,7 @@ def _expected(signal: Signal, model: ShakeModel, where: int | str, frequency: Ar
 
 
 def _series(signal: Signal, where: int | str) -> tuple[list[Array], list[Array]]:
-    """Independent series of one kind, (F,) each, and their weights (1 / variance)."""
+    """Return independent series (F,) of one kind and their weights (1 / variance)."""
     value, weight = signal.value_mm, signal.weight
     items = np.unique(signal.item)
     if where == CARRIAGE or (where == "bubble" and len(items) < 2):
@@ -169,7 +169,7 @@ def _series(signal: Signal, where: int | str) -> tuple[list[Array], list[Array]]
 
 
 def _level(signal: Signal) -> Array:
-    """Values less each item's mean, so that items may come and go."""
+    """Return the values minus each item's mean, so that items may come and go."""
     total = signal.weight.sum(0)
     mean = (signal.weight * signal.value_mm).sum(0) / np.where(total > 0, total, 1.0)
     return np.asarray(signal.value_mm - mean)
@@ -197,7 +197,7 @@ _LEAST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Attribution:
-    """A line and what its other reading costs.
+    """Holds a line's owner and the log-likelihood ratio to the other owner.
 
     owner : "rig" or "bubble".  index : into the model's modes or zigzags.
     log_likelihood_ratio : of this owner to the other, lines refitted (natural logarithm).
@@ -219,7 +219,7 @@ class Attribution:
 def attributions(
     signals: Sequence[Signal], model: ShakeModel, pattern: Sequence[float], up: Array
 ) -> list[Attribution]:
-    """The lines of these signals that could be the rig's as a whole or the bubbles'.
+    """Return the lines of these signals that could be the whole rig's or the bubbles'.
 
     pattern : (3,) the directions along rig axes in which lines are moved.  up : (3,).
     """
@@ -242,7 +242,7 @@ def attributions(
 
 
 def _is_common(mode: RigMode, signals: Sequence[Signal]) -> bool:
-    """Common to all cameras of a signal: only then a bubble's oscillation looks the same."""
+    """Return whether a mode is common to all cameras; only then it looks like a bubble's."""
     if mode.camera == CARRIAGE:
         return True
     return all(c.cameras == (mode.camera,) for c in signals if mode.camera in c.cameras)
@@ -254,7 +254,7 @@ def _lies_in(rms_mm: Sequence[float], pattern: Sequence[float]) -> bool:
 
 
 def _cost(signals: Sequence[Signal], model: ShakeModel, other: ShakeModel, at: float) -> float:
-    """Loss of log likelihood, the lines refitted where that could matter."""
+    """Return the loss of log-likelihood, with the lines refitted where that could matter."""
     loss = at - evidence(signals, other)
     if AMBIGUOUS_LOG_RATIO / 2 < loss < _REFIT_LOG_RATIO:
         loss = min(loss, at - maximise(signals, other, _line_names(other), steps=8).log_evidence)
@@ -268,7 +268,7 @@ def _line_names(model: ShakeModel) -> list[str]:
 
 
 def _own_motion_log_ratio(model: ShakeModel, index: int, differential: bool, up: Array) -> float:
-    """What is known of bubbles before any image: wide swings are theirs, and twice their frequency.
+    """Return the prior log ratio: wide swings and their second harmonic are the bubbles'.
 
     The second harmonic is not taken for theirs where the cameras shake against each other, which
     shows a rig that may well shake as a whole.
@@ -282,7 +282,7 @@ def _own_motion_log_ratio(model: ShakeModel, index: int, differential: bool, up:
 
 
 def is_zigzag(line: Zigzag, up: Array) -> bool:
-    """A wide swing across the vertical, at the frequency of bubbles' paths."""
+    """Return whether a line is a wide swing across the vertical, as bubbles' paths have."""
     rms, upright = np.asarray(line.rms_mm), np.abs(up)
     across = float(np.linalg.norm(rms * (1 - upright)))
     wide = across > _ZIGZAG_MM and across > float(np.linalg.norm(rms * upright))
@@ -290,7 +290,7 @@ def is_zigzag(line: Zigzag, up: Array) -> bool:
 
 
 def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
-    """A share of a mode's variance given to the bubbles; all of it: the mode goes."""
+    """Return the model with a share of a mode's variance given to the bubbles."""
     mode = model.modes[index]
     rms = _scaled(mode.rms_mm, np.sqrt(share))
     added = Zigzag(mode.frequency_hz, mode.damping, rms, mode.force_hz)
@@ -300,7 +300,7 @@ def moved_to_bubble(model: ShakeModel, index: int, share: float = 1.0) -> ShakeM
 
 
 def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeModel:
-    """A share of a bubble line's variance given to a mode of the whole rig."""
+    """Return the model with a share of a bubble line's variance given to a mode of the rig."""
     line = model.bubble.zigzags[index]
     rms = _scaled(line.rms_mm, np.sqrt(share))
     added = RigMode(line.frequency_hz, line.damping, rms, force_hz=line.force_hz)
@@ -309,7 +309,7 @@ def moved_to_rig(model: ShakeModel, index: int, share: float = 1.0) -> ShakeMode
 
 
 def _with_rest(lines: tuple[L, ...], index: int, share: float) -> tuple[L, ...]:
-    """Lines of which one has given away a share of its variance; all of it: that one goes."""
+    """Return the lines after one has lost a share of its variance; without it if all is lost."""
     line = lines[index]
     rest: tuple[L, ...] = ()
     if share < 1:
@@ -318,7 +318,7 @@ def _with_rest(lines: tuple[L, ...], index: int, share: float) -> tuple[L, ...]:
 
 
 def _joined(lines: tuple[Zigzag, ...], added: Zigzag) -> tuple[Zigzag, ...]:
-    """With the variances of equal lines added up."""
+    """Return the lines, with the variances of equal ones added."""
     for i, line in enumerate(lines):
         near = abs(line.frequency_hz / added.frequency_hz - 1) < _SAME_HZ
         near &= line.force_hz == added.force_hz
@@ -334,7 +334,7 @@ def _scaled(rms_mm: Sequence[float], factor: float) -> tuple[float, float, float
 
 
 def with_split_lines(model: ShakeModel, found: Sequence[Attribution]) -> ShakeModel:
-    """Every ambiguous line given half to the rig, half to the bubbles."""
+    """Return the model in which rig and bubbles share the variance of each ambiguous line."""
     for label in sorted(found, key=lambda one: -one.index):
         if label.ambiguous and label.owner == "bubble":
             model = moved_to_rig(model, label.index, 0.5)
@@ -347,7 +347,7 @@ def with_split_lines(model: ShakeModel, found: Sequence[Attribution]) -> ShakeMo
 def with_hidden_modes(
     signals: Sequence[Signal], model: ShakeModel, pattern: Sequence[float], up: Array
 ) -> ShakeModel:
-    """Beside a line of several bubbles, the rig given what of it the data leave open.
+    """Return the model with hidden modes: modes of the rig at the frequency of a bubbles' line.
 
     The bubbles' differences show their own line; a rig's line of the same frequency adds to what
     they have in common, where a share of 1 / bubbles is theirs anyway, and a few cycles do not
@@ -374,7 +374,7 @@ def with_hidden_modes(
 def _with_hidden_mode(
     signals: Sequence[Signal], model: ShakeModel, index: int, rig: RigMode, share: float
 ) -> Fit:
-    """A share of that line given to the rig, beside the bubbles' own, which is fitted again.
+    """Return the model with a share of a line given to the rig, the bubbles' line refitted.
 
     Found without it, the bubbles' line is too wide: it had to be what they have in common, too.
     """
@@ -387,12 +387,12 @@ def _with_hidden_mode(
 
 
 def _is_half(mode: RigMode, model: ShakeModel) -> bool:
-    """Of an ambiguous line, whose other half is the bubbles'."""
+    """Return whether a mode is half of an ambiguous line, the other half being the bubbles'."""
     return any(z.frequency_hz == mode.frequency_hz for z in model.bubble.zigzags)
 
 
 def hidden_mode_weights(line: Zigzag, own: Sequence[RigMode]) -> Array:
-    """Prior weights of lines of the rig beside one of the bubbles', by their `_SHARES` of its RMS.
+    """Return the prior weights of hidden modes, by their `_SHARES` of the line's RMS.
 
     All alike where the rig shows no line of its own elsewhere (a quarter of the frequency away):
     its main one must be somewhere. One that is weaker than the strongest there, or any where that

@@ -53,12 +53,12 @@ class AxisVerdict:
 
     @property
     def ambiguous_lines(self) -> tuple[Attribution, ...]:
-        """Modes of the rig that could be an oscillation of the bubbles."""
+        """Return the modes of the rig that could be an oscillation of the bubbles."""
         return tuple(line for line in self.lines if line.owner == "rig" and line.ambiguous)
 
 
 def verdicts(solution: Solution) -> dict[str, AxisVerdict]:
-    """By axis; empty without bubbles or covariances."""
+    """Return the verdict of each axis; {} without bubbles or covariances."""
     if solution.covariances is None or not solution.graph.problem.bubbles:
         return {}
     window = window_of(solution)
@@ -94,7 +94,7 @@ def _axis(
 
 
 def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
-    """(n, 3) sd of positions, and what they would be were the shake known, away from the ends.
+    """Return the sd (n, 3) of positions, and those if the shake were known, away from the ends.
 
     The uncertainty of the encoder's scale is in neither.
     """
@@ -118,12 +118,12 @@ def _sigmas(solution: Solution, window: Window) -> tuple[Array, Array]:
 
 
 def without_sensors(problem: SmoothingProblem) -> SmoothingProblem:
-    """Images of the bubbles and the encoder alone."""
+    """Return the problem with the images of the bubbles and the encoder alone."""
     return replace(problem, accelerometers=(), marks=(), references=Observations.none())
 
 
 def _inner_rows(window: Window) -> Ints:
-    """Rows of the bubbles' states, a tenth of each track left out at both ends."""
+    """Return the rows of the bubbles' states without a tenth of each track at both ends."""
     at, out = 0, []
     for bubble in window.problem.bubbles:
         edge = int(_EDGE * len(bubble))
@@ -139,7 +139,7 @@ def _position_sigma(solution: Solution, rows: Ints) -> Array:
 
 
 def shake_share(solution: Solution) -> list[float | None]:
-    """eta by axis: the least over the directions near the axis that a camera sees."""
+    """Return eta by axis: the least over the directions near the axis that a camera sees."""
     graph, found = solution.graph, solution.covariances
     assert found is not None
     least: list[float | None] = [None, None, None]
@@ -161,7 +161,7 @@ def shake_share(solution: Solution) -> list[float | None]:
 
 
 def shake_rms(solution: Solution) -> Array:
-    """(3,) RMS of the cameras' offsets, uncertainty included, of the camera that shakes most."""
+    """Return the RMS (3,) of the offsets, uncertainty included, of the camera that shakes most."""
     graph, found = solution.graph, solution.covariances
     assert found is not None
     out = np.zeros(3)
@@ -188,7 +188,7 @@ def _inner_frames(solution: Solution) -> Ints:
 def _lines(
     problem: SmoothingProblem, model: ShakeModel
 ) -> list[tuple[Sequence[float], Attribution]]:
-    """Spectral lines with their owners, and the directions that each moves along.
+    """Return the spectral lines with their owners and the directions in which each moves.
 
     Sensors on the cameras' arms answer the question by themselves: none then.
     """
@@ -212,7 +212,7 @@ class Window:
 
 
 def window_of(solution: Solution) -> Window:
-    """The middle of a solved run, outliers left out, with the bubbles seen longest there."""
+    """Return the middle of a solved run without outliers, with the bubbles seen longest."""
     problem = solution.graph.problem
     count = len(problem.t_s)
     first = max(0, (count - _MOST_FRAMES) // 2)

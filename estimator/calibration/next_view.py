@@ -65,7 +65,7 @@ class NextView:
 
     @property
     def gain(self) -> float:
-        """Share by which the best view lowers the standard deviation."""
+        """Return the share by which the best view lowers the standard deviation."""
         return 1 - self.after_um / self.before_um
 
     def enough(self) -> bool:
@@ -74,7 +74,7 @@ class NextView:
         return many and bool(self.poses) and self.gain < ENOUGH_SHARE
 
     def verdict(self) -> str:
-        """What another view would bring."""
+        """Return words on what another view would bring."""
         if not self.poses:
             good = rounded_um(self.before_um)
             return f"{self.views} views; points are good to {good} µm, and no pose was found to add"
@@ -91,7 +91,7 @@ class NextView:
         return f" ({rounded_um(self.size_um)} µm remain: the target's size is known no better)"
 
     def words(self) -> str:
-        """Verdict, and how to hold the target."""
+        """Return the verdict, and how to hold the target."""
         if not self.poses or self.enough():
             return self.verdict()
         best = self.poses[0]
@@ -99,7 +99,7 @@ class NextView:
         return f"{self.verdict()}. Next: {best.words}{because}"
 
     def as_dict(self) -> dict[str, Any]:
-        """For `Calibration.diagnostics`."""
+        """Return the content for `Calibration.diagnostics`."""
         return {
             "words": self.words(), "verdict": self.verdict(), "views": self.views,
             "before_um": self.before_um, "after_um": self.after_um, "enough": self.enough(),
@@ -148,7 +148,7 @@ def next_view(problem: Problem, state: State, joint: JointCovariance) -> NextVie
 def _preferred(
     problem: Problem, state: State, found: Candidates, gained_um: Array, dots: Ints
 ) -> Ints:
-    """Up to three candidates of different tilts, those nearly as good as the best first.
+    """Return up to three candidates of different tilts, the best first.
 
     The lens model that the views so far have chosen may lack what acts where no dot has been:
     among those nearly as good, the one that fills most of the empty image is preferred.
@@ -163,7 +163,7 @@ def _preferred(
 
 
 def rounded_um(value: float, other: float = np.nan) -> str:
-    """Digits enough to tell the two apart, and no powers of ten."""
+    """Return the numbers as text, with enough digits to tell them apart."""
     if value >= _WHOLE_UM:
         return f"{value:.0f}"
     digits = 2
@@ -211,7 +211,7 @@ class Candidates:
         return len(self.tilt)
 
     def some(self, index: Ints | Bools | slice) -> Candidates:
-        """A choice of them."""
+        """Return a choice of the candidates."""
         return Candidates(
             self.rig_from_target[index], self.facing[index], self.tilt[index], self.sees[index],
             self.pair[index],
@@ -219,7 +219,7 @@ class Candidates:
 
 
 def candidates(problem: Problem, state: State) -> Candidates:
-    """Every pose of the table in which two cameras see enough of the target, marks included."""
+    """Return every pose in which two cameras see enough of the target, marks included."""
     normals, facing, sees, pair = _normals(problem, state)
     places = volume_centre_mm(problem, state) + PLACE_SHARE * field_mm(problem) * PLACES
     size = (len(normals), len(ROLLS_DEG), len(places))
@@ -232,17 +232,17 @@ def candidates(problem: Problem, state: State) -> Candidates:
 
 
 def middle_mm(state: State) -> Array:
-    """(3,) middle of the dots in the target's frame."""
+    """Return the middle (3,) of the dots in the target's frame."""
     return np.asarray((state.dots_mm.min(0) + state.dots_mm.max(0)) / 2)
 
 
 def field_mm(problem: Problem) -> float:
-    """The smaller side of the smaller image, in object space."""
+    """Return the smaller side of the smaller image, in object space."""
     return float(min(min(c.image_size_px) / c["scale_px_per_mm"] for c in problem.cameras))
 
 
 def volume_centre_mm(problem: Problem, state: State) -> Array:
-    """(3,) the rig's origin; where the target was, when the optical axes meet far from there."""
+    """Return the rig's origin (3,), or where the target was if that is far from it."""
     seen = np.unique(problem.view[problem.kept])
     poses = state.rig_from_target[seen]
     mean = np.mean(poses[:, :3, :3] @ middle_mm(state) + poses[:, :3, 3], 0)
@@ -250,7 +250,7 @@ def volume_centre_mm(problem: Problem, state: State) -> Array:
 
 
 def optical_axes(state: State) -> Array:
-    """(C, 3) in the rig frame, away from the cameras."""
+    """Return the optical axes (C, 3) in the rig frame, away from the cameras."""
     return np.asarray(state.rig_from_camera[:, :3, 2])
 
 
@@ -309,7 +309,7 @@ def _normals(problem: Problem, state: State) -> tuple[Array, Array, Bools, Ints]
 
 
 def _sides_seen(problem: Problem, state: State) -> Array:
-    """(C,) which side of the plate each camera has seen most: +1 that of negative z, else -1."""
+    """Return the side (C,) that each camera has seen most: +1 that of negative z, else -1."""
     used = problem.kept
     signs = np.sign(np.einsum("ci,vi->vc", optical_axes(state), state.rig_from_target[:, :3, 2]))
     cameras = range(len(problem.cameras))
@@ -356,7 +356,7 @@ def _plate_shift(problem: Problem, facing: Array) -> Array:
 
 
 def dots_seen(problem: Problem, state: State, poses: Candidates, dots: Ints) -> tuple[Bools, Array]:
-    """(K, C, n) which of ``dots`` are in the images, off the border, (K, C, n, 2) pixels."""
+    """Return (K, C, n) which of ``dots`` are in the images, and their pixels (K, C, n, 2)."""
     count = len(problem.cameras)
     views, obs = predicted(problem, state, poses, dots, np.ones(count))
     uv = pixels(views, obs, problem.rho_mm).reshape(len(poses), count, len(dots), 2)
@@ -370,13 +370,13 @@ def dots_seen(problem: Problem, state: State, poses: Candidates, dots: Ints) -> 
 
 
 def spread_dots(problem: Problem, count: int = FEW_DOTS) -> Ints:
-    """Up to ``count`` dots, spread over the list of all."""
+    """Return up to ``count`` dots, spread over the list of all."""
     whole = len(problem.dot_ids)
     return np.unique(np.linspace(0, whole - 1, min(count, whole)).round().astype(np.int64))
 
 
 def _enough_seen(problem: Problem, state: State, poses: Candidates) -> Bools:
-    """(K,) whether two cameras see as many dots as images do so far, and all marks.
+    """Return (K,) whether two cameras see as many dots as images do so far, and all marks.
 
     The two between which the plate is held; what others see of it is used as it is.
     """
@@ -515,7 +515,7 @@ _CORNER_CELLS = 2
 
 
 def hold_words(problem: Problem, state: State, one: Candidates) -> str:
-    """Turn, lean, roll and place of one pose, as its pair of cameras sees it."""
+    """Return words on turn, lean, roll and place of a pose, as its pair of cameras sees it."""
     pair, rig_from_target = one.pair[0], one.rig_from_target[0]
     axes, facing = optical_axes(state)[pair], one.facing[0][pair]
     alike, along, across = bases(axes, facing)
@@ -561,7 +561,7 @@ def _start_words(problem: Problem, facing: Array, pair: tuple[str, str]) -> str:
 
 
 def _roll_words(problem: Problem, rig_from_target: Array) -> str:
-    """Where the first row points in the first camera's image."""
+    """Return words on where the first row points in the first camera's image."""
     u, v = -rig_from_target[:2, 1]
     way = _WAYS[int(np.round(np.arctan2(v, u) / (np.pi / 4))) % 8]
     if problem.target.layout == "points":
@@ -587,7 +587,7 @@ def _place_words(problem: Problem, state: State, rig_from_target: Array) -> str:
 
 
 def reason_words(problem: Problem, state: State, one: Candidates) -> tuple[str, ...]:
-    """What a pose has that the views so far have not."""
+    """Return words on what a pose has that the views so far have not."""
     out = []
     seen = np.unique(problem.view[problem.kept])
     cosine = np.abs(optical_axes(state) @ state.rig_from_target[seen, :3, 2].T)

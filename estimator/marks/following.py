@@ -53,27 +53,27 @@ class TankView:
 
     @property
     def px_per_mm(self) -> float:
-        """Scale in the middle of the image."""
+        """Return the scale in the middle of the image."""
         steps = self.origin + 1e-2 * np.concatenate([self.basis, -self.basis])
         uv = self.camera.project(steps)
         return float(np.sqrt(abs(np.linalg.det((uv[:2] - uv[2:]) / 2e-2))))
 
     @property
     def travel_px_per_mm(self) -> Array:
-        """(2,) px that what is fixed to the tank moves per mm of travel, in the image's middle."""
+        """Return the motion (2,) in px of the tank per mm of travel, in the image's middle."""
         step_mm = 1e-3
         before, after = (self.origin + s * step_mm * self.axis_rig for s in (1, -1))
         return (self.camera.project(after) - self.camera.project(before)) / (2 * step_mm)
 
     def lab_mm(self, uv_px: Array, position_mm: float) -> Array:
-        """(n, 2) of pixels (n, 2)."""
+        """Return the places (n, 2) in the laboratory of pixels (n, 2)."""
         if not len(uv_px):
             return np.zeros((0, 2))
         rig = self.camera.unproject(uv_px)[0] - self.origin
         return np.asarray((rig + self.axis_rig * position_mm) @ self.basis.T)
 
     def pixels(self, lab_mm: Array, position_mm: float) -> Array:
-        """(n, 2) px of lab places (n, 2)."""
+        """Return the pixels (n, 2) of places (n, 2) in the laboratory."""
         if not len(lab_mm):
             return np.zeros((0, 2))
         across = lab_mm - self.basis @ self.axis_rig * position_mm
@@ -202,7 +202,7 @@ class Follower:
         return self._new_marks(frame, place - predicted, dots, range(len(place)))
 
     def kept(self, *, moved: bool) -> list[Mark]:
-        """Marks that stayed at one place of the tank while the tank passed through the image.
+        """Return the marks that stayed at one place of the tank while it passed the image.
 
         moved : whether the tank did pass; if not, being seen often has to suffice.
         """
@@ -228,7 +228,7 @@ class Follower:
         ]
 
     def _prediction(self, frame: int, place: Array, known: bool) -> tuple[Array, float]:
-        """Shift (2,) mm expected now, and its standard deviation."""
+        """Return the expected shift (2,) in mm and its standard deviation."""
         step = self._step_mm or (_FIRST_STEP_MM if known else self._first_step_mm(place))
         if self._last is None:
             return np.zeros(2), step
@@ -237,14 +237,14 @@ class Follower:
         return shift + (0 if known else gap) * self._speed, step * np.sqrt(gap)
 
     def _first_step_mm(self, place: Array) -> float:
-        """Standard deviation of the first motion without an encoder: well below half a spacing."""
+        """Return the sd of the first motion without an encoder: well below half a spacing."""
         if len(place) < 2:
             return self.diameter_mm
         apart = np.linalg.norm(place[:, None] - place, axis=-1)
         return _FIRST_SHARE * float(apart[apart > 0].min())
 
     def _expected(self, shift: Array) -> list[int]:
-        """Marks that should be whole in the image."""
+        """Return the marks that should be whole in the image."""
         inside, uv = self._in_image(shift)
         return [k for k, whole in zip(inside, self._are_whole(uv, self.margin_px + 1)) if whole]
 
@@ -253,12 +253,12 @@ class Follower:
         return list(np.all((uv > margin) & (uv < size - margin), axis=1).tolist())
 
     def _in_image(self, shift: Array) -> tuple[list[int], Array]:
-        """Marks whose centre is in the image, and these centres (n, 2) px."""
+        """Return the marks whose centre is in the image, and these centres (n, 2) in px."""
         places = np.array([m.place_mm for m in self.marks]).reshape(-1, 2) + shift
         return self.view.in_image(places, self._held_mm)
 
     def _best(self, place: Array, predicted: Array, sd: float) -> _Shift | None:
-        """The likeliest shift; None where no dot is near a mark."""
+        """Return the likeliest shift; None if no dot is near a mark."""
         known = np.array([m.place_mm for m in self.marks])
         apart = place[:, None] - known
         near = np.linalg.norm(apart - predicted, axis=-1) < max(_REACH * sd, self.diameter_mm / 2)
@@ -274,7 +274,7 @@ class Follower:
         return _Shift(shift, pairs, sure)
 
     def _cost(self, apart: Array, shift: Array, predicted: Array, sd: float) -> float:
-        """Negative log-likelihood of a shift: dots off their marks, missed marks, a large step."""
+        """Return minus the log-likelihood of a shift: stray dots, missed marks, a large step."""
         distance = np.linalg.norm(apart - shift, axis=-1).min(1)
         square = (distance / (_TOLERANCE * self.diameter_mm)) ** 2
         seen = {k for _, k in self._pairs(apart, shift)}
@@ -283,7 +283,7 @@ class Follower:
         return float(np.minimum(square / 2, _UNMATCHED).sum()) + _MISSED * missed + step
 
     def _pairs(self, apart: Array, shift: Array) -> list[tuple[int, int]]:
-        """Dots and marks that are each other's nearest and agree with a shift."""
+        """Return the dots and marks that are each other's nearest and agree with a shift."""
         distance = np.linalg.norm(apart - shift, axis=-1)
         nearest, back = distance.argmin(1), distance.argmin(0)
         limit = 3 * _TOLERANCE * self.diameter_mm
@@ -306,7 +306,7 @@ class Follower:
     def _sighted(
         self, frame: int, place: Array, dots: DotSightings, shift: _Shift
     ) -> list[tuple[int, int]]:
-        """Sightings of the marks at their places; dots at other places may be new marks."""
+        """Return the sightings of marks at their places; dots elsewhere may be new marks."""
         out, used = [], set()
         off = np.array([place[i] - self.marks[k].place_mm for i, k in shift.pairs])
         middle = np.median(off, axis=0) if len(off) > 2 else np.zeros(2)

@@ -67,13 +67,13 @@ def leave_one_out(at: Ints, residuals: Array, places: Ints) -> Array:
 
 
 def fit_homography(source: ArrayLike, target: ArrayLike) -> Array:
-    """(3, 3) homography, target ~ H source, of (N, 2) pairs; affine where that is all they tell."""
+    """Return the homography H (3, 3), target ~ H source, of (N, 2) pairs; affine if few."""
     homography, _ = cv2.findHomography(np.asarray(source, float), np.asarray(target, float))
     return fit_affine(source, target) if homography is None else np.asarray(homography)
 
 
 def apply_homography(homography: Array, points: ArrayLike) -> Array:
-    """(..., N, 2) images of (..., N, 2) points under (..., 3, 3) homographies."""
+    """Return the images (..., N, 2) of points (..., N, 2) under homographies (..., 3, 3)."""
     p = np.asarray(points, float)
     h = homography
     mapped = p @ h[..., :2].mT + h[..., None, :, 2]
@@ -81,7 +81,7 @@ def apply_homography(homography: Array, points: ArrayLike) -> Array:
 
 
 def fit_affine(source: ArrayLike, target: ArrayLike) -> Array:
-    """(3, 3) affine map of (N, 2) pairs by least squares, as a homography."""
+    """Return the affine map (3, 3) of (N, 2) pairs by least squares, as a homography."""
     a, b = np.asarray(source, float), np.asarray(target, float)
     solved, *_ = np.linalg.lstsq(np.column_stack([a, np.ones(len(a))]), b, rcond=None)
     return np.vstack([solved.T, [0.0, 0.0, 1.0]])
@@ -122,7 +122,7 @@ class Lattice:
 
 
 def shape_matrix(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> Array:
-    """(..., 2, 2) matrix S of the ellipse x^T S^-1 x = 1 with semi-axes a, b."""
+    """Return the matrix S (..., 2, 2) of the ellipse x^T S^-1 x = 1 with semi-axes a, b."""
     a2, b2 = np.square(np.asarray(a_px, float)), np.square(np.asarray(b_px, float))
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     uu, vv, uv = a2 * c * c + b2 * s * s, a2 * s * s + b2 * c * c, (a2 - b2) * c * s
@@ -130,7 +130,7 @@ def shape_matrix(a_px: ArrayLike, b_px: ArrayLike, angle_rad: ArrayLike) -> Arra
 
 
 def circle_from_ellipses(shapes_px2: ArrayLike) -> Array:
-    """(2, 2) matrix that maps the median ellipse of (N, 2, 2) shapes to the unit circle.
+    """Return the matrix (2, 2) that maps the median ellipse of N shapes to the unit circle.
 
     The median is taken over the logarithms of the shapes, so that neither dirt nor marks matter.
     """
@@ -173,7 +173,7 @@ def grow_lattice(
 
 
 def _best_growth(flat: Array, pitch_ratio: float) -> _Growth | None:
-    """The best of a few starts; the first that covers nearly all dots is good enough."""
+    """Return the best of a few starts, or the first that covers nearly all dots."""
     best: _Growth | None = None
     for basis in _bases(flat, pitch_ratio):
         for seed in _seeds(flat, basis):
@@ -187,7 +187,7 @@ def _best_growth(flat: Array, pitch_ratio: float) -> _Growth | None:
 
 
 def _bases(flat: Array, pitch_ratio: float) -> list[Array]:
-    """Pairs of frequent perpendicular steps whose lengths have the pitch ratio, likeliest first."""
+    """Return pairs of frequent perpendicular steps with the pitch ratio, likeliest first."""
     ratio = max(pitch_ratio, 1 / pitch_ratio)
     steps, votes = _frequent_steps(flat, min(len(flat) - 1, round(4 + 6 * ratio)))
     length = np.linalg.norm(steps, axis=1)
@@ -201,7 +201,7 @@ def _bases(flat: Array, pitch_ratio: float) -> list[Array]:
 
 
 def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
-    """(K, 2) steps between near dots, each up to sign, and how often each occurs (K,)."""
+    """Return the steps (K, 2) between near dots, up to sign, and how often each occurs (K,)."""
     middle = np.median(flat, axis=0)
     patch = np.argsort(np.sum((flat - middle) ** 2, axis=1))[:_PATCH]
     _, near = cKDTree(flat).query(flat[patch], neighbours + 1)
@@ -224,7 +224,7 @@ def _frequent_steps(flat: Array, neighbours: int) -> tuple[Array, Array]:
 
 
 def _seeds(flat: Array, basis: Array) -> Iterator[int]:
-    """Dots with good neighbours on all sides, best first and well apart."""
+    """Return dots with good neighbours on all sides, best first and well apart."""
     steps = np.concatenate([basis, -basis])
     miss, _ = cKDTree(flat).query((flat[:, None] + steps).reshape(-1, 2))
     pitch = np.linalg.norm(steps, axis=1)
@@ -253,7 +253,7 @@ class _Growth:
         return np.asarray(self.place[:, 0] >= 0)
 
     def score(self, pitch_ratio: float) -> float:
-        """Number of dots on the grid, reduced where it has many gaps or is not rectangular."""
+        """Return the number of dots on the grid, reduced for gaps and for a ragged outline."""
         dots = np.flatnonzero(self.placed())
         i, j = self.place[dots].T
         runs = (self.at[i + 1, j] >= 0).sum() + (self.at[i, j + 1] >= 0).sum()

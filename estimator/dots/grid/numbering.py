@@ -78,13 +78,13 @@ class MarkEvidence:
 
 
 def relative_diameter(lattice: Lattice) -> Array:
-    """(n,) diameter of each dot in units of the lattice's own pitch, relative to the median dot."""
+    """Return each dot's diameter (n,) in units of the lattice's pitch, relative to the median."""
     size = np.linalg.det(lattice.shape) ** 0.25
     return np.asarray(size / np.median(size))
 
 
 def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
-    """(n,) probability that each dot looks like a mark of the target's style (not "missing").
+    """Return the probability (n,) that each dot is a mark of the target's style.
 
     rings : (n,) whether the image shows a ring.
     """
@@ -101,7 +101,7 @@ def mark_likeness(lattice: Lattice, rings: Bools, target: Target) -> Array:
 
 
 def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidence:
-    """Evidence at all places of the lattice and of a border one place wide.
+    """Return the evidence at all places of the lattice and of a border one place wide.
 
     rings : (n,) whether the image shows a ring.
     """
@@ -122,7 +122,7 @@ def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidenc
 
 
 def mark_gain(likeness: Array) -> Array:
-    """(n,) log-likelihood ratio of mark to plain dot, from the likeness of `mark_likeness` (n,)."""
+    """Return the log-likelihood ratio (n,) of mark to plain dot, from `mark_likeness` (n,)."""
     missed, false = np.exp(LOG_MISSED_MARK), np.exp(LOG_FALSE_MARK)
     as_mark = np.log(likeness * (1 - missed) + (1 - likeness) * missed)
     as_plain = np.log(likeness * false + (1 - likeness) * (1 - false))
@@ -141,7 +141,7 @@ def _gaps(occupied: Bools, bounded: bool) -> Bools:
 
 
 def _count_around(places: Bools) -> Ints:
-    """(H, W) how many of the eight neighbours are set."""
+    """Return how many of the eight neighbours are set (H, W)."""
     from scipy.ndimage import convolve
 
     ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
@@ -187,7 +187,7 @@ class Placements:
 
 
 def rank_placements(lattice: Lattice, evidence: MarkEvidence, target: Target) -> Placements:
-    """All placements within `MARGIN` of the best, best first (unmirrored before mirrored).
+    """Return all placements within `MARGIN` of the best, best first, unmirrored before mirrored.
 
     Mirrored images are considered where the target's marks tell them apart.
 
@@ -245,7 +245,7 @@ def _shifts(
 
 
 def _bounded_shifts(turned: Ints, target: Target) -> tuple[Ints, Array]:
-    """(S, 2) shifts that keep most dots within rows x columns, and their log-likelihoods (S,)."""
+    """Return the shifts (S, 2) that keep most dots on the grid, and log-likelihoods (S,)."""
     size = np.array([target.columns, target.rows])
     low = turned.min(0) - size + 1
     span = turned.max(0) - low + size
@@ -377,7 +377,7 @@ def check_handedness(handedness_by_image: Mapping[tuple[str, str], int], two_sid
 def _mirrored_camera(
     signs: Mapping[tuple[str, str], int], odd: list[tuple[str, str]]
 ) -> tuple[str, str] | None:
-    """(mirrored, other) when the odd images are all of one camera, and all of its images."""
+    """Return (mirrored, other) if the odd images are all images of one camera, and only those."""
     odd_cameras = {camera for _, camera in odd}
     others = [camera for _, camera in signs if camera not in odd_cameras]
     every = sum(camera in odd_cameras for _, camera in signs) == len(odd)
@@ -387,7 +387,7 @@ def _mirrored_camera(
 
 
 def _kept(ranked: Placements, evidence: MarkEvidence, target: Target) -> tuple[Placements, bool]:
-    """The placements to keep, and whether they differ by more than the target's symmetry."""
+    """Return the placements to keep, and whether they differ by more than a symmetry."""
     best = ranked.take(np.flatnonzero(ranked.score >= ranked.score[0] - 1e-6))
     if len(ranked.score) == len(best.score) and related_by_symmetry(best, target):
         return best, False
@@ -430,7 +430,7 @@ def _numbering(
 
 
 def _ids(columns_rows: Ints, target: Target) -> Ints:
-    """(n,) dot ids, -1 where the target has no dot."""
+    """Return the dot ids (n,), -1 where the target has no dot."""
     column, row = columns_rows.T
     ids = target.id_from_row_column(row, column)
     there = np.ones(len(ids), bool)
@@ -463,7 +463,7 @@ def _unplaced(index: Ints, reasons: list[str]) -> pd.DataFrame:
 
 
 def _number_points(points_px: Array, shapes_px2: Array, target: Target) -> Numbering:
-    """The numbering of a target whose layout is "points"."""
+    """Return the numbering of a target whose layout is "points"."""
     matches = match_points(
         points_px,
         shapes_px2,
@@ -523,7 +523,7 @@ def match_points(
     *,
     dot_radius_mm: float,
 ) -> list[PointMatch]:
-    """Distinct matches of (M, 2) dots with shapes (M, 2, 2) to (N, 2) points, most dots first.
+    """Return distinct matches of dots (M, 2), shapes (M, 2, 2), to points (N, 2), best first.
 
     Raises DetectionError when there are fewer than 6 dots or no map explains half of them.
     """
@@ -552,7 +552,7 @@ def match_points(
 
 
 def _triangles(points: Array) -> Ints:
-    """(T, 3) triangles of each point and two of its near ones, without slivers or repeats."""
+    """Return triangles (T, 3) of each point and two near ones, without slivers or repeats."""
     count = min(_NEAR, len(points) - 1)
     _, near = cKDTree(points).query(points, count + 1)
     pairs = np.array(list(combinations(range(1, count + 1), 2)))
@@ -568,13 +568,13 @@ def _triangles(points: Array) -> Ints:
 
 
 def _sides(points: Array, corners: Ints) -> Array:
-    """(T, 3) sides opposite to the corners."""
+    """Return the sides (T, 3) opposite to the corners."""
     p = points[corners]
     return np.asarray(np.linalg.norm(p[:, [1, 2, 0]] - p[:, [2, 0, 1]], axis=2))
 
 
 def _signature(sides: Array) -> Array:
-    """(T, 3) shape of a triangle, and its size with a third of the weight."""
+    """Return the shape of each triangle (T, 3), and its size with a third of the weight."""
     logs = np.log(sides)
     size = logs.mean(axis=1)
     return np.column_stack([logs[:, 0] - size, logs[:, 1] - size, size / 3])
@@ -605,7 +605,7 @@ def _proposals(flat: Array, wanted: Array) -> list[tuple[Array, int]]:
 
 
 def _distinct(affine: Array, corner: Ints, wanted: Array) -> list[tuple[Array, int]]:
-    """The first few proposals that differ, since many triangles propose the same map."""
+    """Return the first few different proposals; many triangles propose the same map."""
     centre = apply_homography(affine, wanted.mean(0)[None])[:, 0]
     reach = 0.3 * np.ptp(wanted, axis=0).max()
     kept: list[int] = []
@@ -623,7 +623,7 @@ def _distinct(affine: Array, corner: Ints, wanted: Array) -> list[tuple[Array, i
 
 
 def _affine_from_triangles(source: Array, target: Array) -> Array:
-    """(T, 3, 3) affine maps that take (T, 3, 2) corners to (T, 3, 2)."""
+    """Return the affine maps (T, 3, 3) that take corners (T, 3, 2) to corners (T, 3, 2)."""
     ones = np.ones((*source.shape[:2], 1))
     rows = np.linalg.solve(np.concatenate([source, ones], 2), target)
     affine = np.zeros((len(source), 3, 3))
@@ -632,7 +632,7 @@ def _affine_from_triangles(source: Array, target: Array) -> Array:
 
 
 def _extended(flat: Array, wanted: Array, start: Array, middle: int) -> PointMatch:
-    """The match that a map gives when it is refined outwards from its middle."""
+    """Return the match of a map that is refined outwards from its middle."""
     away = np.argsort(np.sum((wanted - wanted[middle]) ** 2, axis=1))
     count, model = min(_LOCAL, len(wanted)), _Model(start, None)
     reach = 0.3 * _spacing(flat)
@@ -679,7 +679,7 @@ class _Model:
         return out
 
     def handedness(self, point: Array) -> int:
-        """Sign of the homography's determinant at a point (2,)."""
+        """Return the sign of the homography's determinant at a point (2,)."""
         depth = self.homography[2] @ [*point, 1.0]
         return 1 if np.linalg.det(self.homography) * depth >= 0 else -1
 
@@ -704,6 +704,6 @@ def _monomials(p: Array) -> Array:
 
 
 def _spacing(flat: Array) -> float:
-    """Median distance of the nearest neighbours."""
+    """Return the median distance of nearest neighbours."""
     near, _ = cKDTree(flat).query(flat, 2)
     return float(np.median(near[:, 1]))

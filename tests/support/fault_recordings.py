@@ -40,7 +40,8 @@ class Account:
 
     reported : readings that recording.json says are missing. edge : those made within the first
     and last moments. wrong : rows that differ from what was sent by more than a stage or an arm
-    can move from one reading to the next, and by less. not_accounted : sent minus the others.
+    can move from one reading to the next, and by less; without stamps, rows whose time is off by
+    more than 8 ms. not_accounted : sent minus the others.
     """
 
     device: str

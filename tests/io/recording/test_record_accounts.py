@@ -39,10 +39,11 @@ SCENARIOS = {
 
 def check(accounts: list[Account]) -> None:
     for one in accounts:
-        assert one.wrong == 0, one
         if one.device == "encoder without stamps":
             assert abs(one.not_accounted) <= 0.01 * one.sent, one
+            assert one.wrong <= 0.02 * one.recorded, "times off by more than 8 ms"
         else:
+            assert one.wrong == 0, one
             assert one.not_accounted == 0, one
             assert one.slightly_wrong <= 0.001 * one.sent, one
             assert one.latest_s < 0.02, one
@@ -62,7 +63,7 @@ def test_a_kill_costs_the_last_second_of_every_device(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_hundred_recordings_with_faults(tmp_path: Path) -> None:
-    """About 12 minutes; TELERIG_ACCOUNTS=FILE writes the table of the benchmark results."""
+    """About 11 minutes; TELERIG_ACCOUNTS=FILE writes the table of the benchmark results."""
     accounts, failed = [], []
     for seed in range(100):
         rng, kill = np.random.default_rng(seed), seed % 5 == 4

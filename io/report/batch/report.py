@@ -33,6 +33,8 @@ KINDS = {"calibrate": "calibrated", "track": "tracked", "smooth": "smoothed"}
 _DONE = "done"
 _COLOUR = {"calibrate": CAMERA_COLOURS[0], "track": CAMERA_COLOURS[1], "smooth": CAMERA_COLOURS[2]}
 _LONGEST_WORDS = 600
+_LONGEST_NAME = 255
+"""What file systems allow for a folder's name."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ def _checked(job: Any) -> Job:
     for name in ("dataset", "run", "kind", "status", "words"):
         if not isinstance(job[name], str):
             raise ValueError(f"a job garbles {name!r}")
+    if max(map(len, f"{job['dataset']}/{job['run']}".split("/"))) > _LONGEST_NAME:
+        raise ValueError("a job has a dataset or run with too long a name")
     if not isinstance(job.get("figures") or {}, dict):
         raise ValueError("a job garbles 'figures'")
     return dict(job)

@@ -109,6 +109,16 @@ class CameraRecord(Part):
     standard_deviations: dict[str, float | None] = Field(default_factory=dict)
     camera_from_rig: PoseRecord
 
+    @model_validator(mode="after")
+    def _is_camera(self) -> Self:
+        for name in (*self.free, *self.standard_deviations):
+            if name not in self.parameters:
+                raise ValueError(f"{name[:60]!r} is no parameter of the camera")
+        for name in ("scale_px_per_mm", "aspect"):
+            if self.parameters.get(name, 1.0) <= 0:
+                raise ValueError(f"{name} is {self.parameters[name]:g}, it must be positive")
+        return self
+
 
 class Target(Part):
     """Hold the calibrated target.
@@ -137,9 +147,16 @@ class Covariance(Part):
     def _fit_together(self) -> Self:
         if self.matrix.shape != (len(self.names),) * 2:
             raise ValueError(f"{len(self.names)} names, but a matrix of {self.matrix.shape}")
-        sd = np.sqrt(np.clip(np.diag(self.matrix), 0, None))
+        if len(set(self.names)) < len(self.names):
+            raise ValueError("a name stands twice")
+        if np.any(np.diag(self.matrix) < 0):
+            raise ValueError("a variance is negative")
+        sd = np.sqrt(np.diag(self.matrix))
         if np.any(np.abs(self.matrix - self.matrix.T) > _ROUNDED * np.outer(sd, sd)):
-            raise ValueError("the matrix is not symmetric, or has a negative variance")
+            raise ValueError("the matrix is not symmetric")
+        units = np.where(sd > 0, sd, 1.0)
+        if np.any(np.linalg.eigvalsh(self.matrix / np.outer(units, units)) < -_ROUNDED):
+            raise ValueError("a variance along some direction is negative")
         return self
 
 

@@ -196,6 +196,32 @@ def test_damaged_files(change: Any, saved: Path) -> None:
         load_calibration(edited(saved, change))
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d["cameras"]["left"]["parameters"].update(scale_px_per_mm=0), "positive"),
+        (lambda d: d["cameras"]["left"]["parameters"].update(aspect=-1), "positive"),
+        (lambda d: d["cameras"]["left"].update(free=["zoom"]), "no parameter"),
+        (lambda d: d["cameras"]["left"].update(standard_deviations={"zoom": 1}), "no parameter"),
+        (lambda d: d["covariance"]["matrix"][0].__setitem__(0, -1), "variance is negative"),
+        (
+            lambda d: d["covariance"].update(names=["a", "b"], matrix=[[1, 2], [2, 1]]),
+            "variance along some direction",
+        ),
+        (
+            lambda d: d["covariance"].update(names=["a", "a"], matrix=[[1, 0], [0, 1]]),
+            "stands twice",
+        ),
+    ],
+)
+def test_cameras_and_covariances_that_cannot_be(change: Any, words: str, saved: Path) -> None:
+    content = json.loads((saved / "calibration.json").read_text())
+    change(content)
+    (saved / "calibration.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=words):
+        load_calibration(saved)
+
+
 def test_damaged_covariance(saved: Path) -> None:
     (saved / "covariance.npz").write_bytes(b"not a zip archive")
     with pytest.raises(InputError, match=r"covariance\.npz"):

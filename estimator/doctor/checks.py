@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Status = Literal["ok", "note", "warning", "failure"]
 
 _IMPORTS = {
+    "google-re2": "re2",
     "pillow": "PIL",
     "opencv-python-headless": "cv2",
     "scikit-image": "skimage",

@@ -172,6 +172,45 @@ def _answer(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[b
         return True, error
 
 
+ISOLATED_S = 60.0
+
+
+def isolated(function: Callable[..., Result], *arguments: Any) -> Result:
+    """Call a module's function in a copy of this process, which a crash of a C library may end.
+
+    Where a copy would not be safe (`can_fork`), the function is called in this process.
+    Raises ChildProcessError if the copy died or took longer than `ISOLATED_S`, and what the
+    function raises.
+    """
+    if not can_fork():
+        return function(*arguments)
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    with _copying():
+        process = multiprocessing.get_context("fork").Process(
+            target=_answer_once, args=(theirs, function, arguments)
+        )
+        process.start()
+    theirs.close()
+    try:
+        if not ours.poll(ISOLATED_S):
+            raise ChildProcessError(f"took longer than {ISOLATED_S:.0f} s")
+        failed, result = ours.recv()
+    except EOFError as error:
+        raise ChildProcessError("crashed") from error
+    finally:
+        process.kill()
+        process.join()
+        ours.close()
+    if failed:
+        raise result
+    return result  # type: ignore[no-any-return]
+
+
+def _answer_once(end: Connection, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end.send(_answer(function, arguments))
+
+
 def _forked(workers: int) -> Pool:
     with _copying():
         return multiprocessing.get_context("fork").Pool(workers, initializer=_begin_work)

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -26,6 +27,7 @@ from telerig.errors import InputError
 from telerig.io.exchange.formats import RECORDINGS
 from telerig.io.files.csv_table import LARGEST_NUMBER, write_table
 from telerig.io.files.text import read_text
+from telerig.io.machine.parallel import isolated
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "g": STANDARD_GRAVITY_M_S2,
@@ -349,7 +351,7 @@ def read_mat(path: Path) -> Recording:
 
     with _reading(path, "MAT"):
         try:
-            content = loadmat(path, squeeze_me=True)
+            content = isolated(partial(loadmat, squeeze_me=True), path)
         except NotImplementedError as error:
             raise InputError(
                 "is a MATLAB 7.3 file, which cannot be read",

@@ -17,6 +17,7 @@ from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.io.exchange.importing.pinhole import ImportedCameras, Pinhole, cameras_from_pinholes
 from telerig.io.files.csv_table import LARGEST_NUMBER
+from telerig.io.machine.parallel import isolated
 from telerig.rig.pose import rotation_from_rotvec
 
 _MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "camera_matrix{}", "mtx{}")
@@ -78,24 +79,11 @@ def read_opencv_cameras(
 
 def _content(file: Path) -> dict[str, Array]:
     """Every matrix and number at the root of the file."""
-    import cv2
-
     if not file.is_file():
         raise InputError("there is no such file", where=str(file), todo="check the path")
     try:
-        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-        root = storage.root()
-        out = {}
-        for name in root.keys():  # noqa: SIM118
-            node = root.getNode(name)
-            if node.isInt() or node.isReal():
-                out[name] = np.array(node.real())
-            elif node.isMap() and node.mat() is not None:
-                out[name] = np.asarray(node.mat(), float)
-            elif node.isSeq():
-                out[name] = np.array([node.at(i).real() for i in range(node.size())])
-        storage.release()
-    except Exception as error:  # cv2.error, and what Python makes of it
+        out = isolated(_root_of, str(file))
+    except Exception as error:  # cv2.error, what Python makes of it, and crashes
         raise InputError(
             f"OpenCV cannot read it ({error})",
             where=str(file),
@@ -105,6 +93,24 @@ def _content(file: Path) -> dict[str, Array]:
         if not (np.abs(values) <= LARGEST_NUMBER).all():
             what = f"{key!r} holds what is no number up to {LARGEST_NUMBER:g}"
             raise InputError(what, where=str(file), todo="correct it, or calibrate again")
+    return out
+
+
+def _root_of(file: str) -> dict[str, Array]:
+    import cv2
+
+    storage = cv2.FileStorage(file, cv2.FILE_STORAGE_READ)
+    root = storage.root()
+    out = {}
+    for name in root.keys():  # noqa: SIM118
+        node = root.getNode(name)
+        if node.isInt() or node.isReal():
+            out[name] = np.array(node.real())
+        elif node.isMap() and node.mat() is not None:
+            out[name] = np.asarray(node.mat(), float)
+        elif node.isSeq():
+            out[name] = np.array([node.at(i).real() for i in range(node.size())])
+    storage.release()
     return out
 
 

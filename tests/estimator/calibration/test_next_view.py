@@ -249,7 +249,7 @@ def test_words_for_a_second_camera_anywhere_round_the_first(azimuth_deg: float) 
     problem: Any = SimpleNamespace(
         cameras=[Camera.create("a", (512, 512), 10.0), Camera.create("b", (512, 512), 10.0)],
         target=SimpleNamespace(two_sided=False, layout="grid"),
-        view=np.zeros(1, int), weight=np.ones(1),
+        view=np.zeros(1, int), kept=np.ones(1, bool),
     )  # fmt: skip
     z = second + [0, 0, 1]
     across = np.cross([0.0, 0.0, 1.0], second)

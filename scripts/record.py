@@ -87,7 +87,9 @@ def record(
                 "--replay reads a recording, it records nothing",
                 todo="leave out the run, --seconds and --port; --out says where the tables go",
             )
-        log = replay / "recording.raw" if replay.is_dir() else replay
+        from telerig.io.recording.session import log_in
+
+        log = log_in(replay) if replay.is_dir() else replay
         if not ((out or log.parent) / "recording.json").exists():
             refuse_existing(out or log.parent)
         devices = _devices(_description(rig), []) if rig is not None else []

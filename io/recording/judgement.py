@@ -19,8 +19,11 @@ _GAP_INTERVALS = 1.5
 _NEIGHBOURS = 8
 """Readings on each side from which a value is predicted."""
 _FAR_RESIDUALS = 5.0
-"""Far from a parabola through the neighbours: more than so many times their largest residual."""
+"""Far from a quartic through the neighbours: more than so many times their largest residual."""
 _PAIRS = 5
+_CUBICS = ((1, 2), (3, 4), (1, 5), (2, 3), (4, 5))
+"""Distances of the four readings, on both sides, of each cubic: every distance twice."""
+_PASSES = 4
 _BLOCK = 32
 _QUANTILE = 0.8
 _MOTION = 3
@@ -69,10 +72,24 @@ def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) 
 
     t_s : (N,) increasing times in s. values : (N,) each. most : the largest second derivative in
     time that the values can have (an encoder's acceleration), which allows a value to differ.
-    A value is far if it is off a parabola through its neighbours by more than `_FAR_RESIDUALS`
+    A value is far if it is off a quartic through its neighbours by more than `_FAR_RESIDUALS`
     times their largest residual and times the resolution of the values. Only readings are tested
     that differ from those around them much more than these do, and those beside a gap or an end.
+    Readings that are found are taken away and the others tested again, because wrong readings near
+    each other hide each other.
     """
+    far = np.zeros(len(t_s), bool)
+    for _ in range(_PASSES):
+        left = np.flatnonzero(~far)
+        found = _far_at_first(t_s[left], [value[left] for value in values], most)
+        if not found.any():
+            break
+        far[left[found]] = True
+    return far
+
+
+def _far_at_first(t_s: Array, values: Sequence[Array], most: float) -> Bools:
+    """Return `far_from_neighbours` of one pass."""
     far = np.zeros(len(t_s), bool)
     step = np.diff(t_s)
     if step.size < 4 * _NEIGHBOURS:
@@ -84,7 +101,7 @@ def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) 
     before, after = np.append(step[0], step), np.append(step, step[-1])
     allowed = most / 2 * before * after
     for value in values:
-        rough = np.abs(_off_pairs(t_s, value))
+        rough = _roughness(t_s, value)
         differences = np.abs(np.diff(value))
         resolution = float(np.min(differences, where=differences > 0, initial=np.inf))
         if not np.isfinite(resolution):
@@ -96,23 +113,36 @@ def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) 
         tested = suspected | beside
         tested[:_PAIRS] = tested[-_PAIRS:] = True
         for i in np.flatnonzero(tested).tolist():
-            off, residual = _off_parabola(t_s, value, plain, i)
+            off, residual = _off_quartic(t_s, value, plain, i)
             off_value[i] = abs(off) > max(_FAR_RESIDUALS * max(residual, resolution), allowed[i])
         far |= _few_in_a_row(off_value)
     return far
 
 
-def _off_pairs(t_s: Array, value: Array) -> Array:
-    """(N,) each value minus the median of what the pairs of readings around it predict."""
-    out = np.zeros(len(value))
+def _roughness(t_s: Array, value: Array) -> Array:
+    """(N,) how far each value is from what the readings around it predict, at least.
+
+    It is the smaller one of the distances to two medians: that of the lines through `_PAIRS` pairs
+    of readings, which two wrong readings do not spoil, and that of `_CUBICS`, which follow motion.
+    """
     inner = slice(_PAIRS, len(value) - _PAIRS)
-    predicted = []
-    for k in range(1, _PAIRS + 1):
-        left, right = slice(_PAIRS - k, -_PAIRS - k), slice(_PAIRS + k, len(value) - _PAIRS + k)
-        share = (t_s[inner] - t_s[left]) / (t_s[right] - t_s[left])
-        predicted.append(value[left] + share * (value[right] - value[left]))
-    out[inner] = value[inner] - np.median(predicted, axis=0)
+    out = np.zeros(len(value))
+    lines = [_predicted(t_s, value, (-k, k)) for k in range(1, _PAIRS + 1)]
+    cubics = [_predicted(t_s, value, (-wide, -near, near, wide)) for near, wide in _CUBICS]
+    medians = [np.median(predicted, axis=0) for predicted in (lines, cubics)]
+    out[inner] = np.abs(value[inner] - medians).min(0)
     return out
+
+
+def _predicted(t_s: Array, value: Array, distances: Sequence[int]) -> Array:
+    """Return what the polynomial through the readings at some distances predicts (Lagrange)."""
+    places = [slice(_PAIRS + k, len(value) - _PAIRS + k) for k in distances]
+    times = [t_s[place] - t_s[_PAIRS : len(value) - _PAIRS] for place in places]
+    total = np.zeros(len(value) - 2 * _PAIRS)
+    for j, place in enumerate(places):
+        others = [time for k, time in enumerate(times) if k != j]
+        total += value[place] * np.prod([o / (o - times[j]) for o in others], axis=0)
+    return total
 
 
 def _scale(size: Array) -> Array:
@@ -136,14 +166,14 @@ def _few_in_a_row(far: Bools) -> Bools:
     return out
 
 
-def _off_parabola(t_s: Array, value: Array, plain: Bools, i: int) -> tuple[float, float]:
-    """Value i minus that of a parabola through its plain neighbours; their largest residual."""
+def _off_quartic(t_s: Array, value: Array, plain: Bools, i: int) -> tuple[float, float]:
+    """Value i minus that of a quartic through its plain neighbours; their largest residual."""
     window = np.arange(max(i - 2 * _NEIGHBOURS, 0), min(i + 2 * _NEIGHBOURS + 1, len(t_s)))
     near = window[plain[window] & (window != i)]
     near = near[np.argsort(np.abs(t_s[near] - t_s[i]), kind="stable")[: 2 * _NEIGHBOURS]]
     if len(near) <= _NEIGHBOURS:
         return 0.0, 0.0
     x, y = t_s[near] - t_s[i], value[near] - value[i]
-    powers = np.vander(x / np.max(np.abs(x)), 3)
+    powers = np.vander(x / np.max(np.abs(x)), 5)
     found, *_ = np.linalg.lstsq(powers, y, rcond=None)
     return -float(found[-1]), float(np.max(np.abs(powers @ found - y)))

@@ -27,10 +27,18 @@ from telerig.io.rig_file.description import DeviceDescription
 
 LOG_NAME = "recording.raw"
 FAILED_NAME = "recording.failed.raw"
+"""The log of a recording that was refused; it is kept, and can be replayed."""
+
 TICK_S = 0.5
 """Interval at which the log goes to the disk and the status is reported; a power cut costs this."""
 GARBAGE_S = 2.0
 """A line on which no reading comes for so long has the wrong baud rate, or another protocol."""
+
+
+def log_in(folder: Path) -> Path:
+    """Return the log of a recording's folder: that of a refused recording if there is no other."""
+    log, failed = folder / LOG_NAME, folder / FAILED_NAME
+    return failed if failed.is_file() and not log.is_file() else log
 
 
 class GarbageError(InputError):

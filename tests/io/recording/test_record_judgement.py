@@ -155,3 +155,25 @@ def test_garbage_counts_around_a_reading() -> None:
     amid = amid_garbage(spans, noise)
     assert amid[:46].all() and not amid[54:].any()
     assert not amid_garbage(spans, noise[:0]).any()
+
+
+@pytest.mark.parametrize("frequency_hz", [0.3, 1.0, 3.0])
+def test_one_line_in_twenty_that_lost_a_byte_leaves_hardly_a_wrong_position(
+    frequency_hz: float,
+) -> None:
+    rng = np.random.default_rng(7)
+    t_s = np.arange(2_000) / 100.0
+    true_mm = np.round(20 * np.sin(2 * np.pi * frequency_hz * t_s), 3)
+    read_mm, whole = true_mm.copy(), np.ones(len(t_s), bool)
+    for i in np.flatnonzero(rng.random(len(t_s)) < 0.05):
+        text = f"{true_mm[i]:.3f}"
+        lost = int(rng.integers(len(text)))
+        try:
+            read_mm[i] = float(text[:lost] + text[lost + 1 :])
+        except ValueError:
+            whole[i] = False
+    far = far_from_neighbours(t_s[whole], [read_mm[whole]])
+    off_mm = np.abs(read_mm - true_mm)[whole]
+    assert (off_mm > 1).sum() > 20
+    assert (off_mm[~far] > 1).sum() <= 0.02 * (off_mm > 1).sum() + 1
+    assert (off_mm[far] == 0).sum() <= 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from telerig.arrays import Array
 from telerig.errors import CalibrationError, TelerigError
@@ -44,7 +44,7 @@ def refuse_copies(problem: Problem) -> None:
         squares = ((uv[i + 1 :] - uv[i]) ** 2).sum(-1) / (variance[i + 1 :] + variance[i])
         common = np.isfinite(squares).sum(-1)
         total = np.nansum(squares, axis=-1)
-        copies = (common >= LEAST_DOTS) & (total < chi2.ppf(COPY_CHANCE, 2 * common))
+        copies = (common >= LEAST_DOTS) & (total < 2 * gammaincinv(common, COPY_CHANCE))
         if copies.any():
             (a, v), (b, w) = images[i], images[i + 1 + int(np.argmax(copies))]
             names = [

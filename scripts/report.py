@@ -55,6 +55,7 @@ def report(
     from telerig.io.report.film.files import need_av
     from telerig.io.report.film.run import write_films
     from telerig.io.report.remake import remake_report, results_folders
+    from telerig.io.results.stale import stale
 
     found = results_folders(folder)
     runs = [results for results in found if results.kind == "run"]
@@ -77,6 +78,8 @@ def report(
             if not quiet and len(found) > 1:
                 stage("reports", i, len(found))
             say(f"written: {remake_report(results, place)}")
+            for sentence in stale(results.folder):
+                say(f"warning: {sentence}")
             if film and results.kind == "run":
                 endings = ("mp4", "gif") if film_format is FilmFormat.both else (film_format.value,)
                 folder_of_films = (place or results.folder) / "film"

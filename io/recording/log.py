@@ -23,6 +23,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from telerig.arrays import Ints
 from telerig.errors import InputError
+from telerig.io.files.names import check_name
 from telerig.io.rig_file.description import DeviceDescription
 
 MAGIC = b"telerig recording 1\n"
@@ -191,11 +192,6 @@ def log_error(path: Path, error: OSError, *, recorded: bool = True) -> InputErro
     )
 
 
-def read_header(path: Path) -> LogHeader:
-    """Read the header of a raw log. Raises InputError for a file that is no log."""
-    return _open(path)[0]
-
-
 @dataclass(frozen=True)
 class LogScan:
     """Hold what a first look at a raw log has found.
@@ -315,6 +311,12 @@ def _open(path: Path) -> tuple[LogHeader, int]:
             where=str(path),
             todo="replay it with the version of telerig that recorded it, or a newer one",
         ) from error
+    for thing, names in (
+        ("device", [device.name for device in header.devices]),
+        ("camera", header.cameras),
+    ):
+        for name in names:
+            check_name(name, str(path), thing)
     return header, len(head) + length + _CRC.size
 
 

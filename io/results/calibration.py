@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     PositiveInt,
@@ -57,6 +58,10 @@ class Verdict(Part):
 
     status: Status
     reasons: tuple[str, ...] = ()
+
+
+_WIDEST = 10.0
+"""Largest residual perspective times rho_mm: the tangent of the half field angle of a lens."""
 
 
 class PoseRecord(Part):
@@ -117,6 +122,11 @@ class CameraRecord(Part):
         for name in ("scale_px_per_mm", "aspect"):
             if self.parameters.get(name, 1.0) <= 0:
                 raise ValueError(f"{name} is {self.parameters[name]:g}, it must be positive")
+        perspective = abs(self.parameters.get("kappa_per_mm", 0.0)) * self.rho_mm
+        if perspective > _WIDEST:
+            raise ValueError(
+                f"kappa_per_mm times rho_mm is {perspective:g}, more than any lens has"
+            )
         return self
 
 
@@ -244,6 +254,60 @@ class Stage(Part):
     notes: tuple[str, ...] = ()
 
 
+class SplitHalves(Part):
+    """Check the keys of the split-half check; each may be missing.
+
+    views : number of views in each half. points_mm, shift_um, sd_um : (points, 3) each.
+    """
+
+    words: str = ""
+    agree: bool = True
+    views: tuple[int, int] = (0, 0)
+    points_mm: Points3 | None = None
+    shift_um: Points3 | None = None
+    sd_um: Points3 | None = None
+
+
+class Structure(Part):
+    """Check the keys of the tests of the residuals; each may be missing."""
+
+    words: tuple[str, ...] = ()
+    sound: bool = True
+
+
+class NextPose(Part):
+    """Check one proposed pose of the target; after_um : the error that it leaves, in um."""
+
+    words: str
+    reasons: tuple[str, ...] = ()
+    after_um: float
+    rig_from_target: Square
+
+
+class NextView(Part):
+    """Check the keys of the recommended next view; each may be missing."""
+
+    words: str = ""
+    verdict: str = ""
+    views: int = 0
+    before_um: float = 0.0
+    after_um: float = 0.0
+    enough: bool = False
+    size_um: float = 0.0
+    marks: tuple[int, ...] = ()
+    poses: tuple[NextPose, ...] = ()
+
+
+def _checked(part: type[Part]) -> AfterValidator:
+    """Return a validator that checks a dictionary as a ``part`` and leaves it as it is."""
+
+    def check(value: dict[str, Any]) -> dict[str, Any]:
+        part.model_validate(value)
+        return value
+
+    return AfterValidator(check)
+
+
 class Diagnostics(Part):
     """Hold further findings of a calibration, which the report shows.
 
@@ -256,9 +320,9 @@ class Diagnostics(Part):
     gauge: str = ""
     weak: tuple[str, ...] = ()
     tilts_deg: dict[str, float | None] = Field(default_factory=dict)
-    halves: dict[str, Any] = Field(default_factory=dict)
-    structure: dict[str, Any] = Field(default_factory=dict)
-    next_view: dict[str, Any] = Field(default_factory=dict)
+    halves: Annotated[dict[str, Any], _checked(SplitHalves)] = Field(default_factory=dict)
+    structure: Annotated[dict[str, Any], _checked(Structure)] = Field(default_factory=dict)
+    next_view: Annotated[dict[str, Any], _checked(NextView)] = Field(default_factory=dict)
 
 
 class CalibrationFile(Record):

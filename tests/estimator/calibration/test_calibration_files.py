@@ -201,6 +201,10 @@ def test_damaged_files(change: Any, saved: Path) -> None:
     [
         (lambda d: d["cameras"]["left"]["parameters"].update(scale_px_per_mm=0), "positive"),
         (lambda d: d["cameras"]["left"]["parameters"].update(aspect=-1), "positive"),
+        (lambda d: d["cameras"]["left"]["parameters"].update(kappa_per_mm=1e10), "any lens"),
+        (lambda d: d["diagnostics"].update(next_view={"poses": 5}), "next_view.*poses"),
+        (lambda d: d["diagnostics"].update(halves={"views": "x"}), "halves.*views"),
+        (lambda d: d["diagnostics"].update(structure={"words": 3}), "structure.*words"),
         (lambda d: d["cameras"]["left"].update(free=["zoom"]), "no parameter"),
         (lambda d: d["cameras"]["left"].update(standard_deviations={"zoom": 1}), "no parameter"),
         (lambda d: d["covariance"]["matrix"][0].__setitem__(0, -1), "variance is negative"),
@@ -216,6 +220,7 @@ def test_damaged_files(change: Any, saved: Path) -> None:
 )
 def test_cameras_and_covariances_that_cannot_be(change: Any, words: str, saved: Path) -> None:
     content = json.loads((saved / "calibration.json").read_text())
+    content.setdefault("diagnostics", {})
     change(content)
     (saved / "calibration.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=words):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,8 @@ from telerig.io.recording.log import (
     LogHeader,
     RawLog,
     damaged_bytes,
-    read_header,
     read_log,
+    scan_log,
 )
 from telerig.io.rig_file.description import DeviceDescription
 
@@ -49,7 +50,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def test_what_is_written_reads_back(log: Path) -> None:
-    assert read_header(log) == HEADER
+    assert scan_log(log).header == HEADER
     assert list(read_log(log)) == entries()
     assert damaged_bytes(log) == 0
 
@@ -131,9 +132,9 @@ def test_what_is_no_log(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "x.raw"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
-        read_header(path)
+        scan_log(path)
     with pytest.raises(InputError, match="check the path"):
-        read_header(tmp_path / "absent.raw")
+        scan_log(tmp_path / "absent.raw")
 
 
 @pytest.mark.parametrize(
@@ -145,7 +146,15 @@ def test_a_sound_header_of_another_version(tmp_path: Path, text: bytes) -> None:
     length, crc = (n.to_bytes(4, "little") for n in (len(text), zlib.crc32(text)))
     path.write_bytes(b"telerig recording 1\n" + length + text + crc)
     with pytest.raises(InputError, match="does not know"):
-        read_header(path)
+        scan_log(path)
+
+
+@pytest.mark.parametrize("name", ["a,b\nc", "../x", ""])
+def test_a_device_with_a_harmful_name_in_the_header(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "x.raw"
+    RawLog(path, replace(HEADER, devices=(replace(DEVICES[0], name=name),)))
+    with pytest.raises(InputError, match="device"):
+        scan_log(path)
 
 
 def test_a_damaged_header(log: Path) -> None:
@@ -153,4 +162,4 @@ def test_a_damaged_header(log: Path) -> None:
     data[60] ^= 1
     log.write_bytes(data)
     with pytest.raises(InputError, match="damaged header"):
-        read_header(log)
+        scan_log(log)

@@ -43,6 +43,13 @@ Medium = Annotated[
         help="Where the target was: air or water. With [walls] in rig.toml, runs are in water."
     ),
 ]
+AcceptedFaults = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--accept",
+        help="Code of a fault of a sensor that is to be used as it is. The refusal names it.",
+    ),
+]
 Report = Annotated[bool, typer.Option(help="Write report.html.")]
 Quiet = Annotated[bool, typer.Option(help="Print the summary only.")]
 

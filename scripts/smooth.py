@@ -40,6 +40,7 @@ def smooth(
             help="Estimate how the cameras have moved against each other since the calibration.",
         ),
     ] = False,
+    accept: options.AcceptedFaults = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
@@ -67,7 +68,8 @@ def smooth(
     with progress(quiet) as stage:
         found = smooth_run(
             data, calibrated, tracks or folder, folder, model=model, inputs=files,
-            refine_rig=refine_rig, report=report, stage=stage, again=typed_command(),
+            refine_rig=refine_rig, accept=accept or (), report=report, stage=stage,
+            again=typed_command(),
         )  # fmt: skip
     say(smoothing_words(found))
     say_written(folder, report)

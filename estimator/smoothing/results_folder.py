@@ -44,6 +44,7 @@ def smooth_run(
     *,
     model: str = "auto",
     refine_rig: bool = False,
+    accept: Sequence[str] = (),
     inputs: Sequence[Path] = (),
     report: bool = True,
     stage: Stage | None = None,
@@ -52,7 +53,7 @@ def smooth_run(
     """Smooth and write trajectories.csv, shake.csv, smoothing.json, results.h5, run.json, report.
 
     tracks : `tracks.csv`, or the folder that `telerig track` wrote.
-    refine_rig : see `telerig.smooth`.
+    refine_rig, accept : see `telerig.smooth`.
     inputs : the files of the calibration.
     again : the command line that makes the files again; "" for `telerig smooth` of the run.
     Files appear together at the end. Raises InputError when there are no tracks, or
@@ -75,13 +76,14 @@ def smooth_run(
     ]
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
     found = smooth(
-        followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig
-    )
+        followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig,
+        accept=accept,
+    )  # fmt: skip
     found = replace(found, summary={**found.summary, "warnings": warnings})
     tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
     record = run_record(
         "smooth", run.path, [*tables, source, *marks, *inputs],
-        {"model": model, "refine_rig": refine_rig},
+        {"model": model, "refine_rig": refine_rig, "accept": list(accept)},
         {"smooth": time.perf_counter() - begun},
     )  # fmt: skip
     if tracked.content():

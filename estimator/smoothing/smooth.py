@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import pair_of_run
+from telerig.estimator.sensors.findings import accepted_codes
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
@@ -75,6 +76,7 @@ def smooth(
     options: Options | None = None,
     progress: Progress | None = None,
     refine_rig: bool | DriftPrior = False,
+    accept: Iterable[str] = (),
 ) -> Smoothing:
     """Smooth a run: estimate every bubble's motion in the laboratory frame and every camera's
     shake.
@@ -100,9 +102,13 @@ def smooth(
     refine_rig : whether to estimate also how the cameras have moved relative to each other since
         the calibration (``summary["rig_change"]``); a `DriftPrior` states how far they may have
         moved.
+    accept : codes of faults that are used as they are, where they would be refused (the error
+        names its code).
 
-    Raises InputError for tables that cannot be used together.
+    Raises InputError for tables that cannot be used together, `SensorError` for a sensor that
+    contradicts the others.
     """
+    accepted = accepted_codes(accept)
     table = getattr(tracks, "table", tracks)
     calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
     refinement = refinement_of(table, calibration, refine_rig)
@@ -122,6 +128,7 @@ def smooth(
             solution = with_hyperparameter_uncertainty(solution)
     verdict = judge(problem, chosen, solution)
     summary = summary_of(solution)
+    summary["accepted"] = sorted(accepted)
     change = refined_change(solution, calibration)
     if change is not None:
         words = change_words(change, problem.cameras[0].name)

@@ -169,6 +169,7 @@ class SmoothingFile(Record):
     bubble_means: dict[str, Any] = Field(default_factory=dict)
     rig_change: RigChange | None = None
     warnings: tuple[str, ...] = ()
+    accepted: tuple[str, ...] = ()
 
 
 def _optional(names: Sequence[str]) -> list[Column]:

@@ -17,12 +17,14 @@ class TelerigError(Exception):
     what : the fault.
     where : the file, row, camera, view, frame or dot in which it is.
     todo : what the user can do about it.
+    code : the name by which a user can accept the fault (`--accept CODE`); "" if nobody can.
 
     Parts longer than `LONGEST_BYTES` are cut, and control characters are shown as escapes, because
     a terminal would obey them.
     """
 
-    def __init__(self, what: str, *, where: str = "", todo: str = "") -> None:
+    def __init__(self, what: str, *, where: str = "", todo: str = "", code: str = "") -> None:
+        self.code = code
         self.what, self.where = _printable(what, "what"), _printable(where, "where")
         self.todo = _printable(todo, "todo")
         parts = [f"{self.where}: {self.what}" if where else self.what]
@@ -31,7 +33,7 @@ class TelerigError(Exception):
         super().__init__("\n  -> ".join(parts))
 
     def __reduce__(self) -> tuple[object, ...]:
-        return (_rebuild, (type(self), self.what, self.where, self.todo))
+        return (_rebuild, (type(self), self.what, self.where, self.todo, self.code))
 
 
 def _printable(text: str, part: str) -> str:
@@ -48,8 +50,8 @@ def _printable(text: str, part: str) -> str:
     return encoded[: longest - len(end)].decode("utf-8", "ignore") + end
 
 
-def _rebuild(kind: type[TelerigError], what: str, where: str, todo: str) -> TelerigError:
-    return kind(what, where=where, todo=todo)
+def _rebuild(kind: type[TelerigError], what: str, where: str, todo: str, code: str) -> TelerigError:
+    return kind(what, where=where, todo=todo, code=code)
 
 
 class InputError(TelerigError):

@@ -235,6 +235,8 @@ class Accelerometer:
     sigma_mm_s2 : noise standard deviation of one sample along each axis.
     bias_sigma_mm_s2 : prior standard deviation of the bias along each axis.
     delay_s : a sample with time t was measured at t - delay_s.
+    clock : "frames" if its times are those of the frames' clock, apart from a small delay;
+        "unknown" if only an alignment with the images can place it.
     """
 
     name: str
@@ -245,6 +247,7 @@ class Accelerometer:
     sigma_mm_s2: float
     bias_sigma_mm_s2: float = 200.0
     delay_s: float = 0.0
+    clock: Literal["frames", "unknown"] = "frames"
 
 
 @dataclass(frozen=True)

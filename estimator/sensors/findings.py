@@ -1,0 +1,103 @@
+"""What the checks of the sensors find, and what becomes of it: a warning, a refusal, acceptance.
+
+A check returns findings. `settled` raises the first refusal that the user has not accepted, and
+returns the rest as warnings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from telerig.errors import InputError, suggestion
+
+
+class Code(StrEnum):
+    """Name every fault that is refused, and that a user can accept by its name."""
+
+    SENSOR_UNIT = "SENSOR_UNIT"
+    SENSOR_GRAVITY = "SENSOR_GRAVITY"
+    SENSOR_AXES = "SENSOR_AXES"
+    SENSOR_MOUNT = "SENSOR_MOUNT"
+    SENSOR_SCALE = "SENSOR_SCALE"
+    SENSOR_CLOCK = "SENSOR_CLOCK"
+    ENCODER_SIGN = "ENCODER_SIGN"
+    ENCODER_UNIT = "ENCODER_UNIT"
+    ENCODER_STUCK = "ENCODER_STUCK"
+    ENCODER_SCALE = "ENCODER_SCALE"
+    ENCODER_JUMP = "ENCODER_JUMP"
+    ENCODER_CLOCK = "ENCODER_CLOCK"
+    FRAME_TIMES = "FRAME_TIMES"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Describe what a check found.
+
+    words : the fault, as a sentence without its place.
+    where : the file, sensor or row in which it is.
+    todo : what the user can do about it.
+    code : the code of a fault that is refused unless it is accepted; None for a warning.
+    fix : the correction as data, for programs: {"sensor": name, "unit": "g"}, {"sensor": name,
+        "axes": rows}, {"sensor": name, "mounted_on": camera}, {"encoder_factor": -1.0}, ...;
+        empty if there is none.
+    """
+
+    words: str
+    where: str = ""
+    todo: str = ""
+    code: Code | None = None
+    fix: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def warning(self) -> str:
+        """The finding as a warning in one line."""
+        place = f"{self.where}: " if self.where else ""
+        return f"{place}{self.words}" + (f"; {self.todo}" if self.todo else "")
+
+
+class SensorError(InputError):
+    """A sensor's record contradicts the images, the description of the rig, or another sensor.
+
+    findings : every refused finding, of which the message shows the first.
+    """
+
+    def __init__(self, *args: Any, findings: Sequence[Finding] = (), **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.findings = tuple(findings)
+
+
+def accepted_codes(accept: Iterable[str]) -> frozenset[Code]:
+    """Return the codes that a user accepts. Raises InputError for an unknown code."""
+    words = [accept] if isinstance(accept, str) else list(accept)
+    known = [str(code) for code in Code]
+    for word in words:
+        if word not in known:
+            raise InputError(
+                f"accept: there is no code {word!r}", todo=suggestion(str(word), known)
+            )
+    return frozenset(Code(word) for word in words)
+
+
+def settled(findings: Sequence[Finding], accept: frozenset[Code]) -> list[str]:
+    """Return the findings as warnings.
+
+    accept : the codes whose faults are used as they are; their warnings say so.
+
+    Raises SensorError if a finding has a code that is not accepted.
+    """
+    refused = [f for f in findings if f.code is not None and f.code not in accept]
+    if refused:
+        first = refused[0]
+        more = f" (and {len(refused) - 1} more faults)" if len(refused) > 1 else ""
+        raise SensorError(
+            first.words + more, where=first.where, code=str(first.code), findings=refused,
+            todo=f"{first.todo}. To use it as it is: --accept {first.code}",
+        )  # fmt: skip
+    out = []
+    for finding in findings:
+        end = f" (accepted: {finding.code})" if finding.code is not None else ""
+        out.append(finding.warning + end)
+    return list(dict.fromkeys(out))

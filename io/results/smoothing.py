@@ -21,11 +21,15 @@ A leading "s" marks the standard deviation, "naive_" and "rts_" two simpler esti
 
 
 class Verdict(StrEnum):
-    """Name whether a run can separate the bubbles' motion from the rig's shake, best case first."""
+    """Name whether a run can separate the bubbles' motion from the rig's shake, best case first.
+
+    CONTRADICTED means that the measurements disagree, so that no standard deviation can be right.
+    """
 
     RESOLVED = "RESOLVED"
     PARTIAL = "PARTIAL"
     UNRESOLVED = "UNRESOLVED"
+    CONTRADICTED = "CONTRADICTED"
 
 
 class Flag(StrEnum):
@@ -41,6 +45,35 @@ class Remedy(StrEnum):
     STRIP = "strip"
     ARMS = "arms"
     LONGER = "longer"
+
+
+class Disagreement(StrEnum):
+    """Name the test that showed a contradiction."""
+
+    RESIDUALS = "residuals"
+    OUTLIERS = "outliers"
+    BIAS = "bias"
+    DELAY = "delay"
+    MOTION = "motion"
+    SPEED = "speed"
+
+
+class Quantity(StrEnum):
+    """Name a quantity of the bubbles for which a run may be good."""
+
+    MEAN_VELOCITY = "mean velocity"
+    PATH = "path"
+    ZIGZAG_AMPLITUDE = "zigzag amplitude"
+    ZIGZAG_FREQUENCY = "zigzag frequency"
+    VELOCITY = "velocity"
+
+
+class Grade(StrEnum):
+    """Name how well a run determines a quantity, best case first."""
+
+    GOOD = "good"
+    LIMITED = "limited"
+    NO = "no"
 
 
 class Place(StrEnum):
@@ -91,6 +124,45 @@ class AxisVerdict(Part):
     words: str = ""
 
 
+class Contradiction(Part):
+    """Hold a source of measurements that disagrees with others.
+
+    source : "bubbles", "marks", "encoder", or the name of an accelerometer.
+    axis : axis of the rig or of the sensor; "" for all.
+    from_s, to_s : the first and the last time at which they disagree.
+    statistic : the test's value divided by the one that is expected, as a factor of standard
+        deviations.
+    test : the test that showed it; None in files of other programs.
+    against : the sources with which it disagrees; () if that was not found out.
+    """
+
+    source: str
+    axis: str = ""
+    from_s: float
+    to_s: float
+    statistic: float
+    test: Disagreement | None = None
+    against: tuple[str, ...] = ()
+
+
+class Use(Part):
+    """Hold how well a run determines one quantity of the bubbles.
+
+    axis : axis of the rig.  value : the median over the bubbles; None if there is none.
+    sd : standard deviation of the quantity of a typical bubble; None if it is not known.
+    unit : unit of both.
+    below_hz : the frequency up to which ``sd`` counts, for a path; None for other quantities.
+    """
+
+    quantity: Quantity
+    axis: str
+    value: float | None = None
+    sd: float | None = None
+    unit: str
+    grade: Grade
+    below_hz: float | None = None
+
+
 class Mode(Part):
     """Hold a vibration of the rig: one of the model, or a peak in the estimated shake's spectrum.
 
@@ -128,6 +200,10 @@ class SmoothingFile(Record):
     """Hold the content of smoothing.json, the result of smoothing a run.
 
     verdict, flags, axes : the verdict of the run, what qualifies it, and the verdict by axis.
+    contradictions : the sources that disagree, the worst first.
+    inflation : factor by which standard deviations in the tables have been multiplied because of
+        contradictions; 1 without.
+    usable_for : what this run is good for, by quantity and axis.
     words, remedy : the verdict as a sentence, and what to do about it.
     vertical, remedies : the axis nearest to the vertical, and the remedy as codes; "" and () in
     older files.
@@ -144,6 +220,9 @@ class SmoothingFile(Record):
     verdict: Verdict | None = None
     flags: tuple[str, ...] = ()
     axes: dict[str, AxisVerdict] = Field(default_factory=dict)
+    contradictions: tuple[Contradiction, ...] = ()
+    inflation: float = 1.0
+    usable_for: tuple[Use, ...] = ()
     words: str = ""
     remedy: str = ""
     remedies: tuple[Remedy, ...] = ()

@@ -45,6 +45,12 @@ VERDICT_WORDS = {
         "interpret any motion as fast as the shake.",
         "bubble motion and shake cannot be separated",
     ),
+    Verdict.CONTRADICTED: VerdictWords(
+        "CONTRADICTED: the measurements of this run disagree with each other",
+        "At least one record is wrong, or was taken at another time or on another axis than stated. "
+        "Do not use these results before this is found.",
+        "the measurements disagree",
+    ),
 }
 
 NOT_JUDGED = VerdictWords(

@@ -71,6 +71,7 @@ _COLOURS = {
     Verdict.RESOLVED: "good",
     Verdict.PARTIAL: "usable",
     Verdict.UNRESOLVED: "rejected",
+    Verdict.CONTRADICTED: "rejected",
 }
 _HARMLESS = {Flag.SHAKE_BELOW_NOISE}
 _HEADS = {

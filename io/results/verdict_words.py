@@ -47,8 +47,8 @@ VERDICT_WORDS = {
     ),
     Verdict.CONTRADICTED: VerdictWords(
         "CONTRADICTED: the measurements of this run disagree with each other",
-        "At least one record is wrong, or belongs to another time or another axis than stated. Do not "
-        "use these results before it is found.",
+        "At least one record is wrong, or belongs to another time or another axis than stated. Do "
+        "not use these results before it is found.",
         "the measurements disagree",
     ),
 }

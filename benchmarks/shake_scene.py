@@ -72,7 +72,8 @@ class Case:
 
     scale_sigma : what rig.toml states of the encoder's scale, 0 exact, None nothing.
     angle_deg between the cameras.  kappa_per_mm of both.  nonlinear : one of ``NONLINEAR``.
-    force_hz : corner of what shakes the rig.
+    force_hz : corner of what shakes the rig.  around_s : how long encoder and accelerometers record
+    before the first and after the last frame; the stage starts and stops within that time.
     """
 
     scenario: Scenario
@@ -86,6 +87,7 @@ class Case:
     scale_sigma: float | None = 0.0
     ramp_s: float = 0.0
     force_hz: float = FORCE_HZ
+    around_s: float = 0.0
 
     @property
     def name(self) -> str:
@@ -159,14 +161,15 @@ def simulate(
     scenario = case.scenario
     true = cameras(case) if rig is None else rig[0]
     thin = round(SAMPLE_HZ / scenario.rate_hz)
-    steps = (scenario.frames - 1) * thin + 1
-    t = np.arange(steps) * H
+    steps, lead = (scenario.frames - 1) * thin + 1, round(case.around_s * scenario.rate_hz) * thin
+    t = np.arange(-lead, steps + lead) * H
     told = Calibration(true, np.zeros(0, int), np.zeros((0, 3)), {}, np.zeros((6, 6)), (), ((), ()))
     carriage, push = _carriage(case, t, rng)
-    common, own = _shake(case, t, rng)
+    common, own = _shake(case, t - t[0], rng)
     offset = common.offset_mm + own.offset_mm
-    place, velocity = _bubbles(case, t, rng)
-    frames = slice(None, None, thin)
+    seen_s = t[lead : lead + steps]
+    place, velocity = (moving[:, ::thin] for moving in _bubbles(case, seen_s, rng))
+    frames = slice(lead, lead + steps, thin)
     moved = carriage[frames, None] * UP + offset[:, frames]
     noise = scenario.noise_px * rng.standard_normal((2, 5, scenario.frames, 2))
     spoiled = rng.random((2, 5, scenario.frames)) < case.outliers
@@ -175,7 +178,7 @@ def simulate(
     kept[:, [0, -1]] = True
     calibration = told if rig is None else rig[1]
     seen, calm = (
-        _tracks(calibration, true, t[frames], place[:, frames], away, noise, kept, scenario)
+        _tracks(calibration, true, t[frames], place, away, noise, kept, scenario)
         for away in (moved, np.broadcast_to(carriage[frames, None] * UP, moved.shape))
     )
     return Run(
@@ -183,20 +186,42 @@ def simulate(
         _stage(case, t, carriage, rng),
         _accelerometers(case, t, push, common, own, rng),
         _references(true, t[frames], moved, rng),
-        place[:, frames], velocity[:, frames], offset[:, frames],
+        place, velocity, offset[:, frames],
     )  # fmt: skip
 
 
 def _carriage(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
     """Position and acceleration along the axis, the servo's error included."""
     place, push = RISE_MM_S * t, np.zeros_like(t)
-    if case.ramp_s > 0:
+    if case.around_s > 0:
+        place, push = _started_and_stopped(t, case.around_s)
+    elif case.ramp_s > 0:
         from telerig.io.simulation.run.motion import stage_trajectory
 
         place, _, push = stage_trajectory(t, RISE_MM_S, case.ramp_s)
     servo = rig_mode(*SERVO, FORCE_HZ)
     states = servo.paths(H, len(t), rng)[0]
     return place + states[:, 0], push + mode_acceleration(states, servo)
+
+
+def _started_and_stopped(t: Array, around_s: float) -> tuple[Array, Array]:
+    """Position (0 at t = 0) and acceleration of a stage that rises at a steady speed from 1 s before
+    the run to 1 s after it, or to half of that margin if this is less, with ramps of 0.3 s."""
+    ramp, margin = 0.3, min(1.0, around_s / 2)
+    first, last = -margin, t[-1] - around_s + margin
+
+    def risen(s: Array) -> tuple[Array, Array]:
+        """Travel and acceleration for a speed that rises from 0 to 1 between s = 0 and s = ramp."""
+        w = np.pi / ramp
+        during = (s > 0) & (s < ramp)
+        travel = np.where(s >= ramp, s - ramp / 2, 0.0)
+        travel = np.where(during, s / 2 - np.sin(w * s) / (2 * w), travel)
+        return travel, np.where(during, w / 2 * np.sin(w * s), 0.0)
+
+    up, faster = risen(t - first + ramp)
+    down, slower = risen(t - last)
+    start = np.interp(0.0, t, up - down)
+    return RISE_MM_S * (up - down - start), RISE_MM_S * (faster - slower)
 
 
 def _bubbles(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:

@@ -80,7 +80,7 @@ class Score:
 
 
 def score(run: Run, table: Any) -> Score:
-    """table : trajectories, or None for an infinite error."""
+    """Score of a table of trajectories. The standard deviations are those of its columns."""
     inner = middle(len(run.t_s))
     frame, bubble = table["frame"].to_numpy(), table["particle"].to_numpy()
     keep = (frame >= inner.start) & (frame < inner.stop)
@@ -148,7 +148,7 @@ def judged(run: Run, inputs: Inputs, fault: Fault, configuration: str, clean: Sc
             said.append(str(error))
             codes.append(error.code)
             return refused()
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - to be counted is what they are here for
             return Outcome(Class.BARE, said=f"{type(error).__name__}: {error}")
     else:
         return refused()
@@ -158,7 +158,7 @@ def judged(run: Run, inputs: Inputs, fault: Fault, configuration: str, clean: Sc
     used = _used(summary)
     left_out = tuple(name for name in inputs["accelerometers"] if name not in used)
     axes = [str(verdict.get("axes", {}).get(a, {}).get("verdict", "")) for a in "xyz"]
-    kind = _class(fault, configuration, found, clean, verdict, axes, left_out, said, run)
+    kind = _class(fault, configuration, found, clean, verdict, axes, left_out, said)
     return Outcome(
         kind, " ".join([str(verdict.get("verdict", "")), *axes]), found.total_um,
         found.total_um / clean.total_um, found.total_nees,
@@ -197,7 +197,6 @@ def _class(
     axes: list[str],
     left_out: tuple[str, ...],
     said: list[str],
-    run: Run,
 ) -> Class:
     if found.total_um <= LARGER * clean.total_um:
         return Class.MENDED
@@ -206,7 +205,7 @@ def _class(
     outside = (found.nees > HONEST) & (found.nees > LARGER * clean.nees)
     wrong = np.array([axis == "RESOLVED" for axis in axes]) & larger & outside
     if configuration in fault.hidden:
-        return Class.HIDDEN if _says_so(verdict, found, run) else Class.WRONG
+        return Class.HIDDEN if _says_so(verdict, found) else Class.WRONG
     if (whole == "RESOLVED" and found.total_nees > HONEST) or (
         whole != "CONTRADICTED" and any(wrong)
     ):
@@ -218,12 +217,10 @@ def _class(
     return Class.OWNED_UP if named(fault, said) else Class.UNNAMED
 
 
-def _says_so(verdict: Mapping[str, Any], found: Score, run: Run) -> bool:
+def _says_so(verdict: Mapping[str, Any], found: Score) -> bool:
     """Whether ``usable_for`` grades the path or the mean rise of the vertical axis below "good", or
-    states a standard deviation that covers the error of the mean rise."""
-    uses = [u for u in verdict.get("usable_for", ()) if u.get("axis") == verdict.get("vertical")]
-    return any(
-        use["grade"] != "good"
-        for use in uses
-        if "path" in use["quantity"] or "mean" in use["quantity"]
-    ) or (bool(uses) and found.total_nees <= HONEST)
+    the stated standard deviations cover the error."""
+    uses = [u for u in verdict.get("usable_for", ()) if u["axis"] == verdict.get("vertical")]
+    of_place = [u for u in uses if "path" in u["quantity"] or "mean" in u["quantity"]]
+    honest = bool(of_place) and found.total_nees <= HONEST
+    return honest or any(use["grade"] != "good" for use in of_place)

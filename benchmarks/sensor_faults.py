@@ -227,7 +227,8 @@ def alarms(options: argparse.Namespace) -> pd.DataFrame:
 
 def alarm_report(table: pd.DataFrame) -> str:
     lines = [
-        "| scenario | configuration | clock | runs | alarms | vertical um | possible | ratio | NEES |",
+        "| scenario | configuration | clock | runs | alarms | vertical um | possible | ratio "
+        "| NEES |",
         "|" + "---|" * 9,
     ]
     possible = {
@@ -279,8 +280,11 @@ def offsets(options: argparse.Namespace) -> pd.DataFrame:
                 found = entry.get("offset_s", entry.get("delay_s", np.nan))
                 found = np.nan if found is None else found
                 rows.append(
-                    row | {"sensor": name, "confirmed": bool(entry.get("confirmed", False)),
-                    "off_ms": 1e3 * (found - true), "sd_ms": 1e3 * (entry.get("offset_sd_s") or np.nan)}
+                    row | {
+                        "sensor": name, "confirmed": bool(entry.get("confirmed", False)),
+                        "off_ms": 1e3 * (found - true),
+                        "sd_ms": 1e3 * (entry.get("offset_sd_s") or np.nan),
+                    }
                 )  # fmt: skip
         print(rows[-1], flush=True)
         written(rows, options)
@@ -289,7 +293,8 @@ def offsets(options: argparse.Namespace) -> pd.DataFrame:
 
 def offset_report(table: pd.DataFrame) -> str:
     lines = [
-        "| scenario | configuration | sensors | confirmed | RMS ms | worst ms | within 0.2 ms | 1 ms |",
+        "| scenario | configuration | sensors | confirmed | RMS ms | worst ms | within 0.2 ms "
+        "| 1 ms |",
         "|" + "---|" * 8,
     ]
     for keys, rows in table.groupby(["scenario", "configuration"], sort=False):

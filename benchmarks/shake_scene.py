@@ -205,8 +205,8 @@ def _carriage(case: Case, t: Array, rng: Generator) -> tuple[Array, Array]:
 
 
 def _started_and_stopped(t: Array, around_s: float) -> tuple[Array, Array]:
-    """Position (0 at t = 0) and acceleration of a stage that rises at a steady speed from 1 s before
-    the run to 1 s after it, or to half of that margin if this is less, with ramps of 0.3 s."""
+    """Position (0 at t = 0) and acceleration of a stage that starts and stops in 0.3 s, 1 s away
+    from the run or half of around_s if this is less, and rises at a steady speed between."""
     ramp, margin = 0.3, min(1.0, around_s / 2)
     first, last = -margin, t[-1] - around_s + margin
 

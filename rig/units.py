@@ -8,3 +8,13 @@ STANDARD_GRAVITY_M_S2 = 9.80665
 A sensor that reads in g uses this value everywhere on Earth. The local gravity of a laboratory
 differs from it by up to 0.03 m/s^2 and is given in rig.toml, `[stage] gravity_m_s2`.
 """
+
+ACCELERATION_UNITS = {
+    "m/s^2": 1.0,
+    "g": STANDARD_GRAVITY_M_S2,
+    "mg": STANDARD_GRAVITY_M_S2 / 1000,
+    "mm/s^2": 0.001,
+    "cm/s^2": 0.01,
+    "ft/s^2": 0.3048,
+}
+"""The units in which accelerometers may be read, and the size of each in m/s^2."""

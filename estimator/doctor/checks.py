@@ -274,9 +274,10 @@ def _clocks(run: RunData, what: str) -> Iterator[Check]:
 def _sensors(run: RunData, what: str) -> Iterator[Check]:
     """Check the run's sensors and list them with their sampling rates."""
     from telerig.estimator.sensors.checks import check_sensors
+    from telerig.estimator.sensors.findings import settled
 
     try:
-        warnings = check_sensors(run)
+        warnings = settled(check_sensors(run), frozenset())
     except TelerigError as error:
         yield _failure(f"{what} sensors", error)
         return

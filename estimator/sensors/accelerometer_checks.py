@@ -1,62 +1,37 @@
-"""Checks an accelerometer's record for a wrong unit, removed gravity, clipping and wrong axes."""
+"""Checks an accelerometer's record for a wrong unit, removed gravity and wrong axes."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
-from telerig.errors import InputError
-from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.estimator.sensors.findings import Code, Finding
+from telerig.estimator.sensors.given import Sensor, unit_of_gravity
+from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
 
-_UNITS = (
-    ("g", 1.0),
-    ("mm/s^2", 1000 * STANDARD_GRAVITY_M_S2),
-    ("mg or cm/s^2", 1000.0),
-    ("ft/s^2", STANDARD_GRAVITY_M_S2 / 0.3048),
-)
-"""The units that are recognised, with the value of gravity in each. They differ so much that an
-error of the reading at rest by a factor of 1.5 does no harm; a strong acceleration at the start of
-a short record can cause such an error. mg and cm/s^2 are named together, because they differ by
-only 2 %, less than the effect of a usual bias."""
-
-_WITHIN = 1.5
 _FLOATING_M_S2 = 0.6
-_CLIPPED_LEAST = 5
-_CLIPPED_EXCESS = 3
+_DOUBLED = (1.8, 2.2)
+_FIT = 1.5
 _TILTED_DEG = 20.0
 _FITS_DEG = 15.0
 _CLEAR = 0.6
 _SMOOTHED_S = 0.03
 
 
-def check_accelerometer(t_s: ArrayLike, reading_m_s2: ArrayLike, *, where: str) -> list[str]:
-    """Return warnings about the readings of one sensor.
+def check_accelerometer(sensor: Sensor, up: ArrayLike, gravity_m_s2: float) -> list[Finding]:
+    """Return what is wrong with unit, gravity and axes of one sensor.
 
-    t_s : (N,) times.
-    reading_m_s2 : (N, 3).
-    where : file and sensor, for the messages.
-
-    Raises InputError for a wrong unit, for readings without gravity and for values that are not
-    finite.
+    up : (3,) upward direction in rig axes.  gravity_m_s2 : of the laboratory.
     """
-    t, reading = np.asarray(t_s, float), np.asarray(reading_m_s2, float).reshape(-1, 3)
-    finite = np.isfinite(t) & np.isfinite(reading).all(1)
-    if not finite.all():
-        row = int(np.flatnonzero(~finite)[0])
-        raise InputError(f"sample {row} is not finite", where=where, todo="leave it out")
-    _check_gravity(float(np.linalg.norm(gravity_of(reading))), where)
-    words = [
-        f"{where}: {found.count} of {len(t)} samples of a{'xyz'[found.axis]} are clipped at "
-        f"{found.value:.4g} m/s^2, the first at {t[found.first]:.6g} s. The sensor's range is too "
-        "small: leave those rows out, or choose a wider range"
-        for found in clippings(reading)
-    ]
-    dead = np.flatnonzero(np.ptp(reading, axis=0) == 0)
-    return words + [
-        f"{where}: a{'xyz'[axis]} never changes: the sensor is stuck, or not connected"
+    found = _check_gravity(sensor, np.asarray(up, float), gravity_m_s2)
+    if not found:
+        found = check_axes(sensor, up)
+    dead = np.flatnonzero(np.ptp(sensor.reading_m_s2, axis=0) == 0)
+    return found + [
+        Finding(
+            f"a{'xyz'[axis]} never changes: the sensor is stuck, or not connected", sensor.where
+        )
         for axis in dead
     ]
 
@@ -69,84 +44,81 @@ def gravity_of(reading: ArrayLike) -> Array:
     return np.asarray(np.median(np.asarray(reading, float), axis=0))
 
 
-def _check_gravity(size: float, where: str) -> None:
-    """Raise InputError if the size of the median reading is not gravity in m/s^2."""
-    for unit, expected in _UNITS:
-        if expected / _WITHIN < size < expected * _WITHIN:
-            factor = STANDARD_GRAVITY_M_S2 / expected
-            raise InputError(
-                f"the sensor reads {size:.4g} at rest, where m/s^2 would be 9.81: it is in {unit}",
-                where=where,
-                todo=f"multiply ax_m_s2, ay_m_s2, az_m_s2 by {factor:.6g}",
+def _check_gravity(sensor: Sensor, up: Array, gravity_m_s2: float) -> list[Finding]:
+    """Return a finding if the size of the median reading is not gravity."""
+    where, name = sensor.where, sensor.name
+    stated = ACCELERATION_UNITS[sensor.unit]
+    size = float(np.linalg.norm(gravity_of(sensor.reading_m_s2))) / stated
+    ratio = size * stated / STANDARD_GRAVITY_M_S2
+    if 1 / _FIT < ratio < _FIT:
+        return []
+    at_rest = f"{STANDARD_GRAVITY_M_S2 / stated:.3g}"
+    unit = unit_of_gravity(size)
+    if unit is not None:
+        factor = ACCELERATION_UNITS[unit] / stated
+        either = "mg or cm/s^2" if unit == "mg" else unit
+        return [
+            Finding(
+                f"the sensor reads {size:.4g} at rest, where {sensor.unit} would be {at_rest}: it "
+                f"is in {either}",
+                where,
+                f'say "unit": "{unit}", or multiply its readings (ax_m_s2, ay_m_s2, az_m_s2) by '
+                f"{factor:.6g}",
+                Code.SENSOR_UNIT, {"sensor": name, "unit": unit},
             )
-    if size < _FLOATING_M_S2:
-        raise InputError(
-            f"the sensor reads {size:.2g} m/s^2 at rest: gravity has been taken out",
-            where=where,
-            todo="give the specific force as the sensor measures it, 9.81 m/s^2 upwards at rest",
+        ]  # fmt: skip
+    upwards = gravity_m_s2 * sensor.axes @ up
+    shown = ", ".join(f"{v:.3f}" for v in upwards + 0.0)
+    if ratio * STANDARD_GRAVITY_M_S2 < _FLOATING_M_S2:
+        return [
+            Finding(
+                f"the sensor reads {size * stated:.2g} m/s^2 at rest: gravity has been taken out",
+                where,
+                "give the specific force as the sensor measures it, 9.81 m/s^2 upwards at rest; "
+                f"with its axes in rig.toml, add ({shown}) m/s^2 to its readings",
+                Code.SENSOR_GRAVITY, {"sensor": name, "add_m_s2": upwards.tolist()},
+            )
+        ]  # fmt: skip
+    doubled = _DOUBLED[0] < ratio < _DOUBLED[1]
+    what = "gravity is contained twice" if doubled else "which is not gravity in any known unit"
+    return [
+        Finding(
+            f"the sensor reads {size:.4g} {sensor.unit} at rest: {what}",
+            where,
+            f"subtract ({shown}) m/s^2 from its readings"
+            if doubled
+            else "check the sensor's scale: it should read 9.81 m/s^2 upwards at rest",
+            Code.SENSOR_GRAVITY if doubled else Code.SENSOR_SCALE,
+            {"sensor": name, "add_m_s2": (-upwards).tolist()} if doubled else {},
         )
-    if not 1 / _WITHIN < size / STANDARD_GRAVITY_M_S2 < _WITHIN:
-        raise InputError(
-            f"the sensor reads {size:.4g} at rest, which is not gravity in any known unit",
-            where=where,
-            todo="check the sensor's scale: it should read 9.81 m/s^2 upwards at rest",
-        )
+    ]
 
 
-@dataclass(frozen=True)
-class Clipping:
-    """Describes one axis of a sensor that is clipped at a limit of its range.
-
-    axis : 0, 1 or 2.
-    value : the limit (m/s^2).
-    count, first : number of clipped samples, and index of the first one.
-    """
-
-    axis: int
-    value: float
-    count: int
-    first: int
-
-
-def clippings(reading: ArrayLike) -> list[Clipping]:
-    """Return the limits at which samples (N, 3) are clipped.
-
-    The smallest or largest value of an axis counts as a limit if it occurs at least 5 times, and at
-    least 3 times as often as the next value.
-    """
-    samples = np.asarray(reading, float)
-    out = []
-    for axis in range(3):
-        values, counts = np.unique(samples[:, axis], return_counts=True)
-        if len(values) < 3:
-            continue
-        for end, next_one in ((0, 1), (-1, -2)):
-            count = int(counts[end])
-            if count >= max(_CLIPPED_LEAST, _CLIPPED_EXCESS * int(counts[next_one])):
-                first = int(np.flatnonzero(samples[:, axis] == values[end])[0])
-                out.append(Clipping(axis, float(values[end]), count, first))
-    return out
-
-
-def check_axes(reading_m_s2: ArrayLike, axes: ArrayLike, up: ArrayLike, *, where: str) -> list[str]:
-    """Return a warning if gravity does not point up with the stated mounting, and axes that would
+def check_axes(sensor: Sensor, up: ArrayLike) -> list[Finding]:
+    """Return a finding if gravity does not point up with the stated mounting, and axes that would
     fit.
 
-    reading_m_s2 : (N, 3).
-    axes : (3, 3) whose rows are the sensor's axes in rig coordinates.
     up : (3,) upward direction in rig axes.
     """
-    gravity = gravity_of(reading_m_s2)
+    gravity, axes = gravity_of(sensor.reading_m_s2), sensor.axes
     angle = _tilt_deg(gravity, axes, up)
     if angle < _TILTED_DEG:
         return []
-    words = f"{where}: with its axes in rig.toml, gravity points {angle:.0f} deg away from up; "
+    words = f"with its axes as stated, gravity points {angle:.0f} deg away from up"
     fits = fitting_axes(gravity, axes, up)
     if fits is None:
         direction = ", ".join(f"{v:.2f}" for v in gravity / np.linalg.norm(gravity))
-        return [f"{words}no exchange of axes fits: up is ({direction}) in the sensor's axes"]
+        todo = f"no exchange of axes fits: up is ({direction}) in the sensor's axes; correct axes"
+        return [Finding(words, sensor.where, todo, Code.SENSOR_AXES, {"sensor": sensor.name})]
     rows = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row + 0.0) + "]" for row in fits)
-    return [f"{words}axes = [{rows}] would fit (or these axes rotated about the vertical)"]
+    return [
+        Finding(
+            words, sensor.where,
+            f"axes = [{rows}] in rig.toml [accelerometers.{sensor.name}] would fit (or these axes "
+            "rotated about the vertical)",
+            Code.SENSOR_AXES, {"sensor": sensor.name, "axes": (fits + 0.0).tolist()},
+        )
+    ]  # fmt: skip
 
 
 def fitting_axes(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> Array | None:
@@ -175,17 +147,14 @@ def _tilt_deg(gravity: ArrayLike, axes: ArrayLike, up: ArrayLike) -> float:
     return float(np.degrees(np.arctan2(across, force @ upwards)))
 
 
-def check_motion(
-    t_s: Array, reading: Array, stage: Array, along: Array, *, where: str
-) -> list[str]:
+def check_motion(sensor: Sensor, stage: Array, along: Array) -> list[Finding]:
     """Return a warning if the carriage's acceleration appears on another axis of the sensor than
     stated.
 
-    t_s, reading : (N,) times and (N, 3) readings.
     stage : (E, 2) times (s) and positions (mm) of the encoder.
     along : (3,) travel axis in the sensor's axes.
     """
-    found = motion_correlation(t_s, reading, stage[:, 0], stage[:, 1]) if len(t_s) > 1 else None
+    found = motion_correlation(sensor.t_s, sensor.reading_m_s2, stage[:, 0], stage[:, 1])
     if found is None:
         return []
     stated, best = float(found @ along), int(np.argmax(np.abs(found)))
@@ -194,9 +163,13 @@ def check_motion(
         return []
     sign = "-" if found[best] < 0 else "+"
     return [
-        f"{where}: the carriage's acceleration is felt along {sign}{'xyz'[best]} of the sensor "
-        f"(correlation {abs(found[best]):.2f}), not where its axes in rig.toml put the travel "
-        f"direction (correlation {stated:.2f}): check axes"
+        Finding(
+            f"the carriage's acceleration is felt along {sign}{'xyz'[best]} of the sensor "
+            f"(correlation {abs(found[best]):.2f}), not where its axes put the travel direction "
+            f"(correlation {stated:.2f})",
+            sensor.where,
+            "check axes",
+        )
     ]
 
 

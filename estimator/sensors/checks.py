@@ -1,76 +1,192 @@
-"""Checks the sensors and the tracks of a run before it is smoothed."""
+"""Reads the sensors of a run and checks them, and its tracks, before it is smoothed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array
-from telerig.errors import InputError, suggestion
-from telerig.estimator.sensors.accelerometer_checks import (
-    check_accelerometer,
-    check_axes,
-    check_motion,
-)
+from telerig.errors import InputError
+from telerig.estimator.sensors.accelerometer_checks import check_accelerometer, check_motion
 from telerig.estimator.sensors.encoder_checks import check_encoder
+from telerig.estimator.sensors.findings import Code, Finding
+from telerig.estimator.sensors.given import Sensor, given_sensors, table_columns
+from telerig.estimator.sensors.samples import mostly_masked, screened
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 if TYPE_CHECKING:
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.io.dataset.run import RunData
+    from telerig.io.rig_file.description import StageDescription
 
 
 _COVERED = 0.999
 _FOREIGN_PX = 5.0
 _DIFFERENT_PX = 0.5
 _SAMPLED = 2000
+_UP = (0.0, -1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """Hold the usable readings of an encoder: t_s (E,) times, position_mm (E,) positions."""
+
+    t_s: Array
+    position_mm: Array
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Hold how the rig stands: axis, up (3,) unit vectors in the rig frame; the travel axis and the
+    direction opposite to gravity. gravity_m_s2 : of the laboratory.
+    """
+
+    axis: Array
+    up: Array
+    gravity_m_s2: float
+
+    @staticmethod
+    def of(described: StageDescription | None, axis: ArrayLike | None = None) -> Mounting:
+        """Return the mounting that rig.toml describes; without it up is upwards in the images.
+
+        axis : the travel axis, if a calibration knows it better.
+        """
+        if described is None:
+            up, gravity = np.asarray(_UP), STANDARD_GRAVITY_M_S2
+        else:
+            up, gravity = np.asarray(described.up, float), float(described.gravity_m_s2)
+        up = up / np.linalg.norm(up)
+        known = up if described is None else np.asarray(described.axis, float)
+        return Mounting(known if axis is None else np.asarray(axis, float), up, gravity)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Hold the records that can be used, and what the checks found in all of them."""
+
+    encoder: Encoder | None
+    accelerometers: tuple[Sensor, ...]
+    findings: tuple[Finding, ...]
+
+
+def read_sensors(
+    stage: Any,
+    accelerometers: Any,
+    rig: Any,
+    cameras: Sequence[str],
+    frames_t_s: ArrayLike,
+    mounting: Mounting,
+    *,
+    files: tuple[str, str] = ("stage", ""),
+) -> Sensors:
+    """Return encoder and accelerometers with their unusable samples masked, and the findings.
+
+    stage, accelerometers, rig : as for `telerig.smooth`; the stage as a table.
+    cameras : their names.
+    frames_t_s : (F,) times of the frames.
+    files : names of both tables for messages; "" for an argument.
+
+    Raises InputError for records that cannot be read.
+    """
+    frames = np.asarray(frames_t_s, float)
+    encoder, findings = _encoder(stage, frames, files[0])
+    given, found = given_sensors(accelerometers, rig, cameras, file=files[1])
+    findings += found
+    kept = []
+    for raw in given:
+        sensor, found = screened(raw)
+        findings += found
+        left_out = mostly_masked(sensor)
+        if left_out is not None:
+            findings.append(left_out)
+            continue
+        kept.append(sensor)
+        if sensor.clock == "frames":
+            findings += check_overlap(
+                sensor.t_s, frames, where=sensor.where, code=Code.SENSOR_CLOCK, sensor=sensor.name
+            )
+        found = check_accelerometer(sensor, mounting.up, mounting.gravity_m_s2)
+        if not found and encoder is not None:
+            record = np.stack([encoder.t_s, encoder.position_mm], -1)
+            found = check_motion(sensor, record, sensor.axes @ mounting.axis)
+        findings += found
+    return Sensors(encoder, tuple(kept), tuple(findings))
+
+
+def _encoder(stage: Any, frames: Array, where: str) -> tuple[Encoder | None, list[Finding]]:
+    """Return the encoder's usable readings, and what is wrong with the record.
+
+    There is no encoder if its record covers no frame.
+    """
+    if stage is None:
+        return None, []
+    t, position = table_columns(stage, ("t_s", "position_mm"), where, what="a table")
+    bad = np.flatnonzero(~(np.diff(t) > 0))
+    if len(bad) or len(t) < 2:
+        raise InputError(
+            f"times do not increase at row {int(bad[0]) + 1}" if len(bad) else "has one reading",
+            where=where,
+            todo="sort the rows and remove duplicates; a stage that stands needs no encoder",
+        )
+    outside = check_overlap(t, frames, where=where, code=Code.ENCODER_CLOCK)
+    if outside and outside[0].code is not None:
+        return None, outside
+    kept, found = check_encoder(t, position, frames, where=where)
+    return Encoder(t[kept], position[kept]), outside + found
 
 
 def check_sensors(
     run: RunData, *, tracks: Any = None, calibration: Calibration | None = None
-) -> list[str]:
-    """Return warnings about a run's encoder and accelerometers, and about its tracks if they are
-    given.
+) -> list[Finding]:
+    """Return the findings about a run's encoder and accelerometers, and about its tracks if they
+    are given.
 
     tracks : `Tracks`, or a table like tracks.csv, which is compared with ``calibration``.
 
-    Raises InputError for data that cannot be used: clocks that do not overlap, an encoder that
-    jumps during the frames, accelerometers in another unit or without gravity, sensors that
-    rig.toml does not name, and tracks from another rig.
+    Raises InputError for data that cannot be read: sensors that rig.toml does not name, values that
+    are not finite, and tracks from another rig.
     """
-    words = []
-    if run.stage is not None:
-        where = f"{run.name}/stage.csv"
-        t, position = run.stage[["t_s", "position_mm"]].to_numpy(float).T
-        words += _check_overlap(t, run.t_s, where=where)
-        words += check_encoder(t, position, run.t_s, where=where)
-    if run.accelerometers is not None:
-        words += _check_accelerometers(run)
+    found = read_sensors(
+        run.stage, run.accelerometers, run.rig, run.cameras, run.t_s,
+        Mounting.of(None if run.rig is None else run.rig.stage), files=files_of(run),
+    )  # fmt: skip
+    findings = list(found.findings)
     if tracks is not None and calibration is not None:
-        words += check_tracks(getattr(tracks, "table", tracks), calibration)
-    return words
+        findings += check_tracks(getattr(tracks, "table", tracks), calibration)
+    return findings
 
 
-def _check_overlap(t: Array, frames_t_s: ArrayLike, *, where: str) -> list[str]:
-    """Return a warning if the record does not cover all frames.
+def files_of(run: RunData) -> tuple[str, str]:
+    """Return the names of a run's tables of sensors, for messages."""
+    return f"{run.name}/stage.csv", f"{run.name}/accelerometer.csv"
+
+
+def check_overlap(
+    t: Array, frames_t_s: ArrayLike, *, where: str, code: Code, sensor: str = ""
+) -> list[Finding]:
+    """Return a finding if the record does not cover all frames; with a code if it covers none.
 
     t, frames_t_s : (N,) times of the record and (F,) times of the frames, in s.
-
-    Raises InputError if the record covers no frame. The error names the offset or the unit that
-    would explain this.
+    sensor : name of an accelerometer; "" for the encoder.
     """
     frames = np.asarray(frames_t_s, float)
     share = float(((frames >= t[0]) & (frames <= t[-1])).mean())
     spans = f"{t[0]:.6g} to {t[-1]:.6g} s, the frames {frames[0]:.6g} to {frames[-1]:.6g} s"
     if share == 0:
-        raise InputError(
-            f"the record's clock does not overlap the frames': it covers {spans}",
-            where=where,
-            todo=_clock_remedy(t, frames),
-        )
+        fix = {"sensor": sensor} if sensor else {"sensor": "encoder"}
+        return [
+            Finding(
+                f"the record's clock does not overlap the frames': it covers {spans}",
+                where, _clock_remedy(t, frames), code,
+                {**fix, "offset_s": float(frames[0] - t[0])},
+            )
+        ]  # fmt: skip
     if share < _COVERED:
-        return [f"{where}: the record covers {100 * share:.0f} % of the frames ({spans})"]
+        return [Finding(f"the record covers {100 * share:.0f} % of the frames ({spans})", where)]
     return []
 
 
@@ -87,40 +203,7 @@ def _clock_remedy(t: Array, frames: Array) -> str:
     return f"put both on one clock; if both started together, add {offset:.6g} s to its times"
 
 
-def _check_accelerometers(run: RunData) -> list[str]:
-    """Return the warnings of all checks for each accelerometer of the run."""
-    table, words = run.accelerometers, []
-    assert table is not None
-    file = f"{run.name}/accelerometer.csv"
-    described = {} if run.rig is None else dict(run.rig.accelerometers)
-    stage = None if run.rig is None else run.rig.stage
-    for sensor, rows in table.groupby("sensor", sort=False):
-        name = str(sensor)
-        where = f"{file}, sensor {name}"
-        if run.rig is not None and name not in described:
-            raise InputError(
-                f"there is no accelerometer {name!r} in rig.toml",
-                where=file,
-                todo=suggestion(name, list(described))
-                if described
-                else f"add a table [accelerometers.{name}]",
-            )
-        t = rows["t_s"].to_numpy(float)
-        reading = rows[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy(float)
-        words += _check_overlap(t, run.t_s, where=where)
-        words += check_accelerometer(t, reading, where=where)
-        if stage is None:
-            continue
-        axes = np.asarray(described[name].axes, float)
-        tilted = check_axes(reading, axes, stage.up, where=where)
-        words += tilted
-        if not tilted and run.stage is not None:
-            encoder = run.stage[["t_s", "position_mm"]].to_numpy(float)
-            words += check_motion(t, reading, encoder, axes @ np.asarray(stage.axis), where=where)
-    return words
-
-
-def check_tracks(table: Any, calibration: Calibration) -> list[str]:
+def check_tracks(table: Any, calibration: Calibration) -> list[Finding]:
     """Return a warning if points and pixels of a table of tracks do not agree with this
     calibration.
 
@@ -148,7 +231,8 @@ def check_tracks(table: Any, calibration: Calibration) -> list[str]:
             where="tracks",
             todo="run `telerig track` with this calibration, or give the one they were made with",
         )
-    return [f"{what}: they were made with another calibration; only the pixels are used"]
+    words = f"{what}: they were made with another calibration; only the pixels are used"
+    return [Finding(words, "tracks")]
 
 
 def _off_px(table: Any, calibration: Calibration) -> float:

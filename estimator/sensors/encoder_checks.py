@@ -9,8 +9,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from telerig.arrays import Array
-from telerig.errors import InputError
+from telerig.arrays import Array, Bools
+from telerig.estimator.sensors.findings import Code, Finding
+from telerig.estimator.sensors.samples import prediction_residual
 from telerig.statistics import robust_sd
 
 _SIGMAS = 10.0
@@ -20,10 +21,9 @@ _PAUSE = 5.0
 """Steps longer than this many median steps are pauses of the record; their motion is not judged."""
 
 _RETURNS = 0.3
+_LONGEST_SPIKE = 3
 _WRAP_OF_RANGE = 0.5
 _LEAST_RECORD = 6
-_LEAST_TO_LEARN = 60
-_NEIGHBOURS = 4
 _SHARE = 0.3
 _HARMLESS_MM = 0.05
 _REAL_M_S2 = 50.0
@@ -76,9 +76,7 @@ class EncoderFault:
 
     @property
     def remedy(self) -> str:
-        """What the user can do about the fault."""
-        if self.kind == "spike":
-            return "remove those rows from stage.csv"
+        """What the user can do about a jump."""
         what = "unwrap the counter: " if self.kind == "wrap" else ""
         return (
             f"{what}subtract {self.size_mm:.6g} mm from every position from {self.t_s:.6g} s on, "
@@ -88,29 +86,45 @@ class EncoderFault:
 
 def check_encoder(
     t_s: ArrayLike, position_mm: ArrayLike, frames_t_s: ArrayLike, *, where: str = "stage"
-) -> list[str]:
-    """Return warnings about the encoder's record.
+) -> tuple[Bools, list[Finding]]:
+    """Return which readings of the encoder can be used (E,), and what is wrong with the others.
+
+    Single wrong readings are masked. A jump that affects the frames is refused (`ENCODER_JUMP`).
 
     t_s, position_mm : (E,) times and readings.
     frames_t_s : (F,) times of the frames.
-
-    Raises InputError for jumps that affect the frames.
     """
     t, frames = np.asarray(t_s, float), np.asarray(frames_t_s, float)
     faults = encoder_faults(t, position_mm)
+    kept = np.ones(len(t), bool)
+    spikes = [f for f in faults if f.kind == "spike"]
+    for fault in spikes:
+        first = int(np.searchsorted(t, fault.t_s))
+        kept[first : first + fault.readings] = False
+    jumps = [f for f in faults if f.kind != "spike"]
     grave = [
         f
-        for f in faults
+        for f in jumps
         if abs(f.size_mm) > _HARMLESS_MM and f.acceleration_m_s2 > _REAL_M_S2
         if f.affects(t, frames)
     ]
+    findings = []
     if grave:
         more = f" (and {len(grave) - 1} more)" if len(grave) > 1 else ""
-        raise InputError(grave[0].words + more, where=where, todo=grave[0].remedy)
-    shown = [f"{where}: {fault.words}" for fault in faults[:_SHOWN]]
-    if len(faults) > _SHOWN:
-        shown.append(f"{where}: and {len(faults) - _SHOWN} more jumps")
-    return shown
+        findings.append(
+            Finding(
+                grave[0].words + more, where, grave[0].remedy, Code.ENCODER_JUMP,
+                {"encoder_jumps": [[f.t_s, f.size_mm] for f in grave]},
+            )
+        )  # fmt: skip
+    else:
+        findings += [Finding(fault.words, where) for fault in jumps[:_SHOWN]]
+        if len(jumps) > _SHOWN:
+            findings.append(Finding(f"and {len(jumps) - _SHOWN} more jumps", where))
+    if spikes:
+        more = f" (and {len(spikes) - 1} more)" if len(spikes) > 1 else ""
+        findings.append(Finding(f"{spikes[0].words}{more}; they are not used", where))
+    return kept, findings
 
 
 def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]:
@@ -129,7 +143,7 @@ def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]
     speed = step / dt
     known = dt <= _PAUSE * np.median(dt)
     excess = np.where(known, _excess_speed(speed) * dt, 0.0)
-    residual = np.where(known, _prediction_residual(speed) * dt, 0.0)
+    residual = np.where(known, prediction_residual(speed) * dt, 0.0)
     least = _least_fault(step)
     odd = np.abs(residual) > max(_SIGMAS * robust_sd(residual), least)
     odd &= (excess * residual > 0) & (np.abs(excess) > _SHARE * np.abs(residual))
@@ -145,31 +159,6 @@ def _excess_speed(speed: Array) -> Array:
     near = np.delete(sliding_window_view(np.pad(speed, 2, constant_values=np.nan), 5), 2, axis=1)
     high, low = np.nanmax(near, 1), np.nanmin(near, 1)
     return np.asarray(np.maximum(speed - high, 0) + np.minimum(speed - low, 0))
-
-
-def _prediction_residual(speed: Array) -> Array:
-    """Return each speed (E - 1,) minus its prediction from four neighbours on each side.
-
-    The linear predictor is fitted to the record itself by least squares, without the steps that it
-    predicts badly, so it also follows an oscillation. The result is 0 for short records, and at the
-    ends.
-    """
-    width = 2 * _NEIGHBOURS + 1
-    if len(speed) < _LEAST_TO_LEARN:
-        return np.zeros(len(speed))
-    near = sliding_window_view(np.pad(speed, _NEIGHBOURS, mode="edge"), width)
-    near = np.delete(near, _NEIGHBOURS, axis=1)
-    near = np.concatenate([near, np.ones((len(speed), 1))], -1)
-    kept = np.ones(len(speed), bool)
-    for _ in range(4):
-        weights = np.linalg.lstsq(near[kept], speed[kept], rcond=None)[0]
-        residual = speed - near @ weights
-        clean = np.abs(residual) <= 5 * robust_sd(residual)
-        kept = np.convolve(~clean, np.ones(width), "same") < 0.5
-        if kept.sum() < _LEAST_TO_LEARN // 2:
-            return np.zeros(len(speed))
-    residual[:_NEIGHBOURS] = residual[-_NEIGHBOURS:] = 0.0
-    return np.asarray(residual)
 
 
 def _least_fault(step: Array) -> float:
@@ -190,14 +179,24 @@ def _classified(
     """
     out: list[EncoderFault] = []
     left = [int(i) for i in steps]
+    last = len(t) - 2
     pace = np.median(np.delete(np.diff(position), steps))
     while left:
         i = left.pop(0)
         size, at, step = float(excess[i]), float(t[i + 1]), float(t[i + 1] - t[i])
-        if left and left[0] - i <= 3 and abs(size + excess[left[0]]) < _RETURNS * abs(size):
+        if left and left[0] - i <= _LONGEST_SPIKE and _ends(size, float(excess[left[0]])):
             out.append(EncoderFault(at, size, "spike", step, left.pop(0) - i))
+        elif i < _LONGEST_SPIKE and i + _LONGEST_SPIKE < last:
+            out.append(EncoderFault(float(t[0]), -size, "spike", step, i + 1))
+        elif last - i < _LONGEST_SPIKE:
+            out.append(EncoderFault(at, size, "spike", step, last - i + 1))
         elif size * pace < 0 and abs(size) > _WRAP_OF_RANGE * float(np.ptp(position)):
             out.append(EncoderFault(at, size, "wrap", step))
         else:
             out.append(EncoderFault(at, size, "jump", step))
     return out
+
+
+def _ends(size: float, after: float) -> bool:
+    """Return whether a step ends the error that began with the step before."""
+    return abs(size + after) < _RETURNS * abs(size)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from telerig.errors import InputError
 from telerig.estimator.calibration.refractive_windows import window_warnings
 from telerig.estimator.calibration.result.calibration import pair_of_run
-from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.estimator.tracking.tracks import Tracks, load_tracks, read_track_table
 from telerig.io.files.atomic import write_json_atomic
@@ -72,14 +71,15 @@ def smooth_run(
         *dict.fromkeys(s for file in used for s in stale(file.parent, [file.name])),
         *window_warnings(run.rig, calibration),
         *([] if refine_rig else _moved(followed)),
-        *check_sensors(run, tracks=followed, calibration=calibration),
     ]
     percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
     found = smooth(
         followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig,
         accept=accept,
     )  # fmt: skip
-    found = replace(found, summary={**found.summary, "warnings": warnings})
+    found = replace(
+        found, summary={**found.summary, "warnings": [*warnings, *found.summary["warnings"]]}
+    )
     tables = [p for p in run.path.glob("*.csv") if p.name != "detections.csv"]
     record = run_record(
         "smooth", run.path, [*tables, source, *marks, *inputs],

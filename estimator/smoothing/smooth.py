@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import pair_of_run
-from telerig.estimator.sensors.findings import accepted_codes
+from telerig.estimator.sensors.checks import Mounting, check_tracks, files_of, read_sensors
+from telerig.estimator.sensors.findings import Finding, accepted_codes, settled
+from telerig.estimator.sensors.given import AccelerometerRecord, times
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
@@ -24,12 +26,14 @@ from telerig.estimator.smoothing.problem.problem import (
     Observations,
     ShakeModel,
     SmoothingProblem,
+    check_increasing,
 )
 from telerig.estimator.smoothing.problem.tables import (
     Tracked,
     accelerometers_of,
     bubbles_of,
     calibration_share,
+    near_frames,
     read_tracks,
     references_of,
     stage_of,
@@ -46,17 +50,20 @@ from telerig.estimator.smoothing.refined_pose import (
 from telerig.estimator.smoothing.result import Smoothing, summary_of, trajectories
 from telerig.estimator.smoothing.result import shake as shake_table
 from telerig.estimator.smoothing.verdict.judge import judge
-from telerig.rig.units import STANDARD_GRAVITY_M_S2
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from telerig.estimator.calibration.result.calibration import Calibration
     from telerig.estimator.rig_drift import DriftPrior
-    from telerig.io.rig_file.description import StageDescription
+    from telerig.io.dataset.run import RunData
+    from telerig.io.rig_file.description import RigDescription
 
 Learn = Callable[[SmoothingProblem], ShakeModel]
 
 _COARSE_STEP_S = 2e-3
 _ENCODER_SIGMA_MM = 0.005
+_LEAST_SAMPLES = 2
 _LEAST_LEARNED_S = 0.2
 """Shortest time of a bubble for which shake is learned. In less time a slow shake shows no period,
 and learning would find no shake.
@@ -67,11 +74,11 @@ def smooth(
     tracks: Any,
     calibration: Calibration,
     *,
-    stage: Any = None,
-    accelerometers: Any = None,
-    references: Any = None,
+    stage: RunData | pd.DataFrame | Mapping[str, ArrayLike] | None = None,
+    accelerometers: pd.DataFrame | Mapping[str, AccelerometerRecord] | None = None,
+    references: pd.DataFrame | None = None,
     model: ShakeModel | Learn | str = "auto",
-    rig: Any = None,
+    rig: RigDescription | None = None,
     t_s: ArrayLike | None = None,
     options: Options | None = None,
     progress: Progress | None = None,
@@ -81,21 +88,32 @@ def smooth(
     """Smooth a run: estimate every bubble's motion in the laboratory frame and every camera's
     shake.
 
-    tracks : `Tracks`, or a table with the columns of tracks.csv; None to estimate only the shake.
+    The laboratory frame has the axes of the rig frame (x right, y down, z away from the first
+    camera), lengths are mm, times s. F is the number of frames.
+
+    tracks : `Tracks`, or a table with the columns of tracks.csv: frame, particle, t_s, x_mm, y_mm,
+        z_mm, and for each camera the pixel <camera>_u_px, <camera>_v_px and its covariance
+        <camera>_suu_px2, <camera>_suv_px2, <camera>_svv_px2. None to estimate only the shake.
     calibration : calibration of the cameras.
-    stage : a table with the columns t_s and position_mm; or the `RunData` of the run, whose other
-        records are then used as well where nothing else is given; None without an encoder.
-    accelerometers : a table with the columns t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2, whose sensors
-        ``rig`` describes; or a mapping of the sensor's name to {t_s (N,), a_m_s2 (N, 3),
-        mounted_on, axes, noise_density_ug_sqrt_hz}; None for none.
+    stage : the encoder: a table or a mapping with t_s (E,) and position_mm (E,), which increases
+        where the stage moves along its axis; or the `RunData` of the run, whose other records are
+        then used as well where nothing else is given; None without an encoder.
+    accelerometers : a mapping of the sensor's name to an `AccelerometerRecord`: {"t_s" (N,), "a"
+        (N, 3) with "unit" ("m/s^2", "g", "mg", ...) or "a_m_s2" (N, 3), "mounted_on" (a camera or
+        "carriage"), "axes" (3, 3)} and optional "noise_density_ug_sqrt_hz", "bias_sigma_m_s2",
+        "range_m_s2", "clock"; or a table with the columns t_s, sensor, ax_m_s2, ay_m_s2, az_m_s2
+        (or ax_g, ...), whose sensors ``rig`` describes; None for none. Readings contain gravity: at
+        rest a sensor reads +9.81 m/s^2 upwards. Times are those of the frames' clock in a table,
+        and of a clock of their own ("unknown") in a mapping.
     references : a table of marks fixed to the tank with the columns frame, camera, mark, u_px, v_px
-        and possibly sigma_px; None to take those of ``tracks``, if it has any.
+        and possibly sigma_px (0.1 px if missing); None to take those of ``tracks``, if it has any.
     model : "auto" (default hyper-parameters for the available measurements; modes are learned if
         only images are available), "default", a `ShakeModel`, or a function that returns one for a
         `SmoothingProblem`.
     rig : the description in rig.toml. It gives the travel axis if the calibration has none, how
-        well the encoder's scale is known, and the sensors. None if there is no description.
-    t_s : (F,) times of the frames; None to take those of the tracks.
+        well the encoder's scale is known, which way is up, and the sensors. None if there is no
+        description; then up is upwards in the first camera's image.
+    t_s : (F,) times of the frames, which increase; None to take those of the tracks or of the run.
     options : settings of the solver; None for the defaults.
     progress : function that is called with the name of the step and the share (0 to 1) that is
         done.
@@ -103,20 +121,30 @@ def smooth(
         the calibration (``summary["rig_change"]``); a `DriftPrior` states how far they may have
         moved.
     accept : codes of faults that are used as they are, where they would be refused (the error
-        names its code).
+        names its code): SENSOR_UNIT, SENSOR_GRAVITY, SENSOR_AXES, SENSOR_MOUNT, SENSOR_SCALE,
+        SENSOR_CLOCK, ENCODER_SIGN, ENCODER_UNIT, ENCODER_STUCK, ENCODER_SCALE, ENCODER_JUMP,
+        ENCODER_CLOCK, FRAME_TIMES.
 
-    Raises InputError for tables that cannot be used together, `SensorError` for a sensor that
-    contradicts the others.
+    Returns a `Smoothing`: the tables ``trajectories`` and ``shake``, the ``verdict``, and
+    ``summary``, whose "warnings" say what the checks found, what was assumed and which samples are
+    not used, and whose "accelerometers" hold the estimates for each sensor.
+
+    Raises InputError for arguments that are not as described, and its subclass `SensorError`, with
+    ``code`` and ``findings``, for a sensor that contradicts gravity, the images or another sensor.
     """
     accepted = accepted_codes(accept)
+    _check_kinds(tracks, calibration, rig)
     table = getattr(tracks, "table", tracks)
     calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
     refinement = refinement_of(table, calibration, refine_rig)
-    problem, tracked, encoder_sigma = problem_of(
+    problem, tracked, encoder_sigma, findings = problem_of(
         tracks, calibration, stage=stage, accelerometers=accelerometers,
         references=references, rig=rig, t_s=t_s,
         drift=None if refinement is None else refinement.drift,
     )  # fmt: skip
+    warnings = settled(findings, accepted)
+    problem, findings = _near_frames(problem)
+    warnings += settled(findings, accepted)
     options = options or Options()
     chosen = _chosen(problem, model, encoder_sigma, refinement)
     if isinstance(model, ShakeModel):
@@ -129,6 +157,7 @@ def smooth(
     verdict = judge(problem, chosen, solution)
     summary = summary_of(solution)
     summary["accepted"] = sorted(accepted)
+    summary["warnings"] = warnings
     change = refined_change(solution, calibration)
     if change is not None:
         words = change_words(change, problem.cameras[0].name)
@@ -141,6 +170,49 @@ def smooth(
         chosen,
         solution,
     )
+
+
+def _check_kinds(tracks: Any, calibration: Any, rig: Any) -> None:
+    """Raise InputError for a path, or anything else, in place of what would be read from it."""
+    if not hasattr(calibration, "cameras"):
+        raise InputError(
+            f"calibration is {type(calibration).__name__}",
+            where="smooth",
+            todo="give a Calibration: telerig.load_calibration(path)",
+        )
+    if tracks is not None and not hasattr(getattr(tracks, "table", tracks), "columns"):
+        raise InputError(
+            f"tracks is {type(tracks).__name__}",
+            where="smooth",
+            todo="give Tracks (telerig.load_tracks(folder)), a table like tracks.csv, or None",
+        )
+    if rig is not None and not (hasattr(rig, "stage") and hasattr(rig, "accelerometers")):
+        raise InputError(
+            f"rig is {type(rig).__name__}",
+            where="smooth",
+            todo="give the description: telerig.load_dataset(path).rig",
+        )
+
+
+def _near_frames(problem: SmoothingProblem) -> tuple[SmoothingProblem, list[Finding]]:
+    """Return the problem with the accelerometers' samples near the frames.
+
+    A sensor without such samples is left out, and a finding says so.
+    """
+    kept, findings = [], []
+    for sensor in problem.accelerometers:
+        near = near_frames(sensor, problem.t_s)
+        if len(near.t_s) - near.masked_samples >= _LEAST_SAMPLES:
+            kept.append(near)
+            continue
+        findings.append(
+            Finding(
+                "it has no usable samples near the frames, so it is left out",
+                f"accelerometer {sensor.name}",
+                "put its times on the frames' clock",
+            )
+        )
+    return replace(problem, accelerometers=tuple(kept)), findings
 
 
 def _cameras_of(table: Any, calibration: Calibration, stage: Any, rig: Any) -> list[str]:
@@ -174,43 +246,62 @@ def problem_of(
     rig: Any = None,
     t_s: ArrayLike | None = None,
     drift: Array | None = None,
-) -> tuple[SmoothingProblem, Tracked | None, float]:
-    """Return the smoothing problem of these tables, the tracks that were read, and the standard
-    deviation of the encoder in mm.
+) -> tuple[SmoothingProblem, Tracked | None, float, list[Finding]]:
+    """Return the smoothing problem of these tables, the tracks that were read, the standard
+    deviation of the encoder in mm, and what the checks found.
+
+    The accelerometers' records are whole; `near_frames` cuts them.
 
     The arguments are those of `smooth`. The tracks are None if none were given.
 
     drift : (6, 6) prior covariance of a movement of the second camera since the calibration
         (rotation in rad, translation in mm); None if it has not moved.
     """
+    files = ("stage", "")
     if hasattr(stage, "frame_count"):
         run = stage
+        of_stage, of_sensors = files_of(run)
+        files = of_stage, of_sensors if accelerometers is None else ""
+        if t_s is not None and not np.array_equal(np.asarray(t_s), run.t_s):
+            raise InputError(
+                "t_s differs from the times of the run",
+                where="smooth",
+                todo="give the run, or its tables (stage=run.stage, ...) with t_s",
+            )
         stage, rig, t_s = run.stage, run.rig if rig is None else rig, run.t_s
         accelerometers = run.accelerometers if accelerometers is None else accelerometers
         references = run.references if references is None else references
     if references is None:
         references = getattr(tracks, "references", None)
     cameras = calibration.cameras
-    frame_times = None if t_s is None else np.asarray(t_s, float)
+    frame_times = None if t_s is None else times(t_s, "frames")
     tracked = None if tracks is None else read_tracks(tracks, cameras, frame_times)
-    times = frame_times if tracked is None else tracked.t_s
-    if times is None:
+    at_frames = frame_times if tracked is None else tracked.t_s
+    if at_frames is None:
         raise InputError(
             "without tracks nothing says when the frames are taken",
             where="smooth",
             todo="give t_s, the times at which offsets are wanted",
         )
+    check_increasing(at_frames, "frames", 0)
     described = None if rig is None else rig.stage
-    up, encoder_sigma, gravity = _stage_geometry(described)
+    encoder_sigma = _ENCODER_SIGMA_MM if described is None else float(described.position_sigma_mm)
     travel = travel_of(calibration.stage, described)
-    axis = travel.axis
-    record = stage_of(stage, times)
+    axis, mounting = travel.axis, Mounting.of(described, travel.axis)
+    sensors = read_sensors(
+        stage, accelerometers, rig, [c.name for c in cameras], at_frames, mounting, files=files
+    )
+    findings = list(sensors.findings)
+    if tracked is not None:
+        findings += check_tracks(tracked.table, calibration)
+    record = stage_of(sensors.encoder, at_frames)
     if record is not None and travel.scale:
         record = replace(record, position_mm=record.position_mm / (1 + travel.scale))
-    positions = np.zeros(len(times))
+    positions = np.zeros(len(at_frames))
     if record is not None:
-        positions = np.interp(times, record.t_s, record.position_mm)
-    marks, seen = references_of(references, cameras, times, positions, axis)
+        positions = np.interp(at_frames, record.t_s, record.position_mm)
+    marks, seen, found = references_of(references, cameras, at_frames, positions, axis)
+    findings += found
     bubbles = () if tracked is None else bubbles_of(tracked, positions, axis)
     share = None
     if tracked is not None:
@@ -219,26 +310,12 @@ def problem_of(
         noise = np.median(np.sqrt(tracked.observations.covariance_px2[:, 0, 0]))
         share = calibration_share(calibration, some, float(noise), drift)
     problem = SmoothingProblem(
-        cameras, times, axis, up, bubbles,
+        cameras, at_frames, axis, mounting.up, bubbles,
         Observations.none() if tracked is None else tracked.observations,
-        record, accelerometers_of(accelerometers, rig, cameras, times), marks, seen, share,
-        travel, gravity,
+        record, accelerometers_of(sensors.accelerometers, cameras), marks, seen, share,
+        travel, mounting.gravity_m_s2,
     )  # fmt: skip
-    return problem, tracked, encoder_sigma
-
-
-def _stage_geometry(described: StageDescription | None) -> tuple[Array, float, float]:
-    """Return the unit vector (3,) that points upwards in the rig frame, the standard deviation of
-    the encoder in mm, and gravity in m/s^2.
-
-    described : the stage in rig.toml; None for the defaults, where upwards is upwards in the
-        images.
-    """
-    if described is None:
-        return np.array([0.0, -1.0, 0.0]), _ENCODER_SIGMA_MM, STANDARD_GRAVITY_M_S2
-    up = np.asarray(described.up, float)
-    up = up / np.linalg.norm(up)
-    return up, float(described.position_sigma_mm), float(described.gravity_m_s2)
+    return problem, tracked, encoder_sigma, findings
 
 
 def choose_model(

@@ -106,6 +106,10 @@ class AccelerometerDescription(Table):
     axes : (3, 3) whose rows are the sensor's x, y, z axes as unit vectors in the rig frame.
     noise_density_ug_sqrt_hz : noise density in micro-g per root hertz.
     bias_sigma_m_s2 : prior standard deviation of the bias of each axis in m/s^2.
+    range_m_s2 : the largest acceleration that the sensor can read, at which it is clipped; None
+    when the file does not state it.
+    clock : "frames" if its times are those of the frames' clock, "unknown" if only the images can
+    show its offset; None when the file does not state it.
     """
 
     name: str
@@ -118,6 +122,10 @@ class AccelerometerDescription(Table):
         Positive, Field(description="a positive number (the data sheet's, in micro-g per root Hz)")
     ]
     bias_sigma_m_s2: Positive = 0.2
+    range_m_s2: Annotated[
+        float | None, Field(gt=0, description="a positive number: 16 g are 156.9 m/s^2")
+    ] = None
+    clock: Literal["frames", "unknown"] | None = None
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ _COMMENTS = {
     "gravity_m_s2": "of the laboratory",
     "mounted_on": 'a camera or "carriage"',
     "axes": "rows: the sensor's x, y, z axes in rig coordinates",
+    "range_m_s2": "beyond it readings are clipped",
+    "clock": 'of its times: "frames", or "unknown" for a logger of its own',
     "normal": "in the camera's frame",
     "indices": "camera side, glass, behind",
     "distance_mm": "of the near face on the camera's axis",

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     )
     from telerig.estimator.dots.dataset_dots import detect_target as detect_target
     from telerig.estimator.dots.locate import locate_dots as locate_dots
+    from telerig.estimator.sensors.findings import SensorError as SensorError
+    from telerig.estimator.sensors.given import AccelerometerRecord as AccelerometerRecord
     from telerig.estimator.smoothing.problem.problem import ShakeModel as ShakeModel
     from telerig.estimator.smoothing.result import Smoothing as Smoothing
     from telerig.estimator.smoothing.smooth import smooth as smooth
@@ -44,8 +46,10 @@ if TYPE_CHECKING:
     from telerig.rig.triangulation import Triangulation as Triangulation
 
 _WHERE = {
+    "AccelerometerRecord": "telerig.estimator.sensors.given",
     "Calibration": "telerig.estimator.calibration.result.calibration",
     "Dataset": "telerig.io.dataset.dataset",
+    "SensorError": "telerig.estimator.sensors.findings",
     "ShakeModel": "telerig.estimator.smoothing.problem.problem",
     "SimulationConfig": "telerig.io.simulation.config",
     "Smoothing": "telerig.estimator.smoothing.result",

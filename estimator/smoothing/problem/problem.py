@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.factors.bubble_motion import BubbleModel, Triple
 from telerig.rig.camera import Camera
@@ -237,6 +237,8 @@ class Accelerometer:
     delay_s : a sample with time t was measured at t - delay_s.
     clock : "frames" if its times are those of the frames' clock, apart from a small delay;
         "unknown" if only an alignment with the images can place it.
+    kept : (N,) whether each sample is used. The readings of the others are interpolated. None if
+        all are used.
     """
 
     name: str
@@ -248,6 +250,19 @@ class Accelerometer:
     bias_sigma_mm_s2: float = 200.0
     delay_s: float = 0.0
     clock: Literal["frames", "unknown"] = "frames"
+    kept: Bools | None = None
+
+    @property
+    def masked_samples(self) -> int:
+        """Number of samples that are not used."""
+        return 0 if self.kept is None else int(np.count_nonzero(~self.kept))
+
+    def of(self, which: NDArray[Any]) -> Accelerometer:
+        """Return the sensor with some of its samples: (N,) booleans, indices, or a slice."""
+        kept = None if self.kept is None else self.kept[which]
+        return replace(
+            self, t_s=self.t_s[which], reading_mm_s2=self.reading_mm_s2[which], kept=kept
+        )
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,11 @@ import numpy as np
 
 from telerig.arrays import Array, Bools
 from telerig.errors import InputError
+from telerig.estimator.sensors.checks import Encoder
+from telerig.estimator.sensors.findings import Finding
+from telerig.estimator.sensors.given import CARRIAGE as ON_CARRIAGE
+from telerig.estimator.sensors.given import Sensor, times
+from telerig.estimator.sensors.samples import sampling_rate
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     Accelerometer,
@@ -18,7 +23,6 @@ from telerig.estimator.smoothing.problem.problem import (
     Mark,
     Observations,
     Stage,
-    check_increasing,
 )
 from telerig.rig.camera import Camera
 from telerig.rig.units import STANDARD_GRAVITY_M_S2
@@ -36,110 +40,44 @@ _MARK_SIGMA_MM = 100.0
 _FELT_PX = 2e-3
 
 
-def stage_of(table: Any, t_s: Array) -> Stage | None:
-    """The encoder's record around the frames. Raises InputError when it does not overlap them."""
-    if table is None:
+def stage_of(encoder: Encoder | None, t_s: Array) -> Stage | None:
+    """Return the encoder's readings near the frames at t_s (F,)."""
+    if encoder is None:
         return None
-    t = _column(table, "t_s", "stage")
-    position = _column(table, "position_mm", "stage")
-    check_increasing(t, "stage", 2)
-    if t[-1] < t_s[0] or t[0] > t_s[-1]:
-        raise InputError(
-            f"the record ({t[0]:.6g} to {t[-1]:.6g} s) does not overlap the frames "
-            f"({t_s[0]:.6g} to {t_s[-1]:.6g} s)",
-            where="stage",
-            todo="put both on one clock",
-        )
-    near = _near(t, t_s)
-    return Stage(t[near], position[near])
+    near = _near(encoder.t_s, t_s)
+    return Stage(encoder.t_s[near], encoder.position_mm[near])
 
 
 def accelerometers_of(
-    given: Any, rig: Any, cameras: Sequence[Camera], t_s: Array
+    sensors: Sequence[Sensor], cameras: Sequence[Camera]
 ) -> tuple[Accelerometer, ...]:
-    """Sensors from a table (t_s, sensor, ax_m_s2, ...) or from a mapping of name to fields.
+    """Return the accelerometers with their whole records, in mm/s^2.
 
-    A mapping's fields: t_s (N,), a_m_s2 (N, 3), and, where the rig does not describe the sensor,
-    mounted_on, axes, noise_density_ug_sqrt_hz, bias_sigma_m_s2.
-    Raises InputError for a sensor that is not described, unknown mounts, NaN.
+    sensors : with their noise densities.
     """
-    if given is None:
-        return ()
-    described = {} if rig is None else dict(rig.accelerometers)
-    sources = dict(given) if isinstance(given, Mapping) else _split(given)
+    names = [c.name for c in cameras]
     out = []
-    for name, source in sources.items():
-        fields = _description(str(name), source, described)
-        t = np.asarray(source["t_s"], float)
-        reading = np.asarray(source["a_m_s2"], float).reshape(-1, 3) * 1000
-        if not (np.all(np.isfinite(t)) and np.all(np.isfinite(reading))):
-            raise InputError(
-                "readings are not finite", where=f"accelerometer {name}", todo="leave them out"
-            )
-        near = _near(t, t_s)
-        if near.sum() < 2:
-            raise InputError(
-                "its record does not overlap the frames",
-                where=f"accelerometer {name}",
-                todo="put both on one clock",
-            )
-        rate = (near.sum() - 1) / (t[near][-1] - t[near][0])
-        sigma = fields["noise_density_ug_sqrt_hz"] * _MICRO_G_MM_S2 * np.sqrt(rate / 2)
+    for sensor in sensors:
+        assert sensor.noise_density_ug_sqrt_hz is not None, "screening estimates it"
+        rate = sampling_rate(sensor.t_s)
+        sigma = sensor.noise_density_ug_sqrt_hz * _MICRO_G_MM_S2 * np.sqrt(rate / 2)
+        camera = CARRIAGE if sensor.mounted_on == ON_CARRIAGE else names.index(sensor.mounted_on)
         out.append(
             Accelerometer(
-                str(name), _mount(str(name), fields["mounted_on"], cameras), t[near],
-                reading[near], np.asarray(fields["axes"], float), float(sigma),
-                1000 * float(fields.get("bias_sigma_m_s2", 0.2)),
+                sensor.name, camera, sensor.t_s, 1000 * sensor.reading_m_s2, sensor.axes,
+                float(sigma), 1000 * sensor.bias_sigma_m_s2, clock=sensor.clock,
+                kept=None if sensor.kept.all() else sensor.kept,
             )
         )  # fmt: skip
     return tuple(out)
 
 
-def _split(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    columns = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
-    missing = [c for c in ("t_s", "sensor", *columns) if c not in table]
-    if missing:
-        raise InputError(
-            f"the table has no column {', '.join(missing)}",
-            where="accelerometers",
-            todo="its columns are t_s,sensor,ax_m_s2,ay_m_s2,az_m_s2",
-        )
-    return {
-        str(name): {"t_s": rows["t_s"].to_numpy(float), "a_m_s2": rows[columns].to_numpy(float)}
-        for name, rows in table.groupby("sensor", sort=False)
-    }
+def near_frames(sensor: Accelerometer, t_s: Array) -> Accelerometer:
+    """Return the sensor with the samples that were measured within 0.25 s of the frames.
 
-
-def _description(
-    name: str, source: Mapping[str, Any], described: Mapping[str, Any]
-) -> dict[str, Any]:
-    needed = ("mounted_on", "axes", "noise_density_ug_sqrt_hz")
-    fields: dict[str, Any] = {}
-    if name in described:
-        entry = described[name]
-        fields = {key: getattr(entry, key) for key in (*needed, "bias_sigma_m_s2")}
-    fields |= {k: source[k] for k in (*needed, "bias_sigma_m_s2") if k in source}
-    missing = [key for key in needed if key not in fields]
-    if missing:
-        raise InputError(
-            f"nothing says its {', '.join(missing)}",
-            where=f"accelerometer {name}",
-            todo=f"describe it under [accelerometers.{name}] in rig.toml",
-        )
-    return fields
-
-
-def _mount(name: str, mounted_on: str, cameras: Sequence[Camera]) -> int:
-    if mounted_on == "carriage":
-        return CARRIAGE
-    names = [c.name for c in cameras]
-    if mounted_on not in names:
-        raise InputError(
-            f"is mounted on {mounted_on!r}, which is no camera",
-            where=f"accelerometer {name}",
-            todo=f'use one of {", ".join(names)} or "carriage"',
-        )
-    return names.index(mounted_on)
+    t_s : (F,) times of the frames.  There may be no such samples.
+    """
+    return sensor.of(_near(sensor.t_s - sensor.delay_s, t_s))
 
 
 def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelerometer, ...]:
@@ -151,6 +89,7 @@ def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelero
 
 
 def _thinned(sensor: Accelerometer, step_s: float) -> Accelerometer:
+    """Return the block averages. A block with a sample that is not used is left out."""
     block = int(step_s / np.median(np.diff(sensor.t_s)) + 1e-6)
     count = len(sensor.t_s) // block if block > 1 else 0
     if count < 2:
@@ -158,30 +97,40 @@ def _thinned(sensor: Accelerometer, step_s: float) -> Accelerometer:
     used = count * block
     t = sensor.t_s[:used].reshape(count, block)
     whole = np.ptp(t, axis=1) < 1.5 * step_s
+    if sensor.kept is not None:
+        whole &= sensor.kept[:used].reshape(count, block).all(1)
+    if whole.sum() < 2:
+        return sensor
     reading = sensor.reading_mm_s2[:used].reshape(count, block, 3)
     return replace(
         sensor,
         t_s=t.mean(1)[whole],
         reading_mm_s2=reading.mean(1)[whole],
         sigma_mm_s2=sensor.sigma_mm_s2 / float(np.sqrt(block)),
+        kept=None,
     )
 
 
 def references_of(
     table: Any, cameras: Sequence[Camera], t_s: Array, positions_mm: Array, axis: Array
-) -> tuple[tuple[Mark, ...], Observations]:
-    """Marks fixed to the tank: where they were seen, and where their rays come closest."""
-    if table is None or not len(table):
-        return (), Observations.none()
+) -> tuple[tuple[Mark, ...], Observations, list[Finding]]:
+    """Return the marks fixed to the tank where their rays come closest, the pixels at which they
+    were seen, and a warning about pixels outside the frames.
+
+    Raises InputError for a table that cannot be used.
+    """
+    if table is None:
+        return (), Observations.none(), []
+    _check_references(table, cameras)
+    if not len(table):
+        return (), Observations.none(), []
     names = [c.name for c in cameras]
-    unknown = sorted(set(table["camera"]) - set(names))
-    if unknown:
-        raise InputError(
-            f"there is no camera {unknown[0]!r} in the calibration",
-            where="references",
-            todo=f"it has {', '.join(names)}",
-        )
-    table = table[(table["frame"] >= 0) & (table["frame"] < len(t_s))]
+    inside = ((table["frame"] >= 0) & (table["frame"] < len(t_s))).to_numpy()
+    findings = []
+    if not inside.all():
+        words = f"{np.count_nonzero(~inside)} rows are of frames outside 0 to {len(t_s) - 1}"
+        findings.append(Finding(f"{words} and are not used", "references"))
+    table = table[inside]
     attributions = sorted(set(table["mark"].astype(str)))
     number = {m: i for i, m in enumerate(attributions)}
     item = table["mark"].astype(str).map(number).to_numpy(np.int64)
@@ -192,7 +141,30 @@ def references_of(
     observations = Observations(item, frame, camera, uv, sigma[:, None, None] ** 2 * np.eye(2))
     guesses = _marks(observations, cameras, positions_mm, axis, len(attributions))
     marks = (Mark(name, g, _MARK_SIGMA_MM) for name, g in zip(attributions, guesses))
-    return tuple(marks), observations
+    return tuple(marks), observations, findings
+
+
+def _check_references(table: Any, cameras: Sequence[Camera]) -> None:
+    """Raise InputError for a table of marks that cannot be used."""
+    where, todo = "references", "give a table with the columns frame, camera, mark, u_px, v_px"
+    if not hasattr(table, "columns"):
+        raise InputError(f"is {type(table).__name__}, not a table", where=where, todo=todo)
+    missing = [c for c in ("frame", "camera", "mark", "u_px", "v_px") if c not in table]
+    if missing:
+        raise InputError(f"has no column {', '.join(missing)}", where=where, todo=todo)
+    names = [c.name for c in cameras]
+    unknown = sorted(set(table["camera"].astype(str)) - set(names))
+    if unknown:
+        raise InputError(
+            f"there is no camera {unknown[0]!r} in the calibration",
+            where=where,
+            todo=f"it has {', '.join(names)}",
+        )
+    for column in ("frame", "u_px", "v_px", *(["sigma_px"] if "sigma_px" in table else [])):
+        values = times(table[column], where, column)
+        if column == "sigma_px" and np.any(values <= 0):
+            row = int(np.argmax(values <= 0))
+            raise InputError(f"sigma_px is not positive at row {row}", where=where, todo="state it")
 
 
 def _marks(
@@ -240,17 +212,6 @@ def calibration_share(
 
 def _near(t: Array, t_s: Array) -> Bools:
     return np.asarray((t >= t_s[0] - _MARGIN_S) & (t <= t_s[-1] + _MARGIN_S))
-
-
-def _column(table: Any, name: str, where: str) -> Array:
-    if name not in table:
-        raise InputError(
-            f"the table has no column {name}", where=where, todo="give t_s,position_mm"
-        )
-    values = np.asarray(table[name], float)
-    if not np.all(np.isfinite(values)):
-        raise InputError(f"{name} is not finite everywhere", where=where, todo="leave rows out")
-    return values
 
 
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")

@@ -62,7 +62,7 @@ def test_the_console_and_the_report_say_it(data: Path) -> None:
 def test_the_smoother_takes_it(data: Path) -> None:
     calibration = telerig.load_calibration(data / "results" / "calibration")
     run = load_run(data / "runs" / "rise")
-    problem, _, _ = problem_of(None, calibration, stage=run)
+    problem, *_ = problem_of(None, calibration, stage=run)
     assert problem.travel is not None and problem.travel.source == "stage_axis"
     np.testing.assert_allclose(problem.axis, calibration.stage["axis"])
     assert problem.stage is not None

@@ -9,22 +9,21 @@ import numpy as np
 import pytest
 
 import telerig
-from telerig.estimator.sensors.accelerometer_checks import (
-    clippings,
-    fitting_axes,
-    motion_correlation,
-)
+from telerig.estimator.sensors.accelerometer_checks import fitting_axes, motion_correlation
 from telerig.estimator.sensors.checks import check_sensors
 from telerig.estimator.sensors.encoder_checks import check_encoder, encoder_faults
+from telerig.estimator.sensors.samples import clippings
 from telerig.io.simulation.presets import run_preset
 
 
 def test_jumps_outside_the_frames_only_warn() -> None:
     t = np.arange(1000) / 1000
     position = 280 * t + np.where(t > 0.8, 5.0, 0.0)
-    words = check_encoder(t, position, np.arange(0.1, 0.7, 0.002))
-    assert len(words) == 1
-    assert "+5 mm at 0.801 s" in words[0]
+    kept, found = check_encoder(t, position, np.arange(0.1, 0.7, 0.002))
+    assert kept.all()
+    assert len(found) == 1
+    assert found[0].code is None
+    assert "+5 mm at 0.801 s" in found[0].warning
 
 
 def test_hard_but_real_motion_is_no_jump() -> None:

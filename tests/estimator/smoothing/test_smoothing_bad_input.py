@@ -15,6 +15,7 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.sensors.checks import check_sensors
+from telerig.estimator.sensors.findings import settled
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.io.dataset.run import RunData
@@ -80,7 +81,6 @@ def refused(run: Path, *words: str) -> str:
     """Loading, checking or smoothing ends in an InputError with what to do and these words."""
     with pytest.raises(InputError) as caught:
         data = telerig.load_run(run)
-        check_sensors(data, tracks=tracks(data), calibration=calibration())
         smooth(tracks(data), calibration(), stage=data, model=ShakeModel())
     message = str(caught.value)
     assert "\n  -> " in message, message
@@ -90,7 +90,7 @@ def refused(run: Path, *words: str) -> str:
 
 
 def warned(run: Path, *words: str) -> list[str]:
-    found = check_sensors(telerig.load_run(run))
+    found = settled(check_sensors(telerig.load_run(run)), frozenset())
     assert any(all(word in line for word in words) for line in found), found
     return found
 
@@ -177,8 +177,13 @@ def test_single_wrong_readings(run: Path) -> None:
     def change(table: pd.DataFrame) -> None:
         table.loc[300:301, "position_mm"] += 3.0
 
+    data = telerig.load_run(run)
+    clean = smooth(tracks(data), calibration(), stage=data).trajectories
     spoil(run / "stage.csv", change)
-    refused(run, "2 reading(s)", moment(run, 300), "+2.99", "remove those rows")
+    warned(run, "2 reading(s)", moment(run, 300), "+2.99", "not used")
+    found = smooth(tracks(data), calibration(), stage=telerig.load_run(run))
+    assert len(found.summary["warnings"]) == 1
+    np.testing.assert_allclose(found.trajectories["y_mm"], clean["y_mm"], atol=2e-3)
 
 
 # --- accelerometers ----------------------------------------------------------------------------
@@ -192,8 +197,8 @@ def test_accelerometers_in_another_unit(factor: float, unit: str, run: Path) -> 
         table[ACCELERATIONS] *= factor
 
     spoil(run / "accelerometer.csv", change)
-    message = refused(run, unit, "multiply", "sensor arm_left")
-    said = float(message.split(" by ")[-1])
+    message = refused(run, unit, "multiply", "sensor arm_left", "--accept SENSOR_UNIT")
+    said = float(message.split(" by ")[-1].split(". To use")[0])
     assert said == pytest.approx(1 / factor, rel=0.1 if unit == "mg" else 1e-5)
 
 
@@ -240,8 +245,9 @@ def test_wrong_mounting_axes(run: Path) -> None:
         table[ACCELERATIONS] = given @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
     spoil(run / "accelerometer.csv", change)
-    found = warned(run, "arm_right", "deg away from up", "would fit")
-    assert len([w for w in found if "away from up" in w]) == 2
+    found = check_sensors(telerig.load_run(run))
+    assert len([f for f in found if "away from up" in f.words]) == 2
+    refused(run, "arm_left", "deg away from up", "would fit", "--accept SENSOR_AXES")
 
 
 def test_upside_down(run: Path) -> None:
@@ -249,7 +255,7 @@ def test_upside_down(run: Path) -> None:
         table[["ax_m_s2", "ay_m_s2"]] *= -1
 
     spoil(run / "accelerometer.csv", change)
-    warned(run, "179 deg away from up")
+    refused(run, "179 deg away from up")
 
 
 @pytest.mark.parametrize(("felt", "sign", "told"), [(0, -1, ""), (2, 1, "-z"), (0, 1, "-x")])
@@ -266,7 +272,7 @@ def test_axes_that_gravity_cannot_tell(felt: int, sign: int, told: str, run: Pat
     table[ACCELERATIONS] = still - [0.0, 9.81, 0.0]
     table[ACCELERATIONS[felt]] += sign * push
     rig = replace(data.rig, stage=StageDescription((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), 0.001))
-    words = check_sensors(replace(data, rig=rig, accelerometers=table))
+    words = settled(check_sensors(replace(data, rig=rig, accelerometers=table)), frozenset())
     assert len(words) == (2 if told else 0), words
     assert all(f"felt along {told} of the sensor" in w for w in words), words
 
@@ -350,4 +356,4 @@ def test_tracks_of_another_calibration(run: Path) -> None:
         check_sensors(data, tracks=table, calibration=moved)
     again = other(lambda c: c.with_parameters(centre_v_px=c["centre_v_px"] + 1))
     words = check_sensors(data, tracks=table, calibration=again)
-    assert len(words) == 1 and "another calibration" in words[0]
+    assert len(words) == 1 and "another calibration" in words[0].words

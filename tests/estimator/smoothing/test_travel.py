@@ -146,7 +146,7 @@ def test_calibrated_stage_goes_before_rig_toml() -> None:
     calibration: Any = SimpleNamespace(cameras=CAMERAS, stage=stage, covariance=np.zeros((0, 0)))
     table = pd.DataFrame({"t_s": [0.0, 1.0], "position_mm": [0.0, 102.0]})
     rig = SimpleNamespace(stage=described, accelerometers={})
-    found, _, _ = problem_of(None, calibration, stage=table, rig=rig, t_s=[0.0, 0.5, 1.0])
+    found, *_ = problem_of(None, calibration, stage=table, rig=rig, t_s=[0.0, 0.5, 1.0])
     np.testing.assert_allclose(found.axis, axis)
     assert found.stage is not None and found.stage.position_mm[-1] == pytest.approx(100)
     stated = travel_of({}, described)

@@ -1,0 +1,330 @@
+"""Finds the samples of an accelerometer that cannot be right: spikes, clipped and frozen ones.
+
+`screened` masks them one by one; what it misses gets less weight in the smoothing graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike
+
+from telerig.arrays import Array, Bools
+from telerig.estimator.sensors.findings import Finding
+from telerig.estimator.sensors.given import Sensor
+from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.statistics import robust_sd
+
+_MICRO_G_M_S2 = 1e-6 * STANDARD_GRAVITY_M_S2
+_NEIGHBOURS = 4
+_LEAST_TO_LEARN = 60
+_BLOCK = 1 << 16
+
+_SPIKE_SIGMAS = 20.0
+_LONGEST_SPIKE = 3
+_ALONE, _QUIET = 12, 0.1
+"""A spike stands alone: it exceeds the range of the 12 samples on each side, of which none is
+predicted badly. An impact rings."""
+
+_LOCAL = 64
+_ROUNDS = 20
+
+_CLIPPED_LEAST = 5
+_CLIPPED_EXCESS = 3
+_AT_LIMIT = 1e-3
+
+_LEAST_FROZEN = 4
+_CHANCE = 1e-6
+_WINDOWS = (16, 64)
+
+_GAP_STEPS = 5.0
+_MOST_MASKED = 0.5
+_SEGMENT = 256
+_BAND = (0.125, 0.45)
+_LEAST_UG_SQRT_HZ = 1.0
+
+
+@dataclass(frozen=True)
+class Clipping:
+    """Describes one axis of a sensor that is clipped at a limit of its range.
+
+    axis : 0, 1 or 2.
+    value : the limit (m/s^2).
+    samples : (N,) which samples are clipped.
+    """
+
+    axis: int
+    value: float
+    samples: Bools
+
+
+def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
+    """Return the sensor with samples masked that cannot be right, and warnings that count them.
+
+    The readings of masked samples are interpolated from their neighbours, so that filters of the
+    record see nothing of them. A noise density that nothing states is estimated.
+    """
+    t, reading, where = sensor.t_s, sensor.reading_m_s2, sensor.where
+    findings: list[Finding] = []
+
+    def warn(words: str, masked: Bools) -> None:
+        first = int(np.argmax(masked))
+        findings.append(Finding(f"{words} and are not used, the first at {t[first]:.6g} s", where))
+
+    clipped = np.zeros(len(t), bool)
+    for found in clippings(reading, sensor.range_m_s2):
+        clipped |= found.samples
+        warn(
+            f"{np.count_nonzero(found.samples)} of {len(t)} samples of "
+            f"a{'xyz'[found.axis]} are clipped at "
+            f"{found.value:.4g} m/s^2: the sensor's range is too small; they", found.samples,
+        )  # fmt: skip
+    density = sensor.noise_density_ug_sqrt_hz
+    if density is None:
+        density = noise_density(t, reading)
+        findings.append(
+            Finding(
+                f"no noise density is given; {density:.3g} ug/sqrt(Hz) are estimated",
+                where,
+                "give noise_density_ug_sqrt_hz from the data sheet",
+            )
+        )
+    sigma = density * _MICRO_G_M_S2 * np.sqrt(sampling_rate(t) / 2)
+    frozen = frozen_samples(reading, sigma) & ~clipped
+    if frozen.any():
+        warn(f"{np.count_nonzero(frozen)} of {len(t)} samples repeat the one before: the sensor "
+             "had stopped; they", frozen)  # fmt: skip
+    spikes = np.any([spike_samples(a) for a in reading.T], axis=0) & ~clipped & ~frozen
+    if spikes.any():
+        warn(f"{np.count_nonzero(spikes)} of {len(t)} samples are spikes", spikes)
+    findings += _gaps(t, where)
+    kept = ~(clipped | frozen | spikes)
+    filled = reading
+    if not kept.all() and kept.any():
+        filled = np.stack([np.interp(t, t[kept], a[kept]) for a in reading.T], -1)
+    sensor = replace(sensor, reading_m_s2=filled, kept=kept, noise_density_ug_sqrt_hz=density)
+    return sensor, findings
+
+
+def mostly_masked(sensor: Sensor) -> Finding | None:
+    """Return a warning if so many samples are masked that the sensor has to be left out."""
+    share = 1 - float(sensor.kept.mean())
+    if share <= _MOST_MASKED:
+        return None
+    return Finding(
+        f"{100 * share:.0f} % of its samples cannot be used, so the sensor is left out",
+        sensor.where,
+        "record again with a wider range, or repair the sensor",
+    )
+
+
+def sampling_rate(t_s: ArrayLike) -> float:
+    """Return the sampling rate in Hz of times (N,), without their gaps."""
+    steps = np.diff(np.asarray(t_s, float))
+    return float(1 / steps[steps < 3 * np.median(steps)].mean())
+
+
+def noise_density(t_s: ArrayLike, reading_m_s2: ArrayLike) -> float:
+    """Return the noise density in micro-g per root hertz that a record (N, 3) shows.
+
+    It is the level of the spectrum between 1/8 and 0.45 of the sampling rate, where shake is small:
+    the median over frequencies, and the lower quartile over parts of the record.
+    """
+    from scipy.signal import spectrogram
+
+    reading = np.asarray(reading_m_s2, float)
+    rate = sampling_rate(t_s)
+    frequency, _, power = spectrogram(
+        reading, rate, nperseg=min(_SEGMENT, len(reading)), axis=0, detrend="linear"
+    )
+    band = (frequency >= _BAND[0] * rate) & (frequency <= _BAND[1] * rate)
+    if not band.any():
+        return _LEAST_UG_SQRT_HZ
+    level = np.quantile(np.median(power[band], axis=0) / np.log(2), 0.25, axis=-1)
+    quantum = min(quantisation(axis) for axis in reading.T) ** 2 / 6 / rate
+    density = float(np.sqrt(np.mean(np.maximum(level, quantum)))) / _MICRO_G_M_S2
+    return max(density, _LEAST_UG_SQRT_HZ)
+
+
+def quantisation(values: ArrayLike) -> float:
+    """Return the smallest step between different values (N,); 0 if there is only one value."""
+    steps = np.diff(np.unique(np.asarray(values, float)))
+    size = np.abs(values).max(initial=0.0) if len(steps) else 0.0
+    steps = steps[steps > 1e-9 * size]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def clippings(reading: ArrayLike, range_m_s2: float | None = None) -> list[Clipping]:
+    """Return the limits at which samples (N, 3) are clipped.
+
+    Without a range, the smallest or largest value of an axis counts as a limit if it occurs at
+    least 5 times, and at least 3 times as often as the next value.
+    """
+    out = []
+    for axis, a in enumerate(np.asarray(reading, float).T):
+        beyond: Bools = np.zeros(len(a), bool)
+        for limit in [] if range_m_s2 is None else [-range_m_s2, range_m_s2]:
+            mine = a / limit >= 1 - _AT_LIMIT
+            beyond |= mine
+            out.append(Clipping(axis, limit, mine))
+        values, counts = np.unique(a[~beyond], return_counts=True)
+        for end, next_one in ((0, 1), (-1, -2)) if len(values) >= 3 else ():
+            if counts[end] >= max(_CLIPPED_LEAST, _CLIPPED_EXCESS * int(counts[next_one])):
+                out.append(Clipping(axis, float(values[end]), a == values[end]))
+    return [found for found in out if found.samples.any()]
+
+
+def frozen_samples(reading: ArrayLike, sigma: float) -> Bools:
+    """Return which samples (N, 3) repeat the one before because the sensor had stopped.
+
+    A run of identical samples counts if it is too long to be a sensor at rest that reads in coarse
+    steps. How probable a repetition is follows from the noise and the step, and from how often
+    samples are repeated elsewhere; or, where this allows it, from the samples just before and just
+    after the run, because a sensor that comes to rest does so gradually.
+
+    sigma : noise standard deviation of one sample in m/s^2.
+    """
+    samples = np.asarray(reading, float)
+    same = np.all(np.diff(samples, axis=0) == 0, axis=1)
+    frozen = np.zeros(len(samples), bool)
+    if not same.any():
+        return frozen
+    steps = np.array([quantisation(axis) for axis in samples.T])
+    at_rest = float(np.prod(np.minimum(1.0, steps[steps > 0] / (2 * np.sqrt(np.pi) * sigma))))
+    total, count = np.count_nonzero(same), len(same)
+    needed = np.log(_CHANCE / count)
+    for first, last in _runs(same):
+        length = last - first
+        if length < _LEAST_FROZEN:
+            continue
+        elsewhere = (total - length + 1) / (count - length + 2)
+        chances = [max(at_rest, elsewhere)]
+        if first > 0 and last < count:
+            chances.append(max(_repeated(same, first, last)))
+        if length * np.log(min(*chances, 1.0)) < needed:
+            frozen[first + 1 : last + 1] = True
+    return frozen
+
+
+def _runs(which: Bools) -> Iterator[tuple[int, int]]:
+    """Return (first, last + 1) of each run of true values (N,)."""
+    edges = np.diff(np.r_[0, which.astype(np.int8), 0])
+    for first, last in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)):
+        yield int(first), int(last)
+
+
+def _repeated(same: Bools, first: int, last: int) -> Iterator[float]:
+    """Return the probability of a repetition in windows just before and just after a run."""
+    for window in _WINDOWS:
+        for part in (same[max(first - window, 0) : first], same[last : last + window]):
+            yield (np.count_nonzero(part) + 1) / (len(part) + 2)
+
+
+def spike_samples(values: ArrayLike) -> Bools:
+    """Return which values (N,) are spikes of at most three samples that stand alone.
+
+    A spike differs by 20 standard deviations from what its neighbours predict, of the whole record
+    and of the 64 samples about it.
+    """
+    signal = np.asarray(values, float)
+    out = np.zeros(len(signal), bool)
+    for first in range(0, len(signal), _BLOCK):
+        part = slice(max(first - _LOCAL, 0), first + _BLOCK + _LOCAL)
+        found = _spikes(signal[part])
+        out[first : first + _BLOCK] = found[first - part.start :][:_BLOCK]
+    return out
+
+
+def _spikes(signal: Array) -> Bools:
+    from scipy.ndimage import maximum_filter1d
+
+    clean, hit = signal.copy(), np.zeros(len(signal), bool)
+    predictor = _predictor(clean)
+    residual = _residual(clean, predictor)
+    bound = _SPIKE_SIGMAS * np.maximum(_local_sd(residual), quantisation(signal))
+    for _ in range(_ROUNDS):
+        size = np.abs(residual)
+        peaks = (size > bound) & (size == maximum_filter1d(size, 2 * _NEIGHBOURS + 1))
+        if not peaks.any():
+            break
+        clean[peaks] -= residual[peaks]
+        hit |= peaks
+        residual = _residual(clean, predictor)
+    off = np.abs(signal - clean)
+    for first, last in list(_runs(hit)):
+        near = slice(max(first - _ALONE, 0), last + _ALONE)
+        least, size = off[first:last].min(), np.abs(residual[near])
+        quiet = size.max() <= max(_QUIET * least, bound[first:last].min() / 2)
+        if last - first > _LONGEST_SPIKE or least < np.ptp(clean[near]) or not quiet:
+            hit[first:last] = False
+    return hit
+
+
+def _local_sd(residual: Array) -> Array:
+    """Return the larger of the robust standard deviations of the record and of 64 samples (N,)."""
+    whole = float(robust_sd(residual))
+    count = len(residual) // _LOCAL
+    if count < 2:
+        return np.full(len(residual), whole)
+    each = robust_sd(residual[: count * _LOCAL].reshape(count, _LOCAL), axis=1)
+    wide = np.max(sliding_window_view(np.pad(each, 1, mode="edge"), 3), axis=1)
+    block = np.minimum(np.arange(len(residual)) // _LOCAL, count - 1)
+    return np.asarray(np.maximum(whole, wide[block]))
+
+
+def prediction_residual(values: Array) -> Array:
+    """Return each value (N,) minus its prediction from four neighbours on each side.
+
+    The result is 0 for short records, and at the ends.
+    """
+    return _residual(values, _predictor(values))
+
+
+def _predictor(values: Array) -> Array | None:
+    """Return the weights (8,) of the four neighbours on each side, and a constant, that predict a
+    value best; None for short records.
+
+    They are fitted to the record itself by least squares, without the values that they predict
+    badly, so they also follow an oscillation.
+    """
+    width = 2 * _NEIGHBOURS + 1
+    if len(values) < _LEAST_TO_LEARN:
+        return None
+    near = sliding_window_view(np.pad(values, _NEIGHBOURS, mode="edge"), width)
+    near = np.delete(near, _NEIGHBOURS, axis=1)
+    near = np.concatenate([near, np.ones((len(values), 1))], -1)
+    kept = np.ones(len(values), bool)
+    for _ in range(4):
+        weights = np.linalg.lstsq(near[kept], values[kept], rcond=None)[0]
+        residual = values - near @ weights
+        clean = np.abs(residual) <= 5 * robust_sd(residual)
+        kept = np.convolve(~clean, np.ones(width), "same") < 0.5
+        if kept.sum() < _LEAST_TO_LEARN // 2:
+            return None
+    return np.asarray(weights)
+
+
+def _residual(values: Array, predictor: Array | None) -> Array:
+    if predictor is None:
+        return np.zeros(len(values))
+    taps = np.insert(-predictor[:-1], _NEIGHBOURS, 1.0)
+    residual = np.correlate(np.pad(values, _NEIGHBOURS, mode="edge"), taps, "valid") - predictor[-1]
+    residual[:_NEIGHBOURS] = residual[-_NEIGHBOURS:] = 0.0
+    return np.asarray(residual)
+
+
+def _gaps(t: Array, where: str) -> list[Finding]:
+    """Return a warning about steps in which samples are missing."""
+    steps = np.diff(t)
+    gaps = np.flatnonzero(steps > _GAP_STEPS * np.median(steps))
+    if not len(gaps):
+        return []
+    words = (
+        f"samples are missing in {len(gaps)} gap{'s' * (len(gaps) > 1)}, the first of "
+        f"{1000 * steps[gaps[0]]:.3g} ms at {t[gaps[0]]:.6g} s, the longest of "
+        f"{1000 * steps[gaps].max():.3g} ms"
+    )
+    return [Finding(words, where)]

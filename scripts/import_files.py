@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,10 +12,12 @@ from telerig.io.exchange.formats import CAMERA_IMPORTERS, recording_words
 from telerig.scripts import options
 from telerig.scripts.console import errors_in_words, say, typed_command
 
-app = typer.Typer(
-    no_args_is_help=True,
-    help="Import cameras of other programs, and recordings of accelerometers.",
-)
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from telerig.arrays import Array
+
+app = typer.Typer(no_args_is_help=True)
 
 Files = Annotated[list[Path], typer.Argument(help="The files, in the order of the cameras.")]
 Out = Annotated[Path, typer.Option(help="Folder for calibration.json and nominal.toml.")]
@@ -95,7 +97,10 @@ def accelerometer(
         str | None, typer.Option(help="Names or numbers (from 0) of x, y and z: 'ch1,ch2,ch3'.")
     ] = None,
     time: Annotated[
-        str | None, typer.Option(help="Name of the channel that holds the times in s.")
+        str | None, typer.Option(help="Name or number (from 0) of the channel of times.")
+    ] = None,
+    time_unit: Annotated[
+        str | None, typer.Option(help="Unit of the times: s, ms, us, ns, min or h.")
     ] = None,
     rate_hz: Annotated[
         float | None, typer.Option(help="Sampling rate, for a file without times.")
@@ -104,7 +109,7 @@ def accelerometer(
         float, typer.Option(help="Added to all times, to bring them to the run's clock.")
     ] = 0.0,
     unit: Annotated[
-        str | None, typer.Option(help="Unit of the readings: m/s2, mm/s2, g or mg.")
+        str | None, typer.Option(help="Unit of the readings: m/s2, cm/s2, mm/s2, g, mg or ug.")
     ] = None,
     scale: Annotated[
         str | None,
@@ -115,29 +120,137 @@ def accelerometer(
     ] = None,
     group: Annotated[str | None, typer.Option(help="Group of a TDMS file.")] = None,
 ) -> None:
-    from telerig.io.exchange.importing.accelerometer import (
-        layout_from,
-        merge_accelerations,
-        read_accelerations,
-    )
+    """The sensor must be in rig.toml; the refusal of another one shows the lines to add.
 
-    if not run.is_dir():
-        raise InputError("there is no such run", where=str(run), todo="check --run")
+    What the file does not say is asked for by the name of the option that says it.
+    """
+    from telerig.io.exchange.importing.accelerometer import import_accelerations, layout_from
+    from telerig.io.exchange.importing.records import merge_accelerations
+
+    _check_run(run)
     layout = layout_from(
         {
-            "channels": channels, "time": time, "rate_hz": rate_hz, "start_s": start_s,
-            "unit": unit, "scale_m_s2": scale, "group": group,
+            "channels": channels, "time": time, "time_unit": time_unit, "rate_hz": rate_hz,
+            "start_s": start_s, "unit": unit, "scale_m_s2": scale, "group": group,
         }
     )  # fmt: skip
-    table = read_accelerations(file, sensor, layout)
-    replaced = merge_accelerations(table, run / "accelerometer.csv")
-    first, last = table["t_s"].iloc[0], table["t_s"].iloc[-1]
-    say(f"{sensor}: {len(table)} readings from {first:.6g} to {last:.6g} s")
-    means = table[["ax_m_s2", "ay_m_s2", "az_m_s2"]].mean()
-    say("mean reading (x, y, z): " + ", ".join(f"{value:.4g}" for value in means) + " m/s^2")
+    found = import_accelerations(file, sensor, layout)
+    _check_sensor(run, sensor, found.table)
+    replaced = merge_accelerations(found.table, run / "accelerometer.csv")
+    for note in found.notes:
+        say(note)
+    say(_record_words(sensor, found.table, _frame_times(run)))
     if replaced:
         say(f"the earlier readings of {sensor} were replaced; other sensors' readings stay")
     say(f"written: {run / 'accelerometer.csv'}")
+
+
+@app.callback(invoke_without_command=True)
+@errors_in_words()
+def records(
+    context: typer.Context,
+    listed: Annotated[
+        Path | None,
+        typer.Option("--list", help="DATASET/runs/NAME: list its recordings of accelerometers."),
+    ] = None,
+    remove: Annotated[
+        str | None,
+        typer.Option(help="Name of a sensor: remove its recording from the run given by --list."),
+    ] = None,
+) -> None:
+    """Import cameras of other programs, and recordings of accelerometers; list and remove these."""
+    from telerig.io.exchange.importing.records import imported_records, remove_accelerations
+
+    if listed is None:
+        if remove is not None:
+            raise InputError(
+                f"--remove {remove}: no run is given", todo="give it with --list DATASET/runs/NAME"
+            )
+        return
+    if context.invoked_subcommand:
+        raise InputError(
+            f"--list and {context.invoked_subcommand} are given", todo="give one of them"
+        )
+    _check_run(listed)
+    file = listed / "accelerometer.csv"
+    if remove is not None:
+        say(f"removed: {remove_accelerations(remove, file)} readings of {remove}")
+    found = imported_records(file)
+    frames_t_s = _frame_times(listed) if found else None
+    for name, table in found.items():
+        say(_record_words(name, table, frames_t_s))
+    if not found:
+        say(f"{listed}: there are no recordings of accelerometers")
+
+
+def _check_run(run: Path) -> None:
+    if not run.is_dir():
+        raise InputError("there is no such run", where=str(run), todo="check the path")
+
+
+def _check_sensor(run: Path, sensor: str, table: pd.DataFrame) -> None:
+    """Raise InputError for a sensor that the rig.toml of the run's dataset does not know.
+
+    The error shows the lines to add. A run outside a dataset has no rig.toml and no check.
+    """
+    from telerig.io.exchange.importing.sensor_table import sensor_toml
+    from telerig.io.rig_file.rig_file import read_rig_toml
+
+    file = run.resolve().parent.parent / "rig.toml"
+    if not file.is_file():
+        return
+    rig = read_rig_toml(file)
+    if sensor not in rig.accelerometers:
+        known = f" (there are: {', '.join(rig.accelerometers)})" if rig.accelerometers else ""
+        raise InputError(
+            f"there is no accelerometer {sensor!r}{known}",
+            where=str(file),
+            todo="give --sensor another name, or add these lines and import again:\n"
+            + sensor_toml(sensor, table, list(rig.cameras)),
+        )
+
+
+def _frame_times(run: Path) -> Array | None:
+    """Return the (F,) times of the run's frames in s; None if they cannot be read yet."""
+    from telerig.io.dataset.run import load_run
+
+    try:
+        return load_run(
+            run, source="detections" if (run / "detections.csv").is_file() else None
+        ).t_s
+    except InputError:
+        return None
+
+
+def _record_words(sensor: str, table: pd.DataFrame, frames_t_s: Array | None) -> str:
+    """Return the lines about a sensor's readings.
+
+    table : its rows of accelerometer.csv. frames_t_s : (F,) times of the frames in s, or None.
+    """
+    t_s = table["t_s"].to_numpy()
+    rate = f" at {(len(t_s) - 1) / (t_s[-1] - t_s[0]):.5g} Hz" if len(t_s) > 1 else ""
+    mean = table[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy().mean(0)
+    numbers = ", ".join(f"{value:.4g}" for value in mean)
+    size = float((mean @ mean) ** 0.5)
+    lines = [
+        f"{sensor}: {len(table)} readings from {t_s[0]:.6g} to {t_s[-1]:.6g} s{rate}",
+        f"  mean reading (x, y, z): {numbers} m/s^2, {size:.4g} in all (gravity at rest: 9.81)",
+    ]
+    if frames_t_s is not None and len(frames_t_s):
+        first, last = float(frames_t_s[0]), float(frames_t_s[-1])
+        outside = (t_s < first) | (t_s > last)
+        if outside.any():
+            times = t_s[outside]
+            lines.append(
+                f"  {100 * outside.mean():.3g} % of them are outside the run's time ({first:.6g} "
+                f"to {last:.6g} s): the first at {times[0]:.6g} s, the last at {times[-1]:.6g} s"
+            )
+        if outside.all():
+            lines.append(
+                '  the sensor seems to have its own clock: write clock = "unknown" into its table '
+                "in rig.toml, or bring it to the run's clock with --start-s"
+            )
+    return "\n".join(lines)
 
 
 def _pair(option: str, text: str) -> tuple[float, float]:

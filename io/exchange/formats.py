@@ -98,18 +98,16 @@ CAMERA_IMPORTERS = {
         options=("names", "sensor"),
     ),
 }
-_ACCELEROMETER = "importing.accelerometer"
+_BINARY = "importing.binary_recordings"
 RECORDINGS = {
-    ".csv": Format("CSV", f"{_ACCELEROMETER}:read_csv", "readings in columns"),
-    ".wav": Format("WAV", f"{_ACCELEROMETER}:read_wav", "channels of a sound file"),
-    ".mat": Format("MAT", f"{_ACCELEROMETER}:read_mat", "vectors of MATLAB"),
-    ".tdms": Format(
-        "TDMS", f"{_ACCELEROMETER}:read_tdms", "LabVIEW", options=("group",), extra="tdms"
-    ),
+    ".csv": Format("CSV", "importing.logger_text:read_logger_text", "readings in columns"),
+    ".wav": Format("WAV", f"{_BINARY}:read_wav", "channels of a sound file"),
+    ".mat": Format("MAT", f"{_BINARY}:read_mat", "vectors of MATLAB"),
+    ".tdms": Format("TDMS", f"{_BINARY}:read_tdms", "LabVIEW", options=("group",), extra="tdms"),
 }
 """Recordings of accelerometers by the ending of the file. A reader takes the path, and returns a
 `Recording`."""
-RECORDINGS |= dict.fromkeys((".txt", ".tsv"), RECORDINGS[".csv"])
+RECORDINGS |= dict.fromkeys((".txt", ".tsv", ".lvm", ".dat"), RECORDINGS[".csv"])
 
 
 def recording_words() -> str:

@@ -8,6 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import h5py
 import imageio.v3 as iio
 import numpy as np
 import pandas as pd
@@ -152,6 +153,8 @@ def _foreign(folder: Path, rng: np.random.Generator) -> None:
     wavfile.write(folder / "arm.wav", 1000, (axes * 1000).astype(np.int16))
     savemat(folder / "arm.mat", {"t": t_s, "ax": axes[:, 0], "ay": axes[:, 1], "az": axes[:, 2]})
     _tdms(folder / "arm.tdms", axes)
+    _matlab_7_3(folder / "arm73.mat", t_s, axes)
+    _loggers_texts(folder, axes)
     matrices = {f"M{i}": np.array([[9000.0, 0, 650], [0, 9010, 395], [0, 0, 1]]) for i in (1, 2)}
     turned = cv2.Rodrigues(np.array([0.02, -1.2, 0.03]))[0]
     content = matrices | {"R": turned, "T": np.array([420.0, 5, 280]), "D1": np.zeros(5)}
@@ -162,6 +165,37 @@ def _foreign(folder: Path, rng: np.random.Generator) -> None:
         storage.release()
     _openptv(folder)
     _openlpt(folder)
+
+
+def _matlab_7_3(file: Path, t_s: Any, axes: Any) -> None:
+    with h5py.File(file, "w", userblock_size=512) as hdf5:
+        for name, values in (("t", t_s), *zip(("ax", "ay", "az"), axes.T)):
+            hdf5[name] = values[None]
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    file.write_bytes(head.ljust(512, b"\0") + file.read_bytes()[512:])
+
+
+def _loggers_texts(folder: Path, axes: Any) -> None:
+    """Stamps with decimal commas; a counter below comments; a line of units; two bytes a letter."""
+    cells = [[f"{value:.5f}" for value in row] for row in axes]
+    stamps = [
+        f"09.03.2024;23:59:{59.97 + i / 1000:06.3f}"
+        if i < 30
+        else f"10.03.2024;00:00:{i / 1e3:06.3f}"
+        for i in range(len(axes))
+    ]
+    rows = [";".join([stamp, *row]).replace(".", ",") for stamp, row in zip(stamps, cells)]
+    rows = [row.replace(",03,2024", ".03.2024") for row in rows]
+    head = "Logger;7\nAbtastrate;1000\nDatum;Uhrzeit;Acc X [mg];Acc Y [mg];Acc Z [mg]\n"
+    stamped = head + "\n".join(rows) + "\n"
+    (folder / "stamps.txt").write_text(stamped, "utf-8-sig")
+    (folder / "wide.txt").write_text(stamped, "utf-16")
+    rows = [f"{i},{','.join(row)}" for i, row in enumerate(cells)]
+    head = "# data_rate = 1 kHz, range 4 g\n;Headers,count,Ax,Ay,Az\n"
+    (folder / "counter.txt").write_text(head + "\n".join(rows) + "\n;switched off\n")
+    rows = [f"{i}\t" + "\t".join(row) + "\t" for i, row in enumerate(cells)]
+    head = "time\tX\tY\tZ\t\nms\tm/(s^2)\tm/(s^2)\tm/(s^2)\t\n"
+    (folder / "units.txt").write_text(head + "\n".join(rows))
 
 
 def _tdms(file: Path, axes: Any) -> None:

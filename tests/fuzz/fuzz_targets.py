@@ -184,9 +184,21 @@ def _batch(file: Path) -> Any:
 def _accelerometer(file: Path) -> Any:
     from telerig.io.exchange.importing.accelerometer import Layout, read_accelerations
 
-    unit = {".wav": {"scale_m_s2": 20.0}, ".tdms": {}, ".csv": {}}.get(file.suffix, {"unit": "g"})
+    unit = {".wav": {"scale_m_s2": 20.0}, ".mat": {"unit": "g"}}.get(file.suffix, {})
     more = {"time": "t", "channels": ("ax", "ay", "az")} if file.suffix == ".mat" else {}
     return read_accelerations(file, "arm", Layout(**unit, **more))
+
+
+def _loggers_text(file: Path) -> Any:
+    """What is read can be described for rig.toml, too."""
+    import tomllib
+
+    from telerig.io.exchange.importing.accelerometer import Layout, import_accelerations
+    from telerig.io.exchange.importing.sensor_table import sensor_toml
+
+    found = import_accelerations(file, "arm", Layout(unit="g"))
+    tomllib.loads(sensor_toml("arm", found.table, ["left", "right"]))
+    return found.table
 
 
 def _opencv(file: Path) -> Any:
@@ -269,6 +281,12 @@ TARGETS = {
     "to trackpy": Target(f"{_TRACKED}/trajectories.csv", "csv", _run_to("trackpy"), 0.5),
     "batch": Target("batch/batch.json", "json", _batch, 0.3),
     "arm.csv": Target("foreign/arm.csv", "csv", _accelerometer),
+    **{
+        f"logger's {name}": Target(f"foreign/{name}.txt", "csv", _loggers_text)
+        for name in ("stamps", "counter", "units")
+    },
+    "logger's UTF-16": Target("foreign/wide.txt", "binary", _loggers_text),
+    "arm73.mat": Target("foreign/arm73.mat", "binary", _accelerometer),
     "arm.wav": Target("foreign/arm.wav", "binary", _accelerometer, 2),
     "arm.mat": Target("foreign/arm.mat", "binary", _accelerometer),
     "arm.tdms": Target("foreign/arm.tdms", "binary", _accelerometer),

@@ -1,48 +1,56 @@
-"""Readings of accelerometers from CSV, WAV, TDMS and MAT files, for `accelerometer.csv`.
+"""Readings of accelerometers from the files of loggers, for `accelerometer.csv`.
 
-The unit is never guessed: it is in the column names of the file (``ax_m_s2``), in the
-``unit_string`` of a TDMS channel, or given. The axes stay those of the sensor; rig.toml says how
-they lie in the rig.
+The unit is never guessed: it is in the names of the channels (``X (g)``, ``ax_m_s2``), in a line of
+units, in the ``unit_string`` of a TDMS channel, or given. The axes stay those of the sensor;
+rig.toml says how they lie in the rig.
 """
 
 from __future__ import annotations
 
-import logging
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import partial
-from importlib import import_module
+from collections.abc import Sequence
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.errors import InputError
 from telerig.io.exchange.formats import RECORDINGS
-from telerig.io.files.csv_table import LARGEST_NUMBER, write_table
-from telerig.io.files.text import read_text
-from telerig.io.machine.parallel import isolated
-from telerig.rig.units import STANDARD_GRAVITY_M_S2
+from telerig.io.exchange.importing.binary_recordings import EXPORT_AGAIN
+from telerig.io.exchange.importing.headers import (
+    TIME_UNITS,
+    UNITS,
+    axes_in,
+    is_counter,
+    is_date,
+    is_time,
+    known_unit,
+    time_unit_in,
+    unit_in,
+)
+from telerig.io.exchange.importing.recording import Recording
+from telerig.io.exchange.importing.stamps import seconds_of
+from telerig.io.files.csv_table import LARGEST_NUMBER
 
-UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mm/s2": 1e-3, "g": STANDARD_GRAVITY_M_S2,
-         "mg": 1e-3 * STANDARD_GRAVITY_M_S2}  # fmt: skip
-_EXPORT_AGAIN = "export the recording again from the program that made it, or give another file"
-COLUMNS = ["t_s", "sensor", "ax_m_s2", "ay_m_s2", "az_m_s2"]
+AXES = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
+_PLAUSIBLE_HZ = (5.0, 2e5)
+"""Sampling rates by which the unit of times is told, where nothing states it."""
+_SAME_RATE = 0.05
+_SEEN_CELLS = 200
 
 
 @dataclass(frozen=True)
 class Layout:
     """Hold where the readings are in a file, and what they mean.
 
-    channels : names (CSV, MAT, TDMS) or numbers from 0 of the channels x, y, z; None looks for
-    common names.
-    time : name of the channel of times in s; None looks for a common name, or uses the file's rate.
+    channels : names or numbers from 0 of the channels x, y, z; None looks for common names.
+    time : name or number of the channel of times; None looks for a common name, or uses the file's
+    rate.
+    time_unit : one of `TIME_UNITS`; None uses the unit that the file states, or the one by which
+    the times agree with the stated rate or with a possible rate.
     rate_hz : the sampling rate in Hz, in place of times; None uses what the file has.
     start_s : is added to every time (s), to bring the sensor's clock to that of the run.
     unit : one of `UNITS`; None uses the unit that the file states.
@@ -52,7 +60,8 @@ class Layout:
     """
 
     channels: tuple[str | int, str | int, str | int] | None = None
-    time: str | None = None
+    time: str | int | None = None
+    time_unit: str | None = None
     rate_hz: float | None = None
     start_s: float = 0.0
     unit: str | None = None
@@ -60,146 +69,298 @@ class Layout:
     group: str | None = None
 
 
+@dataclass(frozen=True)
+class Imported:
+    """Hold the readings of one accelerometer, and how the file was understood.
+
+    table : the columns t_s (s), sensor, ax_m_s2, ay_m_s2, az_m_s2 (m/s^2), in the order of time.
+    notes : sentences for the user: channels, unit, times, and what was left out.
+    """
+
+    table: pd.DataFrame
+    notes: tuple[str, ...]
+
+
 def read_accelerations(
     path: str | PathLike[str], sensor: str, layout: Layout | None = None
 ) -> pd.DataFrame:
-    """Read the recording of one accelerometer from a CSV, WAV, MAT or TDMS file.
+    """Read the recording of one accelerometer from a logger's text file, WAV, MAT or TDMS file.
 
     sensor : the sensor's name in rig.toml. layout : None looks for common names and units.
     Returns the columns t_s (s), sensor, ax_m_s2, ay_m_s2, az_m_s2 (m/s^2), in the order of time.
     Raises InputError, naming the file and what it holds, when a channel, the times or the unit are
     missing, or when a value is not a finite number.
     """
+    return import_accelerations(path, sensor, layout).table
+
+
+def import_accelerations(
+    path: str | PathLike[str], sensor: str, layout: Layout | None = None
+) -> Imported:
+    """Read a recording as `read_accelerations` does, and say how it was understood."""
     layout = layout or Layout()
     recording = open_recording(Path(path), layout.group)
-    names = _channels(recording, layout.channels)
+    names = _channels(recording, layout)
     columns = [_values(recording, name) for name in names]
     if len({len(column) for column in columns}) > 1:
         lengths = ", ".join(f"{name} {len(column)}" for name, column in zip(names, columns))
-        raise recording.error(f"its channels differ in length: {lengths}", _EXPORT_AGAIN)
+        raise recording.error(f"its channels differ in length: {lengths}", EXPORT_AGAIN)
     raw = np.stack(columns, -1)
-    t_s = _times(recording, layout, len(raw)) + layout.start_s
+    t_s, said = _times(recording, layout, len(raw))
+    t_s = t_s + layout.start_s
     if len(raw) != len(t_s) or not len(raw):
         raise recording.error(
             f"has {len(raw)} readings and {len(t_s)} times",
             "give as many times as readings, at least one",
         )
-    bad = np.argwhere(~(np.abs(np.c_[raw, t_s]) <= LARGEST_NUMBER))
+    blank = np.isnan(raw).all(-1) if recording.lines is not None else np.zeros(len(raw), bool)
+    kept = np.logical_not(blank)
+    notes = [*recording.notes, f"x, y, z are the channels {', '.join(map(repr, names))}", *said]
+    if not kept.all():
+        notes.append(f"{int((~kept).sum())} rows without any reading are left out")
+    _check_numbers(recording, np.c_[raw, t_s], [*names, "time"], kept)
+    _check_order(recording, t_s, kept)
+    readings = (raw * _scale(recording, names, layout))[kept]
+    table = pd.DataFrame({"t_s": t_s[kept], "sensor": sensor})
+    table[AXES] = readings
+    return Imported(table, tuple(notes))
+
+
+def _check_numbers(recording: Recording, values: Array, names: Sequence[str], kept: Bools) -> None:
+    """Raise InputError for a kept row with a value that is no number."""
+    bad = np.argwhere(~(np.abs(values) <= LARGEST_NUMBER) & kept[:, None])
+    if not kept.any():
+        raise recording.error("has no readings", EXPORT_AGAIN)
     if len(bad):
-        row, column = bad[0]
-        name = [*names, "time"][column]
+        row, column = (int(i) for i in bad[0])
         raise recording.error(
-            f"reading {row} of {name!r} is no finite number up to {LARGEST_NUMBER:g} "
+            f"reading {row} of {names[column]!r} is no finite number up to {LARGEST_NUMBER:g} "
             f"({len(bad)} such)",
             "cut it out, or export the recording again",
+            row,
         )
-    late = np.flatnonzero(np.diff(t_s) <= 0)
+
+
+def _check_order(recording: Recording, t_s: Array, kept: Bools) -> None:
+    """Raise InputError for a kept row whose time is not later than the one before."""
+    rows = np.flatnonzero(kept)
+    late = np.flatnonzero(np.diff(t_s[rows]) <= 0)
     if len(late):
-        i = int(late[0])
+        before, row = (int(i) for i in rows[late[0] : late[0] + 2])
         raise recording.error(
-            f"time {t_s[i + 1]:.9g} s follows {t_s[i]:.9g} s (reading {i + 1})",
-            "times must increase; give rate_hz instead if they are rounded",
+            f"time {t_s[row]:.9g} s follows {t_s[before]:.9g} s (reading {row}, {len(late)} such)",
+            "times must increase; if they are rounded, give the sampling rate instead: "
+            "--rate-hz 1600",
+            row,
         )
-    readings = raw * _scale(recording, names, layout)
-    table = pd.DataFrame({"t_s": t_s, "sensor": sensor})
-    table[COLUMNS[2:]] = readings
-    return table
 
 
-def merge_accelerations(table: pd.DataFrame, path: str | PathLike[str]) -> list[str]:
-    """Write ``table`` to `accelerometer.csv`, and keep the readings of other sensors in that file.
-
-    Returns the names of the sensors whose earlier readings were replaced.
-    Raises InputError when the existing file cannot be read, or the new one cannot be written.
-    """
-    from telerig.io.dataset.tables import read_accelerometer_csv
-
-    file = Path(path)
-    replaced: list[str] = []
-    if file.is_file():
-        old = read_accelerometer_csv(file, None)
-        new = set(table["sensor"])
-        replaced = sorted(set(old["sensor"]) & new)
-        table = pd.concat([old[~old["sensor"].isin(new)], table], ignore_index=True)
-    write_table(table, file)
-    return replaced
-
-
-def _channels(recording: Recording, chosen: Sequence[str | int] | None) -> list[str]:
+def _channels(recording: Recording, layout: Layout) -> list[str]:
     there = list(recording.channels)
-    if chosen is None:
-        for trial in ("a{}_m_s2", "a{}", "acc_{}", "accel_{}", "acc{}", "{}"):
-            wanted = [trial.format(axis) for axis in "xyz"]
-            found = {name.lower(): name for name in there}
-            if all(name in found for name in wanted):
-                return [found[name] for name in wanted]
-        if len(there) == 3:
+    listed = ", ".join(there)
+    if layout.channels is None:
+        found = axes_in(name for name in there if not _is_text(recording, name))
+        if len(found) == 1:
+            return list(found[0])
+        if not found and len(there) == 3:
             return there
         raise recording.error(
-            "does not say which channels are x, y and z", f"name three of them: {', '.join(there)}"
+            f"has {len(found)} groups of channels x, y and z"
+            if found
+            else "does not say which channels are x, y and z",
+            f"name three of them with --channels {','.join(found[0]) if found else 'x,y,z'}"
+            f" (by names, or by numbers from 0): {listed}",
         )
-    names = [there[c] if isinstance(c, int) and 0 <= c < len(there) else str(c) for c in chosen]
+    names = [_named(there, one) for one in layout.channels]
     missing = [name for name in names if name not in there]
     if missing or len(names) != 3:
         raise recording.error(
             f"has no channel {', '.join(missing)}" if missing else f"{len(names)} channels named",
-            f"name three of: {', '.join(there)}",
+            f"name three with --channels x,y,z: {listed}",
         )
     return names
 
 
+def _named(there: Sequence[str], one: str | int) -> str:
+    return there[one] if isinstance(one, int) and 0 <= one < len(there) else str(one)
+
+
+def _is_text(recording: Recording, name: str) -> bool:
+    """Return whether a channel has text in half of its cells or more, so far as they are seen."""
+    values = recording.channels[name]
+    some = [str(cell) for cell in values[:: max(1, len(values) // _SEEN_CELLS)]]
+    return values.dtype.kind not in "iufb" and 2 * sum(map(_is_number, some)) <= len(some)
+
+
 def _values(recording: Recording, name: str) -> Array:
     values = recording.channels[name]
-    if values.dtype.kind not in "iufb" or values.ndim != 1:
-        raise recording.error(f"channel {name!r} is no column of numbers", "name another one")
+    if values.ndim != 1 or _is_text(recording, name):
+        raise recording.error(
+            f"channel {name!r} is no column of numbers", "name another one with --channels"
+        )
+    if values.dtype.kind not in "iufb":
+        bad = next(i for i, cell in enumerate(values) if not _is_number(str(cell)))
+        what = f"reading {bad} of {name!r} is {str(values[bad])!r:.60}, no number"
+        raise recording.error(what, "correct or remove the row", bad)
     return np.asarray(values, float)
 
 
-def _times(recording: Recording, layout: Layout, rows: int) -> Array:
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", ".") or "nan")
+    except ValueError:
+        return False
+    return "_" not in cell
+
+
+def _times(recording: Recording, layout: Layout, rows: int) -> tuple[Array, list[str]]:
+    """Return the (rows,) times in s, and sentences that say where they are from."""
+    there = list(recording.channels)
     if layout.time is not None:
-        if layout.time not in recording.channels:
+        name = _named(there, layout.time)
+        if name not in there:
             raise recording.error(
-                f"has no channel {layout.time!r} for the times",
-                f"there are: {', '.join(recording.channels)}",
+                f"has no channel {name!r} for the times",
+                f"name one with --time: {', '.join(there)}",
             )
-        return _values(recording, layout.time)
-    rate = layout.rate_hz if layout.rate_hz is not None else recording.rate_hz
+        return _times_in(recording, layout, name)
     if layout.rate_hz is None:
-        common = {"t_s", "time", "time_s", "time (s)", "time [s]", "t", "timestamp_s"}
-        for name in recording.channels:
-            if name.strip().lower() in common:
-                return _values(recording, name)
+        told = [name for name in there if is_time(name)] or [
+            name
+            for name in there
+            if _is_text(recording, name) and _stamps(recording, name) is not None
+        ]
+        if told:
+            best = min(told, key=lambda name: _time_order(recording, name))
+            return _times_in(recording, layout, best)
+    rate = layout.rate_hz if layout.rate_hz is not None else recording.rate_hz
     if rate is None or not rate > 0:
         raise recording.error(
             "contains neither times nor a sampling rate" if rate is None else f"rate is {rate} Hz",
-            "give the name of the channel with times in s, or rate_hz",
+            "name the channel of times with --time, or give the sampling rate with --rate-hz 1600",
         )
-    return recording.offset_s + np.arange(rows) / rate
+    counted = _counted(recording, rows)
+    if counted is None:
+        return recording.offset_s + np.arange(rows) / rate, [f"times are counted at {rate:g} Hz"]
+    name, count = counted
+    said = [f"times are those of the counter {name!r} at {rate:g} Hz"]
+    lost = int(count[-1] - count[0]) + 1 - rows
+    said += [f"{lost} samples are missing by the counter {name!r}"] if lost else []
+    return recording.offset_s + count / rate, said
+
+
+def _time_order(recording: Recording, name: str) -> int:
+    """Return the rank of a channel of times: numbers with a unit, numbers, text."""
+    if _is_text(recording, name):
+        return 2
+    return 0 if time_unit_in(name, recording.units) else 1
+
+
+def _times_in(recording: Recording, layout: Layout, name: str) -> tuple[Array, list[str]]:
+    """Return the times in s that a channel holds, and a sentence about them."""
+    if _is_text(recording, name):
+        t_s = _stamps(recording, name)
+        if t_s is None:
+            raise recording.error(
+                f"channel {name!r} holds no times that can be read",
+                "name another one with --time, or give the sampling rate with --rate-hz 1600",
+            )
+        first = str(recording.channels[name][0])
+        return t_s, [f"times are counted from the first stamp of {name!r}, {first}"]
+    values = _values(recording, name)
+    unit = layout.time_unit or time_unit_in(name, recording.units)
+    unit = unit or _unit_of_times(recording, values, name)
+    if unit not in TIME_UNITS:
+        todo = f"use --time-unit with one of: {', '.join(TIME_UNITS)}"
+        raise InputError(f"--time-unit {unit}: there is no such unit", todo=todo)
+    t_s = values * TIME_UNITS[unit]
+    said = [f"times are those of {name!r} in {unit}"]
+    step = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    stated = recording.rate_hz
+    if stated and step > 0 and abs(1 / step / stated - 1) > _SAME_RATE:
+        said.append(f"the times have {1 / step:.6g} Hz, the file states {stated:g} Hz")
+    return t_s, said
+
+
+def _stamps(recording: Recording, name: str) -> Array | None:
+    """Return the times in s of a channel of stamps; a channel of dates is put before them."""
+    stamps = [str(cell) for cell in recording.channels[name]]
+    t_s = None if is_date(name) else seconds_of(stamps)
+    dates = next((n for n in recording.channels if is_date(n) and n != name), None)
+    if dates is None or not _is_text(recording, dates):
+        return t_s
+    joined = seconds_of([f"{d} {s}" for d, s in zip(recording.channels[dates], stamps)])
+    return t_s if joined is None else joined
+
+
+def _unit_of_times(recording: Recording, values: Array, name: str) -> str:
+    """Return the unit of times that state none.
+
+    It is the one that agrees with the sampling rate that the file states; else the one that makes
+    them times since 1970; else seconds if these give a possible rate.
+    Raises InputError where none does.
+    """
+    step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+    if step > 0:
+        rates = {unit: 1 / (step * TIME_UNITS[unit]) for unit in ("s", "ms", "us", "ns")}
+        stated = recording.rate_hz
+        agreeing = [u for u, r in rates.items() if stated and abs(r / stated - 1) < _SAME_RATE]
+        possible = [u for u, r in rates.items() if _PLAUSIBLE_HZ[0] <= r <= _PLAUSIBLE_HZ[1]]
+        since_1970 = [u for u in possible if 1e8 < values[0] * TIME_UNITS[u] < 1e10]
+        for found in (agreeing, since_1970, [u for u in possible if u == "s"]):
+            if found:
+                return found[0]
+    raise recording.error(
+        f"does not say the unit of the times in {name!r}, which increase by {step:g}",
+        f"give it with --time-unit {'ms' if step >= 1 else 's'} ({', '.join(TIME_UNITS)})",
+    )
+
+
+def _counted(recording: Recording, rows: int) -> tuple[str, Array] | None:
+    """Return a channel that counts the samples, from 0 and without the turns of the counter."""
+    for name in recording.channels:
+        if not is_counter(name) or _is_text(recording, name):
+            continue
+        values = _values(recording, name)
+        if len(values) != rows or rows < 2:
+            continue
+        step = np.diff(values)
+        for turn in (0, 2**8, 2**16, 2**32):
+            steps = step % turn if turn else step
+            whole = np.isfinite(steps) & (steps == np.round(steps)) & (steps >= 1)
+            if whole.all() and np.median(steps) == 1 and (not turn or np.max(values) < turn):
+                return name, np.r_[0.0, np.cumsum(steps)]
+    return None
 
 
 def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
     if layout.scale_m_s2 is not None:
         if layout.unit is not None:
-            raise InputError("both a unit and scale_m_s2 are given", todo="give one of them")
+            raise InputError("both --unit and --scale are given", todo="give one of them")
         values = np.asarray(layout.scale_m_s2, float)
         if values.shape not in ((), (3,)) or not np.isfinite(values).all() or not values.all():
             raise InputError(
-                f"scale_m_s2 is {layout.scale_m_s2!r}",
+                f"--scale is {layout.scale_m_s2!r}",
                 todo="give one number or three, none of them zero",
             )
         return values
-    units = [layout.unit or recording.units.get(name) or "" for name in names]
-    if all(name.endswith("_m_s2") for name in names) and layout.unit is None:
-        units = ["m/s2"] * 3
+    units = [_unit(recording, name) if layout.unit is None else layout.unit for name in names]
     unknown = [unit for unit in units if unit not in UNITS]
     if unknown:
         raise recording.error(
             f"the unit of its readings is {unknown[0]!r}"
             if unknown[0]
             else "does not say the unit of its readings",
-            f"give unit ({', '.join(UNITS)}), or scale_m_s2, the m/s^2 of a reading of 1",
+            f"say the unit with --unit g ({', '.join(UNITS)}), or with --scale the m/s^2 of a "
+            "reading of 1",
         )
     return np.array([UNITS[unit] for unit in units])
+
+
+def _unit(recording: Recording, name: str) -> str:
+    """Return the unit that the file states for a channel; "" where it states none."""
+    stated = recording.units.get(name, "")
+    return known_unit(stated) or stated or unit_in(name)
 
 
 def layout_from(options: dict[str, Any]) -> Layout:
@@ -212,36 +373,17 @@ def layout_from(options: dict[str, Any]) -> Layout:
     if "channels" in values:
         words = [w.strip() for w in str(values["channels"]).split(",")]
         values["channels"] = tuple(int(w) if w.isdecimal() else w for w in words)
+    if str(values.get("time", "")).isdecimal():
+        values["time"] = int(values["time"])
     if "scale_m_s2" in values:
         try:
             numbers = tuple(float(w) for w in str(values["scale_m_s2"]).split(","))
         except ValueError as error:
             raise InputError(
-                f"scale {values['scale_m_s2']!r} is no number", todo="write 98.1 or 98,97.5,99"
+                f"--scale {values['scale_m_s2']} is no number", todo="write 98.1 or 98,97.5,99"
             ) from error
         values["scale_m_s2"] = numbers[0] if len(numbers) == 1 else numbers
     return Layout(**values)
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Hold the channels of a sensor's file before they are converted.
-
-    where : the file, for errors. channels : name -> (samples,) raw values.
-    units : name -> unit, for the channels that state one.
-    rate_hz : sampling rate in Hz; None where the file does not state it.
-    offset_s : the time of the first sample in s.
-    """
-
-    where: str
-    channels: dict[str, NDArray[Any]]
-    units: dict[str, str] = field(default_factory=dict)
-    rate_hz: float | None = None
-    offset_s: float = 0.0
-
-    def error(self, what: str, todo: str) -> InputError:
-        """Return the error that names this recording's file."""
-        return InputError(what, where=self.where, todo=todo)
 
 
 def open_recording(path: Path, group: str | None = None) -> Recording:
@@ -261,149 +403,3 @@ def open_recording(path: Path, group: str | None = None) -> Recording:
         )
     recording: Recording = RECORDINGS[ending](path, group=group)
     return recording
-
-
-def read_csv(path: Path) -> Recording:
-    """The header is the last line before the numbers; lines above it (from a logger) are skipped.
-
-    Cells are separated by commas, semicolons (also with decimal commas) or tabs.
-    """
-    lines = read_text(path).splitlines()
-    first = next((i for i, line in enumerate(lines) if _cells(line) is not None), None)
-    if not first:
-        raise InputError(
-            "has no rows of numbers below a header" if first is None else "has no header line",
-            where=str(path),
-            todo="write the names of the channels above the numbers",
-        )
-    mark, _ = _cells(lines[first]) or ("", [])
-    header = [name.strip().strip('"') for name in lines[first - 1].split(mark)]
-    rows = []
-    for i, line in enumerate(lines[first:], first + 1):
-        if not line.strip():
-            continue
-        cells = _cells(line)
-        if cells is None or len(cells[1]) != len(header):
-            raise InputError(
-                f"{line[:60]!r} is not {len(header)} numbers",
-                where=f"{path} row {i}",
-                todo="correct or remove the row",
-            )
-        rows.append(cells[1])
-    if len(set(header)) != len(header):
-        raise InputError(
-            "two columns have the same name", where=str(path), todo="rename one of them"
-        )
-    return Recording(str(path), dict(zip(header, np.array(rows).T)))
-
-
-def _cells(line: str) -> tuple[str, list[float]] | None:
-    """Separator and numbers of a line; None when it holds anything else."""
-    mark = next((m for m in (";", "\t", ",") if m in line), ",")
-    cells = [cell.strip() for cell in line.split(mark)]
-    if mark != ",":
-        cells = [cell.replace(",", ".") for cell in cells]
-    if not any(cells):
-        return None
-    try:
-        return mark, [float(cell) if cell else np.nan for cell in cells]
-    except ValueError:
-        return None
-
-
-@contextmanager
-def _reading(path: Path, kind: str) -> Iterator[list[warnings.WarningMessage]]:
-    """Turn every error of a library that reads a damaged file into InputError.
-
-    Yields the list to which the library's warnings are added.
-    """
-    try:
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            yield warned
-    except InputError:
-        raise
-    except Exception as error:
-        what = f"is no {kind} file that can be read ({error or type(error).__name__})"
-        raise InputError(what, where=str(path), todo=_EXPORT_AGAIN) from error
-
-
-def read_wav(path: Path) -> Recording:
-    """Channels and rate of a WAV file; whole numbers are scaled so that ±1 is full scale."""
-    from scipy.io import wavfile
-
-    with _reading(path, "WAV") as warned:
-        rate, samples = wavfile.read(path)
-    if any("EOF" in str(one.message) for one in warned):
-        raise InputError("ends too early", where=str(path), todo=_EXPORT_AGAIN)
-    values = samples.reshape(len(samples), -1).astype(float)
-    if samples.dtype == np.uint8:
-        values = (values - 128) / 128
-    elif samples.dtype.kind == "i":
-        values /= -float(np.iinfo(samples.dtype).min)
-    channels = {str(i): column for i, column in enumerate(values.T)}
-    return Recording(str(path), channels, rate_hz=float(rate))
-
-
-def read_mat(path: Path) -> Recording:
-    """Vectors by their names; the columns of an (N, k) matrix as name_0, name_1, ..."""
-    from scipy.io import loadmat
-
-    with _reading(path, "MAT"):
-        try:
-            content = isolated(partial(loadmat, squeeze_me=True), path)
-        except NotImplementedError as error:
-            raise InputError(
-                "is a MATLAB 7.3 file, which cannot be read",
-                where=str(path),
-                todo="in MATLAB, save it with the option -v7",
-            ) from error
-    channels: dict[str, NDArray[Any]] = {}
-    for name, value in content.items():
-        array = np.asarray(value)
-        if name.startswith("__") or array.dtype.kind not in "iuf":
-            continue
-        if array.ndim == 1:
-            channels[name] = array
-        elif array.ndim == 2:
-            columns = array if array.shape[0] >= array.shape[1] else array.T
-            channels |= {f"{name}_{i}": column for i, column in enumerate(columns.T)}
-    return Recording(str(path), channels)
-
-
-def read_tdms(path: Path, group: str | None = None) -> Recording:
-    try:
-        nptdms = import_module("nptdms")
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "TDMS files need nptdms", where=str(path), todo="pip install 'telerig[tdms]'"
-        ) from error
-    nptdms.log.log_manager.set_level(logging.CRITICAL)  # what it finds is in our errors
-    with _reading(path, "TDMS"):
-        return _of_tdms(nptdms.TdmsFile.read(path), path, group)
-
-
-def _of_tdms(file: Any, path: Path, group: str | None) -> Recording:
-    groups = [g for g in file.groups() if g.channels()]
-    chosen = [g for g in groups if group in (None, g.name)]
-    if len(chosen) != 1:
-        names = ", ".join(g.name for g in groups)
-        raise InputError(
-            f"has no group {group!r}" if group else f"has {len(groups)} groups",
-            where=str(path),
-            todo=f"name one of: {names}",
-        )
-    found = chosen[0].channels()
-    units = {c.name: str(c.properties["unit_string"]) for c in found
-             if c.properties.get("unit_string")}  # fmt: skip
-    steps = {float(c.properties["wf_increment"]) for c in found if "wf_increment" in c.properties}
-    starts = {float(c.properties.get("wf_start_offset", 0.0)) for c in found}
-    if len(steps) > 1 or len(starts) > 1:
-        raise InputError(
-            "its channels were sampled at different times",
-            where=str(path),
-            todo="resample them to one clock before the import",
-        )
-    step = steps.pop() if steps else 0.0
-    channels = {c.name: np.asarray(c[:]) for c in found}
-    return Recording(str(path), channels, units, 1 / step if step > 0 else None, starts.pop())

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from places import ROOT
+from rig_text import FULL
 from scipy.io import loadmat, wavfile
 from typer.testing import CliRunner
 
@@ -58,7 +59,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     calibration_from_cameras(cameras).save(data / "results" / "calibration")
     (data / "runs" / "rise").mkdir(parents=True)
     (data / "results" / "rise").mkdir()
-    (data / "rig.toml").write_text("schema = 1\n")
+    (data / "rig.toml").write_text(FULL.replace("arm_left", "left"))
     table = pd.DataFrame({"frame": [0, 1, 1, 2], "particle": [4, 4, 5, 5]})
     table["t_s"] = 0.01 * table["frame"]
     table[["x_mm", "y_mm", "z_mm"]] = np.arange(12).reshape(4, 3) / 7

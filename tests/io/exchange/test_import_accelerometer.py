@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,9 +16,9 @@ from telerig.io.exchange.importing.accelerometer import (
     UNITS,
     Layout,
     layout_from,
-    merge_accelerations,
     read_accelerations,
 )
+from telerig.io.exchange.importing.records import merge_accelerations
 
 Array = NDArray[np.float64]
 
@@ -84,6 +85,37 @@ def test_mat(tmp_path: Path) -> None:
     (tmp_path / "c.mat").write_bytes(b"nothing")
     with pytest.raises(InputError, match="no MAT file"):
         readings(tmp_path / "c.mat", unit="g")
+
+
+def test_mat_with_structs(tmp_path: Path) -> None:
+    logger = {
+        "t": T_S,
+        "Acc_X": TRUE_M_S2[:, 0],
+        "Acc_Y": TRUE_M_S2[:, 1],
+        "Acc_Z": TRUE_M_S2[:, 2],
+    }
+    savemat(tmp_path / "a.mat", {"logger": {**logger, "name": "arm"}})
+    check(readings(tmp_path / "a.mat", unit="m/s2", time="logger.t"))
+
+
+def test_mat_of_version_7_3(tmp_path: Path) -> None:
+    """MATLAB writes its columns as rows of HDF5, and text as numbers with a class."""
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        file["data/time"] = T_S[None]
+        for name, column in zip("xyz", TRUE_M_S2.T):
+            file[f"data/acc_{name}"] = column[None]
+        file["data/name"] = np.array([[97, 114, 109]], np.uint16)
+        file["data/name"].attrs["MATLAB_class"] = np.bytes_("char")
+        file["#refs#/a"] = T_S[None]
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    content = (tmp_path / "a.mat").read_bytes()
+    (tmp_path / "a.mat").write_bytes(head.ljust(512, b"\0") + content[512:])
+    check(readings(tmp_path / "a.mat", unit="m/s2"))
+    with pytest.raises(InputError, match=r"data\.acc_x, data\.acc_y, data\.acc_z"):
+        readings(tmp_path / "a.mat", unit="m/s2", channels=("name", "x", "y"))
+    (tmp_path / "b.mat").write_bytes(head.ljust(512, b"\0") + content[512:700])
+    with pytest.raises(InputError, match="no MAT file"):
+        readings(tmp_path / "b.mat")
 
 
 def write_tdms(path: Path, unit: str = "g", groups: int = 1) -> None:

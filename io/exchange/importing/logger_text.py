@@ -1,0 +1,282 @@
+"""Read the text files that loggers write: lines about the logger, a header, columns of numbers.
+
+The layout is found from the rows themselves: the separator and the number of columns are those of
+most rows, the table begins with the first row that is like them, and the header is above it.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+from telerig.io.exchange.importing.headers import TIME_UNITS, is_unit, known_unit
+from telerig.io.exchange.importing.recording import Recording
+from telerig.io.exchange.importing.stamps import is_stamp
+from telerig.io.files.csv_table import MOST_COLUMNS
+from telerig.io.files.text import read_bytes
+
+_SEPARATORS = (";", "\t", ",", " ")
+"""The last one stands for any number of spaces."""
+_COMMENTS = ("#", "%", "//", "*", ";")
+_SAMPLED_ROWS = 60
+_HEADER_WITHIN = 4
+"""Lines with words above the table among which the header must be: units and rules are others."""
+_HEADER_LABELS = {"header", "headers", "columns", "fields"}
+_EXPORT = "export the recording as text with one row per sample below a header"
+_RATE = re.compile(
+    r"(?:sampl\w*[ _-]*(?:rate|freq\w*)|data[ _-]?rate|update[ _-]?rate|scan[ _-]?rate|"
+    r"acquisition[ _-]?rate|abtast\w*rate|abtast\w*frequenz|\bodr|\bfs)\b[^\d\n-]{0,20}?"
+    r"(\d+(?:[.,]\d+)?(?:e[+-]?\d+)?)[\s,;\"]*(k?hz)?|\bat (\d+(?:\.\d+)?) ?(k?hz)\b",
+    re.IGNORECASE,
+)
+_INTERVAL = re.compile(
+    r"(?:sampl\w*[ _-]*(?:interval|period)|delta[ _-]?[xt]|time[ _-]?step)\b[^\d\n-]{0,20}?"
+    r"(\d+(?:[.,]\d+)?(?:e[+-]?\d+)?)[\s,;\"]*([mµμun]?s(?:ec)?\b)?",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Hold what most rows have in common.
+
+    separator : one of `_SEPARATORS`. columns : number of cells in a row.
+    measured : for each column, whether its cells are numbers or stamps of a clock.
+    """
+
+    separator: str
+    columns: int
+    measured: tuple[bool, ...]
+
+    def is_row(self, line: str) -> bool:
+        """Return whether a line is a row of the table: every measured cell is blank or is one."""
+        cells = self.cells(line)
+        if len(cells) != self.columns:
+            return False
+        kinds = [not cell or _measured(cell, self.separator) for cell in cells]
+        return any(cells) and all(k for k, m in zip(kinds, self.measured) if m)
+
+    def cells(self, line: str) -> list[str]:
+        """Return the cells of a line without blank ones beyond the last column."""
+        cells = _split(line, self.separator)
+        while len(cells) > self.columns and not cells[-1]:
+            cells.pop()
+        return cells
+
+
+def read_logger_text(path: Path) -> Recording:
+    """Read a logger's text file.
+
+    Text is UTF-8, UTF-16 or Latin-1. Cells are separated by commas, semicolons, tabs or spaces;
+    numbers may have decimal commas where commas do not separate the cells. Lines that begin with
+    one of `_COMMENTS` are not rows. A line of units below the header, and a sampling rate above it,
+    are used. Without a header the channels are named by their numbers from 0.
+    Raises InputError for a file without rows of numbers, and for a row with another number of
+    cells than most.
+    """
+    text = _text(path)
+    lines = text.split("\n")
+    shape = _shape(lines, path)
+    first = next(i for i, line in enumerate(lines) if shape.is_row(line))
+    rows, numbers, notes = _rows(lines, first, shape, path)
+    names, units = _header(lines[:first], shape)
+    channels, decimals = {}, set()
+    for i, name in enumerate(names):
+        channel, decimal = _column([row[i] for row in rows], shape.separator)
+        decimals |= decimal
+        if name or any(row[i] for row in rows):
+            channels[name or f"column {i}"] = channel
+    if len(decimals) > 1:
+        raise InputError(
+            "has numbers with decimal commas and numbers with decimal points",
+            where=str(path),
+            todo="export it with one of them",
+        )
+    rate, said = _stated_rate(lines[:first])
+    return Recording(
+        str(path), channels, {n: u for n, u in zip(names, units) if u}, rate,
+        lines=np.array(numbers), notes=(*notes, *said),
+    )  # fmt: skip
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file, in which lines end with a line feed."""
+    content = read_bytes(path)
+    marks = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le",
+             codecs.BOM_UTF16_BE: "utf-16-be"}  # fmt: skip
+    mark = next((m for m in marks if content.startswith(m)), b"")
+    head = content[:200]
+    encodings = [marks[mark]] if mark else ["utf-8", "latin-1"]
+    if not mark and len(head) > 8 and min(head[::2].count(0), head[1::2].count(0)) == 0:
+        zeros = (head[::2].count(0), head[1::2].count(0))
+        if max(zeros) > len(head) / 4:
+            encodings = ["utf-16-be" if zeros[0] else "utf-16-le"]
+    for encoding in encodings:
+        try:
+            text = content[len(mark) :].decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        if "\0" not in text:
+            return text.replace("\r\n", "\n").replace("\r", "\n")
+    raise InputError("is not text", where=str(path), todo=_EXPORT)
+
+
+def _shape(lines: Sequence[str], path: Path) -> _Shape:
+    """Find separator, number of columns and their kinds from rows of the second half."""
+    told = [line for line in lines if line.strip() and not _is_comment(line)]
+    half = told[len(told) // 2 :] if len(told) > 4 else told
+    some = half[:: max(1, len(half) // _SAMPLED_ROWS)]
+    best, most = None, 0
+    for separator in _SEPARATORS:
+        split = [_split(line, separator) for line in some]
+        if not split:
+            break
+        columns = Counter(map(len, split)).most_common(1)[0][0]
+        rows = [cells for cells in split if len(cells) == columns]
+        kinds = [[_measured(cell, separator) for cell in cells] for cells in rows]
+        count = sum(map(sum, kinds))
+        if count > most:
+            blank = np.array([[not cell for cell in cells] for cells in rows])
+            share = np.array(kinds).sum(0) / np.maximum(1, (~blank).sum(0))
+            best, most = _Shape(separator, columns, tuple((share >= 0.5).tolist())), count
+    if best is None or not (any(best.measured) and any(map(best.is_row, lines))):
+        raise InputError("has no rows of numbers below a header", where=str(path), todo=_EXPORT)
+    if best.columns > MOST_COLUMNS:
+        what = f"has {best.columns} columns; {MOST_COLUMNS} are read at most"
+        raise InputError(what, where=str(path), todo=_EXPORT)
+    return best
+
+
+def _rows(
+    lines: Sequence[str], first: int, shape: _Shape, path: Path
+) -> tuple[list[list[str]], list[int], list[str]]:
+    """Return the cells of the table's rows, the line of each from 1, and notes."""
+    rows, numbers, notes = [], [], []
+    last = len(lines) - 1
+    for i, line in enumerate(lines[first:], first):
+        if not line.strip():
+            continue
+        cells = shape.cells(line)
+        if len(cells) == shape.columns:
+            rows.append(cells)
+            numbers.append(i + 1)
+        elif _is_comment(line):
+            continue
+        elif i == last and len(cells) <= shape.columns and rows:
+            notes.append(f"row {i + 1} is left out: the file ends in the middle of it")
+        else:
+            raise InputError(
+                f"{line[:60]!r} has {len(cells)} cells, most rows have {shape.columns}",
+                where=f"{path} row {i + 1}",
+                todo="correct or remove the row",
+            )
+    return rows, numbers, notes
+
+
+def _header(above: Sequence[str], shape: _Shape) -> tuple[list[str], list[str]]:
+    """Return the names and the units of the columns from the lines above the table."""
+    units = [""] * shape.columns
+    told = [line for line in reversed(above) if re.search(r"\w|\([^)]*\)|\[[^\]]*\]", line)]
+    for line in told[:_HEADER_WITHIN]:
+        cells = _header_cells(line, shape)
+        if cells is None:
+            continue
+        if not any(units) and all(map(is_unit, cells)) and any(map(known_unit, cells)):
+            units = [cell.strip("[]() ") if not known_unit(cell) else known_unit(cell)
+                     for cell in cells]  # fmt: skip
+        elif not all(not cell or _measured(cell, shape.separator) for cell in cells):
+            return _distinct(cells), units
+    return [str(i) for i in range(shape.columns)], units
+
+
+def _header_cells(line: str, shape: _Shape) -> list[str] | None:
+    """Return as many cells as the table has columns; None for a line that has not so many."""
+    text = re.sub(r"^\s*(?://|[#%*;])+ ?(?=\S|\t)", "", line)
+    for separator in dict.fromkeys((shape.separator, *_SEPARATORS)):
+        cells = _split(text, separator)
+        if len(cells) == shape.columns + 1 and cells[0].lower().rstrip(":") in _HEADER_LABELS:
+            cells = cells[1:]
+        longer = len(cells) > shape.columns and separator == shape.separator != " "
+        if len(cells) == shape.columns or (longer and shape.columns > 1):
+            return cells[: shape.columns]
+    for pattern in (r"\s{2,}", r"\s+(?![\[(])"):
+        cells = re.split(pattern, text.strip())
+        if len(cells) == shape.columns:
+            return cells
+    return None
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Return the names; those that stand twice get the numbers of their columns."""
+    twice = {name for name, count in Counter(names).items() if count > 1 and name}
+    return [f"{name} (column {i})" if name in twice else name for i, name in enumerate(names)]
+
+
+def _column(cells: Sequence[str], separator: str) -> tuple[NDArray[Any], set[str]]:
+    """Return a column as numbers, or as text, and which decimal marks its numbers have."""
+    try:
+        if any("_" in cell for cell in cells):
+            raise ValueError
+        values = np.array([_point(cell, separator) or "nan" for cell in cells], float)
+    except ValueError:
+        return np.array(cells, object), set()
+    marks = {mark for mark in ".," if any(mark in cell for cell in cells)}
+    return values, marks if separator != "," else set()
+
+
+def _stated_rate(above: Sequence[str]) -> tuple[float | None, list[str]]:
+    """Return the sampling rate in Hz that the lines above the table state, and a note about it.
+
+    Returns None where they state none, or several.
+    """
+    found: dict[float, int] = {}
+    for i, line in enumerate(above, 1):
+        for match in _RATE.finditer(line):
+            factor = 1000.0 if (match[2] or match[4] or "").lower() == "khz" else 1.0
+            found.setdefault(float((match[1] or match[3]).replace(",", ".")) * factor, i)
+        for match in _INTERVAL.finditer(line):
+            step = float(match[1].replace(",", ".")) * TIME_UNITS[known_unit(match[2] or "s")]
+            found.setdefault(1 / step if step > 0 else 0.0, i)
+    rates = {rate: i for rate, i in found.items() if 0 < rate < np.inf}
+    if len(rates) != 1:
+        return None, []
+    ((rate, number),) = rates.items()
+    return rate, [f"line {number} states a sampling rate of {rate:g} Hz"]
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(_COMMENTS)
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(separator)]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error:
+        return []
+
+
+def _point(cell: str, separator: str) -> str:
+    return cell if separator == "," else cell.replace(",", ".")
+
+
+def _measured(cell: str, separator: str) -> bool:
+    """Return whether a cell is a number or a stamp of a clock."""
+    try:
+        float(_point(cell, separator))
+    except ValueError:
+        return is_stamp(cell)
+    return "_" not in cell

@@ -1,0 +1,40 @@
+"""Hold the channels of a sensor's file as the file has them, before they are converted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from numpy.typing import NDArray
+
+from telerig.errors import InputError
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Hold the channels of a sensor's file before they are converted.
+
+    where : the file, for errors. channels : name -> (samples,) raw values; text where a channel
+    has no numbers.
+    units : name -> unit, for the channels that state one apart from their name.
+    rate_hz : sampling rate in Hz; None where the file does not state it.
+    offset_s : the time of the first sample in s.
+    lines : (samples,) the line of the file that each sample is in, from 1; None where the file
+    has no lines.
+    notes : sentences for the user about what was left out.
+    """
+
+    where: str
+    channels: dict[str, NDArray[Any]]
+    units: dict[str, str] = field(default_factory=dict)
+    rate_hz: float | None = None
+    offset_s: float = 0.0
+    lines: NDArray[Any] | None = None
+    notes: tuple[str, ...] = ()
+
+    def error(self, what: str, todo: str, sample: int | None = None) -> InputError:
+        """Return the error that names this recording's file, and the line of a sample."""
+        where = self.where
+        if sample is not None and self.lines is not None:
+            where += f" row {self.lines[sample]}"
+        return InputError(what, where=where, todo=todo)

@@ -26,6 +26,8 @@ from telerig.scripts.run import run as run_dataset
 from telerig.scripts.simulate import simulate
 from telerig.scripts.smooth import smooth
 from telerig.scripts.track import track
+from telerig.scripts.validate import validate
+
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -52,8 +54,8 @@ def _main(
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo, "init": init, "doctor": doctor, "simulate": simulate, "detect": detect,
-    "calibrate": calibrate, "track": track, "smooth": smooth, "run": run_dataset, "batch": batch,
-    "record": record, "export": export, "report": report,
+    "calibrate": calibrate, "track": track, "smooth": smooth, "validate": validate, "run": run_dataset,
+    "batch": batch, "record": record, "export": export, "report": report,
 }  # fmt: skip
 for name, command in _COMMANDS.items():
     app.command(name)(command)

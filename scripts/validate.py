@@ -1,0 +1,72 @@
+"""telerig validate: marks that stand still, smoothed as if they were bubbles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from telerig.scripts import options
+from telerig.scripts.console import (
+    EXIT_REJECTED,
+    errors_in_words,
+    progress,
+    run_file,
+    say,
+    typed_command,
+)
+
+
+@errors_in_words()
+def validate(
+    run: options.Run,
+    calibration: options.CalibrationFiles = None,
+    out: options.RunFolder = None,
+    marks: Annotated[int, typer.Option(min=1, help="How many marks are withheld in turn.")] = 6,
+    model: Annotated[
+        str, typer.Option(help="Priors of the shake, as of `telerig smooth`: auto or default.")
+    ] = "auto",
+    accept: options.AcceptedFaults = None,
+    seed: Annotated[int, typer.Option(help="Seed of the motions that the marks are given.")] = 0,
+    report: Annotated[bool, typer.Option(help="Write validation.html.")] = True,
+    quiet: options.Quiet = False,
+) -> None:
+    """Prove a rig with marks or a target fixed to the tank, while the stage moves and shakes.
+
+    Marks are withheld in turn, given the known motion of a bubble, and smoothed as bubbles. Less
+    this motion their paths must stand still in the laboratory. Writes validation.json and
+    validation.html.
+
+    Exit code 0: they stand still within the stated standard deviations. 1: they do not. 2: the
+    input cannot be used. 130: interrupted.
+    """
+    from telerig.estimator.calibration.result.calibration import calibration_for
+    from telerig.estimator.smoothing.validate import validate_run
+    from telerig.io.dataset.run import load_run
+    from telerig.io.results.validation import Stillness, table_words, validation_words
+    from telerig.scripts.track import cameras_without_rig, default_folder
+
+    calibrated, files = calibration_for(run, calibration)
+    data = load_run(
+        run, source="detections" if (run / "detections.csv").is_file() else None,
+        **cameras_without_rig(run, calibrated),
+    )  # fmt: skip
+    folder = out or default_folder(run)
+    with progress(quiet) as stage:
+        found = validate_run(
+            data, calibrated, folder, marks=marks, model=model, accept=accept or (), seed=seed,
+            inputs=files, report=report, stage=stage, again=typed_command(),
+        )  # fmt: skip
+    say("\n".join(validation_words(found)))
+    if not quiet:
+        say("\n".join(table_words(found)))
+    for warning in found.warnings:
+        say(f"warning: {warning}")
+    say(f"written: {folder}/validation." + ("html" if report else "json"))
+    if found.verdict is Stillness.FAILED:
+        raise typer.Exit(EXIT_REJECTED)
+
+
+if __name__ == "__main__":
+    run_file(validate)

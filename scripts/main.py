@@ -28,7 +28,6 @@ from telerig.scripts.smooth import smooth
 from telerig.scripts.track import track
 from telerig.scripts.validate import validate
 
-
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
@@ -54,8 +53,8 @@ def _main(
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo, "init": init, "doctor": doctor, "simulate": simulate, "detect": detect,
-    "calibrate": calibrate, "track": track, "smooth": smooth, "validate": validate, "run": run_dataset,
-    "batch": batch, "record": record, "export": export, "report": report,
+    "calibrate": calibrate, "track": track, "smooth": smooth, "validate": validate,
+    "run": run_dataset, "batch": batch, "record": record, "export": export, "report": report,
 }  # fmt: skip
 for name, command in _COMMANDS.items():
     app.command(name)(command)

@@ -65,7 +65,7 @@ def smooth_run(
     run, marks = with_followed_references(run, source.parent)
     of_tracks = [source.parent / name for name in _USED] if tracks.is_dir() else [source]
     used = [*of_tracks, *marks, *inputs]
-    fingerprint = fingerprints(folder, [*_sources(run), *used])
+    fingerprint = fingerprints(folder, [*run_sources(run), *used])
     tracked = RunFile.read_if_there(source.parent / "run.json")
     warnings = [
         *dict.fromkeys(s for file in used for s in stale(file.parent, [file.name])),
@@ -97,7 +97,7 @@ def smooth_run(
     return found
 
 
-def _sources(run: RunData) -> list[Path | Source]:
+def run_sources(run: RunData) -> list[Path | Source]:
     """The inputs of the run's folder whose change makes its smoothing stale."""
     rig = run.path.parent.parent / "rig.toml"
     names = ("frames.csv", "run.toml", "stage.csv", "accelerometer.csv", "references.csv")

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from telerig.io.dataset.run import RunData
     from telerig.rig.camera import Camera
 
-UP = np.array([0.0, -1.0, 0.0])
+_UP = np.array([0.0, -1.0, 0.0])
 FEWEST_FRAMES = 30
 """Fewest frames of a mark that is withheld: a path of fewer says little."""
 MARKS = 6
@@ -54,8 +54,8 @@ _UNSEEN_PX = 1e4
 _MOST_STORED = 300
 _VELOCITY_MM_S, _VELOCITY_TAU_S = 10.0, 0.3
 _ZIGZAG_HZ, _ZIGZAG_MM, _VERTICAL_MM = (5.0, 8.0), (1.0, 3.0), 0.2
-"""The motion that a mark is given: an Ornstein-Uhlenbeck velocity, a zigzag across the rise, and its
-second harmonic along it."""
+"""The motion that a mark is given: an Ornstein-Uhlenbeck velocity, a zigzag across the rise, and
+its second harmonic along it."""
 _PIXEL = ("u_px", "v_px")
 
 
@@ -100,9 +100,9 @@ def validate(
 ) -> ValidationFile:
     """Withhold marks of a run in turn, and smooth each as a bubble whose own motion is known.
 
-    Each mark is smoothed beside the other marks and all sensors, and, if the run has accelerometers,
-    also beside the sensors only, as in a run without marks. A mark that both cameras see is a bubble
-    that both see; of any other mark only the two axes of its image count.
+    Each mark is smoothed beside the other marks and all sensors, and, if the run has
+    accelerometers, also beside the sensors only, as in a run without marks. A mark that both
+    cameras see is a bubble that both see; of any other mark only the two axes of its image count.
 
     run : a run with references, whose stage moves.
     marks : how many marks are withheld; those that are seen longest, of each camera in turn.
@@ -120,14 +120,16 @@ def validate(
         rests.append(Rest.SENSORS)
     done: list[WithheldMark] = []
     warnings: list[str] = []
-    up = UP if run.rig is None else np.asarray(run.rig.stage.up, float)
+    described = None if run.rig is None else run.rig.stage
+    up = _UP if described is None else np.asarray(described.up, float)
     for rest in rests:
         for i, mark in enumerate(chosen):
             motion = bubble_motion(run.t_s, up, np.random.default_rng([seed, i]))
             if progress is not None:
                 progress(f"mark {mark.mark}", len(done) / (len(rests) * len(chosen)))
+            bubble = moved(mark, motion, calibration.cameras)
             found = smooth(
-                track_of(moved(mark, motion, calibration.cameras), calibration, run.t_s), calibration,
+                track_of(bubble, calibration, run.t_s), calibration,
                 stage=_without(run, mark, rest), model=model, accept=accept,
             )  # fmt: skip
             warnings += found.summary.get("warnings", ())
@@ -207,10 +209,10 @@ def seen_marks(run: RunData, calibration: Calibration) -> list[Seen]:
     ).sort_values(["frame", "number"])
     out = []
     for name, rows in table.groupby(table["mark"].astype(str), sort=False):
-        counts = rows["number"].value_counts()
+        counts = np.bincount(rows["number"].to_numpy(np.int64), minlength=2)
         both = len(set.intersection(*(set(r["frame"]) for _, r in rows.groupby("number"))))
-        pair = len(counts) == 2 and both >= FEWEST_FRAMES
-        cameras = (0, 1) if pair else (int(counts.idxmax()),)
+        pair = bool(counts.all()) and both >= FEWEST_FRAMES
+        cameras = (0, 1) if pair else (int(counts.argmax()),)
         rows = rows[rows["number"].isin(cameras)]
         if pair:
             shared = rows.groupby("frame")["number"].nunique()
@@ -232,7 +234,7 @@ def longest(every: Sequence[Seen], count: int) -> list[Seen]:
     Raises InputError if none is seen in `FEWEST_FRAMES` frames.
     """
     ranked: dict[tuple[int, ...], int] = {}
-    order = []
+    order: list[tuple[int, int, Seen]] = []
     for mark in sorted(every, key=lambda mark: -mark.frames):
         if len(mark.frame) >= FEWEST_FRAMES * len(mark.cameras):
             ranked[mark.cameras] = ranked.get(mark.cameras, 0) + 1

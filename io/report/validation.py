@@ -41,7 +41,7 @@ def render(content: ValidationFile) -> str:
         "name": content.run,
         "stale": (),
         "verdict": {
-            "colour": "accepted" if passed else "rejected",
+            "colour": "good" if passed else "rejected",
             "headline": str(content.verdict),
             "sentences": validation_words(content),
             "warnings": content.warnings,
@@ -87,6 +87,6 @@ def _picture(mark: WithheldMark) -> Picture:
     return Picture(
         f"Mark {mark.mark}, {mark.beside}", sheet.source,
         f"Distance of the smoothed path from its mean, less the motion that the mark was given, "
-        f"along the axes of the {'rig' if len(mark.off_um) == 3 else 'image'}. It should stay within "
-        f"the bands. Seen by {' and '.join(mark.cameras)}.",
+        f"along the axes of the {'rig' if len(mark.off_um) == 3 else 'image'}. It should stay "
+        f"within the bands. Seen by {' and '.join(mark.cameras)}.",
     )  # fmt: skip

@@ -41,7 +41,8 @@ class WithheldMark(Part):
     cameras : the cameras whose pixels were used. Of one camera, only the two axes of its image
         count.
     frames : from the mark's first to its last frame.
-    error_um, sd_um : RMS of the position about its mean per axis, and the stated standard deviation.
+    error_um, sd_um : RMS of the position about its mean per axis, and the stated standard
+        deviation.
     velocity_error_mm_s, velocity_sd_mm_s : RMS of the velocity, which should be 0, and the stated
         standard deviation.
     nees, velocity_nees : squared errors over their stated variances.

@@ -89,6 +89,9 @@ def test_a_sensor_that_rig_toml_does_not_know_is_refused_with_the_lines_to_add(p
     lines = said[said.index("[accelerometers.arm]") :]
     table = tomllib.loads(lines)["accelerometers"]["arm"]
     assert table["mounted_on"] == "left" and table["clock"] == "unknown"
+    with (place / "data" / "rig.toml").open("a") as file:
+        file.write(lines)
+    command(f"telerig import accelerometer arm.csv --run {RUN} --sensor arm")
 
 
 def test_the_lines_to_add_follow_from_the_record(place: Path) -> None:

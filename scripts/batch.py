@@ -40,13 +40,18 @@ def batch(
             help="I/N does every N-th dataset only, beginning with the I-th; for job arrays."
         ),
     ] = "1/1",
+    only: options.Only = None,
     calibration: options.GivenCalibration = None,
-    model: options.Model = "auto",
+    model: options.ModelHere = "auto",
     medium: options.Medium = "air",
+    shake: options.ShakeModel = None,
+    refine_rig: options.RefineRig = False,
+    accept: options.AcceptedFaults = None,
+    tracks: options.TracksOfRuns = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
-    """Calibrate many datasets, track and smooth all of their runs.
+    """Calibrate many datasets, track and smooth all of their runs, or do some of it (--only).
 
     Every job runs in a process of its own; one that fails or dies stops only the jobs that need
     its result. The output folder keeps a journal of what is done: the same command, given again,
@@ -65,7 +70,7 @@ def batch(
         summary_line,
         write_batch,
     )
-    from telerig.estimator.batch.jobs import check_options, jobs_of, share_of
+    from telerig.estimator.batch.jobs import check_options, jobs_of, shake_model, share_of
 
     def tell(job: Job, record: dict[str, Any], done: int, of: int) -> None:
         say(f"[{done}/{of}] {summary_line(job, record, whole_path=same_names)}")
@@ -79,8 +84,12 @@ def batch(
     if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
         raise InputError(f"--share {share}", todo="give I/N with I from 1 to N, like 3/40")
     index, of = int(first) - 1, int(last)
+    model, shake = shake_model(model, shake, only or ())
     check_options(calibration, model, medium)
-    jobs = jobs_of(datasets, calibration=calibration, model=model, medium=medium, report=report)
+    jobs = jobs_of(
+        datasets, calibration=calibration, model=model, medium=medium, shake=shake,
+        refine_rig=refine_rig, accept=accept or (), tracks=tracks, report=report, only=only or (),
+    )  # fmt: skip
     mine = share_of(jobs, index, of)
     places = {job.dataset for job in mine}
     same_names = len({Path(place).name for place in places}) < len(places)

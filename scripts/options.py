@@ -14,6 +14,7 @@ Dataset = Annotated[
     Path, typer.Argument(help="Dataset folder, with rig.toml and the views in calibration/.")
 ]
 Run = Annotated[Path, typer.Argument(help="Folder of the recording, DATASET/runs/NAME.")]
+Runs = Annotated[list[Path], typer.Argument(help="Folders of the recordings, DATASET/runs/NAME.")]
 CalibrationFolder = Annotated[
     Path | None, typer.Option(help="Results folder [DATASET/results/calibration].")
 ]
@@ -41,6 +42,40 @@ Medium = Annotated[
     str,
     typer.Option(
         help="Where the target was: air or water. With [walls] in rig.toml, runs are in water."
+    ),
+]
+ModelHere = Annotated[
+    str,
+    typer.Option(
+        help=f"Lens model: auto chooses one per camera. Others: {', '.join(NAMES)}, or several "
+        "joined by + (k1+k2). left=brown,right=auto gives each camera its own. With --only smooth "
+        "as in `telerig smooth`: auto or default."
+    ),
+]
+ShakeModel = Annotated[
+    str | None,
+    typer.Option(
+        help="Priors of the shake: auto learns what no sensor measures, default fixes them [auto]."
+    ),
+]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="calibrate, track or smooth, or the name of a run; can be given several times [all]."
+    ),
+]
+TracksOfRuns = Annotated[
+    Path | None,
+    typer.Option(
+        help="With --only smooth: folder that holds the tracks of each run in a folder of the "
+        "run's name [the results folders]."
+    ),
+]
+RefineRig = Annotated[
+    bool,
+    typer.Option(
+        "--refine-rig",
+        help="Estimate how the cameras have moved against each other since the calibration.",
     ),
 ]
 AcceptedFaults = Annotated[

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -25,12 +25,13 @@ if TYPE_CHECKING:
 def run(
     dataset: options.Dataset,
     calibration: options.GivenCalibration = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(help="Name of a run to do; can be given several times [all runs]."),
-    ] = None,
-    model: options.Model = "auto",
+    only: options.Only = None,
+    model: options.ModelHere = "auto",
     medium: options.Medium = "air",
+    shake: options.ShakeModel = None,
+    refine_rig: options.RefineRig = False,
+    accept: options.AcceptedFaults = None,
+    tracks: options.TracksOfRuns = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
@@ -43,11 +44,15 @@ def run(
     used. 130: interrupted; the same command continues.
     """
     from telerig.estimator.batch.batch import DONE, FAILED, LEFT_OUT, batch_words, failure
-    from telerig.estimator.batch.jobs import check_options, jobs_of
+    from telerig.estimator.batch.jobs import check_options, jobs_of, shake_model
 
+    model, shake = shake_model(model, shake, only or ())
     check_options(calibration, model, medium)
-    jobs = jobs_of([dataset], calibration=calibration, only=only or (), model=model,
-                   medium=medium, report=report, strict=True)  # fmt: skip
+    jobs = jobs_of(
+        [dataset], calibration=calibration, only=only or (), model=model, medium=medium,
+        shake=shake, refine_rig=refine_rig, accept=accept or (), tracks=tracks, report=report,
+        strict=True,
+    )  # fmt: skip
     records: dict[str, dict[str, Any]] = {}
     for job in jobs:
         missing = [name for name in job.needs if records[name]["status"] != DONE]

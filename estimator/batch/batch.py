@@ -22,7 +22,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -214,9 +214,13 @@ def _smooth(job: Job, stage: Stage | None) -> dict[str, Any]:
 
     run = Path(job.dataset) / "runs" / job.run
     calibration, files = calibration_for(run, [Path(job.calibration)] if job.calibration else None)
+    source: Literal["detections"] | None = (
+        "detections" if (run / "detections.csv").is_file() else None
+    )
     found = smooth_run(
-        load_run(run), calibration, job.results, job.results, inputs=files, report=job.report,
-        stage=stage, again=job.command,
+        load_run(run, source=source), calibration, Path(job.tracks or job.results), job.results,
+        model=job.shake, refine_rig=job.refine_rig, accept=job.accept, inputs=files,
+        report=job.report, stage=stage, again=job.command,
     )  # fmt: skip
     table = found.trajectories
     figures: dict[str, Any] = {

@@ -7,7 +7,7 @@ import hashlib
 import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +16,9 @@ from telerig.io.dataset.dataset import load_dataset
 from telerig.version import VERSION
 
 Kind = Literal["calibrate", "track", "smooth"]
+KINDS: tuple[Kind, ...] = ("calibrate", "track", "smooth")
+SHAKE_MODELS = ("auto", "default")
+"""The priors of the shake that `telerig smooth --model` can name."""
 
 MAIN_RESULT = {"calibrate": "calibration.json", "track": "tracks.csv", "smooth": "trajectories.csv"}
 RESERVED = "calibration"
@@ -32,6 +35,9 @@ class Job:
     run : name of the run; empty for a calibration.
     calibration : file that is used for all runs; empty for the dataset's own calibration.
     model, medium : lens model of a calibration, and the medium in which the target was.
+    shake, refine_rig, accept : of a smoothing: see ``model``, ``refine_rig`` and ``accept`` of
+        `telerig.smooth`.
+    tracks : of a smoothing: tracks.csv, or the folder that has it; empty for the results folder.
     needs : names of the jobs that must be done before this one.
     """
 
@@ -41,6 +47,10 @@ class Job:
     calibration: str = ""
     model: str = "auto"
     medium: str = "air"
+    shake: str = "auto"
+    refine_rig: bool = False
+    accept: tuple[str, ...] = ()
+    tracks: str = ""
     report: bool = True
     needs: tuple[str, ...] = ()
 
@@ -74,7 +84,15 @@ class Job:
             words += ["--calibration", self.calibration]
         if self.kind == "calibrate":
             words += [f"--model={self.model}", f"--medium={self.medium}"]
+        if self.kind == "smooth":
+            words += self._smoothing_options()
         return shlex.join(words if self.report else [*words, "--no-report"])
+
+    def _smoothing_options(self) -> list[str]:
+        words = ["--tracks", self.tracks] if self.tracks else []
+        words += [f"--model={self.shake}"] if self.shake != "auto" else []
+        words += ["--refine-rig"] if self.refine_rig else []
+        return [*words, *(word for code in self.accept for word in ("--accept", code))]
 
     def as_json(self) -> str:
         """Return the job as one line of JSON."""
@@ -84,7 +102,7 @@ class Job:
     def from_json(cls, line: str) -> Job:
         """Return the job that `as_json` has written."""
         content = json.loads(line)
-        return cls(**{**content, "needs": tuple(content["needs"])})
+        return cls(**{**content, **{key: tuple(content[key]) for key in ("needs", "accept")}})
 
 
 def jobs_of(
@@ -93,6 +111,10 @@ def jobs_of(
     calibration: Path | None = None,
     model: str = "auto",
     medium: str = "air",
+    shake: str = "auto",
+    refine_rig: bool = False,
+    accept: Sequence[str] = (),
+    tracks: Path | None = None,
     report: bool = True,
     only: Sequence[str] = (),
     strict: bool = False,
@@ -101,44 +123,109 @@ def jobs_of(
     needs.
 
     calibration : a calibration for all datasets; then none is calibrated.
-    only : names of the runs to be done; empty for all runs.
+    model : the lens model of calibrations.
+    shake, refine_rig, accept : of smoothings, see `Job`.
+    tracks : a folder with tracks in a folder for each run, or None; only where nothing is tracked.
+    only : kinds of jobs (`KINDS`) and names of runs to be done; without kinds all kinds are done,
+        without names all runs.
     strict : if True, a dataset that cannot be used raises InputError; otherwise it becomes a
         calibration job that fails, so that the other datasets are still done.
 
     A dataset without views of the target must have been calibrated before. Raises InputError for
-    folders that do not exist or are named twice, and for unknown runs.
+    folders that do not exist or are named twice, for unknown runs, and for options of jobs that are
+    not done.
     """
+    kinds, only = kinds_and_runs(only)
+    if tracks is not None and "track" in kinds:
+        raise InputError("--tracks is given, and runs are tracked", todo="add --only smooth")
     places = _checked(datasets)
     shared: dict[str, Any] = {
         "calibration": "" if calibration is None else str(Path(calibration).resolve()),
         "model": model,
         "medium": medium,
+        "shake": shake,
+        "refine_rig": refine_rig,
+        "accept": tuple(accept),
         "report": report,
     }
     jobs: list[Job] = []
     for place in places:
         try:
-            jobs += _jobs_of_one(place, only, shared)
+            jobs += _jobs_of_one(place, kinds, only, shared)
         except InputError:
             if strict:
                 raise
             jobs.append(Job("calibrate", str(place), **shared))
     _check_only(jobs, only)
-    return jobs
+    return jobs if tracks is None else _with_tracks(jobs, tracks)
 
 
-def _jobs_of_one(place: Path, only: Sequence[str], shared: Mapping[str, Any]) -> list[Job]:
+def kinds_and_runs(only: Iterable[str]) -> tuple[tuple[Kind, ...], list[str]]:
+    """Return the kinds of jobs and the names of runs among the words of `--only`.
+
+    All kinds are returned where none is named.
+    """
+    words = list(only)
+    kinds = tuple(kind for kind in KINDS if kind in words)
+    return kinds or KINDS, [word for word in words if word not in KINDS]
+
+
+def shake_model(model: str, shake: str | None, only: Iterable[str]) -> tuple[str, str]:
+    """Return the lens model and the shake's priors that `--model` and `--shake` mean.
+
+    Where only smoothing is done there is no lens model, and `--model` has the meaning that it has
+    for `telerig smooth`. Raises InputError for unknown priors, and for a model that belongs to jobs
+    that are not done.
+    """
+    smooths_only = kinds_and_runs(only)[0] == ("smooth",)
+    if smooths_only and shake is None:
+        model, shake = "auto", model
+    elif model == "default":
+        todo = "say --shake default; --model names a lens model unless --only smooth is given"
+        raise InputError("--model default is no lens model", todo=todo)
+    if (shake or "auto") not in SHAKE_MODELS:
+        option = "--model" if smooths_only else "--shake"
+        todo = f"use one of: {', '.join(SHAKE_MODELS)}"
+        raise InputError(f"{option} {shake}: there is no such choice", todo=todo)
+    return model, shake or "auto"
+
+
+def _with_tracks(jobs: Sequence[Job], tracks: Path) -> list[Job]:
+    """Return the jobs with the folder of each run's tracks.
+
+    Raises InputError for two runs with the same name.
+    """
+    folders = [str(tracks.resolve() / job.run) if job.kind == "smooth" else "" for job in jobs]
+    check_distinct([folder for folder in folders if folder], "--tracks")
+    return [replace(job, tracks=folder) for job, folder in zip(jobs, folders)]
+
+
+def check_distinct(folders: Sequence[str], option: str) -> None:
+    """Raise InputError where two runs would have the same folder in that of an option."""
+    twice = next((folder for folder in folders if folders.count(folder) > 1), None)
+    if twice is not None:
+        raise InputError(
+            f"several runs are named {Path(twice).name!r}, and {option} has one folder for them",
+            todo="give them in commands of their own, each with its own folder",
+        )
+
+
+def _jobs_of_one(
+    place: Path, kinds: Sequence[Kind], only: Sequence[str], shared: Mapping[str, Any]
+) -> list[Job]:
     given = bool(shared["calibration"])
     calibrated_before = (place / "results" / "calibration" / "calibration.json").is_file()
-    data = load_dataset(place, need_views=not given and not calibrated_before)
-    jobs = [Job("calibrate", str(place), **shared)] if data.views and not given else []
+    calibrates = "calibrate" in kinds and not given
+    data = load_dataset(place, need_views=calibrates and not calibrated_before)
+    jobs = [Job("calibrate", str(place), **shared)] if data.views and calibrates else []
     calibrated = tuple(job.name for job in jobs)
     for run in data.runs:
         if only and run not in only:
             continue
-        tracked = Job("track", str(place), run, needs=calibrated, **shared)
-        smoothed = Job("smooth", str(place), run, needs=(*calibrated, tracked.name), **shared)
-        jobs += [tracked, smoothed]
+        needs = calibrated
+        for kind in (kind for kind in KINDS[1:] if kind in kinds):
+            jobs.append(Job(kind, str(place), run, needs=needs, **shared))
+            needs = (*needs, jobs[-1].name)
     return jobs
 
 
@@ -162,7 +249,8 @@ def _check_only(jobs: Sequence[Job], only: Sequence[str]) -> None:
         if run not in known:
             raise InputError(
                 f"no dataset has a run {run!r}", where="--only",
-                todo="leave --only out, or name runs as their folders in runs/ are named",
+                todo="leave --only out, name runs as their folders in runs/ are named, or kinds of "
+            f"jobs: {', '.join(KINDS)}",
             )  # fmt: skip
 
 
@@ -232,4 +320,7 @@ def _used_results(job: Job) -> list[Path]:
         return []
     own = Path(job.dataset) / "results" / "calibration" / "calibration.json"
     used = [Path(job.calibration) if job.calibration else own]
-    return used if job.kind == "track" else [*used, job.results / "tracks.csv"]
+    if job.kind == "track":
+        return used
+    tracks = Path(job.tracks) if job.tracks else job.results
+    return [*used, tracks / "tracks.csv" if tracks.is_dir() else tracks]

@@ -63,7 +63,8 @@ def test_several_runs_are_smoothed_with_one_call(data: Path) -> None:
     for name in found:
         (data / "results" / name / "trajectories.csv").unlink()
     command(
-        f"telerig batch {data} --only smooth {options} --no-report --quiet --workers 1 --out {data}/b"
+        f"telerig batch {data} --only smooth {options} --no-report --quiet --workers 1 "
+        f"--out {data}/b"
     )
     assert {name: smoothed(data / "results" / name) for name in found} == found
 

@@ -143,14 +143,16 @@ def validation_words(file: ValidationFile) -> list[str]:
 
 
 def _words(entry: Overall) -> str:
-    count = "1 mark" if entry.marks == 1 else f"{entry.marks} marks"
+    one, passed = entry.marks == 1, entry.verdict is Stillness.PASSED
+    count = "1 mark smoothed as a bubble" if one else f"{entry.marks} marks smoothed as bubbles"
+    stand = "stands" if one else "stand"
+    fall = "does not stand" if one else "do not stand"
     means = {
         Rest.MARKS: "with the other marks and all sensors",
         Rest.SENSORS: "with encoder and accelerometers only, as in a run without marks",
     }[entry.beside]
-    still = "stand" if entry.verdict is Stillness.PASSED else "do not stand"
     return (
-        f"{entry.verdict} {means}: {count} smoothed as bubbles {still} still within the stated "
+        f"{entry.verdict} {means}: {count} {stand if passed else fall} still within the stated "
         f"standard deviations: {entry.error_um:.3g} µm at stated {entry.sd_um:.3g} µm "
         f"(NEES {entry.nees:.2f}), {entry.velocity_error_mm_s:.2g} mm/s at stated "
         f"{entry.velocity_sd_mm_s:.2g} mm/s (NEES {entry.velocity_nees:.2f}); "

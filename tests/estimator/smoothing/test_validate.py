@@ -127,9 +127,7 @@ def test_a_moved_mark_moves_as_it_was_told(run: RunData, calibration: Calibratio
         assert_allclose(by, motion.position_mm[mark.frame] @ across.T, atol=1e-6)
 
 
-def test_a_mark_of_both_cameras_is_a_bubble_of_both(
-    run: RunData, calibration: Calibration
-) -> None:
+def test_a_mark_of_both_cameras_is_a_bubble_of_both(run: RunData, calibration: Calibration) -> None:
     frames = np.arange(40)
     point = np.array([1.0, 2.0, 3.0]) + np.outer(frames, [0.0, 0.5, 0.0])
     rows = [

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Bools
-from telerig.errors import InputError, suggestion
+from telerig.errors import InputError, nearest, suggestion
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
 
@@ -87,7 +87,7 @@ class Sensor:
     unit : the unit in which the readings were given.
     mounted_on : a camera's name, or "carriage".  axes : (3, 3) the sensor's axes as unit rows.
     noise_density_ug_sqrt_hz, range_m_s2 : None if nothing states them.
-    kept : (N,) whether each sample is used.
+    kept : (N,) whether each sample is used.  unused_axes : indices of axes that are not used.
     """
 
     name: str
@@ -102,6 +102,7 @@ class Sensor:
     range_m_s2: float | None
     clock: Clock
     kept: Bools
+    unused_axes: tuple[int, ...] = ()
 
 
 def given_sensors(
@@ -271,10 +272,8 @@ def _samples(
     if unit is None:
         unit, found = _inferred(reading, name, where)
     if unit not in ACCELERATION_UNITS:
-        known = list(ACCELERATION_UNITS)
-        raise InputError(
-            f"unit is {unit!r}", where=where, todo=suggestion(str(unit), known) + f" ({known})"
-        )
+        todo = _one_of(str(unit), list(ACCELERATION_UNITS))
+        raise InputError(f"unit is {unit!r}", where=where, todo=todo)
     return t, reading * ACCELERATION_UNITS[unit], unit, found
 
 
@@ -365,7 +364,7 @@ def _mount(mounted_on: Any, cameras: Sequence[str], where: str) -> str:
         raise InputError(
             f"is mounted on {mounted_on!r}, which is no camera",
             where=where,
-            todo=f"{suggestion(str(mounted_on), mounts)} (one of {', '.join(mounts)})",
+            todo=_one_of(str(mounted_on), mounts),
         )
     return str(mounted_on)
 
@@ -451,8 +450,15 @@ def known_keys(source: Iterable[Any], known: Sequence[str], where: str) -> None:
             raise InputError(
                 f"unknown key {key!r}",
                 where=where,
-                todo=f"{suggestion(str(key), list(known))} (known: {', '.join(known)})",
+                todo=_one_of(str(key), known),
             )
+
+
+def _one_of(word: str, known: Sequence[str]) -> str:
+    """Return the advice for an unknown word: the most similar known word, and all others."""
+    near = nearest(word, list(known))
+    every = f"give one of {', '.join(known)}"
+    return every if near is None else f"did you mean {near}? {every}"
 
 
 def table_columns(table: Any, names: Sequence[str], where: str, *, what: str) -> list[Array]:

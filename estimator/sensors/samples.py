@@ -35,6 +35,7 @@ _ROUNDS = 20
 _CLIPPED_LEAST = 5
 _CLIPPED_EXCESS = 3
 _AT_LIMIT = 1e-3
+_MOST_CLIPPED = 0.1
 
 _LEAST_FROZEN = 4
 _CHANCE = 1e-6
@@ -64,61 +65,68 @@ class Clipping:
 def screened(sensor: Sensor) -> tuple[Sensor, list[Finding]]:
     """Return the sensor with samples masked that cannot be right, and warnings that count them.
 
-    The readings of masked samples are interpolated from their neighbours, so that filters of the
-    record see nothing of them. A noise density that nothing states is estimated.
+    An axis that is often clipped or never changes is not used at all. The readings of masked
+    samples are interpolated from their neighbours, so that filters of the record see nothing of
+    them. A noise density that nothing states is estimated.
     """
     t, reading, where = sensor.t_s, sensor.reading_m_s2, sensor.where
     findings: list[Finding] = []
 
     def warn(words: str, masked: Bools) -> None:
-        first = int(np.argmax(masked))
-        findings.append(Finding(f"{words} and are not used, the first at {t[first]:.6g} s", where))
+        first = float(t[np.argmax(masked)])
+        findings.append(Finding(f"{words}, the first at {first:.6g} s", where))
 
+    unused = set(np.flatnonzero(np.ptp(reading, axis=0) == 0).tolist())
+    for axis in sorted(unused):
+        words = f"a{'xyz'[axis]} never changes: the sensor is stuck, or not connected"
+        findings.append(Finding(f"{words}, and the axis is not used", where))
     clipped = np.zeros(len(t), bool)
     for found in clippings(reading, sensor.range_m_s2):
-        clipped |= found.samples
-        warn(
-            f"{np.count_nonzero(found.samples)} of {len(t)} samples of "
-            f"a{'xyz'[found.axis]} are clipped at "
-            f"{found.value:.4g} m/s^2: the sensor's range is too small; they", found.samples,
-        )  # fmt: skip
+        count, name = np.count_nonzero(found.samples), f"a{'xyz'[found.axis]}"
+        often = count > _MOST_CLIPPED * len(t)
+        words = f"{count} of {len(t)} samples of {name} are clipped at {found.value:.4g} m/s^2: "
+        words += "the sensor's range is too small"
+        if often:
+            unused.add(found.axis)
+        else:
+            clipped |= found.samples
+        warn(f"{words}, and {f'{name} is' if often else 'they are'} not used", found.samples)
     density = sensor.noise_density_ug_sqrt_hz
     if density is None:
         density = noise_density(t, reading)
-        findings.append(
-            Finding(
-                f"no noise density is given; {density:.3g} ug/sqrt(Hz) are estimated",
-                where,
-                "give noise_density_ug_sqrt_hz from the data sheet",
-            )
-        )
+        words = f"no noise density is given; {density:.3g} ug/sqrt(Hz) are estimated"
+        todo = "give noise_density_ug_sqrt_hz from the data sheet"
+        findings.append(Finding(words, where, todo))
     sigma = density * _MICRO_G_M_S2 * np.sqrt(sampling_rate(t) / 2)
     frozen = frozen_samples(reading, sigma) & ~clipped
     if frozen.any():
-        warn(f"{np.count_nonzero(frozen)} of {len(t)} samples repeat the one before: the sensor "
-             "had stopped; they", frozen)  # fmt: skip
-    spikes = np.any([spike_samples(a) for a in reading.T], axis=0) & ~clipped & ~frozen
+        words = f"{np.count_nonzero(frozen)} of {len(t)} samples repeat the one before: the sensor "
+        warn(f"{words}had stopped, and they are not used", frozen)
+    axes = [a for i, a in enumerate(reading.T) if i not in unused]
+    spikes = np.any([np.zeros(len(t), bool), *map(spike_samples, axes)], axis=0)
+    spikes &= ~clipped & ~frozen
     if spikes.any():
-        warn(f"{np.count_nonzero(spikes)} of {len(t)} samples are spikes", spikes)
+        warn(f"{np.count_nonzero(spikes)} of {len(t)} samples are spikes and are not used", spikes)
     findings += _gaps(t, where)
     kept = ~(clipped | frozen | spikes)
     filled = reading
     if not kept.all() and kept.any():
         filled = np.stack([np.interp(t, t[kept], a[kept]) for a in reading.T], -1)
-    sensor = replace(sensor, reading_m_s2=filled, kept=kept, noise_density_ug_sqrt_hz=density)
-    return sensor, findings
+    return replace(
+        sensor, reading_m_s2=filled, kept=kept, noise_density_ug_sqrt_hz=density,
+        unused_axes=tuple(sorted(unused)),
+    ), findings  # fmt: skip
 
 
 def mostly_masked(sensor: Sensor) -> Finding | None:
-    """Return a warning if so many samples are masked that the sensor has to be left out."""
+    """Return a warning if so much of the record is not used that the sensor has to be left out."""
     share = 1 - float(sensor.kept.mean())
-    if share <= _MOST_MASKED:
+    if share <= _MOST_MASKED and len(sensor.unused_axes) < 3:
         return None
-    return Finding(
-        f"{100 * share:.0f} % of its samples cannot be used, so the sensor is left out",
-        sensor.where,
-        "record again with a wider range, or repair the sensor",
-    )
+    what = "none of its axes" if len(sensor.unused_axes) == 3 else f"{100 * share:.0f} % of its"
+    words = f"{what} can be used" if "axes" in what else f"{what} samples cannot be used"
+    todo = "record again with a wider range, or repair the sensor"
+    return Finding(f"{words}, so the sensor is left out", sensor.where, todo)
 
 
 def sampling_rate(t_s: ArrayLike) -> float:

@@ -172,6 +172,10 @@ def _sensors(solution: Solution) -> dict[str, Any]:
         found["delay_s"] = float(solution.delays_s[i])
         if clocks is not None and graph.sensor_flags[1]:
             found["sdelay_s"] = float(np.sqrt(clocks[graph.clock_of[i], 0, 0]))
+        found["masked_samples"] = sensor.masked_samples
+        weight = solution.sample_weights[i] if solution.sample_weights else None
+        if weight is not None:
+            found["masked_samples"] = int(np.count_nonzero(weight < _USED))
         out[sensor.name] = found
     return out
 
@@ -229,6 +233,8 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
         file.attrs["schema"] = SmoothingFile.SCHEMA
         file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"
 
+
+_USED = 0.5
 
 AXES = ("x", "y", "z")
 LONGEST_RTS = 5000

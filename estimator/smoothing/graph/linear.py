@@ -13,12 +13,23 @@ from numpy.typing import ArrayLike
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State
-from telerig.estimator.smoothing.problem.problem import CARRIAGE, Accelerometer, Observations
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    Accelerometer,
+    Observations,
+    SmoothingProblem,
+)
 from telerig.factors import measurements
 from telerig.factors.linear_factors import LinearFactors, prior_factors
 from telerig.factors.motion import start_factors
 from telerig.factors.state_space import log_det_of, whitener_of
 from telerig.rig.triangulation import rig_jacobian
+
+SampleWeights = tuple[Array | None, ...]
+"""Weights (N,) of the samples of each accelerometer; None where all are 1."""
+
+_UNUSED = 1e8
+"""Variance of an axis that is not used, in units of the others'."""
 
 _SLOPE_S = 2e-3
 """Width of the filter that takes the readings' rate of change for the delay."""
@@ -255,31 +266,69 @@ def encoder(graph: GraphLayout, state: State) -> list[LinearFactors]:
     ]
 
 
-def accelerometers(graph: GraphLayout, state: State) -> list[LinearFactors]:
+def accelerometers(
+    graph: GraphLayout, state: State, weights: SampleWeights | None = None
+) -> list[LinearFactors]:
     """Samples of all sensors, along the directions in which their mount's motion is modelled.
 
     Their information on the encoder's scale, by the carriage's own acceleration, is not used.
+
+    weights : of each sensor's samples; None for those of the record.
     """
-    return [_accelerometer(graph, state, i) for i in range(len(graph.problem.accelerometers))]
+    given = weights or sample_weights(graph.problem)
+    return [_accelerometer(graph, state, i, weight) for i, weight in enumerate(given)]
 
 
-def _accelerometer(graph: GraphLayout, state: State, index: int) -> LinearFactors:
-    problem, layout = graph.problem, graph.shake
-    sensor = problem.accelerometers[index]
-    node, late = graph.nodes.of_accelerometers[index], graph.nodes.accelerometer_late_s[index]
-    gain = 1 / (1 + state.encoder_scale(graph))
-    jerk_rows = np.multiply.outer(gain * problem.axis, layout.jerk)
-    jerk_rows += layout.offset_jerk[sensor.camera]
-    rows = np.multiply.outer(gain * problem.axis, layout.acceleration)
+def sample_weights(problem: SmoothingProblem) -> SampleWeights:
+    """Weights (N,) of each sensor's samples: 0 for those that are not used, otherwise 1."""
+    return tuple(None if a.kept is None else a.kept.astype(float) for a in problem.accelerometers)
+
+
+def sample_residuals(graph: GraphLayout, state: State) -> tuple[Array, ...]:
+    """Whitened residuals (N, k) of each sensor's samples."""
+    out = []
+    for index, sensor in enumerate(graph.problem.accelerometers):
+        read = _predicted_reading(graph, state, index).reading_mm_s2
+        delay = state.clocks[graph.clock_of[index]].sum()
+        project, _ = sensed_directions(graph, index)
+        late = delay * _slope(sensor) if delay else 0.0
+        out.append((read - sensor.reading_mm_s2 - late) @ project.T)
+    return tuple(out)
+
+
+def _acceleration_rows(graph: GraphLayout, state: State, index: int) -> tuple[Array, Array]:
+    """(3, D) rows that give the mount's acceleration and its jerk from a node's state."""
+    layout, sensor = graph.shake, graph.problem.accelerometers[index]
+    along = graph.problem.axis / (1 + state.encoder_scale(graph))
+    rows = np.multiply.outer(along, layout.acceleration)
     rows += layout.offset_acceleration[sensor.camera]
-    bias = state.sensors[index, :3]
-    clock = graph.clock_of[index]
-    scale, delay = state.sensors[index, 3:].sum(), state.clocks[clock].sum()
+    jerk_rows = np.multiply.outer(along, layout.jerk) + layout.offset_jerk[sensor.camera]
+    return rows, jerk_rows
+
+
+def _predicted_reading(
+    graph: GraphLayout, state: State, index: int
+) -> measurements.AccelerometerPrediction:
+    problem, sensor = graph.problem, graph.problem.accelerometers[index]
+    node, late = graph.nodes.of_accelerometers[index], graph.nodes.accelerometer_late_s[index]
+    rows, jerk_rows = _acceleration_rows(graph, state, index)
     states = state.shake[node]
     acceleration = states @ rows.T + late[:, None] * (states @ jerk_rows.T)
-    read = measurements.accelerometer_reading(
-        acceleration, problem.gravity_mm_s2, sensor.axes, bias, scale
-    )
+    return measurements.accelerometer_reading(
+        acceleration, problem.gravity_mm_s2, sensor.axes, state.sensors[index, :3],
+        state.sensors[index, 3:].sum(),
+    )  # fmt: skip
+
+
+def _accelerometer(
+    graph: GraphLayout, state: State, index: int, weight: Array | None
+) -> LinearFactors:
+    sensor = graph.problem.accelerometers[index]
+    node, late = graph.nodes.of_accelerometers[index], graph.nodes.accelerometer_late_s[index]
+    rows, jerk_rows = _acceleration_rows(graph, state, index)
+    clock = graph.clock_of[index]
+    delay = state.clocks[clock].sum()
+    read = _predicted_reading(graph, state, index)
     slope = _slope(sensor)
     project, white = sensed_directions(graph, index)
     by_shake = (project @ read.by_acceleration[0]) @ (
@@ -294,7 +343,12 @@ def _accelerometer(graph: GraphLayout, state: State, index: int) -> LinearFactor
     rhs = (sensor.reading_mm_s2 - read.reading_mm_s2 + delay * slope) @ project.T
     log_det = np.full(len(node), white)
     keys = (node, graph.base().sensors + index, graph.base().clocks + clock)
-    return LinearFactors(keys, blocks, rhs, log_det)
+    if weight is not None:
+        root = np.sqrt(weight)
+        by_shake, by_sensor, by_clock = (block * root[:, None, None] for block in blocks)
+        blocks = (by_shake, by_sensor, by_clock)
+        rhs = rhs * root[:, None]
+    return LinearFactors(keys, blocks, rhs, log_det, weight)
 
 
 def _slope(sensor: Accelerometer) -> Array:
@@ -308,7 +362,13 @@ def _slope(sensor: Accelerometer) -> Array:
 
     step = float(np.median(np.diff(sensor.t_s)))
     width = max(_SLOPE_S / step, 1.0)
-    slope = gaussian_filter1d(sensor.reading_mm_s2, width, axis=0, order=1, mode="nearest")
+    reading, at = sensor.reading_mm_s2, np.arange(len(sensor.t_s))
+    steps = np.rint(np.diff(sensor.t_s) / step).astype(np.int64)
+    if np.any(steps > 1):
+        at = np.r_[0, np.cumsum(np.maximum(steps, 1))]
+        every = np.arange(at[-1] + 1)
+        reading = np.stack([np.interp(every, at, column) for column in reading.T], -1)
+    slope = gaussian_filter1d(reading, width, axis=0, order=1, mode="nearest")[at]
     return np.asarray(slope / step, np.float64)
 
 
@@ -317,17 +377,23 @@ def sensed_directions(graph: GraphLayout, index: int) -> tuple[Array, float]:
     sensor = graph.problem.accelerometers[index]
     directions = np.eye(3) if sensor.camera == CARRIAGE else graph.shake.seen[sensor.camera]
     rows = directions @ np.linalg.inv(sensor.axes)
-    whitener = whitener_of(rows @ rows.T * sensor.sigma_mm_s2**2)
+    variance = np.ones(3)
+    variance[list(sensor.unused_axes)] = _UNUSED
+    whitener = whitener_of((rows * variance) @ rows.T * sensor.sigma_mm_s2**2)
     return np.asarray(whitener @ rows), float(log_det_of(whitener))
 
 
 def all_factors(
-    graph: GraphLayout, state: State, weights: tuple[Array, Array]
+    graph: GraphLayout,
+    state: State,
+    weights: tuple[Array, Array],
+    samples: SampleWeights | None = None,
 ) -> list[LinearFactors]:
-    """Every factor of the graph; weights of the bubbles' and of the marks' pixels."""
+    """Every factor of the graph; weights of the bubbles' and of the marks' pixels, and of the
+    sensors' samples."""
     out = priors_and_motion(graph, state)
     out += images(graph, state, weights[0]).linear + references(graph, state, weights[1]).linear
-    return out + encoder(graph, state) + accelerometers(graph, state)
+    return out + encoder(graph, state) + accelerometers(graph, state, samples)
 
 
 def pixel_residuals(graph: GraphLayout, state: State) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph, eliminate
 from telerig.estimator.smoothing.graph.layout import (
@@ -22,11 +22,18 @@ from telerig.estimator.smoothing.graph.layout import (
     moved,
     times,
 )
-from telerig.estimator.smoothing.graph.linear import all_factors, pixel_residuals
+from telerig.estimator.smoothing.graph.linear import (
+    SampleWeights,
+    all_factors,
+    pixel_residuals,
+    sample_residuals,
+    sample_weights,
+)
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.robust_loss import truncation_weights
 from telerig.rig.lens_parameters import INDEX
+from telerig.statistics import robust_sd
 
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
@@ -34,6 +41,10 @@ T = TypeVar("T")
 _CLOCK_PASSES = 6
 _OUTLIER_SIGMAS, _SUSPICIOUS_SIGMAS = 4.0, 5.0
 _LEAST_KEPT = 0.7
+_SAMPLE_OUTLIER, _SAMPLE_SUSPICIOUS, _BACK = 12.0, 20.0, 0.9
+_PEAK_SAMPLES = 8
+_LEAST_SAMPLES_KEPT = 0.95
+_MOST_ROUNDS, _LEAST_SCALE = 5, 1e-9
 _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
 _STACK_BYTES = 512 << 20
 
@@ -88,6 +99,8 @@ class Solution:
     log_evidence : natural logarithm of the marginal likelihood; exact for affine cameras, otherwise
         at the last linearisation.
     passes : number of linearisations that were made.
+    sample_weights, sample_residuals : weights (N,) of each accelerometer's samples, None where all
+        are 1, and their whitened residuals (N, k) along the k directions of modelled motion.
     """
 
     graph: GraphLayout
@@ -97,6 +110,8 @@ class Solution:
     residuals: tuple[Array, Array]
     log_evidence: float
     passes: int
+    sample_weights: SampleWeights = ()
+    sample_residuals: tuple[Array, ...] = ()
 
     @property
     def delays_s(self) -> Array:
@@ -142,18 +157,22 @@ def _solve(
     weights = (np.ones(len(problem.observations)), np.ones(len(problem.references)))
     if start is not None:
         weights, state = start.weights, _warm(graph, state, start)
-    robust = Truncation(options.robust)
+    samples = sample_weights(problem)
+    robust, rejection = Truncation(options.robust), SampleRejection(options.robust)
     last: _Pass | None = None
     exact = _is_linear(problem, model)
     done = 0
     for done in range(1, options.passes + _CLOCK_PASSES + 1):
-        if done > options.passes and not delays_have_moved(graph, state):
+        if done > options.passes + rejection.rounds and not delays_have_moved(graph, state):
             break
         progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
-        last = made = _linear_solve(graph, state, weights)
+        last = made = _linear_solve(graph, state, weights, samples)
         state = moved(graph, state, made.done.vector)
         residuals = pixel_residuals(graph, state)
-        fresh, changed = robust.update(weights, residuals)
+        samples, changed = rejection.update(samples, sample_residuals(graph, state))
+        fresh = weights
+        if not changed:
+            fresh, changed = robust.update(weights, residuals)
         still = made.largest_px < options.tolerance_px and not delays_have_moved(graph, state)
         if (still or exact) and not changed and (done > 1 or start is not None or exact):
             break
@@ -162,10 +181,13 @@ def _solve(
         last = None if again or changed else last
     if last is None:
         weights = ((weights[0] > 0.5).astype(float), (weights[1] > 0.5).astype(float))
-        last = _linear_solve(graph, state, weights)
+        last = _linear_solve(graph, state, weights, samples)
         state = moved(graph, state, last.done.vector)
         residuals = pixel_residuals(graph, state)
-    return _finish(graph, state, (weights, residuals), last, options, done, progress)
+    found = _finish(graph, state, (weights, residuals), last, options, done, progress)
+    return replace(
+        found, sample_weights=samples, sample_residuals=sample_residuals(graph, found.state)
+    )
 
 
 def _warm(graph: GraphLayout, state: State, start: Solution) -> State:
@@ -204,13 +226,15 @@ class _Pass:
     squared: float
 
 
-def _linear_solve(graph: GraphLayout, state: State, weights: tuple[Array, Array]) -> _Pass:
+def _linear_solve(
+    graph: GraphLayout, state: State, weights: tuple[Array, Array], samples: SampleWeights
+) -> _Pass:
     """One Gauss-Newton pass, by Cholesky or by QR, which is four times slower.
 
     The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
     good to 3e-6), and more than double precision has with steps as short as a sensor's.
     """
-    factors = all_factors(graph, state, weights)
+    factors = all_factors(graph, state, weights, samples)
     only_frames = len(graph.nodes.t_s) == len(graph.problem.t_s)
     done = eliminate(graph, factors, cholesky=only_frames and not graph.model.broad_bands)
     if not np.all(np.isfinite(done.vector)):
@@ -327,6 +351,61 @@ class Truncation:
             fresh = tuple(np.ones_like(w) for w in weights)
         change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fresh, weights))
         return (fresh[0], fresh[1]), change > 1e-3
+
+
+class SampleRejection:
+    """Rejects single samples of accelerometers that the other measurements contradict.
+
+    The fit follows most of each sample's noise, and a wrong sample moves its neighbours' residuals,
+    too. So limits are in units of the residuals' own standard deviation s, and in each pass only
+    the samples whose residuals are local maxima lose their weight. One that is not used has a
+    standard deviation of 1 / s instead, and is taken back if it fits. Nothing is touched as long
+    as no residual is suspicious.
+
+    rounds : number of passes in which weights have changed.
+    """
+
+    def __init__(self, wanted: bool) -> None:
+        self.wanted, self.rounds = wanted, 0
+        self.usable: dict[int, Bools] = {}
+        self.motion: set[int] = set()
+
+    def update(
+        self, weights: SampleWeights, residuals: tuple[Array, ...]
+    ) -> tuple[SampleWeights, bool]:
+        """Return the new weights, and whether they have changed.
+
+        residuals : (N, k) of each sensor, whitened.
+        """
+        if not self.wanted or self.rounds >= _MOST_ROUNDS:
+            return weights, False
+        fresh = tuple(self._of(i, w, r) for i, (w, r) in enumerate(zip(weights, residuals)))
+        changed = any(a is not b for a, b in zip(fresh, weights))
+        self.rounds += changed
+        return fresh, changed
+
+    def _of(self, sensor: int, weight: Array | None, residual: Array) -> Array | None:
+        """Return the weights of one sensor, the same object if they are unchanged."""
+        from scipy.ndimage import maximum_filter1d
+
+        size = np.sqrt((residual**2).sum(-1))
+        scale = max(float(robust_sd(residual)), _LEAST_SCALE)
+        used = np.ones(len(size), bool) if weight is None else weight > 0.5
+        if sensor not in self.usable:
+            if sensor in self.motion or not np.any(size[used] > _SAMPLE_SUSPICIOUS * scale):
+                return weight
+            self.usable[sensor] = used
+        usable = self.usable[sensor]
+        peak = size == maximum_filter1d(np.where(used, size, 0.0), 2 * _PEAK_SAMPLES + 1)
+        out = used & peak & (size > _SAMPLE_OUTLIER * scale)
+        back = usable & ~used & (size < _BACK * _SAMPLE_OUTLIER / min(scale, 1.0))
+        fresh = (used & ~out) | back
+        if fresh.sum() < _LEAST_SAMPLES_KEPT * usable.sum():
+            # so many cannot be wrong: it is the motion that the priors do not allow
+            del self.usable[sensor]
+            self.motion.add(sensor)
+            fresh = usable
+        return weight if np.array_equal(fresh, used) else fresh.astype(float)
 
 
 def delays_have_moved(graph: GraphLayout, state: State) -> bool:

@@ -239,6 +239,7 @@ class Accelerometer:
         "unknown" if only an alignment with the images can place it.
     kept : (N,) whether each sample is used. The readings of the others are interpolated. None if
         all are used.
+    unused_axes : indices of the sensor's axes whose readings are not used.
     """
 
     name: str
@@ -251,6 +252,7 @@ class Accelerometer:
     delay_s: float = 0.0
     clock: Literal["frames", "unknown"] = "frames"
     kept: Bools | None = None
+    unused_axes: tuple[int, ...] = ()
 
     @property
     def masked_samples(self) -> int:

@@ -66,7 +66,7 @@ def accelerometers_of(
             Accelerometer(
                 sensor.name, camera, sensor.t_s, 1000 * sensor.reading_m_s2, sensor.axes,
                 float(sigma), 1000 * sensor.bias_sigma_m_s2, clock=sensor.clock,
-                kept=None if sensor.kept.all() else sensor.kept,
+                kept=None if sensor.kept.all() else sensor.kept, unused_axes=sensor.unused_axes,
             )
         )  # fmt: skip
     return tuple(out)

@@ -114,7 +114,7 @@ def accelerometer_spectra(solution: Solution) -> dict[str, Any]:
     """
     graph, state = solution.graph, solution.state
     out: dict[str, Any] = {}
-    for index, linear in enumerate(accelerometers(graph, state)):
+    for index, linear in enumerate(accelerometers(graph, state, solution.sample_weights)):
         sensor = graph.problem.accelerometers[index]
         if len(sensor.t_s) < LAGS:
             continue
@@ -203,7 +203,8 @@ def drawn_residuals(
     Kept pixels in the inner frames. Raises numpy.linalg.LinAlgError where digits run out.
     """
     graph, observed = solution.graph, solution.graph.problem.observations
-    parts = [_Part.of(stretch, f) for f in all_factors(graph, solution.state, solution.weights)]
+    factors = all_factors(graph, solution.state, solution.weights, solution.sample_weights)
+    parts = [_Part.of(stretch, f) for f in factors]
     noise = [rng.standard_normal((*p.block.shape[:2], draws)) for p in parts]
     found = _fitted(stretch, parts, noise)
     inside = (observed.frame >= stretch.inner[0]) & (observed.frame <= stretch.inner[1])

@@ -15,6 +15,8 @@ import pytest
 
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration
+from telerig.estimator.sensors.findings import SensorError
+from telerig.estimator.smoothing.graph.solve import SampleRejection
 from telerig.estimator.smoothing.problem.problem import CarriageModel, RigMode, ShakeModel
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.factors.bubble_motion import BubbleModel, Zigzag
@@ -246,6 +248,90 @@ def test_the_laboratorys_gravity_is_no_bias(run: Run) -> None:
     assert missing == pytest.approx([25.65, 25.65], abs=0.5), "then it is taken for a bias"
 
 
+def with_sensors(run: Run, change: Any) -> Any:
+    sensors = {name: dict(record) for name, record in run.accelerometers.items()}
+    change(sensors["arm_left"])
+    return smooth(run.tracks, run.calibration, stage=run.stage, accelerometers=sensors, rig=RIG)
+
+
+def test_a_spoilt_sample_and_another_unit_move_nothing(run: Run) -> None:
+    """One sample of 1,400 is off by 100 m/s^2; or the readings are in g, and this is said."""
+
+    def spoil(record: dict[str, Any]) -> None:
+        record["a_m_s2"] = record["a_m_s2"].copy()
+        record["a_m_s2"][700] += 100.0
+
+    def in_g(record: dict[str, Any]) -> None:
+        record |= {"a": record.pop("a_m_s2") / 9.80665, "unit": "g"}
+
+    clean = with_sensors(run, lambda record: None)
+    assert clean.summary["warnings"] == []
+    assert clean.summary["accelerometers"]["arm_left"]["masked_samples"] == 0
+    spoilt = with_sensors(run, spoil)
+    assert spoilt.summary["accelerometers"]["arm_left"]["masked_samples"] == 1
+    assert ["1 of 1400 samples are spikes" in w for w in spoilt.summary["warnings"]] == [True]
+    place = ["x_mm", "y_mm", "z_mm"]
+    np.testing.assert_allclose(spoilt.trajectories[place], clean.trajectories[place], atol=1e-3)
+    other = with_sensors(run, in_g)
+    assert other.summary["warnings"] == []
+    np.testing.assert_allclose(other.trajectories[place], clean.trajectories[place], atol=1e-6)
+
+
+def test_an_axis_that_never_changes_does_not_hold_the_shake_still(run: Run) -> None:
+    def dead(record: dict[str, Any]) -> None:
+        record["a_m_s2"] = record["a_m_s2"] * [0.0, 1.0, 1.0]
+
+    found = with_sensors(run, dead)
+    assert "ax never changes" in found.summary["warnings"][0]
+    table = found.trajectories
+    error = (table["x_mm"] - run.truth_mm[:, 0]) / table["sx_mm"]
+    assert float((error[30:-30] ** 2).mean()) < 2.0
+    assert table["sx_mm"].median() > 2 * table["sy_mm"].median()
+
+
+def test_sensors_that_cannot_be_used_are_left_out_in_words(run: Run) -> None:
+    def elsewhere(record: dict[str, Any]) -> None:
+        record["t_s"] = record["t_s"] + 1e4
+
+    def wrong_unit(record: dict[str, Any]) -> None:
+        record |= {"a": record.pop("a_m_s2"), "unit": "g"}
+
+    found = with_sensors(run, elsewhere)
+    assert list(found.summary["accelerometers"]) == ["arm_right"]
+    assert "left out" in found.summary["warnings"][0]
+    assert "arm_left" in found.summary["warnings"][0]
+    with pytest.raises(SensorError) as caught:
+        with_sensors(run, wrong_unit)
+    assert caught.value.code == "SENSOR_UNIT"
+    assert caught.value.findings[0].fix == {"sensor": "arm_left", "unit": "m/s^2"}
+
+
+def test_samples_that_the_images_contradict_lose_their_weight() -> None:
+    """Of residuals that scatter by 0.02 of the stated noise, as they do where the fit follows each
+    sample: a wrong sample, whose neighbours are off, too, goes alone, and comes back if it fits.
+    """
+    rng = np.random.default_rng(3)
+    sound = 0.02 * rng.standard_normal((2000, 3))
+    rejection = SampleRejection(True)
+    assert rejection.update((None,), (sound,)) == ((None,), False)
+    spoilt = sound.copy()
+    spoilt[998:1003, 1] += [0.3, -0.5, 1.0, -0.5, 0.3]
+    (weight,), changed = rejection.update((None,), (spoilt,))
+    assert changed and weight is not None
+    assert np.flatnonzero(weight == 0).tolist() == [1000]
+    innovation = sound.copy()
+    innovation[1000, 1] = 2000.0
+    (again,), changed = rejection.update((weight,), (innovation,))
+    assert again is weight and not changed
+    innovation[1000, 1] = 100.0
+    (again,), changed = rejection.update((weight,), (innovation,))
+    assert changed and again is not None and np.all(again == 1)
+    many = sound.copy()
+    many[::16, 0] += 1.0
+    (weight,), changed = SampleRejection(True).update((None,), (many,))
+    assert weight is None and not changed
+
+
 def test_outliers_cost_little(run: Run) -> None:
     """5 % of the pixels 20 px off; the true hyper-parameters are given."""
     rng = np.random.default_rng(3)
@@ -407,6 +493,22 @@ def test_bad_input(run: Run) -> None:
     )
     with pytest.raises(InputError, match="nothing says its mounted_on"):
         smooth(run.tracks, run.calibration, accelerometers=nameless, **good)
+    for wrong, words in (
+        ({"stage": run.stage.to_numpy()}, "not a table"),
+        ({"stage": {"t_s": [0.0], "positon": [0.0]}}, "did you mean position_mm"),
+        ({"references": "references.csv"}, "not a table"),
+        ({"references": run.references.assign(u_px=np.nan)}, "u_px is not finite at row 0"),
+        ({"references": run.references.assign(sigma_px=0.0)}, "sigma_px is not positive"),
+        ({"t_s": np.arange(FRAMES)[:, None]}, "t_s has the shape"),
+        ({"t_s": np.arange(FRAMES)[::-1]}, "frames: times do not increase"),
+        ({"rig": "rig.toml"}, "rig is str"),
+    ):
+        with pytest.raises(InputError, match=words):
+            smooth(run.tracks, run.calibration, **{**good, **wrong})
+    with pytest.raises(InputError, match="load_tracks"):
+        smooth("tracks.csv", run.calibration, **good)
+    with pytest.raises(InputError, match="load_calibration"):
+        smooth(run.tracks, "calibration.json", **good)
     with pytest.raises(InputError, match="model is 'best'"):
         smooth(run.tracks, run.calibration, model="best", **good)
     with pytest.raises(InputError, match="nothing says when the frames are"):

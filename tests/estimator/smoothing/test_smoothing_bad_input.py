@@ -178,10 +178,10 @@ def test_single_wrong_readings(run: Path) -> None:
         table.loc[300:301, "position_mm"] += 3.0
 
     data = telerig.load_run(run)
-    clean = smooth(tracks(data), calibration(), stage=data).trajectories
+    clean = smooth(tracks(data), calibration(), stage=data, model=ShakeModel()).trajectories
     spoil(run / "stage.csv", change)
     warned(run, "2 reading(s)", moment(run, 300), "+2.99", "not used")
-    found = smooth(tracks(data), calibration(), stage=telerig.load_run(run))
+    found = smooth(tracks(data), calibration(), stage=telerig.load_run(run), model=ShakeModel())
     assert len(found.summary["warnings"]) == 1
     np.testing.assert_allclose(found.trajectories["y_mm"], clean["y_mm"], atol=2e-3)
 

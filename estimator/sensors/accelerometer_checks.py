@@ -15,7 +15,10 @@ _DOUBLED = (1.8, 2.2)
 _FIT = 1.5
 _TILTED_DEG = 20.0
 _FITS_DEG = 15.0
-_CLEAR = 0.6
+_CLEAR, _CHANCE_SIGMAS, _INDEPENDENT_S = 0.6, 3.5, 0.025
+"""A correlation counts if it is above 0.6 and above 3.5 times that of independent signals, whose
+values 25 ms apart are independent."""
+
 _SMOOTHED_S = 0.03
 
 
@@ -149,8 +152,10 @@ def check_motion(sensor: Sensor, stage: Array, along: Array) -> list[Finding]:
     if found is None:
         return []
     stated, best = float(found @ along), int(np.argmax(np.abs(found)))
-    clear = abs(found[best]) > _CLEAR and stated < abs(found[best]) / 2
-    if not (stated < -_CLEAR or clear):
+    length = min(sensor.t_s[-1], stage[-1, 0]) - max(sensor.t_s[0], stage[0, 0])
+    bound = max(_CLEAR, _CHANCE_SIGMAS * np.sqrt(_INDEPENDENT_S / length))
+    clear = abs(found[best]) > bound and stated < abs(found[best]) / 2
+    if not (stated < -bound or clear):
         return []
     sign = "-" if found[best] < 0 else "+"
     return [

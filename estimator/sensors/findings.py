@@ -40,9 +40,10 @@ class Finding:
     where : the file, sensor or row in which it is.
     todo : what the user can do about it.
     code : the code of a fault that is refused unless it is accepted; None for a warning.
-    fix : the correction as data, for programs: {"sensor": name, "unit": "g"}, {"sensor": name,
-        "axes": rows}, {"sensor": name, "mounted_on": camera}, {"encoder_factor": -1.0}, ...;
-        empty if there is none.
+    fix : the correction as data, for programs; empty if there is none. {"sensor": name} and one of
+        "unit": "g"; "axes": rows; "mounted_on": camera; "add_m_s2": [x, y, z], to be added to every
+        reading; "offset_s": s, to be added to its times. Without a sensor: {"encoder_factor":
+        -1.0}, {"encoder_jumps": [[t_s, mm], ...]} to be subtracted from t_s on, ...
     """
 
     words: str

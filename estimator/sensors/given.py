@@ -400,6 +400,10 @@ def numbers(values: Any, where: str, key: str) -> Array:
 
     Raises InputError for text, dates, objects, and lists of unequal length.
     """
+    dtype = getattr(values, "dtype", None)
+    if not isinstance(dtype, np.dtype | None) and getattr(dtype, "kind", "") in "iuf":
+        # a column of pandas' own types of numbers
+        values = values.to_numpy(dtype=float, na_value=np.nan)
     try:
         array = np.ma.asanyarray(values) if np.ma.isMaskedArray(values) else np.asarray(values)
     except ValueError:

@@ -20,7 +20,7 @@ from telerig.statistics import robust_sd
 
 _MICRO_G_M_S2 = 1e-6 * STANDARD_GRAVITY_M_S2
 _NEIGHBOURS = 4
-_LEAST_TO_LEARN = 60
+_LEAST_TO_LEARN, _MOST_TO_LEARN = 60, 8192
 _BLOCK = 1 << 16
 
 _SPIKE_SIGMAS = 20.0
@@ -306,7 +306,8 @@ def _predictor(values: Array) -> Array | None:
     near = np.concatenate([near, np.ones((len(values), 1))], -1)
     kept = np.ones(len(values), bool)
     for _ in range(4):
-        weights = np.linalg.lstsq(near[kept], values[kept], rcond=None)[0]
+        some = np.flatnonzero(kept)[:: 1 + int(kept.sum()) // _MOST_TO_LEARN]
+        weights = np.linalg.lstsq(near[some], values[some], rcond=None)[0]
         residual = values - near @ weights
         clean = np.abs(residual) <= 5 * robust_sd(residual)
         kept = np.convolve(~clean, np.ones(width), "same") < 0.5

@@ -330,8 +330,15 @@ def choose_model(
     if isinstance(model, ShakeModel):
         return model
     if callable(model):
-        return model(problem)
-    if model not in ("auto", "default"):
+        made = model(problem)
+        if not isinstance(made, ShakeModel):
+            raise InputError(
+                f"the function given as model returns {type(made).__name__}",
+                where="smooth",
+                todo="return a ShakeModel",
+            )
+        return made
+    if not isinstance(model, str) or model not in ("auto", "default"):
         raise InputError(
             f"model is {model!r}", where="smooth", todo='give "auto", "default" or a ShakeModel'
         )

@@ -13,7 +13,7 @@ from telerig.errors import InputError
 from telerig.estimator.sensors.checks import Encoder
 from telerig.estimator.sensors.findings import Finding
 from telerig.estimator.sensors.given import CARRIAGE as ON_CARRIAGE
-from telerig.estimator.sensors.given import Sensor, times
+from telerig.estimator.sensors.given import Sensor, numbers, times
 from telerig.estimator.sensors.samples import sampling_rate
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
@@ -266,6 +266,8 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
             where="tracks",
             todo="give the tracks.csv that `telerig track` wrote with this calibration",
         )
+    if not len(table):
+        raise InputError("the tracks have no rows", where="tracks", todo="track the run first")
     names = [p for p in table["particle"].unique() if isinstance(p, str)]
     if names:
         raise InputError(
@@ -273,7 +275,7 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
             where="tracks",
             todo="number the bubbles in detections.csv and track them again",
         )
-    values = table[needed].to_numpy(float)
+    values = np.stack([numbers(table[column], "tracks", column) for column in needed], -1)
     bad = ~np.isfinite(values).all(1)
     if bad.any():
         raise InputError(
@@ -282,6 +284,15 @@ def _check(table: pd.DataFrame, cameras: Sequence[Camera]) -> None:
             where="tracks",
             todo="leave those rows out",
         )
+    for number, column in enumerate(("frame", "particle")):
+        whole = values[:, number] == np.floor(values[:, number])
+        wrong = np.flatnonzero(~whole | ((column == "frame") & (values[:, number] < 0)))
+        if len(wrong):
+            raise InputError(
+                f"{column} is {values[wrong[0], number]:g} in row {int(wrong[0]) + 2}",
+                where="tracks",
+                todo="give whole numbers; frames count from 0",
+            )
     if table.duplicated(["frame", "particle"]).any():
         row = int(np.flatnonzero(table.duplicated(["frame", "particle"]))[0]) + 2
         raise InputError(
@@ -301,7 +312,7 @@ def _times(table: pd.DataFrame, frame_times_s: Array | None) -> Array:
     if "t_s" not in table:
         raise InputError("the tracks have no times", todo="give a column t_s, or t_s=")
     first = table.drop_duplicates("frame").sort_values("frame")
-    known, t = first["frame"].to_numpy(float), first["t_s"].to_numpy(float)
+    known, t = first["frame"].to_numpy(float), times(first["t_s"], "tracks")
     frames = np.arange(last + 1)
     if len(known) < 2:
         raise InputError("the tracks cover one frame", todo="give at least two frames")

@@ -12,7 +12,7 @@ import pytest
 from telerig.errors import InputError
 from telerig.estimator.sensors.accelerometer_checks import check_accelerometer
 from telerig.estimator.sensors.findings import Code, SensorError, settled
-from telerig.estimator.sensors.given import given_sensors, longest_increase, table_columns
+from telerig.estimator.sensors.given import given_sensors, longest_increase, numbers, table_columns
 from telerig.io.rig_file.description import AccelerometerDescription
 from telerig.rig.units import ACCELERATION_UNITS, STANDARD_GRAVITY_M_S2
 
@@ -194,6 +194,19 @@ def test_few_stamps_out_of_order_are_left_out() -> None:
     assert len(sensor.t_s) == N - 3
     assert "3 of 200 samples" in findings[0].words and "0.049 s" in findings[0].words
     assert np.flatnonzero(~longest_increase(t)).tolist() == [49, 90, 120]
+
+
+def test_columns_of_pandas_own_types() -> None:
+    for kind in ("Float64", "Int64", "string"):
+        column = pd.Series([1, 2, None]).astype("Int64").astype(kind)
+        if kind == "string":
+            with pytest.raises(InputError, match="not numbers"):
+                numbers(column, "here", "t_s")
+        else:
+            np.testing.assert_array_equal(numbers(column, "here", "t_s"), [1, 2, np.nan])
+    column = pd.Series(pd.date_range("2026-01-01", periods=3, tz="UTC"))
+    with pytest.raises(InputError, match="not numbers"):
+        numbers(column, "here", "t_s")
 
 
 def test_tables_of_the_encoder() -> None:

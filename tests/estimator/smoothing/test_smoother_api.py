@@ -505,6 +505,20 @@ def test_bad_input(run: Run) -> None:
     ):
         with pytest.raises(InputError, match=words):
             smooth(run.tracks, run.calibration, **{**good, **wrong})
+    for change, words in (
+        ({"x_mm": "far"}, "x_mm is Series of .*, not numbers"),
+        ({"frame": run.tracks["frame"] + 0.5}, "frame is 0.5 in row 2"),
+        ({"frame": run.tracks["frame"] - 1}, "frame is -1 in row 2"),
+        ({"t_s": np.nan}, "t_s is not finite at row 0"),
+        ({"particle": 0.5}, "particle is 0.5 in row 2"),
+    ):
+        with pytest.raises(InputError, match=words):
+            smooth(run.tracks.assign(**change), run.calibration, **good)
+    with pytest.raises(InputError, match="no rows"):
+        smooth(run.tracks.iloc[:0], run.calibration, **good)
+    for model in (3, lambda problem: "auto"):
+        with pytest.raises(InputError, match="model"):
+            smooth(run.tracks, run.calibration, model=model, **good)
     with pytest.raises(InputError, match="load_tracks"):
         smooth("tracks.csv", run.calibration, **good)
     with pytest.raises(InputError, match="load_calibration"):

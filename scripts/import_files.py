@@ -109,7 +109,8 @@ def accelerometer(
         float, typer.Option(help="Added to all times, to bring them to the run's clock.")
     ] = 0.0,
     unit: Annotated[
-        str | None, typer.Option(help="Unit of the readings: m/s2, cm/s2, mm/s2, g, mg or ug.")
+        str | None,
+        typer.Option(help="Unit of the readings: m/s^2, g, mg, mm/s^2, cm/s^2 or ft/s^2."),
     ] = None,
     scale: Annotated[
         str | None,

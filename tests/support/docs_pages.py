@@ -26,6 +26,7 @@ from telerig.io.rig_file.rig_file import description_from_toml
 LANGUAGES = ("sh", "python", "toml", "text", "{toctree}", "{eval-rst}")
 
 NOT_RUN = {
+    "cron": "needs a cron daemon and waits for the night; the script is run",
     "completion": "changes the start-up file of the user's shell",
     "dask": "needs a cluster; a test runs a scheduler and two workers",
     "devices": "needs a laboratory; a test records simulated devices",
@@ -37,6 +38,7 @@ NOT_RUN = {
 
 ELSEWHERE = {
     "docs/exports.md": "tests/io/exchange/test_docs_exports.py",
+    "docs/howto/join.md": "tests/estimator/smoothing/test_logger_joined.py",
     "docs/reports.md": "tests/io/report/test_report_command.py",
 }
 """Pages whose blocks run in a test of their own."""

@@ -22,7 +22,6 @@ from telerig.io.exchange.formats import RECORDINGS
 from telerig.io.exchange.importing.binary_recordings import EXPORT_AGAIN
 from telerig.io.exchange.importing.headers import (
     TIME_UNITS,
-    UNITS,
     axes_in,
     is_counter,
     is_date,
@@ -34,6 +33,7 @@ from telerig.io.exchange.importing.headers import (
 from telerig.io.exchange.importing.recording import Recording
 from telerig.io.exchange.importing.stamps import seconds_of
 from telerig.io.files.csv_table import LARGEST_NUMBER
+from telerig.rig.units import ACCELERATION_UNITS
 
 AXES = ["ax_m_s2", "ay_m_s2", "az_m_s2"]
 _PLAUSIBLE_HZ = (5.0, 2e5)
@@ -53,7 +53,7 @@ class Layout:
     the times agree with the stated rate or with a possible rate.
     rate_hz : the sampling rate in Hz, in place of times; None uses what the file has.
     start_s : is added to every time (s), to bring the sensor's clock to that of the run.
-    unit : one of `UNITS`; None uses the unit that the file states.
+    unit : one of `ACCELERATION_UNITS`, also as "m/s2"; None uses the unit that the file states.
     scale_m_s2 : the acceleration in m/s^2 that 1 in the file means, one number or three (WAV: for
     full scale; volts: 9.80665 / (V per g)). It is given in place of ``unit``.
     group : the group of a TDMS file.
@@ -115,14 +115,15 @@ def import_accelerations(
         )
     blank = np.isnan(raw).all(-1) if recording.lines is not None else np.zeros(len(raw), bool)
     kept = np.logical_not(blank)
-    notes = [*recording.notes, f"x, y, z are the channels {', '.join(map(repr, names))}", *said]
+    scale, unit = _scale(recording, names, layout)
+    channels = f"x, y, z are the channels {', '.join(map(repr, names))} in {unit}"
+    notes = [*recording.notes, channels, *said]
     if not kept.all():
         notes.append(f"{int((~kept).sum())} rows without any reading are left out")
     _check_numbers(recording, np.c_[raw, t_s], [*names, "time"], kept)
     _check_order(recording, t_s, kept)
-    readings = (raw * _scale(recording, names, layout))[kept]
     table = pd.DataFrame({"t_s": t_s[kept], "sensor": sensor})
-    table[AXES] = readings
+    table[AXES] = (raw * scale)[kept]
     return Imported(table, tuple(notes))
 
 
@@ -333,7 +334,8 @@ def _counted(recording: Recording, rows: int) -> tuple[str, Array] | None:
     return None
 
 
-def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
+def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> tuple[Array, str]:
+    """Return the m/s^2 of a reading of 1, for all axes or (3,), and the unit in words."""
     if layout.scale_m_s2 is not None:
         if layout.unit is not None:
             raise InputError("both --unit and --scale are given", todo="give one of them")
@@ -343,23 +345,24 @@ def _scale(recording: Recording, names: Sequence[str], layout: Layout) -> Array:
                 f"--scale is {layout.scale_m_s2!r}",
                 todo="give one number or three, none of them zero",
             )
-        return values
-    units = [_unit(recording, name) if layout.unit is None else layout.unit for name in names]
-    unknown = [unit for unit in units if unit not in UNITS]
+        return values, f"{', '.join(f'{v:g}' for v in np.atleast_1d(values))} m/s^2"
+    units = [_unit(recording, name, layout) for name in names]
+    unknown = [unit for unit in units if unit not in ACCELERATION_UNITS]
     if unknown:
         raise recording.error(
             f"the unit of its readings is {unknown[0]!r}"
             if unknown[0]
             else "does not say the unit of its readings",
-            f"say the unit with --unit g ({', '.join(UNITS)}), or with --scale the m/s^2 of a "
-            "reading of 1",
+            f"say the unit with --unit g ({', '.join(ACCELERATION_UNITS)}), or with --scale the "
+            "m/s^2 of a reading of 1",
         )
-    return np.array([UNITS[unit] for unit in units])
+    sizes = np.array([ACCELERATION_UNITS[unit] for unit in units])
+    return sizes, ", ".join(dict.fromkeys(units))
 
 
-def _unit(recording: Recording, name: str) -> str:
-    """Return the unit that the file states for a channel; "" where it states none."""
-    stated = recording.units.get(name, "")
+def _unit(recording: Recording, name: str, layout: Layout) -> str:
+    """Return the unit that is given, or that the file states for a channel; "" where none is."""
+    stated = layout.unit or recording.units.get(name, "")
     return known_unit(stated) or stated or unit_in(name)
 
 

@@ -9,20 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 
-from telerig.rig.units import STANDARD_GRAVITY_M_S2
-
-UNITS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "cm/s2": 1e-2, "mm/s2": 1e-3,
-         "g": STANDARD_GRAVITY_M_S2, "mg": 1e-3 * STANDARD_GRAVITY_M_S2,
-         "ug": 1e-6 * STANDARD_GRAVITY_M_S2}  # fmt: skip
-"""Units of acceleration, in m/s^2."""
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 """Units of time, in s."""
 
 _SPELLINGS = {
-    **{f"{length}{per}": f"{length}/s2" for length in ("m", "cm", "mm")
+    **{f"{length}{per}": f"{length}/s^2" for length in ("m", "cm", "mm", "ft")
        for per in ("/s2", "/s^2", "/s/s", "/(s^2)", "/(s2)", "s-2", "s^-2", "_s2", "_s^2", "ps2")},
     "g": "g", "gn": "g", "g0": "g", "gs": "g", "g-force": "g", "gforce": "g",
-    "mg": "mg", "milli-g": "mg", "millig": "mg", "ug": "ug", "micro-g": "ug",
+    "mg": "mg", "milli-g": "mg", "millig": "mg",
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sek", "sekunden"), "s"),
     **dict.fromkeys(("ms", "msec", "millis", "millisec", "millisecond", "milliseconds"), "ms"),
     **dict.fromkeys(("us", "usec", "micros", "microsec", "microsecond", "microseconds"), "us"),
@@ -57,7 +51,8 @@ _AXIS = re.compile(r"(?:^|[^a-z])(?P<a>a|acc|accel|acceleration|accelerometer|be
 
 
 def known_unit(text: str) -> str:
-    """Return the name of a unit of acceleration or time in `UNITS` or `TIME_UNITS`.
+    """Return the name of a unit of acceleration or time in `ACCELERATION_UNITS` or
+    `TIME_UNITS`.
 
     text : as a file writes it, such as "m/(s^2)", "[g]" or "µs". Returns "" for anything else.
     """

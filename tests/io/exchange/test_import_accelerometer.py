@@ -13,12 +13,12 @@ from scipy.io import savemat, wavfile
 from telerig.errors import InputError
 from telerig.io.dataset.tables import read_accelerometer_csv
 from telerig.io.exchange.importing.accelerometer import (
-    UNITS,
     Layout,
     layout_from,
     read_accelerations,
 )
 from telerig.io.exchange.importing.records import merge_accelerations
+from telerig.rig.units import ACCELERATION_UNITS
 
 Array = NDArray[np.float64]
 
@@ -158,8 +158,8 @@ def test_units_and_channels_are_never_guessed(tmp_path: Path) -> None:
 
 
 def test_the_unit_g_is_the_standard_one() -> None:
-    assert UNITS["g"] == 9.80665
-    assert UNITS["mg"] == pytest.approx(9.80665e-3, rel=1e-15)
+    assert ACCELERATION_UNITS["g"] == 9.80665
+    assert ACCELERATION_UNITS["mg"] == pytest.approx(9.80665e-3, rel=1e-15)
 
 
 def test_bad_readings_are_named(tmp_path: Path) -> None:

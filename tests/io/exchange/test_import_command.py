@@ -47,7 +47,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_record_is_imported_listed_and_removed(place: Path) -> None:
     said = command(f"telerig import accelerometer arm.csv --run {RUN} --sensor arm_left")
-    assert "x, y, z are the channels 'X (g)', 'Y (g)', 'Z (g)'" in said
+    assert "x, y, z are the channels 'X (g)', 'Y (g)', 'Z (g)' in g" in said
     assert "arm_left: 4000 readings from 0 to 3.999 s at 1000 Hz" in said
     assert " m/s^2, 9.807 in all (gravity at rest: 9.81)" in said
     assert (

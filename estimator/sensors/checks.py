@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from telerig.io.rig_file.description import StageDescription
 
 
-_COVERED = 0.999
+_COVERED, _MOSTLY, _LEAST_COVERED = 0.999, 0.8, 0.1
+_SMALLER_UNITS = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
 _FOREIGN_PX = 5.0
 _DIFFERENT_PX = 0.5
 _SAMPLED = 2000
@@ -168,26 +169,35 @@ def files_of(run: RunData) -> tuple[str, str]:
 def check_overlap(
     t: Array, frames_t_s: ArrayLike, *, where: str, code: Code, sensor: str = ""
 ) -> list[Finding]:
-    """Return a finding if the record does not cover all frames; with a code if it covers none.
+    """Return a finding if the record does not cover all frames; with a code if it covers hardly
+    any.
 
     t, frames_t_s : (N,) times of the record and (F,) times of the frames, in s.
     sensor : name of an accelerometer; "" for the encoder.
     """
     frames = np.asarray(frames_t_s, float)
-    share = float(((frames >= t[0]) & (frames <= t[-1])).mean())
+    share = _covered(t, frames)
+    if share >= _COVERED:
+        return []
     spans = f"{t[0]:.6g} to {t[-1]:.6g} s, the frames {frames[0]:.6g} to {frames[-1]:.6g} s"
+    words = f"the record covers {100 * share:.0f} % of the frames ({spans})"
+    if share >= _LEAST_COVERED:
+        return [Finding(words, where)]
+    for name, factor in _SMALLER_UNITS:
+        if _covered(t, frames / factor) > _MOSTLY:
+            todo = f"the frames' times look like {name}: divide them by {factor:g}"
+            return [
+                Finding(words, where, todo, Code.FRAME_TIMES, {"frame_time_factor": 1 / factor})
+            ]
     if share == 0:
-        fix = {"sensor": sensor} if sensor else {"sensor": "encoder"}
-        return [
-            Finding(
-                f"the record's clock does not overlap the frames': it covers {spans}",
-                where, _clock_remedy(t, frames), code,
-                {**fix, "offset_s": float(frames[0] - t[0])},
-            )
-        ]  # fmt: skip
-    if share < _COVERED:
-        return [Finding(f"the record covers {100 * share:.0f} % of the frames ({spans})", where)]
-    return []
+        words = f"the record's clock does not overlap the frames': it covers {spans}"
+    offset = {"sensor": sensor or "encoder", "offset_s": float(frames[0] - t[0])}
+    return [Finding(words, where, _clock_remedy(t, frames), code, offset)]
+
+
+def _covered(t: Array, frames: Array) -> float:
+    """Return the share of the frames' times (F,) that lie within a record's times (N,)."""
+    return float(((frames >= t[0]) & (frames <= t[-1])).mean())
 
 
 def _clock_remedy(t: Array, frames: Array) -> str:
@@ -195,7 +205,7 @@ def _clock_remedy(t: Array, frames: Array) -> str:
     frames.
     """
     length, wanted = t[-1] - t[0], frames[-1] - frames[0]
-    for name, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+    for name, factor in _SMALLER_UNITS:
         near = t[0] / factor <= frames[-1] and t[-1] / factor >= frames[0]
         if near and wanted > 0 and 0.5 < length / factor / wanted < 5:
             return f"its times look like {name}: divide them by {factor:g}"

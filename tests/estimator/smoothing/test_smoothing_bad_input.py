@@ -127,6 +127,18 @@ def test_times_in_milliseconds(run: Path) -> None:
     refused(run, "look like milliseconds", "divide them by 1000")
 
 
+@pytest.mark.parametrize("start_s", [0.0, 100.0])
+def test_frames_in_milliseconds(start_s: float, run: Path) -> None:
+    def change(table: pd.DataFrame) -> None:
+        table["t_s"] = 1000 * (table["t_s"] + start_s)
+
+    spoil(run / "frames.csv", change)
+    for file in ("stage.csv", "accelerometer.csv"):
+        spoil(run / file, add("t_s", start_s))
+    message = refused(run, "the frames' times look like milliseconds", "--accept FRAME_TIMES")
+    assert "divide them by 1000" in message
+
+
 def test_a_record_that_ends_early_is_told(run: Path) -> None:
     spoil(run / "stage.csv", lambda table: table[: len(table) // 2])
     warned(run, "S2/stage.csv", "% of the frames")

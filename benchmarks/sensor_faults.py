@@ -209,7 +209,7 @@ def alarms(options: argparse.Namespace) -> pd.DataFrame:
                 ]
                 masked = sum(e.get("masked_samples") or 0 for e in sensors.values())
                 inside = len(ARMS) * (run.t_s[-1] - run.t_s[0]) * 2000
-                kinds += ["masked"] * (masked > MOST_MASKED * inside)
+                kinds += ["masked"] * int(masked > MOST_MASKED * inside)
                 verdict = str(result.verdict["verdict"])
                 kinds += ["contradicted"] * (verdict == "CONTRADICTED")
                 row |= {

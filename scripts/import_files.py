@@ -136,13 +136,19 @@ def accelerometer(
         }
     )  # fmt: skip
     found = import_accelerations(file, sensor, layout)
-    _check_sensor(run, sensor, found.table)
+    clock = _clock_of(run, sensor, found.table)
     replaced = merge_accelerations(found.table, run / "accelerometer.csv")
     for note in found.notes:
         say(note)
     say(_record_words(sensor, found.table, _frame_times(run)))
     if replaced:
         say(f"the earlier readings of {sensor} were replaced; other sensors' readings stay")
+    if clock is None:
+        say(
+            f"rig.toml does not state the clock of {sensor}, so its times count as those of the "
+            f'frames; for a logger with a clock of its own add clock = "unknown" to '
+            f"[accelerometers.{sensor}]"
+        )
     say(f"written: {run / 'accelerometer.csv'}")
 
 
@@ -189,17 +195,19 @@ def _check_run(run: Path) -> None:
         raise InputError("there is no such run", where=str(run), todo="check the path")
 
 
-def _check_sensor(run: Path, sensor: str, table: pd.DataFrame) -> None:
-    """Raise InputError for a sensor that the rig.toml of the run's dataset does not know.
+def _clock_of(run: Path, sensor: str, table: pd.DataFrame) -> str | None:
+    """Return the sensor's clock in the rig.toml of the run's dataset; None where it states none.
 
-    The error shows the lines to add. A run outside a dataset has no rig.toml and no check.
+    table : the readings. A run outside a dataset has no rig.toml, and its sensors no clock to
+    state: "" is returned.
+    Raises InputError, with the lines to add, for a sensor that rig.toml does not know.
     """
     from telerig.io.exchange.importing.sensor_table import sensor_toml
     from telerig.io.rig_file.rig_file import read_rig_toml
 
     file = run.resolve().parent.parent / "rig.toml"
     if not file.is_file():
-        return
+        return ""
     rig = read_rig_toml(file)
     if sensor not in rig.accelerometers:
         known = f" (there are: {', '.join(rig.accelerometers)})" if rig.accelerometers else ""
@@ -209,6 +217,7 @@ def _check_sensor(run: Path, sensor: str, table: pd.DataFrame) -> None:
             todo="give --sensor another name, or add these lines and import again:\n"
             + sensor_toml(sensor, table, list(rig.cameras)),
         )
+    return rig.accelerometers[sensor].clock
 
 
 def _frame_times(run: Path) -> Array | None:

@@ -53,6 +53,7 @@ def test_a_record_is_imported_listed_and_removed(place: Path) -> None:
     assert (
         "75 % of them are outside the run's time (1 to 2 s): the first at 0 s, the last at 3.999 s"
     ) in said
+    assert 'add clock = "unknown" to [accelerometers.arm_left]' in said
     assert said.endswith(f"written: {RUN}/accelerometer.csv\n")
     listed = command(f"telerig import --list {RUN}")
     assert listed in said
@@ -91,7 +92,8 @@ def test_a_sensor_that_rig_toml_does_not_know_is_refused_with_the_lines_to_add(p
     assert table["mounted_on"] == "left" and table["clock"] == "unknown"
     with (place / "data" / "rig.toml").open("a") as file:
         file.write(lines)
-    command(f"telerig import accelerometer arm.csv --run {RUN} --sensor arm")
+    said = command(f"telerig import accelerometer arm.csv --run {RUN} --sensor arm")
+    assert "does not state the clock" not in said
 
 
 def test_the_lines_to_add_follow_from_the_record(place: Path) -> None:

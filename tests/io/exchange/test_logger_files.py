@@ -294,6 +294,9 @@ def test_the_unit_of_times_follows_from_a_stated_rate_or_is_asked_for(
     silent = write(tmp_path, lines(["time,ax_g,ay_g,az_g"], first))
     with pytest.raises(InputError, match=r"unit of the times in 'time'[\s\S]*--time-unit ms"):
         read_accelerations(silent, "arm")
+    tenths = write(tmp_path, lines(["time,ax_g,ay_g,az_g"], seconds(0.1)), name="tenths.csv")
+    with pytest.raises(InputError, match=r"increase by 0\.1"):
+        read_accelerations(tenths, "arm")
     check(silent, time_unit={1e-3: "ms", 1e-6: "us", 1e-9: "ns"}[unit_s])
 
 

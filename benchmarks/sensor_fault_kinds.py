@@ -221,7 +221,7 @@ FAULTS = {
         Fault("clock of one arm", "clock", "left arm 60 ms late", _late(0.06, "arm_left"), _SENSOR),
         Fault("drift", "clock", "200 ppm from the record's begin", _late(0, ppm=200), _SENSOR),
         Fault("1 % fast", "clock", "stamps made with a wrong rate", _late(0, ppm=1e4), _SENSOR),
-        Fault("1,600 Hz", "clock", "another sampling rate", _sampled(4, 5), _SENSOR),
+        Fault("1600 Hz", "clock", "another sampling rate", _sampled(4, 5), _SENSOR),
         Fault("400 Hz", "clock", "a low sampling rate", _sampled(1, 5), _SENSOR),
         Fault("in g", "unit", "given as m/s^2", _times(1 / STANDARD_GRAVITY_M_S2), _SENSOR),
         Fault("in mg", "unit", "given as m/s^2", _times(1e3 / STANDARD_GRAVITY_M_S2), _SENSOR),

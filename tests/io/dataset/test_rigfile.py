@@ -71,6 +71,20 @@ def test_gravity_is_the_standard_one_unless_given() -> None:
         assert "[stage] gravity_m_s2" in message and "from 9.7 to 9.9" in message
 
 
+def test_range_and_clock_of_an_accelerometer(tmp_path: Path) -> None:
+    plain = parse(FULL).accelerometers["arm_left"]
+    assert (plain.range_m_s2, plain.clock) == (None, None)
+    line = 'range_m_s2 = 156.9\nclock = "unknown"\nbias_sigma_m_s2'
+    rig = parse(changed("bias_sigma_m_s2", line))
+    sensor = rig.accelerometers["arm_left"]
+    assert (sensor.range_m_s2, sensor.clock) == (156.9, "unknown")
+    write_rig_toml(rig, tmp_path / "rig.toml")
+    assert read_rig_toml(tmp_path / "rig.toml").accelerometers == rig.accelerometers
+    for wrong, key in (('clock = "utc"', "clock"), ("range_m_s2 = -1.0", "range_m_s2")):
+        message = error_of(changed("bias_sigma_m_s2", f"{wrong}\nbias_sigma_m_s2"))
+        assert f"[accelerometers.arm_left] {key}" in message
+
+
 def test_defaults_of_the_target() -> None:
     text = FULL[: FULL.index("[stereo]")] + (
         "[target]\nrows = 4\ncolumns = 6\npitch_mm = [2.0, 3.0]\ndot_diameter_mm = 1.0\n"

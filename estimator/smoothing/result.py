@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -243,7 +243,11 @@ computed. For longer tracks filterpy would need more time than the whole smoothi
 """
 
 
-def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFrame:
+def trajectories(
+    solution: Solution,
+    tracks: pd.DataFrame | None,
+    inflation: Sequence[float] = (1.0, 1.0, 1.0),
+) -> pd.DataFrame:
     """Return the table of the bubbles' positions (mm) and velocities (mm/s) in the laboratory
     frame.
 
@@ -253,6 +257,7 @@ def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFram
 
     tracks : table with the columns of tracks.csv, from which the triangulated positions, the result
         of a plain RTS smoother and the diameters are added; None to leave these columns out.
+    inflation : (3,) factor of the standard deviations along each axis where measurements disagree.
     """
     import pandas as pd
 
@@ -271,9 +276,9 @@ def trajectories(solution: Solution, tracks: pd.DataFrame | None) -> pd.DataFram
     if covariances is not None:
         place, speed = considered_variance(solution)
         sigma = _sigma(layout.position, covariances.bubbles)
-        columns |= _named(np.sqrt(sigma**2 + place), "s{}_mm")
+        columns |= _named(np.sqrt(sigma**2 + place) * inflation, "s{}_mm")
         sigma = _sigma(layout.velocity, covariances.bubbles)
-        columns |= _named(np.sqrt(sigma**2 + speed), "sv{}_mm_s")
+        columns |= _named(np.sqrt(sigma**2 + speed) * inflation, "sv{}_mm_s")
     columns["observed"] = _observed(solution)
     if tracks is not None:
         columns |= _baselines(solution, tracks)
@@ -390,12 +395,14 @@ def _rts(
     return smooth[:, :3, 0], smooth[:, 3:6, 0]
 
 
-def shake(solution: Solution) -> pd.DataFrame:
+def shake(solution: Solution, inflation: Sequence[float] = (1.0, 1.0, 1.0)) -> pd.DataFrame:
     """Return a table with one row per frame: the carriage's position and the offset of each camera
     from the carriage, in mm along the axes of the rig frame.
 
     A camera's own shake along its optical axis cannot be seen. Its estimate is 0 and its standard
     deviation is that of the prior.
+
+    inflation : as for `trajectories`.
     """
     import pandas as pd
 
@@ -407,7 +414,8 @@ def shake(solution: Solution) -> pd.DataFrame:
         if covariances is not None:
             sigma = _sigma(layout.offset[c], covariances.shake)
             unseen = np.diagonal(layout.unseen_variance_mm2[c])
-            columns |= _named(np.sqrt(sigma**2 + unseen), f"s{camera.name}_{{}}_mm")
+            sd = np.sqrt(sigma**2 + unseen) * inflation
+            columns |= _named(sd, f"s{camera.name}_{{}}_mm")
     if problem.stage is not None:
         columns["position_mm"], _ = carriage(solution)
         if covariances is not None:

@@ -49,6 +49,7 @@ from telerig.estimator.smoothing.refined_pose import (
 )
 from telerig.estimator.smoothing.result import Smoothing, summary_of, trajectories
 from telerig.estimator.smoothing.result import shake as shake_table
+from telerig.estimator.smoothing.verdict.contradiction import speed_warnings
 from telerig.estimator.smoothing.verdict.judge import judge
 
 if TYPE_CHECKING:
@@ -155,16 +156,17 @@ def smooth(
         if chosen.learned:
             solution = with_hyperparameter_uncertainty(solution)
     verdict = judge(problem, chosen, solution)
+    inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
     summary = summary_of(solution)
     summary["accepted"] = sorted(accepted)
-    summary["warnings"] = warnings
+    summary["warnings"] = warnings + speed_warnings(solution)
     change = refined_change(solution, calibration)
     if change is not None:
         words = change_words(change, problem.cameras[0].name)
         summary["rig_change"] = {**change.as_dict(), "words": words}
     return Smoothing(
-        trajectories(solution, None if tracked is None else tracked.table),
-        shake_table(solution),
+        trajectories(solution, None if tracked is None else tracked.table, inflation),
+        shake_table(solution, inflation),
         verdict,
         summary,
         chosen,

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from telerig.io.results.verdict_words import to_resolve
+from telerig.io.results.smoothing import Contradiction, Use
+from telerig.io.results.verdict_words import to_resolve, uses_words, words_of_contradiction
 
 if TYPE_CHECKING:
     from telerig.estimator.smoothing.result import Smoothing
@@ -27,11 +28,15 @@ def smoothing_words(found: Smoothing) -> str:
     verdict, summary, table = found.verdict, found.summary, found.trajectories
     lines = []
     if "verdict" in verdict:
-        flags = ", ".join(verdict["flags"])
+        flags = ", ".join(verdict.get("flags", ()))
         lines.append(verdict["verdict"] + (f" ({flags})" if flags else ""))
-        lines += [f"  {axis['words']}" for axis in verdict["axes"].values()]
-        if verdict["remedy"]:
+        found_off = [Contradiction.model_validate(c) for c in verdict.get("contradictions", ())]
+        lines += [f"  {words_of_contradiction(one)}" for one in found_off]
+        lines += [f"  {axis['words']}" for axis in verdict.get("axes", {}).values()]
+        if verdict.get("remedy"):
             lines.append(f"  {to_resolve(verdict['remedy'])}")
+        usable = [Use.model_validate(use) for use in verdict.get("usable_for", ())]
+        lines += [f"  {line}" for line in uses_words(usable)]
     bubbles = "1 bubble" if summary["bubbles"] == 1 else f"{summary['bubbles']} bubbles"
     lines.append(f"{bubbles} in {summary['frames']} frames; priors: {found.model.name}")
     if len(table) and "sx_mm" in table:

@@ -152,6 +152,8 @@ class Use(Part):
     sd : standard deviation of the quantity of a typical bubble; None if it is not known.
     unit : unit of both.
     below_hz : the frequency up to which ``sd`` counts, for a path; None for other quantities.
+    assumes : records whose sign, unit or scale nothing in the run confirms, and on which the value
+        rests.
     """
 
     quantity: Quantity
@@ -161,6 +163,7 @@ class Use(Part):
     unit: str
     grade: Grade
     below_hz: float | None = None
+    assumes: tuple[str, ...] = ()
 
 
 class Mode(Part):
@@ -201,8 +204,8 @@ class SmoothingFile(Record):
 
     verdict, flags, axes : the verdict of the run, what qualifies it, and the verdict by axis.
     contradictions : the sources that disagree, the worst first.
-    inflation : factor by which standard deviations in the tables have been multiplied because of
-        contradictions; 1 without.
+    inflation : factor by axis by which the standard deviations in the tables have been multiplied
+        because of contradictions; () without.
     usable_for : what this run is good for, by quantity and axis.
     words, remedy : the verdict as a sentence, and what to do about it.
     vertical, remedies : the axis nearest to the vertical, and the remedy as codes; "" and () in
@@ -221,7 +224,7 @@ class SmoothingFile(Record):
     flags: tuple[str, ...] = ()
     axes: dict[str, AxisVerdict] = Field(default_factory=dict)
     contradictions: tuple[Contradiction, ...] = ()
-    inflation: float = 1.0
+    inflation: tuple[float, ...] = ()
     usable_for: tuple[Use, ...] = ()
     words: str = ""
     remedy: str = ""

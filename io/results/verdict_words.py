@@ -9,14 +9,23 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from telerig.io.results.smoothing import (
+    AXES,
     AxisVerdict,
+    Contradiction,
+    Disagreement,
     Flag,
+    Grade,
     Mode,
     Place,
+    Quantity,
     Remedy,
     SmoothingFile,
+    Use,
     Verdict,
 )
+
+HARDLY_WIDER = 1.25
+"""Ratio of standard deviations up to which the shake is said to hardly widen the bands."""
 
 
 class VerdictWords(NamedTuple):
@@ -41,8 +50,8 @@ VERDICT_WORDS = {
     ),
     Verdict.UNRESOLVED: VerdictWords(
         "UNRESOLVED: the data cannot separate the bubbles' motion from the rig's shake",
-        "What is drawn below as motion of bubbles may be shake, and the other way round: do not "
-        "interpret any motion as fast as the shake.",
+        "Motion at the frequencies of the shake may be the bubbles' or the rig's; the bands below "
+        "hold this uncertainty.",
         "bubble motion and shake cannot be separated",
     ),
     Verdict.CONTRADICTED: VerdictWords(
@@ -108,6 +117,97 @@ def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
             f" The oscillation at {', '.join(lines)} could be the bubble's as well as the rig's."
         )
     return text
+
+
+_WORDS_OF_TEST = {
+    Disagreement.RESIDUALS: "its residuals are {factor} times as large as the noise allows",
+    Disagreement.OUTLIERS: "{factor} times as many of its pixels as can be outliers do not fit",
+    Disagreement.BIAS: "its bias is {factor} standard deviations from 0; unit, axes or gravity may "
+    "be wrong",
+    Disagreement.DELAY: "its delay is {factor} standard deviations from the stated one",
+    Disagreement.MOTION: "its motion is {factor} times as lively as its prior allows",
+    Disagreement.SPEED: "the bubbles' mean speed is {factor} times the highest possible one",
+}
+
+
+def words_of_contradiction(one: Contradiction) -> str:
+    """Return the sentence on one contradiction."""
+    who = f"{one.source} disagrees with the other measurements"
+    if one.against:
+        who = " and ".join((one.source, ", ".join(one.against))) + " disagree"
+    axis = f" along {one.axis}" if one.axis else ""
+    why = ""
+    if one.test is not None:
+        factor = f"{one.statistic:.2g}" if one.statistic < 100 else f"{one.statistic:.0f}"
+        why = f" ({one.source}: {_WORDS_OF_TEST[one.test].format(factor=factor)})"
+    return f"{who}{axis} from {one.from_s:.3g} s to {one.to_s:.3g} s{why}."
+
+
+def contradiction_words(found: Sequence[Contradiction]) -> str:
+    """Return the sentences on all contradictions, the worst first."""
+    return " ".join(words_of_contradiction(one) for one in found)
+
+
+def consequence_words(file: SmoothingFile) -> str:
+    """Return what the verdict means for the bands, true for the numbers of this run."""
+    if file.verdict is None:
+        return NOT_JUDGED.consequence
+    text = VERDICT_WORDS[file.verdict].consequence
+    known = [
+        (axis.q, name, axis.sigma_mm, axis.sigma_shake_known_mm)
+        for name, axis in file.axes.items()
+        if axis.q is not None and axis.sigma_mm is not None
+        and axis.sigma_shake_known_mm is not None
+    ]  # fmt: skip
+    if file.verdict == Verdict.RESOLVED and known and max(known)[0] > HARDLY_WIDER:
+        q, name, sd, sd_known = max(known)
+        text = (
+            "The data remove at least 99 % of the shake's variance. What is left of it widens the "
+            f"bands below up to {q:.2g} times (along {name}: {1e3 * sd:.3g} µm now; "
+            f"{1e3 * sd_known:.3g} µm if the shake were known)."
+        )
+    if file.verdict == Verdict.CONTRADICTED and file.inflation:
+        factors = ", ".join(f"{a} {f:.2g}" for a, f in zip(AXES, file.inflation))
+        text += f" The standard deviations have been multiplied ({factors}) because of it."
+    return text
+
+
+QUANTITY_WORDS = {
+    Quantity.MEAN_VELOCITY: "mean velocity",
+    Quantity.VELOCITY: "velocity in a frame",
+    Quantity.PATH: "path",
+    Quantity.ZIGZAG_AMPLITUDE: "zigzag amplitude",
+    Quantity.ZIGZAG_FREQUENCY: "zigzag frequency",
+}
+
+
+def words_of_use(use: Use) -> str:
+    """Return the name of a quantity, with the frequency up to which it counts."""
+    words = QUANTITY_WORDS[use.quantity]
+    return words if use.below_hz is None else f"{words} below {use.below_hz:.2g} Hz"
+
+
+def uses_words(found: Sequence[Use]) -> list[str]:
+    """Return a line for each grade with the quantities and axes that have it."""
+    lines = []
+    for grade, start in (
+        (Grade.GOOD, "good for"),
+        (Grade.LIMITED, "limited for"),
+        (Grade.NO, "not good for"),
+    ):
+        axes: dict[str, list[str]] = {}
+        for use in found:
+            if use.grade == grade:
+                axes.setdefault(QUANTITY_WORDS[use.quantity], []).append(use.axis)
+        if axes:
+            parts = [f"{what} ({', '.join(which)})" for what, which in axes.items()]
+            lines.append(f"{start}: {', '.join(parts)}")
+    assumed = sorted({name for use in found for name in use.assumes})
+    if assumed:
+        lines.append(
+            f"nothing in this run confirms the sign, unit and scale of: {', '.join(assumed)}"
+        )
+    return lines
 
 
 def words_of_axes(file: SmoothingFile) -> list[str]:

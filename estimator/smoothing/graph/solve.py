@@ -46,6 +46,7 @@ _PEAK_SAMPLES = 8
 _LEAST_SAMPLES_KEPT = 0.95
 _MOST_ROUNDS, _LEAST_SCALE = 5, 1e-9
 _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
+_LARGEST_STEP_PX = 5.0
 _STACK_BYTES = 512 << 20
 
 
@@ -137,7 +138,8 @@ def solve(
     start : solution of the same measurements under another model, from which the first guess is
         taken; None to start from the triangulated positions.
 
-    Raises CalibrationError when the measurements leave something undetermined.
+    Raises CalibrationError when the measurements leave something undetermined, and when the passes
+    do not converge.
     """
     chosen = options or Options()
     report = progress or (lambda _what, _share: None)
@@ -184,10 +186,33 @@ def _solve(
         last = _linear_solve(graph, state, weights, samples)
         state = moved(graph, state, last.done.vector)
         residuals = pixel_residuals(graph, state)
+    _check_converged(graph, state, 0.0 if exact else last.largest_px)
     found = _finish(graph, state, (weights, residuals), last, options, done, progress)
     return replace(
         found, sample_weights=samples, sample_residuals=sample_residuals(graph, found.state)
     )
+
+
+def _check_converged(graph: GraphLayout, state: State, largest_px: float) -> None:
+    """Raise CalibrationError if the last pass still moved a bubble or a clock by much."""
+    if not all(np.all(np.isfinite(values)) for values in vars(state).values()):
+        raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
+    late = np.abs(state.clocks[:, 0]) if state.clocks.size else np.zeros(0)
+    if np.any(late >= _DELAY_LEAP_S):
+        clock = int(late.argmax())
+        name = graph.problem.accelerometers[int(np.argmax(graph.clock_of == clock))].name
+        raise CalibrationError(
+            f"the delay of accelerometer {name} does not converge: the last pass moved it by "
+            f"{1e3 * late[clock]:.3g} ms",
+            where="smooth",
+            todo="check the times, axes and unit of this sensor, or smooth without it",
+        )
+    if largest_px > _LARGEST_STEP_PX:
+        raise CalibrationError(
+            f"the smoother does not converge: the last pass moved a bubble by {largest_px:.3g} px",
+            where="smooth",
+            todo="check calibration, encoder and sensors, or smooth without each of them in turn",
+        )
 
 
 def _warm(graph: GraphLayout, state: State, start: Solution) -> State:

@@ -6,17 +6,26 @@ that would separate them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.whole_fit import drawn
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
-from telerig.estimator.smoothing.verdict.identifiability import AxisVerdict, verdicts
+from telerig.estimator.smoothing.verdict.contradiction import contradictions
+from telerig.estimator.smoothing.verdict.identifiability import (
+    RESOLVED_Q,
+    AxisVerdict,
+    verdicts,
+)
 from telerig.estimator.smoothing.verdict.modes import ShakeMode, shake_modes
+from telerig.estimator.smoothing.verdict.purposes import uses
 from telerig.io.results.smoothing import AXES, Flag, Mode, Remedy, Verdict
 from telerig.io.results.smoothing import AxisVerdict as AxisRecord
 from telerig.io.results.verdict_words import (
+    contradiction_words,
     mode_remedy,
     remedy_words,
     to_resolve,
@@ -26,27 +35,47 @@ from telerig.io.results.verdict_words import (
 
 
 def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> dict[str, Any]:
-    """The verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ``modes``.
+    """The verdict part of smoothing.json: ``verdict``, ``flags``, ``axes``, ``words``, ``modes``,
+    ``contradictions``, ``inflation`` and ``usable_for``.
 
     solution : of the problem under the model; without covariances the answer is empty. Without
         bubbles there is nothing to judge, and only the modes are listed.
     """
     if solution.covariances is None:
         return {}
+    fit, errors, left = drawn(solution)
+    disagree = contradictions(solution, fit, left)
     found = verdicts(solution) if problem.bubbles else {}
     modes = [_mode_json(mode) for mode in shake_modes(solution)]
+    out: dict[str, Any] = {"modes": modes}
+    if disagree.found:
+        out |= {
+            "verdict": str(Verdict.CONTRADICTED),
+            "contradictions": [one.content() for one in disagree.found],
+            "inflation": list(disagree.inflation),
+            "words": contradiction_words(disagree.found),
+        }
     if not found:
-        return {"modes": modes}
+        return out
+    found = {
+        name: _widened(axis, factor)
+        for (name, axis), factor in zip(found.items(), disagree.inflation)
+    }
+    usable = [use.content() for use in uses(solution, fit, errors, disagree.inflation)]
     vertical = AXES[int(np.abs(problem.up).argmax())]
     axes = {name: _with_words(name, axis, vertical) for name, axis in found.items()}
     worst = max((a.verdict for a in found.values()), key=list(Verdict).index)
-    remedies = () if worst == Verdict.RESOLVED else remedies_of(problem)
-    words = [axis["words"] for axis in axes.values()]
+    sound = not disagree.found and worst != Verdict.RESOLVED
+    remedies = remedies_of(problem) if sound else ()
+    words = [contradiction_words(disagree.found)] if disagree.found else []
+    words += [axis["words"] for axis in axes.values()]
     words += [to_resolve(remedy_words(remedies))] if remedies else []
     words += ["The shake's modes were learned from this run."] if model.name == "learned" else []
     depths = {camera.name: camera.camera_from_rig.rotation[2] for camera in problem.cameras}
     return {
         "verdict": str(worst),
+        **out,
+        "usable_for": usable,
         "flags": [str(flag) for flag in _flags(found)],
         "axes": axes,
         "words": " ".join(words),
@@ -54,8 +83,16 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
         "remedies": [str(remedy) for remedy in remedies],
         "vertical": vertical,
         "left_out": [unseen_words(name, axis) for name, axis in depths.items()],
-        "modes": modes,
     }
+
+
+def _widened(axis: AxisVerdict, factor: float) -> AxisVerdict:
+    """The verdict along an axis where measurements disagree by a factor of standard deviations."""
+    if factor <= RESOLVED_Q:
+        return axis
+    return replace(
+        axis, verdict=Verdict.CONTRADICTED, q=axis.q * factor, sigma_mm=axis.sigma_mm * factor
+    )
 
 
 def _flags(found: dict[str, AxisVerdict]) -> list[Flag]:

@@ -30,15 +30,18 @@ from telerig.io.report.run.smoothing.results import (
 )
 from telerig.io.report.run.tracking.results import TrackResults
 from telerig.io.report.run.tracking.tables import Headline
-from telerig.io.results.smoothing import AttributedLine, Flag, Mode, Verdict
+from telerig.io.results.smoothing import AttributedLine, Flag, Grade, Mode, Verdict
 from telerig.io.results.verdict_words import (
     FLAG_WORDS,
     NOT_JUDGED,
     VERDICT_WORDS,
+    consequence_words,
     mode_remedy,
     remedy_words,
     to_resolve,
     words_of_axes,
+    words_of_contradiction,
+    words_of_use,
 )
 
 
@@ -47,6 +50,7 @@ def smoothing_words(results: SmoothingResults, tracks: TrackResults) -> dict[str
     verdict = smoothing_verdict(results, tracks)
     return {
         "verdict": verdict,
+        "uses": use_rows(results),
         "figures": smoothing_figures(results),
         "axes": axis_table(results),
         "judged": bool(results.file.axes),
@@ -90,9 +94,10 @@ def smoothing_verdict(results: SmoothingResults, tracks: TrackResults) -> Headli
     (headline, meaning, _), colour = NOT_JUDGED, "usable"
     if file.verdict is not None:
         colour = _COLOURS[file.verdict]
-        headline, meaning, _ = VERDICT_WORDS[file.verdict]
+        headline, meaning = VERDICT_WORDS[file.verdict].headline, consequence_words(file)
     of_axes = words_of_axes(file)
-    sentences = [meaning, *(of_axes or [file.words])]
+    sentences = [meaning, *map(words_of_contradiction, file.contradictions)]
+    sentences += of_axes or [file.words]
     if file.rig_change is not None and file.rig_change.words:
         sentences.append(f"Rig: {file.rig_change.words}.")
     in_words = file.words and not of_axes  # files from before hold the remedy in their words
@@ -150,6 +155,23 @@ def smoothing_figures(results: SmoothingResults) -> list[Figure]:
 def _largest(values: list[float | None], factor: float = 1.0) -> str:
     known = [value for value in values if value is not None]
     return number(factor * max(known), 3) if known else ABSENT
+
+
+def use_rows(results: SmoothingResults) -> list[Row]:
+    """What the run is good for: grade, quantity, axis, value with its sd, what it rests on."""
+    return [
+        Row(
+            (
+                str(use.grade),
+                words_of_use(use),
+                use.axis,
+                f"{with_sd(use.value, use.sd)} {use.unit}",
+                ", ".join(use.assumes) or ABSENT,
+            ),
+            strong=use.grade == Grade.NO,
+        )
+        for use in sorted(results.file.usable_for, key=lambda u: list(Grade).index(u.grade))
+    ]
 
 
 def axis_table(results: SmoothingResults) -> tuple[list[str], list[Row]]:

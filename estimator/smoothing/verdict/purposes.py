@@ -1,0 +1,197 @@
+"""What is a run good for? Quantities of the bubbles with their standard deviations, and a grade.
+
+A verdict about the shake is not the whole answer: positions that are uncertain by the shake's
+half millimetre leave a mean velocity over a second known to a few mm/s. Standard deviations of
+means, spectra and amplitudes come from draws of the posterior, correlation in time included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from telerig.arrays import Array, Bools
+from telerig.estimator.smoothing.graph.solve import Solution
+from telerig.estimator.smoothing.graph.stage_travel import considered_variance
+from telerig.estimator.smoothing.graph.whole_fit import WholeFit
+from telerig.io.results.smoothing import AXES, Grade, Quantity, Use
+
+GOOD, LIMITED = 10.0, 3.0
+"""Signal over standard deviation from which a quantity is called good, or limited."""
+_MOST_BUBBLES, _LEAST_FRAMES = 5, 20
+_CLEAR_POWER = 9.0
+_ZIGZAG_HZ = (3.0, 12.0)
+_LEAST_PERIODS = 3.0
+_LEAST_SHARE = 0.3
+
+
+def uses(
+    solution: Solution, fit: WholeFit, errors: Array, inflation: Sequence[float] = (1.0, 1.0, 1.0)
+) -> list[Use]:
+    """Return what a solved run is good for, axis by axis; [] without bubbles or covariances.
+
+    fit, errors : at the solution, with (D, K) draws of the errors of its estimates.
+    inflation : (3,) factor of the standard deviations along each axis where measurements disagree.
+        Then nothing is called better than limited.
+    """
+    graph = solution.graph
+    if solution.covariances is None or not graph.rows:
+        return []
+    lengths = np.diff(graph.first_row)
+    chosen = np.argsort(-lengths, kind="stable")[:_MOST_BUBBLES]
+    chosen = chosen[lengths[chosen] >= _LEAST_FRAMES]
+    if not len(chosen):
+        return []
+    widen = np.asarray(inflation)
+    paths = [_Path(solution, fit, errors, int(bubble), widen) for bubble in chosen]
+    best = Grade.LIMITED if np.any(widen > 1) else Grade.GOOD
+    out = []
+    for axis in range(3):
+        for use in _of_axis(solution, paths, axis):
+            order = list(Grade)
+            grade = max(use.grade, best, key=order.index)
+            out.append(use.model_copy(update={"grade": grade}))
+    return out
+
+
+class _Path:
+    """One bubble: times (n,), positions and velocities (n, 3), and K draws of their errors."""
+
+    def __init__(
+        self, solution: Solution, fit: WholeFit, errors: Array, bubble: int, widen: Array
+    ) -> None:
+        graph, found = solution.graph, solution.covariances
+        assert found is not None
+        rows = np.arange(graph.first_row[bubble], graph.first_row[bubble + 1])
+        states = solution.state.bubbles[rows]
+        self.t_s = graph.problem.t_s[graph.frame_of_row[rows]]
+        drawn = graph.bubble_basis(rows) @ fit.increments(errors, 1)[rows]
+        both = []
+        self.values, self.sd = [], []
+        for row, more in zip(
+            (graph.bubble.position, graph.bubble.velocity), considered_variance(solution)
+        ):
+            error = np.einsum("id,ndk->nik", row, drawn)
+            variance = np.einsum("id,nde,ie->ni", row, found.bubbles[rows], row, optimize=True)
+            scale = np.sqrt(variance.mean(0) / (error**2).mean((0, 2)).clip(1e-300))
+            both.append(error * (scale * widen)[None, :, None])
+            self.values.append(states @ row.T)
+            self.sd.append(np.sqrt(variance + more[rows]) * widen)
+        self.errors = both
+        speed = considered_variance(solution)[1][rows]
+        self.mean_speed_variance = speed.mean(0) * widen**2
+
+    @property
+    def span_s(self) -> float:
+        return float(self.t_s[-1] - self.t_s[0])
+
+    def spectrum(self, values: Array) -> tuple[Array, Array]:
+        """Frequencies (F,) and power (F, ...) of values (n, ...) at even times, lines removed."""
+        from scipy.signal import detrend
+
+        step = float(np.median(np.diff(self.t_s)))
+        taper = np.hanning(len(values)).reshape(-1, *[1] * (values.ndim - 1))
+        level = np.asarray(detrend(values, axis=0)) * taper
+        power = np.abs(np.fft.rfft(level, axis=0)) ** 2 / (taper**2).sum() / len(values) * 2
+        return np.asarray(np.fft.rfftfreq(len(values), step)), np.asarray(power)
+
+
+def _of_axis(solution: Solution, paths: Sequence[_Path], axis: int) -> Iterator[Use]:
+    problem = solution.graph.problem
+    along = abs(float(problem.axis[axis])) > 0.5 and problem.stage is not None
+    assumes = ("encoder",) if along and not len(problem.references) else ()
+    name = AXES[axis]
+
+    def use(quantity: Quantity, found: Sequence[tuple[float, float]], unit: str) -> Use:
+        value, sd = (float(np.median(column)) for column in zip(*found))
+        return Use(
+            quantity=quantity, axis=name, value=value, sd=sd, unit=unit,
+            grade=grade_of(value, sd), assumes=assumes,
+        )  # fmt: skip
+
+    yield use(Quantity.MEAN_VELOCITY, [_mean_velocity(p, axis) for p in paths], "mm/s")
+    yield use(
+        Quantity.VELOCITY,
+        [(_rms(p.values[1][:, axis]), _rms(p.sd[1][:, axis])) for p in paths], "mm/s",
+    )  # fmt: skip
+    below = float(np.median([_clear_hz(p, axis) for p in paths]))
+    path = use(Quantity.PATH, [_band_rms(p, axis, below) for p in paths], "mm")
+    if not below:
+        path = path.model_copy(update={"grade": Grade.NO})
+    yield path.model_copy(update={"below_hz": below or None})
+    if abs(float(problem.up[axis])) > 0.5:
+        return
+    for quantity, unit, of in (
+        (Quantity.ZIGZAG_AMPLITUDE, "mm", 1),
+        (Quantity.ZIGZAG_FREQUENCY, "Hz", 0),
+    ):
+        found = [z[of] for p in paths if (z := _zigzag(p, axis)) is not None]
+        if found:
+            yield use(quantity, found, unit)
+
+
+def grade_of(value: float, sd: float) -> Grade:
+    """Return the grade of a quantity from its size and its standard deviation."""
+    ratio = abs(value) / sd if sd > 0 else np.inf
+    return Grade.GOOD if ratio >= GOOD else Grade.LIMITED if ratio >= LIMITED else Grade.NO
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _mean_velocity(path: _Path, axis: int) -> tuple[float, float]:
+    """Displacement from the first to the last frame over the time, mm/s."""
+    place, error = path.values[0][:, axis], path.errors[0][:, axis]
+    variance = np.mean(((error[-1] - error[0]) / path.span_s) ** 2)
+    sd = np.sqrt(variance + path.mean_speed_variance[axis])
+    return float((place[-1] - place[0]) / path.span_s), float(sd)
+
+
+def _clear_hz(path: _Path, axis: int) -> float:
+    """Frequency up to which the path's power is above that of its errors; 0 if nowhere."""
+    frequency, power = path.spectrum(path.values[0][:, axis])
+    noise = path.spectrum(path.errors[0][:, axis])[1].mean(-1)
+    three = np.ones(3) / 3
+    clear = np.convolve(power, three, "same") > _CLEAR_POWER * np.convolve(noise, three, "same")
+    first = np.flatnonzero(~clear[1:])
+    last = int(first[0]) if len(first) else len(frequency) - 1
+    return float(frequency[last])
+
+
+def _band_rms(path: _Path, axis: int, below_hz: float) -> tuple[float, float]:
+    """RMS of the path about its line and of its errors up to a frequency, mm."""
+    frequency, power = path.spectrum(path.values[0][:, axis])
+    noise = path.spectrum(path.errors[0][:, axis])[1].mean(-1)
+    band = frequency <= (below_hz or np.inf)
+    return float(np.sqrt(power[band].sum())), float(np.sqrt(noise[band].sum()))
+
+
+def _zigzag(path: _Path, axis: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Frequency (Hz) and amplitude (mm) of the swing, each with its sd; None if there is none."""
+    if path.span_s * _ZIGZAG_HZ[0] < _LEAST_PERIODS:
+        return None
+    place, error = path.values[0][:, axis], path.errors[0][:, axis]
+    frequency, power = path.spectrum(place)
+    band = (frequency >= _ZIGZAG_HZ[0]) & (frequency <= _ZIGZAG_HZ[1])
+    if not band.any() or power[band].sum() < _LEAST_SHARE * power.sum():
+        return None
+    measure = _swing(frequency, band)
+    drawn = np.array([measure(p) for p in path.spectrum(place[:, None] + error)[1].T])
+    value, sd = measure(power), np.sqrt(np.mean((drawn - measure(power)) ** 2, axis=0))
+    width = 1 / (np.sqrt(12) * path.span_s)
+    return (
+        (float(value[0]), float(np.hypot(sd[0], width))),
+        (float(value[1]), float(sd[1])),
+    )
+
+
+def _swing(frequency: Array, band: Bools) -> Callable[[Array], Array]:
+    """The mean frequency and the amplitude of what a spectrum has in a band."""
+
+    def measure(power: Array) -> Array:
+        total = power[band].sum()
+        return np.array([(frequency[band] * power[band]).sum() / total, np.sqrt(2 * total)])
+
+    return measure

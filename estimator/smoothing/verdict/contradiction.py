@@ -31,7 +31,7 @@ HIGHEST_SPEED_MM_S = 10_000.0
 MOST_OUTLIERS = 0.2
 _MOST_SD = 5.0
 _LEAST_RISE_MM_S = 5.0
-_RATIO, _SURE = 1.2, 6.0
+_RATIO, _SURE, _LEAST_EXPECTED = 1.2, 6.0, 20.0
 _WINDOW_S, _LEAST_FRAMES = 0.1, 10
 _WINDOW_SURE = 3.0
 
@@ -166,7 +166,8 @@ def residual_contradictions(
         seen, draws = float(group.square.sum()), group.expected.shape[-1]
         expected = float(group.expected.sum() / draws)
         spread = np.sqrt(2 * expected * (1 + 1 / draws))
-        if expected <= 0 or seen < _RATIO * expected or seen < expected + _SURE * spread:
+        sure = seen > expected + _SURE * spread and seen > _RATIO * expected
+        if expected < _LEAST_EXPECTED or not sure:
             continue
         first, last = _when(solution, group)
         yield Contradiction(

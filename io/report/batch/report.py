@@ -153,7 +153,8 @@ def _run(dataset: str, run: str, kinds: Mapping[str, Job], folder: Path) -> Line
         ", ".join(map(_text, sd)) if any(map(is_number, sd)) else ABSENT,
     )
     link = _link(next(iter(kinds.values())), folder, run)
-    return Line(f"{Path(dataset).name} / {run}", link, cells, bool(failed))
+    off = bool(failed) or str(verdict).startswith("CONTRADICTED")
+    return Line(f"{Path(dataset).name} / {run}", link, cells, off)
 
 
 def _text(value: Any) -> str:

@@ -18,8 +18,9 @@ from telerig.io.report.run import report
 from telerig.io.report.run.report import write_track_report
 from telerig.io.report.run.smoothing.figures import smoothing_drawings
 from telerig.io.report.run.smoothing.results import shake_spectrum, velocity_spectrum
-from telerig.io.report.run.smoothing.tables import smoothing_verdict
+from telerig.io.report.run.smoothing.tables import smoothing_verdict, use_rows
 from telerig.io.report.run.tracking.results import read_track_results
+from telerig.io.results.verdict_words import uses_words
 
 TRACKING = ["verdict", "key", "space", "time", "rays", "quality", "images", "worst", "events"]
 TRACKING += ["notes", "more", "origin"]
@@ -102,6 +103,7 @@ def test_without_smoothing_the_page_is_of_the_tracking_alone(folder: Path) -> No
         ("RESOLVED", "good", "the data separate the motion of the bubbles"),
         ("PARTIAL", "usable", "only in part"),
         ("UNRESOLVED", "rejected", "cannot separate the bubbles' motion from the rig's shake"),
+        ("CONTRADICTED", "rejected", "the measurements of this run disagree"),
         (None, "usable", "Not judged"),
     ],
 )
@@ -140,6 +142,56 @@ def test_the_page_makes_its_sentences_from_codes_and_numbers(folder: Path) -> No
     )
     changed(folder, axes={"y": {"verdict": "PARTIAL", "words": "y: as it was said then."}})
     assert _judged(folder).sentences[1] == "y: as it was said then."
+
+
+def test_the_sentence_under_resolved_is_true_for_its_numbers(folder: Path) -> None:
+    numbers = {"verdict": "RESOLVED", "q": 9.2, "sigma_mm": 0.0142, "shake_rms_mm": 0.1,
+               "sigma_shake_known_mm": 0.00155}  # fmt: skip
+    changed(folder, axes={"x": numbers})
+    told = _judged(folder).sentences[0]
+    assert "hardly" not in told
+    assert "9.2 times (along x: 14.2 µm now; 1.55 µm if the shake were known)" in told
+    changed(folder, axes={"x": numbers | {"q": 1.1}})
+    assert "hardly widens" in _judged(folder).sentences[0]
+
+
+def test_a_contradiction_is_named_with_its_sources_and_times(folder: Path) -> None:
+    one = {"source": "marks", "axis": "y", "from_s": 0.4, "to_s": 1.5, "statistic": 3.14,
+           "test": "residuals", "against": ["arm_left"]}  # fmt: skip
+    changed(folder, verdict="CONTRADICTED", contradictions=[one], inflation=[1.0, 4.5, 1.0])
+    told = _judged(folder)
+    assert "(x 1, y 4.5, z 1)" in told.sentences[0]
+    assert told.sentences[1] == (
+        "marks and arm_left disagree along y from 0.4 s to 1.5 s (marks: its residuals are 3.1 "
+        "times as large as the noise allows)."
+    )
+    alone = {"source": "arm_left", "from_s": 0.0, "to_s": 1.5, "statistic": 719.0, "test": "bias"}
+    changed(folder, contradictions=[alone])
+    assert "arm_left disagrees with the other measurements" in _judged(folder).sentences[1]
+    assert "719 standard deviations from 0" in _judged(folder).sentences[1]
+
+
+def test_the_page_says_what_the_run_is_good_for(folder: Path) -> None:
+    uses = [
+        {"quantity": "velocity", "axis": "x", "value": 10.0, "sd": 8.0, "unit": "mm/s",
+         "grade": "no"},
+        {"quantity": "path", "axis": "x", "value": 2.5, "sd": 0.015, "unit": "mm",
+         "grade": "good", "below_hz": 19.3},
+        {"quantity": "mean velocity", "axis": "y", "value": -277.0, "sd": 2.8, "unit": "mm/s",
+         "grade": "good", "assumes": ["encoder"]},
+    ]  # fmt: skip
+    changed(folder, usable_for=uses)
+    rows = [row.cells for row in use_rows(read(folder))]
+    assert [row[:3] for row in rows] == [
+        ("good", "path below 19 Hz", "x"), ("good", "mean velocity", "y"),
+        ("no", "velocity in a frame", "x"),
+    ]  # fmt: skip
+    assert rows[1][3:] == ("-277.0 ±\u00a02.8 mm/s", "encoder")
+    assert uses_words(read(folder).file.usable_for) == [
+        "good for: path (x), mean velocity (y)",
+        "not good for: velocity in a frame (x)",
+        "nothing in this run confirms the sign, unit and scale of: encoder",
+    ]
 
 
 def test_flags_are_explained_and_only_the_harmful_ones_warn(folder: Path) -> None:

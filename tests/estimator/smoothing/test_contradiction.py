@@ -1,0 +1,147 @@
+"""Measurements that disagree are called so, and the bands then hold the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shake_learning_data import run, true_model
+
+from telerig.errors import CalibrationError
+from telerig.estimator.smoothing.graph.layout import GraphLayout, State
+from telerig.estimator.smoothing.graph.solve import Options, Solution, _check_converged, solve
+from telerig.estimator.smoothing.graph.whole_fit import drawn
+from telerig.estimator.smoothing.learning.default_priors import leverages
+from telerig.estimator.smoothing.problem.problem import (
+    Accelerometer,
+    BroadBand,
+    SmoothingProblem,
+)
+from telerig.estimator.smoothing.result import trajectories
+from telerig.estimator.smoothing.verdict.contradiction import contradictions, speed_warnings
+from telerig.estimator.smoothing.verdict.judge import judge
+from telerig.io.results.smoothing import Contradiction, Disagreement
+
+BANDS = replace(
+    true_model(), modes=(), broad_bands=tuple(BroadBand((0.02, 0.2, 0.02), j) for j in (0, 1))
+)
+
+
+def marked(seed: int) -> SmoothingProblem:
+    return run(np.random.default_rng(seed), marks=4)[0]
+
+
+def late_marks(problem: SmoothingProblem) -> SmoothingProblem:
+    """The marks of one camera, measured a quarter of a second after what they are said to show."""
+    seen = problem.references
+    count = len(problem.t_s)
+    frame = np.where(seen.camera == 0, (seen.frame + 50) % count, seen.frame)
+    return replace(problem, references=replace(seen, frame=frame))
+
+
+def found_in(solution: Solution) -> tuple[Contradiction, ...]:
+    fit, _, left = drawn(solution)
+    return contradictions(solution, fit, left).found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_measurements_that_agree_are_not_contradicted(seed: int) -> None:
+    for problem in (marked(seed), run(np.random.default_rng(seed), bubbles=2)[0]):
+        assert found_in(solve(problem, true_model())) == ()
+
+
+def test_marks_of_another_time_are_named_and_the_bands_are_widened() -> None:
+    problem = late_marks(marked(1))
+    solution = solve(problem, BANDS, Options(robust=False))
+    verdict = judge(problem, BANDS, solution)
+    assert verdict["verdict"] == "CONTRADICTED"
+    found = [Contradiction.model_validate(one) for one in verdict["contradictions"]]
+    assert {"marks"} <= {found[0].source, *found[0].against}
+    assert "marks" in verdict["words"]
+    factor = verdict["inflation"]["xyz".index("y")]
+    assert factor > 1.2
+    plain = trajectories(solution, None)
+    wide = trajectories(solution, None, verdict["inflation"])
+    np.testing.assert_allclose(wide["sy_mm"], factor * plain["sy_mm"])
+    assert verdict["axes"]["y"]["verdict"] == "CONTRADICTED"
+    assert {use["grade"] for use in verdict["usable_for"]} <= {"limited", "no"}
+
+
+def test_a_bias_that_no_sensor_has_is_a_contradiction() -> None:
+    problem = marked(2)
+    count = len(problem.t_s)
+    still = np.tile(-problem.gravity_mm_s2, (count, 1))
+    sensors = tuple(
+        Accelerometer(f"arm {c}", c, problem.t_s, still + [0.0, 3000.0 * c, 0.0], np.eye(3), 1000.0)
+        for c in range(2)
+    )
+    problem = replace(problem, accelerometers=sensors)
+    biased = [one for one in found_in(solve(problem, BANDS)) if one.test == Disagreement.BIAS]
+    assert [(one.source, one.axis) for one in biased] == [("arm 1", "y")]
+
+
+def test_so_many_outliers_are_none() -> None:
+    solution = solve(marked(3), true_model())
+    share = np.where(np.arange(len(solution.weights[1])) % 10 < 8, 0.0, 1.0)
+    found = found_in(replace(solution, weights=(solution.weights[0], share)))
+    assert any(o.source == "marks" and o.test == Disagreement.OUTLIERS for o in found)
+
+
+@pytest.mark.parametrize(("rise", "word"), [(-50.0, "sink"), (0.0, "hover"), (50.0, "")])
+def test_bubbles_that_do_not_rise_are_a_warning(rise: float, word: str) -> None:
+    from telerig.estimator.smoothing.problem.problem import Stage
+
+    problem = marked(4)
+    problem = replace(problem, stage=Stage(problem.t_s, 100 * problem.t_s))
+    solution = solve(marked(4), true_model())
+    means = np.tile(rise * problem.up, (len(problem.bubbles), 1))
+    moving = replace(
+        solution,
+        graph=replace(solution.graph, problem=problem),
+        state=replace(solution.state, means=means),
+    )
+    warnings = speed_warnings(moving)
+    assert bool(warnings) == bool(word)
+    assert all(word in warning for warning in warnings)
+
+
+def test_residuals_that_a_right_model_leaves_have_one_minus_the_leverage_as_variance() -> None:
+    solution = solve(marked(5), true_model(), Options(robust=False))
+    fit, errors, left = drawn(solution, draws=300)
+    pixels = [n for n, f in enumerate(fit.factors) if f.weight is not None][:2]
+    for number, (which, leverage) in zip(pixels, leverages(solution)):
+        variance = (fit.of_group(left, number) ** 2).mean(-1)
+        assert len(which) == len(variance)
+        assert np.median(variance / (1 - leverage)) == pytest.approx(1, abs=0.03)
+    states = solution.graph.bubble_basis(np.arange(solution.graph.rows)) @ fit.increments(errors, 1)
+    position = np.einsum("id,ndk->nik", solution.graph.bubble.position, states)
+    assert solution.covariances is not None
+    row = solution.graph.bubble.position
+    stated = np.einsum("id,nde,ie->ni", row, solution.covariances.bubbles, row)
+    ratio = (position**2).mean((0, 2)) / stated.mean(0)
+    np.testing.assert_allclose(ratio, 1, atol=0.2)
+
+
+def _with_clock(late_s: float) -> tuple[GraphLayout, State]:
+    problem = marked(6)
+    reading = np.tile(-problem.gravity_mm_s2, (len(problem.t_s), 1))
+    sensor = Accelerometer("arm", 0, problem.t_s, reading, np.eye(3), 10.0)
+    solution = solve(
+        replace(problem, accelerometers=(sensor,)),
+        replace(BANDS, accelerometer_delay_sigma_s=1e-4),
+        Options(covariances=False),
+    )
+    return solution.graph, replace(solution.state, clocks=np.full((1, 1), late_s))
+
+
+def test_a_clock_that_still_moves_is_an_error() -> None:
+    graph, state = _with_clock(5e-3)
+    with pytest.raises(CalibrationError, match="delay of accelerometer arm does not converge"):
+        _check_converged(graph, state, 0.0)
+    calm = replace(state, clocks=np.zeros((1, 1)))
+    _check_converged(graph, calm, 0.1)
+    with pytest.raises(CalibrationError, match="moved a bubble by 30 px"):
+        _check_converged(graph, calm, 30.0)
+    with pytest.raises(CalibrationError, match="not finite"):
+        _check_converged(graph, replace(calm, means=np.full_like(calm.means, np.nan)), 0.0)

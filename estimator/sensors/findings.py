@@ -30,6 +30,7 @@ class Code(StrEnum):
     ENCODER_JUMP = "ENCODER_JUMP"
     ENCODER_CLOCK = "ENCODER_CLOCK"
     FRAME_TIMES = "FRAME_TIMES"
+    RISE_SPEED = "RISE_SPEED"
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,11 @@ class Finding:
     todo : what the user can do about it.
     code : the code of a fault that is refused unless it is accepted; None for a warning.
     fix : the correction as data, for programs; empty if there is none. {"sensor": name} and one of
-        "unit": "g"; "axes": rows; "mounted_on": camera; "add_m_s2": [x, y, z], to be added to every
-        reading; "offset_s": s, to be added to its times. Without a sensor: {"encoder_factor":
-        -1.0}, {"encoder_jumps": [[t_s, mm], ...]} to be subtracted from t_s on, ...
+        "unit": "g"; "axes": rows; "factor": number by which readings are multiplied; "add_m_s2":
+        [x, y, z], to be added to every reading; "offset_s": s, to be added to its times.
+        {"exchange": [name, name]} for the records of two sensors. {"encoder_factor": -1.0},
+        {"encoder_offset_s": s, to be added to its times}, {"encoder_jumps": [[t_s, mm], ...]} to
+        be subtracted from t_s on. {"frame_time_factor": 0.001}.
     """
 
     words: str

@@ -176,6 +176,11 @@ def _sensors(solution: Solution) -> dict[str, Any]:
         weight = solution.sample_weights[i] if solution.sample_weights else None
         if weight is not None:
             found["masked_samples"] = int(np.count_nonzero(weight < _USED))
+        found["delay_s"] += sensor.offset_s
+        found["offset_s"] = found["delay_s"]
+        found["offset_sd_s"] = found.get("sdelay_s", sensor.offset_sd_s)
+        found["drift_ppm"] = sensor.drift_ppm
+        found["confirmed"] = sensor.confirmed
         out[sensor.name] = found
     return out
 

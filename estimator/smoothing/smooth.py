@@ -28,12 +28,12 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
     check_increasing,
 )
+from telerig.estimator.smoothing.problem.sensor_alignment import aligned
 from telerig.estimator.smoothing.problem.tables import (
     Tracked,
     accelerometers_of,
     bubbles_of,
     calibration_share,
-    near_frames,
     read_tracks,
     references_of,
     stage_of,
@@ -143,9 +143,8 @@ def smooth(
         references=references, rig=rig, t_s=t_s,
         drift=None if refinement is None else refinement.drift,
     )  # fmt: skip
+    problem, findings = aligned(problem, findings)
     warnings = settled(findings, accepted)
-    problem, findings = _near_frames(problem)
-    warnings += settled(findings, accepted)
     options = options or Options()
     chosen = _chosen(problem, model, encoder_sigma, refinement)
     if isinstance(model, ShakeModel):
@@ -194,27 +193,6 @@ def _check_kinds(tracks: Any, calibration: Any, rig: Any) -> None:
             where="smooth",
             todo="give the description: telerig.load_dataset(path).rig",
         )
-
-
-def _near_frames(problem: SmoothingProblem) -> tuple[SmoothingProblem, list[Finding]]:
-    """Return the problem with the accelerometers' samples near the frames.
-
-    A sensor without such samples is left out, and a finding says so.
-    """
-    kept, findings = [], []
-    for sensor in problem.accelerometers:
-        near = near_frames(sensor, problem.t_s)
-        if len(near.t_s) - near.masked_samples >= _LEAST_SAMPLES:
-            kept.append(near)
-            continue
-        findings.append(
-            Finding(
-                "it has no usable samples near the frames, so it is left out",
-                f"accelerometer {sensor.name}",
-                "put its times on the frames' clock",
-            )
-        )
-    return replace(problem, accelerometers=tuple(kept)), findings
 
 
 def _cameras_of(table: Any, calibration: Calibration, stage: Any, rig: Any) -> list[str]:

@@ -240,6 +240,9 @@ class Accelerometer:
     kept : (N,) whether each sample is used. The readings of the others are interpolated. None if
         all are used.
     unused_axes : indices of the sensor's axes whose readings are not used.
+    offset_s, drift_ppm : what alignment with the images subtracted from its stamps, and the drift
+        that it took out. offset_sd_s : sd of the offset; None if it was not found.
+    confirmed : whether the images confirm its clock; None if that was not tried.
     """
 
     name: str
@@ -253,6 +256,10 @@ class Accelerometer:
     clock: Literal["frames", "unknown"] = "frames"
     kept: Bools | None = None
     unused_axes: tuple[int, ...] = ()
+    offset_s: float = 0.0
+    offset_sd_s: float | None = None
+    drift_ppm: float = 0.0
+    confirmed: bool | None = None
 
     @property
     def masked_samples(self) -> int:

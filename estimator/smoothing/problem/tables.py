@@ -72,12 +72,12 @@ def accelerometers_of(
     return tuple(out)
 
 
-def near_frames(sensor: Accelerometer, t_s: Array) -> Accelerometer:
-    """Return the sensor with the samples that were measured within 0.25 s of the frames.
+def near_frames(sensor: Accelerometer, t_s: Array, margin_s: float = _MARGIN_S) -> Accelerometer:
+    """Return the sensor with the samples that were measured within a margin about the frames.
 
     t_s : (F,) times of the frames.  There may be no such samples.
     """
-    return sensor.of(_near(sensor.t_s - sensor.delay_s, t_s))
+    return sensor.of(_near(sensor.t_s - sensor.delay_s, t_s, margin_s))
 
 
 def thinned(sensors: tuple[Accelerometer, ...], step_s: float) -> tuple[Accelerometer, ...]:
@@ -210,8 +210,8 @@ def calibration_share(
     return CalibrationShare(root @ turn[felt].T, free, covariance, drift)
 
 
-def _near(t: Array, t_s: Array) -> Bools:
-    return np.asarray((t >= t_s[0] - _MARGIN_S) & (t <= t_s[-1] + _MARGIN_S))
+def _near(t: Array, t_s: Array, margin_s: float = _MARGIN_S) -> Bools:
+    return np.asarray((t >= t_s[0] - margin_s) & (t <= t_s[-1] + margin_s))
 
 
 _PIXELS = ("u_px", "v_px", "suu_px2", "suv_px2", "svv_px2")

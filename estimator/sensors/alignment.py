@@ -1,0 +1,303 @@
+"""Finds the offset of a clock: accelerometers against images and encoder, at every possible lag.
+
+Each channel (the acceleration of a camera's images along one direction, or of the carriage) is
+regressed on the readings of the sensors that explain it, at every lag at which the records overlap.
+The sum of the log-likelihood ratios over the channels has its peak at the offset. The regression
+has free coefficients, so a wrong unit or a wrong axis does not hide the peak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from telerig.arrays import Array, Bools
+from telerig.estimator.sensors.accelerations import Accelerations, Grid
+
+_LEAST_NATS = 20.0
+_MOST_OF_PEAK = 0.7
+"""Largest share of the peak that other lags, or the reversed record, may reach. In 160 simulated
+runs without a connection 0.7 was never reached by both; see docs/decisions/025."""
+
+_LEAST_OVERLAP = 0.3
+_LEAST_SAMPLES = 60
+_END_S = 0.005
+_RIPPLE_NATS = 0.5
+_MOST_LAG_SHARE = 0.25
+_ORDER = 16
+_RIDGE = 1e-5
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Hold an acceleration that sensors explain.
+
+    name : in words.  values, known : (n,) in mm/s^2 on the grid of the images.
+    sensors : indices of the sensors whose axes explain it.
+    """
+
+    name: str
+    values: Array
+    known: Bools
+    sensors: tuple[int, ...]
+
+    def fitted(
+        self,
+        readings: Sequence[Accelerations],
+        at: int,
+        whitening: Array | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the known values (m,) and their fit by the readings at a lag, means removed.
+
+        at : index of the lag.  whitening : filter for both; None for none.
+        """
+        x = np.concatenate([readings[s].values for s in self.sensors], axis=1)
+        index = np.arange(len(self.values)) + at - (len(self.values) - 1)
+        inside = (index >= 0) & (index < len(x)) & self.known
+        y, design = self.values[inside], x[index[inside]]
+        if whitening is not None:
+            y = np.convolve(y, whitening, "valid")
+            design = np.stack([np.convolve(c, whitening, "valid") for c in design.T], -1)
+        y, design = y - y.mean(), design - design.mean(0)
+        return y, np.asarray(design @ np.linalg.lstsq(design, y, rcond=None)[0])
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Hold the offset of a clock.
+
+    offset_s, sd_s : a sample stamped t was measured at t - offset_s.
+    nats : log-likelihood ratio at the peak, against no connection at all.
+    runner_up_nats, runner_up_s : the same at the best other lag, and that lag.
+    reversed_nats : the best with the record reversed in time, which no true connection survives.
+    at_zero_nats : the best at offsets that a clock shared with the frames can have.
+    at_end : whether the peak lies at the end of the lags that were tried.
+    explained : by channel, the share of its variance that the sensors explain at the peak.
+    """
+
+    offset_s: float
+    sd_s: float
+    nats: float
+    runner_up_nats: float
+    runner_up_s: float
+    reversed_nats: float
+    at_zero_nats: float
+    at_end: bool
+    explained: dict[str, float]
+
+    @property
+    def connected(self) -> bool:
+        """Whether the record explains the channels better than it does when it is reversed."""
+        return self.nats > _LEAST_NATS and self.reversed_nats < _MOST_OF_PEAK * self.nats
+
+    @property
+    def unique(self) -> bool:
+        """Whether the record is connected with the channels at one lag alone."""
+        alone = self.runner_up_nats < _MOST_OF_PEAK * self.nats
+        return self.connected and alone and not self.at_end
+
+    @property
+    def at_zero(self) -> bool:
+        """Whether the data show a connection at the clock of the frames, and none clearly better
+        elsewhere.
+        """
+        return self.connected and self.at_zero_nats > _MOST_OF_PEAK * self.nats
+
+
+def align(
+    frames: Grid, channels: Sequence[Channel], readings: Sequence[Accelerations], near_s: float
+) -> Alignment | None:
+    """Return the offset of the clock that the sensors share, or None if no lag can be tried.
+
+    frames : the grid of the channels.
+    readings : of the sensors, on one grid with the steps of ``frames``.
+    near_s : the largest offset of a clock that is that of the frames.
+    """
+    own = readings[0].grid
+    shift = round((frames.start_s - own.start_s) / frames.step_s)
+    lags = np.arange(-(frames.count - 1), own.count) - shift
+    used = [c for c in channels if np.count_nonzero(c.known) > _LEAST_SAMPLES]
+    if not used:
+        return None
+    first = [_Profile.of(c, readings, whitening_filter(c.values[c.known])) for c in used]
+    tried = np.min([p.overlap for p in first], axis=0) >= _LEAST_OVERLAP
+    if np.count_nonzero(tried) < 3:
+        return None
+    total = _total(first, [float(np.count_nonzero(p.channel.known)) for p in first], tried)
+    peak = int(np.argmax(total))
+    filters = [whitening_filter(np.subtract(*p.channel.fitted(readings, peak))) for p in first]
+    forward = [_Profile.of(c, readings, f) for c, f in zip(used, filters)]
+    total = _total(forward, [float(np.count_nonzero(c.known)) for c in used], tried)
+    peak = int(np.argmax(total))
+    sizes = [p.effective_size(readings, peak) for p in forward]
+    total = _total(forward, sizes, tried)
+    peak = int(np.argmax(total))
+    others = total.copy()
+    others[_lobe(total, peak)] = -np.inf
+    second = int(np.argmax(others))
+    backward = [_Profile.of(c, readings, f, reverse=True) for c, f in zip(used, filters)]
+    place, sd = _refined(total, peak)
+    offsets = lags * frames.step_s
+    ends = np.flatnonzero(tried)[[0, -1]]
+    edge = max(round(_END_S / frames.step_s), 1)
+    near = np.abs(offsets) <= near_s + frames.step_s / 2
+    return Alignment(
+        float(offsets[peak] + place * frames.step_s), float(sd * frames.step_s),
+        float(total[peak]), float(others[second]), float(offsets[second]),
+        float(_total(backward, sizes, tried[::-1]).max()),
+        float(total[near].max(initial=-np.inf)),
+        bool(np.abs(peak - ends).min() <= edge),
+        {p.channel.name: float(p.explained[peak]) for p in forward},
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Profile:
+    """Hold for each lag the share of a channel's variance that is explained, and the overlap.
+
+    explained, overlap : (lags,).  reverse : whether the record runs backwards.
+    """
+
+    channel: Channel
+    explained: Array
+    overlap: Array
+    whitening: Array
+
+    @classmethod
+    def of(
+        cls,
+        channel: Channel,
+        readings: Sequence[Accelerations],
+        whitening: Array,
+        *,
+        reverse: bool = False,
+    ) -> _Profile:
+        turn = slice(None, None, -1 if reverse else 1)
+        x = np.concatenate([readings[s].values for s in channel.sensors], axis=1)[turn]
+        there = np.all([readings[s].known for s in channel.sensors], axis=0)[turn]
+        x, usable = _filtered(x, there, whitening)
+        whole, there = _filtered(channel.values[:, None], channel.known, whitening)
+        known = there.astype(float)
+        if not there.any():
+            none = np.zeros(len(x) + len(known) - 1)
+            return cls(channel, none, none, whitening)
+        y = np.where(there, whole[:, 0] - whole[there, 0].mean(), 0.0)
+        ok = usable.astype(float)
+        width = x.shape[1]
+        pairs = [(i, j) for i in range(width) for j in range(i, width)]
+        series = np.array([ok, *x.T, *(x[:, i] * x[:, j] for i, j in pairs)])
+        n, *sums = _sliding(series, known)
+        over_y = _sliding(series[: 1 + width], y)
+        safe = np.maximum(n, 1.0)
+        mean_x, mean_y = np.stack(sums[:width], -1) / safe[:, None], over_y[0] / safe
+        yy = _sliding(ok[None], y**2)[0] / safe - mean_y**2
+        xy = over_y[1:].T / safe[:, None] - mean_x * mean_y[:, None]
+        xx = np.empty((len(n), width, width))
+        for (i, j), total in zip(pairs, sums[width:]):
+            xx[:, i, j] = xx[:, j, i] = total / safe
+        xx -= mean_x[:, :, None] * mean_x[:, None]
+        size = float((x**2).mean()) + 1e-12
+        xx += 1e-6 * size * np.eye(width)
+        overlap = n / known.sum()
+        used = overlap >= _LEAST_OVERLAP
+        share = np.zeros(len(n))
+        gain = np.linalg.solve(xx[used], xy[used][..., None])[..., 0]
+        share[used] = (gain * xy[used]).sum(-1) / np.maximum(yy[used], 1e-12)
+        return cls(channel, np.clip(share, 0.0, 1 - 1e-6), overlap, whitening)
+
+    def effective_size(self, readings: Sequence[Accelerations], at: int) -> float:
+        """Return the number of independent samples that the regression at a lag has."""
+        y, fit = self.channel.fitted(readings, at, self.whitening)
+        return effective_size(y - fit, fit)
+
+
+def _filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bools]:
+    """Return filtered columns (n, D) and where all their samples are known (n,)."""
+    reach = len(whitening) - 1
+    out = np.stack([np.convolve(c, whitening)[: len(c)] for c in values.T], -1)
+    unknown = np.convolve(~known, np.ones(reach + 1))[: len(known)] > 0.5
+    unknown[:reach] = True
+    return np.where(unknown[:, None], 0.0, out), ~unknown
+
+
+def effective_size(residual: Array, fit: Array) -> float:
+    """Return the number of independent samples that a regression of n samples has.
+
+    It is n over the sum of the products of the autocorrelations of residual and fit (Bartlett,
+    J. R. Stat. Soc. Suppl. 8:27, 1946).
+    """
+    count = len(fit)
+    products = _autocorrelation(residual) * _autocorrelation(fit)
+    longest = max(int(_MOST_LAG_SHARE * count), 1)
+    spread = 1 + 2 * float(products[1:longest].sum())
+    return count / float(np.clip(spread, 1.0, count / 4))
+
+
+def whitening_filter(residual: Array) -> Array:
+    """Return the filter that makes a residual white: of an autoregression (Yule, Phil. Trans. R.
+    Soc. A 226:267, 1927). Regression of what it returns is generalised least squares.
+    """
+    from scipy.linalg import solve_toeplitz
+
+    order = min(_ORDER, len(residual) // 10)
+    covariance = _sliding(residual[None], residual)[0, len(residual) - 1 :][: order + 1]
+    if order < 1 or not covariance[0] > 0:
+        return np.ones(1)
+    column = covariance[:order].copy()
+    column[0] *= 1 + _RIDGE
+    return np.concatenate([[1.0], -solve_toeplitz(column, covariance[1:])])
+
+
+def _sliding(series: Array, weight: Array) -> Array:
+    """Return sum_i weight_i x_(i + l) at every lag l at which the two overlap.
+
+    series : (K, N) rows x.  weight : (n,).  The result is (K, N + n - 1), from l = 1 - n on.
+    """
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    count = series.shape[1] + len(weight) - 1
+    size = next_fast_len(count, real=True)
+    product = rfft(series, size, axis=1) * rfft(weight[::-1], size)
+    return np.asarray(irfft(product, size, axis=1)[:, :count])
+
+
+def _autocorrelation(x: Array) -> Array:
+    """Return the autocorrelation (n,) of a series, 1 at lag 0."""
+    full = _sliding(x[None], x)[0, len(x) - 1 :]
+    return np.asarray(full / max(float(full[0]), 1e-300))
+
+
+def _total(profiles: Sequence[_Profile], sizes: Sequence[float], tried: Bools) -> Array:
+    """Return the log-likelihood ratio (lags,) of all channels, -inf at lags that are not tried."""
+    total = np.zeros(len(tried))
+    for profile, size in zip(profiles, sizes):
+        total -= 0.5 * size * np.minimum(profile.overlap, 1.0) * np.log1p(-profile.explained)
+    return np.where(tried, total, -np.inf)
+
+
+def _lobe(total: Array, peak: int) -> slice:
+    """Return the lags about the peak down to the nearest valleys on both sides."""
+    ends = []
+    for step in (-1, 1):
+        at, lowest = peak, peak
+        while 0 <= at + step < len(total) and np.isfinite(total[at + step]):
+            at += step
+            if total[at] < total[lowest]:
+                lowest = at
+            elif total[at] > total[lowest] + _RIPPLE_NATS:
+                break
+        ends.append(lowest)
+    return slice(ends[0], ends[1] + 1)
+
+
+def _refined(total: Array, peak: int) -> tuple[float, float]:
+    """Return place and sd of the peak in steps, from a parabola through three values."""
+    if not 0 < peak < len(total) - 1 or not np.isfinite(total[[peak - 1, peak + 1]]).all():
+        return 0.0, float("inf")
+    before, at, after = total[peak - 1 : peak + 2]
+    bend = before - 2 * at + after
+    if not bend < 0:
+        return 0.0, float("inf")
+    return float((before - after) / (2 * bend)), float(1 / np.sqrt(-bend))

@@ -1,0 +1,172 @@
+"""Checks how sensors are mounted, in which unit they read, and what the encoder counts.
+
+All by the same regression as the clocks' (see ``alignment``), with the coefficients that the
+description states, against those that another mounting or another unit would give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from telerig.arrays import Array, Bools
+from telerig.estimator.sensors.alignment import effective_size, whitening_filter
+
+CLEAR_NATS = 8.0
+_SHIFTS = 24
+_CHANCE = 1.5
+_UPRIGHT_DEG = 30.0
+_SDS = 5.0
+
+
+@dataclass(frozen=True)
+class Felt:
+    """Hold an acceleration that a sensor should feel along one direction.
+
+    direction : (3,) in the rig frame.  values, known : (n,) in mm/s^2.
+    whole : whether the sensor feels just this, so that its gain follows; False if it also feels
+        something else, as an arm does beside the carriage.
+    """
+
+    direction: Array
+    values: Array
+    known: Bools
+    whole: bool = True
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Hold what the regression says about a sensor.
+
+    axes : (3, 3) rows that fit best.  clear : whether they fit clearly better than the stated ones.
+    gain, gain_sd : the reading over the true acceleration, with the axes that fit best; NaN and
+        infinite where nothing is felt.
+    """
+
+    axes: Array
+    clear: bool
+    lead_nats: float
+    gain: float
+    gain_sd: float
+
+    @property
+    def wrong_gain(self) -> bool:
+        """Whether the readings are clearly too large or too small for any usual scale error."""
+        off = abs(self.gain - 1) > _SDS * self.gain_sd
+        return bool(off and not 0.7 < self.gain < 1.4)
+
+
+def signed_permutations() -> Array:
+    """Return all exchanges and reversals of three axes, (48, 3, 3), the identity first."""
+    out = [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+    return np.array(out)
+
+
+def mounting(
+    axes: Array, at_rest: Array, up: Array, x: Array, known: Bools, felt: Sequence[Felt]
+) -> Mounting:
+    """Return the axes, among exchanges and reversals of the stated ones, and the gain that fit.
+
+    axes : (3, 3) stated rows.  at_rest : (3,) median reading, whose direction must be up.
+    up : (3,) in the rig frame.  x, known : (n, 3) readings on the grid of the images, (n,).
+    felt : accelerations that this sensor feels.
+    """
+    turned = np.swapaxes(signed_permutations(), -1, -2) @ axes
+    forces = np.einsum("pij,i->pj", turned, at_rest)
+    size = np.linalg.norm(forces, axis=1)
+    upright = forces @ up > np.cos(np.radians(_UPRIGHT_DEG)) * size
+    if not upright.any() or not size.max() > 0:
+        upright[:] = True
+    candidates = turned[upright]
+    stated = np.flatnonzero(np.abs(candidates - axes).max((1, 2)) < 1e-9)
+    parts = [p for f in felt if (p := _Part.of(f, x, known)) is not None]
+    if not parts:
+        found = axes if len(stated) else candidates[0]
+        return Mounting(found, not len(stated), 0.0, float("nan"), float("inf"))
+    score = _scores(candidates, parts, 0)
+    changes = np.abs(candidates - axes).sum((1, 2))
+    best = int(np.lexsort((changes, -score))[0])
+    gain, gain_sd = _gain(candidates[best], parts)
+    if not len(stated):
+        return Mounting(candidates[best], True, float("inf"), gain, gain_sd)
+    own = int(stated[0])
+    length = len(parts[0].x)
+    shifts = np.linspace(0.1, 0.9, _SHIFTS) * length
+    chance = [np.ptp(_scores(candidates, parts, int(s))) for s in shifts]
+    lead = float(score[best] - score[own])
+    clear = best != own and lead > max(CLEAR_NATS, _CHANCE * float(np.max(chance)))
+    return Mounting(candidates[best], bool(clear), lead, gain, gain_sd)
+
+
+@dataclass(frozen=True)
+class _Part:
+    direction: Array
+    y: Array
+    x: Array
+    size: float
+    whole: bool
+
+    @classmethod
+    def of(cls, felt: Felt, x: Array, known: Bools) -> _Part | None:
+        both = felt.known & known
+        if np.count_nonzero(both) < 20:
+            return None
+        y, x = felt.values[both], x[both]
+        y, x = y - y.mean(), x - x.mean(0)
+        whitening = whitening_filter(y - x @ np.linalg.lstsq(x, y, rcond=None)[0])
+        y = np.convolve(y, whitening, "valid")
+        x = np.stack([np.convolve(column, whitening, "valid") for column in x.T], -1)
+        fit = x @ np.linalg.lstsq(x, y, rcond=None)[0]
+        return cls(felt.direction, y, x, effective_size(y - fit, fit), felt.whole)
+
+
+def _scores(candidates: Array, parts: Sequence[_Part], shift: int) -> Array:
+    """Return the log-likelihood ratio (p,) of each candidate's axes (p, 3, 3), with its best gain.
+
+    shift : by so many samples the readings are rotated in time, to see what chance does.
+    """
+    total = np.zeros(len(candidates))
+    for p in parts:
+        x = np.roll(p.x, shift, axis=0)
+        force = np.einsum("pij,j->pi", candidates, p.direction) @ x.T
+        gain = np.clip((force @ p.y) / np.maximum((force**2).sum(1), 1e-12), 0.0, None)
+        rest = ((p.y - gain[:, None] * force) ** 2).sum(1)
+        total -= 0.5 * p.size * np.log(np.maximum(rest, 1e-12) / max(float(p.y @ p.y), 1e-12))
+    return total
+
+
+def _gain(axes: Array, parts: Sequence[_Part]) -> tuple[float, float]:
+    """Return reading over true acceleration and its sd, over the parts that are whole."""
+    weight = total = 0.0
+    for p in (p for p in parts if p.whole):
+        force = p.x @ (axes @ p.direction)
+        square = float(force @ force)
+        if square <= 0:
+            continue
+        ratio = float(force @ p.y) / square
+        variance = float(((p.y - ratio * force) ** 2).mean()) / square * len(p.y) / p.size
+        weight += 1 / max(variance, 1e-12)
+        total += ratio / max(variance, 1e-12)
+    if not weight or not total > 0:
+        return float("nan"), float("inf")
+    inverse, sd = total / weight, float(weight**-0.5)
+    return 1 / inverse, sd / inverse**2
+
+
+def slope(y: Array, x: Array) -> tuple[float, float]:
+    """Return the coefficient of y on x (n,), means removed, and its sd with correlated errors."""
+    y, x = y - y.mean(), x - x.mean()
+    square = float(x @ x)
+    if square <= 0 or len(x) < 20:
+        return float("nan"), float("inf")
+    found = float(x @ y) / square
+    rest = y - found * x
+    size = effective_size(rest, x)
+    return found, float(np.sqrt((rest**2).mean() / square * len(x) / size))

@@ -1,0 +1,820 @@
+"""Holds the sensors of a run against its images: clocks, mounting, units, encoder, frame times.
+
+In: a `SmoothingProblem` with the whole records of its sensors. Out: the problem with each record on
+the clock of the frames and cut to them, and what was found. The regressions are in
+`telerig.estimator.sensors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from telerig.arrays import Array, Bools
+from telerig.estimator.sensors.accelerations import (
+    Accelerations,
+    Grid,
+    of_positions,
+    of_readings,
+)
+from telerig.estimator.sensors.alignment import Alignment, Channel, align, effective_size
+from telerig.estimator.sensors.findings import Code, Finding
+from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
+from telerig.estimator.sensors.mounting import Felt, Mounting, mounting, slope
+from telerig.estimator.smoothing.problem.problem import (
+    CARRIAGE,
+    Accelerometer,
+    SmoothingProblem,
+)
+from telerig.estimator.smoothing.problem.tables import near_frames
+
+SAME_CLOCK_S = 0.006
+"""Largest offset of a clock that counts as that of the frames: three sd of the delay's prior."""
+
+_SHARED_S = 2.0
+"""Before and after the frames, so much of a record is searched first whose clock is the frames'."""
+
+_LEAST_SAMPLES = 100
+_DIFFERENT_SDS = 5.0
+_LONG_S = 6.0
+_WINDOW_S = 3.0
+_WINDOW_MARGIN_S = 0.1
+_FACTOR_NATS = 60.0
+_FRAME_FACTORS = {1e-3: "milliseconds", 1e3: "1000 s", 0.5: "", 2.0: ""}
+_CLEAR_GAIN = 5.0
+_USUAL_GAIN = (0.75, 1.35)
+_FASTEST_MM_S = 3000.0
+_HOVERS_MM_S = 20.0
+_STUCK_S = 0.05
+_MOVING_MM_S = 20.0
+_EXCHANGED = 1.05
+_LEAST_NATS = 8.0
+
+
+def aligned(
+    problem: SmoothingProblem, known: Sequence[Finding] = ()
+) -> tuple[SmoothingProblem, list[Finding]]:
+    """Return the problem with its sensors on the clock of the frames, and what was found.
+
+    Sensors whose clock is unknown and cannot be found are left out.
+
+    known : what other checks have found. They are returned as well, without those that the images
+        tell better.
+    """
+    placed, found = _aligned(problem, [f for f in known if f.code is not None])
+    better: dict[tuple[Code | None, Any], Finding] = {
+        (f.code, f.fix.get("sensor")): f for f in found if f.code is not None
+    }
+    out = []
+    for finding in known:
+        mine = better.pop((finding.code, finding.fix.get("sensor")), None)
+        out.append(finding if mine is None else replace(finding, todo=mine.todo, fix=mine.fix))
+    return placed, [*out, *(f for f in found if f.code is None), *better.values()]
+
+
+def _aligned(
+    problem: SmoothingProblem, refused: Sequence[Finding]
+) -> tuple[SmoothingProblem, list[Finding]]:
+    images = _Images.of(problem)
+    if not problem.bubbles and not len(problem.references):
+        cut = [near_frames(s, problem.t_s) for s in problem.accelerometers]
+        return _with(problem, [s for s in cut if len(s.t_s) > 1]), []
+    if images is None:
+        sensors = [_unaligned(s, problem.t_s) for s in problem.accelerometers]
+        said = [f for _, found in sensors for f in found]
+        return _with(problem, [s for s, _ in sensors if s is not None]), said
+    clocks = [_clock(problem, images, group) for group in _groups(problem)]
+    encoder = images.encoder_alignment(problem)
+    if not any(c.connected for c in _of_images(problem, images, encoder)):
+        wrong = _frame_times(problem)
+        if wrong is not None:
+            cut = [near_frames(s, problem.t_s) for s in problem.accelerometers]
+            return _with(problem, [s for s in cut if len(s.t_s) > 1]), [wrong]
+    findings: list[Finding] = []
+    placed: dict[int, Accelerometer] = {}
+    groups = sorted(zip(_groups(problem), clocks), key=lambda g: -(g[1].nats if g[1] else 0.0))
+    for group, clock in groups:
+        if clock is None or not (clock.unique or clock.at_zero):
+            sure = [s for s in placed.values() if s.confirmed]
+            clock = _clock(problem, images, group, beside=sure) or clock
+        for index in group:
+            sensor, found = _placed(problem.accelerometers[index], clock, problem, images)
+            findings += found
+            if sensor is not None:
+                placed[index] = sensor
+    problem = _with(problem, [placed[i] for i in sorted(placed)])
+    findings += _mountings(problem, images, refused)
+    findings += _encoder(problem, images, encoder)
+    findings += _rise(problem)
+    near = [near_frames(s, problem.t_s) for s in problem.accelerometers]
+    return _with(problem, near), findings
+
+
+def _with(problem: SmoothingProblem, sensors: Sequence[Accelerometer]) -> SmoothingProblem:
+    return replace(problem, accelerometers=tuple(sensors))
+
+
+def _groups(problem: SmoothingProblem) -> list[list[int]]:
+    """Return the indices of the sensors by clock: those with the same stamps share one."""
+    groups: list[list[int]] = []
+    for index, sensor in enumerate(problem.accelerometers):
+        for group in groups:
+            if np.array_equal(problem.accelerometers[group[0]].t_s, sensor.t_s):
+                group.append(index)
+                break
+        else:
+            groups.append([index])
+    return groups
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Hold what the images and the encoder show, on one grid.
+
+    cameras : (camera, source, accelerations (n, 2)), where the source is "marks" or "bubbles".
+    encoder : accelerations (n, 1) of the carriage along its axis; None without an encoder.
+    """
+
+    grid: Grid
+    cameras: tuple[tuple[int, str, Accelerations], ...]
+    encoder: Accelerations | None
+
+    @classmethod
+    def of(cls, problem: SmoothingProblem) -> _Images | None:
+        """Return None if the run is too short for the kernel, or nothing was seen."""
+        noise = _noise_mm(problem)
+        if noise is None:
+            return None
+
+        def felt(grid: Grid) -> float:
+            rms = [_readings(grid, s).values.std(0).max() for s in problem.accelerometers]
+            return float(min(rms))
+
+        grid = frame_grid(problem.t_s, noise, felt if problem.accelerometers else None)
+        if grid.count < 8 * grid.knots:
+            return None
+        seen = (("marks", problem.references), ("bubbles", problem.observations))
+        cameras = []
+        for index, camera in enumerate(problem.cameras):
+            for source, observed in seen:
+                mine = observed.camera == index
+                if mine.any():
+                    part = observed.of(mine)
+                    found = accelerations(
+                        grid, problem.t_s, camera, part.item, part.frame, part.uv_px
+                    )
+                    if found.known.any():
+                        cameras.append((index, source, found))
+        stage, encoder = problem.stage, None
+        if stage is not None and len(stage.t_s) > 1:
+            encoder = of_positions(grid, stage.t_s, stage.position_mm[:, None])
+            if not encoder.known.any() or not np.ptp(stage.position_mm) > 0:
+                encoder = None
+        return cls(grid, tuple(cameras), encoder) if cameras else None
+
+    def channels(
+        self, problem: SmoothingProblem, group: Sequence[int], *, images_alone: bool = False
+    ) -> list[Channel]:
+        """Return what the sensors of a group explain: the images of their cameras, and the
+        encoder unless ``images_alone``.
+        """
+        mounts = {i: problem.accelerometers[i].camera for i in group}
+        number = {i: n for n, i in enumerate(group)}
+        out = []
+        for camera, source, seen in self.cameras:
+            name = f"{source} in camera {problem.cameras[camera].name}"
+            felt = tuple(number[i] for i in group if mounts[i] in (camera, CARRIAGE))
+            if felt:
+                out += [
+                    Channel(f"{name}, {way}", seen.values[:, k], seen.known, felt)
+                    for k, way in enumerate(("along rows", "along columns"))
+                ]
+        for source in ("marks", "bubbles"):
+            for name, values, known, two in self.differences(problem, source):
+                carried = [i for i in group if mounts[i] in two]
+                if {mounts[i] for i in carried} == set(two):
+                    out.append(Channel(name, values, known, tuple(number[i] for i in carried)))
+        if self.encoder is not None and not images_alone:
+            out += [
+                Channel(f"encoder, {problem.accelerometers[i].name}", self.encoder.values[:, 0],
+                        self.encoder.known, (number[i],))
+                for i in group
+            ]  # fmt: skip
+        return out
+
+    def differences(
+        self, problem: SmoothingProblem, source: str
+    ) -> list[tuple[str, Array, Bools, tuple[int, int]]]:
+        """Return, for each two cameras, what both see of a point cancelled: the motion of one
+        camera against the other along the direction that they share.
+        """
+        seen = {camera: a for camera, kind, a in self.cameras if kind == source}
+        out = []
+        for first in seen:
+            for second in (c for c in seen if c > first):
+                shared = shared_rows(problem, first, second)
+                both = np.concatenate([seen[first].values, seen[second].values], 1)
+                names = [problem.cameras[c].name for c in (first, second)]
+                out.append(
+                    (
+                        f"{source}, cameras {names[0]} and {names[1]} against each other",
+                        both @ shared,
+                        seen[first].known & seen[second].known,
+                        (first, second),
+                    )
+                )
+        return out
+
+    def encoder_alignment(self, problem: SmoothingProblem) -> Alignment | None:
+        """Return the clock of the encoder against the images along the travel axis."""
+        if self.encoder is None:
+            return None
+        channels = [
+            Channel(f"{source} in camera {problem.cameras[c].name}", values, seen.known, (0,))
+            for c, source, seen in self.cameras
+            if (values := along_axis(problem, c, seen)) is not None
+        ]
+        return align(self.grid, channels, [self.encoder], SAME_CLOCK_S) if channels else None
+
+
+def shared_rows(problem: SmoothingProblem, first: int, second: int) -> Array:
+    """Return the combination (4,) of two cameras' directions that no motion of a point changes."""
+    seen = np.concatenate([directions(problem.cameras[c]) for c in (first, second)])
+    return np.asarray(np.linalg.svd(seen)[0][:, 3])
+
+
+def along_axis(problem: SmoothingProblem, camera: int, seen: Accelerations) -> Array | None:
+    """Return a camera's accelerations (n,) along the travel axis; None if it looks along it."""
+    axis = directions(problem.cameras[camera]) @ problem.axis
+    size = float(axis @ axis)
+    return np.asarray(seen.values @ axis / size) if size > 0.1 else None
+
+
+def _noise_mm(problem: SmoothingProblem) -> float | None:
+    """Return the sd of the mean position in one frame, of marks or bubbles, whichever is less."""
+    found = []
+    for observed in (problem.references, problem.observations):
+        if len(observed):
+            scale = np.mean([c["scale_px_per_mm"] for c in problem.cameras])
+            sd = np.sqrt(np.median(observed.covariance_px2[:, 0, 0])) / scale
+            each = len(observed) / (len(np.unique(observed.frame)) * len(problem.cameras))
+            found.append(float(sd / np.sqrt(max(each, 1.0))))
+    return min(found, default=None)
+
+
+def _readings(grid: Grid, sensor: Accelerometer) -> Accelerations:
+    used = sensor if sensor.kept is None else sensor.of(sensor.kept)
+    readings = used.reading_mm_s2.copy()
+    readings[:, list(used.unused_axes)] = 0.0
+    return of_readings(grid, used.t_s, readings)
+
+
+def _of_images(
+    problem: SmoothingProblem, images: _Images, encoder: Alignment | None
+) -> Iterator[Alignment]:
+    """Return what aligns encoder and accelerometers with the images, and not with each other."""
+    if encoder is not None:
+        yield encoder
+    for group in _groups(problem):
+        found = _clock(problem, images, group, images_alone=True)
+        if found is not None:
+            yield found
+
+
+def _clock(
+    problem: SmoothingProblem,
+    images: _Images,
+    group: list[int],
+    *,
+    images_alone: bool = False,
+    beside: Sequence[Accelerometer] = (),
+) -> Alignment | None:
+    """Return the clock of a group of sensors.
+
+    beside : sensors on the clock of the frames, which the group is compared with as well.
+    """
+    sensors = [problem.accelerometers[i] for i in group]
+    channels = images.channels(problem, group, images_alone=images_alone)
+    for other in beside:
+        values, known = _at_frames(images, other)
+        force = values @ other.axes
+        channels += [
+            Channel(f"{other.name}, {axis}, {n}", force[:, k], known, (n,))
+            for k, axis in enumerate("xyz")
+            for n in range(len(group))
+        ]
+    if all(s.clock == "frames" for s in sensors):
+        near = [near_frames(s, problem.t_s, _SHARED_S) for s in sensors]
+        found = _aligned_by(images, channels, near)
+        if found is not None and found.at_zero:
+            return found
+    return _aligned_by(images, channels, sensors)
+
+
+def _aligned_by(
+    images: _Images, channels: Sequence[Channel], sensors: Sequence[Accelerometer]
+) -> Alignment | None:
+    if min(len(s.t_s) for s in sensors) < _LEAST_SAMPLES:
+        return None
+    readings = [_readings(images.grid, s) for s in sensors]
+    if readings[0].grid.count < 8 * images.grid.knots:
+        return None
+    return align(images.grid, channels, readings, SAME_CLOCK_S)
+
+
+def _unaligned(sensor: Accelerometer, t_s: Array) -> tuple[Accelerometer | None, list[Finding]]:
+    """Return a sensor that nothing can be compared with: as it is if it has the frames' clock."""
+    where = f"accelerometer {sensor.name}"
+    near = near_frames(sensor, t_s)
+    if sensor.clock == "frames":
+        if len(near.t_s) < 2:
+            return None, [_left_out(where, "its record does not overlap the frames")]
+        return near, []
+    return None, [_left_out(where, "its clock is unknown, and no image shows the rig's motion")]
+
+
+def _left_out(where: str, why: str) -> Finding:
+    return Finding(
+        f"{why}: it is not used", where,
+        "put its times on the clock of the frames, or tap the arm or start the stage within both "
+        "records",
+    )  # fmt: skip
+
+
+def _placed(
+    sensor: Accelerometer, clock: Alignment | None, problem: SmoothingProblem, images: _Images
+) -> tuple[Accelerometer | None, list[Finding]]:
+    """Return a sensor on the clock of the frames, None if it is left out, and what to say."""
+    where = f"accelerometer {sensor.name}"
+    shared = sensor.clock == "frames"
+    if shared and clock is not None and clock.at_zero:
+        near_zero = abs(clock.offset_s) <= SAME_CLOCK_S
+        return replace(sensor, confirmed=True, offset_sd_s=clock.sd_s if near_zero else None), []
+    if clock is not None and clock.unique:
+        moved = replace(
+            sensor, t_s=sensor.t_s - clock.offset_s, offset_s=clock.offset_s,
+            offset_sd_s=clock.sd_s, confirmed=True,
+        )  # fmt: skip
+        moved, findings = _without_drift(moved, problem, images)
+        if shared and abs(clock.offset_s) > max(SAME_CLOCK_S, _DIFFERENT_SDS * clock.sd_s):
+            findings.append(
+                Finding(
+                    f"its clock is {clock.offset_s:+.4f} ± {clock.sd_s:.4f} s off that of the "
+                    "frames, as the images show; its times are corrected",
+                    where,
+                    f"state [accelerometers.{sensor.name}] clock = \"unknown\" if it has one of "
+                    "its own",
+                )
+            )  # fmt: skip
+        return moved, findings
+    if shared:
+        if len(near_frames(sensor, problem.t_s).t_s) < 2:
+            return None, [_left_out(where, "its record does not overlap the frames")]
+        words = "the images cannot confirm that its clock is that of the frames"
+        return replace(sensor, confirmed=False), [Finding(words, where)]
+    return None, [_left_out(where, _unconfirmed_words(clock))]
+
+
+def _unconfirmed_words(clock: Alignment | None) -> str:
+    """Say why the offset of an unknown clock is not taken."""
+    if clock is None:
+        return "its clock is unknown, and its record is too short to be held against the images"
+    if not clock.connected:
+        return "its clock is unknown, and at no offset do its readings explain the images"
+    if clock.at_end:
+        return (
+            f"its clock is unknown, and the offset that fits best, {clock.offset_s:.3f} s, lies at "
+            "the end of the record"
+        )
+    return (
+        f"its clock is unknown, and offsets of {clock.offset_s:.3f} and {clock.runner_up_s:.3f} s "
+        "fit the images alike, as they do for a shake of one frequency"
+    )
+
+
+def _without_drift(
+    sensor: Accelerometer, problem: SmoothingProblem, images: _Images
+) -> tuple[Accelerometer, list[Finding]]:
+    """Return the sensor with a drift of its clock taken out, where the run is long enough."""
+    t = problem.t_s
+    if t[-1] - t[0] < _LONG_S:
+        return sensor, []
+    edges = np.linspace(t[0], t[-1], int((t[-1] - t[0]) / _WINDOW_S) + 1)
+    group = [
+        problem.accelerometers.index(s) for s in problem.accelerometers if s.name == sensor.name
+    ]
+    places, offsets, sds = [], [], []
+    for low, high in pairwise(edges):
+        near = (sensor.t_s > low - _WINDOW_MARGIN_S) & (sensor.t_s < high + _WINDOW_MARGIN_S)
+        first, last = (round((e - t[0]) / images.grid.step_s) for e in (low, high))
+        grid = replace(images.grid, start_s=t[0] + first * images.grid.step_s, count=last - first)
+        channels = [
+            replace(c, values=c.values[first:last], known=c.known[first:last])
+            for c in images.channels(problem, group)
+        ]
+        if np.count_nonzero(near) < 100:
+            continue
+        found = align(grid, channels, [_readings(grid, sensor.of(near))], SAME_CLOCK_S)
+        if found is not None and found.nats > found.reversed_nats and np.isfinite(found.sd_s):
+            places.append((low + high) / 2)
+            offsets.append(found.offset_s)
+            sds.append(found.sd_s)
+    if len(places) < 3:
+        return sensor, []
+    middle = float(np.mean(places))
+    design = (
+        np.stack([np.ones(len(places)), np.array(places) - middle], -1) / np.array(sds)[:, None]
+    )
+    normal = np.linalg.inv(design.T @ design)
+    shift, drift = normal @ design.T @ (np.array(offsets) / sds)
+    if abs(drift) < _DIFFERENT_SDS * np.sqrt(normal[1, 1]):
+        return sensor, []
+    corrected = sensor.t_s - shift - drift * (sensor.t_s - middle)
+    words = f"its clock drifts by {1e6 * drift:+.0f} ppm against that of the frames; corrected"
+    return (
+        replace(
+            sensor, t_s=corrected, drift_ppm=float(1e6 * drift),
+            offset_s=sensor.offset_s + float(shift),
+        ),
+        [Finding(words, f"accelerometer {sensor.name}")],
+    )  # fmt: skip
+
+
+def _at_frames(images: _Images, sensor: Accelerometer) -> tuple[Array, Bools]:
+    """Return a placed sensor's smoothed readings (n, 3) on the grid of the images, and which are
+    known.
+    """
+    found = _readings(images.grid, sensor)
+    if found.grid.count < 2:
+        return np.zeros((images.grid.count, 3)), np.zeros(images.grid.count, bool)
+    return found.at(images.grid.t_s)
+
+
+def _mountings(
+    problem: SmoothingProblem, images: _Images, refused: Sequence[Finding]
+) -> list[Finding]:
+    """Return the sensors whose axes, place or unit contradict the images, encoder and each other.
+
+    The sensor with the clearest contradiction is corrected first; then the others are compared
+    with it.
+
+    refused : faults that are known. The unit of a sensor is not judged twice, and without gravity
+        its axes are not.
+    """
+    without = {f.where for f in refused if f.code == Code.SENSOR_GRAVITY}
+    measured = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_UNIT}
+    sensors = [s for s in problem.accelerometers if s.confirmed and not s.unused_axes]
+    sensors = [s for s in sensors if not any(w.endswith(s.name) for w in without)]
+    read = {s.name: _at_frames(images, s) for s in sensors}
+    exchanged = _exchanged(problem, images, sensors, read)
+    if exchanged is not None:
+        return [exchanged]
+    axes = {s.name: s.axes for s in sensors}
+    findings: list[Finding] = []
+    judged: dict[str, Mounting] = {}
+    while True:
+        judged = {
+            s.name: mounting(
+                s.axes, np.median(s.reading_mm_s2, axis=0), problem.up, *read[s.name],
+                _felt(problem, images, s, axes, read),
+            )
+            for s in sensors
+        }  # fmt: skip
+        worst = max(
+            (n for n, m in judged.items() if m.clear and axes[n] is not m.axes
+             and not np.allclose(axes[n], m.axes)),
+            key=lambda n: judged[n].lead_nats, default=None,
+        )  # fmt: skip
+        if worst is None or any(f.fix.get("sensor") == worst for f in findings):
+            break
+        axes[worst] = judged[worst].axes
+        findings.append(_axes_finding(worst, judged[worst]))
+    for name, found in judged.items():
+        if found.wrong_gain and name not in measured:
+            findings.append(
+                Finding(
+                    f"reads {found.gain:.4g} ± {found.gain_sd:.2g} times the acceleration that the "
+                    "images show",
+                    f"accelerometer {name}",
+                    f"check its unit and scale: readings times {1 / found.gain:.4g} would fit",
+                    Code.SENSOR_SCALE,
+                    {"sensor": name, "factor": 1 / found.gain},
+                )
+            )
+    return findings
+
+
+def _axes_finding(name: str, found: Mounting) -> Finding:
+    rows = [[float(v) + 0.0 for v in np.round(row, 6)] for row in found.axes]
+    line = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in rows)
+    return Finding(
+        "its axes do not fit what images, encoder and gravity show",
+        f"accelerometer {name}",
+        f"[accelerometers.{name}] axes = [{line}] would fit",
+        Code.SENSOR_AXES,
+        {"sensor": name, "axes": rows},
+    )
+
+
+def _felt(
+    problem: SmoothingProblem,
+    images: _Images,
+    sensor: Accelerometer,
+    axes: dict[str, Array],
+    read: dict[str, tuple[Array, Bools]],
+) -> list[Felt]:
+    """Return the accelerations that a sensor should feel, of images, encoder and other sensors."""
+    out = []
+    for camera, _, seen in images.cameras:
+        if sensor.camera in (camera, CARRIAGE):
+            out += [
+                Felt(d, seen.values[:, k], seen.known)
+                for k, d in enumerate(directions(problem.cameras[camera]))
+            ]
+    if images.encoder is not None:
+        out.append(
+            Felt(problem.axis, images.encoder.values[:, 0], images.encoder.known, whole=False)
+        )
+    for other in problem.accelerometers:
+        if other.name != sensor.name and other.name in read:
+            values, known = read[other.name]
+            force = values @ axes[other.name]
+            out += [Felt(d, force @ d, known, whole=False) for d in np.eye(3)]
+    return out
+
+
+def _exchanged(
+    problem: SmoothingProblem,
+    images: _Images,
+    sensors: Sequence[Accelerometer],
+    read: dict[str, tuple[Array, Bools]],
+) -> Finding | None:
+    """Return two sensors on different cameras whose records fit better exchanged, if there are."""
+    for i, one in enumerate(sensors):
+        for two in sensors[i + 1 :]:
+            if CARRIAGE in (one.camera, two.camera) or one.camera == two.camera:
+                continue
+            known = read[one.name][1] & read[two.name][1]
+            stated = _pair_score(problem, images, one, two, read, known)
+            other = {one.name: read[two.name], two.name: read[one.name]}
+            swapped = _pair_score(problem, images, one, two, other, known)
+            if swapped - stated > _LEAST_NATS and swapped > _EXCHANGED * stated:
+                names = f"{one.name} and {two.name}"
+                return Finding(
+                    "the images of each camera fit the readings of the other camera's sensor",
+                    f"accelerometers {names}",
+                    f"exchange mounted_on of {names}, or their records",
+                    Code.SENSOR_MOUNT,
+                    {"exchange": [one.name, two.name]},
+                )
+    return None
+
+
+def _pair_score(
+    problem: SmoothingProblem,
+    images: _Images,
+    one: Accelerometer,
+    two: Accelerometer,
+    read: dict[str, tuple[Array, Bools]],
+    known: Bools,
+) -> float:
+    """Return the log-likelihood ratio of what two cameras show, given their sensors' readings."""
+    total = 0.0
+    force = {s.camera: read[s.name][0] @ s.axes for s in (one, two)}
+    parts = [
+        (seen.values[:, k], force[c] @ d, seen.known)
+        for c, _, seen in images.cameras
+        if c in force
+        for k, d in enumerate(directions(problem.cameras[c]))
+    ]
+    for source in ("marks", "bubbles"):
+        for _, values, there, cameras in images.differences(problem, source):
+            if set(cameras) == set(force):
+                shared = shared_rows(problem, *cameras)
+                rows = [directions(problem.cameras[c]) for c in cameras]
+                felt = sum(
+                    force[c] @ r.T @ w for c, r, w in zip(cameras, rows, np.split(shared, 2))
+                )
+                parts.append((values, np.asarray(felt), there))
+    for y, x, there in parts:
+        both = there & known
+        if np.count_nonzero(both) < 20:
+            continue
+        y, x = y[both] - y[both].mean(), x[both] - x[both].mean()
+        gain = max(float(x @ y) / max(float(x @ x), 1e-12), 0.0)
+        rest = y - gain * x
+        total -= (
+            0.5 * effective_size(rest, x) * np.log(float(rest @ rest) / max(float(y @ y), 1e-12))
+        )
+    return total
+
+
+def _encoder(problem: SmoothingProblem, images: _Images, clock: Alignment | None) -> list[Finding]:
+    """Return what is wrong with the encoder's sign, unit and clock, or whether it is stuck."""
+    where = "stage"
+    if problem.stage is None:
+        return []
+    stuck = _stuck(problem)
+    if stuck is not None:
+        return [stuck]
+    gains = [] if images.encoder is None else _gains(problem, images, images.encoder)
+    marked = _gain_of_marks(problem)
+    if marked is not None:
+        gains.insert(0, marked)
+    weights = np.array([1 / sd**2 for _, sd in gains])
+    if len(gains):
+        gain = float(np.sum(weights * [g for g, _ in gains]) / weights.sum())
+        sd = float(weights.sum() ** -0.5)
+        usual = _USUAL_GAIN[0] < gain < _USUAL_GAIN[1]
+        if abs(gain) > _CLEAR_GAIN * sd and not usual and abs(gain - 1) > _CLEAR_GAIN * sd:
+            return [_gain_finding(gain, sd, where)]
+    if clock is not None and clock.unique and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
+        return [
+            Finding(
+                f"its clock is {clock.offset_s:+.4f} ± {clock.sd_s:.4f} s off that of the frames, "
+                "as the images show",
+                where,
+                f"subtract {clock.offset_s:.6g} s from its times",
+                Code.ENCODER_CLOCK,
+                {"encoder_offset_s": -clock.offset_s},
+            )
+        ]
+    return []
+
+
+def _gains(
+    problem: SmoothingProblem, images: _Images, encoder: Accelerations
+) -> list[tuple[float, float]]:
+    """Return the true motion over the encoder's, with its sd, by images and by sensors."""
+    x, out = encoder.values[:, 0], []
+    for camera, _, seen in images.cameras:
+        y = along_axis(problem, camera, seen)
+        if y is not None:
+            known = seen.known & encoder.known
+            out.append(slope(y[known], x[known]))
+    for sensor in problem.accelerometers:
+        if sensor.confirmed:
+            values, there = _at_frames(images, sensor)
+            known = there & encoder.known
+            out.append(slope((values @ sensor.axes @ problem.axis)[known], x[known]))
+    return [(g, sd) for g, sd in out if np.isfinite(g) and np.isfinite(sd) and sd > 0]
+
+
+def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
+    """Return how far the marks move in the images over how far the encoder moves, and its sd."""
+    seen = problem.references
+    if not len(seen) or problem.stage is None or not np.ptp(problem.encoder_mm) > 1.0:
+        return None
+    square = product = rest = 0.0
+    count = 0
+    for c, camera in enumerate(problem.cameras):
+        mine = seen.camera == c
+        axis = directions(camera) @ problem.axis
+        if not mine.any() or axis @ axis < 0.1:
+            continue
+        place = camera.unproject(seen.uv_px[mine])[0] @ directions(camera).T @ axis / (axis @ axis)
+        moved = problem.encoder_mm[seen.frame[mine]]
+        item = np.unique(seen.item[mine], return_inverse=True)[1]
+        size = np.bincount(item)
+        y = place - (np.bincount(item, place) / size)[item]
+        x = moved - (np.bincount(item, moved) / size)[item]
+        square, product = square + float(x @ x), product - float(x @ y)
+        rest, count = rest + float(y @ y), count + len(y)
+    if square <= 0:
+        return None
+    gain = product / square
+    spread = max(rest - gain**2 * square, 0.0) / max(count, 1)
+    return gain, max(float(np.sqrt(spread / square * 10)), 1e-4)
+
+
+def _gain_finding(gain: float, sd: float, where: str) -> Finding:
+    """Name the sign or the unit that explains the true motion over the encoder's."""
+    units = {1000.0: "m", 25.4: "inches", 10.0: "cm", 0.001: "µm"}
+    size = min(units, key=lambda u: abs(np.log(abs(gain) / u)))
+    named = abs(np.log(abs(gain) / size)) < 0.3
+    factor = float(np.sign(gain)) * (size if named else 1.0 if 0.7 < abs(gain) < 1.4 else abs(gain))
+    seen = f"images and sensors show {gain:.4g} ± {sd:.2g} times the motion that it reads"
+    if factor == -1.0:
+        words, code = f"{seen}: its sign is turned", Code.ENCODER_SIGN
+    elif named:
+        words, code = f"{seen}: it reads {units[size]}, not mm", Code.ENCODER_UNIT
+    else:
+        words, code = f"{seen}: its scale is wrong", Code.ENCODER_SCALE
+    return Finding(
+        words, where, f"multiply position_mm by {factor:.6g}", code, {"encoder_factor": factor}
+    )
+
+
+def _stuck(problem: SmoothingProblem) -> Finding | None:
+    """Return a stretch in which the encoder does not change although the carriage must move."""
+    stage = problem.stage
+    assert stage is not None
+    t, x = stage.t_s, stage.position_mm
+    inside = (t >= problem.t_s[0]) & (t <= problem.t_s[-1])
+    t, x = t[inside], x[inside]
+    if len(t) < 20:
+        return None
+    change = np.flatnonzero(np.diff(x) != 0)
+    ends = np.r_[-1, change, len(x) - 1]
+    longest = int(np.argmax(np.diff(ends)))
+    first, last = int(ends[longest]) + 1, int(ends[longest + 1])
+    length = float(t[last] - t[first])
+    if length < _STUCK_S or last - first < 10:
+        return None
+    if len(change):
+        around = np.r_[np.diff(x[: first + 1])[-10:], np.diff(x[last:])[:10]]
+        pace = float(np.median(np.diff(t)))
+        moving = len(around) > 0 and np.median(np.abs(around)) / pace > _MOVING_MM_S
+    else:
+        moving = _sweeps(problem)
+    if not moving:
+        return None
+    return Finding(
+        f"reads {x[first]:.6g} mm from {t[first]:.6g} to {t[last]:.6g} s without any change, while "
+        "the carriage moves: it is stuck",
+        "stage",
+        "leave those rows out or repair the encoder; without the stage's positions, positions and "
+        "velocities are relative to the carriage",
+        Code.ENCODER_STUCK,
+    )
+
+
+def _sweeps(problem: SmoothingProblem) -> bool:
+    """Return whether the images say that a carriage moves whose encoder stands still: marks that
+    sweep through, or bubbles that all stand still in the images.
+    """
+    speeds = []
+    for observed in (problem.references, problem.observations):
+        for c, camera in enumerate(problem.cameras):
+            mine = np.flatnonzero(observed.camera == c)
+            axis = directions(camera) @ problem.axis
+            if not len(mine) or axis @ axis < 0.1:
+                continue
+            place = camera.unproject(observed.uv_px[mine])[0] @ directions(camera).T @ axis
+            for item in np.unique(observed.item[mine])[:50]:
+                one = mine[observed.item[mine] == item]
+                x, t = place[observed.item[mine] == item], problem.t_s[observed.frame[one]]
+                if len(one) > 10:
+                    speeds.append(abs(float(np.polyfit(t - t[0], x, 1)[0])))
+        if speeds:
+            fast = float(np.median(speeds)) > _MOVING_MM_S
+            return fast if observed is problem.references else not fast
+    return False
+
+
+def _rise(problem: SmoothingProblem) -> list[Finding]:
+    """Refuse bubbles that rise faster than any bubble; warn of bubbles that hover or sink."""
+    speeds = []
+    for bubble in problem.bubbles:
+        seconds = float(problem.t_s[bubble.last] - problem.t_s[bubble.first])
+        if len(bubble) > 5 and seconds > 0:
+            speeds.append(float((bubble.guess_mm[-1] - bubble.guess_mm[0]) @ problem.up) / seconds)
+    if not speeds:
+        return []
+    rise = float(np.median(speeds))
+    if abs(rise) > _FASTEST_MM_S:
+        return [
+            Finding(
+                f"the bubbles rise at {rise / 1000:.4g} m/s, which no bubble does",
+                "stage and frames",
+                "check the units of the frames' times and of the encoder",
+                Code.RISE_SPEED,
+            )
+        ]
+    if problem.stage is not None and rise < _HOVERS_MM_S:
+        what = "hover" if rise > -_HOVERS_MM_S else f"sink at {-rise:.3g} mm/s"
+        return [
+            Finding(
+                f"the bubbles {what} in the laboratory, as they can in a counterflow",
+                "stage",
+                "if there is none, check sign and unit of the encoder, and that it is not stuck",
+            )
+        ]
+    return []
+
+
+def _frame_times(problem: SmoothingProblem) -> Finding | None:
+    """Return a factor of the frames' times with which images and sensors or encoder agree."""
+    nats: dict[float, float] = {}
+    for factor in _FRAME_FACTORS:
+        trial = replace(problem, t_s=problem.t_s * factor)
+        images = _Images.of(trial)
+        if images is not None:
+            found = _of_images(trial, images, images.encoder_alignment(trial))
+            nats[factor] = sum(c.nats for c in found if c.unique)
+    best = max(nats, key=lambda f: nats[f], default=None)
+    if best is None or nats[best] < _FACTOR_NATS:
+        return None
+    unit = _FRAME_FACTORS[best]
+    words = f"they are in {unit}" if unit else f"they run {1 / best:g} times too fast"
+    return Finding(
+        f"the images agree with the sensors only if the times are multiplied by {best:g}: {words}",
+        "times of the frames",
+        f"multiply t_s by {best:g}, or correct the frame rate",
+        Code.FRAME_TIMES,
+        {"frame_time_factor": best},
+    )

@@ -355,11 +355,11 @@ def judged(
     seen = np.eye(3)
     if len(mark.cameras) == 1:
         seen = cameras[mark.cameras[0]].camera_from_rig.rotation[:2]
-    inflation = float(found.verdict.get("inflation", found.summary.get("inflation", 1.0)))
+    wider = np.diag(found.verdict.get("inflation", (1.0, 1.0, 1.0)))
 
     def covariance(row: Array, extra: Array) -> Array:
         stated = row @ covariances.bubbles @ row.T + extra[:, :, None] * np.eye(3)
-        return np.asarray(inflation**2 * (seen @ stated @ seen.T))
+        return np.asarray(seen @ wider @ stated @ wider @ seen.T)
 
     place, speed = considered_variance(solution)
     states, at = solution.state.bubbles, graph.frame_of_row

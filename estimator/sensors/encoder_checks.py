@@ -145,9 +145,13 @@ def encoder_faults(t_s: ArrayLike, position_mm: ArrayLike) -> list[EncoderFault]
     excess = np.where(known, _excess_speed(speed) * dt, 0.0)
     residual = np.where(known, prediction_residual(speed) * dt, 0.0)
     least = _least_fault(step)
-    odd = np.abs(residual) > max(_SIGMAS * robust_sd(residual), least)
+    moves = step != 0  # a long rest, in which readings repeat, says nothing about the noise
+    if not moves.any():
+        return []
+    odd = np.abs(residual) > max(_SIGMAS * robust_sd(residual[moves]), least)
     odd &= (excess * residual > 0) & (np.abs(excess) > _SHARE * np.abs(residual))
     bend = (speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * dt[1:-1]
+    bend = bend[moves[1:-1]] if moves[1:-1].any() else bend
     clear = np.abs(excess) > max(_SIGMAS * robust_sd(bend - np.median(bend)), least)
     excess = np.where(odd & ~clear, residual, excess)
     return _classified(np.flatnonzero(odd | clear), excess, t, position)

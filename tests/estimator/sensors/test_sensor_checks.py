@@ -39,6 +39,18 @@ def test_hard_but_real_motion_is_no_jump() -> None:
         assert encoder_faults(t, counts) == []
 
 
+def test_a_rest_in_which_readings_repeat_is_no_measure_of_the_noise() -> None:
+    """The stage stands for most of the record, before its start or because the encoder is stuck."""
+    rng = np.random.default_rng(6)
+    t = np.arange(0, 3, 1e-3)
+    noise = 0.001 * rng.standard_normal(len(t))
+    moving = 280 * (t - 2) + 0.1 * np.sin(2 * np.pi * 15 * (t - 2)) + noise
+    start = np.where(t > 2, np.maximum(t - 2, 0) ** 2 * 280 + noise, 0.0)
+    assert encoder_faults(t, start) == []
+    stuck = np.where(t > 2, moving, moving[2000])
+    assert [f for f in encoder_faults(t, stuck) if abs(f.size_mm) < 0.1] == []
+
+
 def test_a_jump_is_found_under_a_hunting_servo() -> None:
     """0.1 mm RMS at 15 Hz: jumps of 50 um at 1 kHz and 0.5 mm at 100 Hz stand out, none besides."""
     for rate, size in ((1000, 0.05), (100, 0.5)):

@@ -120,12 +120,12 @@ def words_of_axis(name: str, axis: AxisVerdict, *, vertical: bool) -> str:
 
 
 _WORDS_OF_TEST = {
-    Disagreement.RESIDUALS: "its residuals are {factor} times as large as the noise allows",
-    Disagreement.OUTLIERS: "{factor} times as many of its pixels as can be outliers do not fit",
-    Disagreement.BIAS: "its bias is {factor} standard deviations from 0; unit, axes or gravity may "
+    Disagreement.RESIDUALS: "residuals are {factor} times as large as the noise allows",
+    Disagreement.OUTLIERS: "{factor} times as many pixels as can be outliers do not fit",
+    Disagreement.BIAS: "the bias is {factor} standard deviations from 0; unit, axes or gravity may "
     "be wrong",
-    Disagreement.DELAY: "its delay is {factor} standard deviations from the stated one",
-    Disagreement.MOTION: "its motion is {factor} times as lively as its prior allows",
+    Disagreement.DELAY: "the delay is {factor} standard deviations from the stated one",
+    Disagreement.MOTION: "motion is {factor} times as lively as the prior allows",
     Disagreement.SPEED: "the bubbles' mean speed is {factor} times the highest possible one",
 }
 

@@ -88,11 +88,11 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
 
 def _widened(axis: AxisVerdict, factor: float) -> AxisVerdict:
     """The verdict along an axis where measurements disagree by a factor of standard deviations."""
+    wide = replace(axis, q=axis.q * factor, sigma_mm=axis.sigma_mm * factor)
     if factor <= RESOLVED_Q:
-        return axis
-    return replace(
-        axis, verdict=Verdict.CONTRADICTED, q=axis.q * factor, sigma_mm=axis.sigma_mm * factor
-    )
+        return wide
+    flags = tuple(flag for flag in axis.flags if flag != Flag.SHAKE_BELOW_NOISE)
+    return replace(wide, verdict=Verdict.CONTRADICTED, flags=flags)
 
 
 def _flags(found: dict[str, AxisVerdict]) -> list[Flag]:

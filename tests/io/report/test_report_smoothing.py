@@ -162,7 +162,7 @@ def test_a_contradiction_is_named_with_its_sources_and_times(folder: Path) -> No
     told = _judged(folder)
     assert "(x 1, y 4.5, z 1)" in told.sentences[0]
     assert told.sentences[1] == (
-        "marks and arm_left disagree along y from 0.4 s to 1.5 s (marks: its residuals are 3.1 "
+        "marks and arm_left disagree along y from 0.4 s to 1.5 s (marks: residuals are 3.1 "
         "times as large as the noise allows)."
     )
     alone = {"source": "arm_left", "from_s": 0.0, "to_s": 1.5, "statistic": 719.0, "test": "bias"}

@@ -166,7 +166,7 @@ def use_rows(results: SmoothingResults) -> list[Row]:
                 words_of_use(use),
                 use.axis,
                 f"{with_sd(use.value, use.sd)} {use.unit}",
-                ", ".join(use.assumes) or ABSENT,
+                ", ".join(use.assumes) or "-",
             ),
             strong=use.grade == Grade.NO,
         )

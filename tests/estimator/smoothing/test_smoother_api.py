@@ -296,7 +296,10 @@ def test_sensors_that_cannot_be_used_are_left_out_in_words(run: Run) -> None:
     def wrong_unit(record: dict[str, Any]) -> None:
         record |= {"a": record.pop("a_m_s2"), "unit": "g"}
 
-    found = with_sensors(run, elsewhere)
+    sensors = {name: {**record, "clock": "frames"} for name, record in run.accelerometers.items()}
+    sensors["arm_left"] = {**run.accelerometers["arm_left"]}
+    elsewhere(sensors["arm_left"])
+    found = smooth(run.tracks, run.calibration, stage=run.stage, accelerometers=sensors, rig=RIG)
     assert list(found.summary["accelerometers"]) == ["arm_right"]
     assert any("arm_left" in w and "not used" in w for w in found.summary["warnings"])
     with pytest.raises(SensorError) as caught:

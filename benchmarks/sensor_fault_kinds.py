@@ -265,21 +265,24 @@ FAULTS = {
 def repaired(inputs: Inputs, fix: Mapping[str, Any]) -> Inputs | None:
     """The arguments with the correction that a finding proposes; None for a key that is unknown.
 
-    fix : {"sensor": name} with "unit", "axes" (rows), "mounted_on", "offset_s" (the stamps are late
-    by so much) and "drift_ppm"; {"encoder_factor": f}, by which positions are multiplied, with
-    "encoder_offset_s"; {"frame_time_factor": f}, by which frame times are multiplied.
+    fix : as `telerig.estimator.sensors.findings.Finding` describes it.
     """
     out, left = copied(inputs), dict(fix)
+    if "exchange" in left:
+        one, two = (out["accelerometers"][name] for name in left.pop("exchange"))
+        one["mounted_on"], two["mounted_on"] = two["mounted_on"], one["mounted_on"]
+    if left.get("sensor") == "encoder":
+        left["encoder_offset_s"] = -left.pop("offset_s", 0.0)
+        left.pop("sensor")
     if "sensor" in left:
         sensor = out["accelerometers"][left.pop("sensor")]
         if "unit" in left:
             sensor["a"], sensor["unit"] = sensor.pop(READING, sensor.get("a")), left.pop("unit")
-        for key in ("axes", "mounted_on", "scale"):
-            if key in left:
-                sensor[key] = left.pop(key)
-        if "offset_s" in left:
-            t = sensor[TIME] - left.pop("offset_s")
-            sensor[TIME] = t[0] + (t - t[0]) / (1 + 1e-6 * left.pop("drift_ppm", 0.0))
+        if "axes" in left:
+            sensor["axes"] = left.pop("axes")
+        key = READING if READING in sensor else "a"
+        sensor[key] = left.pop("factor", 1.0) * sensor[key] + np.asarray(left.pop("add_m_s2", 0.0))
+        sensor[TIME] = sensor[TIME] + left.pop("offset_s", 0.0)
     if "encoder_factor" in left:
         table = out["stage"]
         factor = left.pop("encoder_factor")

@@ -38,6 +38,8 @@ SAME_CLOCK_S = 0.006
 _SHARED_S = 2.0
 """Before and after the frames, so much of a record is searched first whose clock is the frames'."""
 
+_SLOWEST_S = 0.05
+_MOST_STEPS = 3e6
 _LEAST_SAMPLES = 100
 _DIFFERENT_SDS = 5.0
 _LONG_S = 6.0
@@ -62,8 +64,8 @@ def aligned(
 
     Sensors whose clock is unknown and cannot be found are left out.
 
-    known : what other checks have found. They are returned as well, without those that the images
-        tell better.
+    known : what other checks have found. They are returned as well; of axes that gravity alone
+        has shown to be wrong, the images tell which would be right.
     """
     placed, found = _aligned(problem, [f for f in known if f.code is not None])
     better: dict[tuple[Code | None, Any], Finding] = {
@@ -72,35 +74,33 @@ def aligned(
     out = []
     for finding in known:
         mine = better.pop((finding.code, finding.fix.get("sensor")), None)
-        out.append(finding if mine is None else replace(finding, todo=mine.todo, fix=mine.fix))
+        if mine is not None and mine.code == Code.SENSOR_AXES:
+            finding = replace(finding, todo=mine.todo, fix=mine.fix)
+        out.append(finding)
     return placed, [*out, *(f for f in found if f.code is None), *better.values()]
 
 
 def _aligned(
     problem: SmoothingProblem, refused: Sequence[Finding]
 ) -> tuple[SmoothingProblem, list[Finding]]:
-    images = _Images.of(problem)
     if not problem.bubbles and not len(problem.references):
-        cut = [near_frames(s, problem.t_s) for s in problem.accelerometers]
-        return _with(problem, [s for s in cut if len(s.t_s) > 1]), []
+        return _cut(problem), []
+    images = _Images.of(problem)
+    encoder = None if images is None else images.encoder_alignment(problem)
+    if images is None or not any(c.connected for c in _of_images(problem, images, encoder)):
+        wrong = _frame_times(problem)
+        if wrong is not None:
+            return _cut(problem), [wrong]
     if images is None:
         sensors = [_unaligned(s, problem.t_s) for s in problem.accelerometers]
         said = [f for _, found in sensors for f in found]
         return _with(problem, [s for s, _ in sensors if s is not None]), said
-    clocks = [_clock(problem, images, group) for group in _groups(problem)]
-    encoder = images.encoder_alignment(problem)
-    if not any(c.connected for c in _of_images(problem, images, encoder)):
-        wrong = _frame_times(problem)
-        if wrong is not None:
-            cut = [near_frames(s, problem.t_s) for s in problem.accelerometers]
-            return _with(problem, [s for s in cut if len(s.t_s) > 1]), [wrong]
     findings: list[Finding] = []
     placed: dict[int, Accelerometer] = {}
-    groups = sorted(zip(_groups(problem), clocks), key=lambda g: -(g[1].nats if g[1] else 0.0))
-    for group, clock in groups:
-        if clock is None or not (clock.unique or clock.at_zero):
-            sure = [s for s in placed.values() if s.confirmed]
-            clock = _clock(problem, images, group, beside=sure) or clock
+    for group, clock in _clocks(problem, images):
+        if not _sure(clock):
+            beside = [s for s in placed.values() if s.confirmed]
+            clock = _clock(problem, images, group, beside=beside) or clock
         for index in group:
             sensor, found = _placed(problem.accelerometers[index], clock, problem, images)
             findings += found
@@ -116,6 +116,31 @@ def _aligned(
 
 def _with(problem: SmoothingProblem, sensors: Sequence[Accelerometer]) -> SmoothingProblem:
     return replace(problem, accelerometers=tuple(sensors))
+
+
+def _cut(problem: SmoothingProblem) -> SmoothingProblem:
+    """Return the problem with the samples near the frames, by the clocks as they are stated."""
+    cut = [near_frames(s, problem.t_s) for s in problem.accelerometers]
+    return _with(problem, [s for s in cut if len(s.t_s) > 1])
+
+
+def _sure(clock: Alignment | None) -> bool:
+    return clock is not None and (clock.unique or clock.at_zero)
+
+
+def _clocks(problem: SmoothingProblem, images: _Images) -> list[tuple[list[int], Alignment | None]]:
+    """Return groups of sensors with their clocks, the clearest first.
+
+    Where sensors with the same stamps do not agree with the images together, each is alone.
+    """
+    out = []
+    for group in _groups(problem):
+        clock = _clock(problem, images, group)
+        if _sure(clock) or len(group) == 1:
+            out.append((group, clock))
+            continue
+        out += [([index], _clock(problem, images, [index])) for index in group]
+    return sorted(out, key=lambda g: -(g[1].nats if g[1] is not None else 0.0))
 
 
 def _groups(problem: SmoothingProblem) -> list[list[int]]:
@@ -145,9 +170,12 @@ class _Images:
 
     @classmethod
     def of(cls, problem: SmoothingProblem) -> _Images | None:
-        """Return None if the run is too short for the kernel, or nothing was seen."""
+        """Return None if the run is too short for the kernel, if frames are too far apart to show
+        shake, or if nothing was seen.
+        """
         noise = _noise_mm(problem)
-        if noise is None:
+        pace = float(np.median(np.diff(problem.t_s)))
+        if noise is None or pace > _SLOWEST_S or np.ptp(problem.t_s) > _MOST_STEPS * pace:
             return None
 
         def felt(grid: Grid) -> float:

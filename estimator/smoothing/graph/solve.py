@@ -163,12 +163,14 @@ def _solve(
     robust, rejection = Truncation(options.robust), SampleRejection(options.robust)
     last: _Pass | None = None
     exact = _is_linear(problem, model)
-    done = 0
+    done, leap = 0, 0.0
     for done in range(1, options.passes + _CLOCK_PASSES + 1):
-        if done > options.passes + rejection.rounds and not delays_have_moved(graph, state):
+        moving = delays_have_moved(graph, state) or leap > _LARGEST_STEP_PX
+        if done > options.passes + rejection.rounds and not moving:
             break
         progress("smoothing", min((done - 1) / (options.passes + 1), 0.95))
         last = made = _linear_solve(graph, state, weights, samples)
+        leap = 0.0 if exact else made.largest_px
         state = moved(graph, state, made.done.vector)
         residuals = pixel_residuals(graph, state)
         samples, changed = rejection.update(samples, sample_residuals(graph, state))

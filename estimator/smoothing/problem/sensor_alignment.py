@@ -348,6 +348,8 @@ def _aligned_by(
 ) -> Alignment | None:
     if min(len(s.t_s) for s in sensors) < _LEAST_SAMPLES:
         return None
+    if max(float(np.median(np.diff(s.t_s))) for s in sensors) > _SLOWEST_S:
+        return None
     readings = [_readings(images.grid, s) for s in sensors]
     if readings[0].grid.count < 8 * images.grid.knots:
         return None
@@ -410,7 +412,10 @@ def _placed(
 def _unconfirmed_words(clock: Alignment | None) -> str:
     """Say why the offset of an unknown clock is not taken."""
     if clock is None:
-        return "its clock is unknown, and its record is too short to be held against the images"
+        return (
+            "its clock is unknown, and its record is too short or too slow to be compared with the "
+            "images"
+        )
     if not clock.connected:
         return "its clock is unknown, and at no offset do its readings explain the images"
     if clock.at_end:

@@ -119,6 +119,7 @@ def _read(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
     table = read_table(file, [*columns, *more], extra=True, empty=True).reset_index(drop=True)
     if "particle" in table:
         ids = pd.to_numeric(table["particle"].replace("", np.nan), errors="coerce")
+        ids = ids.where(np.isfinite(ids))
         if ids.notna().equals(table["particle"].replace("", np.nan).notna()):
             whole = bool(len(ids)) and bool((ids % 1 == 0).all())
             table["particle"] = ids.astype(np.int64) if whole else ids

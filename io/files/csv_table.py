@@ -220,7 +220,8 @@ def _sound_table(
 def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
     """Read a CSV file as text; blank lines are skipped.
 
-    Returns the header, the cells of each column, and the number of each row in the file.
+    Returns the header, the cells of each column, and the number of each row in the file. A column
+    without a name, such as an index, gets the one that pandas gives it.
     Raises InputError for an empty file, another separator, and rows of different lengths.
     """
     lines = read_text(file, _EXPORT).split("\n")
@@ -243,7 +244,8 @@ def _cells(file: Path) -> tuple[list[str], Sequence[Sequence[str]], list[int]]:
         "complete the row; a decimal comma must be a point",
     )
     content = list(zip(*rows)) or [()] * len(header)
-    return [name.strip() for name in header], content, numbers[1:]
+    names = [name.strip() or f"Unnamed: {i}" for i, name in enumerate(header)]
+    return names, content, numbers[1:]
 
 
 def _split(line: str, where: str) -> list[str]:

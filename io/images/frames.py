@@ -182,6 +182,9 @@ def _contiguous_stack(tiff: Any, pages: int, path: Path) -> _Stack | None:
     page = tiff.pages[0]
     if page.samplesperpixel != 1 or page.photometric == 0:
         return None
+    described = tiff.is_imagej or tiff.is_shaped or tiff.is_ome
+    if page.subifds is not None or not described:  # a damaged file can count billions of subifds
+        return None
     count = int(np.prod(tiff.series[0].shape)) // max(page.size, 1)
     count = max(count, int((tiff.imagej_metadata or {}).get("images", 0)))
     if count <= pages or not page.is_contiguous:

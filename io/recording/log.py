@@ -293,6 +293,8 @@ def _open(path: Path) -> tuple[LogHeader, int]:
             if not head.startswith(MAGIC) or len(head) < len(MAGIC) + _CRC.size:
                 raise _no_log(path, "is no recording of telerig")
             (length,) = _CRC.unpack(head[-_CRC.size :])
+            if length > path.stat().st_size:
+                raise _no_log(path, "its header is damaged")
             text = stream.read(length)
             crc = stream.read(_CRC.size)
     except OSError as error:

@@ -46,6 +46,8 @@ def read_wav(path: Path) -> Recording:
         rate, samples = wavfile.read(path)
     if any("EOF" in str(one.message) for one in warned):
         raise InputError("ends too early", where=str(path), todo=EXPORT_AGAIN)
+    if not samples.size:
+        raise InputError("holds no samples", where=str(path), todo=EXPORT_AGAIN)
     values = samples.reshape(len(samples), -1).astype(float)
     if samples.dtype == np.uint8:
         values = (values - 128) / 128

@@ -72,6 +72,8 @@ def _checked(job: Any) -> Job:
             raise ValueError(f"a job garbles {name!r}")
     if max(map(len, f"{job['dataset']}/{job['run']}".split("/"))) > _LONGEST_NAME:
         raise ValueError("a job has a dataset or run with too long a name")
+    if not isinstance(job.get("host") or "", str):
+        raise ValueError("a job garbles 'host'")
     if not isinstance(job.get("figures") or {}, dict):
         raise ValueError("a job garbles 'figures'")
     return dict(job)

@@ -45,7 +45,7 @@ def check(accounts: list[Account]) -> None:
         else:
             assert one.wrong == 0, one
             assert one.not_accounted == 0, one
-            assert one.slightly_wrong <= 0.001 * one.sent, one
+            assert one.slightly_wrong <= 0.001 * one.sent + 3 * np.sqrt(0.001 * one.sent), one
             assert one.latest_s < 0.02, one
 
 
@@ -76,6 +76,9 @@ def test_a_hundred_recordings_with_faults(tmp_path: Path) -> None:
             check(found)
         except (AssertionError, InputError) as error:
             failed.append(f"{seed}: {error}")
+    slight, sent = (sum(getattr(a, k) for a in accounts) for k in ("slightly_wrong", "sent"))
+    if slight > 0.001 * sent:
+        failed.append(f"{slight} of {sent} are wrong by less than the motion hides")
     if file := os.environ.get("TELERIG_ACCOUNTS"):
         Path(file).write_text("\n".join([table(accounts), *failed]), encoding="utf-8")
     assert not failed, "\n".join(failed)

@@ -1,0 +1,62 @@
+"""Damaged files that the fuzz tests once found to be read wrongly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from telerig.errors import InputError
+from telerig.estimator.tracking.tracks import read_track_table
+from telerig.io.exchange.importing.binary_recordings import read_wav
+from telerig.io.files.csv_table import Column, read_table
+from telerig.io.images.frames import open_frames
+from telerig.io.recording.log import MAGIC, scan_log
+from telerig.io.report.batch.report import write_batch_report
+
+
+def test_a_column_without_a_name_gets_one(tmp_path: Path) -> None:
+    file = tmp_path / "t.csv"
+    file.write_text('t_s,,"x"\n1,2,a\n', encoding="utf-8")
+    assert list(read_table(file, [Column("t_s")], extra=True)) == ["t_s", "Unnamed: 1", "x"]
+
+
+def test_a_particle_that_is_infinite_is_a_name(tmp_path: Path) -> None:
+    file = tmp_path / "tracks.csv"
+    file.write_text("frame,particle,t_s,x_mm,y_mm,z_mm\n0,inf,0,1,2,3\n", encoding="utf-8")
+    assert read_track_table(file)["particle"].tolist() == ["inf"]
+
+
+def test_a_wav_file_without_samples_is_refused(tmp_path: Path) -> None:
+    from scipy.io import wavfile
+
+    wavfile.write(tmp_path / "a.wav", 100, np.zeros(0, np.int16))
+    with pytest.raises(InputError, match="holds no samples"):
+        read_wav(tmp_path / "a.wav")
+
+
+def test_a_recording_whose_header_states_gigabytes_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "recording.raw"
+    file.write_bytes(MAGIC + b"\xf0\xff\xff\xff" + bytes(64))
+    with pytest.raises(InputError, match="header is damaged"):
+        scan_log(file)
+
+
+def test_a_batch_whose_job_garbles_its_host_is_refused(tmp_path: Path) -> None:
+    job = '{"dataset": "a", "run": "b", "kind": "smooth", "status": "done", "words": "", "host": ["a"]}'
+    (tmp_path / "batch.json").write_text(f'{{"jobs": [{job}]}}', encoding="utf-8")
+    with pytest.raises(InputError, match="garbles 'host'"):
+        write_batch_report(tmp_path)
+
+
+@pytest.mark.parametrize("kind", [{"imagej": True}, {"metadata": {"axes": "TYX"}}])
+def test_stacks_with_one_page_header_are_still_read(
+    kind: dict[str, object], tmp_path: Path
+) -> None:
+    stack = np.arange(3 * 16 * 24, dtype=np.uint8).reshape(3, 16, 24)
+    tifffile.imwrite(tmp_path / "left.tif", stack, photometric="minisblack", **kind)  # type: ignore[arg-type]
+    frames = open_frames(tmp_path, "left")
+    assert frames is not None and len(frames) == 3
+    np.testing.assert_array_equal(frames.read(2), stack[2])

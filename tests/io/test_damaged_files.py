@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +46,8 @@ def test_a_recording_whose_header_states_gigabytes_is_refused(tmp_path: Path) ->
 
 
 def test_a_batch_whose_job_garbles_its_host_is_refused(tmp_path: Path) -> None:
-    job = '{"dataset": "a", "run": "b", "kind": "smooth", "status": "done", "words": "", "host": ["a"]}'
-    (tmp_path / "batch.json").write_text(f'{{"jobs": [{job}]}}', encoding="utf-8")
+    job = dict.fromkeys(("dataset", "run", "kind", "status", "words"), "") | {"host": ["a"]}
+    (tmp_path / "batch.json").write_text(json.dumps({"jobs": [job]}), encoding="utf-8")
     with pytest.raises(InputError, match="garbles 'host'"):
         write_batch_report(tmp_path)
 

@@ -68,7 +68,8 @@ class Channel:
 class Alignment:
     """Hold the offset of a clock.
 
-    offset_s, sd_s : a sample stamped t was measured at t - offset_s.
+    offset_s, sd_s : a sample stamped t was measured at t - offset_s. The sd includes how far the
+        channels disagree.
     nats : log-likelihood ratio at the peak, against no connection at all.
     runner_up_nats, runner_up_s : the same at the best other lag, and that lag.
     reversed_nats : the best with the record reversed in time, which no true connection survives.
@@ -139,6 +140,7 @@ def align(
     second = int(np.argmax(others))
     backward = [_Profile.of(c, readings, f, reverse=True) for c, f in zip(used, filters)]
     place, sd = _refined(total, peak)
+    sd *= _disagreement(forward, sizes, tried, peak + place, 2 * frames.knots)
     offsets = lags * frames.step_s
     ends = np.flatnonzero(tried)[[0, -1]]
     edge = max(round(_END_S / frames.step_s), 1)
@@ -290,6 +292,27 @@ def _lobe(total: Array, peak: int) -> slice:
                 break
         ends.append(lowest)
     return slice(ends[0], ends[1] + 1)
+
+
+def _disagreement(
+    profiles: Sequence[_Profile], sizes: Sequence[float], tried: Bools, place: float, reach: int
+) -> float:
+    """Return the factor by which the channels' own peaks scatter more than their sds say, 1 at
+    least (Birge, Phys. Rev. 40:207, 1932). Different low-pass filters of a sensor's axes do that.
+
+    place : of the common peak, in lags.  reach : so far from it a channel's own may lie.
+    """
+    squares = []
+    for profile, size in zip(profiles, sizes):
+        own = _total([profile], [size], tried)
+        low = max(round(place) - reach, 0)
+        peak = low + int(np.argmax(own[low : round(place) + reach + 1]))
+        if own[peak] > _LEAST_NATS and abs(peak - round(place)) < reach:
+            shift, sd = _refined(own, peak)
+            squares.append(((peak + shift - place) / sd) ** 2)
+    if len(squares) < 2:
+        return 1.0
+    return max(1.0, float(np.sqrt(np.sum(squares) / (len(squares) - 1))))
 
 
 def _refined(total: Array, peak: int) -> tuple[float, float]:

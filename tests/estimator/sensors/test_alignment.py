@@ -1,0 +1,165 @@
+"""Clocks and mounting of sensors, by motion made here and by a real box of two sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.random import Generator
+
+from telerig.arrays import Array
+from telerig.estimator.sensors.accelerations import (
+    Accelerations,
+    Grid,
+    of_positions,
+    of_readings,
+)
+from telerig.estimator.sensors.alignment import Alignment, Channel, align
+from telerig.estimator.sensors.mounting import Felt, mounting, slope
+
+GRID = Grid(0.0, 0.002, 1000, 5)
+BOX = REAL / "accelerometers"
+UP = np.array([0.0, -1.0, 0.0])
+GRAVITY = 9806.65
+
+
+def motion(rng: Generator, seconds: float) -> tuple[Array, Array, Array]:
+    """(t, place, acceleration) every 0.5 ms: sums of 60 sines along three axes, mm and mm/s^2."""
+    t = np.arange(-round(seconds * 2000), round((2 + seconds) * 2000)) / 2000
+    w = 2 * np.pi * rng.uniform(3.0, 40.0, (60, 3))
+    a, phase = rng.normal(size=(60, 3)) * 100, rng.uniform(0, 2 * np.pi, (60, 3))
+    sines = a * np.sin(w * t[:, None, None] + phase)
+    return t, (-sines / w**2).sum(1), sines.sum(1)
+
+
+def test_positions_and_readings_give_the_same_accelerations() -> None:
+    """Beside the closed form: a cubic B-spline of knot spacing h weakens a sine by sinc^4."""
+    t = np.arange(0, 2, 5e-4)
+    w = 2 * np.pi * 12.0
+    place, acceleration = np.sin(w * t)[:, None], -(w**2) * np.sin(w * t)[:, None]
+    seen = of_positions(GRID, t, place)
+    felt, known = of_readings(GRID, t, acceleration).at(GRID.t_s)
+    both = known & seen.known
+    assert np.count_nonzero(both) > 900
+    expected = -(w**2) * np.sin(w * GRID.t_s) * np.sinc(12.0 * GRID.width_s) ** 4
+    np.testing.assert_allclose(seen.values[both, 0], expected[both], atol=0.02 * w**2)
+    np.testing.assert_allclose(felt[both, 0], expected[both], atol=0.02 * w**2)
+
+
+def test_a_gap_stays_a_gap() -> None:
+    t = np.delete(np.arange(0, 2, 0.002), slice(400, 450))
+    found = of_positions(GRID, t, np.sin(9 * t)[:, None])
+    assert not found.known[391:459].any()
+    assert found.known[:380].any() and found.known[470:].any()
+
+
+def aligned(
+    rng: Generator, offset_s: float, *, around_s: float = 20.0, connected: bool = True
+) -> Alignment:
+    t, place, acceleration = motion(rng, around_s)
+    other = motion(rng, around_s)[2]
+    reading = (acceleration if connected else other) + 5.0 * rng.normal(size=acceleration.shape)
+    seen = place[(t >= 0) & (t < 2)][::4]
+    seen = seen + 0.02 * rng.normal(size=seen.shape)
+    images = of_positions(GRID, GRID.t_s, seen)
+    felt = of_readings(GRID, t + offset_s, reading)
+    channels = [Channel("xyz"[k], images.values[:, k], images.known, (0,)) for k in range(2)]
+    found = align(GRID, channels, [felt], 0.006)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("offset_s", [0.0, -0.06, 0.3, 17.0])
+def test_an_offset_is_found_within_its_standard_deviation(offset_s: float) -> None:
+    errors = []
+    for seed in range(5):
+        found = aligned(np.random.default_rng(seed), offset_s)
+        assert found.unique and found.at_zero == (offset_s == 0)
+        assert abs(found.offset_s - offset_s) < 2e-4
+        errors.append((found.offset_s - offset_s) / found.sd_s)
+    assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 2.0
+
+
+def test_a_record_without_a_connection_is_not_taken() -> None:
+    for seed in range(10):
+        rng = np.random.default_rng(100 + seed)
+        found = aligned(rng, 0.3, around_s=3.0, connected=False)
+        assert not found.unique and not found.at_zero
+
+
+def test_a_single_frequency_is_ambiguous_by_whole_periods() -> None:
+    t = np.arange(-5, 7, 5e-4)
+    rng = np.random.default_rng(4)
+    seen = -np.sin(60 * GRID.t_s)[:, None] / 3600 * 500 + 0.02 * rng.normal(size=(1000, 1))
+    images = of_positions(GRID, GRID.t_s, seen)
+    reading = 500 * np.sin(60 * t)[:, None] * np.ones(3) + 5 * rng.normal(size=(len(t), 3))
+    channel = Channel("x", images.values[:, 0], images.known, (0,))
+    found = align(GRID, [channel], [of_readings(GRID, t, reading)], 0.006)
+    assert found is not None and not found.unique
+
+
+def sensor(rng: Generator, rows: Array) -> tuple[Array, Accelerations, list[Felt]]:
+    """Reading at rest, readings of a sensor with these axes, and what it should feel."""
+    t, place, acceleration = motion(rng, 0.5)
+    reading = (acceleration + GRAVITY * UP) @ rows.T + 5.0 * rng.normal(size=acceleration.shape)
+    seen = place[(t >= 0) & (t < 2)][::4] + 0.02 * rng.normal(size=(1000, 3))
+    images = of_positions(GRID, GRID.t_s, seen)
+    felt = [Felt(d, images.values[:, k], images.known) for k, d in enumerate(np.eye(3)[:2])]
+    return np.median(reading, axis=0), of_readings(GRID, t, reading), felt
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        np.eye(3),
+        np.eye(3)[[2, 1, 0]],
+        np.diag([-1.0, 1.0, 1.0]),
+        np.eye(3)[[1, 0, 2]],
+        -np.eye(3),
+    ],
+    ids=["right", "x and z exchanged", "x reversed", "x and y exchanged", "all reversed"],
+)
+def test_axes_are_named_that_fit_gravity_and_images(rows: Array) -> None:
+    """Only what the images show can be told: z is not seen, so its sign is that of the nearest."""
+    at_rest, readings, felt = sensor(np.random.default_rng(7), rows)
+    values, known = readings.at(GRID.t_s)
+    found = mounting(np.eye(3), at_rest, UP, values, known, felt)
+    assert found.clear == (not np.array_equal(rows, np.eye(3)))
+    np.testing.assert_allclose(np.abs(found.axes), np.abs(rows))
+    np.testing.assert_allclose(found.axes[:, :2], rows[:, :2])
+    assert found.gain == pytest.approx(1.0, abs=5 * found.gain_sd)
+    assert not found.wrong_gain
+
+
+def test_a_unit_shows_as_a_gain() -> None:
+    at_rest, readings, felt = sensor(np.random.default_rng(8), np.eye(3))
+    values, known = readings.at(GRID.t_s)
+    found = mounting(np.eye(3), at_rest / 9.80665, UP, values / 9.80665, known, felt)
+    assert found.wrong_gain
+    assert found.gain == pytest.approx(1 / 9.80665, rel=0.05)
+
+
+def test_a_slope_with_correlated_errors_has_a_true_standard_deviation() -> None:
+    rng, ratios = np.random.default_rng(9), []
+    for _ in range(60):
+        x, error = (np.convolve(rng.normal(size=2000), np.ones(30), "same") for _ in range(2))
+        found, sd = slope(2.0 * x + error, x)
+        ratios.append((found - 2.0) / sd)
+    assert 0.75 < float(np.std(ratios)) < 1.35
+
+
+@pytest.mark.skipif(not BOX.is_dir(), reason="the real records are not here")
+def test_two_sensors_of_one_real_box() -> None:
+    """The 8 g sensor lags by 1.2 +- 0.3 ms (cross-correlation, 0.5-20 Hz)."""
+    one = pd.read_csv(BOX / "accelerometer_16g.csv").to_numpy(float)
+    two = pd.read_csv(BOX / "accelerometer_8g.csv").to_numpy(float)[3:]
+    grid = replace(GRID, start_s=one[0, 0], count=int(np.ptp(one[:, 0]) / 0.002), knots=10)
+    first = of_readings(grid, one[:, 0], GRAVITY * one[:, 1:])
+    second = of_readings(grid, two[:, 0] + 4.0, GRAVITY * two[:, 1:])
+    channels = [Channel("xyz"[k], first.values[:, k], first.known, (0,)) for k in range(3)]
+    found = align(first.grid, channels, [second], 0.006)
+    assert found is not None and found.unique
+    assert abs(found.offset_s - 4.0 - 1.2e-3) < 0.3e-3 + 2 * found.sd_s
+    assert 1e-4 < found.sd_s < 5e-4

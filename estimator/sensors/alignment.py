@@ -18,7 +18,7 @@ from telerig.estimator.sensors.accelerations import Accelerations, Grid
 
 _LEAST_NATS = 20.0
 _MOST_OF_PEAK = 0.7
-"""Largest share of the peak that other lags, or the reversed record, may reach. In 160 simulated
+"""Largest share of the peak that other lags, or the reversed record, may reach. In the simulated
 runs without a connection 0.7 was never reached by both; see docs/decisions/025."""
 
 _LEAST_OVERLAP = 0.3
@@ -56,10 +56,10 @@ class Channel:
         x = np.concatenate([readings[s].values for s in self.sensors], axis=1)
         index = np.arange(len(self.values)) + at - (len(self.values) - 1)
         inside = (index >= 0) & (index < len(x)) & self.known
-        y, design = self.values[inside], x[index[inside]]
+        both = np.column_stack([self.values, x[np.clip(index, 0, len(x) - 1)]])
         if whitening is not None:
-            y = np.convolve(y, whitening, "valid")
-            design = np.stack([np.convolve(c, whitening, "valid") for c in design.T], -1)
+            both, inside = filtered(both, inside, whitening)
+        y, design = both[inside, 0], both[inside, 1:]
         y, design = y - y.mean(), design - design.mean(0)
         return y, np.asarray(design @ np.linalg.lstsq(design, y, rcond=None)[0])
 
@@ -179,8 +179,8 @@ class _Profile:
         turn = slice(None, None, -1 if reverse else 1)
         x = np.concatenate([readings[s].values for s in channel.sensors], axis=1)[turn]
         there = np.all([readings[s].known for s in channel.sensors], axis=0)[turn]
-        x, usable = _filtered(x, there, whitening)
-        whole, there = _filtered(channel.values[:, None], channel.known, whitening)
+        x, usable = filtered(x, there, whitening)
+        whole, there = filtered(channel.values[:, None], channel.known, whitening)
         known = there.astype(float)
         if not there.any():
             none = np.zeros(len(x) + len(known) - 1)
@@ -215,7 +215,7 @@ class _Profile:
         return effective_size(y - fit, fit)
 
 
-def _filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bools]:
+def filtered(values: Array, known: Bools, whitening: Array) -> tuple[Array, Bools]:
     """Return filtered columns (n, D) and where all their samples are known (n,)."""
     reach = len(whitening) - 1
     out = np.stack([np.convolve(c, whitening)[: len(c)] for c in values.T], -1)

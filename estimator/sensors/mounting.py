@@ -13,13 +13,14 @@ from itertools import permutations, product
 import numpy as np
 
 from telerig.arrays import Array, Bools
-from telerig.estimator.sensors.alignment import effective_size, whitening_filter
+from telerig.estimator.sensors.alignment import effective_size, filtered, whitening_filter
 
 CLEAR_NATS = 8.0
 _SHIFTS = 24
 _CHANCE = 1.5
 _UPRIGHT_DEG = 30.0
 _SDS = 5.0
+_LEAST_SAMPLES = 60
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,14 @@ class _Part:
     @classmethod
     def of(cls, felt: Felt, x: Array, known: Bools) -> _Part | None:
         both = felt.known & known
-        if np.count_nonzero(both) < 20:
+        if np.count_nonzero(both) < _LEAST_SAMPLES:
             return None
-        y, x = felt.values[both], x[both]
-        y, x = y - y.mean(), x - x.mean(0)
-        whitening = whitening_filter(y - x @ np.linalg.lstsq(x, y, rcond=None)[0])
-        y = np.convolve(y, whitening, "valid")
-        x = np.stack([np.convolve(column, whitening, "valid") for column in x.T], -1)
+        y, x = felt.values - felt.values[both].mean(), x - x[both].mean(0)
+        rest = y[both] - x[both] @ np.linalg.lstsq(x[both], y[both], rcond=None)[0]
+        whole, used = filtered(np.column_stack([y, x]), both, whitening_filter(rest))
+        if np.count_nonzero(used) < _LEAST_SAMPLES:
+            return None
+        y, x = whole[used, 0], whole[used, 1:]
         fit = x @ np.linalg.lstsq(x, y, rcond=None)[0]
         return cls(felt.direction, y, x, effective_size(y - fit, fit), felt.whole)
 

@@ -34,6 +34,7 @@ _LEAST_RISE_MM_S = 5.0
 _RATIO, _SURE, _LEAST_EXPECTED = 1.2, 6.0, 20.0
 _WINDOW_S, _LEAST_FRAMES = 0.1, 10
 _WINDOW_SURE = 3.0
+_BEYOND_NOISE = 3.0
 
 
 @dataclass(frozen=True)
@@ -161,12 +162,19 @@ class Group:
 def residual_contradictions(
     solution: Solution, fit: WholeFit, left: Array
 ) -> Iterator[Contradiction]:
-    """Return the sources whose residuals are larger than a right model leaves them."""
+    """Return the sources whose residuals are larger than a right model leaves them, and larger
+    than the noise itself.
+
+    The second keeps short runs, whose fit takes up most of the noise, from false alarms where the
+    noise is not quite as stated.
+    """
     for group in groups(solution, fit, left):
         seen, draws = float(group.square.sum()), group.expected.shape[-1]
         expected = float(group.expected.sum() / draws)
         spread = np.sqrt(2 * expected * (1 + 1 / draws))
         sure = seen > expected + _SURE * spread and seen > _RATIO * expected
+        count = len(group.square)
+        sure &= seen > count + _BEYOND_NOISE * np.sqrt(2 * count)
         if expected < _LEAST_EXPECTED or not sure:
             continue
         first, last = _when(solution, group)

@@ -42,8 +42,9 @@ _SLOWEST_S = 0.05
 _MOST_STEPS = 3e6
 _LEAST_SAMPLES = 100
 _DIFFERENT_SDS = 5.0
-_LONG_S = 6.0
+_LONG_S = 1.2
 _WINDOW_S = 3.0
+_LEAST_WINDOWS = 3
 _WINDOW_MARGIN_S = 0.1
 _FACTOR_NATS = 60.0
 _FRAME_FACTORS = {1e-3: "milliseconds", 1e3: "1000 s", 0.5: "", 2.0: ""}
@@ -436,7 +437,8 @@ def _without_drift(
     t = problem.t_s
     if t[-1] - t[0] < _LONG_S:
         return sensor, []
-    edges = np.linspace(t[0], t[-1], int((t[-1] - t[0]) / _WINDOW_S) + 1)
+    windows = max(round((t[-1] - t[0]) / _WINDOW_S), _LEAST_WINDOWS)
+    edges = np.linspace(t[0], t[-1], windows + 1)
     group = [
         problem.accelerometers.index(s) for s in problem.accelerometers if s.name == sensor.name
     ]
@@ -456,7 +458,7 @@ def _without_drift(
             places.append((low + high) / 2)
             offsets.append(found.offset_s)
             sds.append(found.sd_s)
-    if len(places) < 3:
+    if len(places) < _LEAST_WINDOWS:
         return sensor, []
     middle = float(np.mean(places))
     design = (

@@ -47,6 +47,7 @@ _WINDOW_S = 3.0
 _LEAST_WINDOWS = 3
 _WINDOW_MARGIN_S = 0.1
 _FACTOR_NATS = 60.0
+_LEAST_FRAMES = 150
 _FRAME_FACTORS = {1e-3: "milliseconds", 1e3: "1000 s", 0.5: "", 2.0: ""}
 _CLEAR_GAIN = 5.0
 _USUAL_GAIN = (0.75, 1.35)
@@ -834,13 +835,18 @@ def _rise(problem: SmoothingProblem) -> list[Finding]:
 
 def _frame_times(problem: SmoothingProblem) -> Finding | None:
     """Return a factor of the frames' times with which images and sensors or encoder agree."""
+    if len(problem.t_s) < _LEAST_FRAMES:
+        return None
     nats: dict[float, float] = {}
     for factor in _FRAME_FACTORS:
         trial = replace(problem, t_s=problem.t_s * factor)
         images = _Images.of(trial)
         if images is not None:
             found = _of_images(trial, images, images.encoder_alignment(trial))
-            nats[factor] = sum(c.nats for c in found if c.unique)
+            shift = abs(factor - 1) * abs(float(problem.t_s[0])) + SAME_CLOCK_S
+            free = any(s.clock == "unknown" for s in problem.accelerometers)
+            near = [c for c in found if free or abs(c.offset_s) < shift]
+            nats[factor] = sum(c.nats for c in near if c.unique)
     best = max(nats, key=lambda f: nats[f], default=None)
     if best is None or nats[best] < _FACTOR_NATS:
         return None

@@ -154,9 +154,10 @@ def _assist(other_end: Connection, end: Connection, prepare: Callable[[], object
     """Until the other end is closed: then ``recv`` ends this copy by EOFError."""
     other_end.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # an exit within an import would be a traceback
     try:
         prepare()
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit())
         while True:
             end.send(_answer(*end.recv()))
     except (EOFError, BrokenPipeError):

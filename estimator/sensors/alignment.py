@@ -21,6 +21,9 @@ _MOST_OF_PEAK = 0.7
 """Largest share of the peak that other lags, or the reversed record, may reach. In the simulated
 runs without a connection 0.7 was never reached by both; see docs/decisions/025."""
 
+_LONG_RECORD, _MOST_SENSORS = 200_000, 1
+"""In longer records, channels that several sensors explain take gigabytes and bring little."""
+
 _LEAST_OVERLAP = 0.3
 _LEAST_SAMPLES = 60
 _END_S = 0.005
@@ -119,7 +122,9 @@ def align(
     own = readings[0].grid
     shift = round((frames.start_s - own.start_s) / frames.step_s)
     lags = np.arange(-(frames.count - 1), own.count) - shift
+    most = _MOST_SENSORS if own.count > _LONG_RECORD else len(readings)
     used = [c for c in channels if np.count_nonzero(c.known) > _LEAST_SAMPLES]
+    used = [c for c in used if len(c.sensors) <= most] or used
     if not used:
         return None
     first = [_Profile.of(c, readings, whitening_filter(c.values[c.known])) for c in used]

@@ -162,6 +162,28 @@ def _gain(axes: Array, parts: Sequence[_Part]) -> tuple[float, float]:
     return 1 / inverse, sd / inverse**2
 
 
+def preference(y: Array, known: Bools, stated: Array, other: Array) -> float:
+    """Return the log-likelihood of y (n,) as a multiple of another signal (n,) less that of the
+    stated one, by generalised least squares.
+    """
+    if np.count_nonzero(known) < _LEAST_SAMPLES:
+        return 0.0
+    both = np.column_stack([y, stated, other])
+    both = both - both[known].mean(0)
+    x = both[known, 1:]
+    rest = both[known, 0] - x @ np.linalg.lstsq(x, both[known, 0], rcond=None)[0]
+    whole, used = filtered(both, known, whitening_filter(rest))
+    if np.count_nonzero(used) < _LEAST_SAMPLES:
+        return 0.0
+    target, squares = whole[used, 0], []
+    for x in whole[used, 1:].T:
+        gain = max(float(x @ target) / max(float(x @ x), 1e-12), 0.0)
+        left = target - gain * x
+        squares.append((max(float(left @ left), 1e-12), effective_size(left, x)))
+    size = min(size for _, size in squares)
+    return 0.5 * size * float(np.log(squares[0][0] / squares[1][0]))
+
+
 def slope(y: Array, x: Array) -> tuple[float, float]:
     """Return the coefficient of y on x (n,), means removed, and its sd with correlated errors."""
     y, x = y - y.mean(), x - x.mean()

@@ -124,7 +124,7 @@ def smooth(
     accept : codes of faults that are used as they are, where they would be refused (the error
         names its code): SENSOR_UNIT, SENSOR_GRAVITY, SENSOR_AXES, SENSOR_MOUNT, SENSOR_SCALE,
         SENSOR_CLOCK, ENCODER_SIGN, ENCODER_UNIT, ENCODER_STUCK, ENCODER_SCALE, ENCODER_JUMP,
-        ENCODER_CLOCK, FRAME_TIMES.
+        ENCODER_CLOCK, FRAME_TIMES, RISE_SPEED.
 
     Returns a `Smoothing`: the tables ``trajectories`` and ``shake``, the ``verdict``, and
     ``summary``, whose "warnings" say what the checks found, what was assumed and which samples are

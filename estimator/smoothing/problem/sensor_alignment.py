@@ -21,10 +21,17 @@ from telerig.estimator.sensors.accelerations import (
     of_positions,
     of_readings,
 )
-from telerig.estimator.sensors.alignment import Alignment, Channel, align, effective_size
+from telerig.estimator.sensors.alignment import Alignment, Channel, align
 from telerig.estimator.sensors.findings import Code, Finding
 from telerig.estimator.sensors.image_motion import accelerations, directions, frame_grid
-from telerig.estimator.sensors.mounting import Felt, Mounting, mounting, slope
+from telerig.estimator.sensors.mounting import (
+    CLEAR_NATS,
+    Felt,
+    Mounting,
+    mounting,
+    preference,
+    slope,
+)
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     Accelerometer,
@@ -48,15 +55,19 @@ _LEAST_WINDOWS = 3
 _WINDOW_MARGIN_S = 0.1
 _FACTOR_NATS = 60.0
 _LEAST_FRAMES = 150
-_FRAME_FACTORS = {1e-3: "milliseconds", 1e3: "1000 s", 0.5: "", 2.0: ""}
+_FRAME_FACTORS = {
+    1e-3: "they are in milliseconds",
+    0.5: "the stated frame rate is half the true one",
+    2.0: "the stated frame rate is twice the true one",
+}
 _CLEAR_GAIN = 5.0
+_CORRELATED = 10.0
+"""So many neighbouring pixels of a mark count as one, because the shake moves them alike."""
+
 _USUAL_GAIN = (0.75, 1.35)
 _FASTEST_MM_S = 3000.0
-_HOVERS_MM_S = 20.0
 _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
-_EXCHANGED = 1.05
-_LEAST_NATS = 8.0
 
 
 def aligned(
@@ -67,14 +78,18 @@ def aligned(
     Sensors whose clock is unknown and cannot be found are left out.
 
     known : what other checks have found. They are returned as well; of axes that gravity alone
-        has shown to be wrong, the images tell which would be right.
+        has shown to be wrong, the images tell which would be right, and a clock that hardly covers
+        the frames is no fault if they show its offset.
     """
     placed, found = _aligned(problem, [f for f in known if f.code is not None])
     better: dict[tuple[Code | None, Any], Finding] = {
         (f.code, f.fix.get("sensor")): f for f in found if f.code is not None
     }
+    confirmed = {s.name for s in placed.accelerometers if s.confirmed}
     out = []
     for finding in known:
+        if finding.code == Code.SENSOR_CLOCK and finding.fix.get("sensor") in confirmed:
+            continue
         mine = better.pop((finding.code, finding.fix.get("sensor")), None)
         if mine is not None and mine.code == Code.SENSOR_AXES:
             finding = replace(finding, todo=mine.todo, fix=mine.fix)
@@ -87,17 +102,19 @@ def _aligned(
 ) -> tuple[SmoothingProblem, list[Finding]]:
     if not problem.bubbles and not len(problem.references):
         return _cut(problem), []
-    images = _Images.of(problem)
+    images, wrong = _Images.of(problem), None
     encoder = None if images is None else images.encoder_alignment(problem)
+    findings: list[Finding]
     if images is None or not any(c.connected for c in _of_images(problem, images, encoder)):
         wrong = _frame_times(problem)
         if wrong is not None:
-            return _cut(problem), [wrong]
+            images = None
     if images is None:
         sensors = [_unaligned(s, problem.t_s) for s in problem.accelerometers]
-        said = [f for _, found in sensors for f in found]
-        return _with(problem, [s for s, _ in sensors if s is not None]), said
-    findings: list[Finding] = []
+        findings = [*([] if wrong is None else [wrong]), *(f for _, said in sensors for f in said)]
+        findings += [*_stuck(problem), *_rise(problem)] if wrong is None else []
+        return _with(problem, [s for s, _ in sensors if s is not None]), findings
+    findings = []
     placed: dict[int, Accelerometer] = {}
     for group, clock in _clocks(problem, images):
         if not _sure(clock):
@@ -110,7 +127,7 @@ def _aligned(
                 placed[index] = sensor
     problem = _with(problem, [placed[i] for i in sorted(placed)])
     findings += _mountings(problem, images, refused)
-    findings += _encoder(problem, images, encoder)
+    findings += _encoder(problem, images, encoder, [*refused, *findings])
     findings += _rise(problem)
     near = [near_frames(s, problem.t_s) for s in problem.accelerometers]
     return _with(problem, near), findings
@@ -440,9 +457,7 @@ def _without_drift(
         return sensor, []
     windows = max(round((t[-1] - t[0]) / _WINDOW_S), _LEAST_WINDOWS)
     edges = np.linspace(t[0], t[-1], windows + 1)
-    group = [
-        problem.accelerometers.index(s) for s in problem.accelerometers if s.name == sensor.name
-    ]
+    group = [i for i, s in enumerate(problem.accelerometers) if s.name == sensor.name]
     places, offsets, sds = [], [], []
     for low, high in pairwise(edges):
         near = (sensor.t_s > low - _WINDOW_MARGIN_S) & (sensor.t_s < high + _WINDOW_MARGIN_S)
@@ -452,7 +467,7 @@ def _without_drift(
             replace(c, values=c.values[first:last], known=c.known[first:last])
             for c in images.channels(problem, group)
         ]
-        if np.count_nonzero(near) < 100:
+        if np.count_nonzero(near) < _LEAST_SAMPLES:
             continue
         found = align(grid, channels, [_readings(grid, sensor.of(near))], SAME_CLOCK_S)
         if found is not None and found.nats > found.reversed_nats and np.isfinite(found.sd_s):
@@ -501,10 +516,13 @@ def _mountings(
     refused : faults that are known. The unit of a sensor is not judged twice, and without gravity
         its axes are not.
     """
-    without = {f.where for f in refused if f.code == Code.SENSOR_GRAVITY}
+    without = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_GRAVITY}
     measured = {f.fix.get("sensor") for f in refused if f.code == Code.SENSOR_UNIT}
-    sensors = [s for s in problem.accelerometers if s.confirmed and not s.unused_axes]
-    sensors = [s for s in sensors if not any(w.endswith(s.name) for w in without)]
+    sensors = [
+        s
+        for s in problem.accelerometers
+        if s.confirmed and not s.unused_axes and s.name not in without
+    ]
     read = {s.name: _at_frames(images, s) for s in sensors}
     exchanged = _exchanged(problem, images, sensors, read)
     if exchanged is not None:
@@ -521,8 +539,7 @@ def _mountings(
             for s in sensors
         }  # fmt: skip
         worst = max(
-            (n for n, m in judged.items() if m.clear and axes[n] is not m.axes
-             and not np.allclose(axes[n], m.axes)),
+            (n for n, m in judged.items() if m.clear and not np.allclose(axes[n], m.axes)),
             key=lambda n: judged[n].lead_nats, default=None,
         )  # fmt: skip
         if worst is None or any(f.fix.get("sensor") == worst for f in findings):
@@ -594,11 +611,7 @@ def _exchanged(
         for two in sensors[i + 1 :]:
             if CARRIAGE in (one.camera, two.camera) or one.camera == two.camera:
                 continue
-            known = read[one.name][1] & read[two.name][1]
-            stated = _pair_score(problem, images, one, two, read, known)
-            other = {one.name: read[two.name], two.name: read[one.name]}
-            swapped = _pair_score(problem, images, one, two, other, known)
-            if swapped - stated > _LEAST_NATS and swapped > _EXCHANGED * stated:
+            if _lead_of_exchange(problem, images, one, two, read) > CLEAR_NATS:
                 names = f"{one.name} and {two.name}"
                 return Finding(
                     "the images of each camera fit the readings of the other camera's sensor",
@@ -610,54 +623,57 @@ def _exchanged(
     return None
 
 
-def _pair_score(
+def _lead_of_exchange(
     problem: SmoothingProblem,
     images: _Images,
     one: Accelerometer,
     two: Accelerometer,
     read: dict[str, tuple[Array, Bools]],
-    known: Bools,
 ) -> float:
-    """Return the log-likelihood ratio of what two cameras show, given their sensors' readings."""
-    total = 0.0
+    """Return by how much the log-likelihood of what two cameras show is larger if the records of
+    their sensors are exchanged.
+    """
+    known = read[one.name][1] & read[two.name][1]
     force = {s.camera: read[s.name][0] @ s.axes for s in (one, two)}
-    parts = [
-        (seen.values[:, k], force[c] @ d, seen.known)
-        for c, _, seen in images.cameras
-        if c in force
-        for k, d in enumerate(directions(problem.cameras[c]))
-    ]
+    exchanged = {s.camera: read[o.name][0] @ s.axes for s, o in ((one, two), (two, one))}
+    lead = 0.0
+    for c, _, seen in images.cameras:
+        if c in force:
+            for k, d in enumerate(directions(problem.cameras[c])):
+                predicted = force[c] @ d, exchanged[c] @ d
+                lead += preference(seen.values[:, k], seen.known & known, *predicted)
     for source in ("marks", "bubbles"):
         for _, values, there, cameras in images.differences(problem, source):
             if set(cameras) == set(force):
-                shared = shared_rows(problem, *cameras)
-                rows = [directions(problem.cameras[c]) for c in cameras]
-                felt = sum(
-                    force[c] @ r.T @ w for c, r, w in zip(cameras, rows, np.split(shared, 2))
+                weights = np.split(shared_rows(problem, *cameras), 2)
+                rows = [w @ directions(problem.cameras[c]) for c, w in zip(cameras, weights)]
+                stated, other = (
+                    np.sum([f[c] @ r for c, r in zip(cameras, rows)], axis=0)
+                    for f in (force, exchanged)
                 )
-                parts.append((values, np.asarray(felt), there))
-    for y, x, there in parts:
-        both = there & known
-        if np.count_nonzero(both) < 20:
-            continue
-        y, x = y[both] - y[both].mean(), x[both] - x[both].mean()
-        gain = max(float(x @ y) / max(float(x @ x), 1e-12), 0.0)
-        rest = y - gain * x
-        total -= (
-            0.5 * effective_size(rest, x) * np.log(float(rest @ rest) / max(float(y @ y), 1e-12))
-        )
-    return total
+                lead += preference(values, there & known, stated, other)
+    return lead
 
 
-def _encoder(problem: SmoothingProblem, images: _Images, clock: Alignment | None) -> list[Finding]:
-    """Return what is wrong with the encoder's sign, unit and clock, or whether it is stuck."""
+def _encoder(
+    problem: SmoothingProblem,
+    images: _Images,
+    clock: Alignment | None,
+    refused: Sequence[Finding],
+) -> list[Finding]:
+    """Return what is wrong with the encoder's sign, unit and clock, or whether it is stuck.
+
+    refused : faults that are known. A sensor that has one is no witness.
+    """
     where = "stage"
     if problem.stage is None:
         return []
     stuck = _stuck(problem)
-    if stuck is not None:
-        return [stuck]
-    gains = [] if images.encoder is None else _gains(problem, images, images.encoder)
+    if stuck:
+        return stuck
+    doubtful = {f.fix.get("sensor") for f in refused}
+    sensors = [s for s in problem.accelerometers if s.confirmed and s.name not in doubtful]
+    gains = [] if images.encoder is None else _gains(problem, images, images.encoder, sensors)
     marked = _gain_of_marks(problem)
     if marked is not None:
         gains.insert(0, marked)
@@ -683,7 +699,10 @@ def _encoder(problem: SmoothingProblem, images: _Images, clock: Alignment | None
 
 
 def _gains(
-    problem: SmoothingProblem, images: _Images, encoder: Accelerations
+    problem: SmoothingProblem,
+    images: _Images,
+    encoder: Accelerations,
+    sensors: Sequence[Accelerometer],
 ) -> list[tuple[float, float]]:
     """Return the true motion over the encoder's, with its sd, by images and by sensors."""
     x, out = encoder.values[:, 0], []
@@ -692,11 +711,10 @@ def _gains(
         if y is not None:
             known = seen.known & encoder.known
             out.append(slope(y[known], x[known]))
-    for sensor in problem.accelerometers:
-        if sensor.confirmed:
-            values, there = _at_frames(images, sensor)
-            known = there & encoder.known
-            out.append(slope((values @ sensor.axes @ problem.axis)[known], x[known]))
+    for sensor in sensors:
+        values, there = _at_frames(images, sensor)
+        known = there & encoder.known
+        out.append(slope((values @ sensor.axes @ problem.axis)[known], x[known]))
     return [(g, sd) for g, sd in out if np.isfinite(g) and np.isfinite(sd) and sd > 0]
 
 
@@ -724,7 +742,7 @@ def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
         return None
     gain = product / square
     spread = max(rest - gain**2 * square, 0.0) / max(count, 1)
-    return gain, max(float(np.sqrt(spread / square * 10)), 1e-4)
+    return gain, max(float(np.sqrt(_CORRELATED * spread / square)), 1e-4)
 
 
 def _gain_finding(gain: float, sd: float, where: str) -> Finding:
@@ -745,22 +763,23 @@ def _gain_finding(gain: float, sd: float, where: str) -> Finding:
     )
 
 
-def _stuck(problem: SmoothingProblem) -> Finding | None:
-    """Return a stretch in which the encoder does not change although the carriage must move."""
+def _stuck(problem: SmoothingProblem) -> list[Finding]:
+    """Return the stretch in which the encoder does not change although the carriage must move."""
     stage = problem.stage
-    assert stage is not None
+    if stage is None:
+        return []
     t, x = stage.t_s, stage.position_mm
     inside = (t >= problem.t_s[0]) & (t <= problem.t_s[-1])
     t, x = t[inside], x[inside]
     if len(t) < 20:
-        return None
+        return []
     change = np.flatnonzero(np.diff(x) != 0)
     ends = np.r_[-1, change, len(x) - 1]
     longest = int(np.argmax(np.diff(ends)))
     first, last = int(ends[longest]) + 1, int(ends[longest + 1])
     length = float(t[last] - t[first])
     if length < _STUCK_S or last - first < 10:
-        return None
+        return []
     if len(change):
         around = np.r_[np.diff(x[: first + 1])[-10:], np.diff(x[last:])[:10]]
         pace = float(np.median(np.diff(t)))
@@ -768,15 +787,17 @@ def _stuck(problem: SmoothingProblem) -> Finding | None:
     else:
         moving = _sweeps(problem)
     if not moving:
-        return None
-    return Finding(
-        f"reads {x[first]:.6g} mm from {t[first]:.6g} to {t[last]:.6g} s without any change, while "
-        "the carriage moves: it is stuck",
-        "stage",
-        "leave those rows out or repair the encoder; without the stage's positions, positions and "
-        "velocities are relative to the carriage",
-        Code.ENCODER_STUCK,
-    )
+        return []
+    return [
+        Finding(
+            f"the encoder reads {x[first]:.6g} mm from {t[first]:.6g} to {t[last]:.6g} s without "
+            "any change, while the carriage moves: it is stuck",
+            "stage",
+            "leave those rows out or repair the encoder; without the stage's positions, positions "
+            "and velocities are relative to the carriage",
+            Code.ENCODER_STUCK,
+        )
+    ]
 
 
 def _sweeps(problem: SmoothingProblem) -> bool:
@@ -803,7 +824,7 @@ def _sweeps(problem: SmoothingProblem) -> bool:
 
 
 def _rise(problem: SmoothingProblem) -> list[Finding]:
-    """Refuse bubbles that rise faster than any bubble; warn of bubbles that hover or sink."""
+    """Return a refusal of bubbles that rise or sink faster than any bubble."""
     speeds = []
     for bubble in problem.bubbles:
         seconds = float(problem.t_s[bubble.last] - problem.t_s[bubble.first])
@@ -812,25 +833,16 @@ def _rise(problem: SmoothingProblem) -> list[Finding]:
     if not speeds:
         return []
     rise = float(np.median(speeds))
-    if abs(rise) > _FASTEST_MM_S:
-        return [
-            Finding(
-                f"the bubbles rise at {rise / 1000:.4g} m/s, which no bubble does",
-                "stage and frames",
-                "check the units of the frames' times and of the encoder",
-                Code.RISE_SPEED,
-            )
-        ]
-    if problem.stage is not None and rise < _HOVERS_MM_S:
-        what = "hover" if rise > -_HOVERS_MM_S else f"sink at {-rise:.3g} mm/s"
-        return [
-            Finding(
-                f"the bubbles {what} in the laboratory, as they can in a counterflow",
-                "stage",
-                "if there is none, check sign and unit of the encoder, and that it is not stuck",
-            )
-        ]
-    return []
+    if abs(rise) <= _FASTEST_MM_S:
+        return []
+    return [
+        Finding(
+            f"the bubbles rise at {rise / 1000:.4g} m/s, which no bubble does",
+            "stage and frames",
+            "check the units of the frames' times and of the encoder",
+            Code.RISE_SPEED,
+        )
+    ]
 
 
 def _frame_times(problem: SmoothingProblem) -> Finding | None:
@@ -850,10 +862,9 @@ def _frame_times(problem: SmoothingProblem) -> Finding | None:
     best = max(nats, key=lambda f: nats[f], default=None)
     if best is None or nats[best] < _FACTOR_NATS:
         return None
-    unit = _FRAME_FACTORS[best]
-    words = f"they are in {unit}" if unit else f"they run {1 / best:g} times too fast"
     return Finding(
-        f"the images agree with the sensors only if the times are multiplied by {best:g}: {words}",
+        f"the images agree with the sensors only if the times are multiplied by {best:g}: "
+        + _FRAME_FACTORS[best],
         "times of the frames",
         f"multiply t_s by {best:g}, or correct the frame rate",
         Code.FRAME_TIMES,

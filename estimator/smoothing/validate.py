@@ -25,6 +25,7 @@ from telerig.estimator.calibration.result.calibration import pair_of_run
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
 from telerig.estimator.smoothing.results_folder import run_sources, with_followed_references
 from telerig.estimator.smoothing.smooth import smooth
+from telerig.estimator.smoothing.verdict.contradiction import speed_warnings
 from telerig.estimator.tracking.tracks import Tracks
 from telerig.io.results.inputs import fingerprints
 from telerig.io.results.manifest import replaced_results
@@ -132,7 +133,8 @@ def validate(
                 track_of(bubble, calibration, run.t_s), calibration,
                 stage=_without(run, mark, rest), model=model, accept=accept,
             )  # fmt: skip
-            warnings += found.summary.get("warnings", ())
+            of_rise = speed_warnings(found.solution)  # marks do not rise
+            warnings += [w for w in found.summary["warnings"] if w not in of_rise]
             done.append(judged(mark, rest, found, motion, calibration.cameras))
     entries = tuple(overall(done, rest) for rest in rests)
     failed = any(entry.verdict is Stillness.FAILED for entry in entries)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -59,6 +60,7 @@ def _dataset(folder: Path, rng: np.random.Generator) -> None:
     (results / "S2" / "run.json").write_text(json.dumps(record))
     (folder / "runs" / "S2" / "run.toml").write_text("frame_rate_hz = 500.0\nstart_s = 0.0\n")
     _stage_axis(folder, calibration)
+    shutil.copytree(results / "S2", folder.parent / "kept")
     for manifest in folder.rglob("manifest.json"):
         manifest.unlink()  # it would refuse every changed file before that is read
 

@@ -276,6 +276,8 @@ TARGETS = {
     "smoothing": Target(f"{_TRACKED}/smoothing.json", "json", _smoothing_report, 2),
     "trajectories": Target(f"{_TRACKED}/trajectories.csv", "csv", _smoothing_report),
     "shake": Target(f"{_TRACKED}/shake.csv", "csv", _smoothing_report),
+    "manifest": Target("kept/manifest.json", "json", _tracks, 2),
+    "manifest report": Target("kept/manifest.json", "json", _smoothing_report),
     "to HDF5": Target(f"{_TRACKED}/trajectories.csv", "csv", _run_to("hdf5"), 0.5),
     "to MATLAB": Target(f"{_TRACKED}/smoothing.json", "json", _run_to("mat"), 0.3),
     "to trackpy": Target(f"{_TRACKED}/trajectories.csv", "csv", _run_to("trackpy"), 0.5),

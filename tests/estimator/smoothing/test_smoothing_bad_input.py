@@ -110,11 +110,29 @@ def test_a_good_run_is_told_nothing(dataset: Path) -> None:
 # --- clocks ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("file", ["stage.csv", "accelerometer.csv"])
-def test_clocks_that_do_not_overlap(file: str, run: Path) -> None:
-    spoil(run / file, add("t_s", 1000.0))
-    message = refused(run, "does not overlap", file, "one clock")
+def test_an_encoder_whose_clock_does_not_overlap(run: Path) -> None:
+    spoil(run / "stage.csv", add("t_s", 1000.0))
+    message = refused(run, "does not overlap", "stage.csv", "one clock")
     assert "add -1" in message
+
+
+def test_accelerometers_whose_clock_does_not_overlap_are_aligned_with_the_images(run: Path) -> None:
+    spoil(run / "accelerometer.csv", add("t_s", 1000.0))
+    data = telerig.load_run(run)
+    found = smooth(tracks(data), calibration(), stage=data, model=ShakeModel())
+    for sensor in found.summary["accelerometers"].values():
+        assert sensor["confirmed"]
+        assert sensor["offset_s"] == pytest.approx(1000.0, abs=2e-3)
+    assert any("its times are corrected" in w for w in found.summary["warnings"])
+
+
+def test_accelerometers_of_another_time_are_refused(run: Path) -> None:
+    def change(table: pd.DataFrame) -> None:
+        table[ACCELERATIONS] = table[ACCELERATIONS].to_numpy()[::-1]
+        table["t_s"] += 1000.0
+
+    spoil(run / "accelerometer.csv", change)
+    assert "add -1" in refused(run, "does not overlap", "accelerometer.csv", "one clock")
 
 
 def test_times_in_milliseconds(run: Path) -> None:

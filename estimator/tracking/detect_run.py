@@ -29,7 +29,7 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS
 from telerig.io.dataset.run import RunData
 from telerig.io.files.atomic import write_json_atomic
 from telerig.io.files.csv_table import write_table
-from telerig.io.machine.parallel import cores, ordered_map, quick_workers
+from telerig.io.machine.parallel import cores, keep_freed_memory, ordered_map, quick_workers
 from telerig.rig.camera import Camera
 
 if TYPE_CHECKING:
@@ -109,6 +109,7 @@ def _background(
     strips: Mapping[str, StripInImages],
     camera: str,
 ) -> methods.RunBackground:
+    keep_freed_memory()
     images = partial(_image, run, strips, camera)
     return method(images, run.frame_count, shift_px=shifts[camera])
 
@@ -224,6 +225,7 @@ def detect_missing(scene: Scene, store: DetectionStore, progress: Progress | Non
 
 
 def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:
+    keep_freed_memory()
     tables = [
         _detect(scene, camera, frame) for frame in range(*batch) for camera in scene.run.cameras
     ]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.arrays import Array, Bools, Float32
+from telerig.arrays import Bools, Float32
 from telerig.statistics import robust_sd
 
 _CELL_PX = 4
@@ -17,6 +17,7 @@ DARK = 0.05
 
 _LEVEL_SCALE_CELLS = 3.0
 _EDGE_SHARE = 1 / 3
+_ENOUGH_PIXELS = 10_000
 
 
 def level_of_image(image: NDArray[np.generic]) -> tuple[Float32, Bools]:
@@ -66,14 +67,13 @@ def fill_masked(
 
 def _holes(mask: Bools) -> Iterator[tuple[tuple[slice, slice], Bools]]:
     """Windows about the connected parts of a mask, with a margin of half their size."""
-    from skimage.measure import label, regionprops
-
-    labels = label(mask)
-    for region in regionprops(labels):
-        extent = max(side.stop - side.start for side in region.slice)
-        margin = max(12, extent // 2)
-        rows, columns = (slice(max(0, s.start - margin), s.stop + margin) for s in region.slice)
-        yield (rows, columns), labels[rows, columns] == region.label
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    for k in range(1, count):
+        left, top, width, height = boxes[k, :4].tolist()
+        margin = max(12, max(width, height) // 2)
+        rows = slice(max(0, top - margin), top + height + margin)
+        columns = slice(max(0, left - margin), left + width + margin)
+        yield (rows, columns), labels[rows, columns] == k
 
 
 def _carried(residual: Float32, known: Bools, across: tuple[float, float] | None = None) -> Float32:
@@ -95,26 +95,30 @@ def _carried(residual: Float32, known: Bools, across: tuple[float, float] | None
 
 
 def bright_surface(log: Float32, degree: int, known: Bools | None = None) -> Float32:
-    """Least squares over what is known and not much darker than the fit."""
-    flat = log.ravel().astype(np.float64)
-    usable = np.ones(flat.shape, bool) if known is None else known.ravel()
-    terms = _terms(log.shape, degree)
+    """Least squares over what is known and not much darker than the fit; of a large image, over
+    every second, third, ... pixel.
+    """
+    thin = (slice(None, None, max(1, int(np.sqrt(log.size / _ENOUGH_PIXELS)))),) * 2
+    flat = log[thin].ravel().astype(np.float64)
+    usable = np.ones(flat.shape, bool) if known is None else known[thin].ravel()
+    powers = [np.linspace(-1, 1, n)[:, None] ** np.arange(degree + 1) for n in log.shape]
+    of_v, of_u = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
+    along_v, along_u = (p[t] for p, t in zip(powers, thin))
+    terms = (along_v[:, None, of_v] * along_u[None, :, of_u]).reshape(flat.size, -1)
     keep = usable & (flat > np.quantile(flat[usable], 0.3))
-    fit = np.zeros(flat.shape)
+    coefficients = np.zeros(terms.shape[1])
     for _ in range(12):
-        coefficients, *_ = np.linalg.lstsq(terms[keep], flat[keep], rcond=None)
-        fit = terms @ coefficients
-        residual = flat - fit
+        chosen = terms[keep]
+        coefficients = np.linalg.lstsq(chosen.T @ chosen, chosen.T @ flat[keep], rcond=None)[0]
+        residual = flat - terms @ coefficients
         above = residual[usable & (residual > 0)]
         spread = float(np.median(above)) / 0.6745 if above.size else 0.01
-        keep = usable & (residual > -max(2.5 * spread, 0.01))
-    return fit.reshape(log.shape).astype(np.float32)
-
-
-def _terms(shape: tuple[int, ...], degree: int) -> Array:
-    v, u = (np.linspace(-1, 1, n) for n in shape)
-    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
-    return np.stack([np.outer(v**i, u**j).ravel() for i, j in powers], axis=1)
+        before, keep = keep, usable & (residual > -max(2.5 * spread, 0.01))
+        if np.array_equal(keep, before):
+            break
+    square = np.zeros((degree + 1, degree + 1))
+    square[of_v, of_u] = coefficients
+    return (powers[0] @ square @ powers[1].T).astype(np.float32)
 
 
 def _dark_things(log: Float32, surface: Float32) -> Bools:
@@ -128,15 +132,15 @@ def _dark_things(log: Float32, surface: Float32) -> Bools:
 
 def compact_things(dark: Bools) -> Bools:
     """``dark`` with bright centres filled; what covers a third of a border is the screen's edge."""
-    from scipy.ndimage import binary_fill_holes
-    from skimage.measure import label, regionprops
-
-    kept = np.asarray(binary_fill_holes(dark), bool)
-    height, width = kept.shape
-    for region in regionprops(label(kept)):
-        top, left, bottom, right = region.bbox
-        along_side = (left == 0 or right == width) and bottom - top > _EDGE_SHARE * height
-        along_top = (top == 0 or bottom == height) and right - left > _EDGE_SHARE * width
+    kept = dark.astype(np.uint8)
+    outlines, _ = cv2.findContours(kept, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(kept, outlines, -1, 1, cv2.FILLED)
+    things, rows = kept > 0, len(kept)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(kept)
+    for k in range(1, count):
+        left, top, width, height = boxes[k, :4].tolist()
+        along_side = (left == 0 or left + width == kept.shape[1]) and height > _EDGE_SHARE * rows
+        along_top = (top == 0 or top + height == rows) and width > _EDGE_SHARE * kept.shape[1]
         if along_side or along_top:
-            kept[region.slice] &= ~region.image
-    return kept
+            things[labels == k] = False
+    return things

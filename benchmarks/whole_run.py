@@ -1,6 +1,6 @@
 """What does a whole run cost, phase by phase, beside a minimal pipeline?
 
-Usage: python benchmarks/whole_run.py [--data FOLDER] [--images 60] [--frames 1000 ...] [--out FILE.md]
+Usage: python benchmarks/whole_run.py [--data FOLDER] [--images 60] [--frames 1000] [--out FILE.md]
 
 The run: 1280 x 800 px, two cameras, 20 bubbles in sight (the simulator's `swarm`). Simulating the
 images takes longer than tracking them, so they are kept in ``--data`` for the next time, and each
@@ -83,6 +83,7 @@ class Study:
     medians: dict[str, Image] = field(default_factory=dict)
     tables: Tables = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def frames(self) -> int:
@@ -95,8 +96,8 @@ class Study:
     def row(self, phase: str, unit: str, ours_s: float, peer: str, peer_s: float) -> None:
         per, scale = ("s", 1.0) if ours_s > 1 else ("ms", 1e3)
         self.say(
-            f"| {phase} | {unit} | {scale * ours_s:.2f} {per} | {peer} | {scale * peer_s:.2f} {per} "
-            f"| {ours_s / peer_s:.1f} |"
+            f"| {phase} | {unit} | {scale * ours_s:.2f} {per} | {peer} "
+            f"| {scale * peer_s:.2f} {per} | {ours_s / peer_s:.1f} |"
         )
 
 
@@ -172,8 +173,8 @@ def detection(found: Study) -> None:
     plain, centres = cpu_s(peer, 2)
     found.row("detection", "an image", spent / many, "threshold and contours", plain / many)
     bubbles = sum(len(t) for tables in found.tables.values() for t in tables) / many
-    found.say(f"\nBubbles an image: {bubbles:.1f}; {sum(map(len, centres)) / many:.1f} by the "
-              "threshold.\n")  # fmt: skip
+    plain_many = sum(map(len, centres)) / many
+    found.notes.append(f"Bubbles an image: {bubbles:.1f}; {plain_many:.1f} by the threshold.")
 
 
 def linking(found: Study) -> None:
@@ -207,7 +208,9 @@ def linking(found: Study) -> None:
     found.row("linking", "a frame", spent / frames, "filterpy and SciPy", kalman / frames)
     found.row("linking", "a frame", spent / frames, "nearest neighbour", plain / frames)
     drift_s, _ = cpu_s(drift)
-    found.say(f"\nOnce a run: pair model {model_s:.2f} s, movement of the cameras {drift_s:.2f} s.\n")
+    found.say(
+        f"\nOnce a run: pair model {model_s:.2f} s, movement of the cameras {drift_s:.2f} s.\n"
+    )
 
 
 def kalman_links(found: Study, run: Any, pairs: list[Any]) -> None:
@@ -282,7 +285,7 @@ def whole(found: Study, frames: int) -> None:
 def long_run(found: Study, folder: Path, frames: int) -> Path:
     """A run of links to the images, forwards and backwards in turn."""
     run = folder / "runs" / "long"
-    (run).mkdir(parents=True)
+    run.mkdir(parents=True)
     (folder / "rig.toml").symlink_to(found.folder / "rig.toml")
     for camera in found.cameras:
         images = sorted((found.folder / "runs" / PRESET / camera.name).iterdir())
@@ -311,6 +314,7 @@ def main() -> None:
         found.say("| phase | of | telerig | peer | peer's | ratio |\n|---|---|---|---|---|---|")
         for phase in PHASES:
             phase(found)
+        found.say("\n" + "\n".join(found.notes) + "\n")
         if asked.frames:
             found.say("| frames | CPU s | wall s | memory MB | largest worker MB |")
             found.say("|---|---|---|---|---|")

@@ -412,9 +412,7 @@ def _outliers(residual: Float32, sigma: Float32) -> Bools:
     return np.asarray((grown > 0) | (residual > 5 * sigma), bool)
 
 
-def _covered(
-    layers: Layers, marked: Bools, spread: Float32, never: Bools
-) -> tuple[Bools, Bools]:
+def _covered(layers: Layers, marked: Bools, spread: Float32, never: Bools) -> tuple[Bools, Bools]:
     """(H, W) where a bubble kept the rig layer dark all the time, and what is clean enough to fill
     it from.
 

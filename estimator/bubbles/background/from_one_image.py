@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.arrays import Bools, Float32
+from telerig.arrays import Array, Bools, Float32
 from telerig.statistics import robust_sd
 
 _CELL_PX = 4
@@ -106,7 +106,7 @@ def bright_surface(log: Float32, degree: int, known: Bools | None = None) -> Flo
     along_v, along_u = (p[t] for p, t in zip(powers, thin))
     terms = (along_v[:, None, of_v] * along_u[None, :, of_u]).reshape(flat.size, -1)
     keep = usable & (flat > np.quantile(flat[usable], 0.3))
-    coefficients = np.zeros(terms.shape[1])
+    coefficients: Array = np.zeros(terms.shape[1])
     for _ in range(12):
         chosen = terms[keep]
         coefficients = np.linalg.lstsq(chosen.T @ chosen, chosen.T @ flat[keep], rcond=None)[0]

@@ -109,7 +109,8 @@ def bright_surface(log: Float32, degree: int, known: Bools | None = None) -> Flo
     coefficients: Array = np.zeros(terms.shape[1])
     for _ in range(12):
         chosen = terms[keep]
-        coefficients = np.linalg.lstsq(chosen.T @ chosen, chosen.T @ flat[keep], rcond=None)[0]
+        normal, right = chosen.T @ chosen, chosen.T @ flat[keep]
+        coefficients = np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], np.float64)
         residual = flat - terms @ coefficients
         above = residual[usable & (residual > 0)]
         spread = float(np.median(above)) / 0.6745 if above.size else 0.01

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
@@ -49,26 +50,39 @@ from telerig.factors.state_space import (
     whitener_of,
 )
 
+_STEADY = 1e-12
+_EVERY = 8
+
 
 @dataclass(frozen=True)
 class Chain:
     """upper : (F, D, D) L_t^T.
 
     sides : (F, S, D) what was joined to each frame, times L_t^-T.  following : (F - 1, D, D) M_t.
+    steady : the frames from which on, and before which, L_t and M_t no longer change.
     """
 
     upper: Array
     sides: Array
     following: Array
+    steady: tuple[int, int] = (0, 0)
 
     def log_det(self) -> float:
         """Return half the logarithm of the precision's determinant."""
         return float(np.log(np.diagonal(self.upper, axis1=-2, axis2=-1)).sum())
 
+    def inverses(self) -> Array:
+        """Return the inverses (F, D, D) of L_t^T."""
+        out = self.upper.copy()
+        first, end = self.steady
+        for t in (*range(min(first + 1, end)), *range(end, len(out))):
+            dtrtri(out[t].T, lower=1, overwrite_c=1)
+        out[first + 1 : end] = out[first]
+        return out
+
     def means(self, sides: Array) -> Array:
         """Return the solutions (F, K, D) for right sides (F, K, D) as in ``sides``."""
-        inverse = inverses(self.upper)
-        turned = np.swapaxes(inverse, -1, -2)
+        turned = np.swapaxes(self.inverses(), -1, -2)
         out, gain = sides @ turned, self.following @ turned[:-1]
         part = np.empty(out.shape[1:])
         for t in range(len(gain) - 1, -1, -1):
@@ -78,7 +92,7 @@ class Chain:
 
     def moments(self, sides: Array) -> tuple[Array, Array, Array]:
         """Return `means`, and covariances (F, D, D) and (F - 1, D, D) with the state before."""
-        inverse = inverses(self.upper)
+        inverse = self.inverses()
         turned = np.swapaxes(inverse, -1, -2)
         size = self.upper.shape[-1]
         gain = self.following @ turned[:-1]
@@ -87,13 +101,40 @@ class Chain:
         own, mean = both[:, :size], both[:, size:]
         carried = np.empty((len(gain), *both.shape[1:]))
         part = np.empty((size, size))
-        for t in range(len(gain) - 1, -1, -1):
+        (first, end), t = self.steady, len(gain) - 1
+        while t >= 0:
             product = carried[t]
             np.matmul(both[t + 1], gain[t], out=product)
             np.matmul(back[t], product[:size], out=part)
             own[t] += part
             mean[t] -= product[size:]
+            inside = first < t < end - 1 and not t % _EVERY
+            if inside and _alike(own[t], own[t + 1]):
+                break
+            t -= 1
+        if t > first:
+            own[first:t] = own[t]
+            carried[first:t, :size] = own[t] @ gain[first]
+            _carry_on(mean[first : t + 1][::-1], gain[first])
+            for t in range(first - 1, -1, -1):
+                product = carried[t]
+                np.matmul(both[t + 1], gain[t], out=product)
+                own[t] += back[t] @ product[:size]
+                mean[t] -= product[size:]
         return mean, own, -carried[:, :size]
+
+
+def _alike(one: Array, other: Array) -> bool:
+    """Whether two blocks (D, D) are equal but for `_STEADY` of the largest of each column."""
+    return bool((np.abs(one - other) <= _STEADY * np.abs(one).max(0)).all())
+
+
+def _carry_on(values: Array, gain: Array) -> None:
+    """Subtract from each of values (n, K, D) the one before times a gain (D, D), in place."""
+    part = np.empty(values.shape[1:])
+    for before, value in pairwise(values):
+        np.matmul(before, gain, out=part)
+        value -= part
 
 
 def eliminated(own: Array, following: Array, sides: Array) -> Chain:
@@ -104,36 +145,55 @@ def eliminated(own: Array, following: Array, sides: Array) -> Chain:
     count = sides.shape[1]
     joined = np.zeros((len(own), count + own.shape[-1], own.shape[-1]))
     joined[:, :count], joined[:-1, count:] = sides, following
-    eliminate_forward(own, joined)
-    return Chain(own, joined[:, :count], joined[:-1, count:])
+    steady = eliminate_forward(own, joined)
+    return Chain(own, joined[:, :count], joined[:-1, count:], steady)
 
 
-def eliminate_forward(own: Array, joined: Array) -> None:
-    """Eliminate frame by frame, in place.
+def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
+    """Eliminate frame by frame, in place; return `Chain.steady`.
 
     own : (F, D, D), in: diagonal blocks, out: L_t^T.
     joined : (F, S + D, D), in: rows of the sides and of the next frame, out: the same times L_t^-T.
+    Where frames are alike (equal steps and weights), the recursion comes to rest after the filter's
+    memory. From then on only the sides are carried on.
     Raises numpy's LinAlgError where the precision is not positive definite.
     """
     width, last = own.shape[-1], len(own) - 1
     after = joined.shape[1] - width
     product = np.empty(joined.shape[1:])
-    for t in range(last + 1):
+    ends = _ends_of_alike(own, joined[:, after:])
+    steady, t = (0, 0), 0
+    while t <= last:
         if dpotrf(own[t].T, lower=1, clean=1, overwrite_a=1)[1]:
             raise np.linalg.LinAlgError(f"frame {t}")
         rows = joined[t]
         dtrsm(1.0, own[t].T, rows.T, lower=1, overwrite_b=1)
+        end = ends[t]
+        tried = not t % _EVERY and t > 0 and end - t > max(_EVERY, steady[1] - steady[0])
+        if tried and ends[t - 1] == end and _alike(own[t], own[t - 1]):
+            steady = (t, end)
+            own[t + 1 : end], joined[t + 1 : end, after:] = own[t], rows[after:]
+            inverse = dtrtri(own[t].T, lower=1)[0]
+            joined[t + 1 : end, :after] = joined[t + 1 : end, :after] @ inverse.T
+            _carry_on(joined[t:end, :after], rows[after:].T @ inverse.T)
+            t = end - 1
+            rows = joined[t]
         if t < last:
             np.matmul(rows, rows[after:].T, out=product)
             own[t + 1] -= product[after:]
             joined[t + 1, :after] -= product[:after]
+        t += 1
+    return steady
 
 
-def inverses(upper: Array) -> Array:
-    """Return the inverses (F, D, D) of upper triangular blocks (F, D, D)."""
-    out = upper.copy()
-    for block in out:
-        dtrtri(block.T, lower=1, overwrite_c=1)
+def _ends_of_alike(own: Array, following: Array) -> list[int]:
+    """For each frame the end of the stretch of frames whose blocks are like its own."""
+    root = np.sqrt(np.abs(np.diagonal(own, axis1=-2, axis2=-1)).max(0))
+    scale = 1e-13 * root[:, None] * root
+    same = [(np.abs(a[1:] - a[:-1]) <= scale).all((1, 2)) for a in (own, following)]
+    breaks = np.flatnonzero(~(same[0] & same[1])) + 1
+    at = np.searchsorted(breaks, np.arange(len(own)), "right")
+    out: list[int] = np.append(breaks, len(own))[at].tolist()
     return out
 
 

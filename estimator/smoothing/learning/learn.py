@@ -43,6 +43,7 @@ from telerig.estimator.smoothing.learning.spectral_lines import (
     with_hidden_modes,
     with_split_lines,
 )
+from telerig.estimator.smoothing.learning.window import learning_window
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     RigMode,
@@ -60,6 +61,8 @@ _START_FORCE_HZ = 60.0
 LOW_HZ = 15.0
 _HARMONIC = 0.12
 _TIE_LOG_RATIO = 2.0
+_NEEDED_LOG_RATIO = 150.0
+"""A line without which the log evidence falls by more is not taken out and the rest fitted anew."""
 
 
 def learn(
@@ -69,14 +72,15 @@ def learn(
 
     start : gives what is not learned. Its modes are kept and improved, unless they are the default
     guess (its name is "default"). Returns a model named "learned", with the standard deviations of
-    its log-parameters in ``learned``. Accelerometers are not learned from: where there are any, a
+    its log-parameters in ``learned``. Of a long run only the frames of `learning_window` are used.
+    Accelerometers are not learned from: where there are any, a
     default start is returned unchanged, since its broad band needs no modes.
     """
     options = options or Learning()
     if start.name == "default" and problem.accelerometers:
         return start
     model = replace(start, modes=()) if start.name == "default" else start
-    signals = signals_of(problem, fixed=options.target)
+    signals = signals_of(learning_window(problem).problem, fixed=options.target)
     signals = tuple(c for c in signals if c.samples)
     if options.target:
         model = replace(model, bubble=replace(model.bubble, zigzags=()))
@@ -362,6 +366,9 @@ def pruned(group: Group, fit: Fit, options: Learning, first: bool, given: int = 
         if at >= len(names):
             return fit
         less = _without(fit.model, names[at])
+        if evidence(group.fast, less) < fit.log_evidence - _NEEDED_LOG_RATIO:
+            at += 1
+            continue
         free = free_names(less, group, options, first)
         quick = maximise(group.fast, less, free, steps=6)
         own = names[at].startswith("modes") and _owner(fit.model, names[at]) != CARRIAGE

@@ -35,6 +35,7 @@ from telerig.estimator.smoothing.learning.parameters import (
     value_of,
     with_values,
 )
+from telerig.estimator.smoothing.learning.window import learning_window
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 
 _IMPOSSIBLE = -1e12
@@ -151,17 +152,22 @@ _Triple = tuple[Array, Array, Array]
 def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
     """Return the solution with the spread by its model's ``learned`` parameters in its covariances.
 
-    Bubbles beyond those that learning looks at get the mean spread of those. The solution is
-    unchanged without covariances, learned parameters or measurements of positive weight.
+    Bubbles beyond those that learning looks at get the mean spread of those, and all frames of a
+    long run that of the frames that learning looks at. The solution is unchanged without
+    covariances, learned parameters or measurements of positive weight.
     """
     found, model, problem = solution.covariances, solution.graph.model, solution.graph.problem
     if found is None or not model.learned or not problem.bubbles:
         return solution
-    signals = [c for c in signals_of(problem, solution.weights) if c.samples]
+    window = learning_window(problem, solution.weights)
+    signals = [c for c in signals_of(window.problem) if c.samples]
     if not signals:
         return solution
     directions = np.array([c.direction for c in signals])
     spreads = [_spread(c, model) for c in signals]
+    if len(window.problem.t_s) < len(problem.t_s):
+        spreads = [(p.mean(keepdims=True), v.mean(keepdims=True), o.mean(keepdims=True))
+                   for p, v, o in spreads]  # fmt: skip
     # coordinates along the signals, which need not be at right angles, back into the lab
     lab = np.linalg.pinv(directions)
     bubbles = found.bubbles.copy()
@@ -221,8 +227,10 @@ def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
 
 
 def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
-    """(rows,) of the bubbles' states, from (B, F) of the signal's bubbles."""
+    """(rows,) of the bubbles' states, from (B, F) of the signal's bubbles, or (1, 1) of all."""
     graph = solution.graph
+    if variance.size == 1:
+        return np.full(graph.rows, variance.item())
     number = np.full(len(graph.problem.bubbles), -1)
     movers = signal.bubble[signal.moving]
     number[movers] = np.arange(len(movers))

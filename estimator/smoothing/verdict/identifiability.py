@@ -18,12 +18,12 @@ from telerig.estimator.smoothing.learning.learn import Learning, groups_of
 from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
 from telerig.estimator.smoothing.learning.spectral_lines import Attribution, attributions
 from telerig.estimator.smoothing.problem.problem import (
-    Bubble,
     CarriageModel,
     Observations,
     ShakeModel,
     SmoothingProblem,
 )
+from telerig.estimator.smoothing.problem.window import Window, cut_out
 from telerig.factors.motion import start
 from telerig.io.results.smoothing import AXES, Flag, Verdict
 
@@ -202,49 +202,11 @@ def _lines(
     return out
 
 
-@dataclass(frozen=True)
-class Window:
-    """problem : of frames ``first`` on.  bubbles : which of the whole problem's it holds."""
-
-    problem: SmoothingProblem
-    first: int
-    bubbles: Ints
-
-
 def window_of(solution: Solution) -> Window:
     """Return the middle of a solved run without outliers, with the bubbles seen longest."""
     problem = solution.graph.problem
     count = len(problem.t_s)
     first = max(0, (count - _MOST_FRAMES) // 2)
-    end = min(count, first + _MOST_FRAMES)
-    seen = _between(problem.observations.of(solution.weights[0] > 0.5), first, end)
-    marks = _between(problem.references.of(solution.weights[1] > 0.5), first, end)
-    often = np.bincount(seen.item, minlength=len(problem.bubbles))
-    chosen = np.sort(np.argsort(-often, kind="stable")[:_MOST_BUBBLES])
-    chosen = chosen[often[chosen] > 1]
-    known = np.unique(marks.item)
-    cut = replace(
-        problem,
-        t_s=problem.t_s[first:end],
-        bubbles=tuple(_cut(problem.bubbles[b], first, end) for b in chosen),
-        observations=_renumbered(seen, chosen),
-        marks=tuple(problem.marks[m] for m in known),
-        references=_renumbered(marks, known),
+    return cut_out(
+        problem, first, min(count, first + _MOST_FRAMES), solution.weights, _MOST_BUBBLES
     )
-    return Window(cut, first, chosen)
-
-
-def _between(obs: Observations, first: int, end: int) -> Observations:
-    inside = obs.of((obs.frame >= first) & (obs.frame < end))
-    return replace(inside, frame=inside.frame - first)
-
-
-def _renumbered(obs: Observations, chosen: Ints) -> Observations:
-    kept = obs.of(np.isin(obs.item, chosen))
-    return replace(kept, item=np.searchsorted(chosen, kept.item))
-
-
-def _cut(bubble: Bubble, first: int, end: int) -> Bubble:
-    low, high = max(bubble.first, first), min(bubble.last, end - 1)
-    guess = bubble.guess_mm[low - bubble.first : high - bubble.first + 1]
-    return Bubble(bubble.particle, low - first, high - first, guess[0], guess)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from shake_learning_data import run, true_model
 
 from telerig.estimator.smoothing.learning.evidence import (
+    Factor,
     eliminated,
     signal_evidence,
     signal_gradient,
@@ -111,6 +112,20 @@ def test_the_chains_solution_and_covariances_equal_dense_algebra() -> None:
     np.testing.assert_allclose(across, blocks[at[1:], :, at[:-1]], atol=1e-12)
     with pytest.raises(np.linalg.LinAlgError):
         eliminated(-np.ones((2, 1, 1)), np.zeros((1, 1, 1)), np.zeros((2, 1, 1)))
+
+
+def test_frames_that_are_alike_are_eliminated_once() -> None:
+    problem, _, _ = run(np.random.default_rng(7), bubbles=3, seconds=4)
+    part = pooled(signals_of(problem)[0])[1]
+    found = Factor(part, true_model())
+    first, end = found.chain.steady
+    assert end - first > 400
+    jitter = np.random.default_rng(0).normal(0, 1e-9, len(part.t_s))
+    each = Factor(replace(part, t_s=part.t_s + jitter), true_model())
+    assert each.chain.steady == (0, 0)
+    assert abs(found.log_evidence() - each.log_evidence()) < 1e-2
+    for one, other in zip(*(f.chain.moments(f.spread()[0])[1:] for f in (found, each))):
+        np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(other).max())
 
 
 def test_laplace_equals_second_differences_of_the_posterior() -> None:

@@ -1,0 +1,70 @@
+"""A window of a run: some of its frames, with the bubbles that are seen most in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from telerig.arrays import Array, Ints
+from telerig.estimator.smoothing.problem.problem import Bubble, Observations, SmoothingProblem
+
+
+@dataclass(frozen=True)
+class Window:
+    """Hold a part of a run.
+
+    problem : of the frames from ``first`` on; sensors and encoder are not cut.
+    bubbles : which of the whole run's bubbles it holds.
+    """
+
+    problem: SmoothingProblem
+    first: int
+    bubbles: Ints
+
+
+def cut_out(
+    problem: SmoothingProblem,
+    first: int,
+    end: int,
+    weights: tuple[Array, Array] | None = None,
+    most_bubbles: int | None = None,
+) -> Window:
+    """Return the frames from ``first`` to before ``end``, with the bubbles seen more than once.
+
+    weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. None for all.
+    most_bubbles : so many bubbles, those seen in most frames; None for all.
+    """
+    seen, marks = problem.observations, problem.references
+    if weights is not None:
+        seen, marks = seen.of(weights[0] > 0.5), marks.of(weights[1] > 0.5)
+    seen, marks = _between(seen, first, end), _between(marks, first, end)
+    often = np.bincount(seen.item, minlength=len(problem.bubbles))
+    chosen = np.sort(np.argsort(-often, kind="stable")[:most_bubbles])
+    chosen = chosen[often[chosen] > 1]
+    known = np.unique(marks.item)
+    cut = replace(
+        problem,
+        t_s=problem.t_s[first:end],
+        bubbles=tuple(_cut(problem.bubbles[b], first, end) for b in chosen),
+        observations=_renumbered(seen, chosen),
+        marks=tuple(problem.marks[m] for m in known),
+        references=_renumbered(marks, known),
+    )
+    return Window(cut, first, chosen)
+
+
+def _between(obs: Observations, first: int, end: int) -> Observations:
+    inside = obs.of((obs.frame >= first) & (obs.frame < end))
+    return replace(inside, frame=inside.frame - first)
+
+
+def _renumbered(obs: Observations, chosen: Ints) -> Observations:
+    kept = obs.of(np.isin(obs.item, chosen))
+    return replace(kept, item=np.searchsorted(chosen, kept.item))
+
+
+def _cut(bubble: Bubble, first: int, end: int) -> Bubble:
+    low, high = max(bubble.first, first), min(bubble.last, end - 1)
+    guess = bubble.guess_mm[low - bubble.first : high - bubble.first + 1]
+    return Bubble(bubble.particle, low - first, high - first, guess[0], guess)

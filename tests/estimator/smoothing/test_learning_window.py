@@ -40,5 +40,7 @@ def test_a_long_run_is_learned_from_where_the_bubbles_are_seen_most() -> None:
         assert len(one.problem.t_s) == MOST_FRAMES
         for bubble in one.problem.bubbles:
             whole = problem.bubbles[bubble.particle].guess_mm
-            np.testing.assert_array_equal(bubble.guess_mm, whole[one.first : one.first + len(bubble)])
+            np.testing.assert_array_equal(
+                bubble.guess_mm, whole[one.first : one.first + len(bubble)]
+            )
     assert [w.first for w in other_windows(fewer, window, 5)] == [0, MOST_FRAMES]

@@ -6,7 +6,7 @@ in NumPy and then given to GTSAM one by one. GTSAM's `JacobianFactor` takes up t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, cast
@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Ints
 
 
 @dataclass(frozen=True)
@@ -97,3 +97,43 @@ def add_linear_factors(
     push_back = graph.push_back
     for parts in zip(*columns, rhs):
         push_back(factor(*parts, noise))
+
+
+def product(factors: Sequence[LinearFactors], starts: Ints, values: Array) -> list[Array]:
+    """Return for each group of factors sum_k A_k x_k (M, rows, K), x the columns of values (D, K).
+
+    starts : first row of each key in ``values``, keys counting from 0.
+    """
+    out = []
+    for linear in factors:
+        total = np.zeros((*linear.rhs.shape, values.shape[1]))
+        for at, block in _places(linear, starts):
+            total += block @ values[at]
+        out.append(total)
+    return out
+
+
+def transposed_product(
+    factors: Sequence[LinearFactors], starts: Ints, values: Sequence[Array]
+) -> Array:
+    """Return the sum (D, K) of A^T times the values (M, rows, K) of each group of factors."""
+    out = np.zeros((int(starts[-1]), values[0].shape[-1]))
+    for linear, mine in zip(factors, values):
+        for at, block in _places(linear, starts):
+            share = np.swapaxes(block, -1, -2) @ mine
+            order = np.argsort(at[:, 0], kind="stable")
+            first = np.flatnonzero(np.diff(at[order, 0], prepend=-1))
+            if len(first) < len(order):
+                share = np.add.reduceat(share[order], first, axis=0)
+                at = at[order[first]]
+            out[at] += share
+    return out
+
+
+def _places(linear: LinearFactors, starts: Ints) -> Iterator[tuple[Ints, Array]]:
+    """Yield the rows (M, columns) of each variable, and its block."""
+    count = len(linear.rhs)
+    for key, block in zip(linear.keys, linear.blocks):
+        if count and block.shape[-1]:
+            first = starts[np.broadcast_to(np.asarray(key, np.int64), (count,))]
+            yield np.asarray(first[:, None] + np.arange(block.shape[-1])), block

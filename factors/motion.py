@@ -49,10 +49,12 @@ class Motion:
         last, following : (M, n) states before and after each step.
         inputs : (M, K), or (K,) for all steps.
         """
-        i = self.index
-        constant = np.broadcast_to(np.asarray(inputs, float), (len(i), self.by_input.shape[-1]))
+        count, width = len(self.index), self.by_input.shape[-1]
+        constant = np.broadcast_to(np.asarray(inputs, float), (count, width))
         terms = ((self.by_next, following), (self.by_last, last), (self.by_input, constant))
-        return np.asarray(sum(np.einsum("mij,mj->mi", a[i], x) for a, x in terms))
+        if len(self.by_next) == 1:
+            return np.asarray(sum(x @ a[0].T for a, x in terms))
+        return np.asarray(sum(np.einsum("mij,mj->mi", a[self.index], x) for a, x in terms))
 
     def factors(
         self,
@@ -71,7 +73,7 @@ class Motion:
         following : (M,) as in `in_basis`.
         """
         residual = self.residual(*states, inputs)
-        blocks = (*self.in_basis(following), self.by_input[self.index])
+        blocks = (*self.in_basis(following), _chosen(self.by_input, self.index))
         return LinearFactors(tuple(keys), blocks[: len(keys)], -residual, self.log_det[self.index])
 
     def in_basis(self, following: Ints) -> tuple[Array, Array]:
@@ -81,7 +83,7 @@ class Motion:
         following : (M,) index into ``basis`` of the state after each step.
         """
         last, ahead, place = self.distinct_in_basis(following)
-        return last[place], ahead[place]
+        return _chosen(last, place), _chosen(ahead, place)
 
     def distinct_in_basis(self, following: Ints) -> tuple[Array, Array, Ints]:
         """Return the same as `in_basis`, but every different pair of matrices only once.
@@ -93,6 +95,13 @@ class Motion:
         own, place = np.unique(self.index * count + following % count, return_inverse=True)
         step, after = np.divmod(own, count)
         return self.by_last[step] @ self.basis[step], self.by_next[step] @ self.basis[after], place
+
+
+def _chosen(blocks: Array, which: Ints) -> Array:
+    """(M, i, j) blocks (U, i, j)[which]; one block is not copied."""
+    if len(blocks) == 1:
+        return np.broadcast_to(blocks[0], (len(which), *blocks.shape[1:]))
+    return np.asarray(blocks[which])
 
 
 def motion(components: Sequence[Component], dt_s: ArrayLike, *, batched: bool = False) -> Motion:

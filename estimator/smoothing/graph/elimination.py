@@ -12,11 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg.lapack import dtrtri, dtrtrs
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
@@ -35,11 +36,15 @@ class Blocks:
     """Covariances of increments, in their bases.
 
     own : of each family of keys, (n, d, d); the shake's at the frames.
-    cross : (rows, Ds, Db) of the shake with each bubble at the same frame.
+    cross : (C, Ds, Db) of the shake with a bubble at the same frame.
+    cross_row : (C,) rows of the bubbles in whose bases these are.
+    cross_of_row : (rows,) which of them is that of each row.
     """
 
     own: list[Array]
     cross: Array
+    cross_row: Ints
+    cross_of_row: Ints
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,26 @@ class EliminatedGraph:
     def log_det(self) -> float:
         """log |R|; QR leaves signs on the diagonal."""
         return float(np.log(np.abs(_diagonal(self.cliques))).sum())
+
+    @cached_property
+    def _columns(self) -> list[tuple[Ints, Ints]]:
+        """Of each clique, the columns of its own keys and of its separator."""
+        starts = starts_of(self.graph)
+
+        def of(keys: list[int]) -> Ints:
+            return np.concatenate([_NOTHING, *(np.arange(starts[k], starts[k + 1]) for k in keys)])
+
+        return [(of(c.fronts), of(c.separator)) for c in self.cliques]
+
+    def solved(self, side: Array) -> Array:
+        """Return the solutions (D, N) of the normal equations for right sides (D, N)."""
+        out = side.copy()
+        for clique, (own, above) in zip(self.cliques, self._columns):
+            mine = out[own] = dtrtrs(clique.root, out[own], trans=1)[0]
+            out[above] -= clique.right.T @ mine
+        for clique, (own, above) in zip(reversed(self.cliques), reversed(self._columns)):
+            out[own] = dtrtrs(clique.root, out[own] - clique.right @ out[above])[0]
+        return out
 
     def blocks(self) -> Blocks:
         """Marginal covariances of all increments, and of shake with bubbles at the same frame."""
@@ -74,7 +99,8 @@ class EliminatedGraph:
             if cross.size:
                 pairs.setdefault(node, []).append((row, block))
         fill_covariances(self.cliques, _sizes(graph), wanted, pairs)
-        return Blocks([own[0][of_frame], *own[1:]], cross)
+        rows = np.arange(graph.rows)
+        return Blocks([own[0][of_frame], *own[1:]], cross, rows, rows)
 
 
 def eliminate(
@@ -112,6 +138,11 @@ def eliminate(
 def _sizes(graph: GraphLayout) -> list[int]:
     """Dimension of each key."""
     return [d for n, d in graph.counts() for _ in range(n)]
+
+
+def starts_of(graph: GraphLayout) -> Ints:
+    """First column of each key, and the number of columns."""
+    return np.asarray(np.r_[0, np.cumsum(_sizes(graph))], np.int64)
 
 
 def _diagonal(cliques: Sequence[Clique]) -> Array:

@@ -40,6 +40,7 @@ _NEAR, _NEAR_S = 0.6, 1e-3
 _TERMS = 9
 _READING_SIGMA_MM = 10.0
 _ALIGNED = 1 - 1e-9
+_FEW_KINDS, _AT_ONCE = 16, 4096
 
 
 @dataclass(frozen=True)
@@ -392,11 +393,41 @@ class GraphLayout:
             return np.asarray(states)
         return np.asarray((self.to_frames @ states[..., None])[..., 0])
 
+    def in_shake_basis(self, block: Array, node: Ints) -> Array:
+        """(n, r, D) derivatives by states at nodes (n,) as those by their increments."""
+        return times_chosen(
+            block, self.shake_motion.basis, _basis_index(self.shake_motion.index, node)
+        )
+
+    def in_bubble_basis(self, block: Array, row: Ints) -> Array:
+        """(n, r, D) derivatives by states of bubble rows (n,) as those by their increments."""
+        return times_chosen(block, self.bubble_motion.basis, self.row_basis[row])
+
+    def out_of_bubble_basis(self, block: Array, row: Ints) -> Array:
+        """(n, r, D) covariances of something with increments of bubble rows (n,) as with states."""
+        turned = np.swapaxes(self.bubble_motion.basis, -1, -2)
+        return times_chosen(block, turned, self.row_basis[row])
+
+    def shake_moved(self, increments: Array) -> Array:
+        """(N, D) changes of the shake's states by increments (N, D) at all nodes."""
+        which = _basis_index(self.shake_motion.index, np.arange(len(increments)))
+        turned = np.swapaxes(self.shake_motion.basis, -1, -2)
+        return times_chosen(increments[:, None], turned, which)[:, 0]
+
+    def bubbles_moved(self, increments: Array) -> Array:
+        """(rows, D) changes of the bubbles' states by increments (rows, D)."""
+        turned = np.swapaxes(self.bubble_motion.basis, -1, -2)
+        return times_chosen(increments[:, None], turned, self.row_basis)[:, 0]
+
     @cached_property
     def row_basis(self) -> Ints:
-        """(rows,) which basis of the bubbles' motion each row has."""
+        """(rows,) which basis of the bubbles' motion each row has; the last of a bubble that of the
+        one before."""
         out = np.full(self.rows, len(self.bubble_motion.basis) - 1)
         out[self.moving_rows] = self.bubble_motion.index
+        last = self.first_row[1:] - 1
+        last = last[np.diff(self.first_row) > 1]
+        out[last] = out[last - 1]
         return out
 
     def bubble_basis(self, row: ArrayLike) -> Array:
@@ -533,8 +564,8 @@ def moved(graph: GraphLayout, state: State, step: Array) -> State:
     )
     encoder, calibration = np.split(constants[0], [graph.encoder_size])
     return State(
-        state.shake + times(graph.shake_basis(np.arange(len(shake))), shake),
-        state.bubbles + times(graph.bubble_basis(np.arange(len(bubbles))), bubbles),
+        state.shake + graph.shake_moved(shake),
+        state.bubbles + graph.bubbles_moved(bubbles),
         state.means + means,
         state.sensors + sensors,
         state.encoder + encoder,
@@ -546,3 +577,24 @@ def moved(graph: GraphLayout, state: State, step: Array) -> State:
 
 def times(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def times_chosen(blocks: Array, matrices: Array, which: Ints) -> Array:
+    """(n, r, E) blocks (n, r, D) times ``matrices`` (U, D, E)[which]; ``which`` is (n,).
+
+    Large: the matrices are not copied for each block. Blocks of one row may be given as (1, r, D).
+    """
+    out = np.empty((len(which), blocks.shape[-2], matrices.shape[-1]))
+    blocks = np.broadcast_to(blocks, (len(which), *blocks.shape[-2:]))
+    values = np.unique(which)
+    if len(values) == 1:
+        np.matmul(blocks, matrices[values[0]], out=out)
+    elif len(values) <= _FEW_KINDS:
+        for value in values:
+            mine = which == value
+            out[mine] = blocks[mine] @ matrices[value]
+    else:
+        for first in range(0, len(which), _AT_ONCE):
+            mine = slice(first, first + _AT_ONCE)
+            np.matmul(blocks[mine], matrices[which[mine]], out=out[mine])
+    return out

@@ -137,10 +137,11 @@ def images(graph: GraphLayout, state: State, weight: Array) -> Seen:
     rows = graph.row(obs.item, obs.frame)
     states = state.bubbles[rows]
     points = states @ layout.position.T
-    basis = graph.bubble_basis(rows)
-    by_point = layout.position @ basis
-    shift = np.einsum("mid,md->mi", layout.wander[obs.camera], states)
-    extra = layout.wander[obs.camera] @ basis
+    by_point = graph.in_bubble_basis(layout.position[None], rows)
+    shift, extra = np.zeros((len(obs), 2)), np.zeros((1, 2, layout.size))
+    if np.any(layout.wander):
+        shift = np.einsum("mid,md->mi", layout.wander[obs.camera], states)
+        extra = graph.in_bubble_basis(layout.wander[obs.camera], rows)
     keys = graph.base().bubbles + rows
     return _seen(graph, state, obs, weight, points, by_point, keys, shift, extra)
 
@@ -150,7 +151,7 @@ def references(graph: GraphLayout, state: State, weight: Array) -> Seen:
     obs = graph.problem.references
     points = state.marks[obs.item]
     keys = graph.base().marks + obs.item
-    extra, shift = np.zeros((len(obs), 2, 3)), np.zeros((len(obs), 2))
+    extra, shift = np.zeros((1, 2, 3)), np.zeros((len(obs), 2))
     by_point = np.broadcast_to(np.eye(3), (len(obs), 3, 3))
     return _seen(graph, state, obs, weight, points, by_point, keys, shift, extra)
 
@@ -200,9 +201,10 @@ def _seen(
         residual[mine] = np.einsum("mij,mj->mi", w, off)
         root = np.sqrt(weight[mine])
         w = w * root[:, None, None]
+        more = extra if len(extra) == 1 else extra[mine]
         blocks = (
-            w @ (seen.by_point @ by_state[mine] + extra[mine]),
-            w @ (by_shake @ graph.shake_basis(node)),
+            w @ (seen.by_point @ by_state[mine] + more),
+            graph.in_shake_basis(w @ by_shake, node),
             w @ np.concatenate([graph.by_encoder(by_travel, np.zeros_like(by_travel)), by_rig], -1),
         )
         rhs = -residual[mine] * root[:, None]

@@ -11,16 +11,16 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array, Bools
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph, eliminate
+from telerig.estimator.smoothing.graph.crowd import EliminatedCrowd, eliminated
+from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph
 from telerig.estimator.smoothing.graph.layout import (
     GraphLayout,
     State,
     first_guess,
     graph_layout,
     moved,
-    times,
 )
 from telerig.estimator.smoothing.graph.linear import (
     SampleWeights,
@@ -73,7 +73,8 @@ class Covariances:
 
     shake : (F, Ds, Ds) for the F frames, with Ds states of carriage and cameras.
     bubbles : (rows, Db, Db), one row per bubble and frame, with Db states of a bubble.
-    cross : (rows, Ds, Db) between the shake and each bubble in the same frame.
+    cross : (C, Ds, Db) between the shake and a bubble in the same frame.
+    cross_of_row : (rows,) which of them is that of each bubble and frame.
     means : (K, 3, 3) for the mean velocities of K bubbles.
     sensors, encoder, calibration, marks, clocks : for the constants of `State` with the same names.
     """
@@ -81,6 +82,7 @@ class Covariances:
     shake: Array
     bubbles: Array
     cross: Array
+    cross_of_row: Ints
     means: Array
     sensors: Array
     encoder: Array
@@ -247,7 +249,7 @@ def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
 
 @dataclass(frozen=True)
 class _Pass:
-    done: EliminatedGraph
+    done: EliminatedGraph | EliminatedCrowd
     largest_px: float
     log_norm: float
     squared: float
@@ -256,14 +258,9 @@ class _Pass:
 def _linear_solve(
     graph: GraphLayout, state: State, weights: tuple[Array, Array], samples: SampleWeights
 ) -> _Pass:
-    """One Gauss-Newton pass, by Cholesky or by QR, which is four times slower.
-
-    The normal equations of a broad band's smooth prior lose ten digits at 500 Hz (covariances are
-    good to 3e-6), and more than double precision has with steps as short as a sensor's.
-    """
+    """One Gauss-Newton pass."""
     factors = all_factors(graph, state, weights, samples)
-    only_frames = len(graph.nodes.t_s) == len(graph.problem.t_s)
-    done = eliminate(graph, factors, cholesky=only_frames and not graph.model.broad_bands)
+    done = eliminated(graph, factors)
     if not np.all(np.isfinite(done.vector)):
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
     largest = _largest_shift_px(graph, done.vector)
@@ -299,7 +296,7 @@ def _largest_shift_px(graph: GraphLayout, vector: Array) -> float:
     layout, (nodes, size) = graph.bubble, graph.counts()[0]
     start = nodes * size
     states = vector[start : start + graph.rows * layout.size].reshape(-1, layout.size)
-    moves = times(graph.bubble_basis(np.arange(graph.rows)), states) @ layout.position.T
+    moves = graph.bubbles_moved(states) @ layout.position.T
     scale = max(c["scale_px_per_mm"] for c in graph.problem.cameras)
     return float(np.max(np.abs(moves), initial=0.0) * scale)
 
@@ -330,17 +327,18 @@ def _finish(
 
 def _covariances(graph: GraphLayout, blocks: Blocks) -> Covariances:
     """Marginals in physical units."""
-    own = blocks.own
+    own, rows = blocks.own, np.arange(graph.rows)
     shake_basis = graph.shake_basis(graph.nodes.of_frame)
     if graph.to_frames is not None:
         shake_basis = graph.to_frames @ shake_basis
-    bubble_basis = graph.bubble_basis(np.arange(graph.rows))
     shake = shake_basis @ own[0] @ np.swapaxes(shake_basis, -1, -2)
-    bubbles = bubble_basis @ own[1] @ np.swapaxes(bubble_basis, -1, -2)
-    cross = shake_basis[graph.frame_of_row] @ blocks.cross @ np.swapaxes(bubble_basis, -1, -2)
+    half = np.swapaxes(graph.out_of_bubble_basis(own[1], rows), -1, -2)
+    bubbles = graph.out_of_bubble_basis(half, rows)
+    row = blocks.cross_row
+    cross = graph.out_of_bubble_basis(shake_basis[graph.frame_of_row[row]] @ blocks.cross, row)
     encoder = graph.encoder_size
     return Covariances(
-        shake, bubbles, cross, own[2], own[3], own[4][0, :encoder, :encoder],
+        shake, bubbles, cross, blocks.cross_of_row, own[2], own[3], own[4][0, :encoder, :encoder],
         own[4][0, encoder:, encoder:], *own[5:],
     )  # fmt: skip
 

@@ -10,16 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 
 from telerig.arrays import Array, Ints
-from telerig.estimator.smoothing.graph.elimination import Clique, eliminate
+from telerig.estimator.smoothing.graph.crowd import EliminatedCrowd, eliminated
+from telerig.estimator.smoothing.graph.elimination import EliminatedGraph, starts_of
 from telerig.estimator.smoothing.graph.layout import GraphLayout
 from telerig.estimator.smoothing.graph.linear import all_factors
 from telerig.estimator.smoothing.graph.solve import Solution, in_large_stack
-from telerig.factors.linear_factors import LinearFactors
+from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 
 DRAWS = 16
+_FEWER_DRAWS, _MANY_ROWS = 4, 20_000
+"""So many states of bubbles make up for fewer draws: what is compared are means over all."""
 _REFINEMENTS = 1
 
 
@@ -32,7 +34,7 @@ class WholeFit:
 
     graph: GraphLayout
     factors: list[LinearFactors]
-    cliques: list[Clique]
+    root: EliminatedGraph | EliminatedCrowd
     starts: Ints
     first_row: Ints
 
@@ -54,8 +56,10 @@ class WholeFit:
         found = np.zeros((int(self.starts[-1]), right.shape[1]))
         rest = right
         for _ in range(1 + _REFINEMENTS):
-            found += self._by_root(self._transposed(rest))
-            rest = right - self._applied(found)
+            parts = [self.of_group(rest, i) for i in range(len(self.factors))]
+            found += self.root.solved(transposed_product(self.factors, self.starts, parts))
+            fitted = product(self.factors, self.starts, found)
+            rest = right - np.concatenate([f.reshape(-1, f.shape[-1]) for f in fitted])
         return found, rest
 
     def increments(self, found: Array, family: int) -> Array:
@@ -64,63 +68,26 @@ class WholeFit:
         first = self.starts[self.graph.base()[family]]
         return found[first : first + number * size].reshape(number, size, -1)
 
-    def _columns(self, key: object, block: Array, count: int) -> Ints:
-        first = self.starts[np.broadcast_to(np.asarray(key, np.int64), (count,))]
-        return np.asarray(first[:, None] + np.arange(block.shape[-1]))
-
-    def _applied(self, found: Array) -> Array:
-        out = np.zeros((self.rows, found.shape[1]))
-        for group, linear in enumerate(self.factors):
-            mine = self.of_group(out, group)
-            for key, block in zip(linear.keys, linear.blocks):
-                if block.shape[-1]:
-                    mine += block @ found[self._columns(key, block, len(linear.rhs))]
-        return out
-
-    def _transposed(self, values: Array) -> Array:
-        count, width = int(self.starts[-1]), values.shape[1]
-        out = np.zeros(count * width)
-        for group, linear in enumerate(self.factors):
-            mine = self.of_group(values, group)
-            for key, block in zip(linear.keys, linear.blocks):
-                if block.shape[-1] and len(mine):
-                    column = self._columns(key, block, len(mine))
-                    place = column[..., None] * width + np.arange(width)
-                    share = np.swapaxes(block, -1, -2) @ mine
-                    out += np.bincount(place.ravel(), share.ravel(), len(out))
-        return out.reshape(count, width)
-
-    def _by_root(self, side: Array) -> Array:
-        at = [(self._places(c.fronts), self._places(c.separator)) for c in self.cliques]
-        for clique, (own, above) in zip(self.cliques, at):
-            side[own] = dtrtrs(clique.root, side[own], trans=1)[0]
-            side[above] -= clique.right.T @ side[own]
-        for clique, (own, above) in zip(reversed(self.cliques), reversed(at)):
-            side[own] = dtrtrs(clique.root, side[own] - clique.right @ side[above])[0]
-        return side
-
-    def _places(self, keys: list[int]) -> Ints:
-        parts = [np.arange(self.starts[k], self.starts[k + 1]) for k in keys]
-        return np.concatenate([np.zeros(0, np.int64), *parts])
-
 
 def whole_fit(solution: Solution) -> WholeFit:
     """Return the fit at a solution; one elimination more than it took."""
     graph = solution.graph
     samples = solution.sample_weights or None
     factors = all_factors(graph, solution.state, solution.weights, samples)
-    only_frames = len(graph.nodes.t_s) == len(graph.problem.t_s)
-    quick = only_frames and not graph.model.broad_bands
-    done = in_large_stack(lambda: eliminate(graph, factors, cholesky=quick))
-    sizes = [d for n, d in graph.counts() for _ in range(n)]
-    starts = np.r_[0, np.cumsum(sizes)].astype(np.int64)
+    done = in_large_stack(lambda: eliminated(graph, factors))
     first_row = np.r_[0, np.cumsum([f.rhs.size for f in factors])].astype(np.int64)
-    return WholeFit(graph, factors, done.cliques, starts, first_row)
+    return WholeFit(graph, factors, done, starts_of(graph), first_row)
 
 
-def drawn(solution: Solution, draws: int = DRAWS, seed: int = 0) -> tuple[WholeFit, Array, Array]:
+def drawn(
+    solution: Solution, draws: int | None = None, seed: int = 0
+) -> tuple[WholeFit, Array, Array]:
     """Return the fit, errors (D, draws) of its estimates and residuals (rows, draws) that a right
-    model leaves."""
+    model leaves.
+
+    draws : their number; None for `DRAWS`, or fewer for a run with many states.
+    """
     fit = whole_fit(solution)
+    draws = draws or (DRAWS if solution.graph.rows < _MANY_ROWS else _FEWER_DRAWS)
     noise = np.random.default_rng(seed).standard_normal((fit.rows, draws))
     return (fit, *fit.solved(noise))

@@ -336,7 +336,7 @@ def leverages(solution: Solution) -> list[tuple[Ints, Array]]:
         by_shake = part.blocks[1][some] @ np.linalg.inv(graph.shake_basis(node))
         if graph.to_frames is not None:
             by_shake = by_shake @ np.linalg.inv(graph.to_frames[at])
-        both = by_shake @ found.cross[row]
+        both = by_shake @ found.cross[found.cross_of_row[row]]
         leverage = (by_bubble @ found.bubbles[row] * by_bubble).sum(-1)
         leverage += (by_shake @ found.shake[at] * by_shake).sum(-1)
         leverage += 2 * (both * by_bubble).sum(-1)

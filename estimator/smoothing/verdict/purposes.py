@@ -14,7 +14,7 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
-from telerig.estimator.smoothing.graph.whole_fit import WholeFit
+from telerig.estimator.smoothing.graph.whole_fit import DRAWS, WholeFit
 from telerig.io.results.smoothing import AXES, Grade, Quantity, Use
 
 GOOD, LIMITED = 10.0, 3.0
@@ -39,7 +39,8 @@ def uses(
     if solution.covariances is None or not graph.rows:
         return []
     lengths = np.diff(graph.first_row)
-    chosen = np.argsort(-lengths, kind="stable")[:_MOST_BUBBLES]
+    most = _MOST_BUBBLES * max(1, DRAWS // errors.shape[-1])
+    chosen = np.argsort(-lengths, kind="stable")[:most]
     chosen = chosen[lengths[chosen] >= _LEAST_FRAMES]
     if not len(chosen):
         return []

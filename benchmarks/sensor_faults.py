@@ -4,6 +4,8 @@ Usage: python benchmarks/sensor_faults.py faults [--scenarios S1,stick-slip] [--
     [--configurations one,five,marks] [--clocks unknown,frames] [--seeds 1] [--seed 900]
     [--csv FILE.csv] [--out FILE.md] [--read FILE.csv ...]
     python benchmarks/sensor_faults.py alarms [--seeds 10] ...  false alarms of undisturbed runs
+    python benchmarks/sensor_faults.py checks [--seeds 10] [--frames 120,300,600] [--around 0.05,10]
+        false alarms of the checks before the solution, which are quick
     python benchmarks/sensor_faults.py offsets [--seeds 10] ... errors of recovered clock offsets
 --faults takes names and groups. Loggers record 10 s before and after the frames. The classes of
 the outcomes are described in `sensor_fault_judging`, the faults in `sensor_fault_kinds`.
@@ -17,6 +19,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,8 @@ from shake_scene import Run, cases, simulate
 
 import telerig
 from telerig.errors import TelerigError
+from telerig.estimator.smoothing.problem.sensor_alignment import aligned
+from telerig.estimator.smoothing.smooth import problem_of
 
 AROUND_S = 10.0
 SCENARIOS = ("S1", "S2", "S3", "S6", "stick-slip")
@@ -41,9 +46,11 @@ ALIGNED, SAMPLED = ("clock", "unit", "axes"), ("one spike", "spikes", "frozen", 
 
 
 @lru_cache(maxsize=2)
-def run_of(scenario: str, seed: int) -> Run:
-    """The run of a seed, with loggers that record before and after it."""
-    case = replace(cases()[scenario], around_s=AROUND_S)
+def run_of(scenario: str, seed: int, frames: int = 0, around_s: float = AROUND_S) -> Run:
+    """The run of a seed, with loggers that record before and after it; 0 for all frames."""
+    case = replace(cases()[scenario], around_s=around_s)
+    if frames:
+        case = replace(case, scenario=replace(case.scenario, frames=frames))
     return simulate(case, np.random.default_rng([seed, hash_of(scenario), 19]))
 
 
@@ -258,6 +265,68 @@ with arm accelerometers and one bubble, which knows the hyper-parameters.
 """
 
 
+def checks(options: argparse.Namespace) -> pd.DataFrame:
+    """Undisturbed runs, also short ones: what is refused or left out before the solution."""
+    rows: list[dict[str, Any]] = []
+    lengths = [int(n) for n in options.frames.split(",")]
+    margins = [float(s) for s in options.around.split(",")]
+    for scenario, seed, configuration in each(options):
+        for frames, around_s in product(lengths, margins):
+            run = run_of(scenario, seed, frames, around_s)
+            for clock in options.clocks.split(","):
+                begin = time.perf_counter()
+                rows.append(
+                    {"scenario": scenario, "configuration": configuration, "clock": clock,
+                     "seed": seed, "frames": frames, "around_s": around_s}
+                    | _checked(inputs_of(run, configuration, clock))
+                    | {"seconds": time.perf_counter() - begin}
+                )  # fmt: skip
+                print(rows[-1], flush=True)
+        written(rows, options)
+    return written(rows, options)
+
+
+def _checked(inputs: dict[str, Any]) -> dict[str, Any]:
+    given = {k: v for k, v in inputs.items() if k not in ("tracks", "calibration")}
+    try:
+        problem, _, _, known = problem_of(inputs["tracks"], inputs["calibration"], **given)
+        placed, found = aligned(problem, known)
+    except TelerigError as error:
+        return {"alarm": f"refused {error.code}", "said": str(error)}
+    codes = sorted({str(f.code) for f in found if f.code is not None})
+    sensors = {s.name: s for s in placed.accelerometers}
+    out = [f"left out {name}" for name in ARMS if name not in sensors]
+    masked = sum(int((~s.kept).sum()) for s in sensors.values() if s.kept is not None)
+    given_samples = sum(len(s.t_s) for s in sensors.values())
+    kinds = [*codes, *["masked"] * int(masked > MOST_MASKED * given_samples)]
+    return {
+        "alarm": "; ".join(kinds), "left_out": "; ".join(out),
+        "confirmed": sum(s.confirmed for s in sensors.values()),
+        "said": " | ".join(f.warning for f in found),
+    }  # fmt: skip
+
+
+def check_report(table: pd.DataFrame) -> str:
+    table = table.fillna("")
+    lines = ["| scenario | configuration | clock | frames | runs | alarms | a sensor left out |",
+             "|" + "---|" * 7]  # fmt: skip
+    columns = ["scenario", "configuration", "clock", "frames"]
+    for keys, rows in table.groupby(columns, sort=False):
+        counts = [len(rows), (rows["alarm"] != "").sum(), (rows["left_out"] != "").sum()]
+        lines.append("| " + " | ".join([*map(str, keys), *map(str, counts)]) + " |")
+    kinds = table["alarm"][table["alarm"] != ""].value_counts()
+    share = (table["alarm"] != "").mean()
+    return f"""# False alarms of the checks before the solution
+
+{len(table)} undisturbed runs, {share:.2%} with an alarm: a refusal, or more than 0.1 % of the
+samples masked. Sensors whose clock is unknown and not confirmed are left out; that is no alarm.
+
+{chr(10).join(lines)}
+
+{chr(10).join(f"- {count} x {kind}" for kind, count in kinds.items())}
+"""
+
+
 def offsets(options: argparse.Namespace) -> pd.DataFrame:
     """Clocks that are off by up to the length of the record, the same for both arms."""
     rows: list[dict[str, Any]] = []
@@ -311,6 +380,7 @@ def offset_report(table: pd.DataFrame) -> str:
 MODES = {
     "faults": (faults, fault_report),
     "alarms": (alarms, alarm_report),
+    "checks": (checks, check_report),
     "offsets": (offsets, offset_report),
 }
 
@@ -324,6 +394,8 @@ def main() -> None:
     parser.add_argument("--faults", default="", help="names or groups; all by default")
     parser.add_argument("--configurations", default=",".join(CONFIGURATIONS))
     parser.add_argument("--clocks", default="unknown,frames")
+    parser.add_argument("--frames", default="120,300,0", help="numbers of frames; 0: all of them")
+    parser.add_argument("--around", default="0.05,10", help="seconds of record around the frames")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--seed", type=int, default=900, help="the first")
     parser.add_argument("--csv", type=Path, help="one line a run")

@@ -97,6 +97,8 @@ class Wall:
         Raises KeyError, TypeError or ValueError for other contents.
         """
         normal = np.array(data["normal"], float).reshape(3)
+        if not 0 < np.linalg.norm(normal) < np.inf:
+            raise ValueError("the normal of a window has no direction")
         air, glass, behind = (float(n) for n in data["indices"])
         return Wall(
             normal / np.linalg.norm(normal), float(data["distance_mm"]),

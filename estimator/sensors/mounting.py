@@ -20,6 +20,7 @@ _SHIFTS = 24
 _CHANCE = 1.5
 _UPRIGHT_DEG = 30.0
 _SDS = 5.0
+_USUAL_GAIN = (0.5, 2.0)
 _LEAST_SAMPLES = 60
 
 
@@ -55,9 +56,12 @@ class Mounting:
 
     @property
     def wrong_gain(self) -> bool:
-        """Whether the readings are clearly too large or too small for any usual scale error."""
-        off = abs(self.gain - 1) > _SDS * self.gain_sd
-        return bool(off and not 0.7 < self.gain < 1.4)
+        """Whether the readings are clearly too large or too small for any usual scale error.
+
+        The regression's errors are those of the inverse of the gain.
+        """
+        off = abs(1 / self.gain - 1) > _SDS * self.gain_sd / self.gain**2
+        return bool(off and not _USUAL_GAIN[0] < self.gain < _USUAL_GAIN[1])
 
 
 def signed_permutations() -> Array:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import tifffile
 from telerig.errors import InputError
 from telerig.estimator.tracking.tracks import read_track_table
 from telerig.io.exchange.importing.binary_recordings import read_wav
+from telerig.io.exchange.importing.accelerometer import Layout, read_accelerations
 from telerig.io.files.csv_table import Column, read_table
 from telerig.io.images.frames import open_frames
 from telerig.io.recording.log import MAGIC, scan_log
@@ -61,3 +64,14 @@ def test_stacks_with_one_page_header_are_still_read(
     frames = open_frames(tmp_path, "left")
     assert frames is not None and len(frames) == 3
     np.testing.assert_array_equal(frames.read(2), stack[2])
+
+
+def test_a_counter_that_reads_infinity_is_no_clock(tmp_path: Path) -> None:
+    file = tmp_path / "log.txt"
+    rows = [f"{'-inf' if i == 20 else i},0.1,{0.01 * i},1.0" for i in range(40)]
+    text = ["# data_rate = 1 kHz, range 4 g", ";Headers,count,Ax,Ay,Az", *rows]
+    file.write_text("\n".join(text), encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        with suppress(InputError):
+            read_accelerations(file, "arm", Layout(unit="g"))

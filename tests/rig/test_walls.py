@@ -232,6 +232,12 @@ def test_a_wall_survives_its_file() -> None:
     assert replace(again, normal=wall.normal, normal_sigma_rad=0.01) == wall
 
 
+@pytest.mark.parametrize("normal", [[0.0, 0.0, 0.0], [0.0, float("nan"), 1.0]])
+def test_a_wall_without_a_direction_is_refused(normal: list[float]) -> None:
+    with pytest.raises(ValueError, match="has no direction"):
+        Wall.from_dict(wall_named("25 deg").as_dict() | {"normal": normal})
+
+
 def test_what_no_ray_reaches_is_an_error() -> None:
     wall = wall_named("facing")
     with pytest.raises(GeometryError, match="out of the camera's reach"):

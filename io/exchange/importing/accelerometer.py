@@ -324,12 +324,12 @@ def _counted(recording: Recording, rows: int) -> tuple[str, Array] | None:
         if not is_counter(name) or _is_text(recording, name):
             continue
         values = _values(recording, name)
-        if len(values) != rows or rows < 2:
+        if len(values) != rows or rows < 2 or not np.isfinite(values).all():
             continue
         step = np.diff(values)
         for turn in (0, 2**8, 2**16, 2**32):
             steps = step % turn if turn else step
-            whole = np.isfinite(steps) & (steps == np.round(steps)) & (steps >= 1)
+            whole = (steps == np.round(steps)) & (steps >= 1)
             if whole.all() and np.median(steps) == 1 and (not turn or np.max(values) < turn):
                 return name, np.r_[0.0, np.cumsum(steps)]
     return None

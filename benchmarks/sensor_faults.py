@@ -2,12 +2,13 @@
 
 Usage: python benchmarks/sensor_faults.py faults [--scenarios S1,stick-slip] [--faults clock,gap]
     [--configurations one,five,marks] [--clocks unknown,frames] [--seeds 1] [--seed 900]
-    [--csv FILE.csv] [--out FILE.md] [--read FILE.csv ...]
+    [--checks] [--csv FILE.csv] [--out FILE.md] [--read FILE.csv ...]
     python benchmarks/sensor_faults.py alarms [--seeds 10] ...  false alarms of undisturbed runs
     python benchmarks/sensor_faults.py checks [--seeds 10] [--frames 120,300,600] [--around 0.05,10]
         false alarms of the checks before the solution, which are quick
     python benchmarks/sensor_faults.py offsets [--seeds 10] ... errors of recovered clock offsets
---faults takes names and groups. Loggers record 10 s before and after the frames. The classes of
+--checks ends before the solution, which is quick: a fault is mended where the checks give the
+problem of the undisturbed run, and else open. --faults takes names and groups. Loggers record 10 s before and after the frames. The classes of
 the outcomes are described in `sensor_fault_judging`, the faults in `sensor_fault_kinds`.
 """
 
@@ -28,13 +29,22 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 sys.path.insert(0, str(Path(__file__).parent))
-from sensor_fault_judging import PASSED, Class, Score, judged, score
+from sensor_fault_judging import (
+    PASSED,
+    Class,
+    Score,
+    checked,
+    judged,
+    mended_by_checks,
+    score,
+)
 from sensor_fault_kinds import ARMS, CONFIGURATIONS, FAULTS, Fault, copied, inputs_of
 from shake_scenarios import hash_of, posteriors
 from shake_scene import Run, cases, simulate
 
 import telerig
 from telerig.errors import TelerigError
+from telerig.estimator.smoothing.problem.problem import SmoothingProblem
 from telerig.estimator.smoothing.problem.sensor_alignment import aligned
 from telerig.estimator.smoothing.smooth import problem_of
 
@@ -61,17 +71,31 @@ def undisturbed(scenario: str, seed: int, configuration: str) -> Score:
     return score(run, telerig.smooth(**inputs_of(run, configuration, "frames")).trajectories)
 
 
-def cell(fault: Fault, scenario: str, seed: int, configuration: str, clock: str) -> dict[str, Any]:
+@lru_cache(maxsize=4)
+def undisturbed_problem(
+    scenario: str, seed: int, configuration: str, clock: str
+) -> SmoothingProblem:
+    return checked(inputs_of(run_of(scenario, seed), configuration, clock))
+
+
+def cell(
+    fault: Fault, scenario: str, seed: int, configuration: str, clock: str, checks: bool
+) -> dict[str, Any]:
     """One line of the CSV."""
     run = run_of(scenario, seed)
-    clean = undisturbed(scenario, seed, configuration)
     inputs = copied(inputs_of(run, configuration, clock))
     fault.change(inputs, np.random.default_rng([seed, hash_of(fault.name)]))
-    out = judged(run, inputs, fault, configuration, clean)
+    total_um = np.nan
+    if checks:
+        like = undisturbed_problem(scenario, seed, configuration, clock)
+        out = mended_by_checks(inputs, like)
+    else:
+        clean = undisturbed(scenario, seed, configuration)
+        out, total_um = judged(run, inputs, fault, configuration, clean), clean.total_um
     return {
         "fault": fault.name, "group": fault.group, "scenario": scenario,
         "configuration": configuration, "clock": clock, "seed": seed, "class": str(out.kind),
-        "verdict": out.verdict, "error_um": out.error_um, "undisturbed_um": clean.total_um,
+        "verdict": out.verdict, "error_um": out.error_um, "undisturbed_um": total_um,
         "ratio": out.ratio, "nees": out.nees,
         **{f"ratio_{a}": v for a, v in zip("xyz", out.axis_ratio)},
         **{f"nees_{a}": v for a, v in zip("xyz", out.axis_nees)},
@@ -127,7 +151,7 @@ def faults(options: argparse.Namespace) -> pd.DataFrame:
             for clock in options.clocks.split(","):
                 if clock == "frames" and fault.group == "clock":
                     continue
-                rows.append(cell(fault, scenario, seed, configuration, clock))
+                rows.append(cell(fault, scenario, seed, configuration, clock, options.checks))
                 print(_brief(rows[-1]), flush=True)
         written(rows, options)
     return written(rows, options)
@@ -394,6 +418,7 @@ def main() -> None:
     parser.add_argument("--faults", default="", help="names or groups; all by default")
     parser.add_argument("--configurations", default=",".join(CONFIGURATIONS))
     parser.add_argument("--clocks", default="unknown,frames")
+    parser.add_argument("--checks", action="store_true", help="end before the solution")
     parser.add_argument("--frames", default="120,300,0", help="numbers of frames; 0: all of them")
     parser.add_argument("--around", default="0.05,10", help="seconds of record around the frames")
     parser.add_argument("--seeds", type=int, default=1)

@@ -58,10 +58,12 @@ class Mounting:
     def wrong_gain(self) -> bool:
         """Whether the readings are clearly too large or too small for any usual scale error.
 
-        The regression's errors are those of the inverse of the gain.
+        The regression's errors are those of the inverse of the gain. Readings that the images do
+        not show at all have no gain.
         """
-        off = abs(1 / self.gain - 1) > _SDS * self.gain_sd / self.gain**2
-        return bool(off and not _USUAL_GAIN[0] < self.gain < _USUAL_GAIN[1])
+        inverse, sd = 1 / self.gain, self.gain_sd / self.gain**2
+        clear = inverse > _SDS * sd and abs(inverse - 1) > _SDS * sd
+        return bool(clear and not _USUAL_GAIN[0] < self.gain < _USUAL_GAIN[1])
 
 
 def signed_permutations() -> Array:

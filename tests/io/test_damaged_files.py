@@ -13,8 +13,8 @@ import tifffile
 
 from telerig.errors import InputError
 from telerig.estimator.tracking.tracks import read_track_table
-from telerig.io.exchange.importing.binary_recordings import read_wav
 from telerig.io.exchange.importing.accelerometer import Layout, read_accelerations
+from telerig.io.exchange.importing.binary_recordings import read_wav
 from telerig.io.files.csv_table import Column, read_table
 from telerig.io.images.frames import open_frames
 from telerig.io.recording.log import MAGIC, scan_log

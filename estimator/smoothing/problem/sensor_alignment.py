@@ -45,7 +45,7 @@ SAME_CLOCK_S = 0.006
 _SHARED_S = 2.0
 """Before and after the frames, so much of a record is searched first whose clock is the frames'."""
 
-_SLOWEST_S = 0.05
+_SLOWEST_S, _FASTEST_S = 0.05, 2e-5
 _MOST_STEPS = 3e6
 _LEAST_SAMPLES = 100
 _DIFFERENT_SDS = 5.0
@@ -105,8 +105,9 @@ def _aligned(
     images, wrong = _Images.of(problem), None
     encoder = None if images is None else images.encoder_alignment(problem)
     findings: list[Finding]
-    if images is None or not any(c.connected for c in _of_images(problem, images, encoder)):
-        wrong = _frame_times(problem)
+    seen = [] if images is None else list(_of_images(problem, images, encoder))
+    if not any(c.connected and _in_place(c, encoder, problem) for c in seen):
+        wrong = _frame_times(problem, max((c.nats for c in seen if c.connected), default=0.0))
         if wrong is not None:
             images = None
     if images is None:
@@ -131,6 +132,12 @@ def _aligned(
     findings += _rise(problem)
     near = [near_frames(s, problem.t_s) for s in problem.accelerometers]
     return _with(problem, near), findings
+
+
+def _in_place(clock: Alignment, encoder: Alignment | None, problem: SmoothingProblem) -> bool:
+    """Whether a clock has the offset at which it is expected, where that is known."""
+    free = clock is not encoder and any(s.clock == "unknown" for s in problem.accelerometers)
+    return free or abs(clock.offset_s) < 2 * SAME_CLOCK_S
 
 
 def _with(problem: SmoothingProblem, sensors: Sequence[Accelerometer]) -> SmoothingProblem:
@@ -845,12 +852,16 @@ def _rise(problem: SmoothingProblem) -> list[Finding]:
     ]
 
 
-def _frame_times(problem: SmoothingProblem) -> Finding | None:
-    """Return a factor of the frames' times with which images and sensors or encoder agree."""
+def _frame_times(problem: SmoothingProblem, nats_as_stated: float) -> Finding | None:
+    """Return a factor of the frames' times with which images and sensors or encoder agree.
+
+    nats_as_stated : how well the clearest of them agrees with the images at the stated times.
+    """
     if len(problem.t_s) < _LEAST_FRAMES:
         return None
     nats: dict[float, float] = {}
-    for factor in _FRAME_FACTORS:
+    pace = float(np.median(np.diff(problem.t_s)))
+    for factor in (f for f in _FRAME_FACTORS if f * pace > _FASTEST_S):
         trial = replace(problem, t_s=problem.t_s * factor)
         images = _Images.of(trial)
         if images is not None:
@@ -860,7 +871,7 @@ def _frame_times(problem: SmoothingProblem) -> Finding | None:
             near = [c for c in found if free or abs(c.offset_s) < shift]
             nats[factor] = sum(c.nats for c in near if c.unique)
     best = max(nats, key=lambda f: nats[f], default=None)
-    if best is None or nats[best] < _FACTOR_NATS:
+    if best is None or nats[best] < max(_FACTOR_NATS, 2 * nats_as_stated):
         return None
     return Finding(
         f"the images agree with the sensors only if the times are multiplied by {best:g}: "

@@ -42,6 +42,7 @@ from telerig.estimator.smoothing.problem.tables import near_frames
 SAME_CLOCK_S = 0.006
 """Largest offset of a clock that counts as that of the frames: three sd of the delay's prior."""
 
+_MOST_REFINEMENTS = 6
 _SHARED_S = 2.0
 """Before and after the frames, so much of a record is searched first whose clock is the frames'."""
 
@@ -365,8 +366,35 @@ def _clock(
         near = [near_frames(s, problem.t_s, _SHARED_S) for s in sensors]
         found = _aligned_by(images, channels, near)
         if found is not None and found.at_zero:
-            return found
-    return _aligned_by(images, channels, sensors)
+            return _between_steps(found, problem, images, channels, near)
+    found = _aligned_by(images, channels, sensors)
+    return None if found is None else _between_steps(found, problem, images, channels, sensors)
+
+
+def _between_steps(
+    found: Alignment,
+    problem: SmoothingProblem,
+    images: _Images,
+    channels: Sequence[Channel],
+    sensors: Sequence[Accelerometer],
+) -> Alignment:
+    """Return a unique offset again from records that it has placed, until it no longer changes.
+
+    The parabola through three lags of the grid is off by up to a tenth of a step between them.
+    """
+    step_s = images.grid.step_s
+    if not found.unique:
+        return found
+    for _ in range(_MOST_REFINEMENTS):
+        moved = [replace(s, t_s=s.t_s - found.offset_s) for s in sensors]
+        near = [near_frames(s, problem.t_s, _WINDOW_MARGIN_S) for s in moved]
+        again = _aligned_by(images, channels, near)
+        if again is None or not abs(again.offset_s) < step_s or not np.isfinite(again.sd_s):
+            break
+        found = replace(found, offset_s=found.offset_s + again.offset_s, sd_s=again.sd_s)
+        if abs(again.offset_s) < 0.2 * again.sd_s:
+            break
+    return found
 
 
 def _aligned_by(

@@ -16,8 +16,9 @@ import numpy as np
 from telerig.arrays import Array, Bools
 from telerig.estimator.sensors.accelerations import Accelerations, Grid
 
+_CLEAR_NATS = 60.0
 _LEAST_NATS = 20.0
-_MOST_OF_PEAK = 0.7
+_MOST_OF_PEAK, _LESS_OF_PEAK = 0.7, 0.5
 """Largest share of the peak that other lags, or the reversed record, may reach. In the simulated
 runs without a connection 0.7 was never reached by both; see docs/decisions/025."""
 
@@ -101,6 +102,13 @@ class Alignment:
         """Whether the record is connected with the channels at one lag alone."""
         alone = self.runner_up_nats < _MOST_OF_PEAK * self.nats
         return self.connected and alone and not self.at_end
+
+    @property
+    def clear(self) -> bool:
+        """Whether the connection is so clear that the clock of an encoder, which is expected to be
+        that of the frames, is said to be wrong."""
+        others = max(self.runner_up_nats, self.reversed_nats)
+        return self.unique and self.nats > _CLEAR_NATS and others < _LESS_OF_PEAK * self.nats
 
     @property
     def at_zero(self) -> bool:

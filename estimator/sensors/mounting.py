@@ -112,6 +112,18 @@ def mounting(
     return Mounting(candidates[best], bool(clear), lead, gain, gain_sd)
 
 
+def lead_of_axes(
+    stated: Array, other: Array, x: Array, known: Bools, felt: Sequence[Felt]
+) -> float:
+    """Return the log-likelihood of other axes (3, 3) less that of the stated ones.
+
+    x, known, felt : as for `mounting`.
+    """
+    parts = [p for f in felt if (p := _Part.of(f, x, known)) is not None]
+    own, best = _scores(np.array([stated, other]), parts, 0)
+    return float(best - own)
+
+
 @dataclass(frozen=True)
 class _Part:
     direction: Array

@@ -75,3 +75,10 @@ def test_a_counter_that_reads_infinity_is_no_clock(tmp_path: Path) -> None:
         warnings.simplefilter("error", RuntimeWarning)
         with suppress(InputError):
             read_accelerations(file, "arm", Layout(unit="g"))
+
+
+def test_a_logger_file_of_lines_of_megabytes_is_refused_at_once(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_text((",".join(f"c{i}" for i in range(100_000)) + "\n") * 20, encoding="utf-8")
+    with pytest.raises(InputError, match="begins with a line of more than"):
+        read_accelerations(file, "arm", Layout(unit="g"))

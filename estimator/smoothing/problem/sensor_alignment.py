@@ -28,6 +28,7 @@ from telerig.estimator.sensors.mounting import (
     CLEAR_NATS,
     Felt,
     Mounting,
+    lead_of_axes,
     mounting,
     preference,
     slope,
@@ -564,22 +565,43 @@ def _mountings(
         return [exchanged]
     axes = {s.name: s.axes for s in sensors}
     findings: list[Finding] = []
-    judged: dict[str, Mounting] = {}
-    while True:
-        judged = {
+
+    def judge() -> dict[str, Mounting]:
+        return {
             s.name: mounting(
                 s.axes, np.median(s.reading_mm_s2, axis=0), problem.up, *read[s.name],
                 _felt(problem, images, s, axes, read),
             )
             for s in sensors
         }  # fmt: skip
-        worst = max(
-            (n for n, m in judged.items() if m.clear and not np.allclose(axes[n], m.axes)),
-            key=lambda n: judged[n].lead_nats, default=None,
-        )  # fmt: skip
+
+    def lead_of_images(name: str, judged: dict[str, Mounting]) -> float:
+        """By how much images and encoder alone prefer the axes that were found."""
+        sensor = next(s for s in sensors if s.name == name)
+        felt = _felt(problem, images, sensor, axes, {})
+        return lead_of_axes(sensor.axes, judged[name].axes, *read[name], felt)
+
+    while True:
+        judged = judge()
+        leads = {
+            n: m.lead_nats
+            for n, m in judged.items()
+            if m.clear and not np.allclose(axes[n], m.axes)
+        }
+        worst = max(leads, key=lambda n: leads[n], default=None)
         if worst is None or any(f.fix.get("sensor") == worst for f in findings):
             break
         axes[worst] = judged[worst].axes
+        after = judge()
+        rivals = [n for n in leads if n != worst and not after[n].clear]
+        if rivals:
+            rival = max(rivals, key=lambda n: leads[n])
+            apart = lead_of_images(worst, judged) - lead_of_images(rival, judged)
+            if abs(apart) < CLEAR_NATS:
+                return [*findings, _one_of(worst, rival, judged)]
+            if apart < 0:
+                axes[worst] = next(s.axes for s in sensors if s.name == worst)
+                worst, axes[rival] = rival, judged[rival].axes
         findings.append(_axes_finding(worst, judged[worst]))
     for name, found in judged.items():
         if found.wrong_gain and name not in measured:
@@ -598,14 +620,31 @@ def _mountings(
 
 def _axes_finding(name: str, found: Mounting) -> Finding:
     rows = [[float(v) + 0.0 for v in np.round(row, 6)] for row in found.axes]
-    line = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in rows)
     return Finding(
         "its axes do not fit what images, encoder and gravity show",
         f"accelerometer {name}",
-        f"[accelerometers.{name}] axes = [{line}] would fit",
+        f"{_axes_line(name, found)} would fit",
         Code.SENSOR_AXES,
         {"sensor": name, "axes": rows},
     )
+
+
+def _one_of(first: str, second: str, judged: dict[str, Mounting]) -> Finding:
+    """Return that two sensors contradict each other, and nothing tells which of them is wrong."""
+    return Finding(
+        "they contradict each other: the axes of one of them are wrong, and images and encoder do "
+        "not show clearly which",
+        f"accelerometers {first} and {second}",
+        f"look how both are mounted; either {_axes_line(first, judged[first])} or "
+        f"{_axes_line(second, judged[second])} would fit",
+        Code.SENSOR_AXES,
+    )
+
+
+def _axes_line(name: str, found: Mounting) -> str:
+    rows = np.round(found.axes, 6) + 0.0
+    line = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in rows)
+    return f"[accelerometers.{name}] axes = [{line}]"
 
 
 def _felt(
@@ -719,7 +758,7 @@ def _encoder(
         usual = _USUAL_GAIN[0] < gain < _USUAL_GAIN[1]
         if abs(gain) > _CLEAR_GAIN * sd and not usual and abs(gain - 1) > _CLEAR_GAIN * sd:
             return [_gain_finding(gain, sd, where)]
-    if clock is not None and clock.unique and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
+    if clock is not None and clock.clear and abs(clock.offset_s) > 2 * SAME_CLOCK_S:
         return [
             Finding(
                 f"its clock is {clock.offset_s:+.4f} ± {clock.sd_s:.4f} s off that of the frames, "
@@ -739,13 +778,20 @@ def _gains(
     encoder: Accelerations,
     sensors: Sequence[Accelerometer],
 ) -> list[tuple[float, float]]:
-    """Return the true motion over the encoder's, with its sd, by images and by sensors."""
+    """Return the true motion over the encoder's, with its sd, by images and by sensors.
+
+    The cameras see the same bubbles, whose own motion is the error: two are no better than one.
+    """
     x, out = encoder.values[:, 0], []
+    seen_by = []
     for camera, _, seen in images.cameras:
         y = along_axis(problem, camera, seen)
         if y is not None:
             known = seen.known & encoder.known
-            out.append(slope(y[known], x[known]))
+            seen_by.append(slope(y[known], x[known]))
+    if seen_by:
+        mean, sd = np.mean(seen_by, axis=0)
+        out.append((float(mean), float(sd)))
     for sensor in sensors:
         values, there = _at_frames(images, sensor)
         known = there & encoder.known

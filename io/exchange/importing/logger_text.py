@@ -28,6 +28,7 @@ from telerig.io.files.text import read_bytes
 _SEPARATORS = (";", "\t", ",", " ")
 """The last one stands for any number of spaces."""
 _COMMENTS = ("#", "%", "//", "*", ";")
+_LONGEST_LINE = 100 * MOST_COLUMNS
 _SAMPLED_ROWS = 60
 _HEADER_WITHIN = 4
 """Lines with words above the table among which the header must be: units and rules are others."""
@@ -112,6 +113,14 @@ def read_logger_text(path: Path) -> Recording:
 def _text(path: Path) -> str:
     """Return the text of a file, in which lines end with a line feed."""
     content = read_bytes(path)
+    begin = content[:_LONGEST_LINE]
+    if len(begin) == _LONGEST_LINE and not {10, 13} & set(begin):
+        raise InputError(
+            f"begins with a line of more than {_LONGEST_LINE} characters; {MOST_COLUMNS} columns "
+            "are read at most",
+            where=str(path),
+            todo=_EXPORT,
+        )
     marks = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le",
              codecs.BOM_UTF16_BE: "utf-16-be"}  # fmt: skip
     mark = next((m for m in marks if content.startswith(m)), b"")

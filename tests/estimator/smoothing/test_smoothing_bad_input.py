@@ -15,7 +15,7 @@ import telerig
 from telerig.errors import InputError
 from telerig.estimator.calibration.result.calibration import Calibration, calibration_from_cameras
 from telerig.estimator.sensors.checks import check_sensors
-from telerig.estimator.sensors.findings import settled
+from telerig.estimator.sensors.findings import SensorError, settled
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.smooth import smooth
 from telerig.io.dataset.run import RunData
@@ -305,6 +305,27 @@ def test_axes_that_gravity_cannot_tell(felt: int, sign: int, told: str, run: Pat
     words = settled(check_sensors(replace(data, rig=rig, accelerometers=table)), frozenset())
     assert len(words) == (2 if told else 0), words
     assert all(f"felt along {told} of the sensor" in w for w in words), words
+
+
+@pytest.mark.parametrize(("turned", "axis"), [("arm_left", "ax"), ("arm_right", "az")])
+@pytest.mark.parametrize("marks", [True, False])
+def test_of_two_arms_that_contradict_each_other_the_sound_one_is_not_blamed(
+    turned: str, axis: str, marks: bool, run: Path
+) -> None:
+    """The axis that its camera sees from the side."""
+
+    def change(table: pd.DataFrame) -> None:
+        table.loc[table["sensor"] == turned, f"{axis}_m_s2"] *= -1
+
+    spoil(run / "accelerometer.csv", change)
+    data = telerig.load_run(run)
+    seen = data if marks else replace(data, references=None)
+    with pytest.raises(SensorError) as caught:
+        smooth(tracks(data), calibration(), stage=seen, model=ShakeModel())
+    assert caught.value.code == "SENSOR_AXES"
+    fix = caught.value.findings[0].fix
+    assert fix.get("sensor") == turned or (not fix and turned in str(caught.value))
+    assert fix or not marks
 
 
 # --- names, NaN, short runs, tracks -------------------------------------------------------------

@@ -31,7 +31,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     rough_distance,
 )
 from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, close_pairs, fit_outlines
-from telerig.estimator.images.noise import high_pass
 
 __all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
 
@@ -106,8 +105,7 @@ def find_bubbles(
     if reason:
         return _bubbles({}, [], np.nan, reason)
     ratio, clipped = normalised(image, background)
-    response = high_pass(ratio)
-    sigma = max(noise_share(ratio, response), 1e-4)
+    sigma = max(noise_share(ratio), 1e-4)
     blobs, rejected = find_blobs(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
@@ -116,7 +114,7 @@ def find_bubbles(
     rejected += slender
     if not parts:
         return _bubbles({}, rejected, sigma, "no shadow dark and large enough")
-    dark_sigma = max(dark_noise_share(ratio, response, blobs, sigma), 1e-4)
+    dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
     columns = _columns(outlines, parts, image.shape, clipped)

@@ -54,9 +54,8 @@ def _full_scale(image: NDArray[Any]) -> float:
 
 def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Float32, bool]:
     """Grey over background, and whether the screen is clipped at the sensor's white."""
-    grey = image.astype(np.float32, copy=False)
     if background is None:
-        screen = screen_level(grey)
+        screen = screen_level(image.astype(np.float32, copy=False))
     else:
         screen = np.asarray(background)
         if screen.shape != image.shape:
@@ -72,8 +71,10 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
                 where="background",
                 todo="give the level of the lit screen at every pixel",
             )
-    screen = np.maximum(screen, 1e-6 * float(image.max()) + 1e-12)
-    ratio = cv2.divide(grey, screen)
+    floor = 1e-6 * float(image.max()) + 1e-12
+    if float(screen.min()) < floor:
+        screen = np.maximum(screen, floor)
+    ratio = np.asarray(cv2.divide(_divisible(image), screen, dtype=cv2.CV_32F), np.float32)
     sample = image[::8, ::8]
     clipped = bool(
         image.dtype.kind in "ui"
@@ -81,6 +82,11 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
         and sample.max() >= _WHITE_SHARE * _full_scale(image)
     )
     return ratio, clipped
+
+
+def _divisible(image: NDArray[Any]) -> NDArray[Any]:
+    """The image in a type that OpenCV divides without a copy, or else in single precision."""
+    return image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32, copy=False)
 
 
 def screen_level(image: Float32) -> Float32:

@@ -28,9 +28,10 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     rough_distance,
 )
 from telerig.estimator.bubbles.outline.outline_fit import Outlines
-from telerig.estimator.images.noise import clipped_sigma
+from telerig.estimator.images.noise import clipped_sigma, high_pass
 
 _NOISE_SAMPLES = 40_000
+_BAND_ROWS = 16
 _DARK_SHARE, _ENOUGH_DARK = 0.12, 120
 _FAINT_SHARE = 0.5
 _LOW_SIGMA = 6.0
@@ -62,19 +63,29 @@ class Rejected(NamedTuple):
     reason: str
 
 
-def noise_share(ratio: Float32, response: Float32) -> float:
+def noise_share(ratio: Float32) -> float:
     """Noise of the normalised image where the screen is free, as a share of the background.
 
-    response : the image's `high_pass`, which is blind to any plane.
+    From the `high_pass`, which is blind to any plane, of bands of rows of a large image.
     """
-    free = cv2.erode((ratio > _LIT).astype(np.uint8), np.ones((3, 7), np.uint8)) > 0
-    values = response[free] if np.count_nonzero(free) > 200 else response.ravel()
-    return clipped_sigma(
-        values[:: max(1, values.size // _NOISE_SAMPLES)].astype(np.float64), rounds=6
-    )
+    found, lit = [], []
+    for first in range(0, max(len(ratio) - _BAND_ROWS, 0) + 1, _band_step(ratio)):
+        band = ratio[first : first + _BAND_ROWS]
+        free = cv2.erode((band > _LIT).view(np.uint8), np.ones((3, 7), np.uint8))
+        found.append(high_pass(band)[1:-1].ravel())
+        lit.append(free[1:-1].ravel() > 0)
+    response, free = np.concatenate(found), np.concatenate(lit)
+    values = response[free] if np.count_nonzero(free) > 200 else response
+    values = values[:: max(1, values.size // _NOISE_SAMPLES)]
+    return clipped_sigma(values.astype(np.float64), rounds=6)
 
 
-def dark_noise_share(ratio: Float32, response: Float32, blobs: list[Blob], sigma: float) -> float:
+def _band_step(ratio: Float32) -> int:
+    """Rows from one band to the next: all of a small image, a quarter of a large one."""
+    return _BAND_ROWS - 2 if ratio.size < 4 * _NOISE_SAMPLES else 4 * _BAND_ROWS
+
+
+def dark_noise_share(ratio: Float32, blobs: list[Blob], sigma: float) -> float:
     """Noise within the dark rims, at most ``sigma``, that of the screen: photons are fewer there.
 
     From the `high_pass` where five by five pixels are dark alike. Structure within the rims makes
@@ -83,9 +94,10 @@ def dark_noise_share(ratio: Float32, response: Float32, blobs: list[Blob], sigma
     found = [np.empty(0, np.float32)]
     for blob in blobs:
         x, y, width, height = blob.box
-        crop = np.s_[y : y + height, x : x + width]
-        even = (ratio[crop] < blob.inner + _DARK_SHARE * (1.0 - blob.inner)).astype(np.uint8)
-        found.append(response[crop][cv2.erode(even, np.ones((5, 5), np.uint8), borderValue=0) > 0])
+        part = ratio[y : y + height, x : x + width]
+        dark = blob.inner + _DARK_SHARE * (1.0 - blob.inner)
+        even = cv2.erode((part < dark).view(np.uint8), np.ones((5, 5), np.uint8), borderValue=0)
+        found.append(high_pass(part)[even > 0])
     values = np.concatenate(found)
     if values.size < _ENOUGH_DARK:
         return sigma
@@ -103,23 +115,31 @@ def find_blobs(
     low = 1.0 - max(_FAINT_SHARE * min_contrast, min(_LOW_SIGMA * sigma, 0.9 * min_contrast))
     mask = cv2.compare(ratio, low, cv2.CMP_LT)
     regions, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    blobs: list[Blob] = []
+    traced: list[_Traced] = []
     rejected: list[Rejected] = []
     too_small = f"smaller than {min_diameter_px:g} px"
     for region in regions:
         if len(region) < _LEAST_OUTLINE:
             continue
         x, y, width, height = cv2.boundingRect(region)
-        found: list[Blob] = []
+        found: list[_Traced] = []
         reason = too_small
         if max(width, height) >= min_diameter_px:
             box = (x, y, width, height)
             found, reason = _trace(ratio, region, box, low, min_contrast, min_diameter_px)
-        blobs += found
+        traced += found
         if not found:
             radius = 0.5 * float(np.sqrt(width * height))
             rejected.append(Rejected(x + (width - 1) / 2, y + (height - 1) / 2, radius, reason))
-    return blobs, rejected
+    return _refined(ratio, traced), rejected
+
+
+class _Traced(NamedTuple):
+    """An outline of pixels (n, 2), the level inside, and the box of the region it came from."""
+
+    pixels: NDArray[np.int_]
+    inner: float
+    box: tuple[int, int, int, int]
 
 
 def _trace(
@@ -129,7 +149,7 @@ def _trace(
     low: float,
     min_contrast: float,
     min_diameter_px: float,
-) -> tuple[list[Blob], str]:
+) -> tuple[list[_Traced], str]:
     """Outlines at half depth within one region, or the reason why there is none."""
     x, y, width, height = box
     rows, columns = ratio.shape
@@ -148,19 +168,14 @@ def _trace(
     if any(at_border):
         _close_at_border(dark, at_border)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    blobs = []
+    traced = []
     for outline in outlines:
         points = outline.reshape(-1, 2)
         size = int(np.max(np.max(points, axis=0) - np.min(points, axis=0))) + 1
         if len(points) < _LEAST_OUTLINE or size < min_diameter_px:
             continue
-        points = points + np.array([left, top])
-        refined, blur = refined_contour(ratio, points, half, 1.0 - inner)
-        edge = (points[:, 0] <= 0) | (points[:, 1] <= 0)
-        edge |= (points[:, 0] >= columns - 1) | (points[:, 1] >= rows - 1)
-        refined[edge] = np.nan
-        blobs.append(Blob(refined, inner, blur, box, bool(np.any(edge))))
-    return blobs, "" if blobs else f"smaller than {min_diameter_px:g} px"
+        traced.append(_Traced(points + np.array([left, top]), inner, box))
+    return traced, "" if traced else f"smaller than {min_diameter_px:g} px"
 
 
 def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
@@ -175,32 +190,42 @@ def _close_at_border(dark: NDArray[np.uint8], sides: tuple[bool, ...]) -> None:
                 line[low:high] = 1
 
 
-def refined_contour(
-    ratio: Float32, points: NDArray[np.int_], half: float, contrast: float
-) -> tuple[Array, float]:
-    """Outline points (n, 2) moved along the gradient to the half level, and the edge's blur."""
+def _refined(ratio: Float32, traced: list[_Traced]) -> list[Blob]:
+    """The blobs: outline points moved along the gradient to half depth, and the edges' blur."""
+    if not traced:
+        return []
     rows, columns = ratio.shape
-    u, v = points[:, 0].astype(np.intp), points[:, 1].astype(np.intp)
-    u0, u1 = np.maximum(u - 1, 0), np.minimum(u + 1, columns - 1)
-    v0, v1 = np.maximum(v - 1, 0), np.minimum(v + 1, rows - 1)
-    slope_u = (
-        2.0 * (ratio[v, u1] - ratio[v, u0])
-        + (ratio[v0, u1] - ratio[v0, u0])
-        + (ratio[v1, u1] - ratio[v1, u0])
-    ) / 8.0
-    slope_v = (
-        2.0 * (ratio[v1, u] - ratio[v0, u])
-        + (ratio[v1, u0] - ratio[v0, u0])
-        + (ratio[v1, u1] - ratio[v0, u1])
-    ) / 8.0
-    square = np.maximum(slope_u**2 + slope_v**2, (0.02 * contrast) ** 2)
-    shift = (half - ratio[v, u]) / square
+    sizes = np.array([len(one.pixels) for one in traced])
+    points = np.concatenate([one.pixels for one in traced]).astype(np.intp)
+    inner = np.repeat(np.array([one.inner for one in traced], np.float32), sizes)
+    u, v = points.T
+    left, right = np.maximum(u - 1, 0), np.minimum(u + 1, columns - 1)
+    above, here, below = (
+        row * columns for row in (np.maximum(v - 1, 0), v, np.minimum(v + 1, rows - 1))
+    )
+    value = ratio.ravel().take
+    north_west, north_east = value(above + left), value(above + right)
+    south_west, south_east = value(below + left), value(below + right)
+    slope_u = 2.0 * (value(here + right) - value(here + left))
+    slope_u = (slope_u + (north_east - north_west) + (south_east - south_west)) / 8.0
+    slope_v = 2.0 * (value(below + u) - value(above + u))
+    slope_v = (slope_v + (south_west - north_west) + (south_east - north_east)) / 8.0
+    square = np.maximum(slope_u**2 + slope_v**2, (0.02 * (1.0 - inner)) ** 2)
+    shift = (0.5 * (1.0 + inner) - value(here + u)) / square
     shift = shift * np.minimum(1.0, 1.2 / np.maximum(np.abs(shift) * np.sqrt(square), 1e-9))
-    refined = np.stack([u + shift * slope_u, v + shift * slope_v], axis=1).astype(np.float64)
-    place = int(_STEEP_SHARE * square.size)
-    steepest = float(np.sqrt(np.partition(square, place)[place]))
-    blur = contrast / (np.sqrt(2.0 * np.pi) * max(steepest, 1e-6))
-    return refined, float(np.sqrt(max(blur**2 - 0.6, 0.15)))
+    moved = np.stack([u + shift * slope_u, v + shift * slope_v], axis=1).astype(np.float64)
+    edge = (u <= 0) | (v <= 0) | (u >= columns - 1) | (v >= rows - 1)
+    moved[edge] = np.nan
+    blobs, first = [], 0
+    for one, size in zip(traced, sizes.tolist(), strict=True):
+        part = slice(first, first + size)
+        place = int(_STEEP_SHARE * size)
+        steepest = float(np.sqrt(np.partition(square[part], place)[place]))
+        blur = (1.0 - one.inner) / (np.sqrt(2.0 * np.pi) * max(steepest, 1e-6))
+        blur = float(np.sqrt(max(blur**2 - 0.6, 0.15)))
+        blobs.append(Blob(moved[part], one.inner, blur, one.box, bool(edge[part].any())))
+        first += size
+    return blobs
 
 
 _TURN_RAD = -0.1
@@ -215,21 +240,23 @@ def contour_moments(contours: list[Array]) -> tuple[Array, Array, Array]:
 
     Points that are NaN (beyond the image) are passed over.
     """
-    found = []
+    found, used = [], []
     for contour in contours:
         points = contour[np.isfinite(contour[:, 0])]
         points = points if len(points) >= 3 else np.eye(3, 2)
         m = cv2.moments(points.astype(np.float32)[:, None])
         area = m["m00"] or 1e-9
-        uu, vv, uv = m["mu20"] / area, m["mu02"] / area, m["mu11"] / area
-        middle, half = (uu + vv) / 2.0, np.hypot((uu - vv) / 2.0, uv)
-        a, b = 2.0 * np.sqrt(np.maximum([middle + half, middle - half], 0.1))
-        angle = 0.5 * np.arctan2(2.0 * uv, uu - vv)
-        ellipse = np.array([m["m10"] / area, m["m01"] / area, a, b, angle])
-        gap = rough_distance(ellipse, points[:, 0], points[:, 1])
-        found.append((ellipse, np.sqrt(np.mean(gap**2)), np.max(np.abs(gap))))
-    ellipses, rms, largest = zip(*found)
-    return np.array(ellipses), np.array(rms), np.array(largest)
+        found.append([m[name] / area for name in ("m10", "m01", "mu20", "mu02", "mu11")])
+        used.append(points)
+    u, v, uu, vv, uv = np.array(found).T
+    middle, half = (uu + vv) / 2.0, np.hypot((uu - vv) / 2.0, uv)
+    a, b = 2.0 * np.sqrt(np.maximum([middle + half, middle - half], 0.1))
+    ellipses = np.stack([u, v, a, b, 0.5 * np.arctan2(2.0 * uv, uu - vv)], axis=1)
+    sizes = np.array([len(points) for points in used])
+    first = np.cumsum(sizes) - sizes
+    gap = rough_distance(np.repeat(ellipses, sizes, axis=0), *np.concatenate(used).T)
+    rms = np.sqrt(np.add.reduceat(gap**2, first) / sizes)
+    return ellipses, rms, np.maximum.reduceat(np.abs(gap), first)
 
 
 def notch_arcs(contour: Array) -> list[Array]:
@@ -350,22 +377,26 @@ def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
     """
     sizes = np.array([len(arc) for arc in arcs])
     first = np.cumsum(sizes) - sizes
-    points = np.concatenate(arcs)
-    origin = np.mean(points, axis=0)
-    u, v = (points - origin).astype(np.float32).T
+    parts = [slice(low, low + size) for low, size in zip(first.tolist(), sizes.tolist())]
+    origin = np.array([np.mean(arc, axis=0) for arc in arcs])
+    points = np.concatenate(arcs) - np.repeat(origin, sizes, axis=0)
+    u, v = points.astype(np.float32).T
     ellipse = _circles(arcs)
     ellipse[:, :2] -= origin
     radius = ellipse[:, 2].copy()
-    basis = np.empty((ELLIPSE_PARAMETERS, u.size), dtype=np.float32)
+    rows = np.empty((ELLIPSE_PARAMETERS + 1, u.size), dtype=np.float32)
+    products = np.empty((len(arcs), len(rows), len(rows)))
     for _ in range(_ROUNDS):
         foot = foot_points(ellipse, sizes, u, v)
-        ellipse_basis(foot, basis)
-        weight = 1.0 / (_POINT_SIGMA_PX**2 * (1.0 + (foot.distance / 0.6) ** 2))
-        products = np.add.reduceat(basis[:, None] * basis[None] * weight, first, axis=2)
-        pull = np.add.reduceat(basis * (weight * foot.distance), first, axis=1).T.astype(np.float64)
-        information = np.moveaxis(products, 2, 0).astype(np.float64)
+        ellipse_basis(foot, rows[:ELLIPSE_PARAMETERS])
+        rows[ELLIPSE_PARAMETERS] = foot.distance
+        rows /= _POINT_SIGMA_PX * np.sqrt(1.0 + (foot.distance / 0.6) ** 2)
+        for index, part in enumerate(parts):
+            products[index] = rows[:, part] @ rows[:, part].T
+        information = products[:, :ELLIPSE_PARAMETERS, :ELLIPSE_PARAMETERS]
+        pull = products[:, :ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS]
         _add_roundness(information, pull, ellipse, _ROUND_SHARE * radius)
-        step = np.linalg.solve(information, pull[..., None])[..., 0].astype(np.float64)
+        step = np.linalg.solve(information, pull[..., None])[..., 0]
         reach = np.max(np.abs(step), axis=1)
         step *= np.minimum(1.0, 0.4 * ellipse[:, 3] / (reach + 1e-12))[:, None]
         ellipse, _ = moved(ellipse, step)
@@ -421,16 +452,28 @@ def split_blobs(blobs: list[Blob], shape: tuple[int, ...], *, min_diameter_px: f
     if not blobs:
         return []
     whole, rms, largest = contour_moments([blob.contour_px for blob in blobs])
-    parts: list[Part] = []
-    for index, blob in enumerate(blobs):
-        radius = float(np.sqrt(whole[index, 2] * whole[index, 3]))
-        allowed = _CLEAN_PX + _CLEAN_SHARE * radius
-        clean = rms[index] < allowed and largest[index] < 4.0 * allowed
-        if clean and not blob.touches_border:
-            parts.append(Part(whole[index], index))
-        else:
-            parts += _split(blob, index, whole[index], shape, min_diameter_px)
-    return parts
+    allowed = _CLEAN_PX + _CLEAN_SHARE * np.sqrt(whole[:, 2] * whole[:, 3])
+    clean = (rms < allowed) & (largest < 4.0 * allowed)
+    clean &= ~np.array([blob.touches_border for blob in blobs])
+    parts = {index: [Part(whole[index], index)] for index in np.flatnonzero(clean).tolist()}
+    unclean = np.flatnonzero(~clean).tolist()
+    arcs = {index: notch_arcs(blobs[index].contour_px) for index in unclean}
+    single = [index for index in unclean if len(arcs[index]) == 1]
+    fits = zip(*fit_ellipses([arcs[index][0] for index in single])) if single else ()
+    for index, (ellipse, error) in zip(single, fits):
+        sound = error < 2.5 * _tolerance(ellipse)
+        sound = sound and _dark(ellipse, _in_image(blobs[index]), shape)
+        parts[index] = [Part(ellipse if sound else whole[index], index, merged=not sound)]
+    for index in set(unclean) - set(single):
+        good = _split(_in_image(blobs[index]), arcs[index], shape, min_diameter_px)
+        parts[index] = [Part(ellipse, index, shared=len(good) > 1) for ellipse in good]
+        parts[index] = parts[index] or [Part(whole[index], index, merged=True)]
+    return [part for index in range(len(blobs)) for part in parts[index]]
+
+
+def _in_image(blob: Blob) -> Array:
+    """The outline's points that are not on the image's edge."""
+    return blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
 
 
 def _tolerance(ellipse: Array) -> Array:
@@ -438,17 +481,11 @@ def _tolerance(ellipse: Array) -> Array:
 
 
 def _split(
-    blob: Blob, index: int, whole: Array, shape: tuple[int, ...], min_diameter_px: float
-) -> list[Part]:
-    arcs = notch_arcs(blob.contour_px)
-    unsplit = [Part(whole, index, merged=True)]
+    contour: Array, arcs: list[Array], shape: tuple[int, ...], min_diameter_px: float
+) -> list[Array]:
+    """Ellipses (5,) that explain the outline ``contour`` and its arcs; [] if none do."""
     if not arcs or len(arcs) > _MAX_ARCS:
-        return unsplit
-    contour = blob.contour_px[np.isfinite(blob.contour_px[:, 0])]
-    if len(arcs) == 1:
-        fitted, rms = fit_ellipses(arcs)
-        sound = rms[0] < 2.5 * _tolerance(fitted[0]) and _dark(fitted[0], contour, shape)
-        return [Part(fitted[0], index)] if sound else unsplit
+        return []
     groups = _grouped(arcs, contour)
     fitted, rms = fit_ellipses(groups)
     good = [
@@ -457,9 +494,7 @@ def _split(
         if _sound(ellipse, group, float(error), contour, min_diameter_px)
         and _dark(ellipse, contour, shape)
     ]
-    if not _explains(good, contour):
-        return unsplit
-    return [Part(ellipse, index, shared=len(good) > 1) for ellipse in good]
+    return good if _explains(good, contour) else []
 
 
 def _sound(

@@ -36,7 +36,7 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     spread,
     turned_harmonics,
 )
-from telerig.statistics import robust_sd
+from telerig.statistics import NORMAL_FROM_MEDIAN
 
 _OCTANTS = 8
 _UNLIKE_SHARE, _UNLIKE_SIGMA = 0.015, 3.0
@@ -78,6 +78,14 @@ class Pixels:
         """Return the sums (B,) of values (N,) over the pixels of each bubble."""
         weights = values.astype(np.float64)
         return np.bincount(self.owner, weights, self.bubbles).astype(np.float64)
+
+    def of(self, kept: Bools) -> tuple[Pixels, Index]:
+        """Return the pixels of the bubbles that are kept (B,), and their positions (M,)."""
+        places = np.flatnonzero(kept[self.owner])
+        counts = self.counts[kept]
+        owner = np.repeat(np.arange(counts.size), counts)
+        own = (values.take(places) for values in (self.u, self.v, self.value))
+        return Pixels(owner, counts, self.origin[kept], *own), places
 
     def local(self, ellipse: Array) -> Array:
         """Return ellipses (B, 5) with their centres relative to ``origin``."""
@@ -136,62 +144,58 @@ def rim_pixels(
     thin : whether to take only one pixel in four for ellipses with b above 10 px.
     """
     reach = _REACH_SIGMA * sigma + _REACH_PX + slack_px
-    columns = ratio.shape[1]
-    cos, sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
-    a, b = ellipse[:, 2], ellipse[:, 3]
-    half = np.stack([np.hypot(a * cos, b * sin), np.hypot(a * sin, b * cos)], axis=1)
-    half += reach[:, None]
-    size = ratio.shape[::-1]
-    low = np.clip(np.ceil(ellipse[:, :2] - half), 0, size).astype(np.intp)
-    high = np.clip(np.floor(ellipse[:, :2] + half) + 1, 0, size).astype(np.intp)
+    step = np.where(thin & (ellipse[:, 3] > _THIN_ABOVE_PX), 2, 1)
     origin = np.round(ellipse[:, :2])
-    step = np.where(thin & (b > _THIN_ABOVE_PX), 2, 1)
-    rings = [
-        _ring(
-            ellipse[k],
-            origin[k],
-            np.arange(low[k, 0], high[k, 0], step[k]),
-            np.arange(low[k, 1], high[k, 1], step[k]),
-            float(reach[k]),
-        )
-        for k in range(len(ellipse))
-    ]
-    counts = np.array([len(ring[0]) for ring in rings], dtype=np.intp)
-    u, v = (np.concatenate([ring[k] for ring in rings]) for k in (0, 1))
-    start = (origin[:, 1] * columns + origin[:, 0]).astype(np.intp)
-    place = np.repeat(start, counts)
-    place += v.astype(np.intp) * columns + u.astype(np.intp)
-    owner = np.repeat(np.arange(counts.size), counts)
+    local = ellipse.copy()
+    local[:, :2] -= origin
+    edges = np.stack([-origin, np.array(ratio.shape[::-1]) - 1 - origin])
+    extent = np.hypot(local[:, 2] * np.sin(local[:, 4]), local[:, 3] * np.cos(local[:, 4])) + reach
+    top = np.maximum(np.ceil((local[:, 1] - extent) / step), np.ceil(edges[0, :, 1] / step))
+    bottom = np.minimum(np.floor((local[:, 1] + extent) / step), np.floor(edges[1, :, 1] / step))
+    bubble, row = _ranges(top, bottom)
+    local, reach, step, edges = local[bubble], reach[bubble], step[bubble], edges[:, bubble, 0]
+    left, right = _chord(local, reach, row * step)
+    inner_left, inner_right = _chord(local, -reach, row * step)
+    first = np.maximum(np.ceil(np.stack([left, inner_right]) / step), np.ceil(edges[0] / step))
+    until = np.stack([np.minimum(inner_left, right), right])
+    last = np.minimum(np.floor(until / step), np.floor(edges[1] / step))
+    first[1] = np.maximum(first[1], last[0] + 1)
+    span, column = _ranges(first.T.ravel(), last.T.ravel())
+    span //= 2
+    owner = bubble[span]
+    u, v = (column * step[span]).astype(np.float32), (row * step)[span].astype(np.float32)
+    start = (origin[:, 1] * ratio.shape[1] + origin[:, 0]).astype(np.intp)
+    place = start[owner] + v.astype(np.intp) * ratio.shape[1] + u.astype(np.intp)
+    counts = np.bincount(owner, minlength=len(ellipse))
     return Pixels(owner, counts, origin, u, v, ratio.ravel().take(place))
 
 
-def _ring(
-    ellipse: Array, origin: Array, columns: Index, rows: Index, reach: float
-) -> tuple[Float32, Float32]:
-    """Return u and v (n,), relative to ``origin`` (px), of the pixels near one ellipse.
+def _ranges(first: Array, last: Array) -> tuple[Index, Array]:
+    """Return the whole numbers from ``first`` to ``last`` (n,) of n ranges, one after the other,
+    and before them the number of the range of each."""
+    count = np.maximum(last - first + 1, 0).astype(np.intp)
+    owner = np.repeat(np.arange(count.size), count)
+    begin = np.cumsum(count) - count
+    return owner, np.arange(owner.size) - (begin - first)[owner]
 
-    columns, rows : the pixels among which to look; reach : largest distance (px).
+
+def _chord(ellipse: Array, reach_px: Array, v: Array) -> tuple[Array, Array]:
+    """Return where rows of pixels enter and leave ellipses whose semi-axes are longer by a reach.
+
+    ellipse : (R, 5); reach_px : (R,), may be negative; v : (R,) rows.
+
+    Returns two arrays (R,) of columns (px); the first is infinite, the second minus infinite,
+    where the row misses the ellipse.
     """
-    local = ellipse.copy()
-    local[:2] -= origin
-    u = (columns - origin[0]).astype(np.float32)
-    v = (rows - origin[1]).astype(np.float32)
-    cos, sin = np.cos(local[4]), np.sin(local[4])
-    du, dv = (u - np.float32(local[0]))[None, :], (v - np.float32(local[1]))[:, None]
-    a, b = local[2], local[3]
-    x = du * np.float32(cos / a) + dv * np.float32(sin / a)
-    y = dv * np.float32(cos / b) - du * np.float32(sin / b)
-    x *= x
-    y *= y
-    square = x + y
-    x *= np.float32(1.0 / a**2)
-    y *= np.float32(1.0 / b**2)
-    x += y
-    # |g - 1| g / |grad| < reach, with square = g^2 and x = |grad|^2 / 4
-    level = np.sqrt(square)
-    near = np.flatnonzero((np.abs(level - 1.0) * level) < np.float32(reach) * np.sqrt(x))
-    row = near // max(u.size, 1)
-    return u.take(near - row * u.size), v.take(row)
+    a, b = np.maximum(ellipse[:, 2] + reach_px, 0.0), np.maximum(ellipse[:, 3] + reach_px, 0.0)
+    cos, sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
+    dv = v - ellipse[:, 1]
+    height2 = (a * sin) ** 2 + (b * cos) ** 2 + 1e-12
+    middle = ellipse[:, 0] + dv * (a * a - b * b) * sin * cos / height2
+    square = height2 - dv * dv
+    half = a * b * np.sqrt(np.maximum(square, 0.0)) / height2
+    missed = (square <= 0.0) | (half <= 0.0)
+    return np.where(missed, np.inf, middle - half), np.where(missed, -np.inf, middle + half)
 
 
 def unlike_rim(
@@ -257,6 +261,9 @@ class RimState:
     outer: Array
     inner: Array
 
+    def __getitem__(self, index: Index | Bools) -> RimState:
+        return RimState(*(getattr(self, field.name)[index] for field in fields(self)))
+
 
 @dataclass(frozen=True)
 class Linear:
@@ -276,11 +283,19 @@ class Linear:
     resolved: Bools
     bending: Float32 | None
 
+    def of(self, kept: Bools, places: Index) -> Linear:
+        """Return the linearisation of the bubbles that are kept (B,), with pixels at ``places``."""
+        foot = Foot(*(getattr(self.foot, field.name)[..., places] for field in fields(Foot)))
+        bending = None if self.bending is None else self.bending[places]
+        return Linear(foot, self.shape[:, places], self.resolved[kept], bending)
+
     def displacements(self, pixels: Pixels, shifts: Array) -> Float32:
         """Return how far (N,) the outline moves outwards at each pixel's foot (px).
 
         shifts : (B, 13) changes of the outline's parameters since the linearisation (px).
         """
+        if not shifts.any():
+            return np.zeros(self.shape.shape[1], dtype=np.float32)
         result = np.empty(self.shape.shape[1], dtype=np.float32)
         for part, own in zip(pixels.parts(), shifts.astype(np.float32), strict=True):
             np.matmul(own, self.shape[:, part], out=result[part])
@@ -300,8 +315,7 @@ def linearised(state: RimState, pixels: Pixels) -> Linear:
     shape = np.empty((ELLIPSE_PARAMETERS + order.size, pixels.u.size), dtype=np.float32)
     ellipse_basis(foot, shape[:ELLIPSE_PARAMETERS])
     shape[ELLIPSE_PARAMETERS:] = harmonic_basis(foot.cos, foot.sin)
-    for index, part in enumerate(pixels.parts()):
-        shape[ELLIPSE_PARAMETERS:, part] *= gain[:, index : index + 1].astype(np.float32)
+    shape[ELLIPSE_PARAMETERS:] *= spread(gain, pixels.counts)
     sharpest = state.ellipse[:, 2] / state.ellipse[:, 3] ** 2
     bent = bool(np.any(sharpest * state.sigma > _BENDING_FROM))
     resolved = state.ellipse[:, 3] > _RESOLVED_BLURS * state.sigma
@@ -326,27 +340,41 @@ def _bending(state: RimState, pixels: Pixels, foot: Foot) -> Float32:
     return bending
 
 
+@dataclass(frozen=True)
+class Model:
+    """Hold what the model predicts for N pixels.
+
+    grey : (N,) grey levels, as shares of the background.
+    jacobian : (16, N) their derivatives by the 16 parameters.
+    covered : (N,) share of each pixel that the blurred bubble covers, 0 to 1.
+    distance : (N,) distance from the outline (px), positive outside.
+    """
+
+    grey: Float32
+    jacobian: Float32
+    covered: Float32
+    distance: Float32
+
+
 def rim_model(
     state: RimState, pixels: Pixels, linear: Linear, shifts: Array
-) -> tuple[Float32, Float32, Float32]:
+) -> Model:
     """Compute the grey levels that the model predicts for N pixels.
 
     state, pixels, linear : the outlines' blur and levels, the pixels, and the linearisation.
     shifts : (B, 13) displacements of the outline's parameters since the linearisation (px).
 
-    Returns the grey levels (N,) as shares of the background, their derivatives (16, N) by the 16
-    parameters, and the share (N,) of each pixel that the blurred bubble covers (0 to 1).
     """
     counts = pixels.counts
     inverse_sigma, contrast, outer = spread(
         np.stack([1.0 / state.sigma, state.inner - state.outer, state.outer]), counts
     )
-    distance = linear.foot.distance - linear.displacements(pixels, shifts)
+    from_rim = linear.foot.distance - linear.displacements(pixels, shifts)
+    distance = from_rim * inverse_sigma
     if linear.bending is not None:
         limit = spread(_MAX_RETREAT * state.sigma, counts)
         retreat = linear.bending * spread(state.sigma**4, counts)
-        distance += np.clip(retreat, -limit, limit)
-    distance *= inverse_sigma
+        distance += np.clip(retreat, -limit, limit) * inverse_sigma
     curvature = linear.foot.curvature / inverse_sigma
     profile = rim_profile(distance, curvature)
     slope = contrast * inverse_sigma
@@ -359,7 +387,7 @@ def rim_model(
     np.multiply(linear.shape[ELLIPSE_PARAMETERS:], slope, out=jacobian[FIRST_HARMONIC:])
     np.subtract(1.0, profile.value, out=jacobian[OUTER])
     jacobian[INNER] = profile.value
-    return outer + contrast * profile.value, jacobian, profile.value
+    return Model(outer + contrast * profile.value, jacobian, profile.value, from_rim)
 
 
 def normal_equations(
@@ -372,15 +400,15 @@ def normal_equations(
 
     Returns the information matrices (B, 16, 16) and the right-hand sides (B, 16).
     """
-    information = np.empty((pixels.bubbles, PARAMETERS, PARAMETERS))
-    pull = np.empty((pixels.bubbles, PARAMETERS))
+    products = np.empty((pixels.bubbles, PARAMETERS + 1, PARAMETERS + 1))
     root = np.sqrt(weight)
-    whitened, gap = jacobian * root, residual * root
+    whitened = np.empty((PARAMETERS + 1, root.size), dtype=np.float32)
+    np.multiply(jacobian, root, out=whitened[:PARAMETERS])
+    np.multiply(residual, root, out=whitened[PARAMETERS])
     for index, part in enumerate(pixels.parts()):
         own = whitened[:, part]
-        information[index] = own @ own.T
-        pull[index] = own @ gap[part]
-    return information, pull
+        products[index] = own @ own.T
+    return products[:, :PARAMETERS, :PARAMETERS], products[:, :PARAMETERS, PARAMETERS]
 
 
 @dataclass(frozen=True)
@@ -522,7 +550,7 @@ _OUTLIER_SIGMA = 4.5
 _WHOLE = 0.9
 _BINS = 32
 _STEPS = 3
-_FAR_SHIFT_PX, _CONVERGED_PX = 0.25, 0.02
+_FAR_SHIFT_PX, _CONVERGED_PX = 0.25, 0.01
 _HIDING_SIGMA = 3.0
 _MEAN_SLOPE = 0.35
 """RMS of the unit normal density within one sigma."""
@@ -641,14 +669,15 @@ def _first_look(ratio: Float32, state: RimState, start: Start) -> RimState:
     """Fit ellipse, blur and levels to some of the pixels in a narrow band at the rim."""
     pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state), thin=True)
     linear = linearised(state, pixels)
-    distance, sigma = _distance(state, pixels, linear), spread(state.sigma, pixels.counts)
+    model = rim_model(state, pixels, linear, _shifts(state))
     depth = np.minimum(2.0 * state.sigma + 0.5, 0.45 * state.ellipse[:, 3])
-    used = (distance > -spread(depth, pixels.counts)) & (distance < 2.5 * sigma + 1.0)
+    lowest, highest = spread(np.stack([-depth, 2.5 * state.sigma + 1.0]), pixels.counts)
+    used = (model.distance > lowest) & (model.distance < highest)
     everyone = np.arange(len(start))
     used &= ~pixels.hidden(state.ellipse, state.ellipse, _HIDING_SIGMA * state.sigma, everyone)
     weight = spread(1.0 / start.sigma_outer**2, pixels.counts) * used.astype(np.float32)
     prior = np.full(len(start), _HELD)
-    descent = _descend(state, pixels, linear, weight, start, prior, steps=2)
+    descent = _descend(state, pixels, linear, weight, model, start, prior, steps=2)
     return _moved(descent.state, descent.shifts)
 
 
@@ -700,23 +729,26 @@ def _refined(
     pixels = rim_pixels(ratio, state.ellipse, state.sigma, _bulge(state))
     linear = linearised(state, pixels)
     hidden = pixels.hidden(state.ellipse, everyone.ellipse, _HIDING_SIGMA * everyone.sigma, own)
-    weight = _window(state, pixels, linear, start, hidden)
+    model = rim_model(state, pixels, linear, _shifts(state))
+    weight = _window(state, pixels, linear, model, start, hidden)
     prior = np.where(linear.resolved, prior, _HELD)
-    descent = _descend(state, pixels, linear, weight, start, prior, steps=_STEPS)
+    descent = _descend(state, pixels, linear, weight, model, start, prior, steps=_STEPS)
     return _result(descent, pixels, linear, weight, hidden, start)
 
 
 def _window(
-    state: RimState, pixels: Pixels, linear: Linear, start: Start, hidden: Bools
+    state: RimState, pixels: Pixels, linear: Linear, model: Model, start: Start, hidden: Bools
 ) -> Float32:
     """Return the weights (N,): inverse variances of the pixels, 0 for those that are left out."""
     counts = pixels.counts
-    grey, _, inside = rim_model(state, pixels, linear, _shifts(state))
     outside, change = start.sigma_outer**2, start.sigma_inner**2 - start.sigma_outer**2
-    inverse = 1.0 / (spread(outside, counts) + spread(change, counts) * inside)
-    distance, sigma = _distance(state, pixels, linear), spread(state.sigma, counts)
-    kept = (np.abs(distance) < 3.0 * sigma + 0.5) & ~hidden
-    residual = (pixels.value - grey) * np.sqrt(inverse)
+    outside, change, reach = spread(
+        np.stack([outside, change, 3.0 * state.sigma + 0.5]), pixels.counts
+    )
+    inverse = 1.0 / (outside + change * model.covered)
+    distance = model.distance
+    kept = (np.abs(distance) < reach) & ~hidden
+    residual = (pixels.value - model.grey) * np.sqrt(inverse)
     contrast = (state.outer - state.inner) / start.sigma_outer
     kept &= ~unlike_rim(pixels, linear.foot, distance, residual, state.sigma, contrast)
     limit = _OUTLIER_SIGMA * np.maximum(_typical_residual(residual, pixels, kept), 1.0)
@@ -729,7 +761,7 @@ def _typical_residual(residual: Float32, pixels: Pixels, kept: Bools) -> Array:
     for index, part in enumerate(pixels.parts()):
         own = np.abs(residual[part][kept[part]])
         if own.size > 8:
-            typical[index] = robust_sd(own)
+            typical[index] = NORMAL_FROM_MEDIAN * np.partition(own, own.size // 2)[own.size // 2]
     return typical
 
 
@@ -738,34 +770,48 @@ def _descend(
     pixels: Pixels,
     linear: Linear,
     weight: Float32,
+    model: Model,
     start: Start,
     prior: Array,
     *,
     steps: int,
 ) -> _Descent:
-    """Do Gauss-Newton steps with the nearest points on the ellipses held fixed."""
-    first, shifts = state, _shifts(state)
+    """Do Gauss-Newton steps with the nearest points on the ellipses held fixed.
+
+    model : what the model predicts at ``state``. Only bubbles that have not converged go on.
+    """
+    first = _shifts(state)
+    ended, shifts = RimState(*(values.copy() for values in vars(state).values())), first.copy()
+    covariance = np.empty((len(first), PARAMETERS, PARAMETERS))
+    residual = np.empty(pixels.u.size, dtype=np.float32)
+    active, places = np.arange(len(first)), np.arange(pixels.u.size)
     for index in range(steps):
-        grey, jacobian, _ = rim_model(state, pixels, linear, shifts)
-        residual = pixels.value - grey
-        information, pull = normal_equations(jacobian, residual, weight, pixels)
-        prior_equations(information, pull, state, shifts, start.inner, prior)
-        step, covariance = _solved(information, pull)
+        state = ended[active]
+        if index:
+            model = rim_model(state, pixels, linear, shifts[active])
+        left = pixels.value - model.grey
+        information, pull = normal_equations(model.jacobian, left, weight, pixels)
+        prior_equations(information, pull, state, shifts[active], start.inner[active], prior[active])
+        step, covariance[active] = _solved(information, pull)
         step = _limited(step, state)
-        shifts = shifts + np.delete(step, (BLUR, OUTER, INNER), axis=1)
-        state = replace(
-            state,
-            sigma=np.maximum(state.sigma + step[:, BLUR], _MIN_SIGMA_PX),
-            outer=state.outer + step[:, OUTER],
-            inner=state.inner + step[:, INNER],
-        )
-        reach = np.max(np.abs(step[:, :BLUR]), axis=1)
-        if index + 1 == steps or float(np.max(reach)) < _CONVERGED_PX:
+        shifts[active] += np.delete(step, (BLUR, OUTER, INNER), axis=1)
+        ended.sigma[active] = np.maximum(state.sigma + step[:, BLUR], _MIN_SIGMA_PX)
+        ended.outer[active] += step[:, OUTER]
+        ended.inner[active] += step[:, INNER]
+        going = np.max(np.abs(step[:, :BLUR]), axis=1) >= _CONVERGED_PX
+        last = index + 1 == steps or not going.any()
+        if last or not going.all():
+            for part, own in zip(pixels.parts(), step.astype(np.float32), strict=True):
+                left[part] -= own @ model.jacobian[:, part]
+            residual[places] = left
+        if last:
             break
-    for part, own in zip(pixels.parts(), step.astype(np.float32), strict=True):
-        residual[part] -= own @ jacobian[:, part]
-    since = np.max(np.abs(shifts - _shifts(first)), axis=1)
-    return _Descent(state, shifts, covariance, residual, since)
+        if not going.all():
+            pixels, kept = pixels.of(going)
+            linear, weight = linear.of(going, kept), weight[kept]
+            active, places = active[going], places[kept]
+    since = np.max(np.abs(shifts - first), axis=1)
+    return _Descent(ended, shifts, covariance, residual, since)
 
 
 def _solved(information: Array, pull: Array) -> tuple[Array, Array]:

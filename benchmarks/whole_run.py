@@ -189,9 +189,9 @@ def linking(found: Study) -> None:
         tracker = Tracker(found.cameras, AXIS, TrackerSettings())
         maker = RowMaker(found.cameras, model, tracker, None)
         parts.clear()
-        for f, tables in enumerate(pairs):
+        for f, (tables, sight) in enumerate(zip(pairs, maker.sights(pairs))):
             named = tuple(t.assign(frame=f, camera=c.name) for t, c in zip(tables, found.cameras))
-            parts.append(maker.add(f, float(run.t_s[f]), float(run.position_mm[f]), named))
+            parts.append(maker.add(f, float(run.t_s[f]), float(run.position_mm[f]), named, sight))
         parts.append(maker.finish())
 
     def drift() -> None:

@@ -263,11 +263,19 @@ def components_first(batch: tuple[int, ...], *components: int) -> Array:
 
 def _split(coefficients: Array) -> tuple[list[Array], list[Array], list[Array]]:
     """Return the coefficients (...) of the radial, the tangential and the prism terms; [] for terms
-    whose coefficients are all 0."""
-    return tuple(  # type: ignore[return-value]
-        [coefficients[..., i] for i in which] if np.any(coefficients[..., which]) else []
+    whose coefficients are all 0. Radial terms end with the last that is not 0."""
+    if coefficients.ndim == 1:
+        values = coefficients.tolist()
+        used = [value != 0 for value in values]
+    else:
+        values = list(np.moveaxis(coefficients, -1, 0))
+        used = [bool(np.any(value)) for value in values]
+    radial, tangential, prism = (
+        [values[i] for i in which] if any(used[i] for i in which) else []
         for which in (_RADIAL, _TANGENTIAL, _PRISM)
     )
+    last = max((k for k, i in enumerate(_RADIAL) if used[i]), default=-1)
+    return radial[: last + 1], tangential, prism
 
 
 def distort(xy: Array, coefficients: Array) -> Array:
@@ -307,10 +315,10 @@ def distortion_jacobian(xy: Array, coefficients: Array) -> Array:
     out = components_first(np.broadcast_shapes(x.shape, coefficients.shape[:-1]), 2, 2)
     out[..., 0, 0] = out[..., 1, 1] = 1
     if radial:
-        total, rise = radial[-1], r2 * len(radial) * radial[-1]
+        total, rise = radial[-1], len(radial) * radial[-1]
         for power, k in reversed(list(enumerate(radial[:-1], 1))):
             total = k + r2 * total
-            rise = power * k + rise if power == 1 else r2 * (power * k + rise)
+            rise = power * k + r2 * rise
         slope = 2 * rise
         total, cross = r2 * total, slope * x * y
         out[..., 0, 0] += total + slope * x * x
@@ -373,9 +381,12 @@ def undistort(xy_distorted: Array, coefficients: Array) -> Array:
     for _ in range(_NEWTON_STEPS):
         residual = target - distort(xy, coefficients)
         slope = distortion_jacobian(xy, coefficients)
-        singular = (np.abs(np.linalg.det(slope)) <= 1e-12)[..., None, None]
-        slope = np.where(singular, np.eye(2), slope)
-        step = np.linalg.solve(slope, residual[..., None])[..., 0]
+        determinant = _determinant(slope)
+        singular = (np.abs(determinant) <= 1e-12)[..., None]
+        across = slope[..., 1, 1] * residual[..., 0] - slope[..., 0, 1] * residual[..., 1]
+        down = slope[..., 0, 0] * residual[..., 1] - slope[..., 1, 0] * residual[..., 0]
+        step = np.stack([across, down], -1) / np.where(singular, 1.0, determinant[..., None])
+        step = np.where(singular, residual, step)
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         xy = xy + step * np.minimum(1.0, 0.3 / np.maximum(length, 1e-300))
         if np.max(length, initial=0.0) < 1e-15:
@@ -384,9 +395,13 @@ def undistort(xy_distorted: Array, coefficients: Array) -> Array:
     return xy
 
 
+def _determinant(matrix: Array) -> Array:
+    return np.asarray(matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0])
+
+
 def _check_inverse(target: Array, xy: Array, coefficients: Array) -> None:
     error = np.linalg.norm(target - distort(xy, coefficients), axis=-1)
-    fold = np.linalg.det(distortion_jacobian(xy, coefficients)) <= 0
+    fold = _determinant(distortion_jacobian(xy, coefficients)) <= 0
     bad = ~(error <= 1e-12 * (1 + np.linalg.norm(target, axis=-1))) | fold
     if np.any(bad):
         where = np.linalg.norm(target[bad], axis=-1).min()

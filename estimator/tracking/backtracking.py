@@ -60,12 +60,12 @@ class Readings:
         return Readings(np.zeros((frames, bubbles, 3, 3)), np.zeros((frames, bubbles, 3)))
 
     def add(
-        self, frame: int, bubble: int, value: Array, covariance: Array, by_point: Array
+        self, frames: Ints, bubbles: Ints, values: Array, covariances: Array, by_points: Array
     ) -> None:
-        """A measurement value (k,) = by_point (k, 3) @ point, with covariance (k, k)."""
-        weighted = np.linalg.solve(covariance, by_point).T
-        self.information[frame, bubble] += weighted @ by_point
-        self.pull[frame, bubble] += weighted @ value
+        """M measurements values (M, k) = by_points (M, k, 3) @ point, with covariances (M, k, k)."""
+        weighted = np.swapaxes(np.linalg.solve(covariances, by_points), -1, -2)
+        np.add.at(self.information, (frames, bubbles), weighted @ by_points)
+        np.add.at(self.pull, (frames, bubbles), (weighted @ values[..., None])[..., 0])
 
 
 def smooth_points(
@@ -156,7 +156,7 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def of(self, keep: Bools) -> Pairs:
+    def of(self, keep: Bools | Ints) -> Pairs:
         return Pairs(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     def and_also(self, other: Pairs) -> Pairs:
@@ -250,19 +250,31 @@ def readings_of(
     """The frames' measurements of the particles, in the particles' order."""
     place = {p: k for k, p in enumerate(particles)}
     out = Readings.none(len(frames), len(place))
-    for i, frame in enumerate(frames):
-        pairs = frame.pairs
-        for column in np.flatnonzero(np.isin(pairs.particle, list(place))):
-            k = place[int(pairs.particle[column])]
-            out.add(i, k, pairs.points_mm[column], pairs.covariance_mm2[column], np.eye(3))
-        for single in frame.singles:
-            if single.particle not in place:
-                continue
-            uv, by_point = stacked_jacobian((cameras[single.camera],), single.point_mm[None])
-            measured, covariance = frame.pixels[single.camera]
-            left = measured[single.row] - frame.offset_px[single.camera] - uv[0]
-            value = left + by_point[0] @ single.point_mm
-            out.add(i, place[single.particle], value, covariance[single.row], by_point[0])
+    wanted = np.array(particles, np.int64)
+    columns = [np.flatnonzero(np.isin(frame.particle, wanted)) for frame in frames]
+    at = np.repeat(np.arange(len(frames)), [len(c) for c in columns])
+    if len(at):
+        kept = [frame.pairs.of(c) for frame, c in zip(frames, columns)]
+        who = [place[p] for pairs in kept for p in pairs.particle.tolist()]
+        points, covariances = (
+            np.concatenate([getattr(pairs, name) for pairs in kept])
+            for name in ("points_mm", "covariance_mm2")
+        )
+        every = np.broadcast_to(np.eye(3), covariances.shape)
+        out.add(at, np.array(who, np.int64), points, covariances, every)
+    for c, camera in enumerate(cameras):
+        singles = [
+            (i, place[s.particle], s.point_mm, frame.pixels[c][0][s.row] - frame.offset_px[c],
+             frame.pixels[c][1][s.row])
+            for i, frame in enumerate(frames)
+            for s in frame.singles
+            if s.camera == c and s.particle in place
+        ]  # fmt: skip
+        if singles:
+            index, who, points, measured, covariances = map(np.array, zip(*singles))
+            uv, by_point = stacked_jacobian((camera,), points)
+            values = measured - uv + (by_point @ points[..., None])[..., 0]
+            out.add(index, who, values, covariances, by_point)
     return out
 
 

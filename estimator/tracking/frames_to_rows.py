@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, pairwise
 
 import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
-from telerig.estimator.bubbles.pairing.matching import PairModel, Prediction, match_pairs
+from telerig.estimator.bubbles.pairing.matching import (
+    PairModel,
+    Prediction,
+    View,
+    match_views,
+    shared_axis,
+    view_of,
+)
 from telerig.estimator.bubbles.shape.volume_centroid import DEFAULT_SHAPE_SIGMA, Bodies, fit_bodies
 from telerig.estimator.tracking.association import px_per_mm
 from telerig.estimator.tracking.backtracking import (
@@ -54,6 +61,20 @@ class Linked:
     detections: pd.DataFrame
 
 
+@dataclass(frozen=True)
+class Sight:
+    """Hold the detections of one frame as arrays.
+
+    views : as the pairing compares them. pixels : centres and covariances with the share of the
+    unknown shape. d_eq_px : (N,) equivalent diameters. given : (N,) ids given by the user.
+    """
+
+    views: tuple[View, View]
+    pixels: tuple[Pixels, Pixels]
+    d_eq_px: tuple[Array, Array]
+    given: tuple[Ints, Ints]
+
+
 @dataclass
 class RowMaker:
     """Turns frames of detections into finished rows; holds the frames still open, and a few."""
@@ -68,18 +89,37 @@ class RowMaker:
     _before: list[Frame] = field(default_factory=list)
     _waiting: int = 0
 
+    def sights(self, frames: Sequence[Tables]) -> list[Sight]:
+        """Return the detections of several frames as arrays; all frames at once are quicker."""
+        axis = shared_axis(self.cameras)
+        of_cameras: list[list[tuple[View, Pixels, Array, Ints]]] = []
+        for camera, tables in zip(self.cameras, zip(*frames)):
+            table = pd.concat(tables, ignore_index=True)
+            view, (uv, covariance) = view_of(table, camera, axis), _pixels(table, self._wander)
+            d_eq, ids = table["d_eq_px"].to_numpy(float), given_ids(table)
+            ends = np.cumsum([0, *map(len, tables)]).tolist()
+            parts = [slice(low, high) for low, high in pairwise(ends)]
+            of_cameras.append([(view.of(p), (uv[p], covariance[p]), d_eq[p], ids[p]) for p in parts])
+        return [Sight(*zip(*both)) for both in zip(*of_cameras)]
+
     def add(
-        self, number: int, t_s: float, position_mm: float | None, tables: Tables
+        self,
+        number: int,
+        t_s: float,
+        position_mm: float | None,
+        tables: Tables,
+        sight: Sight | None = None,
     ) -> Linked | None:
         """Take in one frame; return final rows when there are enough of them, otherwise None.
 
         number, t_s : number and time of the frame.
         position_mm : encoder position of the stage; None without one.
-        tables : the detections of the two cameras.
+        tables : the detections of the two cameras; sight : the same as arrays, if known.
         """
         predicted = self.tracker.predict(t_s, position_mm)
-        pixels = _pixels(tables[0], self._wander), _pixels(tables[1], self._wander)
-        pairs, offset_px = pair_frame(tables, pixels, self.cameras, self.model, predicted)
+        sight = self.sights([tables])[0] if sight is None else sight
+        pixels = sight.pixels
+        pairs, offset_px = pair_frame(sight, self.cameras, self.model, predicted)
         everyone = (np.arange(len(table)) for table in tables)
         first, second = (np.setdiff1d(i, rows) for i, rows in zip(everyone, pairs.rows.T))
         unpaired = (first, second)
@@ -185,8 +225,7 @@ def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
 
 
 def pair_frame(
-    tables: Tables,
-    pixels: tuple[Pixels, Pixels],
+    sight: Sight,
     cameras: tuple[Camera, Camera],
     model: PairModel,
     predicted: Prediction | None,
@@ -195,22 +234,22 @@ def pair_frame(
 
     Detections with given ids are paired by their ids; all others are matched.
 
-    tables : detections of the two cameras.  pixels : their centres (px) and covariances (px^2).
+    sight : detections of the two cameras.
     model : the model for pairing.
     predicted : expected positions of the tracks; None if there are none.
 
     The shift is (2, 2) in px: for each camera the median of measured minus projected pixels over
     the pairs; 0 if there are fewer than three pairs.
     """
-    ids = [given_ids(table) for table in tables]
+    ids, pixels = sight.given, sight.pixels
     given = np.intersect1d(ids[0][ids[0] != NO_PARTICLE], ids[1]).astype(np.int64)
     rows = np.array([[np.flatnonzero(i == p)[0] for i in ids] for p in given], np.int64)
     rows = rows.reshape(-1, 2)
     confidence, ambiguous = np.ones(len(given)), np.zeros(len(given), bool)
     free = [np.flatnonzero(i == NO_PARTICLE) for i in ids]
     if len(free[0]) and len(free[1]):
-        first, second = (table.iloc[i] for table, i in zip(tables, free))
-        found = match_pairs(first, second, cameras, model, predicted=predicted)
+        first, second = (view.of(i) for view, i in zip(sight.views, free))
+        found = match_views((first, second), model, predicted=predicted)
         matched = np.stack([free[0][found.first], free[1][found.second]], -1)
         rows = np.concatenate([rows, matched])
         confidence = np.concatenate([confidence, found.confidence])
@@ -224,9 +263,9 @@ def pair_frame(
     if len(left) >= _LEAST_FOR_OFFSET:
         offset = np.median(left, axis=0).reshape(2, 2)
     d_eq_mm2 = np.ones(len(rows))
-    for c, table in enumerate(tables):
+    for c, d_eq_px in enumerate(sight.d_eq_px):
         scale = px_per_mm(by_point[:, 2 * c : 2 * c + 2])
-        d_eq_mm2 *= table["d_eq_px"].to_numpy(float)[rows[:, c]] / scale
+        d_eq_mm2 *= d_eq_px[rows[:, c]] / scale
     pairs = Pairs(
         rows,
         confidence,

@@ -49,6 +49,7 @@ MODEL_FRAMES = 60
 """Frames spread over the run from which the pair model is learnt."""
 
 _RELIABLE = 0.99
+_FRAMES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -377,14 +378,17 @@ def _linked(
         split = _split(batch, cameras)
         empty = empty or (batch.iloc[:0], batch.iloc[:0])
         last = run.frame_count if run.detections is not None else int(batch["frame"].max()) + 1
-        for frame in range(done, last):
-            position = None if run.position_mm is None else float(run.position_mm[frame])
-            rows = linker.add(frame, float(run.t_s[frame]), position, split.get(frame, empty))
-            if rows is not None:
-                yield rows
+        for first in range(done, last, _FRAMES_AT_ONCE):
+            frames = range(first, min(first + _FRAMES_AT_ONCE, last))
+            tables = [split.get(frame, empty) for frame in frames]
+            for frame, pair, sight in zip(frames, tables, linker.sights(tables)):
+                position = None if run.position_mm is None else float(run.position_mm[frame])
+                rows = linker.add(frame, float(run.t_s[frame]), position, pair, sight)
+                if rows is not None:
+                    yield rows
+            if stage is not None:
+                stage("tracks", frames.stop, run.frame_count)
         done = last
-        if stage is not None:
-            stage("tracks", done, run.frame_count)
     rows = linker.finish()
     if rows is not None:
         yield rows

@@ -17,7 +17,7 @@ pairs, and each pair has a posterior probability.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum, auto
 from functools import lru_cache
 
@@ -80,6 +80,11 @@ class View:
 
     def __len__(self) -> int:
         return len(self.scatter_factor)
+
+    def of(self, rows: slice | Ints) -> View:
+        """Return some of the detections."""
+        arrays = [getattr(self, field.name)[rows] for field in fields(self)[1:]]
+        return View(self.camera, *arrays)
 
 
 @dataclass(frozen=True)
@@ -580,7 +585,14 @@ def match_pairs(
     """
     axis = shared_axis(cameras)
     views = (view_of(first, cameras[0], axis), view_of(second, cameras[1], axis))
-    if not len(first) or not len(second):
+    return match_views(views, model, predicted=predicted)
+
+
+def match_views(
+    views: tuple[View, View], model: PairModel, *, predicted: Prediction | None = None
+) -> Matches:
+    """Find the pairs among the detections of one frame, as `match_pairs` does."""
+    if not len(views[0]) or not len(views[1]):
         none, empty = np.zeros(0, np.int64), np.zeros(0)
         return Matches(none, none, empty, empty, empty, empty, np.zeros(0, bool))
     geometry = pair_geometry(*views)
@@ -713,15 +725,21 @@ def track_log_odds(
         return 0.0
     density = _track_density(geometry, model, predicted)
     expected = (1 - _NEW_SHARE) * _SEEN**2 * density.sum(-1) / tracks + _NEW_SHARE
-    near = [_unmatched_density(geometry, model, predicted, c) for c in range(2)]
+    cameras = (geometry.views[0].camera, geometry.views[1].camera)
+    seen = stacked_jacobian(cameras, np.asarray(predicted.points_mm, float))
+    near = [_unmatched_density(geometry, model, predicted, seen, c) for c in range(2)]
     alone = (1 + near[0].sum(1))[:, None] * (1 + near[1].sum(1)) - near[0] @ near[1].T
     return np.asarray(np.log(expected) - np.log(alone))
 
 
-def _normal_density(offset: Array, covariance: Array) -> Array:
-    """(...,) of offsets (..., D), not below that at the largest Mahalanobis distance."""
-    distance2 = (offset * np.linalg.solve(covariance, offset[..., None])[..., 0]).sum(-1)
-    peak = 1 / np.sqrt(np.linalg.det(2 * np.pi * covariance))
+def _normal_density(offset: Array, covariance: Array, added: Array) -> Array:
+    """(..., K) of offsets (..., K, D) with the covariances (K, D, D) + ``added`` (...) on their
+    diagonals, not below that at the largest Mahalanobis distance."""
+    values, vectors = np.linalg.eigh(covariance)
+    variance = values + added[..., None, None]
+    along = np.einsum("...ki,kij->...kj", offset, vectors)
+    distance2 = (along**2 / variance).sum(-1)
+    peak = (2 * np.pi) ** (-offset.shape[-1] / 2) / np.sqrt(variance.prod(-1))
     return np.asarray(peak * np.exp(-0.5 * np.minimum(distance2, _LARGEST_MAHALANOBIS2)))
 
 
@@ -735,8 +753,8 @@ def _track_density(geometry: PairGeometry, model: PairModel, predicted: Predicti
     pixel = pixel + model.frame_px**2
     sine2 = 1 - (first.direction @ second.direction.T) ** 2
     measured = pixel * geometry.mm_per_px**2 / sine2
-    covariance = predicted.covariance_mm2 + measured[..., None, None, None] * np.eye(3)
-    density = _normal_density(geometry.points_mm[..., None, :] - predicted.points_mm, covariance)
+    offset = geometry.points_mm[..., None, :] - predicted.points_mm
+    density = _normal_density(offset, predicted.covariance_mm2, measured)
     size = 0.25 * (first.log_size.sum(-1)[:, None] + second.log_size.sum(-1))[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
         log_ratio = size - np.log(np.asarray(predicted.d_eq_mm) / 2)
@@ -750,17 +768,27 @@ def _track_density(geometry: PairGeometry, model: PairModel, predicted: Predicti
 
 
 def _unmatched_density(
-    geometry: PairGeometry, model: PairModel, predicted: Prediction, c: int
+    geometry: PairGeometry,
+    model: PairModel,
+    predicted: Prediction,
+    seen: tuple[Array, Array],
+    c: int,
 ) -> Array:
-    """(N, K) expected density of detections whose track only this camera sees, over the usual."""
-    view = geometry.views[c]
-    cameras = (geometry.views[0].camera, geometry.views[1].camera)
-    pixels, jacobian = stacked_jacobian(cameras, np.asarray(predicted.points_mm, float))
+    """(N, K) expected density of detections whose track only this camera sees, over the usual.
+
+    seen : the tracks' pixels (K, 4) in both cameras, and their derivatives (K, 4, 3).
+    """
+    view, (pixels, jacobian) = geometry.views[c], seen
     rows = jacobian[:, 2 * c : 2 * c + 2]
     spread = rows @ predicted.covariance_mm2 @ np.swapaxes(rows, 1, 2)
     common = model.scatter_px**2 + model.frame_px**2 + model.bias_px[0] ** 2 / 4
     covariance = spread + view.covariance_px2[:, None] + common * np.eye(2)
-    density = _normal_density(view.uv_px[:, None] - pixels[:, 2 * c : 2 * c + 2], covariance)
+    uu, uv, vv = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    u, v = np.moveaxis(view.uv_px[:, None] - pixels[:, 2 * c : 2 * c + 2], -1, 0)
+    determinant = uu * vv - uv * uv
+    distance2 = (vv * u * u - 2 * uv * u * v + uu * v * v) / determinant
+    near = np.exp(-0.5 * np.minimum(distance2, _LARGEST_MAHALANOBIS2))
+    density = near / (2 * np.pi * np.sqrt(determinant))
     width, height = view.camera.image_size_px
     usual = max(len(view) * model.unmatched_share[c], 1e-3)
     return np.asarray(_SEEN * (1 - _SEEN) * density * width * height / usual)

@@ -99,7 +99,9 @@ class RowMaker:
             d_eq, ids = table["d_eq_px"].to_numpy(float), given_ids(table)
             ends = np.cumsum([0, *map(len, tables)]).tolist()
             parts = [slice(low, high) for low, high in pairwise(ends)]
-            of_cameras.append([(view.of(p), (uv[p], covariance[p]), d_eq[p], ids[p]) for p in parts])
+            of_cameras.append(
+                [(view.of(p), (uv[p], covariance[p]), d_eq[p], ids[p]) for p in parts]
+            )
         return [Sight(*zip(*both)) for both in zip(*of_cameras)]
 
     def add(

@@ -356,9 +356,7 @@ class Model:
     distance: Float32
 
 
-def rim_model(
-    state: RimState, pixels: Pixels, linear: Linear, shifts: Array
-) -> Model:
+def rim_model(state: RimState, pixels: Pixels, linear: Linear, shifts: Array) -> Model:
     """Compute the grey levels that the model predicts for N pixels.
 
     state, pixels, linear : the outlines' blur and levels, the pixels, and the linearisation.
@@ -791,7 +789,9 @@ def _descend(
             model = rim_model(state, pixels, linear, shifts[active])
         left = pixels.value - model.grey
         information, pull = normal_equations(model.jacobian, left, weight, pixels)
-        prior_equations(information, pull, state, shifts[active], start.inner[active], prior[active])
+        prior_equations(
+            information, pull, state, shifts[active], start.inner[active], prior[active]
+        )
         step, covariance[active] = _solved(information, pull)
         step = _limited(step, state)
         shifts[active] += np.delete(step, (BLUR, OUTER, INNER), axis=1)

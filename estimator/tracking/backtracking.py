@@ -62,7 +62,7 @@ class Readings:
     def add(
         self, frames: Ints, bubbles: Ints, values: Array, covariances: Array, by_points: Array
     ) -> None:
-        """M measurements values (M, k) = by_points (M, k, 3) @ point, with covariances (M, k, k)."""
+        """M measurements: values (M, k) = by_points (M, k, 3) @ point, covariances (M, k, k)."""
         weighted = np.swapaxes(np.linalg.solve(covariances, by_points), -1, -2)
         np.add.at(self.information, (frames, bubbles), weighted @ by_points)
         np.add.at(self.pull, (frames, bubbles), (weighted @ values[..., None])[..., 0])
@@ -255,13 +255,13 @@ def readings_of(
     at = np.repeat(np.arange(len(frames)), [len(c) for c in columns])
     if len(at):
         kept = [frame.pairs.of(c) for frame, c in zip(frames, columns)]
-        who = [place[p] for pairs in kept for p in pairs.particle.tolist()]
+        who = np.array([place[p] for pairs in kept for p in pairs.particle.tolist()], np.int64)
         points, covariances = (
             np.concatenate([getattr(pairs, name) for pairs in kept])
             for name in ("points_mm", "covariance_mm2")
         )
         every = np.broadcast_to(np.eye(3), covariances.shape)
-        out.add(at, np.array(who, np.int64), points, covariances, every)
+        out.add(at, who, points, covariances, every)
     for c, camera in enumerate(cameras):
         singles = [
             (i, place[s.particle], s.point_mm, frame.pixels[c][0][s.row] - frame.offset_px[c],

@@ -396,7 +396,7 @@ def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
         information = products[:, :ELLIPSE_PARAMETERS, :ELLIPSE_PARAMETERS]
         pull = products[:, :ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS]
         _add_roundness(information, pull, ellipse, _ROUND_SHARE * radius)
-        step = np.linalg.solve(information, pull[..., None])[..., 0]
+        step: Array = np.asarray(np.linalg.solve(information, pull[..., None])[..., 0], float)
         reach = np.max(np.abs(step), axis=1)
         step *= np.minimum(1.0, 0.4 * ellipse[:, 3] / (reach + 1e-12))[:, None]
         ellipse, _ = moved(ellipse, step)

@@ -197,40 +197,96 @@ def stopped_by_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+class Steps:
+    """Show how far a command is: call it with the name of a step, the number done and the total.
+
+    seconds : how long each step has taken so far, by name.
+    """
+
+    def __init__(self, show: Callable[[str, int, int, float, int], None] | None) -> None:
+        self._show = show
+        self._begun: dict[str, tuple[float, int]] = {}
+        self._now = ""
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, what: str, done: int, of: int) -> None:
+        now = time.monotonic()
+        if self._now:
+            self.seconds[self._now] = now - self._begun[self._now][0]
+        self._now = what
+        begun_s, first = self._begun.setdefault(what, (now, done))
+        self.seconds[what] = now - begun_s
+        if self._show is not None:
+            self._show(what, done, of, now - begun_s, done - first)
+
+    def words(self) -> str:
+        """Return the steps that took a second or longer, in words; "" for none."""
+        return ", ".join(f"{what} {s:.0f} s" for what, s in self.seconds.items() if s >= 1)
+
+
 @contextmanager
-def progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+def progress(quiet: bool) -> Iterator[Steps]:
     """A callback (what, done, of): a progress bar on a terminal, plain lines elsewhere."""
     if quiet:
-        yield lambda *_: None
+        yield Steps(None)
     elif sys.stderr.isatty():
         yield from _bar()
     else:
-        yield _plain_lines()
+        yield Steps(_plain_lines())
 
 
-def _bar() -> Iterator[Callable[[str, int, int], None]]:
+def _bar() -> Iterator[Steps]:
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import BarColumn, Progress, TextColumn
 
-    with Progress(console=Console(stderr=True), transient=True, auto_refresh=False) as bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
+    # no refreshing thread: worker processes are copies of this one, which must have one thread
+    with Progress(
+        *columns, console=Console(stderr=True), transient=True, auto_refresh=False
+    ) as bar:
         tasks: dict[str, Any] = {}
 
-        def update(what: str, done: int, of: int) -> None:
+        def update(what: str, done: int, of: int, seconds: float, here: int) -> None:
+            words = _how_far(done, of, seconds, here)
             if what not in tasks:
-                tasks[what] = bar.add_task(what, total=of or None)
-            bar.update(tasks[what], completed=done, refresh=True)
+                tasks[what] = bar.add_task(what, total=of or None, words=words)
+            bar.update(tasks[what], completed=done, words=words, refresh=True)
 
-        yield update
+        yield Steps(update)
 
 
-def _plain_lines() -> Callable[[str, int, int], None]:
-    last = {"time": 0.0}
+_PLAIN_S = 2.0
 
-    def update(what: str, done: int, of: int) -> None:
+
+def _plain_lines() -> Callable[[str, int, int, float, int], None]:
+    last: dict[str, Any] = {"time": 0.0, "what": ""}
+
+    def update(what: str, done: int, of: int, seconds: float, here: int) -> None:
         now = time.monotonic()
-        if (of and done == of) or now - last["time"] > 2:
-            last["time"] = now
-            counted = f": {done} of {of}" if of else f": {done}" if done else ""
-            typer.echo(what + counted, err=True)
+        if what != last["what"] or (of and done == of) or now - last["time"] > _PLAIN_S:
+            last.update(time=now, what=what)
+            words = _how_far(done, of, seconds, here)
+            typer.echo(f"{what}: {words}" if words else what, err=True)
 
     return update
+
+
+def _how_far(done: int, of: int, seconds: float, here: int) -> str:
+    """Return in words how far a step is, how fast, and how long it will take.
+
+    here : how many of those that are done were done in these ``seconds``.
+    """
+    words = [f"{done} of {of}" if of else f"{done}" if done else ""]
+    if here and seconds >= 1:
+        rate = here / seconds
+        words += [f"{rate:.3g} a second", f"{_duration(seconds)} so far"]
+        if of > done:
+            words.append(f"{_duration((of - done) / rate)} left")
+    return ", ".join(word for word in words if word)
+
+
+def _duration(seconds: float) -> str:
+    whole = round(seconds)
+    if whole < 120:
+        return f"{whole} s"
+    return f"{whole // 60} min" if whole < 7200 else f"{whole / 3600:.1f} h"

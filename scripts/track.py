@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from telerig.errors import InputError
 from telerig.scripts import options
 from telerig.scripts.console import (
     errors_in_words,
@@ -35,6 +36,10 @@ def track(
         str | None,
         typer.Option("--from", help="Needed when the run has both: images or detections."),
     ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(help="Track only the first frames, for a first look: 0:500 [all]."),
+    ] = None,
     report: options.Report = True,
     quiet: options.Quiet = False,
 ) -> None:
@@ -59,10 +64,12 @@ def track(
     calibrated, files = calibration_for(run, calibration)
     chosen = options.chosen("--from", source, ("images", "detections"))
     data = load_run(run, source=chosen, **cameras_without_rig(run, calibrated))
+    if frames is not None:
+        data = data.first(first_frames(frames))
     folder = out or default_folder(run)
     record = {
         "command": "track",
-        "options": {"from": source, "min_diameter_px": min_diameter},
+        "options": {"from": source, "min_diameter_px": min_diameter, "frames": frames},
         "inputs": files,
         "again": typed_command(),
     }
@@ -71,8 +78,20 @@ def track(
             data, calibrated, folder, options=TrackOptions(min_diameter_px=min_diameter),
             record=record, report=report, stage=stage,
         )  # fmt: skip
-    say(tracking_words(summary, time.perf_counter() - begun))
+    say(tracking_words(summary, time.perf_counter() - begun, stage.words()))
     say_written(folder, report)
+
+
+def first_frames(text: str) -> int:
+    """Return how many frames 0:N are. Raises InputError for anything else."""
+    first, colon, stop = text.partition(":")
+    if not colon or first not in ("", "0") or not (stop.isascii() and stop.isdecimal()):
+        raise InputError(
+            f"{text!r} does not name the first frames of a run",
+            where="--frames",
+            todo="give 0:N, for example 0:500 for the first 500 frames",
+        )
+    return int(stop)
 
 
 def cameras_without_rig(run: Path, calibration: Calibration) -> dict[str, Any]:

@@ -88,6 +88,8 @@ def make_scene(
     names = [c.name for c in cameras]
     estimate = partial(_background, run, estimator, shifts, strips or {})
     backgrounds = {}
+    if progress is not None:
+        progress("background", 0, len(names))
     for name, found in zip(names, ordered_map(estimate, names, quick_workers(len(names)))):
         backgrounds[name] = found
         if progress is not None:
@@ -178,6 +180,8 @@ class DetectionStore:
         missing = self.missing(kind)
         frames = sum(last - first for first, last in missing)
         done = self.frame_count - frames
+        if progress is not None:
+            progress(name, done, self.frame_count)
         large = frames >= FRAMES_FOR_WORKERS
         workers = min(cores(), len(missing)) if large else quick_workers(len(missing))
         for first, last in ordered_map(partial(_write, self, kind, table_of), missing, workers):
@@ -221,7 +225,7 @@ def fingerprint(run: RunData, options: dict[str, Any]) -> str:
 
 def detect_missing(scene: Scene, store: DetectionStore, progress: Progress | None) -> None:
     """Detect bubbles in every frame that the store lacks."""
-    store.fill("detections", partial(_detect_batch, scene), progress, "frames")
+    store.fill("detections", partial(_detect_batch, scene), progress, "detection")
 
 
 def _detect_batch(scene: Scene, batch: Batch) -> pd.DataFrame:

@@ -211,7 +211,9 @@ def tracking_stream(
         first_id = int(table["particle"].max()) + 1
         batches = partial(iter, (table,))
     else:
-        inputs = {"options": repr(chosen), "cameras": repr(cameras)}
+        inputs = {
+            "options": repr(chosen), "cameras": repr(cameras), "frames": str(run.frame_count)
+        }  # fmt: skip
         strip = described_strip(run)
         if strip is not None:
             inputs |= {"references": repr(strip), "axis": repr(axis)}
@@ -228,6 +230,8 @@ def tracking_stream(
             detect_missing(scene, store, stage)
         batches = store.tables
     without: dict[str, dict[str, int]] = {c.name: {} for c in cameras}
+    if stage is not None:
+        stage("pair model", 0, 0)
     sample = _sample(run, cameras, batches())
     model = estimate_pair_model(sample, cameras)
     tracker = Tracker(cameras, axis, _settings(chosen, run), first_id=first_id)
@@ -373,6 +377,8 @@ def _linked(
 ) -> Iterator[Linked]:
     empty: Tables | None = None
     done = 0
+    if stage is not None:
+        stage("tracks", 0, run.frame_count)
     for batch in batches:
         _count_reasons(batch, without)
         split = _split(batch, cameras)

@@ -126,15 +126,17 @@ def _read(file: Path, columns: Sequence[Column]) -> pd.DataFrame:
     return table
 
 
-def tracking_words(summary: Mapping[str, Any], seconds: float) -> str:
+def tracking_words(summary: Mapping[str, Any], seconds: float, steps: str = "") -> str:
     """Return the text that `telerig track` prints.
 
     summary : content of tracking.json.  seconds : time that the tracking took.
+    steps : how long its steps took, in words.
     """
     tracks = "1 track" if summary["tracks"] == 1 else f"{summary['tracks']} tracks"
     lines = [
         f"Run {summary['run']!r}: {tracks}, {summary['points']} points in space "
-        f"from {summary['detections']} detections in {summary['frames']} frames ({seconds:.1f} s)",
+        f"from {summary['detections']} detections in {summary['frames']} frames "
+        f"({seconds:.1f} s{steps and f': {steps}'})",
     ]
     left = summary["detections_without_partner_or_track"]
     if left:

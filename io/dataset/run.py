@@ -6,7 +6,7 @@ The frames of several cameras are paired by the numbers in their names, or by th
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -111,6 +111,34 @@ class RunData:
             return None
         check_size(image, self.image_sizes_px[name], source.where(position))
         return image
+
+    def first(self, frames: int) -> RunData:
+        """Return the run with its first frames only; the sensors' records stay whole.
+
+        Raises InputError when ``frames`` is not positive. If the run is shorter, it is returned.
+        """
+        if frames < 1:
+            raise InputError(
+                f"the first {frames} frames are none", where=str(self.path), todo="give 1 or more"
+            )
+        if frames >= self.frame_count:
+            return self
+
+        def earlier(table: pd.DataFrame | None) -> pd.DataFrame | None:
+            if table is None:
+                return None
+            return table[table["frame"] < frames].reset_index(drop=True)
+
+        return replace(
+            self,
+            frame_count=frames,
+            t_s=self.t_s[:frames],
+            position_mm=None if self.position_mm is None else self.position_mm[:frames],
+            references=earlier(self.references),
+            detections=earlier(self.detections),
+            positions={name: places[:frames] for name, places in self.positions.items()},
+            notes=[*self.notes, f"only the first {frames} of {self.frame_count} frames are used"],
+        )
 
     def camera_name(self, camera: str | int) -> str:
         """Return the camera's name from its name or its index.

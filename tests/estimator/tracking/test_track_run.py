@@ -227,3 +227,24 @@ def test_bad_input_of_the_command(rise: Path, arguments: list[str], words: str) 
     result = CliRunner().invoke(app, ["track", *given])
     assert result.exit_code == 2
     assert words in result.output.replace("\n", " ")
+
+
+def test_a_first_look_tracks_the_first_frames_and_says_so(rise: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(rise, data)
+    command = ["track", str(data / "runs" / "rise"), "--no-report"]
+    first = CliRunner().invoke(app, [*command, "--frames", "0:6"])
+    assert first.exit_code == 0 and f"only the first 6 of {FRAMES} frames" in first.output
+    assert "detection: 0 of 6" in first.stderr and "tracks: 6 of 6" in first.stderr
+    looked = telerig.load_tracks(data / "results" / "rise")
+    assert set(looked.table["frame"]) == set(range(6))
+    run = telerig.load_run(data / "runs" / "rise")
+    assert run.first(FRAMES) is run
+
+
+@pytest.mark.parametrize("frames", ["500", "5:10", "0:-1", "0:x", "0:0"])
+def test_frames_that_are_no_first_frames_are_refused(rise: Path, frames: str) -> None:
+    command = ["track", str(rise / "runs" / "rise"), "--frames", frames, "--no-report"]
+    answer = CliRunner().invoke(app, command)
+    assert answer.exit_code == 2 and "->" in answer.stderr
+    assert frames in answer.stderr or "first 0 frames" in answer.stderr

@@ -1,0 +1,36 @@
+"""The lines that say how far a command is."""
+
+from __future__ import annotations
+
+import pytest
+
+from telerig.scripts import console
+
+
+def test_lines_say_how_many_of_all_how_fast_and_how_long(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    with console.progress(quiet=False) as stage:
+        for done in (200, 201, 260, 1000):
+            stage("detection", done, 1000)
+            now[0] += 0.5 if done == 200 else 9.5
+        stage("pair model", 0, 0)
+        now[0] += 300.0
+        stage("tracks", 0, 7)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "detection: 200 of 1000",
+        "detection: 260 of 1000, 6 a second, 10 s so far, 2 min left",
+        "detection: 1000 of 1000, 41 a second, 20 s so far",
+        "pair model",
+        "tracks: 0 of 7",
+    ]
+    assert stage.words() == "detection 29 s, pair model 300 s"
+
+
+def test_quiet_says_nothing_but_takes_the_time(capsys: pytest.CaptureFixture[str]) -> None:
+    with console.progress(quiet=True) as stage:
+        stage("tracks", 1, 2)
+    assert capsys.readouterr().err == "" and set(stage.seconds) == {"tracks"}

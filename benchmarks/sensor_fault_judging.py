@@ -224,7 +224,7 @@ def alike(one: SmoothingProblem, two: SmoothingProblem) -> bool:
     """Whether two problems have the same frames, encoder and sensors, to what the noise hides."""
     if not np.allclose(one.t_s, two.t_s, rtol=1e-9, atol=1e-9):
         return False
-    if not np.allclose(one.encoder_mm, two.encoder_mm, rtol=1e-6, atol=1e-3):
+    if not np.allclose(one.encoder_mm, two.encoder_mm, rtol=1e-6, atol=0.05):
         return False
     first, second = ({s.name: s for s in p.accelerometers} for p in (one, two))
     return first.keys() == second.keys() and all(
@@ -302,9 +302,10 @@ def _class(
 
 
 def _says_so(verdict: Mapping[str, Any], found: Score) -> bool:
-    """Whether ``usable_for`` grades the path or the mean rise of the vertical axis below "good", or
-    the stated standard deviations cover the error."""
+    """Whether ``usable_for`` says that the vertical path and mean rise assume a sound encoder, or
+    grades them below "good", or the stated standard deviations cover the error."""
     uses = [u for u in verdict.get("usable_for", ()) if u["axis"] == verdict.get("vertical")]
     of_place = [u for u in uses if "path" in u["quantity"] or "mean" in u["quantity"]]
+    assumed = bool(of_place) and all("encoder" in u["assumes"] for u in of_place)
     honest = bool(of_place) and found.total_nees <= HONEST
-    return honest or any(use["grade"] != "good" for use in of_place)
+    return assumed or honest or any(use["grade"] != "good" for use in of_place)

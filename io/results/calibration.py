@@ -62,6 +62,7 @@ class Verdict(Part):
 
 _WIDEST = 10.0
 """Largest residual perspective times rho_mm: the tangent of the half field angle of a lens."""
+_MOST_DISTORTED = 1.0
 
 
 class PoseRecord(Part):
@@ -126,6 +127,12 @@ class CameraRecord(Part):
         if perspective > _WIDEST:
             raise ValueError(
                 f"kappa_per_mm times rho_mm is {perspective:g}, more than any lens has"
+            )
+        radial = sum(self.parameters.get(name, 0.0) for name in ("k1", "k2", "k3"))
+        if abs(radial) > _MOST_DISTORTED:
+            raise ValueError(
+                f"k1 + k2 + k3 is {radial:g}, more than any lens has: so many half diagonals the "
+                "image's corner would be moved"
             )
         return self
 

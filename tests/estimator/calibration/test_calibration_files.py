@@ -202,6 +202,7 @@ def test_damaged_files(change: Any, saved: Path) -> None:
         (lambda d: d["cameras"]["left"]["parameters"].update(scale_px_per_mm=0), "positive"),
         (lambda d: d["cameras"]["left"]["parameters"].update(aspect=-1), "positive"),
         (lambda d: d["cameras"]["left"]["parameters"].update(kappa_per_mm=1e10), "any lens"),
+        (lambda d: d["cameras"]["left"]["parameters"].update(k1=50.0), "any lens"),
         (lambda d: d["diagnostics"].update(next_view={"poses": 5}), "next_view.*poses"),
         (lambda d: d["diagnostics"].update(halves={"views": "x"}), "halves.*views"),
         (lambda d: d["diagnostics"].update(structure={"words": 3}), "structure.*words"),

@@ -3,7 +3,8 @@
 Usage: python benchmarks/sensor_faults.py faults [--scenarios S1,stick-slip] [--faults clock,gap]
     [--configurations one,five,marks] [--clocks unknown,frames] [--seeds 1] [--seed 900]
     [--checks] [--csv FILE.csv] [--out FILE.md] [--read FILE.csv ...]
-    python benchmarks/sensor_faults.py alarms [--seeds 10] ...  false alarms of undisturbed runs
+    python benchmarks/sensor_faults.py alarms [--seeds 10] [--frames 300] ...
+        false alarms of undisturbed runs
     python benchmarks/sensor_faults.py checks [--seeds 10] [--frames 120,300,600] [--around 0.05,10]
         false alarms of the checks before the solution, which are quick
     python benchmarks/sensor_faults.py offsets [--seeds 10] ... errors of recovered clock offsets
@@ -220,11 +221,13 @@ the truth over the middle 80 %, all axes; the ratio is to the same run without t
 def alarms(options: argparse.Namespace) -> pd.DataFrame:
     """Undisturbed runs: what was refused, left out, masked or contradicted."""
     rows: list[dict[str, Any]] = []
+    lengths = [int(n) for n in (options.frames or "0").split(",")]
     for scenario, seed, configuration in each(options):
-        run = run_of(scenario, seed)
-        for clock in options.clocks.split(","):
+        for frames, clock in product(lengths, options.clocks.split(",")):
+            run = run_of(scenario, seed, frames)
             row: dict[str, Any] = {
                 "scenario": scenario, "configuration": configuration, "clock": clock, "seed": seed,
+                "frames": frames,
             }  # fmt: skip
             begin = time.perf_counter()
             inputs = inputs_of(run, configuration, clock)
@@ -259,19 +262,21 @@ def alarms(options: argparse.Namespace) -> pd.DataFrame:
 
 def alarm_report(table: pd.DataFrame) -> str:
     lines = [
-        "| scenario | configuration | clock | runs | alarms | vertical um | possible | ratio "
-        "| NEES |",
-        "|" + "---|" * 9,
+        "| scenario | configuration | clock | frames | runs | alarms | vertical um | possible "
+        "| ratio | NEES |",
+        "|" + "---|" * 10,
     ]
     possible = {
         name: posteriors(cases()[name], np.random.default_rng(0))["arms"][0]
         for name in table["scenario"].unique()
         if not cases()[name].nonlinear
     }
-    for keys, rows in table.groupby(["scenario", "configuration", "clock"], sort=False):
-        scenario, configuration, _ = keys
+    columns = ["scenario", "configuration", "clock", "frames"]
+    for keys, rows in table.groupby(columns, sort=False):
+        scenario, configuration, _, frames = keys
         found = float(np.sqrt(np.nanmean(rows["vertical_um"] ** 2)))
-        best = possible.get(str(scenario)) if configuration == "one" else None
+        whole = configuration == "one" and not frames
+        best = possible.get(str(scenario)) if whole else None
         beside = ["", ""] if best is None else [f"{best:.1f}", f"{found / best:.2f}"]
         said = rows["alarm"].fillna("")
         cells = [*map(str, keys), f"{len(rows)}", f"{int((said != '').sum())}", f"{found:.1f}"]
@@ -293,7 +298,7 @@ with arm accelerometers and one bubble, which knows the hyper-parameters.
 def checks(options: argparse.Namespace) -> pd.DataFrame:
     """Undisturbed runs, also short ones: what is refused or left out before the solution."""
     rows: list[dict[str, Any]] = []
-    lengths = [int(n) for n in options.frames.split(",")]
+    lengths = [int(n) for n in (options.frames or "120,300,0").split(",")]
     margins = [float(s) for s in options.around.split(",")]
     for scenario, seed, configuration in each(options):
         for frames, around_s in product(lengths, margins):
@@ -420,7 +425,7 @@ def main() -> None:
     parser.add_argument("--configurations", default=",".join(CONFIGURATIONS))
     parser.add_argument("--clocks", default="unknown,frames")
     parser.add_argument("--checks", action="store_true", help="end before the solution")
-    parser.add_argument("--frames", default="120,300,0", help="numbers of frames; 0: all of them")
+    parser.add_argument("--frames", default="", help="numbers of frames; 0: all of them")
     parser.add_argument("--around", default="0.05,10", help="seconds of record around the frames")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--seed", type=int, default=900, help="the first")

@@ -10,10 +10,11 @@ from typing import Literal
 from telerig.errors import InputError
 from telerig.io.results.manifest import replaced_results
 
-Kind = Literal["calibration", "run", "batch"]
+Kind = Literal["calibration", "run", "validation", "batch"]
 
 _KINDS: dict[str, Kind] = {
-    "calibration.json": "calibration", "tracking.json": "run", "batch.json": "batch",
+    "calibration.json": "calibration", "tracking.json": "run", "validation.json": "validation",
+    "batch.json": "batch",
 }  # fmt: skip
 
 
@@ -28,8 +29,9 @@ class ResultsFolder:
 def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
     """What a results folder, or a dataset's folder, holds results of, by name.
 
-    calibration.json, tracking.json or batch.json say which kind a folder is; of a dataset, those
-    in its ``results`` are taken, the calibration first. Raises InputError where there is none.
+    calibration.json, tracking.json, validation.json or batch.json say which kind a folder is; of a
+    dataset, those in its ``results`` are taken, the calibration first. Raises InputError where
+    there is none.
     """
     place = Path(folder)
     if not place.is_dir():
@@ -50,7 +52,9 @@ def results_folders(folder: Path) -> tuple[ResultsFolder, ...]:
 
 
 def remake_report(results: ResultsFolder, out: Path | None = None) -> Path:
-    """Write the page of a results folder into it, or into ``out``; returns report.html's path.
+    """Write the page of a results folder into it, or into ``out``; returns its path.
+
+    The page of a validation is made beside that of a run.
 
     Raises InputError for results that cannot be read.
     """
@@ -66,6 +70,12 @@ def _write_page(results: ResultsFolder, out: Path) -> Path:
         from telerig.io.report.calibration.report import write_calibration_report
 
         return write_calibration_report(results.folder, out)
+    if (results.folder / "validation.json").is_file():
+        from telerig.io.report.validation import write_validation_report
+
+        page = write_validation_report(results.folder, out)
+        if results.kind == "validation":
+            return page
     if results.kind == "run":
         from telerig.io.report.run.report import write_track_report
 

@@ -24,14 +24,15 @@ NAME = "validation.html"
 _MOST_DRAWN = 12
 
 
-def write_validation_report(folder: Path) -> Path:
-    """Write validation.html beside validation.json; returns its path.
+def write_validation_report(folder: Path, out: Path | None = None) -> Path:
+    """Write validation.html beside validation.json, or into ``out``; returns its path.
 
     Raises InputError for a folder without validation.json, or one that cannot be read.
     """
     content = ValidationFile.read(Path(folder) / "validation.json")
-    write_text_atomic(Path(folder) / NAME, render(content))
-    return Path(folder) / NAME
+    page = (folder if out is None else out) / NAME
+    write_text_atomic(page, render(content))
+    return page
 
 
 def render(content: ValidationFile) -> str:

@@ -107,9 +107,14 @@ def _aligned(
     images, wrong = _Images.of(problem), None
     encoder = None if images is None else images.encoder_alignment(problem)
     findings: list[Finding]
-    seen = [] if images is None else list(_of_images(problem, images, encoder))
-    if not any(c.connected and _in_place(c, encoder, problem) for c in seen):
-        wrong = _frame_times(problem, max((c.nats for c in seen if c.connected), default=0.0))
+    seen = iter(()) if images is None else _of_images(problem, images, encoder)
+    elsewhere = 0.0
+    for clock in (c for c in seen if c.connected):
+        if _in_place(clock, encoder, problem):
+            break
+        elsewhere = max(elsewhere, clock.nats)
+    else:
+        wrong = _frame_times(problem, elsewhere)
         if wrong is not None:
             images = None
     if images is None:
@@ -363,13 +368,17 @@ def _clock(
             for k, axis in enumerate("xyz")
             for n in range(len(group))
         ]
+    found = None
     if all(s.clock == "frames" for s in sensors):
         near = [near_frames(s, problem.t_s, _SHARED_S) for s in sensors]
         found = _aligned_by(images, channels, near)
         if found is not None and found.at_zero:
-            return _between_steps(found, problem, images, channels, near)
-    found = _aligned_by(images, channels, sensors)
-    return None if found is None else _between_steps(found, problem, images, channels, sensors)
+            sensors = near
+    if found is None or not found.at_zero:
+        found = _aligned_by(images, channels, sensors)
+    if found is None or images_alone:
+        return found
+    return _between_steps(found, problem, images, channels, sensors)
 
 
 def _between_steps(

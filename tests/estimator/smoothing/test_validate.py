@@ -83,6 +83,10 @@ def test_the_command_proves_a_sound_rig(data: Path) -> None:
     }  # fmt: skip
     page = (folder / "validation.html").read_text(encoding="utf-8")
     assert "PASSED" in page and f"{found.marks[0].error_um:.3g}" in page
+    (folder / "validation.html").unlink()
+    again = CliRunner().invoke(app, ["report", str(folder)])
+    assert again.exit_code == 0, again.output
+    assert (folder / "validation.html").is_file()
 
 
 def test_a_turned_camera_fails(run: RunData, calibration: Calibration) -> None:

@@ -109,10 +109,10 @@ def _aligned(
     findings: list[Finding]
     seen = iter(()) if images is None else _of_images(problem, images, encoder)
     elsewhere = 0.0
-    for clock in (c for c in seen if c.connected):
-        if _in_place(clock, encoder, problem):
+    for one in (c for c in seen if c.connected):
+        if _in_place(one, encoder, problem):
             break
-        elsewhere = max(elsewhere, clock.nats)
+        elsewhere = max(elsewhere, one.nats)
     else:
         wrong = _frame_times(problem, elsewhere)
         if wrong is not None:

@@ -234,7 +234,10 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
         if found is not None:
             arrays |= {"shake_covariance": found.shake, "bubble_covariance": found.bubbles}
         for name, array in arrays.items():
-            states.create_dataset(name, data=array, compression="gzip")
+            # level 1 of shuffled bytes is three times as fast as the default, and not larger
+            states.create_dataset(
+                name, data=array, compression="gzip", compression_opts=1, shuffle=True
+            )
         file.attrs["schema"] = SmoothingFile.SCHEMA
         file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"
 

@@ -18,10 +18,13 @@ from telerig.estimator.sensors.given import AccelerometerRecord, times
 from telerig.estimator.smoothing.graph.solve import Options, Progress, Solution, solve
 from telerig.estimator.smoothing.graph.stage_travel import travel_of
 from telerig.estimator.smoothing.learning.default_priors import adapted, default_model
+from telerig.estimator.smoothing.learning.held_out import learning_record
 from telerig.estimator.smoothing.learning.learn import learn
 from telerig.estimator.smoothing.learning.likelihood import (
     with_hyperparameter_uncertainty,
 )
+from telerig.estimator.smoothing.learning.window import MOST_FRAMES
+from telerig.estimator.smoothing.phases import Phases
 from telerig.estimator.smoothing.problem.problem import (
     Observations,
     ShakeModel,
@@ -133,44 +136,55 @@ def smooth(
     Raises InputError for arguments that are not as described, and its subclass `SensorError`, with
     ``code`` and ``findings``, for a sensor that contradicts gravity, the images or another sensor.
     """
-    accepted = accepted_codes(accept)
+    accepted, phases = accepted_codes(accept), Phases(progress)
     _check_kinds(tracks, calibration, rig)
-    table = getattr(tracks, "table", tracks)
-    calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
-    refinement = refinement_of(table, calibration, refine_rig)
-    problem, tracked, encoder_sigma, findings = problem_of(
-        tracks, calibration, stage=stage, accelerometers=accelerometers,
-        references=references, rig=rig, t_s=t_s,
-        drift=None if refinement is None else refinement.drift,
-    )  # fmt: skip
-    problem, findings = aligned(problem, findings)
-    warnings = settled(findings, accepted)
+    with phases.phase("checks", "checking tracks and sensors"):
+        table = getattr(tracks, "table", tracks)
+        calibration = pair_of_run(calibration, _cameras_of(table, calibration, stage, rig))
+        refinement = refinement_of(table, calibration, refine_rig)
+        problem, tracked, encoder_sigma, findings = problem_of(
+            tracks, calibration, stage=stage, accelerometers=accelerometers,
+            references=references, rig=rig, t_s=t_s,
+            drift=None if refinement is None else refinement.drift,
+        )  # fmt: skip
+        problem, findings = aligned(problem, findings)
+        warnings = settled(findings, accepted)
     options = options or Options()
-    chosen = _chosen(problem, model, encoder_sigma, refinement)
-    if isinstance(model, ShakeModel):
-        solution = solve(problem, chosen, options, progress)
-    else:
-        solution = _adapted_solution(problem, chosen, options, progress)
-        chosen = solution.graph.model
-        if chosen.learned:
-            solution = with_hyperparameter_uncertainty(solution)
-    verdict = judge(problem, chosen, solution)
-    inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
-    summary = summary_of(solution)
-    summary["accepted"] = sorted(accepted)
-    summary["warnings"] = warnings + speed_warnings(solution)
-    change = refined_change(solution, calibration)
-    if change is not None:
-        words = change_words(change, problem.cameras[0].name)
-        summary["rig_change"] = {**change.as_dict(), "words": words}
-    return Smoothing(
-        trajectories(solution, None if tracked is None else tracked.table, inflation),
-        shake_table(solution, inflation),
-        verdict,
-        summary,
-        chosen,
-        solution,
-    )
+    with phases.phase("learning", "learning the shake") as step:
+        chosen = _chosen(problem, model, encoder_sigma, refinement, step)
+        learned: dict[str, Any] = {}
+        if chosen.learned and len(problem.t_s) > MOST_FRAMES:
+            learned, more = learning_record(problem, chosen)
+            warnings = [*warnings, *more]
+    with phases.phase("smoothing", _smoothing_words(problem)) as step:
+        if isinstance(model, ShakeModel):
+            solution = solve(problem, chosen, options, step)
+        else:
+            solution = _adapted_solution(problem, chosen, options, step)
+            chosen = solution.graph.model
+            if chosen.learned:
+                step("uncertainty of what was learned", 0.9)
+                solution = with_hyperparameter_uncertainty(solution)
+    with phases.phase("verdict", "judging the result"):
+        verdict = judge(problem, chosen, solution)
+        inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
+        summary = summary_of(solution)
+        summary["accepted"] = sorted(accepted)
+        summary["warnings"] = warnings + speed_warnings(solution)
+        change = refined_change(solution, calibration)
+        if change is not None:
+            words = change_words(change, problem.cameras[0].name)
+            summary["rig_change"] = {**change.as_dict(), "words": words}
+    with phases.phase("tables", "making the tables"):
+        paths = trajectories(solution, None if tracked is None else tracked.table, inflation)
+        offsets = shake_table(solution, inflation)
+    summary["learning"], summary["seconds"] = learned, phases.seconds
+    return Smoothing(paths, offsets, verdict, summary, chosen, solution)
+
+
+def _smoothing_words(problem: SmoothingProblem) -> str:
+    bubbles = "1 bubble" if len(problem.bubbles) == 1 else f"{len(problem.bubbles)} bubbles"
+    return f"smoothing {bubbles} in {len(problem.t_s)} frames"
 
 
 def _check_kinds(tracks: Any, calibration: Any, rig: Any) -> None:
@@ -209,10 +223,12 @@ def _chosen(
     model: ShakeModel | Learn | str,
     encoder_sigma_mm: float,
     refinement: Refinement | None,
+    progress: Progress,
 ) -> ShakeModel:
     if refinement is None or isinstance(model, ShakeModel):
-        return choose_model(problem, model, encoder_sigma_mm)
-    chosen = choose_model(for_learning(problem, refinement), model, encoder_sigma_mm)
+        return choose_model(problem, model, encoder_sigma_mm, progress)
+    held = for_learning(problem, refinement)
+    chosen = choose_model(held, model, encoder_sigma_mm, progress)
     return with_wander(chosen, refinement)
 
 
@@ -299,7 +315,10 @@ def problem_of(
 
 
 def choose_model(
-    problem: SmoothingProblem, model: ShakeModel | Learn | str, encoder_sigma_mm: float
+    problem: SmoothingProblem,
+    model: ShakeModel | Learn | str,
+    encoder_sigma_mm: float,
+    progress: Progress | None = None,
 ) -> ShakeModel:
     """Return the hyper-parameters: the given, the default or the learned ones.
 
@@ -324,7 +343,7 @@ def choose_model(
         )
     default = default_model(problem, encoder_sigma_mm)
     if model == "auto" and not problem.measures_shake and _longest_s(problem) >= _LEAST_LEARNED_S:
-        return learn(problem, default)
+        return learn(problem, default, progress=progress)
     return default
 
 

@@ -251,3 +251,15 @@ def keep_freed_memory() -> None:
     M_MMAP_THRESHOLD); nothing is written into it, so that it takes no memory.
     """
     np.empty(FREED_BYTES, np.uint8)
+
+
+def give_back_freed_memory() -> None:
+    """Let the C library give what is freed back to the system, where it can (glibc's malloc_trim).
+
+    GTSAM frees hundreds of MB in small pieces, which no large array can use.
+    """
+    import ctypes
+
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(0)

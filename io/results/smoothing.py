@@ -213,6 +213,8 @@ class SmoothingFile(Record):
     frames, bubbles : how many were smoothed. modes : the vibrations of the rig.
     log_evidence : logarithm of the model's probability density for the data; None if not computed.
     depth_axes : by camera, unit vector (3,) in rig axes along which that camera cannot measure.
+    learning : from which part of a long run the modes were learned, and how they hold elsewhere.
+    seconds : wall time by phase.
     rig_change : movement of the cameras relative to each other; None where it was not tested.
     """
 
@@ -250,6 +252,8 @@ class SmoothingFile(Record):
     accelerometers: dict[str, Any] = Field(default_factory=dict)
     bubble_means: dict[str, Any] = Field(default_factory=dict)
     rig_change: RigChange | None = None
+    learning: dict[str, Any] = Field(default_factory=dict)
+    seconds: dict[str, float] = Field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     accepted: tuple[str, ...] = ()
 

@@ -87,18 +87,27 @@ class BubbleChains:
             rest[:count, :size] = rows[mine]
         return rows, means
 
-    def covariances(self) -> Array:
-        """Return the covariances (rows, D, D) of the states, rows as in ``places``."""
-        size, out = self.own.shape[-1], self.own.copy()
+    def covariances(self, place: Ints | None = None, *, spent: bool = False) -> Array:
+        """Return the covariances (n, D, D) of the states at places (n,); None for all.
+
+        spent : whether the chains are not used any more, so that all may take their memory.
+        """
+        size = self.own.shape[-1]
+        where = np.arange(len(self.own)) if place is None else place
+        order = np.argsort(where, kind="stable")
+        sought = where[order]
+        out = self.own if spent else np.empty((len(where), size, size))
         joint = np.zeros((len(self.mean), size + 3, size + 3))
         joint[:, size:, size:] = self.mean
         for mine in reversed(self.places.stretches()):
             count, gain = mine.stop - mine.start, self.gain[mine]
             cross = gain @ joint[:count]
-            out[mine] += cross @ np.swapaxes(gain, -1, -2)
-            joint[:count, :size, :size] = out[mine]
+            block = self.own[mine] + cross @ np.swapaxes(gain, -1, -2)
+            joint[:count, :size, :size] = block
             joint[:count, :size, size:] = -cross[..., size:]
             joint[:count, size:, :size] = -np.swapaxes(cross[..., size:], -1, -2)
+            low, high = np.searchsorted(sought, [mine.start, mine.stop])
+            out[order[low:high]] = block[sought[low:high] - mine.start]
         return out
 
 

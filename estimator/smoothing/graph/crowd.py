@@ -39,6 +39,7 @@ from telerig.estimator.smoothing.graph.layout import (
 from telerig.estimator.smoothing.graph.linear import priors_and_motion
 from telerig.estimator.smoothing.problem.problem import Bubble, Observations
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
+from telerig.io.machine.parallel import give_back_freed_memory
 
 MOST_JOINT = 8
 """So many bubbles in sight are eliminated jointly."""
@@ -47,6 +48,7 @@ _LEFT = 1e-4
 conjugate gradients end."""
 _MOST_STEPS = 60
 _MOST_REFINEMENTS = 8
+_AT_ONCE = 8192
 
 
 def eliminated(
@@ -183,15 +185,21 @@ class EliminatedCrowd:
         return out
 
     def blocks(self) -> Blocks:
-        """Return the marginal covariances; what the rig adds to a bubble's is the mean bubble's."""
+        """Return the marginal covariances; what the rig adds to a bubble's is the mean bubble's.
+
+        The chains are used up.
+        """
         graph, mean = self.graph, self.mean.graph
-        found = self.mean.blocks()
+        found, chain = self.mean.blocks(), self.mean_chains
         row = _mean_row(mean)[graph.frame_of_row]
-        turn = _turn(mean, row, graph, np.arange(graph.rows))
-        known = self.mean_chains.covariances()[self.mean_chains.places.place_of_row]
-        added = (found.own[1] - known)[row]
-        own = self.chains.covariances()[self.chains.places.place_of_row]
-        own += _turned(added, turn)
+        added = found.own[1] - chain.covariances()[chain.places.place_of_row]
+        by_age = self.chains.covariances(spent=True)
+        own = np.empty_like(by_age)
+        for first in range(0, graph.rows, _AT_ONCE):
+            mine = np.arange(first, min(first + _AT_ONCE, graph.rows))
+            more = _turned(added[row[mine]], _turn(mean, row[mine], graph, mine))
+            own[mine] = by_age[self.chains.places.place_of_row[mine]] + more
+        del by_age
         segment = mean.bubble_of_row[row[graph.first_row[:-1]]]
         order = self.chains.places.order
         means = np.empty_like(self.chains.mean)
@@ -200,8 +208,9 @@ class EliminatedCrowd:
         means += mean_added[segment]
         _, any_row, cross_of_row = np.unique(row, return_index=True, return_inverse=True)
         cross = found.cross[row[any_row]]
+        turn = _turn(mean, row[any_row], graph, any_row)
         if turn is not None:
-            cross = cross @ np.swapaxes(turn[any_row], -1, -2)
+            cross = cross @ np.swapaxes(turn, -1, -2)
         blocks = [found.own[0], own, means, *found.own[3:]]
         return Blocks(blocks, cross, any_row, cross_of_row)
 
@@ -213,6 +222,7 @@ def eliminate_crowd(
     chains = bubble_chains(graph, factors)
     mean, its_factors = mean_graph(graph, factors, chains)
     done = eliminate(mean, its_factors, cholesky=cholesky)
+    give_back_freed_memory()
     out = EliminatedCrowd(
         graph, chains, done, bubble_chains(mean, its_factors),
         *_sparse(graph, mean, factors, chains), np.zeros(0),
@@ -327,7 +337,6 @@ def _step_roots(
     noise = np.eye(size) / stay[:, None, None]
     number = np.full(len(alive), -1)
     number[frame] = np.arange(len(frame))
-    covariance = chains.covariances()
     rows = np.arange(graph.rows)
     for block, row, off in (
         (step.blocks[0], graph.first_row[1:] - 1, 0),
@@ -336,7 +345,9 @@ def _step_roots(
         # those that end at the step's first frame, those that begin at its second
         which = number[graph.frame_of_row[row] + off]
         row, which = row[which >= 0], which[which >= 0]
-        own = covariance[chains.places.place_of_row[row]]
+        if not len(row):
+            continue
+        own = chains.covariances(chains.places.place_of_row[row])
         turn = _turn(graph, rows[row], mean, mean.moving_rows[which] - off)
         at = frame[which] - off
         share = 1 / (alive[at] * stay[which])

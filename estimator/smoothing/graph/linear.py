@@ -6,7 +6,9 @@ shake and bubble states are in their whitening basis.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +29,9 @@ from telerig.rig.triangulation import rig_jacobian
 
 SampleWeights = tuple[Array | None, ...]
 """Weights (N,) of the samples of each accelerometer; None where all are 1."""
+
+_AT_ONCE = 8192
+"""Pixels whose factors are worked out together."""
 
 _UNUSED = 1e8
 """Variance of an axis that is not used, in units of the others'."""
@@ -135,85 +140,112 @@ def images(graph: GraphLayout, state: State, weight: Array) -> Seen:
     problem, layout = graph.problem, graph.bubble
     obs = problem.observations
     rows = graph.row(obs.item, obs.frame)
-    states = state.bubbles[rows]
-    points = states @ layout.position.T
-    by_point = graph.in_bubble_basis(layout.position[None], rows)
-    shift, extra = np.zeros((len(obs), 2)), np.zeros((1, 2, layout.size))
-    if np.any(layout.wander):
-        shift = np.einsum("mid,md->mi", layout.wander[obs.camera], states)
-        extra = graph.in_bubble_basis(layout.wander[obs.camera], rows)
-    keys = graph.base().bubbles + rows
-    return _seen(graph, state, obs, weight, points, by_point, keys, shift, extra)
+
+    def states(mine: Ints) -> _Moving:
+        row = rows[mine]
+        each = state.bubbles[row]
+        shift = np.zeros((len(mine), 2))
+        by_state = graph.in_bubble_basis(layout.position[None], row)
+        by_shift = np.zeros((1, 2, layout.size))
+        if np.any(layout.wander):
+            wander = layout.wander[obs.camera[mine]]
+            shift = np.einsum("mid,md->mi", wander, each)
+            by_shift = graph.in_bubble_basis(wander, row)
+        return _Moving(each @ layout.position.T, by_state, shift, by_shift)
+
+    return _seen(graph, state, obs, weight, graph.base().bubbles + rows, states)
 
 
 def references(graph: GraphLayout, state: State, weight: Array) -> Seen:
     """Pixels of the marks fixed to the tank; weight (R,)."""
     obs = graph.problem.references
-    points = state.marks[obs.item]
-    keys = graph.base().marks + obs.item
-    extra, shift = np.zeros((1, 2, 3)), np.zeros((len(obs), 2))
-    by_point = np.broadcast_to(np.eye(3), (len(obs), 3, 3))
-    return _seen(graph, state, obs, weight, points, by_point, keys, shift, extra)
+
+    def states(mine: Ints) -> _Moving:
+        by_state = np.broadcast_to(np.eye(3), (len(mine), 3, 3))
+        shift = np.zeros((len(mine), 2))
+        return _Moving(state.marks[obs.item[mine]], by_state, shift, np.zeros((1, 2, 3)))
+
+    return _seen(graph, state, obs, weight, graph.base().marks + obs.item, states)
+
+
+class _Moving(NamedTuple):
+    """What is seen: points (n, 3) in the lab, and by how much images are shifted (n, 2) px.
+
+    by_state (n, 3, d), by_shift (n or 1, 2, d) : their derivatives by a state.
+    """
+
+    point_mm: Array
+    by_state: Array
+    shift_px: Array
+    by_shift: Array
 
 
 def _seen(
-    graph: GraphLayout,
-    state: State,
-    obs: Observations,
-    weight: Array,
-    points: Array,
-    by_state: Array,
-    keys: Ints,
-    shift: Array,
-    extra: Array,
-) -> Seen:
-    """``points`` (M, 3) of keys whose states move them by ``by_state``, their images ``extra``."""
-    problem, layout, base = graph.problem, graph.shake, graph.base()
-    inflation = graph.model.pixel_inflation
-    whitener = whitener_of(obs.covariance_px2) / inflation
+    graph: GraphLayout, state: State, obs: Observations, weight: Array, keys: Ints,
+    states: Callable[[Ints], _Moving],
+) -> Seen:  # fmt: skip
+    """``states`` returns what is seen in some of the observations; (M,) keys of its states.
+
+    The cameras' pixels are worked out some thousand at a time, since what is worked out on the way
+    takes several times the memory of the factors.
+    """
+    problem, base = graph.problem, graph.base()
     out, residual = [], np.zeros((len(obs), 2))
     at_frames = graph.shake_at_frames(state.shake)
-    gain = 1 / (1 + state.encoder_scale(graph))
-    position = gain * (at_frames @ layout.position)
-    by_scale = -gain * position
-    for c, camera in enumerate(problem.cameras):
+    for c in range(len(problem.cameras)):
         mine = np.flatnonzero(obs.camera == c)
         if not len(mine):
             continue
+        blocks: list[Array] = []
+        rhs, log_det = np.empty((len(mine), 2)), np.empty(len(mine))
+        for first in range(0, len(mine), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            which = mine[part]
+            found = _one_camera(graph, state, obs, c, which, at_frames, states(which))
+            root = np.sqrt(weight[which])
+            blocks = blocks or [np.empty((len(mine), *b.shape[1:])) for b in found.blocks]
+            for whole, block in zip(blocks, found.blocks):
+                whole[part] = block * root[:, None, None]
+            residual[which] = -found.rhs
+            rhs[part], log_det[part] = found.rhs * root[:, None], found.log_det
         node = graph.nodes.of_frame[obs.frame[mine]]
-        shake = at_frames[obs.frame[mine]]
-        seen = measurements.image_of_point(
-            camera, points[mine], position[obs.frame[mine]], problem.axis,
-            shake @ layout.offset[c].T,
-        )  # fmt: skip
-        by_shake = seen.by_offset @ layout.offset[c] + seen.by_position[..., None] * (
-            gain * layout.position
-        )
-        if graph.to_frames is not None:
-            by_shake = by_shake @ graph.to_frames[obs.frame[mine]]
-        off = seen.uv_px + shift[mine] - obs.uv_px[mine]
-        by_rig = np.zeros((len(mine), 2, 0))
-        if problem.calibration is not None and len(state.calibration):
-            by_rig = _by_calibration(graph, c, points[mine], position[obs.frame[mine]], shake)
-            off += by_rig @ state.calibration
-        by_travel = seen.by_position * by_scale[obs.frame[mine], None]
-        w = whitener[mine]
-        residual[mine] = np.einsum("mij,mj->mi", w, off)
-        root = np.sqrt(weight[mine])
-        w = w * root[:, None, None]
-        more = extra if len(extra) == 1 else extra[mine]
-        blocks = (
-            w @ (seen.by_point @ by_state[mine] + more),
-            graph.in_shake_basis(w @ by_shake, node),
-            w @ np.concatenate([graph.by_encoder(by_travel, np.zeros_like(by_travel)), by_rig], -1),
-        )
-        rhs = -residual[mine] * root[:, None]
-        log_det = log_det_of(whitener[mine])
-        linear = LinearFactors(
-            (keys[mine], node, base.constants), blocks, rhs, log_det, weight[mine]
-        )
-        out.append(linear)
+        every = (keys[mine], node, base.constants)
+        out.append(LinearFactors(every, tuple(blocks), rhs, log_det, weight[mine]))
     return Seen(out, residual)
+
+
+def _one_camera(
+    graph: GraphLayout, state: State, obs: Observations, camera: int, mine: Ints,
+    at_frames: Array, moving: _Moving,
+) -> LinearFactors:  # fmt: skip
+    """Some pixels of one camera, all of weight 1. at_frames : (F, D) states of the shake."""
+    problem, layout, frame = graph.problem, graph.shake, obs.frame[mine]
+    w = whitener_of(obs.covariance_px2[mine]) / graph.model.pixel_inflation
+    shake = at_frames[frame]
+    gain = 1 / (1 + state.encoder_scale(graph))
+    position = gain * (shake @ layout.position)
+    seen = measurements.image_of_point(
+        problem.cameras[camera], moving.point_mm, position, problem.axis,
+        shake @ layout.offset[camera].T,
+    )  # fmt: skip
+    by_shake = seen.by_offset @ layout.offset[camera]
+    by_shake += seen.by_position[..., None] * (gain * layout.position)
+    if graph.to_frames is not None:
+        by_shake = by_shake @ graph.to_frames[frame]
+    off = seen.uv_px + moving.shift_px - obs.uv_px[mine]
+    by_rig = np.zeros((len(mine), 2, 0))
+    if problem.calibration is not None and len(state.calibration):
+        by_rig = _by_calibration(graph, camera, moving.point_mm, position, shake)
+        off += by_rig @ state.calibration
+    by_travel = seen.by_position * (-gain * position)[:, None]
+    by_encoder = graph.by_encoder(by_travel, np.zeros_like(by_travel))
+    node = graph.nodes.of_frame[frame]
+    blocks = (
+        w @ (seen.by_point @ moving.by_state + moving.by_shift),
+        graph.in_shake_basis(w @ by_shake, node),
+        w @ np.concatenate([by_encoder, by_rig], -1),
+    )
+    return LinearFactors((), blocks, -np.einsum("mij,mj->mi", w, off), log_det_of(w))
 
 
 def _by_calibration(

@@ -32,6 +32,7 @@ from telerig.estimator.smoothing.graph.linear import (
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.factors.linear_factors import LinearFactors
 from telerig.factors.robust_loss import truncation_weights
+from telerig.io.machine.parallel import give_back_freed_memory
 from telerig.rig.lens_parameters import INDEX
 from telerig.statistics import robust_sd
 
@@ -48,6 +49,7 @@ _MOST_ROUNDS, _LEAST_SCALE = 5, 1e-9
 _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
 _LARGEST_STEP_PX = 5.0
 _STACK_BYTES = 512 << 20
+_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
@@ -332,8 +334,11 @@ def _covariances(graph: GraphLayout, blocks: Blocks) -> Covariances:
     if graph.to_frames is not None:
         shake_basis = graph.to_frames @ shake_basis
     shake = shake_basis @ own[0] @ np.swapaxes(shake_basis, -1, -2)
-    half = np.swapaxes(graph.out_of_bubble_basis(own[1], rows), -1, -2)
-    bubbles = graph.out_of_bubble_basis(half, rows)
+    bubbles = own[1]
+    for first in range(0, graph.rows, _AT_ONCE):
+        mine = rows[first : first + _AT_ONCE]
+        half = np.swapaxes(graph.out_of_bubble_basis(bubbles[mine], mine), -1, -2)
+        bubbles[mine] = graph.out_of_bubble_basis(half, mine)
     row = blocks.cross_row
     cross = graph.out_of_bubble_basis(shake_basis[graph.frame_of_row[row]] @ blocks.cross, row)
     encoder = graph.encoder_size
@@ -485,6 +490,7 @@ def in_large_stack(task: Callable[[], T]) -> T:
     thread.join()
     if collecting:
         gc.enable()
+    give_back_freed_memory()
     if fault:
         raise fault[0]
     return result[0]

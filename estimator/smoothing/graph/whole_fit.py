@@ -7,7 +7,7 @@ expected, correlation in time included.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,8 +20,8 @@ from telerig.estimator.smoothing.graph.solve import Solution, in_large_stack
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 
 DRAWS = 16
-_FEWER_DRAWS, _MANY_ROWS = 4, 20_000
-"""So many states of bubbles make up for fewer draws: what is compared are means over all."""
+_FEWEST_DRAWS, _DRAWN_ROWS = 2, 320_000
+"""Of a long run with many bubbles fewer draws do: what is compared are means over all states."""
 _REFINEMENTS = 1
 
 
@@ -34,7 +34,7 @@ class WholeFit:
 
     graph: GraphLayout
     factors: list[LinearFactors]
-    root: EliminatedGraph | EliminatedCrowd
+    root: EliminatedGraph | EliminatedCrowd | None
     starts: Ints
     first_row: Ints
 
@@ -53,6 +53,7 @@ class WholeFit:
 
         The root is refined, because A^T A alone has too few digits.
         """
+        assert self.root is not None
         found = np.zeros((int(self.starts[-1]), right.shape[1]))
         rest = right
         for _ in range(1 + _REFINEMENTS):
@@ -88,6 +89,11 @@ def drawn(
     draws : their number; None for `DRAWS`, or fewer for a run with many states.
     """
     fit = whole_fit(solution)
-    draws = draws or (DRAWS if solution.graph.rows < _MANY_ROWS else _FEWER_DRAWS)
+    draws = draws or int(np.clip(_DRAWN_ROWS // (fit.graph.rows or 1), _FEWEST_DRAWS, DRAWS))
     noise = np.random.default_rng(seed).standard_normal((fit.rows, draws))
-    return (fit, *fit.solved(noise))
+    if fit.graph.rows < _DRAWN_ROWS // DRAWS:
+        errors, left = fit.solved(noise)
+    else:  # one after the other takes less memory
+        each = [fit.solved(noise[:, k : k + 1]) for k in range(draws)]
+        errors, left = (np.concatenate(parts, -1) for parts in zip(*each))
+    return replace(fit, root=None), errors, left

@@ -9,7 +9,7 @@ a target standing still is the best source: there every line is the rig's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import cached_property
@@ -51,6 +51,7 @@ from telerig.estimator.smoothing.problem.problem import (
     SmoothingProblem,
 )
 from telerig.factors.bubble_motion import Triple, Zigzag
+from telerig.io.machine.parallel import keep_freed_memory
 
 _STRONG = 20.0
 _ACROSS, _ACROSS_LOG_SIGMA = 0.5, 1.0
@@ -66,19 +67,26 @@ _NEEDED_LOG_RATIO = 150.0
 
 
 def learn(
-    problem: SmoothingProblem, start: ShakeModel, options: Learning | None = None
+    problem: SmoothingProblem,
+    start: ShakeModel,
+    options: Learning | None = None,
+    progress: Callable[[str, float], None] | None = None,
 ) -> ShakeModel:
     """A model whose modes, dampings and intensities are the most probable for the run.
 
     start : gives what is not learned. Its modes are kept and improved, unless they are the default
-    guess (its name is "default"). Returns a model named "learned", with the standard deviations of
-    its log-parameters in ``learned``. Of a long run only the frames of `learning_window` are used.
-    Accelerometers are not learned from: where there are any, a
-    default start is returned unchanged, since its broad band needs no modes.
+    guess (its name is "default").
+    progress : called with what was found and the share (0 to 1) that is done.
+
+    Returns a model named "learned", with the standard deviations of its log-parameters in
+    ``learned``. Of a long run only the frames of `learning_window` are used. Accelerometers are not
+    learned from: where there are any, a default start is returned unchanged, since its broad band
+    needs no modes.
     """
     options = options or Learning()
     if start.name == "default" and problem.accelerometers:
         return start
+    keep_freed_memory()
     model = replace(start, modes=()) if start.name == "default" else start
     signals = signals_of(learning_window(problem).problem, fixed=options.target)
     signals = tuple(c for c in signals if c.samples)
@@ -89,13 +97,25 @@ def learn(
     for index, group in enumerate(groups):
         if index and not options.target:
             model, options = _seeded(model, group, options)
-        model, sigma = _learn_group(group, model, options, first=index == 0)
+
+        def report(found: int, at: int = index) -> None:
+            if progress is not None:
+                where = "across" if at else "the shared axis"
+                words = f"{where}, {found} modes so far"
+                progress(words, (at + found / (found + 2)) / len(groups))
+
+        model, sigma = _learn_group(group, model, options, report, first=index == 0)
         learned |= sigma
     return replace(model, name="learned", learned=learned)
 
 
 def _learn_group(
-    group: Group, model: ShakeModel, options: Learning, *, first: bool
+    group: Group,
+    model: ShakeModel,
+    options: Learning,
+    report: Callable[[int], None],
+    *,
+    first: bool,
 ) -> tuple[ShakeModel, dict[str, float]]:
     t_s = group.signals[0].t_s
     factor = averaging_factor(t_s, _highest(group, model))
@@ -103,6 +123,7 @@ def _learn_group(
     coarse = replace(group, signals=tuple(averaged(c, factor) for c in group.signals))
     seeds = {} if first else _seeds(model, options)
     given = len(model.modes)
+    report(0)
     begun_white = model.force_hz is None and options.force_hz is None
     step = Step(maximise(coarse.fast, model, free_names(model, coarse, options, first), steps=15))
     step = try_low_pass_force(coarse, step, options, first)
@@ -111,6 +132,7 @@ def _learn_group(
         if better is None:
             break
         step = try_low_pass_force(coarse, better, options, first)
+        report(len(step.found))
     fit = pruned(coarse, step.fit, options, first, given)
     if first and begun_white:
         fit = try_white_force(coarse, fit, options)

@@ -145,6 +145,7 @@ def laplace_covariance(signals: Sequence[Signal], model: ShakeModel, names: Sequ
 
 
 _FARTHEST = 0.5
+_AT_ONCE = 8192
 _Triple = tuple[Array, Array, Array]
 """Of positions, velocities and offsets."""
 
@@ -174,7 +175,10 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
     for kind, rows in ((0, solution.graph.bubble.position), (1, solution.graph.bubble.velocity)):
         along = np.stack([_rows(solution, c, s[kind]) for c, s in zip(signals, spreads)], -1)
         into = np.linalg.pinv(rows) @ lab
-        bubbles += np.einsum("ik,nk,jk->nij", into, along, into, optimize=True)
+        each = np.einsum("ik,jk->kij", into, into).reshape(along.shape[-1], -1)
+        for first in range(0, len(bubbles), _AT_ONCE):
+            mine = slice(first, first + _AT_ONCE)
+            bubbles[mine] += (along[mine] @ each).reshape(-1, *bubbles.shape[1:])
     shake = _shaken(solution, signals, [s[2] for s in spreads], found)
     return replace(solution, covariances=replace(found, bubbles=bubbles, shake=shake))
 

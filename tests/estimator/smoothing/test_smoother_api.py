@@ -439,18 +439,22 @@ def test_the_calibrations_uncertainty_is_carried_in(run: Run) -> None:
 
 
 def test_two_frames_and_a_bubble_seen_once(run: Run) -> None:
-    seen: list[float] = []
+    seen: list[tuple[str, float]] = []
     two = run.tracks.iloc[:2]
     once = run.tracks.iloc[[1]].assign(particle=9)
     found = smooth(
         pd.concat([two, once]), run.calibration, stage=run.stage, rig=RIG, model=TRUE,
-        progress=lambda what, share: seen.append(share),
+        progress=lambda what, share: seen.append((what, share)),
     )  # fmt: skip
     table = found.trajectories
     assert list(table["particle"]) == [4, 4, 9]
     assert np.isfinite(table[["x_mm", "vx_mm_s", "sx_mm"]].to_numpy()).all()
-    assert seen[0] == 0.0
-    assert seen[-1] == 1.0
+    assert seen[0] == ("checking tracks and sensors", 0.0)
+    assert seen[-1][1] == 1.0
+    assert all(0 <= share <= 1 for _, share in seen)
+    assert list(found.summary["seconds"]) == [
+        "checks", "learning", "smoothing", "verdict", "tables",
+    ]  # fmt: skip
 
 
 def test_too_short_a_run_to_learn_from_is_not_said_to_be_still(run: Run) -> None:

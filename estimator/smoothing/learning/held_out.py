@@ -1,0 +1,115 @@
+"""Do learned hyper-parameters hold for the parts of a run that they were not learned from?
+
+In windows elsewhere in the run: the squared distance of the signals from the model, which is one
+per sample for a right model, and the modes' frequencies, refitted there. A mode whose frequency
+differs by more than its uncertainty drifts along the run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from telerig.estimator.smoothing.learning.evidence import Factor
+from telerig.estimator.smoothing.learning.learn import Learning, free_names, groups_of
+from telerig.estimator.smoothing.learning.likelihood import laplace_covariance, maximise
+from telerig.estimator.smoothing.learning.lines_of_sight import signals_of
+from telerig.estimator.smoothing.learning.parameters import value_of
+from telerig.estimator.smoothing.learning.window import learning_window, other_windows
+from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
+from telerig.estimator.smoothing.problem.window import Window
+
+_MOST_WINDOWS = 3
+_STEPS = 5
+_SURE, _LEAST_DRIFT = 4.0, 0.02
+_LARGEST_SQUARE = 1.3
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Compare one window with the model learned from another.
+
+    from_s, to_s : times of the window.
+    square : mean squared distance of a sample from the model; 1 if the model is right.
+    frequencies : by name of a mode's frequency, its value in the window and the sd of the ratio of
+        this to the learned one.
+    """
+
+    from_s: float
+    to_s: float
+    square: float
+    frequencies: dict[str, tuple[float, float]]
+
+    def drifted(self, model: ShakeModel) -> dict[str, float]:
+        """Return the frequencies that differ from the learned ones, by name."""
+        out = {}
+        for name, (value, sigma) in self.frequencies.items():
+            shift = abs(float(np.log(value / value_of(model, name))))
+            if shift > max(_SURE * sigma, _LEAST_DRIFT):
+                out[name] = value
+        return out
+
+
+def held_out(problem: SmoothingProblem, model: ShakeModel) -> list[HeldOut]:
+    """Return the comparison with up to three windows that a model was not learned from."""
+    used = learning_window(problem)
+    found = [_compared(w, model) for w in other_windows(problem, used, _MOST_WINDOWS)]
+    return [one for one in found if one is not None]
+
+
+def _compared(window: Window, model: ShakeModel) -> HeldOut | None:
+    problem, t = window.problem, window.problem.t_s
+    signals = tuple(s for s in signals_of(problem) if s.samples)
+    if not signals:
+        return None
+    group = groups_of(signals, Learning(), problem.up)[0]
+    parts = group.fast
+    count = sum(Factor(p, model).count * int((p.weight > 0).sum()) for p in parts)
+    square = sum(Factor(p, model).square for p in parts) / max(count, 1)
+    free = free_names(model, group, Learning(), True)
+    names = [n for n in free if n.startswith("modes.") and n.endswith("frequency_hz")]
+    fit = maximise(parts, model, names, steps=_STEPS)
+    here = np.diag(laplace_covariance(parts, fit.model, names)) if names else np.zeros(0)
+    frequencies = {
+        name: (value_of(fit.model, name), float(np.hypot(np.sqrt(v), model.learned.get(name, 0.0))))
+        for name, v in zip(names, here)
+    }
+    return HeldOut(float(t[0]), float(t[-1]), float(square), frequencies)
+
+
+def learning_record(
+    problem: SmoothingProblem, model: ShakeModel
+) -> tuple[dict[str, Any], list[str]]:
+    """Return from what a model was learned and how it holds elsewhere, and warnings where it does
+    not."""
+    window = learning_window(problem)
+    t = window.problem.t_s
+    record: dict[str, Any] = {
+        "from_s": float(t[0]), "to_s": float(t[-1]), "frames": len(t), "held_out": [],
+    }  # fmt: skip
+    warnings: list[str] = []
+    drifts: dict[str, tuple[float, HeldOut]] = {}
+    for one in held_out(problem, model):
+        record["held_out"].append(
+            {"from_s": one.from_s, "to_s": one.to_s, "square_per_sample": one.square}
+        )
+        for name, value in one.drifted(model).items():
+            learned, before = value_of(model, name), drifts.get(name)
+            if before is None or abs(value - learned) > abs(before[0] - learned):
+                drifts[name] = value, one
+        if one.square > _LARGEST_SQUARE:
+            warnings.append(
+                f"the shake learned from {t[0]:.4g} to {t[-1]:.4g} s does not describe the run "
+                f"from {one.from_s:.4g} to {one.to_s:.4g} s: the squared distance per sample is "
+                f"{one.square:.3g} there, and 1 for a right model. Smooth the run in parts"
+            )
+    for name, (value, one) in drifts.items():
+        warnings.append(
+            f"a mode of the rig drifts along the run: {value_of(model, name):.4g} Hz from "
+            f"{t[0]:.4g} to {t[-1]:.4g} s, from which it was learned, and {value:.4g} Hz from "
+            f"{one.from_s:.4g} to {one.to_s:.4g} s. Smooth the run in parts, or with "
+            "accelerometers or marks"
+        )
+    return record, warnings

@@ -28,9 +28,6 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
-from scipy.optimize import minimize
-from scipy.special import chdtrc
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError, InputError
@@ -130,6 +127,21 @@ class Noise:
             out += rms**2 * np.exp(-lag / decay) * wave
         return out
 
+    def slopes(self, lag_s: Array) -> tuple[Array, Array]:
+        """Return the derivatives of `own` (2, L) by the logarithms of wander_mm and wander_s, and
+        those of `common` (3 n, L) by the logarithms of the n oscillations' numbers, in turn.
+        """
+        lag, own = np.abs(lag_s), self.own(lag_s)
+        common = []
+        for rms, decay, hz in self.shake:
+            turn = 2 * np.pi * hz
+            cos, sin = np.cos(turn * lag), np.sin(turn * lag) / (turn * decay)
+            scale = rms**2 * np.exp(-lag / decay)
+            by_decay = lag / decay * (cos + sin) - sin
+            by_hz = lag / decay * cos - sin - (turn * lag) * (turn * decay) * sin
+            common += [2 * scale * (cos + sin), scale * by_decay, scale * by_hz]
+        return np.array([2 * own, own * lag / self.wander_s]), np.reshape(common, (-1, len(lag)))
+
     def covariance(self, series: Series) -> Array:
         """Return the covariance (M, M) of the ray misses, with the unknowns held fixed."""
         t, index = np.unique(series.t_s, return_inverse=True)
@@ -159,19 +171,33 @@ class _Spectrum:
 
     def expected(self, noise: Noise) -> Array:
         """Return the expectation of the periodogram, which includes leakage and aliasing."""
-        lag = np.asarray(np.arange(len(self.overlap)) * self.step_s, np.float64)
-        covariance = self.common * noise.common(lag) + self.single * noise.own(lag)
+        covariance = self.common * noise.common(self._lag_s) + self.single * noise.own(self._lag_s)
         covariance[0] += self.single * noise.white_mm**2
         turned = covariance * self.overlap
-        both = np.concatenate([turned, [0.0], turned[:0:-1]])
-        density = np.fft.fft(both).real[: len(self.overlap) + 1 : 2]
-        return np.asarray(density[_FIRST_BIN : _FIRST_BIN + len(self.power)].clip(1e-18))
+        density = 2 * np.fft.rfft(turned).real - turned[0]
+        return np.asarray(density[self._bins].clip(1e-18))
 
-    def cost(self, noise: Noise) -> float:
+    @property
+    def _lag_s(self) -> Array:
+        return np.asarray(np.arange(len(self.overlap)) * self.step_s, np.float64)
+
+    @property
+    def _bins(self) -> slice:
+        return slice(_FIRST_BIN, _FIRST_BIN + len(self.power))
+
+    def cost(self, noise: Noise) -> tuple[float, Array]:
         """Return the negative debiased Whittle log-likelihood (Sykulski et al., Biometrika 106:251,
-        2019)."""
+        2019), and its derivative by the logarithms of the noise's numbers."""
         density = self.expected(noise)
-        return float(_INDEPENDENT * (np.log(density) + self.power / density).sum())
+        cost = float(_INDEPENDENT * (np.log(density) + self.power / density).sum())
+        by_density = np.zeros(len(self.overlap))
+        by_density[self._bins] = _INDEPENDENT * (1 - self.power / density) / density
+        by_covariance = 2 * np.fft.fft(by_density).real * self.overlap
+        by_covariance[0] /= 2
+        own, common = noise.slopes(self._lag_s)
+        white = self.single * 2 * noise.white_mm**2 * by_covariance[0]
+        rest = np.concatenate([self.single * own, self.common * common]) @ by_covariance
+        return cost, np.concatenate([[white], rest])
 
 
 def learned_noise(parts: list[Series]) -> Noise:
@@ -206,14 +232,15 @@ def learned_noise(parts: list[Series]) -> Noise:
 
 def _fitted(spectra: list[_Spectrum], start: Array, prior: Prior) -> tuple[Array, float]:
     """Return the logarithms of the hyper-parameters, and the negative log posterior there."""
+    from scipy.optimize import minimize
 
-    def cost(log: Array) -> float:
-        noise = _noise(log)
-        pull = 0.5 * float((((log - prior[0]) / prior[1]) ** 2).sum())
-        return pull + sum(s.cost(noise) for s in spectra)
+    def cost(log: Array) -> tuple[float, Array]:
+        noise, off = _noise(log), (log - prior[0]) / prior[1]
+        costs, slopes = zip(*(s.cost(noise) for s in spectra))
+        return 0.5 * float(off @ off) + sum(costs), np.sum(slopes, axis=0) + off / prior[1]
 
     box = [(s - 8.0, s + 4.0) for s in start]
-    found = minimize(cost, start, method="L-BFGS-B", bounds=box, options={"maxiter": 60})
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=box, options={"maxiter": 60})
     return np.asarray(found.x), float(found.fun)
 
 
@@ -278,6 +305,8 @@ def information(series: Series, noise: Noise) -> tuple[Array, Array, Array]:
     residuals (M,) in standard deviations. The residuals are computed at the best unknowns of this
     stretch; the uncertainty of these is neglected.
     """
+    from scipy.linalg import cho_solve, cholesky
+
     lower = cholesky(noise.covariance(series), lower=True, check_finite=False)
     inverse = cho_solve((lower, True), np.eye(len(lower)), check_finite=False)
     matrix = series.by_unknowns.T @ inverse @ series.by_unknowns
@@ -525,6 +554,8 @@ def p_value_of(tangent: Array, covariance: Array, prior: Array) -> float:
     It is a chi-square test over the directions that the prior leaves free. The prior shrinks the
     estimate towards 0, so the true p-value is smaller than the returned one.
     """
+    from scipy.special import chdtrc
+
     basis = covariance_root(prior)
     if not basis.shape[1]:
         return 1.0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from telerig.errors import InputError
-from telerig.io.simulation.presets import PRESETS, RUN_PRESETS, any_preset, run_preset
+from telerig.io.simulation import preset_names
 from telerig.scripts.console import errors_in_words, run_file, say, stopped_by_signals
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ def simulate(
     preset: Annotated[
         str | None,
         typer.Argument(
-            help=f"A calibration ({', '.join(PRESETS)}), or a run of bubbles "
-            f"({', '.join(RUN_PRESETS)})."
+            help=f"A calibration ({', '.join(preset_names.CALIBRATIONS)}), or a run of bubbles "
+            f"({', '.join(preset_names.RUNS)})."
         ),
     ] = None,
     out: Annotated[
@@ -103,11 +103,13 @@ def simulate(
 def _settings(
     name: str, run: dict[str, int | None], stage: dict[str, Any]
 ) -> SimulationConfig | RunConfig:
+    from telerig.io.simulation.presets import any_preset, run_preset
+
     changes: dict[str, Any] = {key: value for key, value in run.items() if value is not None}
     stage_changes = {key: value for key, value in stage.items() if value is not None}
     if not changes and not stage_changes:
         return any_preset(name)
-    if name in RUN_PRESETS:
+    if name in preset_names.RUNS:
         if stage_changes:
             changes["stage"] = replace(run_preset(name).stage, **stage_changes)
         return run_preset(name, **changes)
@@ -135,7 +137,7 @@ def _with_strip(
 def _needs_run(name: str, given: str) -> InputError:
     return InputError(
         f"{name} is a calibration without a run, so {given} have no effect",
-        todo=f"leave them out, or choose one of {', '.join(RUN_PRESETS)}",
+        todo=f"leave them out, or choose one of {', '.join(preset_names.RUNS)}",
     )
 
 

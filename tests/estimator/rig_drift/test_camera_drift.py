@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import telerig
 from telerig.errors import CalibrationError, InputError
+from telerig.estimator import rig_drift
 from telerig.estimator.bubbles.pairing.learning import default_model
 from telerig.estimator.bubbles.pairing.matching import Finding
 from telerig.estimator.calibration.result.calibration import Calibration
@@ -384,3 +385,19 @@ def test_the_graph_refines_the_rig_with_the_shake() -> None:
     true = moved(cameras, tangent)[1].camera_from_rig.inverse().translation_mm
     was = cameras[1].camera_from_rig.inverse().translation_mm
     assert np.linalg.norm(pose - true) < 0.3 * np.linalg.norm(was - true)
+
+
+@pytest.mark.parametrize("samples", [40, 41])
+def test_the_gradient_of_the_noise_is_that_of_its_likelihood(samples: int) -> None:
+    rng = np.random.default_rng(3)
+    t = 0.002 * np.arange(samples)
+    spectrum = rig_drift._spectrum(t, rng.standard_normal(samples) + np.sin(300 * t), 0.8, 0.3)
+    log = np.log([0.5, 0.3, 0.05, 0.4, 0.2, 40.0, 0.2, 0.1, 90.0])
+
+    def cost(place: np.ndarray) -> float:
+        return spectrum.cost(rig_drift._noise(place))[0]
+
+    _, slope = spectrum.cost(rig_drift._noise(log))
+    steps = 1e-6 * np.eye(len(log))
+    numeric = [(cost(log + step) - cost(log - step)) / 2e-6 for step in steps]
+    np.testing.assert_allclose(slope, numeric, rtol=1e-5, atol=1e-6)

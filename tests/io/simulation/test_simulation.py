@@ -10,6 +10,7 @@ import pytest
 import tifffile
 
 from telerig.errors import InputError
+from telerig.io.simulation import preset_names
 from telerig.io.simulation.calibration.scene import (
     hand_held_views,
     true_cameras,
@@ -19,7 +20,7 @@ from telerig.io.simulation.calibration.scene import (
 from telerig.io.simulation.calibration_files import exact_dots, view_image
 from telerig.io.simulation.config import CameraConfig
 from telerig.io.simulation.images.plates import pixel_from_plate
-from telerig.io.simulation.presets import PRESETS, preset
+from telerig.io.simulation.presets import PRESETS, RUN_PRESETS, preset
 from telerig.io.simulation.simulate import simulate
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose
@@ -312,3 +313,7 @@ def test_exact_dots_for_tests_of_solvers(tmp_path):
     )
     exact = pd.read_csv(tmp_path / "truth/dots.csv")
     assert np.array_equal(dataset.dots()[["u_px", "v_px"]], exact[["u_px", "v_px"]])
+
+
+def test_the_help_names_all_presets() -> None:
+    assert (tuple(PRESETS), tuple(RUN_PRESETS)) == (preset_names.CALIBRATIONS, preset_names.RUNS)

@@ -34,13 +34,10 @@ class Rest(StrEnum):
     SENSORS = "sensors only"
 
 
-class WithheldMark(Part):
-    """Hold the result for one mark that was smoothed as a bubble.
+class Errors(Part):
+    """Hold how far marks do not stand still.
 
     beside : what else the smoothing could use.
-    cameras : the cameras whose pixels were used. Of one camera, only the two axes of its image
-        count.
-    frames : from the mark's first to its last frame.
     error_um, sd_um : RMS of the position about its mean per axis, and the stated standard
         deviation.
     velocity_error_mm_s, velocity_sd_mm_s : RMS of the velocity, which should be 0, and the stated
@@ -48,15 +45,9 @@ class WithheldMark(Part):
     nees, velocity_nees : squared errors over their stated variances.
     unsmoothed_um : RMS of the pixels' places about their mean, with the encoder's travel added, in
         place of ``error_um`` without smoothing.
-    smoothing : the verdict of the smoothing.
-    t_s, off_um, sd_um_of_time : the distance from the mean along each axis and its standard
-        deviation over time, in at most some hundred frames.
     """
 
-    mark: str
     beside: Rest
-    cameras: tuple[Name, ...]
-    frames: int
     error_um: float
     sd_um: float
     nees: float
@@ -64,6 +55,22 @@ class WithheldMark(Part):
     velocity_sd_mm_s: float
     velocity_nees: float
     unsmoothed_um: float
+
+
+class WithheldMark(Errors):
+    """Hold the result for one mark that was smoothed as a bubble.
+
+    cameras : the cameras whose pixels were used. Of one camera, only the two axes of its image
+        count.
+    frames : from the mark's first to its last frame.
+    smoothing : the verdict of the smoothing.
+    t_s, off_um, sd_um_of_time : the distance from the mean along each axis and its standard
+        deviation over time, in at most some hundred frames.
+    """
+
+    mark: str
+    cameras: tuple[Name, ...]
+    frames: int
     smoothing: Verdict | None = None
     t_s: tuple[float, ...] = ()
     off_um: tuple[tuple[float, ...], ...] = ()
@@ -77,19 +84,11 @@ class WithheldMark(Part):
         return Stillness.PASSED if honest and agrees else Stillness.FAILED
 
 
-class Overall(Part):
-    """Hold the same numbers for all withheld marks together: RMS of errors and standard deviations,
-    and means of NEES, weighted by frames."""
+class Overall(Errors):
+    """Hold the errors of all withheld marks together: RMS of errors and standard deviations, and
+    means of NEES, weighted by frames."""
 
-    beside: Rest
     marks: int
-    error_um: float
-    sd_um: float
-    nees: float
-    velocity_error_mm_s: float
-    velocity_sd_mm_s: float
-    velocity_nees: float
-    unsmoothed_um: float
     verdict: Stillness
 
 

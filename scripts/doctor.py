@@ -17,10 +17,12 @@ _WIDTH = 8
 
 @errors_in_words()
 def doctor(
-    dataset: Annotated[Path | None, typer.Argument(help="Dataset folder to check as well.")] = None,
+    dataset: Annotated[Path | None, typer.Argument(help="Dataset or run to check as well.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for other programs.")] = False,
 ) -> None:
-    """Check the installation, the serial ports, and a dataset if one is given.
+    """Check the installation, the serial ports, and a dataset or a run if one is given.
+
+    Of each run it also estimates how long tracking and smoothing will take.
 
     Exit code 0: nothing prevents the work, though there may be warnings. 1: there is a failure.
     """

@@ -17,6 +17,7 @@ import numpy as np
 
 from telerig.errors import TelerigError
 from telerig.estimator.batch.jobs import check_run_name
+from telerig.estimator.doctor.cost import cost_words
 from telerig.io.dataset.dataset import Dataset, load_dataset
 from telerig.io.recording.ports import NO_PERMISSION, found_ports
 
@@ -165,7 +166,13 @@ _FEWEST_READINGS = 2
 
 
 def check_dataset(place: Path) -> Iterator[Check]:
-    """Check rig.toml, the views, every run with its clocks and sensors, and the disk space."""
+    """Check rig.toml, the views, every run with its clocks and sensors, and the disk space.
+
+    place : folder of a dataset, or of one of its runs, which is then the only one to be checked.
+    """
+    only = None
+    if place.resolve().parent.name == "runs" and not (place / "rig.toml").is_file():
+        place, only = place.resolve().parent.parent, place.resolve().name
     try:
         data = load_dataset(place, need_views=False)
     except TelerigError as error:
@@ -177,7 +184,8 @@ def check_dataset(place: Path) -> Iterator[Check]:
     yield Check("rig.toml", "ok", f"{data.rig.name!r}: {cameras}")
     yield from _views(data)
     for name in data.runs:
-        yield from _run(data, name)
+        if only in (None, name):
+            yield from _run(data, name)
     if not data.runs:
         yield Check("runs", "note", "none", "put recordings into runs/<name>/<camera>/")
     yield from _left_over(data)
@@ -251,6 +259,9 @@ def _run(data: Dataset, name: str) -> Iterator[Check]:
     yield Check(what, "ok", words)
     for note in run.notes:
         yield Check(what, "note", note)
+    cost = cost_words(run)
+    if cost:
+        yield Check(f"{what} time", "ok", cost)
     yield from _clocks(run, what)
     yield from _sensors(run, what)
 

@@ -241,3 +241,10 @@ def test_the_command_prints_json_and_its_exit_code_says_whether_all_is_well(data
 def test_bad_values_raise_in_the_library_too(tmp_path):
     with pytest.raises(InputError, match="image size"):
         new_dataset(tmp_path / "x", image_size_px=(0, 5))
+
+
+def test_the_time_and_memory_of_a_run_are_estimated(data: Path) -> None:
+    checks = list(check_dataset(data / "runs" / "rise"))
+    words = next(c.words for c in checks if "tracking takes about" in c.words)
+    assert "bubbles in sight: 1;" in words and "smoothing about" in words and "MB" in words
+    assert not [c for c in checks if c.what.startswith("run ") and "rise" not in c.what]

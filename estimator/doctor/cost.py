@@ -1,0 +1,63 @@
+"""Estimate how long a run will take to track and to smooth, from one of its frames."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from telerig.errors import TelerigError
+from telerig.estimator.bubbles.detect import detect_bubbles
+from telerig.io.dataset.run import RunData
+from telerig.io.machine.parallel import cores
+
+_BACKGROUND_S_PER_MPX = 2.0
+_LINK_S, _SMOOTH_S, _LEARN_S = 1.2e-3, 0.2e-3, 25.0
+"""Seconds to link and to smooth a bubble in a frame, and to learn a run's priors, as measured by
+`benchmarks/whole_run.py` and `benchmarks/smoothing_speed.py`."""
+_TRACK_MB, _TRACK_MB_PER_MPX = 200.0, 300.0
+
+
+def cost_words(run: RunData) -> str:
+    """Return in words how long a run takes to track and to smooth, and the memory for tracking.
+
+    Of a run of images, the bubbles of the frame in the middle are detected. Returns "" when that
+    frame cannot be read.
+    """
+    detect_s = background_s = pixels = 0.0
+    if run.detections is not None:
+        known = np.isfinite(run.detections["u_px"].to_numpy(float))
+        bubbles = known.sum() / (run.frame_count * len(run.cameras))
+    else:
+        counts: list[int] = []
+        for camera in run.cameras:
+            begun = time.process_time()
+            try:
+                image = run.image(camera, run.frame_count // 2)
+            except TelerigError:
+                image = None
+            if image is None:
+                return ""
+            if not counts:
+                detect_bubbles(image)  # the first call makes tables
+                begun = time.process_time()
+            counts.append(len(detect_bubbles(image)))
+            detect_s += time.process_time() - begun
+            pixels = max(pixels, image.size / 1e6)
+        bubbles = float(np.mean(counts))
+        background_s = _BACKGROUND_S_PER_MPX * pixels * len(run.cameras)
+    link_s = run.frame_count * bubbles * _LINK_S
+    track_s = (background_s + run.frame_count * detect_s) / cores() + link_s
+    smooth_s = _LEARN_S + run.frame_count * bubbles * _SMOOTH_S
+    memory = _TRACK_MB + _TRACK_MB_PER_MPX * pixels
+    return (
+        f"bubbles in sight: {bubbles:.0f}; tracking takes about {_duration(track_s)} on {cores()} "
+        f"cores and {memory:.0f} MB a process, smoothing about {_duration(smooth_s)}"
+    )
+
+
+def _duration(seconds: float) -> str:
+    """Return a time in words, rounded as an estimate deserves."""
+    if seconds < 90:
+        return f"{max(5, 5 * round(seconds / 5))} s"
+    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -246,8 +246,10 @@ _USED = 0.5
 
 AXES = ("x", "y", "z")
 LONGEST_RTS = 5000
-"""Largest number of frames of a track for which the result of a plain RTS smoother is also
-computed. For longer tracks filterpy would need more time than the whole smoothing graph.
+MOST_RTS_ROWS = 40_000
+"""Largest number of frames of a track, and of frames of all tracks in their order, for which the
+result of a plain RTS smoother is also computed. For more filterpy would need more time than the
+whole smoothing graph.
 """
 
 
@@ -337,7 +339,7 @@ def _baselines(solution: Solution, tracks: pd.DataFrame) -> dict[str, Array]:
         mine = slice(graph.first_row[k], graph.first_row[k + 1])
         t = problem.t_s[graph.frame_of_row[mine]]
         velocity[mine] = _central_velocity(t, naive[mine])
-        if 1 < len(t) <= LONGEST_RTS:
+        if 1 < len(t) <= LONGEST_RTS and mine.stop <= MOST_RTS_ROWS:
             plain[:, mine] = _rts(t, naive[mine], covariance[mine], graph.model.bubble)
     out = _named(naive, "naive_{}_mm") | _named(velocity, "naive_v{}_mm_s")
     out |= _named(plain[0], "rts_{}_mm") | _named(plain[1], "rts_v{}_mm_s")

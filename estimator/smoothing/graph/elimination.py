@@ -118,21 +118,33 @@ def eliminate(
     _add_bonds(factor_graph, graph)
     (ordering, when), sizes = _ordering(graph), _sizes(graph)
     if cholesky:
-        try:
-            net = factor_graph.eliminateSequential(ordering)
-            cliques = cliques_of(net, sizes, when)
-            if _least_pivot(cliques, factors, sizes) > LEAST_PIVOT:
-                return EliminatedGraph(graph, cliques, net.optimize().vector())
-        except RuntimeError:
-            pass
+        found = _by_cholesky(graph, factor_graph, factors, ordering, when)
+        if found is not None:
+            return found
     try:
         net = factor_graph.eliminateSequential(ordering, gtsam.EliminateQR)
+        del factor_graph
         return EliminatedGraph(graph, cliques_of(net, sizes, when), net.optimize().vector())
     except RuntimeError as error:
         raise CalibrationError(
             f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
             todo="check the priors: every component needs a positive intensity",
         ) from error
+
+
+def _by_cholesky(
+    graph: GraphLayout, factor_graph: Any, factors: list[LinearFactors], ordering: Any, when: Ints
+) -> EliminatedGraph | None:
+    """The solution; None where the digits run out."""
+    sizes = _sizes(graph)
+    try:
+        net = factor_graph.eliminateSequential(ordering)
+        cliques = cliques_of(net, sizes, when)
+        if _least_pivot(cliques, factors, sizes) > LEAST_PIVOT:
+            return EliminatedGraph(graph, cliques, net.optimize().vector())
+    except RuntimeError:
+        pass
+    return None
 
 
 def _sizes(graph: GraphLayout) -> list[int]:

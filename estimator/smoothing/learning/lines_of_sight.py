@@ -21,7 +21,8 @@ MOST_BUBBLES = 6
 """So many bubbles, those seen longest, are what the rig's shake is learned from."""
 _PARALLEL = 0.02
 _ACROSS = 0.2
-_PRESENT = 0.75
+PRESENT = 0.75
+"""Share of the frames in which bubbles have to be seen to be pooled."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,7 @@ def pooled(signal: Signal) -> tuple[Signal, ...]:
     seen = signal.weight[:, pairs] > 0
     if count < 2 or len(movers) < len(signal.moving) or len(pairs) != count * cameras:
         return (signal,)
-    if seen.mean(0).min() < _PRESENT:
+    if seen.mean(0).min() < PRESENT:
         return (signal,)
     whole, weight = _bridged(signal.t_s, signal.value_mm[:, pairs], signal.weight[:, pairs])
     value = whole.reshape(-1, count, cameras)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
-from telerig.estimator.smoothing.learning.lines_of_sight import MOST_BUBBLES
+from telerig.arrays import Array
+from telerig.estimator.smoothing.learning.lines_of_sight import MOST_BUBBLES, PRESENT
 from telerig.estimator.smoothing.problem.problem import SmoothingProblem
 from telerig.estimator.smoothing.problem.window import Window, cut_out
 
@@ -15,12 +15,16 @@ MOST_FRAMES = 1500
 """A run of so many frames is learned from as a whole."""
 _PLACES = 8
 """Windows begin at multiples of this part of a window."""
+_SHORTER, _ENOUGH_BUBBLES, _FEW_BUBBLES = (0.7, 0.5), 3, 2
 
 
 def learning_window(
     problem: SmoothingProblem, weights: tuple[Array, Array] | None = None
 ) -> Window:
     """Return the `MOST_FRAMES` frames in which the bubbles that learning uses are seen most.
+
+    Fewer frames where tracks are shorter: bubbles that are seen nearly all of the time are learned
+    from as one (`pooled`), at a fraction of the cost.
 
     weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. None for all.
     """
@@ -30,12 +34,28 @@ def learning_window(
         problem = replace(problem, observations=seen, references=marks.of(weights[1] > 0.5))
     if count <= MOST_FRAMES:
         return Window(problem, 0, np.arange(len(problem.bubbles)))
-    step = MOST_FRAMES // _PLACES
-    firsts = np.unique(np.append(np.arange(0, count - MOST_FRAMES, step), count - MOST_FRAMES))
-    seen = problem.observations
-    told = [_seen(seen.item[(seen.frame >= a) & (seen.frame < a + MOST_FRAMES)]) for a in firsts]
-    first = int(firsts[int(np.argmax(told))])
+    for length in (MOST_FRAMES, *(int(share * MOST_FRAMES) for share in _SHORTER)):
+        first, there = _best(problem, length)
+        if there >= _ENOUGH_BUBBLES:
+            return cut_out(problem, first, first + length, least_share=PRESENT)
+    first, _ = _best(problem, MOST_FRAMES, share=0.0)
     return cut_out(problem, first, first + MOST_FRAMES)
+
+
+def _best(problem: SmoothingProblem, length: int, share: float = PRESENT) -> tuple[int, int]:
+    """First frame of the window in which most is seen of the bubbles that learning uses, and how
+    many of them are seen in a share of its frames."""
+    count, step = len(problem.t_s), max(length // _PLACES, 1)
+    firsts = np.unique(np.append(np.arange(0, count - length, step), count - length))
+    seen, cameras = problem.observations, len(problem.cameras)
+    most, found, there = -1, 0, 0
+    for first in firsts.tolist():
+        inside = seen.item[(seen.frame >= first) & (seen.frame < first + length)]
+        each = np.sort(np.bincount(inside))[::-1][:MOST_BUBBLES]
+        each = each[each >= share * cameras * length]
+        if each.sum() > most:
+            most, found, there = int(each.sum()), first, len(each)
+    return found, there
 
 
 def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Window]:
@@ -47,13 +67,13 @@ def other_windows(problem: SmoothingProblem, used: Window, most: int) -> list[Wi
     if not len(firsts):
         return []
     chosen = firsts[np.unique(np.linspace(0, len(firsts) - 1, most).round().astype(np.int64))]
-    windows = [cut_out(problem, int(a), int(a) + length) for a in chosen]
+    windows = []
+    for first in chosen.tolist():
+        window = cut_out(problem, first, first + length, least_share=PRESENT)
+        if not window.problem.bubbles:
+            window = cut_out(problem, first, first + length, most_bubbles=_FEW_BUBBLES)
+        windows.append(window)
     return [w for w in windows if w.problem.bubbles]
-
-
-def _seen(items: Ints) -> int:
-    """Number of pixels of the bubbles that are seen most."""
-    return int(np.sort(np.bincount(items))[-MOST_BUBBLES:].sum()) if len(items) else 0
 
 
 def _spread(first: int, end: int, length: int) -> list[int]:

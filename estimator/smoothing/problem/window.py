@@ -29,11 +29,13 @@ def cut_out(
     end: int,
     weights: tuple[Array, Array] | None = None,
     most_bubbles: int | None = None,
+    least_share: float = 0.0,
 ) -> Window:
     """Return the frames from ``first`` to before ``end``, with the bubbles seen more than once.
 
     weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. None for all.
     most_bubbles : so many bubbles, those seen in most frames; None for all.
+    least_share : share of the frames in which all cameras together have to see a bubble.
     """
     seen, marks = problem.observations, problem.references
     if weights is not None:
@@ -41,7 +43,8 @@ def cut_out(
     seen, marks = _between(seen, first, end), _between(marks, first, end)
     often = np.bincount(seen.item, minlength=len(problem.bubbles))
     chosen = np.sort(np.argsort(-often, kind="stable")[:most_bubbles])
-    chosen = chosen[often[chosen] > 1]
+    least = least_share * len(problem.cameras) * (end - first)
+    chosen = chosen[often[chosen] > max(1, least - 1)]
     known = np.unique(marks.item)
     cut = replace(
         problem,

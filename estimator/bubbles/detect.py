@@ -253,7 +253,8 @@ def _reasons(
     for i in range(outlines.ellipse.shape[0]):
         _u, _v, a, b, _ = outlines.ellipse[i]
         jump = float(np.hypot(*(outlines.ellipse[i, :2] - start.ellipse[i, :2])))
-        if not np.all(np.isfinite(outlines.ellipse[i])):
+        known = bool(np.all(np.linalg.eigvalsh(outlines.centre_covariance_px2[i]) > 0.0))
+        if not (known and np.all(np.isfinite(outlines.ellipse[i]))):
             reasons.append("the outline's fit failed")
         elif columns["d_eq_px"][i] < min_diameter_px:
             reasons.append(f"smaller than {min_diameter_px:g} px")

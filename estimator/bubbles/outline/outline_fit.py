@@ -396,6 +396,9 @@ def normal_equations(
     jacobian : (16, N) derivatives of the grey levels by the bubble's 16 parameters.
     residual : (N,) measured minus predicted grey levels; weight : (N,) inverse variances.
 
+    The sums are in double precision: their rounding errors in single precision exceed the
+    information on a bubble of which the image shows little, so that its variances may be negative.
+
     Returns the information matrices (B, 16, 16) and the right-hand sides (B, 16).
     """
     products = np.empty((pixels.bubbles, PARAMETERS + 1, PARAMETERS + 1))
@@ -404,7 +407,7 @@ def normal_equations(
     np.multiply(jacobian, root, out=whitened[:PARAMETERS])
     np.multiply(residual, root, out=whitened[PARAMETERS])
     for index, part in enumerate(pixels.parts()):
-        own = whitened[:, part]
+        own = whitened[:, part].astype(np.float64)
         products[index] = own @ own.T
     return products[:, :PARAMETERS, :PARAMETERS], products[:, :PARAMETERS, PARAMETERS]
 

@@ -365,4 +365,5 @@ def _adapted_solution(
     better = adapted(first)
     if better is None and not sensors:
         return first
+    first = replace(first, covariances=None)
     return solve(problem, better or model, options, progress, start=first)

@@ -401,6 +401,8 @@ def _sparse(
 
     def matrix(used: Sequence[tuple[Ints, Array]], columns: int) -> Any:
         """Of blocks (n, rows, d) and the columns (n,) at which each begins."""
+        if not used:
+            return csr_array((count * linear.rhs.shape[1], columns))
         shapes = [(len(first), *block.shape[-2:]) for first, block in used]
         number, rows = shapes[0][:2]
         value = np.concatenate([np.broadcast_to(b, s) for (_, b), s in zip(used, shapes)], -1)
@@ -427,4 +429,5 @@ def _sparse(
         elif not any(base.bubbles <= k[0] < base.sensors for k in keys):
             used = [(starts[k], b) for k, b in zip(moved, linear.blocks) if b.shape[-1]]
             rig.append(matrix(used, width))
+    rig = rig or [csr_array((0, width))]
     return tuple(vstack(m, format="csr") for m in (rig, by_rig, by_bubble))

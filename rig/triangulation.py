@@ -110,6 +110,8 @@ def triangulate(
     uv_px: tuple[ArrayLike, ArrayLike],
     sigma_px: ArrayLike | tuple[ArrayLike, ArrayLike],
     method: str = "ml",
+    *,
+    rays: Sequence[tuple[Array, Array]] | None = None,
 ) -> Triangulation:
     """Return the points that two cameras see at the given pixels.
 
@@ -118,6 +120,7 @@ def triangulate(
         own.
     method : "ml" minimises the whitened reprojection error by Gauss-Newton steps from the
         mid-point; "midpoint" takes the middle of the shortest segment between both rays.
+    rays : what ``unproject`` of each camera gives for the pixels, if it is known.
 
     Raises InputError for unequal shapes, pixels that are not finite or an unknown method, and
     GeometryError for parallel rays.
@@ -139,7 +142,8 @@ def triangulate(
     shape = first.shape[:-1]
     pair = sigma_px if isinstance(sigma_px, tuple) else (sigma_px, sigma_px)
     covariances = [pixel_covariance(s, shape) for s in pair]
-    rays = [camera.unproject(uv) for camera, uv in zip(cameras, (first, second))]
+    if rays is None:
+        rays = [camera.unproject(uv) for camera, uv in zip(cameras, (first, second))]
     middle, miss = midpoint(*rays[0], *rays[1])
     if method == "midpoint":
         covariance = _midpoint_covariance(cameras, middle, covariances)

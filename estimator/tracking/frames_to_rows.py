@@ -258,7 +258,8 @@ def pair_frame(
         ambiguous = np.concatenate([ambiguous, found.ambiguous])
         given = np.concatenate([given, np.full(len(found), NO_PARTICLE)])
     (uv_a, cov_a), (uv_b, cov_b) = ([a[i] for a in p] for p, i in zip(pixels, rows.T))
-    points = triangulate(cameras, (uv_a, uv_b), (cov_a, cov_b))
+    rays = [(view.origin_mm[i], view.direction[i]) for view, i in zip(sight.views, rows.T)]
+    points = triangulate(cameras, (uv_a, uv_b), (cov_a, cov_b), rays=rays)
     expected, by_point = stacked_jacobian(cameras, points.points_mm)
     left = np.hstack([uv_a, uv_b]) - expected
     offset = np.zeros((2, 2))

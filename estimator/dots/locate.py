@@ -172,7 +172,7 @@ def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurem
     usual_contrast = float(np.median([abs(fit.contrast) for fit in fits])) if fits else 0.0
     accepted: list[tuple[Any, ...]] = []
     for blob, fit in zip(blobs, fits):
-        reason = reason_against_fit(fit, grey, found.polarity, usual_contrast, saturation)
+        reason = reason_against_fit(blob, fit, grey, found.polarity, usual_contrast, saturation)
         if reason:
             rejected.append((*fit.centre_px, *axes_from_shape(fit.shape_px), str(reason)))
         else:

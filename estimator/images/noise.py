@@ -31,7 +31,7 @@ class NoiseModel:
 
     alpha : variance at grey level 0 (grey levels squared); beta : its increase per grey level.
     step : distance between neighbouring grey levels, 0 for floats. The variance is never less than
-        that of rounding to this step.
+        that of rounding to this step, nor less than at any grey level at which it was measured.
     relative_error : relative standard deviation of the variance.
     lowest, highest : range of the grey levels at which the noise was measured.
     """
@@ -45,7 +45,8 @@ class NoiseModel:
 
     def variance(self, level: Array) -> Array:
         """Return the variance (grey levels squared) at the given grey levels, in the same shape."""
-        floor = max(self.step**2 / 12.0, 1e-300)
+        ends = [self.alpha + self.beta * e for e in (self.lowest, self.highest) if np.isfinite(e)]
+        floor = max(self.step**2 / 12.0, min(ends, default=0.0), 1e-300)
         return np.maximum(self.alpha + self.beta * np.asarray(level, dtype=np.float64), floor)
 
     def sigma_at(self, level: float) -> float:
@@ -77,7 +78,9 @@ def with_inner_level(
         return noise
     inner, outer = (noise.sigma_at(level) ** 2 for level in (inner_level, outer_level))
     beta = (ratio * inner - outer) / (inner_level - outer_level)
-    return replace(noise, alpha=outer - beta * outer_level, beta=beta)
+    lowest, highest = min(noise.lowest, inner_level), max(noise.highest, inner_level)
+    line = replace(noise, alpha=outer - beta * outer_level, beta=beta)
+    return replace(line, lowest=min(lowest, outer_level), highest=max(highest, outer_level))
 
 
 def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:

@@ -314,6 +314,7 @@ _MIN_RELATIVE_RADIUS = 0.28
 _MIN_RELATIVE_CONTRAST = 0.2
 _MIN_HOLE_SHARE = 0.02
 _MAX_ONE_SIDED_SATURATION = 0.06
+_LARGEST_RATIO = 2.5
 
 
 def reference_radius_px(found: Candidates) -> float:
@@ -352,9 +353,11 @@ def _one_sided_saturation(
     high = np.minimum(np.ceil(centre + half).astype(int) + 1, grey.shape[::-1])
     crop = grey[low[1] : high[1], low[0] : high[0]]
     v, u = np.nonzero(crop >= level)
-    if u.size == 0:
-        return 0.0
     du, dv = u + low[0] - centre[0], v + low[1] - centre[1]
+    round_about = np.hypot(du / half[0], dv / half[1]) <= 1.0  # the crop itself is lopsided
+    du, dv = du[round_about], dv[round_about]
+    if du.size == 0:
+        return 0.0
     away = np.hypot(du, dv) + 1e-9
     return float(np.hypot(np.sum(du / away), np.sum(dv / away))) / crop.size
 
@@ -373,14 +376,30 @@ def reason_against_blob(
     return blob.reason
 
 
+def _left(blob: Candidate, fit: DotFit) -> bool:
+    """Whether the centre or the size of a fit is none that its blob can have."""
+    step = fit.centre_px - blob.centre_px
+    beyond = approximate_distance_px(blob.shape_px, step[:1], step[1:])[0]
+    sizes = np.add(axes_from_shape(fit.shape_px)[:2], 1.0)
+    ratio = sizes / np.add(axes_from_shape(blob.shape_px)[:2], 1.0)
+    return bool(beyond > 0.0 or ratio.max() > _LARGEST_RATIO or ratio.min() < 1 / _LARGEST_RATIO)
+
+
 def reason_against_fit(
-    fit: DotFit, grey: Float32, polarity: Polarity, usual_contrast: float, saturation: float
+    blob: Candidate,
+    fit: DotFit,
+    grey: Float32,
+    polarity: Polarity,
+    usual_contrast: float,
+    saturation: float,
 ) -> Reason | None:
-    """Reason to leave a fitted dot out; None for a good one."""
+    """Reason to leave a dot out that was fitted to a blob; None for a good one."""
     if fit.pixels <= PARAMETERS:
         return Reason.HIDDEN
     if not np.all(np.isfinite(fit.covariance_px2)) or axes_from_shape(fit.shape_px)[1] <= 0.0:
         return Reason.FIT_FAILED
+    if _left(blob, fit):
+        return Reason.MISPLACED
     half, size = extent_px(fit.shape_px) + fit.sigma_px, np.array(grey.shape[::-1])
     if np.any(fit.centre_px - half < -0.5) or np.any(fit.centre_px + half > size - 0.5):
         return Reason.TOUCHES_BORDER

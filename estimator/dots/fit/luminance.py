@@ -52,6 +52,7 @@ class Reason(StrEnum):
     FAINT = "much fainter than the other dots"
     WRONG_SIGN = "does not look like a dot (contrast has the wrong sign)"
     FIT_FAILED = "does not look like a dot (fit failed)"
+    MISPLACED = "does not look like a dot (the fit left its blob)"
     MISFIT = "does not look like a dot (residuals far above the noise)"
 
 

@@ -144,6 +144,29 @@ def test_a_slope_of_light_does_not_move_the_dots() -> None:
     assert abs(np.mean(gap[:, 1])) < 2e-4
 
 
+@pytest.mark.parametrize(
+    ("ground", "dot", "offset", "noise"),
+    [
+        (0.0, 160.0, 0.0, 3.0),
+        (0.0, 160.0, -12.0, 3.0),
+        (270.0, 60.0, 0.0, 3.0),
+        (250.0, 60.0, 0.0, 4.0),
+    ],
+    ids=["black", "far below black", "white", "half white"],
+)
+@pytest.mark.parametrize("radius", [3.0, 7.0])
+def test_a_clipped_background_costs_no_dot(
+    radius: float, ground: float, dot: float, offset: float, noise: float
+) -> None:
+    plate = scene(radius, tilt_deg=25.0, ground_level=ground, dot_level=dot)
+    rng = np.random.default_rng(12)
+    grey = renderer.render(plate) + offset
+    grey += noise * rng.standard_normal(grey.shape)
+    gap, table = errors(locate_dots(grey.clip(0, 255).round().astype(np.uint8)), plate.centres_px)
+    sd = np.sqrt(table[["suu_px2", "svv_px2"]].to_numpy())
+    assert np.abs(gap / sd).max() < 5.0
+
+
 def test_columns_and_conventions() -> None:
     truth = scene(9.0, tilt_deg=50.0)
     table = locate_dots(renderer.picture(renderer.render(truth), 1.0, 8, np.random.default_rng(4)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from telerig.estimator.dots.fit import luminance
 from telerig.estimator.dots.fit.blurred_ellipse import coverage_on_grid, shape_from_axes
-from telerig.estimator.dots.fit.candidates import reason_against_fit
+from telerig.estimator.dots.fit.candidates import Candidate, reason_against_fit
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Reason, Start, Window, fit_dots
 from telerig.estimator.images.noise import (
     NoiseModel,
@@ -133,8 +134,23 @@ def test_a_dot_that_shows_hardly_a_pixel_does_not_disturb_the_others(pixels: int
     start = Start(CENTRE + (0.4, -0.3), shape * 1.06, 1.2)
     none, one = fit_dots([hidden, whole], [start, start], noise_of(2.0), [HELD, HELD])
     assert not none.converged and none.pixels == pixels
-    assert reason_against_fit(none, grey, "white_on_black", 150.0, np.inf) == Reason.HIDDEN
+    blob = Candidate(1, CENTRE, shape, 94.0, (), None)
+    assert reason_against_fit(blob, none, grey, "white_on_black", 150.0, np.inf) == Reason.HIDDEN
     assert one.converged and np.linalg.norm(one.centre_px - CENTRE) < 1e-3
+
+
+@pytest.mark.parametrize("change", [{"centre_px": CENTRE + (7.0, 0.0)}, {"shape_px": 3.0}])
+def test_a_fit_that_left_its_blob_is_no_dot(change: dict[str, Any]) -> None:
+    shape = shape_from_axes(6, 5, 0.3)
+    grey = picture(shape)
+    whole = Window(grey, 0, 0, np.ones(grey.shape, dtype=bool))
+    (fit,) = fit_dots([whole], [Start(CENTRE, shape, 1.2)], noise_of(2.0), [HELD])
+    blob = Candidate(1, CENTRE, shape, 94.0, (), None)
+    rest = (grey, "white_on_black", 150.0, np.inf)
+    assert reason_against_fit(blob, fit, *rest) is None
+    if "shape_px" in change:
+        change = {"shape_px": change["shape_px"] * shape}
+    assert reason_against_fit(blob, replace(fit, **change), *rest) == Reason.MISPLACED
 
 
 def test_a_free_contrast_gradient_would_more_than_double_the_variance() -> None:
@@ -212,6 +228,13 @@ def test_noise_inside_the_dots_comes_from_residuals_only_where_no_flat_shows_it(
     assert with_inner_level(seen, 190.0, 40.0, 1.02, 5000) == seen
     everywhere = replace(seen, highest=195.0)
     assert with_inner_level(everywhere, 190.0, 40.0, 2.5, 5000) == everywhere
+
+
+def test_the_noise_is_never_below_what_was_seen() -> None:
+    """Beyond the levels that were seen, a line through them may reach 0."""
+    line = NoiseModel(-500.0, 10.0, 1.0, 0.02, lowest=100.0, highest=900.0)
+    np.testing.assert_allclose(line.variance(np.array([0.0, 60.0, 100.0, 1000.0])),
+                               [500.0, 500.0, 500.0, 9500.0])  # fmt: skip
 
 
 def test_residuals_settle_an_uncertain_noise_but_not_a_misfit() -> None:

@@ -97,9 +97,11 @@ class Wall:
         Raises KeyError, TypeError or ValueError for other contents.
         """
         normal = np.array(data["normal"], float).reshape(3)
-        if not 0 < np.linalg.norm(normal) < np.inf:
-            raise ValueError("the normal of a window has no direction")
+        if not (0 < np.linalg.norm(normal) < np.inf and normal[2] > 0):
+            raise ValueError("the normal of a window has no direction away from the camera (z > 0)")
         air, glass, behind = (float(n) for n in data["indices"])
+        if not min(air, glass, behind) > 0:
+            raise ValueError("a refractive index of a window is not positive")
         return Wall(
             normal / np.linalg.norm(normal), float(data["distance_mm"]),
             float(data["thickness_mm"]), (air, glass, behind),

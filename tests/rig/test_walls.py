@@ -232,10 +232,18 @@ def test_a_wall_survives_its_file() -> None:
     assert replace(again, normal=wall.normal, normal_sigma_rad=0.01) == wall
 
 
-@pytest.mark.parametrize("normal", [[0.0, 0.0, 0.0], [0.0, float("nan"), 1.0]])
-def test_a_wall_without_a_direction_is_refused(normal: list[float]) -> None:
-    with pytest.raises(ValueError, match="has no direction"):
-        Wall.from_dict(wall_named("25 deg").as_dict() | {"normal": normal})
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"normal": [0.0, 0.0, 0.0]},
+        {"normal": [0.0, float("nan"), 1.0]},
+        {"normal": [0.0, 0.6, -0.8]},
+        {"indices": [1.0, 1.5, 0.0]},
+    ],
+)
+def test_a_wall_that_cannot_be_is_refused(damage: dict[str, list[float]]) -> None:
+    with pytest.raises(ValueError, match="of a window"):
+        Wall.from_dict(wall_named("25 deg").as_dict() | damage)
 
 
 def test_what_no_ray_reaches_is_an_error() -> None:

@@ -102,6 +102,8 @@ def read_ptv_par(path: str | PathLike[str]) -> Sensor:
         values = [float(line) for line in lines[1 + 2 * count :] if line.strip()]
         width, height, pixel_x, pixel_y = values[3:7]
         interlaced, *indices = values[7:11]
+        if len(indices) < 3:
+            raise ValueError("the refractive indices are missing")
         if not np.all(np.abs(values) <= LARGEST_NUMBER):
             raise ValueError("a number is not finite or too large")
     except (ValueError, IndexError) as error:

@@ -26,6 +26,7 @@ from telerig.io.rig_file.writer import toml_key
 from telerig.rig.camera import Camera
 from telerig.rig.pose import Pose, nearest_rotation
 
+_LEAST_SCALE = 1e-12
 _SHEAR_BESIDE_DISTORTION = 1e-5
 _RATIONAL, _TILT = slice(5, 8), slice(12, 14)
 
@@ -114,11 +115,17 @@ def _check(one: Pinhole) -> None:
             "the camera matrix is not [fx 0 cx; 0 fy cy; 0 0 1] with fx > 0",
             "export the camera again",
         )
+    focal = np.abs(np.diag(k)[:2])
+    if not focal.min() > _LEAST_SCALE * focal.max():
+        raise one.error(
+            f"the camera matrix, with fx {k[0, 0]:g} and fy {k[1, 1]:g}, cannot be inverted",
+            "export the camera again",
+        )
     deviation = float(np.abs(r @ r.T - np.eye(3)).max())
-    if deviation > 0.05 or np.linalg.det(r) < 0 or k[1, 1] == 0:
+    if deviation > 0.05 or np.linalg.det(r) < 0:
         raise one.error(
             f"the rotation matrix R is not a rotation (R R' differs by {deviation:.2g} from the "
-            f"unit matrix, det R = {np.linalg.det(r):.3f}), or fy is 0",
+            f"unit matrix, det R = {np.linalg.det(r):.3f})",
             "export the camera again",
         )
     if np.any(one.distortion[_RATIONAL]) or np.any(one.distortion[_TILT]):

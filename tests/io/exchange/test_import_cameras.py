@@ -203,6 +203,9 @@ def test_openptv_refuses_what_it_cannot_read(tmp_path: Path) -> None:
     paths = write_openptv(tmp_path, (0.0, 0.0, -90.0), None)
     with pytest.raises(InputError, match="principal distance"):
         read_openptv_cameras(paths, SENSOR)
+    paths = write_openptv(tmp_path, (0.0, 0.0, 90.0), (0, 0, 0, 0, 0, 1e-320, 0))
+    with pytest.raises(InputError, match="cannot be inverted"):
+        read_openptv_cameras(paths, SENSOR)
     paths[0].write_text("1 2 3")
     with pytest.raises(InputError, match="3 numbers, 21"):
         read_openptv_cameras(paths, SENSOR)
@@ -222,6 +225,9 @@ def test_ptv_par_gives_the_sensor_and_refuses_walls(tmp_path: Path) -> None:
     assert read_ptv_par(path) == SENSOR
     path.write_text(PTV_PAR + "0.012\n0.0125\n0\n1\n1.49\n1.33\n5\n")
     with pytest.raises(InputError, match="refraction"):
+        read_ptv_par(path)
+    path.write_text(PTV_PAR + "0.012\n0.0125\n0\n")
+    with pytest.raises(InputError, match="indices are missing"):
         read_ptv_par(path)
     path.write_text("nothing")
     with pytest.raises(InputError, match=r"not a ptv\.par"):

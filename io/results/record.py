@@ -180,12 +180,22 @@ def read_object(file: Path, todo: str) -> Mapping[str, Any]:
     try:
         content = json.loads(data, parse_constant=lambda _: None)
         _check_size(content, 0)
+        _check_characters(data, content)
     except (ValueError, RecursionError) as error:
         what = str(error)[:_LONGEST_MESSAGE]
         raise InputError(f"cannot be read as JSON: {what}", where=str(file), todo=todo) from error
     if not isinstance(content, dict):
         raise InputError("is JSON, but not an object", where=str(file), todo=todo)
     return content
+
+
+def _check_characters(data: bytes, content: Any) -> None:
+    """Raise ValueError for an escaped half of a surrogate pair, which no file can be written with."""
+    if b"\\ud" in data.lower():
+        try:
+            json.dumps(content, ensure_ascii=False).encode("utf-8")
+        except UnicodeEncodeError as error:
+            raise ValueError("a character is one half of a surrogate pair") from error
 
 
 def _check_size(value: Any, depth: int) -> None:

@@ -55,6 +55,12 @@ def test_a_batch_whose_job_garbles_its_host_is_refused(tmp_path: Path) -> None:
         write_batch_report(tmp_path)
 
 
+def test_a_batch_with_half_a_surrogate_pair_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "batch.json").write_text('{"jobs": [], "name": "a\\ud800"}', encoding="utf-8")
+    with pytest.raises(InputError, match="surrogate pair"):
+        write_batch_report(tmp_path)
+
+
 @pytest.mark.parametrize("kind", [{"imagej": True}, {"metadata": {"axes": "TYX"}}])
 def test_stacks_with_one_page_header_are_still_read(
     kind: dict[str, object], tmp_path: Path

@@ -190,8 +190,8 @@ def read_object(file: Path, todo: str) -> Mapping[str, Any]:
 
 
 def _check_characters(data: bytes, content: Any) -> None:
-    """Raise ValueError for an escaped half of a surrogate pair, which no file can be written with."""
-    if b"\\ud" in data.lower():
+    """Raise ValueError for half of a surrogate pair, escaped or not, which cannot be written."""
+    if b"\\ud" in data.lower() or b"\xed" in data:
         try:
             json.dumps(content, ensure_ascii=False).encode("utf-8")
         except UnicodeEncodeError as error:

@@ -55,8 +55,9 @@ def test_a_batch_whose_job_garbles_its_host_is_refused(tmp_path: Path) -> None:
         write_batch_report(tmp_path)
 
 
-def test_a_batch_with_half_a_surrogate_pair_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "batch.json").write_text('{"jobs": [], "name": "a\\ud800"}', encoding="utf-8")
+@pytest.mark.parametrize("half", [b"\\ud800", b"\xed\xa0\x80"])
+def test_a_batch_with_half_a_surrogate_pair_is_refused(half: bytes, tmp_path: Path) -> None:
+    (tmp_path / "batch.json").write_bytes(b'{"jobs": [], "name": "a' + half + b'"}')
     with pytest.raises(InputError, match="surrogate pair"):
         write_batch_report(tmp_path)
 

@@ -2,14 +2,14 @@
 
 Usage: python benchmarks/sensor_faults.py faults [--scenarios S1,stick-slip] [--faults clock,gap]
     [--configurations one,five,marks] [--clocks unknown,frames] [--seeds 1] [--seed 900]
-    [--checks] [--csv FILE.csv] [--out FILE.md] [--read FILE.csv ...]
+    [--checks only|first] [--csv FILE.csv] [--out FILE.md] [--read FILE.csv ...]
     python benchmarks/sensor_faults.py alarms [--seeds 10] [--frames 300] ...
         false alarms of undisturbed runs
     python benchmarks/sensor_faults.py checks [--seeds 10] [--frames 120,300,600] [--around 0.05,10]
         false alarms of the checks before the solution, which are quick
     python benchmarks/sensor_faults.py offsets [--seeds 10] ... errors of recovered clock offsets
---checks ends before the solution, which is quick: a fault is mended where the checks give the
-problem of the undisturbed run, and else open. --faults takes names and groups. Loggers record 10 s
+--checks only ends before the solution, which is quick: a fault is mended where the checks give the
+problem of the undisturbed run, and else open; --checks first solves those that are open. --faults takes names and groups. Loggers record 10 s
 before and after the frames. The classes of the outcomes are described in `sensor_fault_judging`,
 the faults in `sensor_fault_kinds`.
 """
@@ -81,17 +81,17 @@ def undisturbed_problem(
 
 
 def cell(
-    fault: Fault, scenario: str, seed: int, configuration: str, clock: str, checks: bool
+    fault: Fault, scenario: str, seed: int, configuration: str, clock: str, checks: str
 ) -> dict[str, Any]:
     """One line of the CSV."""
     run = run_of(scenario, seed)
     inputs = copied(inputs_of(run, configuration, clock))
     fault.change(inputs, np.random.default_rng([seed, hash_of(fault.name)]))
-    total_um = np.nan
+    total_um, out = np.nan, None
     if checks:
         like = undisturbed_problem(scenario, seed, configuration, clock)
-        out = mended_by_checks(inputs, like)
-    else:
+        out = mended_by_checks(copied(inputs), like)
+    if out is None or (checks == "first" and out.kind == Class.OPEN):
         clean = undisturbed(scenario, seed, configuration)
         out, total_um = judged(run, inputs, fault, configuration, clean), clean.total_um
     return {
@@ -424,7 +424,12 @@ def main() -> None:
     parser.add_argument("--faults", default="", help="names or groups; all by default")
     parser.add_argument("--configurations", default=",".join(CONFIGURATIONS))
     parser.add_argument("--clocks", default="unknown,frames")
-    parser.add_argument("--checks", action="store_true", help="end before the solution")
+    parser.add_argument(
+        "--checks",
+        choices=("", "only", "first"),
+        default="",
+        help="end before the solution, or solve what the checks leave open",
+    )
     parser.add_argument("--frames", default="", help="numbers of frames; 0: all of them")
     parser.add_argument("--around", default="0.05,10", help="seconds of record around the frames")
     parser.add_argument("--seeds", type=int, default=1)

@@ -211,7 +211,9 @@ def _with_sd(names: list[str], values: Array, covariance: Array | None) -> dict[
 def write_hdf5(smoothing: Smoothing, path: Path) -> None:
     """Write both tables, the states and their covariances into an HDF5 file.
 
-    The file's attribute ``rows`` explains how positions and velocities follow from the states.
+    The file's attribute ``rows`` explains how positions and velocities follow from the states. The
+    covariances are those of the solution; the attribute ``inflation`` holds the factors of the
+    standard deviations along x, y and z by which contradicting measurements widen the tables'.
     """
     from telerig.io.files.hdf5 import hdf5_file
 
@@ -239,6 +241,7 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
                 name, data=array, compression="gzip", compression_opts=1, shuffle=True
             )
         file.attrs["schema"] = SmoothingFile.SCHEMA
+        file.attrs["inflation"] = smoothing.verdict.get("inflation", (1.0, 1.0, 1.0))
         file.attrs["rows"] = "a state times its rows gives mm, mm/s in the lab (rig axes)"
 
 

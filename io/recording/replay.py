@@ -285,7 +285,7 @@ def _judged(line: _Line, start_ns: int, times: Callable[..., _Timed]) -> DeviceR
     t_s[kept] = np.round(timed.t_s, TIME_DIGITS)
     refuse(np.isnan(t_s[kept]), timed.reason)
     refuse(~_later(t_s[kept]), "not later than the one before")
-    if device.kind != "frames" and device.checksum == "none":
+    if device.kind != "frames":
         unit = device.counts_per_mm or 1.0 if "counts" in found.values else 1.0
         most = _ACCELERATION_MM_S2 * abs(unit) if device.kind == "encoder" else 0.0
         measured = [v[kept] for name, v in found.values.items() if name != "t"]

@@ -108,12 +108,16 @@ def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
         before = late[least[0]]
         raised = i < last and ahead[i] - before > period_s / 2
         lowered = surplus[i] > surplus[max(i - window, begin)]
-        if raised or (lowered and late[i] - before < -period_s / 2):
+        # The first reading of the lower count may itself have waited.
+        lowered &= late[i] - before < -period_s / 4 and ahead[i] - before < -period_s / 2
+        short = begin > 0 and i - begin < flush
+        # A lower count's readings came too early for the one before: it does not end at once.
+        if (raised or lowered) and not (short and np.isneginf(previous)):
             if raised:
                 # What came with a delay just before the missing lines is still of the old count.
                 level = ahead[min(i + flush, last)] - period_s / 4
                 i += int(np.max(np.flatnonzero(late_s[i : i + flush] < level), initial=-1)) + 1
-            if begin > 0 and i - begin < flush:
+            if short:
                 begins[begin] = 0  # too short to contain a reading that hardly waited
             begin, previous = i, before if raised else -np.inf
             begins[i] = 1

@@ -217,6 +217,7 @@ def test_references_beat_naive_and_rts_with_defaults(run: Run, tmp_path: Path) -
         np.testing.assert_allclose(
             file["states/bubbles"][:] @ rows.T, table[["x_mm", "y_mm", "z_mm"]], atol=1e-9
         )
+        assert file.attrs["inflation"] == pytest.approx((1.0, 1.0, 1.0)), "nothing disagrees"
     assert len(pd.read_csv(tmp_path / "shake.csv")) == FRAMES
 
 

@@ -52,6 +52,21 @@ def test_missing_lines_shift_the_count_where_they_are_missing(counted: bool) -> 
     assert np.sqrt(np.mean(error**2)) < 2 * found.sd_s
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_garbage_that_is_no_line_of_the_device(seed: int) -> None:
+    """It takes a number, but no reading is missing: the count is lower from there on."""
+    rng = np.random.default_rng(seed)
+    made = np.arange(5000) / 1000
+    extra = np.zeros(5000, np.int64)
+    extra[[500, 2000, 4000]] = 1
+    flushes = np.cumsum(rng.uniform(0, 0.002, 6000))
+    arrived = flushes[np.searchsorted(flushes, made)]
+    found = spread_arrivals(arrived, np.arange(5000) + np.cumsum(extra))
+    error = found.t_s - made
+    assert found.regular and np.max(np.abs(error)) < 1.5e-3
+    assert np.mean(np.abs(error) > 0.3e-3) < 2e-3 and np.sqrt(np.mean(error**2)) < 2 * found.sd_s
+
+
 def test_a_device_that_sends_now_and_then_has_no_regular_clock() -> None:
     rng = np.random.default_rng(2)
     made = np.cumsum(rng.exponential(0.01, 3000))

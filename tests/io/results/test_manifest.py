@@ -11,13 +11,14 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from killed_writers import killed_at_every_rename
 
 from telerig.errors import InputError, TelerigWarning
 from telerig.io.files import atomic
 from telerig.io.results import manifest
-from telerig.io.results.inputs import Source, fingerprints
+from telerig.io.results.inputs import Input, Source, fingerprints
 from telerig.io.results.manifest import is_whole, read_manifest, reading, replaced_results
 from telerig.io.results.stale import refuse_stale, stale
 
@@ -308,6 +309,34 @@ def test_images_count_by_number_and_size(tmp_path: Path) -> None:
     assert stale(folder) == (), "results inside the run's folder are none of its images"
     (run / "left" / "2.tif").write_bytes(b"123")
     assert len(stale(folder)) == 1
+
+
+def test_an_image_replaced_by_one_of_the_same_size_makes_results_stale(tmp_path: Path) -> None:
+    run, folder = tmp_path / "run", tmp_path / "run" / "results"
+    (run / "left").mkdir(parents=True)
+    noise = np.random.default_rng(0)
+    for k in range(5):
+        (run / "left" / f"{k}.raw").write_bytes(noise.bytes(20_000))
+    found = fingerprints(folder, [Source(run, cameras=("left",))])
+    with replaced_results(folder, "track", again="telerig track X", inputs=found) as staged:
+        (staged / "tracks.csv").write_text("t")
+    assert stale(folder) == ()
+    kept = (run / "left" / "3.raw").read_bytes()
+    (run / "left" / "3.raw").write_bytes(noise.bytes(20_000))
+    assert len(stale(folder)) == 1
+    (run / "left" / "3.raw").write_bytes(kept)
+    assert stale(folder) == ()
+    (run / "left" / "4.raw").replace(run / "left" / "5.raw")
+    assert len(stale(folder)) == 1, "an image was renamed"
+
+
+def test_results_without_samples_of_their_images_are_compared_by_number_and_size(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "left").mkdir()
+    (tmp_path / "left" / "1.tif").write_bytes(b"123")
+    assert Input(cameras=("left",), files=1, bytes=3).change(tmp_path) == ""
+    assert Input(cameras=("left",), files=1, bytes=4).change(tmp_path) != ""
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ Usage: python benchmarks/sensor_faults.py faults [--scenarios S1,stick-slip] [--
         false alarms of the checks before the solution, which are quick
     python benchmarks/sensor_faults.py offsets [--seeds 10] ... errors of recovered clock offsets
 --checks only ends before the solution, which is quick: a fault is mended where the checks give the
-problem of the undisturbed run, and else open; --checks first solves those that are open. --faults takes names and groups. Loggers record 10 s
-before and after the frames. The classes of the outcomes are described in `sensor_fault_judging`,
-the faults in `sensor_fault_kinds`.
+problem of the undisturbed run, and else open; --checks first solves those that are open. --faults
+takes names and groups. Loggers record 10 s before and after the frames. The classes of the outcomes
+are described in `sensor_fault_judging`, the faults in `sensor_fault_kinds`.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ _SMALLER_UNITS = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 
 _FOREIGN_PX = 5.0
 _DIFFERENT_PX = 0.5
 _SAMPLED = 2000
+_SLOWER = 0.95
 _UP = (0.0, -1.0, 0.0)
 
 
@@ -106,6 +107,7 @@ def read_sensors(
             findings.append(left_out)
             continue
         kept.append(sensor)
+        findings += _slower_than(frames, sensor)
         if sensor.clock == "frames":
             findings += check_overlap(
                 sensor.t_s, frames, where=sensor.where, code=Code.SENSOR_CLOCK, sensor=sensor.name
@@ -116,6 +118,23 @@ def read_sensors(
             found = check_motion(sensor, record, sensor.axes @ mounting.axis)
         findings += found
     return Sensors(encoder, tuple(kept), tuple(findings))
+
+
+def _slower_than(frames_t_s: Array, sensor: Sensor) -> list[Finding]:
+    """Return a warning for a sensor with fewer samples a second than there are frames."""
+    if len(frames_t_s) < 2 or len(sensor.t_s) < 2:
+        return []
+    rate, frames = (1 / float(np.median(np.diff(t))) for t in (sensor.t_s, frames_t_s))
+    if rate >= _SLOWER * frames:
+        return []
+    return [
+        Finding(
+            f"it records {rate:.4g} samples a second, fewer than the {frames:.4g} frames: it does "
+            f"not show a shake above {rate / 2:.4g} Hz, or shows it at a wrong frequency",
+            sensor.where,
+            f"record at {2 * frames:.4g} Hz or more",
+        )
+    ]
 
 
 def _encoder(stage: Any, frames: Array, where: str) -> tuple[Encoder | None, list[Finding]]:

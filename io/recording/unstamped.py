@@ -26,6 +26,8 @@ _WINDOW = 200
 _LONGEST_WAIT_S = 0.1
 _MOST = 0.8
 """The share of the record that decides: at other times the host may have been too busy to read."""
+_MOST_DRIFT = 5e-4
+"""The period is known at least so well, as a share of it."""
 _SEGMENT = 20
 """A regular device gives at least so many readings, on average, between two that are missing."""
 
@@ -100,7 +102,7 @@ def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
     window = min(max(_WINDOW, 4 * flush), len(late_s) - 1)
     ahead = minimum_filter1d(late_s, 2 * window + 1, origin=-window, mode="nearest")
     late, least = late_s.tolist(), deque([0])
-    begin, i, last, previous = 0, 1, len(late) - flush, -np.inf
+    begin, i, last, previous, level = 0, 1, len(late) - flush, -np.inf, late[0]
     while i < len(late):
         if late[i] < previous + period_s / 2:
             # Nothing was missing: the host was too busy to read for a while, and has caught up.
@@ -109,19 +111,26 @@ def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
         raised = i < last and ahead[i] - before > period_s / 2
         lowered = surplus[i] > surplus[max(i - window, begin)]
         # The first reading of the lower count may itself have waited.
-        lowered &= late[i] - before < -period_s / 4 and ahead[i] - before < -period_s / 2
+        lowered &= late[i] - level < -period_s / 4 and ahead[i] - level < -period_s / 2
         short = begin > 0 and i - begin < flush
         # A lower count's readings came too early for the one before: it does not end at once.
         if (raised or lowered) and not (short and np.isneginf(previous)):
             if raised:
                 # What came with a delay just before the missing lines is still of the old count.
-                level = ahead[min(i + flush, last)] - period_s / 4
-                i += int(np.max(np.flatnonzero(late_s[i : i + flush] < level), initial=-1)) + 1
+                higher = ahead[min(i + flush, last)] - period_s / 4
+                i += int(np.max(np.flatnonzero(late_s[i : i + flush] < higher), initial=-1)) + 1
+                late_by = 0
+            else:
+                # The lower count begins after the most malformed lines; what waited comes before i.
+                steps = np.diff(surplus[max(i - window, begin) : i + 1])[::-1]
+                late_by = int(np.argmax(steps))
             if short:
                 begins[begin] = 0  # too short to contain a reading that hardly waited
-            begin, previous = i, before if raised else -np.inf
-            begins[i] = 1
+            begin, previous = i - late_by, before if raised else -np.inf
+            begins[begin] = 1
             least.clear()
+            level = late[i]
+        level = min(level + _MOST_DRIFT * period_s, late[i])
         while least and late[least[-1]] >= late[i]:
             least.pop()
         least.append(i)

@@ -54,6 +54,8 @@ _DIFFERENT_SDS = 5.0
 _LONG_S = 1.2
 _WINDOW_S = 3.0
 _LEAST_WINDOWS = 3
+_MOST_DRIFT, _DRIFT_NATS = 0.02, 5.0
+"""No clock's rate is off by a larger share; a drift explains the images better by at least this."""
 _WINDOW_MARGIN_S = 0.1
 _FACTOR_NATS = 60.0
 _LEAST_FRAMES = 150
@@ -496,47 +498,75 @@ def _unconfirmed_words(clock: Alignment | None) -> str:
 def _without_drift(
     sensor: Accelerometer, problem: SmoothingProblem, images: _Images
 ) -> tuple[Accelerometer, list[Finding]]:
-    """Return the sensor with a drift of its clock taken out, where the run is long enough."""
+    """Return the sensor with a drift of its clock taken out, where the run is long enough and the
+    images are explained better without it.
+    """
     t = problem.t_s
-    if t[-1] - t[0] < _LONG_S:
-        return sensor, []
-    windows = max(round((t[-1] - t[0]) / _WINDOW_S), _LEAST_WINDOWS)
-    edges = np.linspace(t[0], t[-1], windows + 1)
     group = [i for i, s in enumerate(problem.accelerometers) if s.name == sensor.name]
+    channels = images.channels(problem, group)
+
+    def nats(one: Accelerometer) -> float:
+        found = _aligned_by(images, channels, [near_frames(one, t, _WINDOW_MARGIN_S)])
+        return -np.inf if found is None else found.nats
+
+    best = sensor
+    for _ in range(_MOST_REFINEMENTS if t[-1] - t[0] >= _LONG_S else 0):
+        sds, needed = (_DIFFERENT_SDS, _DRIFT_NATS) if best is sensor else (1.0, 0.0)
+        corrected = _corrected_drift(best, t, channels, images, sds)
+        if corrected is None or not nats(corrected) > nats(best) + needed:
+            break
+        best = corrected
+    if best is sensor:
+        return sensor, []
+    words = f"its clock drifts by {best.drift_ppm:+.0f} ppm against that of the frames; corrected"
+    return best, [Finding(words, f"accelerometer {sensor.name}")]
+
+
+def _corrected_drift(
+    sensor: Accelerometer,
+    t_s: Array,
+    channels: Sequence[Channel],
+    images: _Images,
+    least_sds: float,
+) -> Accelerometer | None:
+    """Return the sensor without the drift that its offsets in parts of the run show, None where
+    they show none.
+
+    t_s : (F,) times of the frames.  least_sds : standard deviations that the drift must exceed.
+    """
+    length_s = float(t_s[-1] - t_s[0])
+    windows = max(round(length_s / _WINDOW_S), _LEAST_WINDOWS)
+    edges = np.linspace(t_s[0], t_s[-1], windows + 1)
     places, offsets, sds = [], [], []
     for low, high in pairwise(edges):
         near = (sensor.t_s > low - _WINDOW_MARGIN_S) & (sensor.t_s < high + _WINDOW_MARGIN_S)
-        first, last = (round((e - t[0]) / images.grid.step_s) for e in (low, high))
-        grid = replace(images.grid, start_s=t[0] + first * images.grid.step_s, count=last - first)
-        channels = [
-            replace(c, values=c.values[first:last], known=c.known[first:last])
-            for c in images.channels(problem, group)
+        first, last = (round((e - t_s[0]) / images.grid.step_s) for e in (low, high))
+        grid = replace(images.grid, start_s=t_s[0] + first * images.grid.step_s, count=last - first)
+        parts = [
+            replace(c, values=c.values[first:last], known=c.known[first:last]) for c in channels
         ]
         if np.count_nonzero(near) < _LEAST_SAMPLES:
             continue
-        found = align(grid, channels, [_readings(grid, sensor.of(near))], SAME_CLOCK_S)
-        if found is not None and found.nats > found.reversed_nats and np.isfinite(found.sd_s):
+        found = align(grid, parts, [_readings(grid, sensor.of(near))], SAME_CLOCK_S)
+        if found is None or not found.connected or not np.isfinite(found.sd_s):
+            continue
+        if abs(found.offset_s) < _MOST_DRIFT * length_s:
             places.append((low + high) / 2)
             offsets.append(found.offset_s)
             sds.append(found.sd_s)
     if len(places) < _LEAST_WINDOWS:
-        return sensor, []
+        return None
     middle = float(np.mean(places))
     design = (
         np.stack([np.ones(len(places)), np.array(places) - middle], -1) / np.array(sds)[:, None]
     )
     normal = np.linalg.inv(design.T @ design)
     shift, drift = normal @ design.T @ (np.array(offsets) / sds)
-    if abs(drift) < _DIFFERENT_SDS * np.sqrt(normal[1, 1]):
-        return sensor, []
-    corrected = sensor.t_s - shift - drift * (sensor.t_s - middle)
-    words = f"its clock drifts by {1e6 * drift:+.0f} ppm against that of the frames; corrected"
-    return (
-        replace(
-            sensor, t_s=corrected, drift_ppm=float(1e6 * drift),
-            offset_s=sensor.offset_s + float(shift),
-        ),
-        [Finding(words, f"accelerometer {sensor.name}")],
+    if abs(drift) < least_sds * np.sqrt(normal[1, 1]):
+        return None
+    return replace(
+        sensor, t_s=sensor.t_s - shift - drift * (sensor.t_s - middle),
+        drift_ppm=sensor.drift_ppm + float(1e6 * drift), offset_s=sensor.offset_s + float(shift),
     )  # fmt: skip
 
 

@@ -1,0 +1,85 @@
+"""A drift of a sensor's clock is taken out where the images show one, and nowhere else."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from places import ROOT
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from shake_scene import Run, cases, simulate
+
+from telerig.estimator.sensors.findings import Finding
+from telerig.estimator.smoothing.problem.problem import Accelerometer
+from telerig.estimator.smoothing.problem.sensor_alignment import aligned
+from telerig.estimator.smoothing.smooth import problem_of
+
+ARMS = {"arm_left": "left", "arm_right": "right"}
+
+
+@cache
+def run_of(seed: int) -> Run:
+    """S6 with loggers that record 10 s before and after the frames."""
+    case = replace(cases()["S6"], around_s=10.0)
+    return simulate(case, np.random.default_rng([seed, int.from_bytes(b"S6", "little"), 19]))
+
+
+def placed(
+    seed: int, information: str, change: Any = None, every: int = 1
+) -> tuple[dict[str, Accelerometer], list[Finding]]:
+    """The sensors on the clock of the frames, and what was found."""
+    run = run_of(seed)
+    inputs: dict[str, Any] = run.inputs(information)
+    table, sensors = run.accelerometers, {}
+    for name, camera in ARMS.items():
+        rows = table[table["sensor"] == name]
+        t = rows["t_s"].to_numpy(float)
+        reading = rows[["ax_m_s2", "ay_m_s2", "az_m_s2"]].to_numpy(float)
+        if change is not None:
+            t, reading = change(name, t, reading.copy())
+        sensors[name] = {
+            "t_s": t[::every], "a_m_s2": reading[::every], "mounted_on": camera,
+            "axes": np.eye(3), "noise_density_ug_sqrt_hz": 22.5, "clock": "unknown",
+        }  # fmt: skip
+    given = inputs | {"accelerometers": sensors, "stage": run.stage}
+    tracks, calibration = given.pop("tracks"), given.pop("calibration")
+    problem, _, _, known = problem_of(tracks, calibration, **given)
+    problem, found = aligned(problem, known)
+    return {s.name: s for s in problem.accelerometers}, found
+
+
+@pytest.mark.parametrize("seed", [905, 906])
+def test_a_clock_that_keeps_time_has_no_drift(seed: int) -> None:
+    """Parts of a run, with readings of 0.1 s missing, may fit the images a period off."""
+
+    def frozen(name: str, t: Any, reading: Any) -> Any:
+        if name == "arm_left":
+            first, last = np.searchsorted(t, [0.6, 0.7])
+            reading[first:last] = reading[first]
+        return t, reading
+
+    sensors, _ = placed(seed, "one", frozen)
+    assert {name: s.drift_ppm for name, s in sensors.items()} == dict.fromkeys(ARMS, 0.0)
+
+
+def test_a_wrong_rate_is_found() -> None:
+    def fast(_: str, t: Any, reading: Any) -> Any:
+        return t[0] + 1.01 * (t - t[0]), reading
+
+    sensors, said = placed(905, "references", fast)
+    for sensor in sensors.values():
+        assert sensor.drift_ppm == pytest.approx(1e4, rel=0.02)
+    assert sum("drifts by +" in f.warning for f in said) == 2
+
+
+def test_a_sensor_slower_than_the_frames_is_told() -> None:
+    _, said = placed(905, "one", every=8)
+    words = [f.warning for f in said if "fewer than the 500 frames" in f.warning]
+    assert len(words) == 2 and "above 125 Hz" in words[0]
+    _, said = placed(905, "one", every=2)
+    assert not any("fewer than" in f.warning for f in said)

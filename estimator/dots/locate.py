@@ -22,13 +22,13 @@ from telerig.estimator.dots.fit.candidates import (
     Candidate,
     Candidates,
     Polarity,
+    clipping_levels,
     edge_map,
     find_candidates,
     is_ring,
     reason_against_blob,
     reason_against_fit,
     reference_radius_px,
-    saturation_level,
 )
 from telerig.estimator.dots.fit.luminance import DotFit, Prior, Start, Window, fit_dots
 from telerig.estimator.dots.fit.surroundings import (
@@ -121,7 +121,9 @@ def measure_dots(
     keep_freed_memory()
     response = high_pass(grey)
     edges = edge_map(grey, rough_sigma(response))
-    noise = estimate_noise(grey, response, edges.flat, step=grey_step(np.asarray(image)))
+    noise = estimate_noise(
+        grey, response, edges.flat, step=grey_step(np.asarray(image)), clip=clipping_levels(grey)
+    )
     wanted: tuple[Polarity, ...] = (
         ("white_on_black", "black_on_white") if polarity == "auto" else (polarity,)
     )
@@ -151,7 +153,7 @@ def _checked(image: NDArray[Any], polarity: str, min_diameter_px: float) -> Floa
 
 
 def _measure(grey: Float32, found: Candidates, noise: NoiseModel) -> DotMeasurement:
-    saturation = saturation_level(grey)
+    saturation = noise.white
     reference_px = reference_radius_px(found)
     rejected: list[tuple[Any, ...]] = []
     blobs: list[Candidate] = []

@@ -23,6 +23,7 @@ _CORRELATED = 3.8  # sum of the filter's squared autocorrelation: neighbours sha
 _MAX_SAMPLES = 100_000
 _ENOUGH_PIXELS = 100
 _UNSEEN_SHARE = 0.2
+_CLIPPED_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class NoiseModel:
         that of rounding to this step, nor less than at any grey level at which it was measured.
     relative_error : relative standard deviation of the variance.
     lowest, highest : range of the grey levels at which the noise was measured.
+    black, white : grey levels at which the image is clipped; infinite where it is not.
     """
 
     alpha: float
@@ -42,6 +44,18 @@ class NoiseModel:
     relative_error: float
     lowest: float = -np.inf
     highest: float = np.inf
+    black: float = -np.inf
+    white: float = np.inf
+
+    def is_clipped(self, grey: Array, model: Array) -> Bools:
+        """Return where noise is cut off, in the shape of ``grey``.
+
+        That is where a pixel is clipped, or its expected level ``model`` is within two standard
+        deviations of clipping.
+        """
+        reach = 2.0 * np.sqrt(self.variance(model))
+        low = np.minimum(grey, model - reach) <= self.black
+        return np.asarray(low | (np.maximum(grey, model + reach) >= self.white))
 
     def variance(self, level: Array) -> Array:
         """Return the variance (grey levels squared) at the given grey levels, in the same shape."""
@@ -91,10 +105,13 @@ def agreed_factor(noise: NoiseModel, chi2_dof: Array, dof: Array) -> float:
 
     Images with many edges have few flat areas, but there the fits' residuals show the noise. The
     median of chi2_dof is averaged with the estimate, weighted by the inverse variances, if both
-    agree to 3 standard deviations. If not, the model does not fit, and the factor is 1.
+    agree to 3 standard deviations. If not, the model does not fit, and the factor is 1. If the
+    flat areas do not show the noise at all, the median is the factor.
     """
     if chi2_dof.size == 0:
         return 1.0
+    if np.isinf(noise.relative_error):
+        return float(np.median(chi2_dof))
     own = noise.relative_error**2
     error = 1.25**2 * 2.0 / (float(np.mean(dof)) * chi2_dof.size)
     excess = float(np.median(chi2_dof)) - 1.0
@@ -160,6 +177,7 @@ def estimate_noise(
     flat: Bools,
     *,
     step: float,
+    clip: tuple[float, float] = (-np.inf, np.inf),
     bins: int = 8,
 ) -> NoiseModel:
     """Estimate the noise of an image from its flat areas.
@@ -167,16 +185,20 @@ def estimate_noise(
     image : (rows, columns) grey levels; response : the same image after :func:`high_pass`.
     flat : (rows, columns) whether a pixel is far from all edges.
     step : distance between neighbouring grey levels, see `grey_step`.
+    clip : grey levels (black, white) at which the image is clipped.
     bins : largest number of groups of grey levels.
 
     Pixels are grouped by the grey level of their surroundings, as their own level holds the noise.
     A line is fitted through the clipped variances of the groups if they differ significantly.
+    Groups that the image's clipping touches are left out, as it hides their noise. If it touches
+    all, the noise is unknown, which an infinite ``relative_error`` of the result says.
     """
     level = cv2.blur(image, (5, 5))
     if np.count_nonzero(flat) >= 64:
-        response, level = response[flat], level[flat]
+        response, level, image = response[flat], level[flat], image[flat]
     stride = response.size // _MAX_SAMPLES + 1
     response, level = response.ravel()[::stride], level.ravel()[::stride]
+    clipped = (image.ravel()[::stride] <= clip[0]) | (image.ravel()[::stride] >= clip[1])
     low, high = np.quantile(level, [0.002, 0.998])
     width = max((high - low) / bins, 6.0 * clipped_sigma(response.astype(np.float64)), 1e-12)
     index = np.clip((level - low) / width, 0, bins - 1).astype(int)
@@ -184,10 +206,14 @@ def estimate_noise(
     groups = [group for group in groups if np.count_nonzero(group) >= 200]
     if not groups:
         groups = [np.ones(level.shape, dtype=np.bool_)]
+    whole = [group for group in groups if np.mean(clipped[group]) < _CLIPPED_SHARE]
+    groups = whole or groups
     variances = np.array([clipped_sigma(response[g].astype(np.float64)) ** 2 for g in groups])
     levels = np.array([float(np.mean(level[g])) for g in groups])
     counts = np.array([np.count_nonzero(g) for g in groups])
-    return _line(levels, np.maximum(variances, step**2 / 12.0), counts, step)
+    line = _line(levels, np.maximum(variances, step**2 / 12.0), counts, step)
+    error = line.relative_error if whole else np.inf
+    return replace(line, relative_error=error, black=clip[0], white=clip[1])
 
 
 def _line(levels: Array, variances: Array, counts: NDArray[np.int_], step: float) -> NoiseModel:

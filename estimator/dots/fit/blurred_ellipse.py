@@ -80,15 +80,18 @@ def _row_kernel(z: Array, sigma: Array) -> tuple[Array, Array]:
     return g * (1.0 + k * (z2 * (z2 - 6.0) + 3.0)), (g / sigma**2) * bent
 
 
-def quadrature_nodes(a_px: float, sigma_px: float) -> int:
-    """Nodes round the contour that make the periodic trapezoid rule exact to about 1e-6."""
-    return max(24, int(np.ceil(2.0 * np.pi * a_px / (_NODE_SPACING_SIGMA * sigma_px))))
+def quadrature_nodes(a_sigma: float) -> int:
+    """Nodes round a contour that make the periodic trapezoid rule exact to about 1e-6.
+
+    a_sigma : larger semi-axis over sigma.
+    """
+    return max(24, int(np.ceil(2.0 * np.pi * a_sigma / _NODE_SPACING_SIGMA)))
 
 
 def coverage_on_grid(
     u_px: Array, v_px: Array, centre_px: ArrayLike, shape_px: ArrayLike, sigma_px: ArrayLike
 ) -> tuple[Array, Array]:
-    """Exact coverage of the pixels at columns ``u_px`` (U,) and rows ``v_px`` (V,).
+    """Exact coverage of the pixels at columns ``u_px`` (..., U) and rows ``v_px`` (..., V).
 
     Returns ``F`` (..., V, U) and its derivatives (..., 6, V, U) by centre (2), shape (3), sigma.
     ``centre_px`` (..., 2), ``shape_px`` (..., 3), ``sigma_px`` (...).
@@ -100,8 +103,7 @@ def coverage_on_grid(
     """
     centre, shape = np.asarray(centre_px, dtype=np.float64), np.asarray(shape_px, dtype=np.float64)
     sigma = np.asarray(sigma_px, dtype=np.float64)
-    longest = float(np.max(semi_axes(shape)[0]))
-    count = quadrature_nodes(longest, float(np.min(sigma)))
+    count = quadrature_nodes(float(np.max(semi_axes(shape)[0] / sigma)))
     t = 2.0 * np.pi / count * np.arange(count)
     c, s = np.cos(t), np.sin(t)
     m11, m12, m22 = (shape[..., i, None] for i in range(3))
@@ -111,18 +113,23 @@ def coverage_on_grid(
     x = centre[..., 0, None] + m11 * c + m12 * s
     y = centre[..., 1, None] + m12 * c + m22 * s
     column_p, column_d, column_d1 = _column_kernel(
-        (x[..., None, :] - u_px[:, None]) / sigma3, sigma3
+        (x[..., None, :] - u_px[..., None]) / sigma3, sigma3
     )
-    row_d, row_d2 = _row_kernel((y[..., None, :] - v_px[:, None]) / sigma3, sigma3)
+    row_d, row_d2 = _row_kernel((y[..., None, :] - v_px[..., None]) / sigma3, sigma3)
 
-    motions = (normal_u, normal_v, normal_u * c, normal_u * s + normal_v * c, normal_v * s)
-    weights = np.stack(motions, axis=-2)
-    moved = (row_d[..., None, :, :] * weights[..., :, None, :]) @ column_d.mT[..., None, :, :]
+    motions = np.stack(
+        (normal_u, normal_v, normal_u * c, normal_u * s + normal_v * c, normal_v * s), axis=-2
+    )
+    weighted = row_d[..., None, :, :] * motions[..., :, None, :]
+    sizes = (v_px.shape[-1], u_px.shape[-1])
+    moved = weighted.reshape(*weighted.shape[:-3], -1, count) @ column_d.mT
     flux = normal_u[..., None, :]
     integral = column_p.mT
-    coverage = (row_d * flux) @ integral
-    widened = (row_d * flux) @ column_d1.mT + (row_d2 * flux) @ integral
-    gradient = np.concatenate([moved, (sigma3 * widened)[..., None, :, :]], axis=-3)
+    row = row_d * flux
+    coverage = row @ integral
+    gradient = np.empty((*coverage.shape[:-2], 6, *sizes))
+    gradient[..., :5, :, :] = moved.reshape(*moved.shape[:-2], 5, *sizes)
+    gradient[..., 5, :, :] = sigma3 * (row @ column_d1.mT + (row_d2 * flux) @ integral)
     return coverage, gradient
 
 
@@ -230,7 +237,7 @@ def _bend(
 
 def semi_axes(shape_px: Array) -> tuple[Array, Array]:
     """Semi-axes a >= b [px], each (...), of (..., 3) shape numbers."""
-    m11, m12, m22 = np.moveaxis(shape_px, -1, 0)
+    m11, m12, m22 = shape_px[..., 0], shape_px[..., 1], shape_px[..., 2]
     mean, half = 0.5 * (m11 + m22), np.hypot(0.5 * (m11 - m22), m12)
     return mean + half, mean - half
 

@@ -8,6 +8,7 @@ size nor even light. Blobs are rejected by their outlines before the fit, dots b
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import hypot, sqrt
 from typing import Literal
 
 import cv2
@@ -17,9 +18,8 @@ from numpy.typing import NDArray
 from telerig.arrays import Array, Bools, Float32
 from telerig.estimator.dots.fit.blurred_ellipse import (
     approximate_distance_px,
-    axes_from_shape,
     extent_px,
-    shape_from_axes,
+    semi_axes,
 )
 from telerig.estimator.dots.fit.luminance import PARAMETERS, DotFit, Reason
 
@@ -250,7 +250,7 @@ def _is_small_dot(outline: NDArray[np.int32], image_shape: tuple[int, ...]) -> b
     if low.min() <= 0 or high[0] >= image_shape[1] - 1 or high[1] >= image_shape[0] - 1:
         return True
     area, centre, shape = _filled_moments(outline)
-    small = axes_from_shape(shape)[1] <= _PIECE_SEMI_AXIS_PX
+    small = semi_axes(shape)[1] <= _PIECE_SEMI_AXIS_PX
     sound = _reason_against_outline(outline, centre, shape) is None
     return bool(area >= _MIN_PIECE_PIXELS and small and sound)
 
@@ -269,7 +269,7 @@ def _first_look(
     reason: Reason | None
     if low.min() <= 0 or np.any(low + size >= image_shape[::-1]):
         reason = Reason.TOUCHES_BORDER
-    elif 2.0 * axes_from_shape(shape)[0] < min_diameter_px:
+    elif 2.0 * semi_axes(shape)[0] < min_diameter_px:
         reason = Reason.TOO_SMALL
     else:
         reason = _reason_against_outline(outline, centre, shape)
@@ -290,8 +290,12 @@ def _filled_moments(outline: NDArray[np.int32]) -> tuple[float, Array, Array]:
 
 def shape_from_matrix(variance: tuple[float, float, float]) -> Array:
     """Shape numbers of the uniform ellipse with these second moments (uu, uv, vv)."""
-    large, small, angle = axes_from_shape(np.array(variance))
-    return shape_from_axes(2.0 * np.sqrt(large), 2.0 * np.sqrt(max(small, 0.05)), angle)
+    uu, uv, vv = variance
+    mean, half = 0.5 * (uu + vv), hypot(0.5 * (uu - vv), uv)
+    a, b = 2.0 * sqrt(mean + half), 2.0 * sqrt(max(mean - half, 0.05))
+    round_part, turned = 0.5 * (a + b), 0.5 * (a - b) / max(half, 1e-12)
+    across = turned * 0.5 * (uu - vv)
+    return np.array([round_part + across, turned * uv, round_part - across])
 
 
 def _reason_against_outline(
@@ -299,7 +303,7 @@ def _reason_against_outline(
 ) -> Reason | None:
     offset = outline - centre
     distance = approximate_distance_px(shape, offset[:, 0], offset[:, 1]) + 0.5
-    _, b, _ = axes_from_shape(shape)
+    b = semi_axes(shape)[1]
     roughness = float(np.sqrt(np.mean(distance**2)))
     if roughness <= 0.5 + 0.04 * b:
         return None
@@ -333,13 +337,20 @@ def is_ring(blob: Candidate) -> bool:
 
 
 def saturation_level(grey: Float32) -> float:
-    """Grey level at which the sensor saturates: the top level if unusually many pixels have it,
-    else infinity."""
+    """Grey level at which the sensor saturates: the top level if more pixels have it than the
+    levels next below it, else infinity."""
     top = float(grey.max())
-    at_top = int(np.count_nonzero(grey == top))
-    span = top - float(grey.min())
-    below = int(np.count_nonzero((grey < top) & (grey >= top - 0.02 * span)))
-    return top if at_top >= 20 and at_top > below and span > 0.0 else np.inf
+    at_top, lower = grey == top, grey[grey < top]
+    if np.count_nonzero(at_top) < 20 or not lower.size:
+        return np.inf
+    second = float(lower.max())
+    below = np.count_nonzero(lower >= min(second, top - 0.005 * (top - float(lower.min()))))
+    return top if np.count_nonzero(at_top) > below else np.inf
+
+
+def clipping_levels(grey: Float32) -> tuple[float, float]:
+    """Grey levels (black, white) at which the image is clipped; infinite where it is not."""
+    return -saturation_level(-grey), saturation_level(grey)
 
 
 def _one_sided_saturation(
@@ -380,8 +391,8 @@ def _left(blob: Candidate, fit: DotFit) -> bool:
     """Whether the centre or the size of a fit is none that its blob can have."""
     step = fit.centre_px - blob.centre_px
     beyond = approximate_distance_px(blob.shape_px, step[:1], step[1:])[0]
-    sizes = np.add(axes_from_shape(fit.shape_px)[:2], 1.0)
-    ratio = sizes / np.add(axes_from_shape(blob.shape_px)[:2], 1.0)
+    sizes = np.add(semi_axes(fit.shape_px), 1.0)
+    ratio = sizes / np.add(semi_axes(blob.shape_px), 1.0)
     return bool(beyond > 0.0 or ratio.max() > _LARGEST_RATIO or ratio.min() < 1 / _LARGEST_RATIO)
 
 
@@ -396,7 +407,7 @@ def reason_against_fit(
     """Reason to leave a dot out that was fitted to a blob; None for a good one."""
     if fit.pixels <= PARAMETERS:
         return Reason.HIDDEN
-    if not np.all(np.isfinite(fit.covariance_px2)) or axes_from_shape(fit.shape_px)[1] <= 0.0:
+    if not np.all(np.isfinite(fit.covariance_px2)) or semi_axes(fit.shape_px)[1] <= 0.0:
         return Reason.FIT_FAILED
     if _left(blob, fit):
         return Reason.MISPLACED

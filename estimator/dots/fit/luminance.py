@@ -16,9 +16,10 @@ parameters (D, 12) are both.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ class DotFit:
     levels : (6,) B0, B1, B2, C, C1, C2 about the window's middle origin_px (2,) in units of
         radius_px.
     covariance_px2 : (2, 2) of the centre. contrast_sigma : of C.
-    dropped : number of pixels left out as outliers.
+    dropped : number of pixels left out of chi-square, as outliers or because they are clipped.
     edge_residual : RMS residual in the band of the edge over C.
     inner_chi2 : mean whitened square residual of the inner_pixels that the dot covers.
     """
@@ -167,6 +168,7 @@ _FEW_PIXELS = 1e-9
 EDGE_EXPANSION_LIMIT = 0.25
 """Curvature times sigma up to which centres agree with the exact sum to 1e-5 px, levels to 5e-4."""
 _PRIOR = np.dtype([(f.name, type(f.default)) for f in fields(Prior)])
+_prior_values = attrgetter(*(f.name for f in fields(Prior)))
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,9 @@ class Pixels:
     """Pixels of D fits, padded to P: offsets x, y from the origin pixel, and grey levels, (D, P).
 
     there : (D, P) False for padding. counts : (D,) pixels that are there.
-    grids : rows, columns and mask of each window. origin : (D, 2). radius : (D,) px.
+    columns (D, U), rows (D, V) : offsets of the windows' columns and rows from the origin pixel,
+        padded by counting on. cell : (D, P) place of each pixel in its V x U window.
+    origin : (D, 2). radius : (D,) px.
     prior : (D,) structured array with the fields of `Prior`.
     """
 
@@ -183,7 +187,9 @@ class Pixels:
     grey: Array
     there: Bools
     counts: Ints
-    grids: tuple[tuple[Array, Array, Bools], ...]
+    columns: Array
+    rows: Array
+    cell: Ints
     origin: Array
     radius: Array
     noise: NoiseModel
@@ -193,9 +199,8 @@ class Pixels:
         """The pixels of some of the dots."""
         if len(dots) == len(self.x):
             return self
-        names = ("x", "y", "grey", "there", "counts", "origin", "radius", "prior")
-        arrays = {name: getattr(self, name)[dots] for name in names}
-        return replace(self, grids=tuple(self.grids[i] for i in dots), **arrays)
+        arrays = {name: value[dots] for name, value in vars(self).items() if name != "noise"}
+        return replace(self, **arrays)
 
 
 def gather(
@@ -203,38 +208,53 @@ def gather(
 ) -> Pixels:
     """The pixels that each window's mask shows, padded to the largest number."""
     counts = np.array([np.count_nonzero(w.mask) for w in windows])
-    x, y, grey = np.zeros((3, len(windows), max(int(counts.max()), 1)))
-    origin, radius, grids = np.empty((len(windows), 2)), np.empty(len(windows)), []
+    sizes = np.array([w.mask.shape for w in windows])
+    height, width = sizes.max(axis=0)
+    grey = np.zeros((len(windows), max(int(counts.max()), 1)))
+    cell = np.zeros(grey.shape, np.int64)
+    origin, radius = np.empty((len(windows), 2)), np.empty(len(windows))
     for i, (window, start) in enumerate(zip(windows, starts)):
         before = start.previous
         origin[i] = np.round(start.centre_px) if before is None else before.origin_px
         radius[i] = semi_axes(start.shape_px)[0] if before is None else before.radius_px
-        columns = np.arange(window.grey.shape[1]) + window.first_u - origin[i, 0]
-        rows = np.arange(window.grey.shape[0]) + window.first_v - origin[i, 1]
         at_row, at_column = np.nonzero(window.mask)
-        x[i, : counts[i]], y[i, : counts[i]] = columns[at_column], rows[at_row]
+        cell[i, : counts[i]] = at_row * width + at_column
         grey[i, : counts[i]] = window.grey[window.mask]
-        grids.append((rows, columns, window.mask))
-    there = np.arange(x.shape[1]) < counts[:, None]
-    prior = np.array([astuple(p) for p in priors], _PRIOR)
-    return Pixels(x, y, grey, there, counts, tuple(grids), origin, radius, noise, prior)
+    first = np.array([(w.first_u, w.first_v) for w in windows]) - origin
+    columns, rows = first[:, :1] + np.arange(width), first[:, 1:] + np.arange(height)
+    there = np.arange(grey.shape[1]) < counts[:, None]
+    at_row, at_column = np.divmod(cell, width)
+    x = np.where(there, first[:, :1] + at_column, 0.0)
+    y = np.where(there, first[:, 1:] + at_row, 0.0)
+    prior = np.array([_prior_values(p) for p in priors], _PRIOR)
+    return Pixels(x, y, grey, there, counts, columns, rows, cell, origin, radius, noise, prior)
 
 
 def _coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
     """(D, P) and its derivatives (D, 6, P) by theta (D, 6)."""
     curved = largest_curvature(theta[:, 2:5]) * theta[:, 5] >= EDGE_EXPANSION_LIMIT
-    if not np.all(curved):
-        value, gradient = coverage_near_edge(
-            pixels.x - theta[:, :1], pixels.y - theta[:, 1:2], theta[:, 2:5], theta[:, 5]
-        )
-    else:
-        value = np.zeros_like(pixels.x)
-        gradient = np.zeros((len(theta), 6, pixels.x.shape[1]))
-    for i in np.flatnonzero(curved):
-        rows, columns, mask = pixels.grids[i]
-        exact, slopes = coverage_on_grid(columns, rows, theta[i, :2], theta[i, 2:5], theta[i, 5])
-        value[i, : pixels.counts[i]] = exact[mask]
-        gradient[i, :, : pixels.counts[i]] = slopes[:, mask]
+    if np.all(curved):
+        return _exact_coverage(pixels, theta)
+    smooth = np.flatnonzero(~curved)
+    some, theirs = pixels.of(smooth), theta[smooth]
+    found = coverage_near_edge(
+        some.x - theirs[:, :1], some.y - theirs[:, 1:2], theirs[:, 2:5], theirs[:, 5]
+    )
+    if len(smooth) == len(theta):
+        return found
+    value, gradient = np.empty_like(pixels.x), np.empty((len(theta), 6, pixels.x.shape[1]))
+    value[smooth], gradient[smooth] = found
+    bent = np.flatnonzero(curved)
+    value[bent], gradient[bent] = _exact_coverage(pixels.of(bent), theta[bent])
+    return value, gradient
+
+
+def _exact_coverage(pixels: Pixels, theta: Array) -> tuple[Array, Array]:
+    exact, slopes = coverage_on_grid(
+        pixels.columns, pixels.rows, theta[:, :2], theta[:, 2:5], theta[:, 5]
+    )
+    value = np.take_along_axis(exact.reshape(len(theta), -1), pixels.cell, axis=1)
+    gradient = np.take_along_axis(slopes.reshape(len(theta), 6, -1), pixels.cell[:, None], axis=2)
     return value, gradient
 
 
@@ -296,7 +316,7 @@ _MIN_SEMI_AXIS_PX = 0.6
 _INSIDE = 0.9
 _OUTLIER_SIGMA = 5.0
 _MAX_OUTLIER_SHARE = 0.15
-_PIXELS_AT_ONCE = 8_000
+_PIXELS_AT_ONCE = 16_000
 """Pixels of one chunk of dots, so that the arrays stay in a core's cache."""
 
 
@@ -521,6 +541,7 @@ def _results(pixels: Pixels, state: _State, converged: Bools) -> list[DotFit]:
     information, _ = _normal_equations(pixels, state, np.arange(len(pixels.x)))
     covariance = _inverses(information)
     used = state.weight > 0.0
+    used &= ~pixels.noise.is_clipped(pixels.grey, state.model)
     dropped = pixels.counts - np.count_nonzero(used, axis=1)
     dof = np.maximum(pixels.counts - dropped - PARAMETERS, 1)
     squared = state.residual**2
@@ -531,7 +552,7 @@ def _results(pixels: Pixels, state: _State, converged: Bools) -> list[DotFit]:
     edge = np.sqrt(_mean_where(squared, (np.abs(distance) < 2.0 * theta[:, 5:]) & used, np.inf))
     inside = used & (state.jacobian[:, 9] > _INSIDE)
     inner = _mean_where(state.weight * squared, inside, 1.0)
-    chi2_dof = np.sum(state.weight * squared, axis=1) / dof
+    chi2_dof = np.sum(state.weight * squared, axis=1, where=used) / dof
     return [
         DotFit(
             theta[i, :2] + pixels.origin[i],

@@ -106,7 +106,10 @@ def test_jacobian_of_the_model() -> None:
 
 
 def test_dots_fitted_together_are_those_fitted_alone() -> None:
-    """Large and small, round and so bent that the edge's expansion would not do, one dirty."""
+    """Large and small, round and so bent that the edge's expansion would not do, one dirty.
+
+    The most curved dot sets the number of nodes of the exact sum for all dots beside it.
+    """
     rng = np.random.default_rng(3)
     shapes = [shape_from_axes(a, b, 0.4) for a, b in ((9, 8), (4, 2.5), (11, 5), (3, 3), (12, 11))]
     windows = []
@@ -120,7 +123,9 @@ def test_dots_fitted_together_are_those_fitted_alone() -> None:
     for i, ours in enumerate(together):
         (alone,) = fit_dots(windows[i : i + 1], starts[i : i + 1], noise_of(2.0), priors[i : i + 1])
         for name in ("centre_px", "shape_px", "levels", "covariance_px2", "chi2_dof"):
-            np.testing.assert_allclose(getattr(ours, name), getattr(alone, name), rtol=1e-7)
+            np.testing.assert_allclose(
+                getattr(ours, name), getattr(alone, name), rtol=1e-6, atol=1e-6
+            )
         assert (ours.pixels, ours.dropped, ours.converged) == (alone.pixels, alone.dropped, True)
 
 

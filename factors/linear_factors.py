@@ -35,6 +35,14 @@ class LinearFactors:
     log_det: Array
     weight: Array | None = None
 
+    def of(self, which: Ints) -> LinearFactors:
+        """Return the factors with the indices (m,)."""
+        count = len(self.rhs)
+        keys = tuple(np.asarray(k)[which] if np.ndim(k) else k for k in self.keys)
+        blocks = tuple(np.broadcast_to(b, (count, *b.shape[-2:]))[which] for b in self.blocks)
+        weight = None if self.weight is None else self.weight[which]
+        return LinearFactors(keys, blocks, self.rhs[which], self.log_det[which], weight)
+
     def squared(self, increments: Callable[[ArrayLike, int], Array]) -> float:
         """Return the sum of all squared residuals.
 
@@ -99,6 +107,10 @@ def add_linear_factors(
         push_back(factor(*parts, noise))
 
 
+_AT_ONCE = 8192
+"""Factors that are multiplied together; what is worked out on the way then stays in the cache."""
+
+
 def product(factors: Sequence[LinearFactors], starts: Ints, values: Array) -> list[Array]:
     """Return for each group of factors sum_k A_k x_k (M, rows, K), x the columns of values (D, K).
 
@@ -107,8 +119,8 @@ def product(factors: Sequence[LinearFactors], starts: Ints, values: Array) -> li
     out = []
     for linear in factors:
         total = np.zeros((*linear.rhs.shape, values.shape[1]))
-        for at, block in _places(linear, starts):
-            total += block @ values[at]
+        for mine, at, block in _places(linear, starts):
+            total[mine] += block @ values[at]
         out.append(total)
     return out
 
@@ -118,9 +130,9 @@ def transposed_product(
 ) -> Array:
     """Return the sum (D, K) of A^T times the values (M, rows, K) of each group of factors."""
     out = np.zeros((int(starts[-1]), values[0].shape[-1]))
-    for linear, mine in zip(factors, values):
-        for at, block in _places(linear, starts):
-            share = np.swapaxes(block, -1, -2) @ mine
+    for linear, given in zip(factors, values):
+        for mine, at, block in _places(linear, starts):
+            share = np.einsum("mij,mik->mjk", block, given[mine])
             order = np.argsort(at[:, 0], kind="stable")
             first = np.flatnonzero(np.diff(at[order, 0], prepend=-1))
             if len(first) < len(order):
@@ -130,10 +142,14 @@ def transposed_product(
     return out
 
 
-def _places(linear: LinearFactors, starts: Ints) -> Iterator[tuple[Ints, Array]]:
-    """Yield the rows (M, columns) of each variable, and its block."""
+def _places(linear: LinearFactors, starts: Ints) -> Iterator[tuple[slice, Ints, Array]]:
+    """Yield some of the factors, the rows (m, columns) of a variable of theirs, and its block."""
     count = len(linear.rhs)
     for key, block in zip(linear.keys, linear.blocks):
-        if count and block.shape[-1]:
-            first = starts[np.broadcast_to(np.asarray(key, np.int64), (count,))]
-            yield np.asarray(first[:, None] + np.arange(block.shape[-1])), block
+        if not count or not block.shape[-1]:
+            continue
+        first = starts[np.broadcast_to(np.asarray(key, np.int64), (count,))]
+        for begin in range(0, count, _AT_ONCE):
+            mine = slice(begin, min(begin + _AT_ONCE, count))
+            part = block[mine] if len(block) == count and block.ndim == 3 else block
+            yield mine, first[mine, None] + np.arange(block.shape[-1]), part

@@ -200,16 +200,17 @@ def stopped_by_signals() -> Iterator[threading.Event]:
 class Steps:
     """Show how far a command is: call it with the name of a step, the number done and the total.
 
+    A number with a point is the share that is done, of 1.
     seconds : how long each step has taken so far, by name.
     """
 
-    def __init__(self, show: Callable[[str, int, int, float, int], None] | None) -> None:
+    def __init__(self, show: Callable[[str, float, int, float, float], None] | None) -> None:
         self._show = show
-        self._begun: dict[str, tuple[float, int]] = {}
+        self._begun: dict[str, tuple[float, float]] = {}
         self._now = ""
         self.seconds: dict[str, float] = {}
 
-    def __call__(self, what: str, done: int, of: int) -> None:
+    def __call__(self, what: str, done: float, of: int) -> None:
         now = time.monotonic()
         if self._now:
             self.seconds[self._now] = now - self._begun[self._now][0]
@@ -246,7 +247,7 @@ def _bar() -> Iterator[Steps]:
     ) as bar:
         tasks: dict[str, Any] = {}
 
-        def update(what: str, done: int, of: int, seconds: float, here: int) -> None:
+        def update(what: str, done: float, of: int, seconds: float, here: float) -> None:
             words = _how_far(done, of, seconds, here)
             if what not in tasks:
                 tasks[what] = bar.add_task(what, total=of or None, words=words)
@@ -258,10 +259,10 @@ def _bar() -> Iterator[Steps]:
 _PLAIN_S = 2.0
 
 
-def _plain_lines() -> Callable[[str, int, int, float, int], None]:
+def _plain_lines() -> Callable[[str, float, int, float, float], None]:
     last: dict[str, Any] = {"time": 0.0, "what": ""}
 
-    def update(what: str, done: int, of: int, seconds: float, here: int) -> None:
+    def update(what: str, done: float, of: int, seconds: float, here: float) -> None:
         now = time.monotonic()
         if what != last["what"] or (of and done == of) or now - last["time"] > _PLAIN_S:
             last.update(time=now, what=what)
@@ -271,15 +272,17 @@ def _plain_lines() -> Callable[[str, int, int, float, int], None]:
     return update
 
 
-def _how_far(done: int, of: int, seconds: float, here: int) -> str:
+def _how_far(done: float, of: int, seconds: float, here: float) -> str:
     """Return in words how far a step is, how fast, and how long it will take.
 
     here : how many of those that are done were done in these ``seconds``.
     """
-    words = [f"{done} of {of}" if of else f"{done}" if done else ""]
+    share = isinstance(done, float)
+    words = [f"{100 * done:.0f} %" if share else f"{done} of {of}" if of else f"{done or ''}"]
     if here and seconds >= 1:
         rate = here / seconds
-        words += [f"{rate:.3g} a second", f"{_duration(seconds)} so far"]
+        words += [] if share else [f"{rate:.3g} a second"]
+        words.append(f"{_duration(seconds)} so far")
         if of > done:
             words.append(f"{_duration((of - done) / rate)} left")
     return ", ".join(word for word in words if word)

@@ -34,7 +34,7 @@ from telerig.io.files.csv_table import write_table
 from telerig.io.machine.parallel import cores
 from telerig.io.results.manifest import is_whole, replaced_results
 
-Stage = Callable[[str, int, int], None]
+Stage = Callable[[str, float, int], None]
 
 DONE, REJECTED, FAILED, CRASHED, LEFT_OUT = "done", "rejected", "failed", "crashed", "left out"
 _KEPT_OUTPUT = 2000

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from telerig.estimator.smoothing.result import Smoothing
     from telerig.io.dataset.run import RunData
 
-Stage = Callable[[str, int, int], None]
+Stage = Callable[[str, float, int], None]
+"""Called with the name of a step, the share that is done, and 1."""
 
 _RIG_TABLES = ("cameras", "stage", "walls", "references", "tracking", "accelerometers")
 """The tables of rig.toml on which smoothing depends."""
@@ -72,9 +73,9 @@ def smooth_run(
         *window_warnings(run.rig, calibration),
         *([] if refine_rig else _moved(followed)),
     ]
-    percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
+    shares = None if stage is None else lambda what, share: stage(what, float(share), 1)
     found = smooth(
-        followed, calibration, stage=run, model=model, progress=percent, refine_rig=refine_rig,
+        followed, calibration, stage=run, model=model, progress=shares, refine_rig=refine_rig,
         accept=accept,
     )  # fmt: skip
     found = replace(

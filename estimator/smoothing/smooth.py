@@ -149,7 +149,7 @@ def smooth(
         )  # fmt: skip
         problem, findings = aligned(problem, findings)
         warnings = settled(findings, accepted)
-    options = options or Options()
+    options = replace(options or Options(), draws=True)
     with phases.phase("learning", "learning the shake") as step:
         chosen = _chosen(problem, model, encoder_sigma, refinement, step)
         learned: dict[str, Any] = {}
@@ -167,6 +167,7 @@ def smooth(
                 solution = with_hyperparameter_uncertainty(solution)
     with phases.phase("verdict", "judging the result"):
         verdict = judge(problem, chosen, solution)
+        solution = replace(solution, draws=None)
         inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
         summary = summary_of(solution)
         summary["accepted"] = sorted(accepted)
@@ -365,5 +366,5 @@ def _adapted_solution(
     better = adapted(first)
     if better is None and not sensors:
         return first
-    first = replace(first, covariances=None)
+    first = replace(first, covariances=None, draws=None)
     return solve(problem, better or model, options, progress, start=first)

@@ -159,7 +159,7 @@ def validate_run(
     seed: int = 0,
     inputs: Sequence[Path] = (),
     report: bool = True,
-    stage: Callable[[str, int, int], None] | None = None,
+    stage: Callable[[str, float, int], None] | None = None,
     again: str = "",
 ) -> ValidationFile:
     """Validate a run and write validation.json and validation.html into its results folder.
@@ -169,16 +169,16 @@ def validate_run(
 
     inputs : the files of the calibration.
     report : whether the page is written.
-    stage : function that is called with the name of the step, and done and total steps.
+    stage : function that is called with the name of the step, the share that is done, and 1.
     again : the command line that makes the files again; "" for `telerig validate` of the run.
 
     Returns what was written. Both files appear together. Raises InputError as `validate` does.
     """
     run, followed = with_followed_references(run, folder)
     fingerprint = fingerprints(folder, [*run_sources(run), *followed, *inputs])
-    percent = None if stage is None else lambda what, share: stage(what, int(100 * share), 100)
+    shares = None if stage is None else lambda what, share: stage(what, float(share), 1)
     found = validate(
-        run, calibration, marks=marks, model=model, accept=accept, seed=seed, progress=percent
+        run, calibration, marks=marks, model=model, accept=accept, seed=seed, progress=shares
     )
     again = again or f"telerig validate {shlex.quote(str(run.path))}"
     with replaced_results(folder, "validate", again=again, inputs=fingerprint) as staged:

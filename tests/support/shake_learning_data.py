@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -106,6 +108,26 @@ def run(
         lab,
         shake,
     )  # fmt: skip
+
+
+def with_comings_and_goings(
+    problem: SmoothingProblem, rng: np.random.Generator, frames: int
+) -> SmoothingProblem:
+    """The problem, each track cut into several with a gap of a frame between them."""
+    bubbles: list[Bubble] = []
+    item = np.full(len(problem.observations), -1)
+    seen, last = problem.observations, len(problem.t_s)
+    for bubble in problem.bubbles:
+        first = 0
+        while first < last - 3:
+            end = min(last, first + int(frames * rng.uniform(0.5, 1.5)))
+            inside = (seen.frame >= first) & (seen.frame < end) & (seen.item == bubble.particle)
+            item[inside] = len(bubbles)
+            guess = bubble.guess_mm[first:end]
+            bubbles.append(Bubble(len(bubbles), first, end - 1, guess[0], guess))
+            first = end + 1
+    kept = replace(seen, item=item).of(item >= 0)
+    return replace(problem, bubbles=tuple(bubbles), observations=kept)
 
 
 def _pixels(

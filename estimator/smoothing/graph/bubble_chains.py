@@ -87,16 +87,12 @@ class BubbleChains:
             rest[:count, :size] = rows[mine]
         return rows, means
 
-    def covariances(self, place: Ints | None = None, *, spent: bool = False) -> Array:
-        """Return the covariances (n, D, D) of the states at places (n,); None for all.
-
-        spent : whether the chains are not used any more, so that all may take their memory.
-        """
+    def covariances(self, place: Ints) -> Array:
+        """Return the covariances (n, D, D) of the states at places (n,)."""
         size = self.own.shape[-1]
-        where = np.arange(len(self.own)) if place is None else place
-        order = np.argsort(where, kind="stable")
-        sought = where[order]
-        out = self.own if spent else np.empty((len(where), size, size))
+        order = np.argsort(place, kind="stable")
+        sought = place[order]
+        out = np.empty((len(place), size, size))
         joint = np.zeros((len(self.mean), size + 3, size + 3))
         joint[:, size:, size:] = self.mean
         for mine in reversed(self.places.stretches()):

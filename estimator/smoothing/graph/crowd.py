@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -77,8 +76,9 @@ class EliminatedCrowd:
 
     chains : the bubbles, the rig held.  mean : the graph with the mean bubble.
     mean_chains : its bubble, the rig held.
-    rig : sparse derivatives of the factors without bubbles.  images_by_rig, images_by_bubble : of
-    the bubbles' pixels. Columns as those of ``mean``, and of the rows of ``chains``.
+    rig : the factors without bubbles, with the keys of ``mean``.  images_by_rig, images_by_bubble :
+    the bubbles' pixels, with the keys of ``mean``, and the rows of ``chains`` in place of keys.
+    starts : first columns of the keys of ``mean``, and of the rows.
     steps : conjugate gradients that were needed.
     """
 
@@ -86,9 +86,10 @@ class EliminatedCrowd:
     chains: BubbleChains
     mean: EliminatedGraph
     mean_chains: BubbleChains
-    rig: Any
-    images_by_rig: Any
-    images_by_bubble: Any
+    rig: list[LinearFactors]
+    images_by_rig: list[LinearFactors]
+    images_by_bubble: list[LinearFactors]
+    starts: tuple[Ints, Ints]
     vector: Array
     steps: int = 0
 
@@ -131,11 +132,20 @@ class EliminatedCrowd:
         )
 
     def _schur(self, way: Array) -> Array:
-        seen = self.images_by_rig @ way
-        push = self.images_by_bubble.T @ seen
+        of_rig, of_rows = self.starts
+        seen = product(self.images_by_rig, of_rig, way)
+        push = transposed_product(self.images_by_bubble, of_rows, seen)
         rows, _ = self._bubbles(push.reshape(*self.chains.own.shape[:2], -1), None)
-        seen -= self.images_by_bubble @ rows.reshape(len(push), -1)
-        return np.asarray(self.rig.T @ (self.rig @ way) + self.images_by_rig.T @ seen)
+        for whole, part in zip(seen, self._seen_by_bubbles(rows)):
+            whole -= part
+        image = transposed_product(self.images_by_rig, of_rig, seen)
+        if self.rig:
+            image += transposed_product(self.rig, of_rig, product(self.rig, of_rig, way))
+        return image
+
+    def _seen_by_bubbles(self, rows: Array) -> list[Array]:
+        flat = rows.reshape(-1, rows.shape[-1])
+        return product(self.images_by_bubble, self.starts[1], flat)
 
     def _preconditioned(self, side: Array) -> Array:
         out = self.mean.solved(side)
@@ -153,12 +163,12 @@ class EliminatedCrowd:
 
     def _push(self, rig: Array) -> Array:
         """What a change of the rig (R, N) puts on the bubbles' rows (rows, D, N)."""
-        push = self.images_by_bubble.T @ (self.images_by_rig @ rig)
-        return np.asarray(push.reshape(*self.chains.own.shape[:2], -1))
+        seen = product(self.images_by_rig, self.starts[0], rig)
+        push = transposed_product(self.images_by_bubble, self.starts[1], seen)
+        return push.reshape(*self.chains.own.shape[:2], -1)
 
     def _pull(self, rows: Array) -> Array:
-        flat = rows.reshape(-1, rows.shape[-1])
-        return np.asarray(self.images_by_rig.T @ (self.images_by_bubble @ flat))
+        return transposed_product(self.images_by_rig, self.starts[0], self._seen_by_bubbles(rows))
 
     def _split(self, side: Array) -> tuple[Array, Array, Array]:
         """A vector (D, N) of the graph as rig (R, N), rows and means of the chains."""
@@ -187,19 +197,19 @@ class EliminatedCrowd:
     def blocks(self) -> Blocks:
         """Return the marginal covariances; what the rig adds to a bubble's is the mean bubble's.
 
-        The chains are used up.
+        All is used up: what is not needed any more makes room for what is worked out.
         """
         graph, mean = self.graph, self.mean.graph
+        for factors in (self.rig, self.images_by_rig, self.images_by_bubble):
+            factors.clear()
         found, chain = self.mean.blocks(), self.mean_chains
+        self.mean.cliques.clear()
         row = _mean_row(mean)[graph.frame_of_row]
-        added = found.own[1] - chain.covariances()[chain.places.place_of_row]
-        by_age = self.chains.covariances(spent=True)
-        own = np.empty_like(by_age)
+        added = found.own[1] - chain.covariances(chain.places.place_of_row)
+        own = self.chains.covariances(self.chains.places.place_of_row)
         for first in range(0, graph.rows, _AT_ONCE):
             mine = np.arange(first, min(first + _AT_ONCE, graph.rows))
-            more = _turned(added[row[mine]], _turn(mean, row[mine], graph, mine))
-            own[mine] = by_age[self.chains.places.place_of_row[mine]] + more
-        del by_age
+            own[mine] += _turned(added[row[mine]], _turn(mean, row[mine], graph, mine))
         segment = mean.bubble_of_row[row[graph.first_row[:-1]]]
         order = self.chains.places.order
         means = np.empty_like(self.chains.mean)
@@ -225,7 +235,8 @@ def eliminate_crowd(
     give_back_freed_memory()
     out = EliminatedCrowd(
         graph, chains, done, bubble_chains(mean, its_factors),
-        *_sparse(graph, mean, factors, chains), np.zeros(0),
+        *_parts(graph, mean, factors, chains),
+        (starts_of(mean), graph.bubble.size * np.arange(graph.rows + 1)), np.zeros(0),
     )  # fmt: skip
     starts, rest = starts_of(graph), [f.rhs[..., None] for f in factors]
     total, steps = np.zeros((_size(graph), 1)), 0
@@ -389,45 +400,21 @@ def _summed(block: Array, place: Ints, count: int) -> Array:
     return np.asarray(np.add.reduceat(block[order], first, axis=0))
 
 
-def _sparse(
+def _parts(
     graph: GraphLayout, mean: GraphLayout, factors: Sequence[LinearFactors], chains: BubbleChains
-) -> tuple[Any, Any, Any]:
-    """Derivatives as sparse matrices: rig's factors, pixels by the rig, pixels by the bubbles."""
-    from scipy.sparse import csr_array, vstack
-
+) -> tuple[list[LinearFactors], list[LinearFactors], list[LinearFactors]]:
+    """Return the rig's factors, pixels by the rig, and pixels by the bubbles; nothing is copied."""
     base, theirs = graph.base(), mean.base()
-    starts = starts_of(mean)
-    width, size = int(starts[-1]), graph.bubble.size
-
-    def matrix(used: Sequence[tuple[Ints, Array]], columns: int) -> Any:
-        """Of blocks (n, rows, d) and the columns (n,) at which each begins."""
-        if not used:
-            return csr_array((count * linear.rhs.shape[1], columns))
-        shapes = [(len(first), *block.shape[-2:]) for first, block in used]
-        number, rows = shapes[0][:2]
-        value = np.concatenate([np.broadcast_to(b, s) for (_, b), s in zip(used, shapes)], -1)
-        at = [first[:, None, None] + np.arange(s[-1]) for (first, _), s in zip(used, shapes)]
-        at = [np.broadcast_to(a.astype(np.int32), s) for a, s in zip(at, shapes)]
-        there = value != 0
-        ends = np.r_[0, np.cumsum(there.sum(-1).ravel())].astype(np.int32)
-        index = np.concatenate(at, -1)[there]
-        return csr_array((value[there], index, ends), shape=(number * rows, columns))
-
     rig, by_rig, by_bubble = [], [], []
     for linear in factors:
-        count = len(linear.rhs)
-        keys = [np.broadcast_to(np.asarray(k, np.int64), (count,)) for k in linear.keys]
+        keys = [np.asarray(k) for k in linear.keys]
         if not linear.rhs.size:
             continue
-        moved = [k + (theirs.sensors - base.sensors) * (k >= base.sensors) for k in keys]
-        of_bubbles = base.bubbles <= keys[0][0] < base.means and linear.weight is not None
-        if of_bubbles:
-            used = [(starts[k], b) for k, b in zip(moved[1:], linear.blocks[1:]) if b.shape[-1]]
-            by_rig.append(matrix(used, width))
-            place = chains.places.place_of_row[keys[0] - base.bubbles] * size
-            by_bubble.append(matrix([(place, linear.blocks[0])], graph.rows * size))
-        elif not any(base.bubbles <= k[0] < base.sensors for k in keys):
-            used = [(starts[k], b) for k, b in zip(moved, linear.blocks) if b.shape[-1]]
-            rig.append(matrix(used, width))
-    rig = rig or [csr_array((0, width))]
-    return tuple(vstack(m, format="csr") for m in (rig, by_rig, by_bubble))
+        moved = tuple(k + (theirs.sensors - base.sensors) * (k >= base.sensors) for k in keys)
+        if linear.weight is not None and base.bubbles <= keys[0].flat[0] < base.means:
+            place = chains.places.place_of_row[keys[0] - base.bubbles]
+            by_rig.append(replace(linear, keys=moved[1:], blocks=linear.blocks[1:]))
+            by_bubble.append(replace(linear, keys=(place,), blocks=linear.blocks[:1]))
+        elif not any(base.bubbles <= k.flat[0] < base.sensors for k in keys):
+            rig.append(replace(linear, keys=moved))
+    return rig, by_rig, by_bubble

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,8 @@ from telerig.factors.linear_factors import LinearFactors, add_linear_factors
 LEAST_PIVOT = 1e-9
 """Of the information's diagonal, what Cholesky's elimination has to leave of it; covariances are
 then good to 1e-5."""
+
+_KEYS_AT_ONCE = 2000
 
 _NOTHING = np.zeros(0, np.int64)
 
@@ -49,11 +51,10 @@ class Blocks:
 
 @dataclass(frozen=True)
 class EliminatedGraph:
-    """cliques : the square root of the information.  vector : the solution, keys in their order."""
+    """cliques : the square root of the information, in order of elimination."""
 
     graph: GraphLayout
     cliques: list[Clique]
-    vector: Array
 
     def log_det(self) -> float:
         """log |R|; QR leaves signs on the diagonal."""
@@ -69,12 +70,24 @@ class EliminatedGraph:
 
         return [(of(c.fronts), of(c.separator)) for c in self.cliques]
 
+    @cached_property
+    def vector(self) -> Array:
+        """The solution, keys in their order."""
+        out = np.zeros(int(starts_of(self.graph)[-1]))
+        for clique, (own, _) in zip(self.cliques, self._columns):
+            out[own] = clique.side
+        return self._substituted(out[:, None])[:, 0]
+
     def solved(self, side: Array) -> Array:
         """Return the solutions (D, N) of the normal equations for right sides (D, N)."""
         out = side.copy()
         for clique, (own, above) in zip(self.cliques, self._columns):
             mine = out[own] = dtrtrs(clique.root, out[own], trans=1)[0]
             out[above] -= clique.right.T @ mine
+        return self._substituted(out)
+
+    def _substituted(self, out: Array) -> Array:
+        """Solve for the roots' right sides (D, N), in place."""
         for clique, (own, above) in zip(reversed(self.cliques), reversed(self._columns)):
             out[own] = dtrtrs(clique.root, out[own] - clique.right @ out[above])[0]
         return out
@@ -112,19 +125,17 @@ def eliminate(
     """
     import gtsam
 
-    factor_graph = gtsam.GaussianFactorGraph()
-    for linear in factors:
-        add_linear_factors(factor_graph, linear.keys, linear.blocks, linear.rhs)
-    _add_bonds(factor_graph, graph)
-    (ordering, when), sizes = _ordering(graph), _sizes(graph)
+    every = [*factors, *_bonds(graph)]
+    (order, when), sizes = _ordering(graph), _sizes(graph)
     if cholesky:
-        found = _by_cholesky(graph, factor_graph, factors, ordering, when)
-        if found is not None:
-            return found
+        try:
+            cliques = _eliminated(every, order, when, sizes)
+            if _least_pivot(cliques, factors, sizes) > LEAST_PIVOT:
+                return EliminatedGraph(graph, cliques)
+        except RuntimeError:
+            pass
     try:
-        net = factor_graph.eliminateSequential(ordering, gtsam.EliminateQR)
-        del factor_graph
-        return EliminatedGraph(graph, cliques_of(net, sizes, when), net.optimize().vector())
+        return EliminatedGraph(graph, _eliminated(every, order, when, sizes, gtsam.EliminateQR))
     except RuntimeError as error:
         raise CalibrationError(
             f"the graph cannot be solved: {str(error).strip().splitlines()[0]}",
@@ -132,19 +143,47 @@ def eliminate(
         ) from error
 
 
-def _by_cholesky(
-    graph: GraphLayout, factor_graph: Any, factors: list[LinearFactors], ordering: Any, when: Ints
-) -> EliminatedGraph | None:
-    """The solution; None where the digits run out."""
-    sizes = _sizes(graph)
-    try:
-        net = factor_graph.eliminateSequential(ordering)
-        cliques = cliques_of(net, sizes, when)
-        if _least_pivot(cliques, factors, sizes) > LEAST_PIVOT:
-            return EliminatedGraph(graph, cliques, net.optimize().vector())
-    except RuntimeError:
-        pass
-    return None
+def _eliminated(
+    factors: Sequence[LinearFactors], order: Ints, when: Ints, sizes: Sequence[int], *function: Any
+) -> list[Clique]:
+    """Return the cliques, from some thousand keys at a time, after which GTSAM's memory is free.
+
+    order : (C,) keys as they are eliminated.  when : (C,) their times, at which alone it is cut.
+    function : GTSAM's of elimination, for another than its default.
+    """
+    import gtsam
+
+    place = np.full(len(sizes), len(order))
+    place[order] = np.arange(len(order))
+    first = [_first_place(linear, place) for linear in factors]
+    begins = np.flatnonzero(np.diff(when, prepend=-1))
+    cuts = [0]
+    while cuts[-1] < len(order):
+        later = begins[np.searchsorted(begins, cuts[-1] + _KEYS_AT_ONCE) :]
+        cuts.append(int(later[0]) if len(later) else len(order))
+    rest, cliques = gtsam.GaussianFactorGraph(), list[Clique]()
+    for begin, end in pairwise(cuts):
+        for linear, at in zip(factors, first):
+            mine = np.flatnonzero((at >= begin) & (at < end))
+            if len(mine):
+                some = linear.of(mine)
+                add_linear_factors(rest, some.keys, some.blocks, some.rhs)
+        some_keys = gtsam.Ordering()
+        for key in order[begin:end].tolist():
+            some_keys.push_back(key)
+        net, rest = rest.eliminatePartialSequential(some_keys, *function)
+        cliques += cliques_of(net, sizes, when[begin:end])
+        del net
+    return cliques
+
+
+def _first_place(linear: LinearFactors, place: Ints) -> Ints:
+    """(M,) the place in the order of each factor's variable that is eliminated first."""
+    out = np.full(len(linear.rhs), len(place))
+    for key, block in zip(linear.keys, linear.blocks):
+        if block.shape[-1]:
+            out = np.minimum(out, place[np.asarray(key)])
+    return out
 
 
 def _sizes(graph: GraphLayout) -> list[int]:
@@ -179,7 +218,7 @@ def _least_pivot(
     return float(np.min(_diagonal(cliques) ** 2 / before[np.concatenate(order)], initial=1.0))
 
 
-def _add_bonds(factor_graph: Any, graph: GraphLayout) -> None:
+def _bonds(graph: GraphLayout) -> list[LinearFactors]:
     """Empty factors between shake and bubbles where no image joins them.
 
     Their cross covariance is read from a clique that holds both, and a bubble that is unseen from
@@ -189,19 +228,18 @@ def _add_bonds(factor_graph: Any, graph: GraphLayout) -> None:
     seen = graph.row(graph.problem.observations.item, graph.problem.observations.frame)
     alone = np.setdiff1d(np.arange(graph.rows), seen)
     if not size or not len(alone):
-        return
+        return []
     keys = (graph.node_of_row[alone], graph.base().bubbles + alone)
     blocks = tuple(np.zeros((len(alone), 1, d)) for d in (size, graph.bubble.size))
-    add_linear_factors(factor_graph, keys, blocks, np.zeros((len(alone), 1)))
+    nothing = np.zeros((len(alone), 1))
+    return [LinearFactors(keys, blocks, nothing, nothing[:, 0])]
 
 
-def _ordering(graph: GraphLayout) -> tuple[Any, Ints]:
-    """Keys in time order, with their times.
+def _ordering(graph: GraphLayout) -> tuple[Ints, Ints]:
+    """Keys in the order in which they are eliminated, with their times.
 
     What ends (a bubble's mean, a mark) follows right after it was last seen; the rest is last.
     """
-    import gtsam
-
     base, problem = graph.base(), graph.problem
     nodes = np.arange(len(graph.nodes.t_s)) if graph.shake.size else np.zeros(0, np.int64)
     rows = np.arange(graph.rows)
@@ -219,10 +257,8 @@ def _ordering(graph: GraphLayout) -> tuple[Any, Ints]:
     order = np.lexsort((joined, rank, times))
     counts = graph.counts()
     rest = [base[i] + np.arange(counts[i].number * (counts[i].size > 0)) for i in (3, 4, 6)]
-    out = gtsam.Ordering()
-    for key in np.concatenate([joined[order], *rest]).tolist():
-        out.push_back(key)
-    return out, np.append(times[order], np.full(sum(map(len, rest)), len(graph.nodes.t_s)))
+    last = np.full(sum(map(len, rest)), len(graph.nodes.t_s))
+    return np.concatenate([joined[order], *rest]), np.append(times[order], last)
 
 
 @dataclass(frozen=True)
@@ -231,12 +267,14 @@ class Clique:
 
     fronts : their own keys, in the order of elimination.  separator : keys.
     root : (n, n) upper triangular R.  right : (n, m) S, columns as in the separator.
+    side : (n,) d.
     """
 
     fronts: list[int]
     separator: list[int]
     root: Array
     right: Array
+    side: Array
 
     @property
     def keys(self) -> list[int]:
@@ -260,7 +298,8 @@ def cliques_of(net: Any, sizes: Sequence[int], when: Ints) -> list[Clique]:
         if len(mine) == 1:
             # copies, since what GTSAM returns are views of memory that ends with the net
             root, right = conditionals[end].R().copy(), conditionals[end].S().copy()
-            out.append(Clique(keys[end][:1], keys[end][1:], root, right))
+            side = conditionals[end].d().copy()
+            out.append(Clique(keys[end][:1], keys[end][1:], root, right, side))
             continue
         fronts, separator = [keys[i][0] for i in mine], keys[end][1:]
         every = fronts + separator
@@ -276,7 +315,8 @@ def cliques_of(net: Any, sizes: Sequence[int], when: Ints) -> list[Clique]:
                 end = column + sizes[key]
                 both[row:below, starts[key] : starts[key] + sizes[key]] = right[:, column:end]
                 column = end
-        out.append(Clique(fronts, separator, both[:, :wide], both[:, wide:]))
+        side = np.concatenate([conditionals[i].d() for i in mine])
+        out.append(Clique(fronts, separator, both[:, :wide], both[:, wide:], side))
     return out
 
 

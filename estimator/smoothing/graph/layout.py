@@ -374,7 +374,7 @@ class GraphLayout:
 
     def shake_basis(self, node: ArrayLike) -> Array:
         """(..., D, D) basis of the increments at nodes (...)."""
-        return np.asarray(self.shake_motion.basis[_basis_index(self.shake_motion.index, node)])
+        return np.asarray(self.shake_motion.basis[self.node_basis[np.asarray(node)]])
 
     @cached_property
     def to_frames(self) -> Array | None:
@@ -395,9 +395,7 @@ class GraphLayout:
 
     def in_shake_basis(self, block: Array, node: Ints) -> Array:
         """(n, r, D) derivatives by states at nodes (n,) as those by their increments."""
-        return times_chosen(
-            block, self.shake_motion.basis, _basis_index(self.shake_motion.index, node)
-        )
+        return times_chosen(block, self.shake_motion.basis, self.node_basis[node])
 
     def in_bubble_basis(self, block: Array, row: Ints) -> Array:
         """(n, r, D) derivatives by states of bubble rows (n,) as those by their increments."""
@@ -410,14 +408,22 @@ class GraphLayout:
 
     def shake_moved(self, increments: Array) -> Array:
         """(N, D) changes of the shake's states by increments (N, D) at all nodes."""
-        which = _basis_index(self.shake_motion.index, np.arange(len(increments)))
         turned = np.swapaxes(self.shake_motion.basis, -1, -2)
-        return times_chosen(increments[:, None], turned, which)[:, 0]
+        return times_chosen(increments[:, None], turned, self.node_basis)[:, 0]
 
     def bubbles_moved(self, increments: Array) -> Array:
         """(rows, D) changes of the bubbles' states by increments (rows, D)."""
         turned = np.swapaxes(self.bubble_motion.basis, -1, -2)
         return times_chosen(increments[:, None], turned, self.row_basis)[:, 0]
+
+    @cached_property
+    def node_basis(self) -> Ints:
+        """(N,) which basis of the shake's motion each node has; the last that of the one before.
+
+        So equal steps have equal factors, which are kept once.
+        """
+        index = self.shake_motion.index
+        return np.append(index, index[-1:] if len(index) else -1).astype(np.int64)
 
     @cached_property
     def row_basis(self) -> Ints:
@@ -519,10 +525,6 @@ def clocks_of(problem: SmoothingProblem) -> Ints:
         known.setdefault((a.t_s.tobytes(), a.delay_s), len(known)) for a in problem.accelerometers
     ]
     return np.array(numbers, np.int64)
-
-
-def _basis_index(index: Ints, node: ArrayLike) -> Ints:
-    return np.asarray(np.append(index, -1)[np.asarray(node)])
 
 
 def first_guess(graph: GraphLayout) -> State:

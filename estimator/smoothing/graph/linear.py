@@ -61,12 +61,13 @@ def _shake_motion(graph: GraphLayout, state: State) -> list[LinearFactors]:
             deviation[:, at] -= graph.nominal_mm[0]
         at += component.size
     still = np.zeros((len(keys), 0))
-    after = np.append(steps.index[1:], -1)
     return [
         start_factors(
             layout.components, (keys[:1],), deviation[:1], graph.shake_basis(keys[:1]), still[:1]
         ),
-        steps.factors((keys[:-1], keys[1:]), (deviation[:-1], deviation[1:]), still[1:], after),
+        steps.factors(
+            (keys[:-1], keys[1:]), (deviation[:-1], deviation[1:]), still[1:], graph.node_basis[1:]
+        ),
     ]
 
 
@@ -129,14 +130,14 @@ def _priors(base: int, deviation: Array, sigma: ArrayLike) -> LinearFactors:
 
 @dataclass(frozen=True)
 class Seen:
-    """Predictions of images: whitened residuals (M, 2), for the robust weights."""
+    """Images as factors, without those where only the whitened residuals (M, 2) are wanted."""
 
     linear: list[LinearFactors]
     residual: Array
 
 
-def images(graph: GraphLayout, state: State, weight: Array) -> Seen:
-    """Pixels of the bubbles; weight (M,)."""
+def images(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
+    """Pixels of the bubbles; weight (M,), None for the residuals alone."""
     problem, layout = graph.problem, graph.bubble
     obs = problem.observations
     rows = graph.row(obs.item, obs.frame)
@@ -156,8 +157,8 @@ def images(graph: GraphLayout, state: State, weight: Array) -> Seen:
     return _seen(graph, state, obs, weight, graph.base().bubbles + rows, states)
 
 
-def references(graph: GraphLayout, state: State, weight: Array) -> Seen:
-    """Pixels of the marks fixed to the tank; weight (R,)."""
+def references(graph: GraphLayout, state: State, weight: Array | None) -> Seen:
+    """Pixels of the marks fixed to the tank; weight (R,), None for the residuals alone."""
     obs = graph.problem.references
 
     def states(mine: Ints) -> _Moving:
@@ -181,7 +182,7 @@ class _Moving(NamedTuple):
 
 
 def _seen(
-    graph: GraphLayout, state: State, obs: Observations, weight: Array, keys: Ints,
+    graph: GraphLayout, state: State, obs: Observations, weight: Array | None, keys: Ints,
     states: Callable[[Ints], _Moving],
 ) -> Seen:  # fmt: skip
     """``states`` returns what is seen in some of the observations; (M,) keys of its states.
@@ -202,12 +203,16 @@ def _seen(
             part = slice(first, first + _AT_ONCE)
             which = mine[part]
             found = _one_camera(graph, state, obs, c, which, at_frames, states(which))
+            residual[which] = -found.rhs
+            if weight is None:
+                continue
             root = np.sqrt(weight[which])
             blocks = blocks or [np.empty((len(mine), *b.shape[1:])) for b in found.blocks]
             for whole, block in zip(blocks, found.blocks):
                 whole[part] = block * root[:, None, None]
-            residual[which] = -found.rhs
             rhs[part], log_det[part] = found.rhs * root[:, None], found.log_det
+        if weight is None:
+            continue
         node = graph.nodes.of_frame[obs.frame[mine]]
         every = (keys[mine], node, base.constants)
         out.append(LinearFactors(every, tuple(blocks), rhs, log_det, weight[mine]))
@@ -432,6 +437,4 @@ def all_factors(
 
 def pixel_residuals(graph: GraphLayout, state: State) -> tuple[Array, Array]:
     """Whitened residuals of the bubbles' (M, 2) and of the marks' pixels (R, 2)."""
-    problem = graph.problem
-    ones = np.ones(len(problem.observations)), np.ones(len(problem.references))
-    return images(graph, state, ones[0]).residual, references(graph, state, ones[1]).residual
+    return images(graph, state, None).residual, references(graph, state, None).residual

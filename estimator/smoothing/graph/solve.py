@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.crowd import EliminatedCrowd, eliminated
+from telerig.estimator.smoothing.graph.draws import Draws, draws_of
 from telerig.estimator.smoothing.graph.elimination import Blocks, EliminatedGraph
 from telerig.estimator.smoothing.graph.layout import (
     GraphLayout,
@@ -61,12 +62,14 @@ class Options:
     covariances : whether the covariances of the states are computed.
     tolerance_px : the passes end when no bubble moved by more than this in the last one. Affine
         cameras with constants that are not estimated need only one pass.
+    draws : whether `Draws` are made, too, which costs less than afterwards (`drawn`).
     """
 
     passes: int = 6
     robust: bool = True
     covariances: bool = True
     tolerance_px: float = 0.05
+    draws: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,7 @@ class Solution:
     passes : number of linearisations that were made.
     sample_weights, sample_residuals : weights (N,) of each accelerometer's samples, None where all
         are 1, and their whitened residuals (N, k) along the k directions of modelled motion.
+    draws : None if they were not asked for.
     """
 
     graph: GraphLayout
@@ -117,6 +121,7 @@ class Solution:
     passes: int
     sample_weights: SampleWeights = ()
     sample_residuals: tuple[Array, ...] = ()
+    draws: Draws | None = None
 
     @property
     def delays_s(self) -> Array:
@@ -251,6 +256,7 @@ def _is_linear(problem: SmoothingProblem, model: ShakeModel) -> bool:
 
 @dataclass(frozen=True)
 class _Pass:
+    factors: list[LinearFactors]
     done: EliminatedGraph | EliminatedCrowd
     largest_px: float
     log_norm: float
@@ -267,7 +273,7 @@ def _linear_solve(
         raise CalibrationError("the smoother's solution is not finite", todo="check the inputs")
     largest = _largest_shift_px(graph, done.vector)
     squared = _squared(graph, factors, done.vector)
-    return _Pass(done, largest, _log_norm(graph, factors), squared)
+    return _Pass(factors, done, largest, _log_norm(graph, factors), squared)
 
 
 def _squared(graph: GraphLayout, factors: list[LinearFactors], vector: Array) -> float:
@@ -288,7 +294,7 @@ def _squared(graph: GraphLayout, factors: list[LinearFactors], vector: Array) ->
 def _log_norm(graph: GraphLayout, factors: list[LinearFactors]) -> float:
     """log of the joint density's normalisation, the change to whitening bases included."""
     shake, bubble = graph.shake_motion, graph.bubble_motion
-    of_nodes = np.linalg.slogdet(shake.basis)[1][np.append(shake.index, -1)]
+    of_nodes = np.linalg.slogdet(shake.basis)[1][graph.node_basis]
     of_rows = np.linalg.slogdet(bubble.basis)[1][graph.row_basis]
     return float(of_nodes.sum() + of_rows.sum()) + sum(f.log_norm() for f in factors)
 
@@ -319,33 +325,57 @@ def _finish(
     dimension = sum(n * d for n, d in graph.counts())
     evidence = last.log_norm - last.squared / 2 + dimension / 2 * np.log(2 * np.pi)
     evidence -= last.done.log_det()
+    draws = draws_of(graph, last.factors, last.done) if options.draws else None
+    last.factors.clear()
     found = None
     if options.covariances:
         progress("covariances", 0.0)
         found = _covariances(graph, last.done.blocks())
     progress("smoothing", 1.0)
-    return Solution(graph, state, found, *fitted, float(evidence), done)
+    return Solution(graph, state, found, *fitted, float(evidence), done, draws=draws)
+
+
+def drawn(solution: Solution, draws: int | None = None) -> Draws:
+    """Return draws at a solution: those that it has, or by one more elimination.
+
+    draws : their number; None for as many as `draws_of` makes.
+    """
+    if solution.draws is not None and draws is None:
+        return solution.draws
+    graph, samples = solution.graph, solution.sample_weights or None
+    factors = all_factors(graph, solution.state, solution.weights, samples)
+    return in_large_stack(lambda: draws_of(graph, factors, eliminated(graph, factors), draws))
 
 
 def _covariances(graph: GraphLayout, blocks: Blocks) -> Covariances:
     """Marginals in physical units."""
-    own, rows = blocks.own, np.arange(graph.rows)
-    shake_basis = graph.shake_basis(graph.nodes.of_frame)
-    if graph.to_frames is not None:
-        shake_basis = graph.to_frames @ shake_basis
-    shake = shake_basis @ own[0] @ np.swapaxes(shake_basis, -1, -2)
-    bubbles = own[1]
-    for first in range(0, graph.rows, _AT_ONCE):
-        mine = rows[first : first + _AT_ONCE]
+    own, row = blocks.own, blocks.cross_row
+    shake, bubbles, cross = own[0], own[1], np.empty_like(blocks.cross)
+    for mine in _parts(len(shake)):
+        basis = _frame_basis(graph, mine)
+        shake[mine] = basis @ shake[mine] @ np.swapaxes(basis, -1, -2)
+    for mine in _parts(graph.rows):
         half = np.swapaxes(graph.out_of_bubble_basis(bubbles[mine], mine), -1, -2)
         bubbles[mine] = graph.out_of_bubble_basis(half, mine)
-    row = blocks.cross_row
-    cross = graph.out_of_bubble_basis(shake_basis[graph.frame_of_row[row]] @ blocks.cross, row)
+    for mine in _parts(len(row)):
+        block = _frame_basis(graph, graph.frame_of_row[row[mine]]) @ blocks.cross[mine]
+        cross[mine] = graph.out_of_bubble_basis(block, row[mine])
     encoder = graph.encoder_size
     return Covariances(
         shake, bubbles, cross, blocks.cross_of_row, own[2], own[3], own[4][0, :encoder, :encoder],
         own[4][0, encoder:, encoder:], *own[5:],
     )  # fmt: skip
+
+
+def _parts(count: int) -> list[Ints]:
+    """Some thousand numbers at a time, since what is worked out on the way takes memory."""
+    return [np.arange(i, min(i + _AT_ONCE, count)) for i in range(0, count, _AT_ONCE)]
+
+
+def _frame_basis(graph: GraphLayout, frame: Ints) -> Array:
+    """(n, D, D) from the increments of the shake at its nodes to its states at frames (n,)."""
+    basis = graph.shake_basis(graph.nodes.of_frame[frame])
+    return basis if graph.to_frames is None else graph.to_frames[frame] @ basis
 
 
 class Truncation:

@@ -322,23 +322,25 @@ def _noise_factor(solution: Solution) -> float:
 def leverages(solution: Solution) -> list[tuple[Ints, Array]]:
     """By camera: some of the bubbles' pixels (m,), var(prediction) / var(noise) of each (m, 2)."""
     graph, found = solution.graph, solution.covariances
-    if found is None or not graph.rows:
-        return []
     observed = graph.problem.observations
+    if found is None or not len(observed):
+        return []
+    every = [np.flatnonzero(observed.camera == camera) for camera in np.unique(observed.camera)]
+    chosen = [m[np.linspace(0, len(m) - 1, min(len(m), _SAMPLED)).astype(int)] for m in every]
+    few = replace(graph.problem, observations=observed.of(np.concatenate(chosen)))
+    weight = np.ones(len(few.observations))
+    linear = images(replace(graph, problem=few), solution.state, weight).linear
     out = []
-    linear = images(graph, solution.state, np.ones(len(observed))).linear
-    for camera, part in zip(np.unique(observed.camera), linear, strict=True):
+    for some, part in zip(chosen, linear, strict=True):
         row, node = np.asarray(part.keys[0]) - graph.base().bubbles, np.asarray(part.keys[1])
-        some = np.linspace(0, len(row) - 1, min(len(row), _SAMPLED)).astype(int)
-        row, node = row[some], node[some]
         at = graph.frame_of_row[row]
-        by_bubble = part.blocks[0][some] @ np.linalg.inv(graph.bubble_basis(row))
-        by_shake = part.blocks[1][some] @ np.linalg.inv(graph.shake_basis(node))
+        by_bubble = part.blocks[0] @ np.linalg.inv(graph.bubble_basis(row))
+        by_shake = part.blocks[1] @ np.linalg.inv(graph.shake_basis(node))
         if graph.to_frames is not None:
             by_shake = by_shake @ np.linalg.inv(graph.to_frames[at])
         both = by_shake @ found.cross[found.cross_of_row[row]]
         leverage = (by_bubble @ found.bubbles[row] * by_bubble).sum(-1)
         leverage += (by_shake @ found.shake[at] * by_shake).sum(-1)
         leverage += 2 * (both * by_bubble).sum(-1)
-        out.append((np.flatnonzero(observed.camera == camera)[some], leverage))
+        out.append((some, leverage))
     return out

@@ -1,6 +1,6 @@
 """Do the measurements of a run disagree? Then no standard deviation of its result can be right.
 
-Residuals are compared with those that a right model would leave (`graph.whole_fit`), by source,
+Residuals are compared with those that a right model would leave (`graph.draws`), by source,
 axis and window of time; constants with their priors; the bubbles' speed with what is possible.
 Where something is off, the run is solved again without each source in turn: the source whose
 absence removes the contradiction is named, and the distance of the two results widens the bands.
@@ -17,11 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array
 from telerig.errors import CalibrationError
-from telerig.estimator.smoothing.graph.solve import Options, Solution, solve
+from telerig.estimator.smoothing.graph.draws import Draws
+from telerig.estimator.smoothing.graph.linear import encoder
+from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
-from telerig.estimator.smoothing.graph.whole_fit import WholeFit, drawn
 from telerig.estimator.smoothing.learning.default_priors import default_model
 from telerig.estimator.smoothing.problem.problem import Observations, SmoothingProblem
 from telerig.io.results.smoothing import AXES, Contradiction, Disagreement
@@ -48,12 +49,9 @@ class Contradictions:
     inflation: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-def contradictions(solution: Solution, fit: WholeFit, left: Array) -> Contradictions:
-    """Return what disagrees in a solved run.
-
-    fit : at the solution.  left : (rows, K) residuals that a right model leaves, K draws.
-    """
-    found = list(_of_one(solution, fit, left))
+def contradictions(solution: Solution, draws: Draws) -> Contradictions:
+    """Return what disagrees in a solved run.  draws : at the solution."""
+    found = list(_of_one(solution, draws))
     if not found:
         return Contradictions()
     factor = max(1.0, *(f.statistic for f in found))
@@ -66,11 +64,11 @@ def contradictions(solution: Solution, fit: WholeFit, left: Array) -> Contradict
     return Contradictions(tuple(dict.fromkeys(order)), inflation)
 
 
-def _of_one(solution: Solution, fit: WholeFit, left: Array) -> Iterator[Contradiction]:
+def _of_one(solution: Solution, draws: Draws) -> Iterator[Contradiction]:
     yield from _outliers(solution)
     yield from _constants(solution)
     yield from _speeds(solution)
-    yield from residual_contradictions(solution, fit, left)
+    yield from residual_contradictions(solution, draws)
 
 
 def _outliers(solution: Solution) -> Iterator[Contradiction]:
@@ -159,19 +157,17 @@ class Group:
     expected: Array
 
 
-def residual_contradictions(
-    solution: Solution, fit: WholeFit, left: Array
-) -> Iterator[Contradiction]:
+def residual_contradictions(solution: Solution, draws: Draws) -> Iterator[Contradiction]:
     """Return the sources whose residuals are larger than a right model leaves them, and larger
     than the noise itself.
 
     The second keeps short runs, whose fit takes up most of the noise, from false alarms where the
     noise is not quite as stated.
     """
-    for group in groups(solution, fit, left):
-        seen, draws = float(group.square.sum()), group.expected.shape[-1]
-        expected = float(group.expected.sum() / draws)
-        spread = np.sqrt(2 * expected * (1 + 1 / draws))
+    for group in groups(solution, draws):
+        seen, number = float(group.square.sum()), group.expected.shape[-1]
+        expected = float(group.expected.sum() / number)
+        spread = np.sqrt(2 * expected * (1 + 1 / number))
         sure = seen > expected + _SURE * spread and seen > _RATIO * expected
         count = len(group.square)
         sure &= seen > count + _BEYOND_NOISE * np.sqrt(2 * count)
@@ -197,40 +193,29 @@ def _when(solution: Solution, group: Group) -> tuple[float, float]:
     return float(t[0] + width * which[0]), float(end)
 
 
-def groups(solution: Solution, fit: WholeFit, left: Array) -> list[Group]:
+def groups(solution: Solution, draws: Draws) -> list[Group]:
     """Return the tested residuals: pixels of bubbles and marks by axis, and the encoder's."""
     graph, problem = solution.graph, solution.graph.problem
-    base = graph.base()
-    cameras = {
-        BUBBLES: iter(np.unique(problem.observations.camera).tolist()),
-        MARKS: iter(np.unique(problem.references.camera).tolist()),
-    }
     parts: dict[tuple[str, str], list[tuple[Array, Array, Array]]] = {}
-    for number, linear in enumerate(fit.factors):
-        drawn = fit.of_group(left, number)
-        key = int(np.min(linear.keys[0])) if len(linear.rhs) else -1
-        of_bubbles = base.bubbles <= key < base.means
-        if linear.weight is not None and (of_bubbles or base.marks <= key < base.clocks):
-            source = BUBBLES if of_bubbles else MARKS
-            obs = problem.observations if of_bubbles else problem.references
-            camera = next(cameras[source])
-            t = problem.t_s[_frames(obs, camera)]
+    for source, obs, residual, weight, expected in (
+        (BUBBLES, problem.observations, solution.residuals[0], solution.weights[0], draws.pixels),
+        (MARKS, problem.references, solution.residuals[1], solution.weights[1], draws.marks),
+    ):
+        for camera in np.unique(obs.camera).tolist():
+            mine = obs.camera == camera
+            t, square = problem.t_s[obs.frame[mine]], residual[mine] ** 2 * weight[mine, None]
             for row in range(2):
                 direction = problem.cameras[camera].camera_from_rig.rotation[row]
                 axis = AXES[int(np.abs(direction).argmax())]
-                mine = (t, linear.rhs[:, row] ** 2, drawn[:, row] ** 2)
-                parts.setdefault((source, axis), []).append(mine)
-        elif linear.rhs.shape[1] == 1 and len(linear.keys) == 2:
-            t = graph.nodes.t_s[np.asarray(linear.keys[0])]
-            parts[ENCODER, ""] = [(t, linear.rhs[:, 0] ** 2, drawn[:, 0] ** 2)]
+                both = (t, square[:, row], expected[mine, row] ** 2)
+                parts.setdefault((source, axis), []).append(both)
+    for linear in encoder(graph, solution.state):
+        t = graph.nodes.t_s[np.asarray(linear.keys[0])]
+        parts[ENCODER, ""] = [(t, linear.rhs[:, 0] ** 2, draws.encoder**2)]
     return [
         Group(source, axis, *(np.concatenate(p) for p in zip(*mine)))
         for (source, axis), mine in parts.items()
     ]
-
-
-def _frames(obs: Observations, camera: int) -> Ints:
-    return np.asarray(obs.frame[obs.camera == camera])
 
 
 def _without(problem: SmoothingProblem) -> Iterator[tuple[tuple[str, ...], SmoothingProblem]]:
@@ -260,7 +245,7 @@ def _blamed(
             bubble=solution.graph.model.bubble,
         )
         try:
-            other = solve(rest, model, Options())
+            other = solve(rest, model, Options(draws=True))
         except CalibrationError:
             continue
         off = sum(f.statistic for f in [*_outliers(other), *_constants(other), *_misfit(other)])
@@ -272,8 +257,7 @@ def _blamed(
 
 
 def _misfit(solution: Solution) -> list[Contradiction]:
-    fit, _, left = drawn(solution)
-    return list(residual_contradictions(solution, fit, left))
+    return list(residual_contradictions(solution, drawn(solution)))
 
 
 def _named(one: Contradiction, blamed: tuple[str, ...]) -> Contradiction:

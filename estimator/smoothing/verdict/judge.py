@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from telerig.estimator.smoothing.graph.solve import Solution
-from telerig.estimator.smoothing.graph.whole_fit import drawn
+from telerig.estimator.smoothing.graph.solve import Solution, drawn
 from telerig.estimator.smoothing.problem.problem import ShakeModel, SmoothingProblem
 from telerig.estimator.smoothing.verdict.contradiction import contradictions
 from telerig.estimator.smoothing.verdict.identifiability import (
@@ -43,8 +42,8 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
     """
     if solution.covariances is None:
         return {}
-    fit, errors, left = drawn(solution)
-    disagree = contradictions(solution, fit, left)
+    draws = drawn(solution)
+    disagree = contradictions(solution, draws)
     found = verdicts(solution) if problem.bubbles else {}
     modes = [_mode_json(mode) for mode in shake_modes(solution)]
     out: dict[str, Any] = {"modes": modes}
@@ -61,7 +60,7 @@ def judge(problem: SmoothingProblem, model: ShakeModel, solution: Solution) -> d
         name: _widened(axis, factor)
         for (name, axis), factor in zip(found.items(), disagree.inflation)
     }
-    usable = [use.content() for use in uses(solution, fit, errors, disagree.inflation)]
+    usable = [use.content() for use in uses(solution, draws, disagree.inflation)]
     vertical = AXES[int(np.abs(problem.up).argmax())]
     axes = {name: _with_words(name, axis, vertical) for name, axis in found.items()}
     worst = max((a.verdict for a in found.values()), key=list(Verdict).index)

@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from telerig.arrays import Array, Bools
+from telerig.estimator.smoothing.graph.draws import DRAWS, Draws
 from telerig.estimator.smoothing.graph.solve import Solution
 from telerig.estimator.smoothing.graph.stage_travel import considered_variance
-from telerig.estimator.smoothing.graph.whole_fit import DRAWS, WholeFit
 from telerig.io.results.smoothing import AXES, Grade, Quantity, Use
 
 GOOD, LIMITED = 10.0, 3.0
@@ -27,11 +27,11 @@ _LEAST_SHARE = 0.3
 
 
 def uses(
-    solution: Solution, fit: WholeFit, errors: Array, inflation: Sequence[float] = (1.0, 1.0, 1.0)
+    solution: Solution, draws: Draws, inflation: Sequence[float] = (1.0, 1.0, 1.0)
 ) -> list[Use]:
     """Return what a solved run is good for, axis by axis; [] without bubbles or covariances.
 
-    fit, errors : at the solution, with (D, K) draws of the errors of its estimates.
+    draws : at the solution.
     inflation : (3,) factor of the standard deviations along each axis where measurements disagree.
         Then nothing is called better than limited.
     """
@@ -39,13 +39,14 @@ def uses(
     if solution.covariances is None or not graph.rows:
         return []
     lengths = np.diff(graph.first_row)
-    most = _MOST_BUBBLES * max(1, DRAWS // errors.shape[-1])
+    most = _MOST_BUBBLES * max(1, DRAWS // draws.errors.shape[-1])
     chosen = np.argsort(-lengths, kind="stable")[:most]
     chosen = chosen[lengths[chosen] >= _LEAST_FRAMES]
     if not len(chosen):
         return []
     widen = np.asarray(inflation)
-    paths = [_Path(solution, fit, errors, int(bubble), widen) for bubble in chosen]
+    errors = draws.of_family(graph, 1)
+    paths = [_Path(solution, errors, int(bubble), widen) for bubble in chosen]
     best = Grade.LIMITED if np.any(widen > 1) else Grade.GOOD
     out = []
     for axis in range(3):
@@ -59,15 +60,14 @@ def uses(
 class _Path:
     """One bubble: times (n,), positions and velocities (n, 3), and K draws of their errors."""
 
-    def __init__(
-        self, solution: Solution, fit: WholeFit, errors: Array, bubble: int, widen: Array
-    ) -> None:
+    def __init__(self, solution: Solution, errors: Array, bubble: int, widen: Array) -> None:
+        """errors : (rows, d, K) draws of all bubbles' increments."""
         graph, found = solution.graph, solution.covariances
         assert found is not None
         rows = np.arange(graph.first_row[bubble], graph.first_row[bubble + 1])
         states = solution.state.bubbles[rows]
         self.t_s = graph.problem.t_s[graph.frame_of_row[rows]]
-        drawn = graph.bubble_basis(rows) @ fit.increments(errors, 1)[rows]
+        drawn = graph.bubble_basis(rows) @ errors[rows]
         both = []
         self.values, self.sd = [], []
         for row, more in zip(

@@ -10,8 +10,13 @@ from shake_learning_data import run, true_model
 
 from telerig.errors import CalibrationError
 from telerig.estimator.smoothing.graph.layout import GraphLayout, State
-from telerig.estimator.smoothing.graph.solve import Options, Solution, _check_converged, solve
-from telerig.estimator.smoothing.graph.whole_fit import drawn
+from telerig.estimator.smoothing.graph.solve import (
+    Options,
+    Solution,
+    _check_converged,
+    drawn,
+    solve,
+)
 from telerig.estimator.smoothing.learning.default_priors import leverages
 from telerig.estimator.smoothing.problem.problem import (
     Accelerometer,
@@ -41,8 +46,7 @@ def late_marks(problem: SmoothingProblem) -> SmoothingProblem:
 
 
 def found_in(solution: Solution) -> tuple[Contradiction, ...]:
-    fit, _, left = drawn(solution)
-    return contradictions(solution, fit, left).found
+    return contradictions(solution, drawn(solution)).found
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -108,13 +112,12 @@ def test_bubbles_that_do_not_rise_are_a_warning(rise: float, word: str) -> None:
 
 def test_residuals_that_a_right_model_leaves_have_one_minus_the_leverage_as_variance() -> None:
     solution = solve(marked(5), true_model(), Options(robust=False))
-    fit, errors, left = drawn(solution, draws=300)
-    pixels = [n for n, f in enumerate(fit.factors) if f.weight is not None][:2]
-    for number, (which, leverage) in zip(pixels, leverages(solution)):
-        variance = (fit.of_group(left, number) ** 2).mean(-1)
-        assert len(which) == len(variance)
+    draws = drawn(solution, draws=300)
+    for which, leverage in leverages(solution):
+        variance = (draws.pixels[which] ** 2).mean(-1)
         assert np.median(variance / (1 - leverage)) == pytest.approx(1, abs=0.03)
-    states = solution.graph.bubble_basis(np.arange(solution.graph.rows)) @ fit.increments(errors, 1)
+    basis = solution.graph.bubble_basis(np.arange(solution.graph.rows))
+    states = basis @ draws.of_family(solution.graph, 1)
     position = np.einsum("id,ndk->nik", solution.graph.bubble.position, states)
     assert solution.covariances is not None
     row = solution.graph.bubble.position

@@ -9,34 +9,13 @@ import pytest
 import shake_problem
 from numpy.typing import NDArray
 from shake_cases import SCENARIOS, generate
-from shake_learning_data import run, true_model
+from shake_learning_data import run, true_model, with_comings_and_goings
 
 from telerig.estimator.smoothing.graph import crowd
-from telerig.estimator.smoothing.graph.solve import Solution, solve
-from telerig.estimator.smoothing.graph.whole_fit import drawn
+from telerig.estimator.smoothing.graph.solve import Options, Solution, drawn, solve
 from telerig.estimator.smoothing.problem.problem import Bubble, ShakeModel, SmoothingProblem
 
 Array = NDArray[np.float64]
-
-
-def _with_comings_and_goings(
-    problem: SmoothingProblem, rng: np.random.Generator, frames: int
-) -> SmoothingProblem:
-    """The problem, each track cut into several with a gap of a frame between them."""
-    bubbles: list[Bubble] = []
-    item = np.full(len(problem.observations), -1)
-    seen, last = problem.observations, len(problem.t_s)
-    for bubble in problem.bubbles:
-        first = 0
-        while first < last - 3:
-            end = min(last, first + int(frames * rng.uniform(0.5, 1.5)))
-            inside = (seen.frame >= first) & (seen.frame < end) & (seen.item == bubble.particle)
-            item[inside] = len(bubbles)
-            guess = bubble.guess_mm[first:end]
-            bubbles.append(Bubble(len(bubbles), first, end - 1, guess[0], guess))
-            first = end + 1
-    kept = replace(seen, item=item).of(item >= 0)
-    return replace(problem, bubbles=tuple(bubbles), observations=kept)
 
 
 def _both(
@@ -98,7 +77,7 @@ def test_where_bubbles_come_and_go_the_estimates_are_those_of_the_joint_graph(
 ) -> None:
     rng = np.random.default_rng(2)
     problem, *_ = run(rng, bubbles=20, seconds=0.4, kept=0.9)
-    cut = _with_comings_and_goings(problem, rng, 40)
+    cut = with_comings_and_goings(problem, rng, 40)
     assert len(cut.bubbles) > 30
     joint, found = _both(cut, true_model(), monkeypatch)
     _compare(joint, found, 0.06)
@@ -148,10 +127,14 @@ def test_sensors_and_marks_join_the_crowd(
 def test_draws_of_a_crowds_errors_have_the_spread_that_it_states() -> None:
     rng = np.random.default_rng(4)
     problem, *_ = run(rng, bubbles=crowd.MOST_JOINT + 4, seconds=0.3)
-    found = solve(_with_comings_and_goings(problem, rng, 40), true_model())
-    fit, errors, left = drawn(found)
+    cut = with_comings_and_goings(problem, rng, 40)
+    found = solve(cut, true_model(), Options(draws=True))
+    draws, anew = found.draws, drawn(replace(found, draws=None))
+    assert draws is not None
+    assert drawn(found) is draws
     assert crowd.most_in_sight(found.graph) > crowd.MOST_JOINT
     rows = found.graph.bubble.position
-    each = found.graph.bubbles_moved(fit.increments(errors, 1)[..., 0]) @ rows.T
+    each = found.graph.bubbles_moved(draws.of_family(found.graph, 1)[..., 0]) @ rows.T
     assert 0.7 < np.sqrt(np.mean((each / _sigma(found, rows)) ** 2)) < 1.3
-    assert left.shape == (fit.rows, errors.shape[1])
+    np.testing.assert_allclose(anew.errors, draws.errors, atol=1e-4 * np.abs(draws.errors).max())
+    np.testing.assert_allclose(anew.pixels, draws.pixels, atol=0.02)

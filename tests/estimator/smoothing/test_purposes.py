@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from shake_learning_data import SWING_HZ, run, true_model
 
-from telerig.estimator.smoothing.graph.solve import Options, solve
-from telerig.estimator.smoothing.graph.whole_fit import drawn
+from telerig.estimator.smoothing.graph.solve import Options, drawn, solve
 from telerig.estimator.smoothing.verdict.purposes import grade_of, uses
 from telerig.io.results.smoothing import Grade, Quantity
 
@@ -24,8 +23,7 @@ def test_an_unresolved_run_is_still_good_for_its_zigzag_and_mean_velocity() -> N
     for seed in range(6):
         problem, lab, _ = run(np.random.default_rng(seed), seconds=1.5)
         solution = solve(problem, true_model(), Options(robust=False))
-        fit, drawn_errors, _ = drawn(solution)
-        found = {(u.quantity, u.axis): u for u in uses(solution, fit, drawn_errors)}
+        found = {(u.quantity, u.axis): u for u in uses(solution, drawn(solution))}
         swing = found[Quantity.ZIGZAG_FREQUENCY, "x"]
         assert swing.value == pytest.approx(SWING_HZ, abs=0.8)
         assert swing.grade == Grade.GOOD
@@ -40,8 +38,8 @@ def test_an_unresolved_run_is_still_good_for_its_zigzag_and_mean_velocity() -> N
 def test_nothing_is_good_where_measurements_disagree() -> None:
     problem, _, _ = run(np.random.default_rng(0))
     solution = solve(problem, true_model(), Options(robust=False))
-    fit, errors, _ = drawn(solution)
-    plain, wide = uses(solution, fit, errors), uses(solution, fit, errors, (2.0, 2.0, 2.0))
+    draws = drawn(solution)
+    plain, wide = uses(solution, draws), uses(solution, draws, (2.0, 2.0, 2.0))
     assert Grade.GOOD in {u.grade for u in plain}
     assert Grade.GOOD not in {u.grade for u in wide}
     for a, b in zip(plain, wide):

@@ -1,0 +1,105 @@
+"""Draws of a fit: the errors of its estimates, and the residuals that a right model leaves.
+
+With A the whitened factors, H = A (A^T A)^-1 A^T. For e ~ N(0, I) a right model leaves (I - H) e as
+residuals, and (A^T A)^-1 A^T e is the error of its estimates: draws of both show what is to be
+expected, correlation in time included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+from telerig.arrays import Array
+from telerig.estimator.smoothing.graph.crowd import EliminatedCrowd
+from telerig.estimator.smoothing.graph.elimination import EliminatedGraph, starts_of
+from telerig.estimator.smoothing.graph.layout import GraphLayout
+from telerig.estimator.smoothing.problem.problem import Observations
+from telerig.factors.linear_factors import LinearFactors, product, transposed_product
+
+DRAWS = 16
+_FEWEST_DRAWS, _DRAWN_ROWS = 2, 320_000
+"""Of a long run with many bubbles fewer draws do: what is compared are means over all states."""
+_REFINEMENTS = 1
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Hold K draws of what a right model leads to.
+
+    errors : (D, K) of the increments, keys in their order.
+    pixels, marks : (M, 2, K) and (R, 2, K) whitened residuals of the bubbles' and the marks'
+        pixels, with the roots of their weights.
+    encoder : (E, K) of the encoder's readings.
+    """
+
+    errors: Array
+    pixels: Array
+    marks: Array
+    encoder: Array
+
+    def of_family(self, graph: GraphLayout, family: int) -> Array:
+        """Return the errors (n, d, K) of a family of keys."""
+        counts = graph.counts()
+        first = sum(n * d for n, d in counts[:family])
+        number, size = counts[family]
+        return self.errors[first : first + number * size].reshape(number, size, -1)
+
+
+def draws_of(
+    graph: GraphLayout, factors: Sequence[LinearFactors], root: EliminatedGraph | EliminatedCrowd,
+    draws: int | None = None, seed: int = 0,
+) -> Draws:  # fmt: skip
+    """Return draws for the factors of a graph and the root of their information.
+
+    draws : their number; None for `DRAWS`, or fewer for a graph with many states.
+    """
+    draws = draws or int(np.clip(_DRAWN_ROWS // (graph.rows or 1), _FEWEST_DRAWS, DRAWS))
+    # of many states one draw after the other takes less memory
+    at_once = draws if graph.rows < _DRAWN_ROWS // DRAWS else 1
+    rng, parts = np.random.default_rng(seed), list[Draws]()
+    for done in range(0, draws, at_once):
+        parts.append(_drawn(graph, factors, root, min(at_once, draws - done), rng))
+    each = zip(*((p.errors, p.pixels, p.marks, p.encoder) for p in parts))
+    return Draws(*(np.concatenate(some, -1) for some in each))
+
+
+def _drawn(
+    graph: GraphLayout, factors: Sequence[LinearFactors], root: EliminatedGraph | EliminatedCrowd,
+    count: int, rng: Generator,
+) -> Draws:  # fmt: skip
+    """The root is refined, because A^T A alone has too few digits."""
+    noise = [rng.standard_normal((*f.rhs.shape, count)) for f in factors]
+    starts = starts_of(graph)
+    errors, left = np.zeros((int(starts[-1]), count)), noise
+    for _ in range(1 + _REFINEMENTS):
+        errors += root.solved(transposed_product(factors, starts, left))
+        fitted = product(factors, starts, errors)
+        left = [np.subtract(whole, part, out=part) for whole, part in zip(noise, fitted)]
+    base, problem = graph.base(), graph.problem
+    pixels, marks, readings = [], [], np.zeros((0, count))
+    for linear, rest in zip(factors, left):
+        key = int(np.min(linear.keys[0])) if len(linear.rhs) else -1
+        if linear.weight is not None and base.bubbles <= key < base.means:
+            pixels.append(rest)
+        elif linear.weight is not None and base.marks <= key < base.clocks:
+            marks.append(rest)
+        elif linear.rhs.shape[1] == 1 and len(linear.keys) == 2:
+            readings = rest[:, 0]
+    return Draws(
+        errors, _by_camera(problem.observations, pixels), _by_camera(problem.references, marks),
+        readings,
+    )  # fmt: skip
+
+
+def _by_camera(obs: Observations, parts: Sequence[Array]) -> Array:
+    """(M, 2, K) of all pixels from those of each camera that has some."""
+    if not parts:
+        return np.zeros((0, 2, 0))
+    out = np.empty((len(obs), *parts[0].shape[1:]))
+    for camera, part in zip(np.unique(obs.camera), parts, strict=True):
+        out[obs.camera == camera] = part
+    return out

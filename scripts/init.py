@@ -18,7 +18,7 @@ def init(
     cameras: Annotated[
         str,
         typer.Option(
-            help="Names of the two to four cameras. The first one's frame is the rig frame."
+            help="Names of the one to four cameras. The first one's frame is the rig frame."
         ),
     ] = "left,right",
     size: Annotated[str, typer.Option(help="Width x height of the images in pixels.")] = "512x512",
@@ -29,32 +29,51 @@ def init(
         float,
         typer.Option(help="Angle from each camera's optical axis to the next one's, in degrees."),
     ] = 90.0,
+    from_images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of images of the target, or of one such folder for each camera, from "
+            "which rig.toml gets the cameras and the target."
+        ),
+    ] = None,
+    pitch: Annotated[
+        float | None,
+        typer.Option(help="With --from-images: distance of neighbouring dots in mm [by --scale]."),
+    ] = None,
 ) -> None:
     """Make the folders of a dataset and a commented rig.toml.
 
     Files that exist are not changed. Then edit rig.toml, put the views of the target into
-    calibration/CAMERA/, and run `telerig doctor DATASET`.
+    calibration/CAMERA/, and run `telerig doctor DATASET`. With --from-images the target's rows,
+    columns, marks and polarity and the image sizes are those that the images show.
 
     Exit code 0: made. 2: there is a rig.toml already, or a value is impossible.
     """
-    from telerig.io.dataset.new_dataset import new_dataset
-    from telerig.io.rig_file.description import MOST_CAMERAS
+    from telerig.io.dataset.new_dataset import PRACTICE_TARGET, NewCamera, new_dataset
 
-    names = options.split_names(cameras) or []
-    if not 2 <= len(names) <= MOST_CAMERAS:
-        todo = f"give two to {MOST_CAMERAS} names, like left,right"
-        raise InputError(f"--cameras {cameras}", todo=todo)
-    todo = "give width x height, like 1280x800"
-    width, height = options.numbers_of("--size", size, 2, "x", todo)
-    if not (width.is_integer() and height.is_integer()):
-        raise InputError(f"--size {size}", todo=todo)
-    made = new_dataset(
-        dataset, cameras=names, image_size_px=(int(width), int(height)),
-        scale_px_per_mm=scale, angle_deg=angle,
-    )  # fmt: skip
+    if from_images is not None:
+        from telerig.estimator.dots.target_from_images import target_from_images
+
+        seen = target_from_images(from_images, pitch_mm=pitch, scale_px_per_mm=scale)
+        rig = [NewCamera(*camera) for camera in seen.cameras]
+        made = new_dataset(dataset, rig, angle_deg=angle, target=seen.lines)
+        for words in seen.words:
+            say(words)
+        missing = "the angles between the cameras" if len(rig) > 1 else "the cameras"
+        if pitch is None:
+            missing = f"pitch_mm, which stands for {seen.pitch_px:.1f} px, and {missing}"
+    else:
+        names = options.split_names(cameras) or []
+        todo = "give width x height, like 1280x800"
+        width, height = options.numbers_of("--size", size, 2, "x", todo)
+        if not (width.is_integer() and height.is_integer()):
+            raise InputError(f"--size {size}", todo=todo)
+        rig = [NewCamera(name, (int(width), int(height)), scale) for name in names]
+        made = new_dataset(dataset, rig, angle_deg=angle, target=PRACTICE_TARGET)
+        missing = "the target and its size, the cameras"
     for path in made:
         say(f"made: {path}")
-    say(f"next: edit {made[0]} (the target and its size, the cameras)")
+    say(f"next: edit {made[0]} ({missing})")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from telerig.estimator.dots.fit.blurred_ellipse import (
     shape_from_axes,
 )
 from telerig.estimator.dots.grid.numbering import Numbering, check_handedness, number_dots
+from telerig.estimator.dots.grid.seen_target import contradiction, seen_target
 from telerig.estimator.dots.locate import REJECTED, DotMeasurement, measure_dots
 from telerig.io.dataset.dataset import Dataset, View
 from telerig.io.machine.parallel import cores, ordered_map, quick_workers
@@ -59,10 +60,37 @@ def detect_target(image: NDArray[Any], target: Target) -> pd.DataFrame:
     Raises DetectionError if the target is not found or its numbers are ambiguous, and InputError
     if ``image`` is no grey image.
     """
-    found = numbered(measure_dots(image, polarity=target.polarity), target)
-    if found.numbering.ambiguous:
-        raise ambiguous_numbering(found.numbering, target)
-    return found.table
+    measured = measure_dots(image, polarity=target.polarity)
+    return _clearly_numbered(measured, target, image.shape).table
+
+
+def _clearly_numbered(
+    measured: DotMeasurement, target: Target, image_shape: tuple[int, ...]
+) -> TargetDetection:
+    """Number the target's dots. Raises DetectionError, also for ambiguous numbers, and says where
+    the marks are seen if `rig.toml` has them elsewhere.
+    """
+    try:
+        found = numbered(measured, target)
+        if found.numbering.ambiguous:
+            raise ambiguous_numbering(found.numbering, target)
+    except DetectionError as error:
+        words = _described_otherwise(measured, target, image_shape)
+        if words:
+            raise DetectionError(error.what, todo=words) from error
+        raise
+    return found
+
+
+def _described_otherwise(
+    measured: DotMeasurement, target: Target, image_shape: tuple[int, ...]
+) -> str:
+    if target.layout != "grid" or not len(measured.dots):
+        return ""
+    try:
+        return contradiction(seen_target(measured.dots, image_shape), target)
+    except DetectionError:
+        return ""
 
 
 def numbered(measured: DotMeasurement, target: Target) -> TargetDetection:
@@ -332,9 +360,7 @@ def _numbered_image(dataset: Dataset, image: NDArray[Any], view: View, camera: s
         where = str(view.image_paths[camera])
         raise InputError(error.what, where=where, todo=error.todo) from error
     try:
-        found = numbered(measured, target)
-        if found.numbering.ambiguous:
-            raise ambiguous_numbering(found.numbering, target)
+        found = _clearly_numbered(measured, target, image.shape)
     except DetectionError as error:
         words = f"{error.what}" + (f" ({error.todo})" if error.todo else "")
         rejected = rejected_table(measured, slice(None), error.what)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from telerig.errors import InputError
 from telerig.estimator.doctor import checks as doctor
 from telerig.estimator.doctor.checks import check_dataset, check_installation, check_ports
-from telerig.io.dataset.new_dataset import new_dataset
+from telerig.io.dataset.new_dataset import NewCamera, new_dataset
 from telerig.io.rig_file.rig_file import read_rig_toml
 from telerig.io.simulation.presets import run_preset
 from telerig.io.simulation.simulate import simulate
@@ -106,7 +106,7 @@ def test_init_never_writes_over_a_rig_file(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--cameras", "left"], "give two to 4 names"),
+        (["--cameras", "a,b,c,d,e"], "name one to 4"),
         (["--cameras", "left,left"], "two cameras have one name"),
         (["--cameras", "left,carriage"], "'carriage'"),
         (["--size", "512"], "give width x height"),
@@ -217,7 +217,7 @@ def test_what_a_killed_command_left_is_named(tmp_path):
 
 
 def test_images_of_the_wrong_size_are_found(tmp_path):
-    new_dataset(tmp_path / "tank", image_size_px=(64, 48))
+    new_dataset(tmp_path / "tank", [NewCamera(n, (64, 48)) for n in ("left", "right")])
     for camera in ("left", "right"):
         for view in range(6):
             picture = np.full((48, 64 if camera == "left" else 60), 90, np.uint8)
@@ -240,7 +240,7 @@ def test_the_command_prints_json_and_its_exit_code_says_whether_all_is_well(data
 
 def test_bad_values_raise_in_the_library_too(tmp_path):
     with pytest.raises(InputError, match="image size"):
-        new_dataset(tmp_path / "x", image_size_px=(0, 5))
+        new_dataset(tmp_path / "x", [NewCamera("left", (0, 5))])
 
 
 def test_the_time_and_memory_of_a_run_are_estimated(data: Path) -> None:

@@ -32,6 +32,7 @@ NOT_RUN = {
     "devices": "needs a laboratory; a test records simulated devices",
     "figures": "is a layout, not a program",
     "install": "makes an environment; .ci/run runs it literally",
+    "plate": "needs images of a plate; a test draws them",
     "slurm": "needs a Slurm cluster; the script that it submits is run",
 }
 """Why a block with this key is not run."""

@@ -110,12 +110,12 @@ def mark_evidence(lattice: Lattice, rings: Bools, target: Target) -> MarkEvidenc
     occupied[tuple((lattice.places + 1).T)] = True
     gain = np.full(shape, LOG_UNSEEN_MARK)
     if target.mark_style == "missing":
-        gaps = _gaps(occupied, target.bounded)
-        lost = max(0.5, gaps.sum() - len(target.marks)) / occupied.sum()
+        empty = gaps(occupied, target.bounded)
+        lost = max(0.5, empty.sum() - len(target.marks)) / occupied.sum()
         gain[_count_around(occupied) >= 4] = LOG_UNSURE_GAP
         gain[occupied] = LOG_FILLED_GAP
-        gain[gaps] = -np.clip(np.log(lost), -5.0, -1.5)
-        return MarkEvidence(gain, np.argwhere(gaps) - 1)
+        gain[empty] = -np.clip(np.log(lost), -5.0, -1.5)
+        return MarkEvidence(gain, np.argwhere(empty) - 1)
     like = mark_likeness(lattice, rings, target)
     gain[tuple((lattice.places + 1).T)] = mark_gain(like)
     return MarkEvidence(gain, lattice.places[like > 0.4])
@@ -129,7 +129,7 @@ def mark_gain(likeness: Array) -> Array:
     return np.asarray(as_mark - as_plain)
 
 
-def _gaps(occupied: Bools, bounded: bool) -> Bools:
+def gaps(occupied: Bools, bounded: bool) -> Bools:
     """Empty places among dots; the border of a bounded grid needs dots on its inner side only."""
     around = _count_around(occupied)
     if not bounded:

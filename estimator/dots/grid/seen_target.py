@@ -1,0 +1,249 @@
+"""What the images tell of the target: its grid, its marks, and the lines of `rig.toml` that fit."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from telerig.arrays import Array, Bools, Ints
+from telerig.errors import DetectionError
+from telerig.estimator.dots.grid.lattice import Lattice, grow_lattice, shape_matrix
+from telerig.estimator.dots.grid.numbering import gaps, relative_diameter
+from telerig.rig.target import QUARTER_TURNS, MarkStyle, Target
+from telerig.statistics import robust_sd
+
+_RATIOS = (1.0, 1.5, 2.0)
+"""Ratios of the pitches of a grid that is looked for; one that is 30 % off is found, too."""
+_ENOUGH = 0.8
+"""Share of the dots on a grid above which no other ratio of the pitches is tried."""
+_LARGER = 1.12
+_LARGER_SD = 6.0
+_MOST_MARKS = 12
+_MOST_GAPS = 4
+
+Places = tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class SeenTarget:
+    """Hold what one image or several show of a grid of dots.
+
+    rows, columns : size of the part of the grid that is seen.
+    whole : whether the grid ends inside the image on all four sides.
+    marks : (row, column) of each mark, counted from the first corner of what is seen. A quarter
+        turn of the target is not told from another one.
+    mark_style : None if there are no marks.
+    mark_diameter : of large marks, in diameters of the other dots; NaN for other marks.
+    pitch : (x, y) in diameters of the dots.
+    diameter_px : of the dots, without foreshortening.
+    """
+
+    rows: int
+    columns: int
+    whole: bool
+    marks: Places
+    mark_style: MarkStyle | None
+    mark_diameter: float
+    pitch: tuple[float, float]
+    diameter_px: float
+
+    def turned(self, quarter: int) -> SeenTarget:
+        """Return the same target, counted after this many quarter turns."""
+        odd = quarter % 2 == 1
+        size = (self.rows, self.columns)[:: -1 if odd else 1]
+        corners = np.array([[0, 0], [self.columns - 1, self.rows - 1]]) @ QUARTER_TURNS[quarter].T
+        marks = np.array(self.marks, int).reshape(-1, 2)[:, ::-1] @ QUARTER_TURNS[quarter].T
+        placed = _as_places((marks - corners.min(axis=0))[:, ::-1])
+        pitch = (self.pitch[1], self.pitch[0]) if odd else self.pitch
+        return replace(self, rows=size[0], columns=size[1], marks=placed, pitch=pitch)
+
+    def counted(self, like: Places = ()) -> SeenTarget:
+        """Return it counted so that most marks are at places of ``like``.
+
+        Otherwise it has at least as many columns as rows, and the first mark as early as can be.
+        The marks of a grid that is seen in part are counted from the first mark.
+        """
+        every = [self.turned(quarter) for quarter in range(4)]
+        if not self.whole:
+            every = [replace(one, marks=_from_first(one.marks)) for one in every]
+        wide = every if like else [one for one in every if one.columns >= one.rows]
+        return min(wide, key=lambda one: (-len({*one.marks} & {*like}), one.marks, -one.columns))
+
+    def lines(self) -> list[str]:
+        """Return the lines of the table [target] that need no measure in mm."""
+        found = [f"rows = {self.rows}", f"columns = {self.columns}"]
+        if self.marks:
+            marks = ", ".join(f"[{row}, {column}]" for row, column in self.marks)
+            found += [f"marks = [{marks}]", f'mark_style = "{self.mark_style}"']
+        return [*found, f'extent = "{"bounded" if self.whole else "unbounded"}"']
+
+
+def _as_places(marks: Ints) -> Places:
+    return tuple(sorted((int(row), int(column)) for row, column in marks))
+
+
+def _from_first(marks: Places) -> Places:
+    return tuple((row - marks[0][0], column - marks[0][1]) for row, column in marks)
+
+
+def seen_target(dots: pd.DataFrame, image_shape: tuple[int, ...]) -> SeenTarget:
+    """Describe the grid among the dots of one image.
+
+    dots : table of dots as `locate_dots` returns it.
+    image_shape : (rows, columns) of the image in px.
+
+    Raises DetectionError if the dots lie on no grid.
+    """
+    points = dots[["u_px", "v_px"]].to_numpy(float)
+    shapes = shape_matrix(*dots[["a_px", "b_px", "angle_rad"]].to_numpy(float).T)
+    lattice = _best_lattice(points, shapes)
+    places = lattice.places
+    occupied = np.zeros(places.max(axis=0) + 3, bool)
+    occupied[tuple((places + 1).T)] = True
+    radius_px = float(np.median(dots["a_px"]))
+    whole = _is_whole(points[lattice.index], lattice, image_shape, radius_px)
+    rings = dots["ring"].to_numpy(bool)[lattice.index]
+    size = relative_diameter(lattice)
+    plain = size[~rings] if np.any(~rings) else size
+    large = size > max(_LARGER, 1.0 + _LARGER_SD * float(robust_sd(plain - np.median(plain))))
+    style, which = _marks(places, rings, large, np.argwhere(gaps(occupied, whole)) - 1)
+    diagonal = np.median(np.diagonal(lattice.shape, axis1=1, axis2=2), axis=0)
+    diameter = 2.0 * np.sqrt(diagonal)
+    plain_dots = ~(rings | large) if style != "missing" else np.ones(len(places), bool)
+    columns, rows = places.max(axis=0) + 1
+    return SeenTarget(
+        int(rows),
+        int(columns),
+        whole,
+        _as_places(which[:, ::-1]),
+        style,
+        float(np.median(size[large])) if style == "large" else float("nan"),
+        (float(1.0 / diameter[0]), float(1.0 / diameter[1])),
+        2.0 * float(np.median(dots["a_px"].to_numpy()[lattice.index[plain_dots]])),
+    )
+
+
+def _best_lattice(points: Array, shapes: Array) -> Lattice:
+    """Return the grid with the most dots among those with a usual ratio of the pitches."""
+    found: list[Lattice] = []
+    failure: DetectionError | None = None
+    for ratio in _RATIOS:
+        try:
+            found.append(grow_lattice(points, shapes, pitch_ratio=ratio))
+        except DetectionError as error:
+            failure = failure or error
+            continue
+        if len(found[-1].index) > _ENOUGH * len(points):
+            break
+    if not found:
+        assert failure is not None
+        raise failure
+    return max(found, key=lambda lattice: len(lattice.index))
+
+
+def _is_whole(
+    points_px: Array, lattice: Lattice, image_shape: tuple[int, ...], radius_px: float
+) -> bool:
+    """Whether the image would show a whole dot at the place next to every outermost one."""
+    room = radius_px + 2.0
+    last = lattice.places.max(axis=0)
+    for axis in (0, 1):
+        for end, sign in ((0, -1.0), (last[axis], 1.0)):
+            outer = lattice.places[:, axis] == end
+            beyond = points_px[outer] + sign * lattice.basis_px[outer, axis]
+            if not np.all((beyond > room) & (beyond < np.array(image_shape[::-1]) - 1 - room)):
+                return False
+    return True
+
+
+def _marks(places: Ints, rings: Bools, large: Bools, empty: Ints) -> tuple[MarkStyle | None, Ints]:
+    """Return the style of the marks, and their places (K, 2)."""
+    most = min(_MOST_MARKS, len(places) // 4)
+    if 0 < np.count_nonzero(rings) <= most:
+        return "ring", places[rings]
+    if 0 < np.count_nonzero(large) <= most:
+        return "large", places[large]
+    if 0 < len(empty) <= _MOST_GAPS:
+        return "missing", empty
+    return None, np.zeros((0, 2), np.int64)
+
+
+def agreed_target(seen: Sequence[SeenTarget]) -> SeenTarget:
+    """Return the description that most images agree with.
+
+    A grid that at least every third image shows as a whole, or that has no marks, is bounded. Of
+    one that is seen in part the most frequent of the largest sets of marks is taken.
+    """
+    whole = [one for one in seen if one.whole]
+    bounded = 3 * len(whole) >= len(seen) or not any(one.marks for one in seen)
+    counted = [
+        replace(one, whole=bounded).counted() for one in (whole if bounded else seen) or seen
+    ]
+    if not bounded:
+        rows, columns = (max(getattr(o, n) for o in counted) for n in ("rows", "columns"))
+        counted = [replace(one, rows=rows, columns=columns) for one in counted]
+    keys = [(one.rows, one.columns, one.marks, one.mark_style) for one in counted]
+    votes = Counter(keys)
+    best = max(votes, key=lambda key: (0 if bounded else len(key[2]), votes[key], key[0] * key[1]))
+    chosen = [one for one, key in zip(counted, keys) if key == best]
+    middle = np.median([(*one.pitch, one.diameter_px, one.mark_diameter) for one in chosen], axis=0)
+    return replace(
+        chosen[0], pitch=(float(middle[0]), float(middle[1])),
+        diameter_px=float(middle[2]), mark_diameter=float(middle[3]),
+    )  # fmt: skip
+
+
+def contradiction(seen: SeenTarget, target: Target) -> str:
+    """Say where the image shows the target's marks, if `rig.toml` has them elsewhere; else "".
+
+    Marks that the image does not show, or shows as further ones, are no contradiction if the
+    others are at places that the target has.
+    """
+    words, lines = [], []
+    stated = _as_places(target.marks_column_row()[:, ::-1])
+    counted = seen.counted(like=stated)
+    if seen.marks and not _fits(seen, target):
+        kind = {"ring": "ring marks", "large": "large dots", "missing": "empty places"}
+        style = kind[seen.mark_style or "large"]
+        theirs = f"{target.mark_style} marks at {_words(stated)}" if stated else "no marks"
+        frame = "of the grid" if seen.whole else "counted from the first"
+        words.append(
+            f"the image shows {len(seen.marks)} {style} at (row, column) {_words(counted.marks)} "
+            f"{frame}; rig.toml says {theirs}"
+        )
+        lines = counted.lines()
+    elif (
+        seen.whole
+        and target.bounded
+        and sorted((seen.rows, seen.columns)) != sorted((target.rows, target.columns))
+    ):
+        words.append(
+            f"the image shows a whole grid of {counted.rows} rows and {counted.columns} columns; "
+            f"rig.toml says {target.rows} and {target.columns}"
+        )
+        lines = counted.lines()
+    if not words:
+        return ""
+    return f"{words[0]}. Lines of [target] that fit this image: {'; '.join(lines)}"
+
+
+def _words(marks: Places) -> str:
+    return ", ".join(f"({row}, {column})" for row, column in marks)
+
+
+def _fits(seen: SeenTarget, target: Target) -> bool:
+    """Whether some way to count the grid has all seen marks at marks of the target."""
+    if seen.mark_style != target.mark_style or not target.marks:
+        return False
+    stated = {(int(r), int(c)) for c, r in target.marks_column_row()}
+    for quarter in range(4):
+        for hand in (1, -1):
+            one = seen.turned(quarter)
+            marks = np.array(one.marks) * (1, hand)
+            if any({*map(tuple, (marks - marks[0] + mark).tolist())} <= stated for mark in stated):
+                return True
+    return False

@@ -1,0 +1,135 @@
+"""From images of a target to the lines that describe it in a new `rig.toml`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from telerig.errors import DetectionError, InputError
+from telerig.estimator.dots.fit.candidates import Polarity
+from telerig.estimator.dots.grid.seen_target import SeenTarget, agreed_target, seen_target
+from telerig.estimator.dots.locate import measure_dots
+from telerig.io.images.read import list_images, read_image
+
+MOST_IMAGES = 6
+"""Images of each camera that are looked at, evenly spread over all."""
+
+
+@dataclass(frozen=True)
+class TargetProposal:
+    """Hold what the images of one camera or several show.
+
+    cameras : name, (width, height) in px and scale in px/mm of each.
+    pitch_px : the larger pitch of the grid, without foreshortening, in the first camera.
+    lines : the lines of [target].
+    words : what was found, for the user.
+    """
+
+    cameras: tuple[tuple[str, tuple[int, int], float], ...]
+    pitch_px: float
+    lines: str
+    words: tuple[str, ...]
+
+
+def target_from_images(
+    folder: Path, *, pitch_mm: float | None, scale_px_per_mm: float
+) -> TargetProposal:
+    """Describe the target that the images of a folder show.
+
+    folder : a folder of images, or one folder of images for each camera.
+    pitch_mm : the known distance of neighbouring dots (along x); None if only the scale is known.
+    scale_px_per_mm : nominal scale of the first camera, used where no pitch is given.
+
+    Raises InputError if there are no images, DetectionError if none shows a grid of dots.
+    """
+    found, failures = [], []
+    for name, images in _images_by_camera(folder).items():
+        some = images[:: -(-len(images) // MOST_IMAGES)]
+        for path in some:
+            image = read_image(path)
+            measured = measure_dots(image)
+            try:
+                seen = seen_target(measured.dots, image.shape)
+            except DetectionError as error:
+                failures.append(f"{path}: {error.what}")
+                continue
+            found.append((name, image.shape[1::-1], measured.polarity, seen))
+    if not found:
+        what = f"no image shows a grid of dots; the first: {failures[0]}"
+        todo = "give images in which at least 6 whole, sharp dots of the grid are seen"
+        raise DetectionError(what, where=str(folder), todo=todo)
+    polarity = Counter(p for *_, p, _ in found).most_common(1)[0][0]
+    found = [one for one in found if one[2] == polarity]
+    agreed = agreed_target([seen for *_, seen in found])
+    diameter_px = {
+        name: float(np.median([seen.diameter_px for n, *_, seen in found if n == name]))
+        for name in dict.fromkeys(n for n, *_ in found)
+    }
+    first = next(iter(diameter_px))
+    pitch_px = max(agreed.pitch) * diameter_px[first]
+    if pitch_mm is None:
+        pitch_mm = round(agreed.pitch[0] * diameter_px[first] / scale_px_per_mm, 4)
+    dot_mm = pitch_mm / agreed.pitch[0]
+    sizes = {n: (int(w), int(h)) for n, (w, h), *_ in found}
+    cameras = tuple((n, sizes[n], round(d / dot_mm, 4)) for n, d in diameter_px.items())
+    words = _words(agreed, polarity, len(found), pitch_px)
+    return TargetProposal(
+        cameras, pitch_px, _lines(agreed, polarity, pitch_mm), (*words, *failures)
+    )
+
+
+def _images_by_camera(folder: Path) -> dict[str, list[Path]]:
+    images = list_images(folder)
+    if images:
+        return {"camera": images}
+    folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    found = {p.name: list_images(p) for p in folders}
+    found = {name: paths for name, paths in found.items() if paths}
+    if not found:
+        todo = "give a folder of images, or one that has a folder of images for each camera"
+        raise InputError("holds no images", where=str(folder), todo=todo)
+    return found
+
+
+def _lines(seen: SeenTarget, polarity: Polarity, pitch_mm: float) -> str:
+    """Return the lines of [target]."""
+    across_mm = round(pitch_mm * seen.pitch[1] / seen.pitch[0], 4)
+    square = abs(across_mm / pitch_mm - 1.0) < 0.02
+    dot_mm = round(pitch_mm / seen.pitch[0], 4)
+    shape, rest = seen.lines()[:2], seen.lines()[2:]
+    large = seen.mark_style == "large"
+    return "\n".join([
+        'layout = "grid"',
+        *shape,
+        f"pitch_mm = {pitch_mm if square else [pitch_mm, across_mm]}",
+        f"dot_diameter_mm = {dot_mm}",
+        f'polarity = "{polarity}"',
+        *rest,
+        *([f"mark_diameter_mm = {round(seen.mark_diameter * dot_mm, 4)}"] if large else []),
+        "print_sigma_mm = 0.02              # how far a dot may be from its place in the plane",
+        "flatness_sigma_mm = 0.02           # and out of it",
+        "# scale_dots = [0, 1]              # two dots, counted along the rows from 0 ...",
+        "# scale_distance_mm = 1.0          # ... whose distance was measured ...",
+        "# scale_sigma_mm = 0.001           # ... so well",
+    ])  # fmt: skip
+
+
+def _words(seen: SeenTarget, polarity: Polarity, images: int, pitch_px: float) -> Sequence[str]:
+    """Return what was found as sentences."""
+    whole = "a grid" if seen.whole else "a grid that goes on beyond the images; seen at once:"
+    marks = f"{len(seen.marks)} marks of the style {seen.mark_style}" if seen.marks else "no marks"
+    words = [
+        f"{images} images show {whole} {seen.rows} rows, {seen.columns} columns, "
+        f"{polarity.replace('_', ' ')}, {marks}, dots {seen.diameter_px:.1f} px across, "
+        f"{pitch_px:.1f} px apart"
+    ]
+    if not seen.marks:
+        words.append(
+            "without marks the whole grid must be in view, and its numbering stays ambiguous by "
+            "the grid's symmetry"
+        )
+    return words

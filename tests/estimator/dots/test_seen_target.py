@@ -1,0 +1,118 @@
+"""What images tell of the target: the lines of rig.toml, and where its marks are seen."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from target_pictures import draw, pixel_from_mm
+
+from telerig.errors import DetectionError, InputError
+from telerig.estimator.dots.dataset_dots import detect_target
+from telerig.estimator.dots.grid.seen_target import contradiction, seen_target
+from telerig.estimator.dots.locate import measure_dots
+from telerig.estimator.dots.target_from_images import target_from_images
+from telerig.io.dataset.new_dataset import NewCamera, new_dataset
+from telerig.io.rig_file.rig_file import read_rig_toml
+from telerig.rig.target import Target
+
+PLATE = Target(
+    rows=5, columns=7, pitch_mm=(7.0, 7.0), dot_diameter_mm=2.4,
+    marks=((2, 2), (2, 4), (1, 2)), mark_style="ring",
+)  # fmt: skip
+LARGE = replace(PLATE, mark_style="large", mark_diameter_mm=3.6)
+OBLONG = replace(LARGE, pitch_mm=(7.0, 9.0), polarity="black_on_white")
+MISSING = replace(PLATE, mark_style="missing")
+
+
+def views(target: Target) -> list[Any]:
+    poses = ((10.0, 8.0), (35.0, -20.0), (25.0, 95.0), (40.0, 170.0))
+    return [
+        draw(target, pixel_from_mm(8.0, tilt, roll, False), size_px=520, seed=k)[0]
+        for k, (tilt, roll) in enumerate(poses)
+    ]
+
+
+@pytest.mark.parametrize(
+    "plate", [PLATE, LARGE, OBLONG, MISSING], ids=["ring", "large", "oblong", "gap"]
+)
+@pytest.mark.parametrize("cameras", [("camera",), ("left", "right")])
+def test_the_description_from_images_numbers_them(
+    tmp_path: Path, plate: Target, cameras: tuple[str, ...]
+) -> None:
+    images = views(plate)
+    folder = tmp_path / "images"
+    for name in cameras:
+        place = folder / name if len(cameras) > 1 else folder
+        place.mkdir(parents=True, exist_ok=True)
+        for k, image in enumerate(images):
+            cv2.imwrite(str(place / f"{k}.png"), image)
+    seen = target_from_images(folder, pitch_mm=7.0, scale_px_per_mm=1.0)
+    made = new_dataset(tmp_path / "new", [NewCamera(*c) for c in seen.cameras], target=seen.lines)
+    rig = read_rig_toml(made[0])
+    found = rig.target
+    assert tuple(rig.cameras) == cameras
+    assert found.mark_style == plate.mark_style and found.polarity == plate.polarity
+    assert found.extent == "bounded" and len(found.marks) == 3
+    assert sorted((found.rows, found.columns)) == [5, 7]
+    assert sorted(found.pitch_mm) == pytest.approx(sorted(plate.pitch_mm), rel=0.02) or (
+        found.pitch_mm[0] == 7.0 and found.pitch_mm[1] == pytest.approx(7.0 * 7 / 9, rel=0.02)
+    )
+    for camera in rig.cameras.values():
+        assert camera.image_size_px == (520, 520)
+    if plate is PLATE:
+        assert found.dot_diameter_mm == pytest.approx(2.4, rel=0.02)
+        assert rig.cameras[cameras[0]].scale_px_per_mm == pytest.approx(8.0, rel=0.02)
+    count = 35 - (3 if plate is MISSING else 0)
+    for image in images:
+        assert len(detect_target(image, found)) == count
+
+
+def test_marks_that_are_counted_otherwise_are_said_with_lines_that_fit() -> None:
+    image = views(PLATE)[0]
+    with pytest.raises(DetectionError) as refused:
+        detect_target(image, replace(PLATE, marks=((0, 0), (0, 3), (2, 0))))
+    words = str(refused.value)
+    assert "3 ring marks at (row, column)" in words
+    assert "rig.toml says ring marks at (0, 0), (0, 3), (2, 0)" in words
+    line = next(part for part in words.split("; ") if part.startswith("marks = "))
+    marks = tuple(map(tuple, json.loads(line.removeprefix("marks = "))))
+    numbered = detect_target(image, replace(PLATE, marks=marks))
+    assert len(numbered) == 35
+
+
+def test_rows_that_are_not_there_are_said() -> None:
+    seen = seen_target(measure_dots(views(PLATE)[0]).dots, (520, 520))
+    assert (seen.rows, seen.columns, seen.whole) == (5, 7, True)
+    words = contradiction(seen, replace(PLATE, rows=6))
+    assert "5 rows and 7 columns; rig.toml says 6 and 7" in words
+
+
+def test_what_fits_is_no_contradiction() -> None:
+    for image in views(PLATE):
+        seen = seen_target(measure_dots(image).dots, image.shape)
+        assert contradiction(seen, PLATE) == ""
+        flipped = seen_target(measure_dots(image[:, ::-1]).dots, image.shape)
+        assert contradiction(flipped, PLATE) == ""
+
+
+def test_a_part_of_a_grid_is_counted_from_its_first_mark() -> None:
+    image = views(replace(PLATE, rows=9, columns=9, marks=((4, 4), (4, 6), (3, 4))))[1]
+    seen = seen_target(measure_dots(image[120:400, 110:410]).dots, (280, 300))
+    assert not seen.whole
+    assert seen.counted().marks[0] == (0, 0)
+    assert 'extent = "unbounded"' in seen.lines()
+
+
+def test_folders_without_a_target(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no images"):
+        target_from_images(tmp_path, pitch_mm=None, scale_px_per_mm=1.0)
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), noise)
+    with pytest.raises(DetectionError, match="no image shows a grid of dots"):
+        target_from_images(tmp_path, pitch_mm=None, scale_px_per_mm=1.0)

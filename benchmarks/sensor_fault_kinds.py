@@ -156,6 +156,12 @@ def _frozen(a: Array, t: Array, rng: Generator) -> Array:
     return a
 
 
+def _shifted(a: Array, t: Array, rng: Generator) -> Array:
+    """3 m/s^2 too much along all axes for 10 ms, as of a cable that is touched."""
+    a[slice(*np.searchsorted(t, [0.6, 0.61]))] += 3.0
+    return a
+
+
 def _gap(sensor: Inputs, rng: Generator) -> None:
     """No samples for 0.1 s."""
     t = sensor[TIME]
@@ -243,6 +249,8 @@ FAULTS = {
         Fault("spikes", "samples", "0.3 % of both arms' samples, to 100 m/s^2",
               _readings(_crackling), _SENSOR),
         Fault("frozen", "samples", "left arm for 0.1 s", _readings(_frozen, "arm_left"), _SENSOR),
+        Fault("shifted", "samples", "left arm for 10 ms, by 3 m/s^2", _readings(_shifted, "arm_left"),
+              _SENSOR),
         Fault("gap", "samples", "left arm for 0.1 s", _sensors(_gap, "arm_left"), _SENSOR),
         Fault("repeated stamps", "samples", "0.2 % of both arms', two of them backward",
               _sensors(_repeated), _SENSOR),

@@ -63,7 +63,7 @@ def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
     period_s = _period_s(arrived_s, slot)
     if not period_s > 0:
         return None
-    count = np.cumsum(_begins(arrived_s - period_s * slot, slot, period_s)) - 1
+    count = np.cumsum(_begins(arrived_s, slot, period_s)) - 1
     device_s = np.asarray(period_s * slot, np.float64)
     clocks = fit_counts(arrived_s, device_s, count)
     parts = np.split(device_s, np.flatnonzero(np.diff(count)) + 1)
@@ -72,7 +72,8 @@ def _by_regular_clock(arrived_s: Array, slot: Ints) -> Spread | None:
     often_s = float(np.quantile(waited_s, _MOST))
     if len(clocks) > 1 + len(slot) // _SEGMENT or not often_s < max(_LONGEST_WAIT_S, 2 * period_s):
         return None
-    least_s = [float(np.min(part)) for part in np.array_split(waited_s, len(slot) // _FEWEST)]
+    part = np.floor((arrived_s - arrived_s[0]) / (_FEWEST * period_s))
+    least_s = np.minimum.reduceat(waited_s, np.unique(part, return_index=True)[1])
     return Spread(_increasing(t_s), float(np.quantile(np.abs(least_s), _MOST)), True)
 
 
@@ -89,12 +90,14 @@ def _period_s(arrived_s: Array, slot: Ints) -> float:
     return period_s
 
 
-def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
+def _begins(arrived_s: Array, slot: Ints, period_s: float) -> Ints:
     """(N,) 1 where a count begins.
 
-    late_s : (N,) arrival minus the period times the line's number: a constant in each count, plus
-    the delay. Missing lines raise the constant; malformed ones that were no line lower it.
+    The arrival minus the period times the line's number is a constant in each count, plus the
+    delay. Missing lines raise the constant; malformed ones that were no line lower it.
     """
+    late_s = arrived_s - period_s * slot
+    waited_least = np.diff(arrived_s, append=np.inf) > period_s / 2
     surplus = (slot - np.arange(len(slot))).tolist()
     begins = np.zeros(len(late_s), np.int64)
     begins[0] = 1
@@ -106,10 +109,10 @@ def _begins(late_s: Array, slot: Ints, period_s: float) -> Ints:
     while i < len(late):
         if late[i] < previous + period_s / 2:
             # Nothing was missing: the host was too busy to read for a while, and has caught up.
-            begins[begin], previous = 0, -np.inf
+            begins[begin], previous, level = 0, -np.inf, late[i]
         before = late[least[0]]
         raised = i < last and ahead[i] - before > period_s / 2
-        lowered = surplus[i] > surplus[max(i - window, begin)]
+        lowered = bool(waited_least[i]) and surplus[i] > surplus[max(i - window, begin)]
         # The first reading of the lower count may itself have waited.
         lowered &= late[i] - level < -period_s / 4 and ahead[i] - level < -period_s / 2
         short = begin > 0 and i - begin < flush

@@ -40,8 +40,8 @@ class Account:
 
     reported : readings that recording.json says are missing. edge : those made within the first
     and last moments. wrong : rows that differ from what was sent by more than a stage or an arm
-    can move from one reading to the next, and by less; without stamps, rows whose time is off by
-    more than 8 ms. not_accounted : sent minus the others.
+    can move from one reading to the next one in the table, and by less; without stamps, rows whose
+    time is off by more than 8 ms. not_accounted : sent minus the others.
     """
 
     device: str
@@ -146,7 +146,8 @@ def account(
         number = np.round(made_s * (1 + 1e-6 * sim.drift_ppm) * sim.rate_hz).astype(np.int64)
     off = np.max([np.abs(one.values[k] - v) for k, v in true_values(sim, number).items()], axis=0)
     most = {"encoder": 5.0 if stamped else 100.0, "accelerometer": 0.2 / sim.device.unit_m_s2}
-    wrong = off > most[sim.device.kind]
+    step = np.diff(number, prepend=number[0] - 1, append=number[-1] + 1)
+    wrong = off > most[sim.device.kind] * np.maximum(step[:-1], step[1:])
     first = min(first, int(number[0]))
     edge = int(number[0]) - first + last - 1 - int(number[-1])
     away = sum(np.clip(min(b, end_s) - max(a, end_s - 2), 0, None) for a, b in truth.away_s)

@@ -36,6 +36,8 @@ ROUNDS = 5
 ALIKE, ALIKE_MM_S2 = 0.05, 300.0
 """Largest difference of two records of a sensor, relative to its RMS, and of their medians (the
 bias is a variable)."""
+MOST_SPOILT_MM_S2 = 500.0
+"""Largest difference of single samples that are used."""
 MOST_LOST = 0.01
 """Largest share of a record's samples that are masked, within the frames."""
 
@@ -248,7 +250,12 @@ def _alike_records(one: Any, two: Any, t_s: Array) -> bool:
     rms = np.sqrt(np.mean(shake[1] ** 2, axis=0)).max()
     # where samples are masked the interpolation differs, so the median of the difference decides
     off = np.median(np.abs(shake[0] - shake[1])) / 0.6745
-    return bool(off < ALIKE * rms and np.abs(np.subtract(*middle_of)).max() < ALIKE_MM_S2)
+    if not (off < ALIKE * rms and np.abs(np.subtract(*middle_of)).max() < ALIKE_MM_S2):
+        return False
+    inside = used[0].of((used[0].t_s >= t_s[0]) & (used[0].t_s <= t_s[-1]))
+    sound = np.stack([np.interp(inside.t_s, two.t_s, c) for c in (two.reading_mm_s2 @ two.axes).T])
+    spoilt = inside.reading_mm_s2 @ inside.axes - sound.T
+    return bool(np.abs(spoilt - np.median(spoilt, axis=0)).max() < MOST_SPOILT_MM_S2 + ALIKE * rms)
 
 
 def _words(summary: Mapping[str, Any], verdict: Mapping[str, Any]) -> list[str]:

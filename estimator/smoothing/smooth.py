@@ -52,7 +52,7 @@ from telerig.estimator.smoothing.refined_pose import (
 )
 from telerig.estimator.smoothing.result import Smoothing, summary_of, trajectories
 from telerig.estimator.smoothing.result import shake as shake_table
-from telerig.estimator.smoothing.verdict.contradiction import speed_warnings
+from telerig.estimator.smoothing.verdict.contradiction import sample_warnings, speed_warnings
 from telerig.estimator.smoothing.verdict.judge import judge
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def smooth(
         inflation = verdict.get("inflation", (1.0, 1.0, 1.0))
         summary = summary_of(solution)
         summary["accepted"] = sorted(accepted)
-        summary["warnings"] = warnings + speed_warnings(solution)
+        summary["warnings"] = warnings + sample_warnings(solution) + speed_warnings(solution)
         change = refined_change(solution, calibration)
         if change is not None:
             words = change_words(change, problem.cameras[0].name)

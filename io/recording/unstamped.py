@@ -101,7 +101,7 @@ def _begins(arrived_s: Array, slot: Ints, period_s: float) -> Ints:
     surplus = (slot - np.arange(len(slot))).tolist()
     begins = np.zeros(len(late_s), np.int64)
     begins[0] = 1
-    flush = int(2 * ADAPTER_S / period_s) + 1
+    flush = int(2 * _usual_wait_s(arrived_s) / period_s) + 1
     window = min(max(_WINDOW, 4 * flush), len(late_s) - 1)
     ahead = minimum_filter1d(late_s, 2 * window + 1, origin=-window, mode="nearest")
     late, least = late_s.tolist(), deque([0])
@@ -141,6 +141,13 @@ def _begins(arrived_s: Array, slot: Ints, period_s: float) -> Ints:
             least.popleft()
         i += 1
     return begins
+
+
+def _usual_wait_s(arrived_s: Array) -> float:
+    """Longest wait that is usual, from the time between arrivals during most of the record."""
+    silence = np.sort(np.diff(arrived_s))
+    half = silence[np.searchsorted(np.cumsum(silence), silence.sum() / 2)]
+    return float(np.clip(1.5 * half, ADAPTER_S, _LONGEST_WAIT_S))
 
 
 def _evenly(arrived_s: Array) -> Spread:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
+from telerig.arrays import Array
 from telerig.io.recording.replay import DeviceRecord, replay
 from telerig.io.recording.session import LOG_NAME, record
 from telerig.io.recording.simulated.devices import (
@@ -30,6 +31,7 @@ ARM = DeviceDescription("arm_left", "accelerometer", "x")
 UNSTAMPED = replace(ENCODER, protocol="regex", pattern=r"(?P<counts>-?\d+)")
 EDGE_S = 0.25
 """Readings made so shortly after the start, or before the end, may still be in the adapter."""
+BUSY_S = 0.1
 KILLED_S = 1.2
 """A kill costs the readings since the log was last brought to the disk."""
 
@@ -41,7 +43,9 @@ class Account:
     reported : readings that recording.json says are missing. edge : those made within the first
     and last moments. wrong : rows that differ from what was sent by more than a stage or an arm
     can move from one reading to the next one in the table, and by less; without stamps, rows whose
-    time is off by more than 8 ms. not_accounted : sent minus the others.
+    time is off by more than 8 ms. busy : those made while the host was too busy to read for more
+    than `BUSY_S`, which says nothing about when they were made. not_accounted : sent minus the
+    others.
     """
 
     device: str
@@ -51,6 +55,7 @@ class Account:
     edge: int
     wrong: int
     slightly_wrong: int
+    busy: int
     latest_s: float
 
     @property
@@ -158,8 +163,18 @@ def account(
         sim.device.name if stamped else "encoder without stamps",
         last - first, len(number), reported, edge,
         int(wrong.sum()), int(np.sum((off > 1e-9) & ~wrong)) if stamped else 0,
+        0 if stamped else round(_busy_s(one.arrived_s + begin_s, truth, sim) * sim.rate_hz),
         float(np.max(np.abs(one.t_s - sim.due_s(number) + begin_s))) if stamped else float("nan"),
     )  # fmt: skip
+
+
+def _busy_s(arrived_s: Array, truth: Truth, sim: SimulatedDevice) -> float:
+    """Time in s during which the device was there and nothing was read."""
+    before, after = arrived_s[:-1], arrived_s[1:]
+    idle = after - before > BUSY_S + sim.jitter_s
+    for lost, found in truth.away_s:
+        idle &= (after < lost) | (before > found)
+    return float(np.sum((after - before)[idle]))
 
 
 def table(accounts: list[Account]) -> str:

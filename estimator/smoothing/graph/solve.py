@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -44,7 +44,7 @@ _CLOCK_PASSES = 6
 _OUTLIER_SIGMAS, _SUSPICIOUS_SIGMAS = 4.0, 5.0
 _LEAST_KEPT = 0.7
 _SAMPLE_OUTLIER, _SAMPLE_SUSPICIOUS, _BACK = 12.0, 20.0, 0.9
-_PEAK_SAMPLES = 8
+_PEAK_SAMPLES, _DISPUTED = 8, 4
 _LEAST_SAMPLES_KEPT = 0.95
 _MOST_ROUNDS, _LEAST_SCALE = 5, 1e-9
 _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
@@ -169,7 +169,8 @@ def _solve(
     if start is not None:
         weights, state = start.weights, _warm(graph, state, start)
     samples = sample_weights(problem)
-    robust, rejection = Truncation(options.robust), SampleRejection(options.robust)
+    times = tuple(a.t_s for a in problem.accelerometers)
+    robust, rejection = Truncation(options.robust), SampleRejection(options.robust, times)
     last: _Pass | None = None
     exact = _is_linear(problem, model)
     done, leap = 0, 0.0
@@ -420,15 +421,18 @@ class SampleRejection:
     too. So limits are in units of the residuals' own standard deviation s, and in each pass only
     the samples whose residuals are local maxima lose their weight. One that is not used has a
     standard deviation of 1 / s instead, and is taken back if it fits. Nothing is touched as long
-    as no residual is suspicious.
+    as no residual is suspicious. Where several samples near each other go, two sensors contradict
+    each other, and the other one may be wrong: then none is used.
 
+    t_s : times (N,) of each sensor's samples.
     rounds : number of passes in which weights have changed.
     """
 
-    def __init__(self, wanted: bool) -> None:
-        self.wanted, self.rounds = wanted, 0
+    def __init__(self, wanted: bool, t_s: Sequence[Array]) -> None:
+        self.wanted, self.t_s, self.rounds = wanted, t_s, 0
         self.usable: dict[int, Bools] = {}
         self.motion: set[int] = set()
+        self.disputed_s: list[tuple[float, float]] = []
 
     def update(
         self, weights: SampleWeights, residuals: tuple[Array, ...]
@@ -440,6 +444,9 @@ class SampleRejection:
         if not self.wanted or self.rounds >= _MOST_ROUNDS:
             return weights, False
         fresh = tuple(self._of(i, w, r) for i, (w, r) in enumerate(zip(weights, residuals)))
+        if len(fresh) > 1:
+            self._dispute(fresh)
+            fresh = tuple(map(self._without_disputed, fresh, self.t_s))
         changed = any(a is not b for a, b in zip(fresh, weights))
         self.rounds += changed
         return fresh, changed
@@ -466,6 +473,30 @@ class SampleRejection:
             self.motion.add(sensor)
             fresh = usable
         return weight if np.array_equal(fresh, used) else fresh.astype(float)
+
+    def _dispute(self, weights: SampleWeights) -> None:
+        """Note the times at which a sensor has lost several samples near each other."""
+        for sensor, usable in self.usable.items():
+            weight, t_s = weights[sensor], self.t_s[sensor]
+            if weight is None:
+                continue
+            lost = np.flatnonzero(usable & (weight < 0.5) & ~self._disputed(t_s))
+            for run in np.split(lost, np.flatnonzero(np.diff(lost) > 2 * _PEAK_SAMPLES) + 1):
+                if len(run) >= _DISPUTED:
+                    ends = np.clip(run[[0, -1]] + [-_PEAK_SAMPLES, _PEAK_SAMPLES], 0, len(t_s) - 1)
+                    self.disputed_s.append((float(t_s[ends[0]]), float(t_s[ends[1]])))
+
+    def _disputed(self, t_s: Array) -> Bools:
+        out = np.zeros(len(t_s), bool)
+        for begin, end in self.disputed_s:
+            out |= (t_s >= begin) & (t_s <= end)
+        return out
+
+    def _without_disputed(self, weight: Array | None, t_s: Array) -> Array | None:
+        out = self._disputed(t_s)
+        if not np.any(out if weight is None else out & (weight > 0.5)):
+            return weight
+        return np.where(out, 0.0, 1.0 if weight is None else weight)
 
 
 def delays_have_moved(graph: GraphLayout, state: State) -> bool:

@@ -143,6 +143,28 @@ def speed_warnings(solution: Solution) -> list[str]:
     ]
 
 
+def sample_warnings(solution: Solution) -> list[str]:
+    """Return a warning for each accelerometer with samples that the other measurements contradict.
+
+    Where several samples near each other go, those of the other accelerometers go, too.
+    """
+    words = []
+    for sensor, weight in zip(solution.graph.problem.accelerometers, solution.sample_weights):
+        if weight is None:
+            continue
+        lost = weight < 0.5
+        if sensor.kept is not None:
+            lost &= sensor.kept
+        if lost.any():
+            when = sensor.t_s[lost]
+            words.append(
+                f"accelerometer {sensor.name}: {len(when)} of {len(lost)} samples, from "
+                f"{when[0]:.4g} to {when[-1]:.4g} s, are not used: there it and the other "
+                "measurements contradict each other"
+            )
+    return words
+
+
 @dataclass(frozen=True)
 class Group:
     """Squared residuals of one source along one axis.

@@ -315,7 +315,7 @@ def test_samples_that_the_images_contradict_lose_their_weight() -> None:
     """
     rng = np.random.default_rng(3)
     sound = 0.02 * rng.standard_normal((2000, 3))
-    rejection = SampleRejection(True)
+    rejection = SampleRejection(True, (np.arange(2000.0),))
     assert rejection.update((None,), (sound,)) == ((None,), False)
     spoilt = sound.copy()
     spoilt[998:1003, 1] += [0.3, -0.5, 1.0, -0.5, 0.3]
@@ -331,7 +331,7 @@ def test_samples_that_the_images_contradict_lose_their_weight() -> None:
     assert changed and again is not None and np.all(again == 1)
     many = sound.copy()
     many[::16, 0] += 1.0
-    (weight,), changed = SampleRejection(True).update((None,), (many,))
+    (weight,), changed = SampleRejection(True, (np.arange(2000.0),)).update((None,), (many,))
     assert weight is None and not changed
 
 

@@ -23,7 +23,7 @@ from telerig.estimator.smoothing.learning.likelihood import (
     laplace_covariance,
     maximise,
 )
-from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled, signals_of
+from telerig.estimator.smoothing.learning.lines_of_sight import Signal, pooled
 from telerig.estimator.smoothing.learning.parameters import (
     FORCE,
     names_of,
@@ -43,7 +43,7 @@ from telerig.estimator.smoothing.learning.spectral_lines import (
     with_hidden_modes,
     with_split_lines,
 )
-from telerig.estimator.smoothing.learning.window import learning_window
+from telerig.estimator.smoothing.learning.window import learning_signals
 from telerig.estimator.smoothing.problem.problem import (
     CARRIAGE,
     RigMode,
@@ -79,17 +79,16 @@ def learn(
     progress : called with what was found and the share (0 to 1) that is done.
 
     Returns a model named "learned", with the standard deviations of its log-parameters in
-    ``learned``. Of a long run only the frames of `learning_window` are used. Accelerometers are not
-    learned from: where there are any, a default start is returned unchanged, since its broad band
-    needs no modes.
+    ``learned``. Of a long run only the frames of `learning_signals` are used. Accelerometers are
+    not learned from: where there are any, a default start is returned unchanged, since its broad
+    band needs no modes.
     """
     options = options or Learning()
     if start.name == "default" and problem.accelerometers:
         return start
     keep_freed_memory()
     model = replace(start, modes=()) if start.name == "default" else start
-    signals = signals_of(learning_window(problem).problem, fixed=options.target)
-    signals = tuple(c for c in signals if c.samples)
+    signals = learning_signals(problem, fixed=options.target)
     if options.target:
         model = replace(model, bubble=replace(model.bubble, zigzags=()))
     groups = groups_of(signals, options, problem.up)
@@ -302,11 +301,11 @@ def _bic_penalty(group: Group, model: ShakeModel) -> float:
 
     n : two samples for each cycle of the fastest line. More frames inform on the noise alone.
     """
-    t = group.signals[0].t_s
+    span_s = group.signals[0].span_s
     lines = [mode.frequency_hz for mode in model.modes]
     lines += [line.frequency_hz for line in model.bubble.zigzags]
     fastest = max(lines, default=LOW_HZ)
-    return 1.5 * float(np.log(max(2 * fastest * (t[-1] - t[0]), 8.0)))
+    return 1.5 * float(np.log(max(2 * fastest * span_s, 8.0)))
 
 
 def _distinct(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from telerig.arrays import Array
+from telerig.arrays import Array, Bools
 from telerig.estimator.smoothing.graph.solve import Covariances, Solution
 from telerig.estimator.smoothing.learning.evidence import (
     signal_evidence,
@@ -25,7 +25,6 @@ from telerig.estimator.smoothing.learning.lines_of_sight import (
     Signal,
     contrasts,
     pooled,
-    signals_of,
 )
 from telerig.estimator.smoothing.learning.parameters import (
     depends_on,
@@ -35,7 +34,7 @@ from telerig.estimator.smoothing.learning.parameters import (
     value_of,
     with_values,
 )
-from telerig.estimator.smoothing.learning.window import learning_window
+from telerig.estimator.smoothing.learning.window import learning_signals
 from telerig.estimator.smoothing.problem.problem import ShakeModel
 
 _IMPOSSIBLE = -1e12
@@ -160,15 +159,13 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
     found, model, problem = solution.covariances, solution.graph.model, solution.graph.problem
     if found is None or not model.learned or not problem.bubbles:
         return solution
-    window = learning_window(problem, solution.weights)
-    signals = [c for c in signals_of(window.problem) if c.samples]
+    signals = list(learning_signals(problem, solution.weights))
     if not signals:
         return solution
     directions = np.array([c.direction for c in signals])
     spreads = [_spread(c, model) for c in signals]
-    if len(window.problem.t_s) < len(problem.t_s):
-        spreads = [(p.mean(keepdims=True), v.mean(keepdims=True), o.mean(keepdims=True))
-                   for p, v, o in spreads]  # fmt: skip
+    if len(signals[0].t_s) < len(problem.t_s):
+        spreads = [(_mean(p), _mean(v), _mean(o)) for p, v, o in spreads]
     # coordinates along the signals, which need not be at right angles, back into the lab
     lab = np.linalg.pinv(directions)
     bubbles = found.bubbles.copy()
@@ -184,7 +181,10 @@ def with_hyperparameter_uncertainty(solution: Solution) -> Solution:
 
 
 def _spread(signal: Signal, model: ShakeModel) -> _Triple:
-    """Return the variances (B, F) of positions and velocities, and (J, F) of offsets."""
+    """Return the variances (B, F) of positions and velocities, and (J, F) of offsets.
+
+    NaN before a bubble is seen for the first time and after the last.
+    """
     parts = pooled(signal)
     total = [np.zeros((1, len(signal.t_s)))] * 3
     for name, sigma in model.learned.items():
@@ -196,7 +196,19 @@ def _spread(signal: Signal, model: ShakeModel) -> _Triple:
         moved = [_still(p) if s else _moved(p, up, down) for p, s in zip(parts, same)]
         for i, change in enumerate(_of_bubbles(moved, int(signal.moving.sum()))):
             total[i] = total[i] + (change / 2 * (sigma / step)) ** 2
+    if signal.value_mm.ndim == 2 and len(total[0]) == signal.moving.sum():
+        there = _there(signal)
+        total[:2] = [np.where(there, variance, np.nan) for variance in total[:2]]
     return total[0], total[1], total[2]
+
+
+def _there(signal: Signal) -> Bools:
+    """(B, F) whether each moving item has been seen and will be seen again."""
+    seen = np.array(
+        [(signal.weight[:, signal.item == i] > 0).any(1) for i in np.flatnonzero(signal.moving)]
+    )
+    before, after = (np.logical_or.accumulate(a, axis=1) for a in (seen, seen[:, ::-1]))
+    return np.asarray(before & after[:, ::-1])
 
 
 def _same(signal: Signal, one: ShakeModel, two: ShakeModel) -> bool:
@@ -224,10 +236,16 @@ def _of_bubbles(moved: list[_Triple], count: int) -> _Triple:
     if len(moved) == 1:
         return moved[0]
     (position, velocity, offset), apart = moved
+    pieces, frames = max(len(position), len(apart[0]) // (count - 1)), position.shape[1]
     place, speed = (
-        contrasts(count).T @ np.broadcast_to(a, (count - 1, a.shape[-1])) for a in apart[:2]
-    )
-    return position + place, velocity + speed, offset
+        np.tensordot(
+            contrasts(count).T,
+            np.broadcast_to(a, ((count - 1) * pieces, frames)).reshape(-1, pieces, frames), 1,
+        ).reshape(count * pieces, frames)
+        for a in apart[:2]
+    )  # fmt: skip
+    own = (np.tile(np.broadcast_to(a, (pieces, frames)), (count, 1)) for a in (position, velocity))
+    return next(own) + place, next(own) + speed, offset
 
 
 def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
@@ -240,8 +258,17 @@ def _rows(solution: Solution, signal: Signal, variance: Array) -> Array:
     number[movers] = np.arange(len(movers))
     mine = number[graph.bubble_of_row]
     variance = np.broadcast_to(variance, (len(movers), variance.shape[-1]))
-    each = variance[mine, graph.frame_of_row]
-    return np.asarray(np.where(mine >= 0, each, variance.mean(0)[graph.frame_of_row]))
+    each = np.where(mine >= 0, variance[mine, graph.frame_of_row], np.nan)
+    known = np.isfinite(variance)
+    count = known.sum(0)
+    typical = np.where(known, variance, 0.0).sum(0) / np.maximum(count, 1)
+    typical = np.where(count > 0, typical, _mean(variance).item())[graph.frame_of_row]
+    return np.asarray(np.where(np.isfinite(each), each, typical))
+
+
+def _mean(variance: Array) -> Array:
+    """(1, 1) of all that are known."""
+    return np.asarray(np.mean(variance[np.isfinite(variance)])).reshape(1, 1)
 
 
 def _shaken(

@@ -9,6 +9,7 @@ attributions work on signals: a few states each, where the whole graph has dozen
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +39,8 @@ class Signal:
     bubble : (I,) index into the problem's bubbles, -1 for marks.
     pooled : number of bubbles whose mean the moving item is.  shaken : False for differences of
     bubbles, (F, P, R) values that no shake reaches.
+    Values (F, P, R) are replicates, which differ in nothing but their values: differences of
+    bubbles, or pieces of a run (`stacked`).
     """
 
     direction: Array
@@ -58,6 +61,12 @@ class Signal:
     @property
     def samples(self) -> int:
         return int((self.weight > 0).sum())
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first to the last frame, of all replicates together."""
+        replicates = self.value_mm.shape[-1] if self.value_mm.ndim == 3 else 1
+        return float(self.t_s[-1] - self.t_s[0]) * replicates
 
 
 def sight_directions(problem: SmoothingProblem) -> list[tuple[Array, tuple[int, ...]]]:
@@ -207,8 +216,10 @@ def pooled(signal: Signal) -> tuple[Signal, ...]:
         return (signal,)
     if seen.mean(0).min() < PRESENT:
         return (signal,)
-    whole, weight = _bridged(signal.t_s, signal.value_mm[:, pairs], signal.weight[:, pairs])
-    value = whole.reshape(-1, count, cameras)
+    whole, weight = signal.value_mm[:, pairs], signal.weight[:, pairs]
+    if whole.ndim == 2:
+        whole, weight = _bridged(signal.t_s, whole, weight)
+    value = whole.reshape(len(whole), count, cameras, -1)
     each = weight.reshape(-1, count, cameras).mean(1)
     one = np.zeros(cameras, np.int64)
     alike = replace(
@@ -217,9 +228,20 @@ def pooled(signal: Signal) -> tuple[Signal, ...]:
         start_sigma_mm=signal.start_sigma_mm[movers[:1]], bubble=np.array([-1]),
     )  # fmt: skip
     mean = replace(alike, value_mm=value.mean(1), weight=each * count, pooled=count)
-    turn = contrasts(count)
-    apart = np.einsum("rk,fkc->fcr", turn, value)
+    apart = np.einsum("rk,fkcs->fcrs", contrasts(count), value)
+    apart = apart.reshape(*apart.shape[:2], -1)
     return mean, replace(alike, value_mm=apart, weight=each, shaken=False)
+
+
+def stacked(pieces: Sequence[Signal]) -> Signal:
+    """Return one signal of pieces of a run as replicates, (F, P, R) values.
+
+    pieces : signals of as many frames and bubbles, all seen nearly all of the time by all cameras.
+    """
+    parts = [_bridged(p.t_s, p.value_mm, p.weight) for p in pieces]
+    value = np.stack([v for v, _ in parts], -1)
+    weight = np.mean([w for _, w in parts], axis=0)
+    return replace(pieces[0], value_mm=value, weight=weight, first=np.zeros_like(pieces[0].first))
 
 
 def contrasts(count: int) -> Array:

@@ -58,9 +58,11 @@ def averaged(signal: Signal, factor: int) -> Signal:
         return signal
     count = len(signal.t_s) // factor
     weight = signal.weight[: count * factor].reshape(count, factor, -1)
-    value = signal.value_mm[: count * factor].reshape(count, factor, -1)
+    given = signal.value_mm[: count * factor]
     total = weight.sum(1)
-    mean = (weight * value).sum(1) / np.where(total > 0, total, 1.0)
+    share = weight / np.where(total > 0, total, 1.0)[:, None]
+    value = given.reshape(count, factor, weight.shape[-1], -1)
+    mean = np.einsum("cfp,cfpr->cpr", share, value).reshape(count, *given.shape[1:])
     t = signal.t_s[: count * factor].reshape(count, factor).mean(1)
     # only whole blocks stand for the time of their middle
     whole = (weight > 0).all(1)
@@ -151,6 +153,10 @@ def _expected(signal: Signal, model: ShakeModel, where: int | str, frequency: Ar
 
 def _series(signal: Signal, where: int | str) -> tuple[list[Array], list[Array]]:
     """Return independent series (F,) of one kind and their weights (1 / variance)."""
+    if signal.value_mm.ndim == 3:
+        pieces = np.moveaxis(signal.value_mm, -1, 0)
+        each = [_series(replace(signal, value_mm=piece), where) for piece in pieces]
+        return [v for values, _ in each for v in values], [w for _, ws in each for w in ws]
     value, weight = signal.value_mm, signal.weight
     items = np.unique(signal.item)
     if where == CARRIAGE or (where == "bubble" and len(items) < 2):

@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.smoothing.learning.lines_of_sight import MOST_BUBBLES, PRESENT
+from telerig.estimator.smoothing.learning.lines_of_sight import (
+    MOST_BUBBLES,
+    PRESENT,
+    Signal,
+    signals_of,
+    stacked,
+)
 from telerig.estimator.smoothing.problem.problem import SmoothingProblem
 from telerig.estimator.smoothing.problem.window import Window, cut_out
 
@@ -16,6 +22,75 @@ MOST_FRAMES = 1500
 _PLACES = 8
 """Windows begin at multiples of this part of a window."""
 _SHORTER, _ENOUGH_BUBBLES, _FEW_BUBBLES = (0.7, 0.5), 3, 2
+_LONG, _SHORTEST, _UNEVEN = 750, 32, 0.01
+"""Frames of a window from which on pieces of it are learned from, and of the shortest piece; by how
+much the steps of frames may differ then."""
+
+
+def learning_signals(
+    problem: SmoothingProblem, weights: tuple[Array, Array] | None = None, *, fixed: bool = False
+) -> tuple[Signal, ...]:
+    """Return the signals that hyper-parameters are learned from: those of `learning_window`.
+
+    Of tracks that come and go those of short pieces of the run in which some bubbles are seen all
+    the time, as replicates of each other.
+
+    weights : as for `learning_window`.  fixed : as for `signals_of`.
+    """
+    window = learning_window(problem, weights)
+    pieces = [] if fixed else _pieces(problem, weights, len(window.problem.t_s))
+    if pieces:
+        each = zip(*(signals_of(piece.problem) for piece in pieces))
+        return tuple(stacked(some) for some in each)
+    return tuple(c for c in signals_of(window.problem, fixed=fixed) if c.samples)
+
+
+def _pieces(
+    problem: SmoothingProblem, weights: tuple[Array, Array] | None, length: int
+) -> list[Window]:
+    """Return pieces of a run in which enough bubbles are seen all the time, the longest possible.
+
+    length : of the window. None where some bubbles are seen all of that time, where it is so short
+    that all bubbles can be learned from jointly, and where something stands still.
+    """
+    firsts, lasts = (np.array([getattr(b, n) for b in problem.bubbles]) for n in ("first", "last"))
+    most = int((lasts - firsts).max(initial=0)) + 1
+    if length < _LONG or len(problem.marks) or most >= PRESENT * length:
+        return []
+    steps = np.diff(problem.t_s)
+    if np.ptp(steps) > _UNEVEN * float(np.median(steps)):
+        return []
+    for size in range(most, _SHORTEST - 1, -max(most // _PLACES, 1)):
+        found, first = list[Window](), 0
+        while first + size <= len(problem.t_s) and len(found) * size < 2 * MOST_FRAMES:
+            lasting = np.count_nonzero((firsts <= first) & (lasts >= first + size - 1))
+            if lasting >= _ENOUGH_BUBBLES:
+                piece = cut_out(
+                    problem, first, first + size, weights, MOST_BUBBLES,
+                    least_share=PRESENT, throughout=True,
+                )  # fmt: skip
+                if len(piece.problem.bubbles) >= _ENOUGH_BUBBLES and _all_see(piece.problem):
+                    found.append(piece)
+                    first += size
+                    continue
+            first += max(size // _PLACES, 1)
+        least = min(len(f.problem.bubbles) for f in found) if found else 0
+        if len(found) * size >= min(MOST_FRAMES, length) / 2:
+            return [_with_fewer(piece, least) for piece in found]
+    return []
+
+
+def _all_see(problem: SmoothingProblem) -> bool:
+    """Whether every camera sees every bubble most of the time."""
+    seen = np.zeros((len(problem.cameras), len(problem.bubbles)), np.int64)
+    np.add.at(seen, (problem.observations.camera, problem.observations.item), 1)
+    return bool(seen.min() >= PRESENT * len(problem.t_s))
+
+
+def _with_fewer(piece: Window, count: int) -> Window:
+    """The piece with so many bubbles only."""
+    fewer = cut_out(piece.problem, 0, len(piece.problem.t_s), most_bubbles=count)
+    return Window(fewer.problem, piece.first, piece.bubbles[fewer.bubbles])
 
 
 def learning_window(

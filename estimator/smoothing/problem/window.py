@@ -30,18 +30,22 @@ def cut_out(
     weights: tuple[Array, Array] | None = None,
     most_bubbles: int | None = None,
     least_share: float = 0.0,
+    throughout: bool = False,
 ) -> Window:
     """Return the frames from ``first`` to before ``end``, with the bubbles seen more than once.
 
     weights : of the bubbles' and the marks' pixels; those below 0.5 are left out. None for all.
     most_bubbles : so many bubbles, those seen in most frames; None for all.
     least_share : share of the frames in which all cameras together have to see a bubble.
+    throughout : whether only tracks are taken that last from the first to the last frame.
     """
     seen, marks = problem.observations, problem.references
     if weights is not None:
         seen, marks = seen.of(weights[0] > 0.5), marks.of(weights[1] > 0.5)
     seen, marks = _between(seen, first, end), _between(marks, first, end)
     often = np.bincount(seen.item, minlength=len(problem.bubbles))
+    if throughout:
+        often *= [b.first <= first and b.last >= end - 1 for b in problem.bubbles]
     chosen = np.sort(np.argsort(-often, kind="stable")[:most_bubbles])
     least = least_share * len(problem.cameras) * (end - first)
     chosen = chosen[often[chosen] > max(1, least - 1)]

@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from shake_learning_data import run
+import pytest
+from shake_learning_data import run, true_model, with_comings_and_goings
 
+from telerig.estimator.smoothing.graph.solve import solve
+from telerig.estimator.smoothing.learning.evidence import signal_evidence
+from telerig.estimator.smoothing.learning.likelihood import with_hyperparameter_uncertainty
+from telerig.estimator.smoothing.learning.lines_of_sight import pooled
 from telerig.estimator.smoothing.learning.window import (
     MOST_FRAMES,
+    learning_signals,
     learning_window,
     other_windows,
 )
@@ -44,3 +50,56 @@ def test_a_long_run_is_learned_from_where_the_bubbles_are_seen_most() -> None:
                 bubble.guess_mm, whole[one.first : one.first + len(bubble)]
             )
     assert [w.first for w in other_windows(fewer, window, 5)] == [0, MOST_FRAMES]
+
+
+def _coming_and_going(frames: int, track: int) -> SmoothingProblem:
+    rng = np.random.default_rng(5)
+    problem, _, _ = run(rng, bubbles=8, seconds=frames / 200.0)
+    return with_comings_and_goings(problem, rng, track)
+
+
+def test_tracks_that_come_and_go_are_learned_from_in_pieces_with_enough_of_them() -> None:
+    problem = _coming_and_going(1600, 200)
+    signals = learning_signals(problem)
+    assert len(signals) == 3
+    for signal in signals:
+        frames, pairs, pieces = signal.value_mm.shape
+        assert frames == len(signal.t_s)
+        assert pairs == int(signal.moving.sum()) * len(signal.cameras)
+        assert signal.moving.sum() >= 3
+        assert 50 < frames < 300
+        assert pieces * frames >= 750
+        assert signal.span_s == pytest.approx(pieces * (frames - 1) / 200.0)
+        assert len(pooled(signal)) == 2
+
+
+def test_the_evidence_of_pieces_is_the_sum_of_theirs() -> None:
+    signal = learning_signals(_coming_and_going(1600, 200))[0]
+    pieces = [replace(signal, value_mm=v) for v in np.moveaxis(signal.value_mm, -1, 0)]
+    each, apart = [], []
+    for model in (true_model(), true_model(0.3)):
+        each.append(sum(signal_evidence(one, model) for one in pieces))
+        assert signal_evidence(signal, model) == pytest.approx(each[-1], rel=1e-9)
+        apart.append(sum(signal_evidence(part, model) for part in pooled(signal)))
+    assert apart[1] - apart[0] == pytest.approx(each[1] - each[0], rel=0.02)
+
+
+def test_short_runs_marks_and_lasting_bubbles_are_learned_from_as_before() -> None:
+    whole, _, _ = run(np.random.default_rng(3), bubbles=3, seconds=800 / 200.0)
+    marked, _, _ = run(np.random.default_rng(3), bubbles=1, seconds=800 / 200.0, marks=2)
+    for problem in (whole, marked, _coming_and_going(400, 60)):
+        assert all(signal.value_mm.ndim == 2 for signal in learning_signals(problem))
+
+
+def test_hyperparameters_widen_no_path_by_where_a_bubble_would_be_when_out_of_sight() -> None:
+    problem = _coming_and_going(300, 50)
+    model = replace(true_model(), learned={"bubble.velocity_tau_s": 0.3, "modes.0.rms_mm": 0.1})
+    before = solve(problem, model)
+    after = with_hyperparameter_uncertainty(before)
+    row = before.graph.bubble.position[1]
+    variance = [
+        row @ s.covariances.bubbles @ row for s in (before, after) if s.covariances is not None
+    ]
+    ratio = np.sqrt(variance[1] / variance[0])
+    assert 1.0 < np.median(ratio) < 1.5
+    assert np.quantile(ratio, 0.99) < 2

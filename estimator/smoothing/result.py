@@ -22,8 +22,6 @@ from telerig.estimator.smoothing.problem.problem import ShakeModel
 from telerig.estimator.smoothing.verdict.whiteness import accelerometer_spectra, pixel_whiteness
 from telerig.factors.bubble_motion import BubbleModel
 from telerig.factors.state_space import discretise, distinct_steps, ou_velocity
-from telerig.io.results.manifest import replaced_results
-from telerig.io.results.smoothing import SmoothingFile
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,6 +52,8 @@ class Smoothing:
 
         All files appear together.
         """
+        from telerig.io.results.manifest import replaced_results
+
         place = Path(folder)
         with replaced_results(place, "smooth", again="Smoothing.save", inputs={}) as staged:
             self.write_files(staged)
@@ -61,6 +61,7 @@ class Smoothing:
     def write_files(self, out: Path) -> None:
         """Write the files of `save` into an existing folder, one after the other."""
         from telerig.io.files.csv_table import write_table
+        from telerig.io.results.smoothing import SmoothingFile
 
         write_table(self.trajectories, out / "trajectories.csv")
         write_table(self.shake, out / "shake.csv")
@@ -75,6 +76,8 @@ def summary_of(solution: Solution) -> dict[str, Any]:
     It holds the hyper-parameters, the estimated constants with their standard deviations, and
     numbers about the residuals.
     """
+    from telerig.io.results.smoothing import SmoothingFile
+
     graph = solution.graph
     problem, model = graph.problem, graph.model
     names = [c.name for c in problem.cameras]
@@ -216,6 +219,7 @@ def write_hdf5(smoothing: Smoothing, path: Path) -> None:
     standard deviations along x, y and z by which contradicting measurements widen the tables'.
     """
     from telerig.io.files.hdf5 import hdf5_file
+    from telerig.io.results.smoothing import SmoothingFile
 
     solution = smoothing.solution
     layout = solution.graph

@@ -52,8 +52,6 @@ from telerig.estimator.smoothing.refined_pose import (
 )
 from telerig.estimator.smoothing.result import Smoothing, summary_of, trajectories
 from telerig.estimator.smoothing.result import shake as shake_table
-from telerig.estimator.smoothing.verdict.contradiction import sample_warnings, speed_warnings
-from telerig.estimator.smoothing.verdict.judge import judge
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -166,6 +164,12 @@ def smooth(
                 step("uncertainty of what was learned", 0.9)
                 solution = with_hyperparameter_uncertainty(solution)
     with phases.phase("verdict", "judging the result"):
+        from telerig.estimator.smoothing.verdict.contradiction import (
+            sample_warnings,
+            speed_warnings,
+        )
+        from telerig.estimator.smoothing.verdict.judge import judge
+
         verdict = judge(problem, chosen, solution)
         solution = replace(solution, draws=None)
         inflation = verdict.get("inflation", (1.0, 1.0, 1.0))

@@ -90,7 +90,11 @@ class Part(BaseModel):
     """Describe a part of a JSON results file; each subclass has one field for each key."""
 
     model_config = ConfigDict(
-        frozen=True, extra="allow", arbitrary_types_allowed=True, allow_inf_nan=False
+        defer_build=True,
+        frozen=True,
+        extra="allow",
+        arbitrary_types_allowed=True,
+        allow_inf_nan=False,
     )
 
     def content(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,14 +18,6 @@ from telerig.errors import CalibrationError, InputError
 from telerig.estimator.calibration.result.summary import summary
 from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
-from telerig.io.results.calibration import (
-    CalibrationFile,
-    CameraRecord,
-    PoseRecord,
-    read_joint_covariance,
-    write_joint_covariance,
-)
-from telerig.io.results.manifest import reading, replaced_results
 from telerig.rig.camera import Camera
 from telerig.rig.lens_parameters import PARAMETERS
 from telerig.rig.pose import Pose
@@ -39,6 +31,9 @@ from telerig.rig.triangulation import (
     triangulate,
     triangulate_views,
 )
+
+if TYPE_CHECKING:
+    from telerig.io.results.calibration import CalibrationFile, CameraRecord
 
 
 @dataclass(frozen=True)
@@ -304,6 +299,8 @@ class Calibration:
 
     def record(self) -> CalibrationFile:
         """Return the content of `calibration.json`; no file is written."""
+        from telerig.io.results.calibration import CalibrationFile, PoseRecord
+
         content = {
             "schema": CalibrationFile.SCHEMA,
             "kind": CalibrationFile.KIND,
@@ -328,6 +325,8 @@ class Calibration:
         return CalibrationFile.model_validate(content)
 
     def _camera_record(self, camera: Camera, free: tuple[str, ...]) -> CameraRecord:
+        from telerig.io.results.calibration import CameraRecord, PoseRecord
+
         deviations = {n: self.sd(f"{camera.name}.{n}") for n in free}
         return CameraRecord(
             image_size_px=camera.image_size_px,
@@ -347,6 +346,8 @@ class Calibration:
         What is not known (``joint_names`` empty, ``dots`` or ``residuals`` None) is not written;
         an old `covariance.npz` is then deleted. All files of a folder appear together.
         """
+        from telerig.io.results.manifest import replaced_results
+
         place = Path(path)
         if place.suffix == ".json":
             self.record().write(place)
@@ -365,6 +366,8 @@ class Calibration:
                 write_table(table, folder / name)
 
     def _write_covariance(self, folder: Path) -> None:
+        from telerig.io.results.calibration import write_joint_covariance
+
         if self.joint_names:
             with atomic_path(folder / "covariance.npz") as temporary:
                 write_joint_covariance(temporary, self.joint_names, self.joint_covariance)
@@ -381,6 +384,9 @@ def load_calibration(path: str | Path) -> Calibration:
     Raises InputError if a file is missing, was not written by telerig, has a newer schema, or if
     the two files belong to different calibrations.
     """
+    from telerig.io.results.calibration import CalibrationFile, read_joint_covariance
+    from telerig.io.results.manifest import reading
+
     place = Path(path)
     file = place / "calibration.json" if place.is_dir() else place
     with reading(file.parent, (file.name, "covariance.npz")):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from telerig.io.results.calibration import CalibrationFile
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from telerig.io.results.calibration import CalibrationFile
 
 
 def summary(calibration: CalibrationFile) -> str:

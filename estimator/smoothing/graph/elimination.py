@@ -17,7 +17,6 @@ from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri, dtrtrs
 
 from telerig.arrays import Array, Ints
 from telerig.errors import CalibrationError
@@ -80,6 +79,8 @@ class EliminatedGraph:
 
     def solved(self, side: Array) -> Array:
         """Return the solutions (D, N) of the normal equations for right sides (D, N)."""
+        from scipy.linalg.lapack import dtrtrs
+
         out = side.copy()
         for clique, (own, above) in zip(self.cliques, self._columns):
             mine = out[own] = dtrtrs(clique.root, out[own], trans=1)[0]
@@ -88,6 +89,8 @@ class EliminatedGraph:
 
     def _substituted(self, out: Array) -> Array:
         """Solve for the roots' right sides (D, N), in place."""
+        from scipy.linalg.lapack import dtrtrs
+
         for clique, (own, above) in zip(reversed(self.cliques), reversed(self._columns)):
             out[own] = dtrtrs(clique.root, out[own] - clique.right @ out[above])[0]
         return out
@@ -331,6 +334,8 @@ def fill_covariances(
     sizes : dimension of each key, keys counting from 0.  wanted : (d, d) of keys.
     pairs : (d, e) of keys with others of their clique.
     """
+    from scipy.linalg.lapack import dtrtri
+
     where = {key: i for i, clique in enumerate(cliques) for key in clique.fronts}
     parents = [min(map(where.__getitem__, c.separator), default=-1) for c in cliques]
     children = [0] * len(cliques)

@@ -28,8 +28,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf, dtrtri
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.learning.lines_of_sight import Signal
@@ -73,6 +71,8 @@ class Chain:
 
     def inverses(self) -> Array:
         """Return the inverses (F, D, D) of L_t^T."""
+        from scipy.linalg.lapack import dtrtri
+
         out = self.upper.copy()
         first, end = self.steady
         for t in (*range(min(first + 1, end)), *range(end, len(out))):
@@ -158,6 +158,9 @@ def eliminate_forward(own: Array, joined: Array) -> tuple[int, int]:
     memory. From then on only the sides are carried on.
     Raises numpy's LinAlgError where the precision is not positive definite.
     """
+    from scipy.linalg.blas import dtrsm
+    from scipy.linalg.lapack import dpotrf, dtrtri
+
     width, last = own.shape[-1], len(own) - 1
     after = joined.shape[1] - width
     product = np.empty(joined.shape[1:])

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from telerig.arrays import Array, Ints
 from telerig.estimator.smoothing.graph.layout import GraphLayout
@@ -255,6 +254,8 @@ class _Part:
 
 def _fitted(stretch: Stretch, parts: Sequence[_Part], noise: Sequence[Array]) -> Array:
     """(columns, draws) least-squares solutions of the stretch for each draw of the noise."""
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
     places, values = [np.zeros(0, np.int64)], [np.zeros(0)]
     side = np.zeros((stretch.size, noise[0].shape[-1]))
     for part, one in zip(parts, noise):

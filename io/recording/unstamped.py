@@ -105,17 +105,20 @@ def _begins(arrived_s: Array, slot: Ints, period_s: float) -> Ints:
     window = min(max(_WINDOW, 4 * flush), len(late_s) - 1)
     ahead = minimum_filter1d(late_s, 2 * window + 1, origin=-window, mode="nearest")
     late, least = late_s.tolist(), deque([0])
-    begin, i, last, previous, level = 0, 1, len(late) - flush, -np.inf, late[0]
+    begin, former, i, last = 0, 0, 1, len(late) - flush
+    previous, level = -np.inf, late[0]
     while i < len(late):
         if late[i] < previous + period_s / 2:
             # Nothing was missing: the host was too busy to read for a while, and has caught up.
-            begins[begin], previous, level = 0, -np.inf, late[i]
+            begins[begin] = 0
+            begin, level, previous = former, previous, -np.inf
         before = late[least[0]]
         raised = i < last and ahead[i] - before > period_s / 2
-        lowered = bool(waited_least[i]) and surplus[i] > surplus[max(i - window, begin)]
+        short = begin > 0 and i - begin < flush
+        first = max(i - window, begin)
+        lowered = bool(waited_least[i]) and surplus[i] > surplus[first]
         # The first reading of the lower count may itself have waited.
         lowered &= late[i] - level < -period_s / 4 and ahead[i] - level < -period_s / 2
-        short = begin > 0 and i - begin < flush
         # A lower count's readings came too early for the one before: it does not end at once.
         if (raised or lowered) and not (short and np.isneginf(previous)):
             if raised:
@@ -125,10 +128,11 @@ def _begins(arrived_s: Array, slot: Ints, period_s: float) -> Ints:
                 late_by = 0
             else:
                 # The lower count begins after the most malformed lines; what waited comes before i.
-                steps = np.diff(surplus[max(i - window, begin) : i + 1])[::-1]
+                steps = np.diff(surplus[first : i + 1])[::-1]
                 late_by = int(np.argmax(steps))
             if short:
                 begins[begin] = 0  # too short to contain a reading that hardly waited
+            former = former if short else begin
             begin, previous = i - late_by, before if raised else -np.inf
             begins[begin] = 1
             least.clear()

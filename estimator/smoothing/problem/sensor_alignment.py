@@ -68,7 +68,7 @@ _CLEAR_GAIN = 5.0
 _CORRELATED = 10.0
 """So many neighbouring pixels of a mark count as one, because the shake moves them alike."""
 
-_USUAL_GAIN = (0.75, 1.35)
+_USUAL_GAIN, _KNOWN_GAIN = (0.75, 1.35), 0.01
 _FASTEST_MM_S = 3000.0
 _STUCK_S = 0.05
 _MOVING_MM_S = 20.0
@@ -866,21 +866,27 @@ def _gain_of_marks(problem: SmoothingProblem) -> tuple[float, float] | None:
 
 
 def _gain_finding(gain: float, sd: float, where: str) -> Finding:
-    """Name the sign or the unit that explains the true motion over the encoder's."""
-    units = {1000.0: "m", 25.4: "inches", 10.0: "cm", 0.001: "µm"}
+    """Name the sign or the unit that explains the true motion over the encoder's.
+
+    A gain that is no unit is proposed only where it is known to `_KNOWN_GAIN`.
+    """
+    units = {1000.0: "m", 25.4: "inches", 10.0: "cm", 0.001: "µm", 1.0: "mm"}
     size = min(units, key=lambda u: abs(np.log(abs(gain) / u)))
-    named = abs(np.log(abs(gain) / size)) < 0.3
-    factor = float(np.sign(gain)) * (size if named else 1.0 if 0.7 < abs(gain) < 1.4 else abs(gain))
+    known = sd < _KNOWN_GAIN * abs(gain)
+    likely = max(3 * sd / abs(gain), 0.02 if known else 0.3)
+    named = abs(np.log(abs(gain) / size)) < likely and (size != 1.0 or gain < 0)
+    factor = float(np.copysign(size, gain)) if named else gain
     seen = f"images and sensors show {gain:.4g} ± {sd:.2g} times the motion that it reads"
+    todo, fix = f"multiply position_mm by {factor:.6g}", {"encoder_factor": factor}
     if factor == -1.0:
         words, code = f"{seen}: its sign is turned", Code.ENCODER_SIGN
     elif named:
         words, code = f"{seen}: it reads {units[size]}, not mm", Code.ENCODER_UNIT
     else:
         words, code = f"{seen}: its scale is wrong", Code.ENCODER_SCALE
-    return Finding(
-        words, where, f"multiply position_mm by {factor:.6g}", code, {"encoder_factor": factor}
-    )
+        if not known:
+            todo, fix = "check its unit and its counts per mm", {}
+    return Finding(words, where, todo, code, fix)
 
 
 def _stuck(problem: SmoothingProblem) -> list[Finding]:

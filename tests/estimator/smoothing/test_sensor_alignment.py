@@ -1,4 +1,4 @@
-"""A drift of a sensor's clock is taken out where the images show one, and nowhere else."""
+"""Clocks and scales of sensors and encoder, against the images of short runs."""
 
 from __future__ import annotations
 
@@ -23,17 +23,24 @@ ARMS = {"arm_left": "left", "arm_right": "right"}
 
 
 @cache
-def run_of(seed: int) -> Run:
-    """S6 with loggers that record 10 s before and after the frames."""
-    case = replace(cases()["S6"], around_s=10.0)
-    return simulate(case, np.random.default_rng([seed, int.from_bytes(b"S6", "little"), 19]))
+def run_of(seed: int, scenario: str = "S6") -> Run:
+    """A run with loggers that record 10 s before and after the frames."""
+    case = replace(cases()[scenario], around_s=10.0)
+    name = int.from_bytes(scenario.encode(), "little")
+    return simulate(case, np.random.default_rng([seed, name, 19]))
 
 
 def placed(
-    seed: int, information: str, change: Any = None, every: int = 1
+    seed: int,
+    information: str,
+    change: Any = None,
+    *,
+    every: int = 1,
+    scenario: str = "S6",
+    encoder: float = 1.0,
 ) -> tuple[dict[str, Accelerometer], list[Finding]]:
     """The sensors on the clock of the frames, and what was found."""
-    run = run_of(seed)
+    run = run_of(seed, scenario)
     inputs: dict[str, Any] = run.inputs(information)
     table, sensors = run.accelerometers, {}
     for name, camera in ARMS.items():
@@ -46,7 +53,8 @@ def placed(
             "t_s": t[::every], "a_m_s2": reading[::every], "mounted_on": camera,
             "axes": np.eye(3), "noise_density_ug_sqrt_hz": 22.5, "clock": "unknown",
         }  # fmt: skip
-    given = inputs | {"accelerometers": sensors, "stage": run.stage}
+    stage = run.stage.assign(position_mm=encoder * run.stage["position_mm"])
+    given = inputs | {"accelerometers": sensors, "stage": stage}
     tracks, calibration = given.pop("tracks"), given.pop("calibration")
     problem, _, _, known = problem_of(tracks, calibration, **given)
     problem, found = aligned(problem, known)
@@ -83,3 +91,22 @@ def test_a_sensor_slower_than_the_frames_is_told() -> None:
     assert len(words) == 2 and "above 125 Hz" in words[0]
     _, said = placed(905, "one", every=2)
     assert not any("fewer than" in f.warning for f in said)
+
+
+@pytest.mark.parametrize(("encoder", "proposed"), [(1e-3, 1e3), (1 / 25.4, 25.4), (-1.0, -1.0)])
+def test_a_scale_that_is_roughly_known_is_taken_for_the_nearest_unit(
+    encoder: float, proposed: float
+) -> None:
+    """One bubble shows 1,355 ± 200 times the motion of an encoder in metres."""
+    _, said = placed(905, "one", scenario="S2", encoder=encoder)
+    assert [f.fix for f in said if f.code is not None] == [{"encoder_factor": proposed}]
+
+
+@pytest.mark.parametrize(("information", "known"), [("one", False), ("references", True)])
+def test_a_scale_that_is_no_unit_is_proposed_where_it_is_well_known(
+    information: str, known: bool
+) -> None:
+    _, said = placed(905, information, scenario="S2", encoder=1 / 4)
+    (finding,) = [f for f in said if f.code is not None]
+    assert finding.code == "ENCODER_SCALE"
+    assert finding.fix == ({"encoder_factor": pytest.approx(4.0, rel=2e-3)} if known else {})

@@ -38,7 +38,7 @@ def learning_signals(
     weights : as for `learning_window`.  fixed : as for `signals_of`.
     """
     window = learning_window(problem, weights)
-    pieces = [] if fixed else _pieces(problem, weights, len(window.problem.t_s))
+    pieces = [] if fixed else _pieces(problem, weights, window)
     if pieces:
         each = zip(*(signals_of(piece.problem) for piece in pieces))
         return tuple(stacked(some) for some in each)
@@ -46,17 +46,19 @@ def learning_signals(
 
 
 def _pieces(
-    problem: SmoothingProblem, weights: tuple[Array, Array] | None, length: int
+    problem: SmoothingProblem, weights: tuple[Array, Array] | None, window: Window
 ) -> list[Window]:
     """Return pieces of a run in which enough bubbles are seen all the time, the longest possible.
 
-    length : of the window. None where some bubbles are seen all of that time, where it is so short
-    that all bubbles can be learned from jointly, and where something stands still.
+    window : what is learned from otherwise. None where enough bubbles are seen all of its time,
+    where it is so short that all can be learned from jointly, and where something stands still.
     """
+    length, end = len(window.problem.t_s), window.first + len(window.problem.t_s)
     firsts, lasts = (np.array([getattr(b, n) for b in problem.bubbles]) for n in ("first", "last"))
-    most = int((lasts - firsts).max(initial=0)) + 1
-    if length < _LONG or len(problem.marks) or most >= PRESENT * length:
+    lasting = np.count_nonzero((firsts <= window.first) & (lasts >= end - 1))
+    if length < _LONG or len(problem.marks) or lasting >= _ENOUGH_BUBBLES:
         return []
+    most = min(int((lasts - firsts).max(initial=0)) + 1, length)
     steps = np.diff(problem.t_s)
     if np.ptp(steps) > _UNEVEN * float(np.median(steps)):
         return []

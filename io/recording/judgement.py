@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
@@ -24,6 +25,7 @@ _PAIRS = 5
 _CUBICS = ((1, 2), (3, 4), (1, 5), (2, 3), (4, 5))
 """Distances of the four readings, on both sides, of each cubic: every distance twice."""
 _PASSES = 4
+_REACH = 5
 _BLOCK = 32
 _QUANTILE = 0.8
 _MOTION = 3
@@ -78,13 +80,30 @@ def far_from_neighbours(t_s: Array, values: Sequence[Array], most: float = 0.0) 
     Readings that are found are taken away and the others tested again, because wrong readings near
     each other hide each other.
     """
-    far = np.zeros(len(t_s), bool)
+    far = _beyond_reach(t_s, values, most)
     for _ in range(_PASSES):
         left = np.flatnonzero(~far)
         found = _far_at_first(t_s[left], [value[left] for value in values], most)
         if not found.any():
             break
         far[left[found]] = True
+    return far
+
+
+def _beyond_reach(t_s: Array, values: Sequence[Array], most: float) -> Bools:
+    """(N,) True for a value that nothing gets to and back from within `_REACH` readings.
+
+    Up to five wrong values in a row do not move the median of eleven.
+    """
+    far = np.zeros(len(t_s), bool)
+    if not most or len(t_s) < 2 * _REACH + 1:
+        return far
+    index = np.arange(_REACH, len(t_s) - _REACH)
+    around_s = t_s[index + _REACH] - t_s[index - _REACH]
+    for value in values:
+        step = np.abs(value[index + 1] - value[index])
+        off = np.abs(value - median_filter(value, 2 * _REACH + 1))[index]
+        far[index] |= off > most / 2 * around_s**2 + _REACH * median_filter(step, 2 * _REACH + 1)
     return far
 
 

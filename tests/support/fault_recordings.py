@@ -163,7 +163,7 @@ def account(
         sim.device.name if stamped else "encoder without stamps",
         last - first, len(number), reported, edge,
         int(wrong.sum()), int(np.sum((off > 1e-9) & ~wrong)) if stamped else 0,
-        0 if stamped else round(_busy_s(one.arrived_s + begin_s, truth, sim) * sim.rate_hz),
+        round(_busy_s(one.arrived_s + begin_s, truth, sim) * sim.rate_hz),
         float(np.max(np.abs(one.t_s - sim.due_s(number) + begin_s))) if stamped else float("nan"),
     )  # fmt: skip
 

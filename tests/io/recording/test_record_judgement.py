@@ -41,6 +41,14 @@ def test_a_value_that_lost_a_digit_is_found() -> None:
     assert np.flatnonzero(far_from_neighbours(T_S, [counts], MOST)).tolist() == damaged
 
 
+@pytest.mark.parametrize("count", [3, 5])
+def test_values_in_a_row_that_lost_a_digit_are_found(count: int) -> None:
+    counts = COUNTS.copy() + 1000
+    damaged = list(range(900, 900 + count))
+    counts[damaged] = np.floor(counts[damaged] / 10)
+    assert np.flatnonzero(far_from_neighbours(T_S, [counts], MOST)).tolist() == damaged
+
+
 def test_what_a_stage_can_do_is_not_doubted() -> None:
     step = np.where(T_S < 1, 0.0, 5000.0)
     kick = np.where(T_S < 1, 0.0, 2e6 * np.maximum(T_S - 1, 0) ** 2)

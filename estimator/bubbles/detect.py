@@ -34,7 +34,7 @@ from telerig.estimator.bubbles.outline.outline_fit import Outlines, Start, close
 
 __all__ = ["Bubbles", "detect_bubbles", "find_bubbles", "outline_centroid", "outline_points"]
 
-_MAX_AXIS_RATIO = 3.0
+_MAX_AXIS_RATIO, _LEAST_AXIS_PX = 3.0, 1.0
 _DEFOCUS_FACTOR = 2.0
 _DEFOCUS_FLOOR_PX = 1.5
 _SMALL_EDGES = 3.0
@@ -136,7 +136,9 @@ def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:
     kept, slender = [], []
     for part in parts:
         u, v, a, b, _ = part.ellipse.tolist()
-        if a <= _MAX_AXIS_RATIO * b:
+        if b < _LEAST_AXIS_PX:
+            slender.append(Rejected(u, v, (a * b) ** 0.5, "too small to have an outline"))
+        elif a <= _MAX_AXIS_RATIO * b:
             kept.append(part)
         else:
             slender.append(Rejected(u, v, (a * b) ** 0.5, f"{a / b:.1f} times as long as wide"))

@@ -12,6 +12,7 @@ import typer
 
 from telerig import __version__
 from telerig.scripts.batch import batch
+from telerig.scripts.bubbles import bubbles
 from telerig.scripts.calibrate import calibrate
 from telerig.scripts.console import interruptible
 from telerig.scripts.demo import demo
@@ -53,8 +54,9 @@ def _main(
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo, "init": init, "doctor": doctor, "simulate": simulate, "detect": detect,
-    "calibrate": calibrate, "track": track, "smooth": smooth, "validate": validate,
-    "run": run_dataset, "batch": batch, "record": record, "export": export, "report": report,
+    "calibrate": calibrate, "bubbles": bubbles, "track": track, "smooth": smooth,
+    "validate": validate, "run": run_dataset, "batch": batch, "record": record,
+    "export": export, "report": report,
 }  # fmt: skip
 for name, command in _COMMANDS.items():
     app.command(name)(command)

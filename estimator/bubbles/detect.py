@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.arrays import Bools
-from telerig.estimator.bubbles.flat_field import checked_image, normalised, nothing_to_see
+from telerig.arrays import Array, Bools
+from telerig.estimator.bubbles.field import lit_field
+from telerig.estimator.bubbles.flat_field import (
+    checked_image,
+    normalised,
+    nothing_to_see,
+    screen_of_field,
+)
 from telerig.estimator.bubbles.outline.blobs import (
     Blob,
     Part,
@@ -52,12 +60,17 @@ class Bubbles:
     noise : standard deviation of the image's noise, as a share of the background's grey level; NaN
         if it was not measured.
     reason : why there are no bubbles, in words; empty if there are some.
+    field : (rows, columns) where bubbles were looked for; None for the whole image.
+    clusters : by row of ``accepted``, the outline (n, 2) in px of a dark region that is no ellipse
+        and could not be divided into bubbles.
     """
 
     accepted: pd.DataFrame
     rejected: pd.DataFrame
     noise: float
     reason: str
+    field: Bools | None = None
+    clusters: Mapping[int, Array] = dataclass_field(default_factory=dict)
 
 
 def detect_bubbles(
@@ -93,19 +106,39 @@ def find_bubbles(
     image: NDArray[Any],
     *,
     background: NDArray[Any] | None = None,
+    field: Bools | None = None,
     min_diameter_px: float = 8.0,
     min_contrast: float = 0.3,
 ) -> Bubbles:
     """Find all bubbles like :func:`detect_bubbles`, and return the rejected shadows as well.
 
-    The arguments and the errors are those of :func:`detect_bubbles`.
+    field : (rows, columns) where bubbles are looked for. Without it and without a background, a
+        dark surround of the lit screen is found and left out.
+
+    The other arguments and the errors are those of :func:`detect_bubbles`.
     """
     image = checked_image(image, min_diameter_px, min_contrast)
     reason = nothing_to_see(image)
     if reason:
         return _bubbles({}, [], np.nan, reason)
+    if field is None and background is None:
+        field = lit_field(image)
+    if field is not None:
+        background = screen_of_field(image, field) if background is None else background
+        image = np.where(field, image, background).astype(image.dtype, copy=False)
+    found = _found(image, background, field, min_diameter_px, min_contrast)
+    return replace(found, field=field)
+
+
+def _found(
+    image: NDArray[Any],
+    background: NDArray[Any] | None,
+    field: Bools | None,
+    min_diameter_px: float,
+    min_contrast: float,
+) -> Bubbles:
     ratio, clipped = normalised(image, background)
-    sigma = max(noise_share(ratio), 1e-4)
+    sigma = max(noise_share(ratio, field), 1e-4)
     blobs, rejected = find_blobs(
         ratio, sigma=sigma, min_contrast=min_contrast, min_diameter_px=min_diameter_px
     )
@@ -117,7 +150,7 @@ def find_bubbles(
     dark_sigma = max(dark_noise_share(ratio, blobs, sigma), 1e-4)
     start = _start(parts, blobs, sigma, dark_sigma)
     outlines = fit_outlines(ratio, start)
-    columns = _columns(outlines, parts, image.shape, clipped)
+    columns = _columns(outlines, parts, image.shape, field, clipped)
     against = _reasons(outlines, columns, start, min_diameter_px, min_contrast)
     kept = np.array([not reason for reason in against])
     rejected += [
@@ -129,7 +162,9 @@ def find_bubbles(
     ]
     kept_columns = {name: values[kept] for name, values in columns.items()}
     reason = "" if np.any(kept) else "no shadow has a bubble's outline"
-    return _bubbles(kept_columns, rejected, sigma, reason)
+    whole = [parts[i] for i in np.flatnonzero(kept)]
+    clusters = {i: blobs[p.blob].contour_px for i, p in enumerate(whole) if p.merged}
+    return replace(_bubbles(kept_columns, rejected, sigma, reason), clusters=clusters)
 
 
 def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:
@@ -169,7 +204,11 @@ def _start(parts: list[Part], blobs: list[Blob], sigma: float, dark_sigma: float
 
 
 def _columns(
-    outlines: Outlines, parts: list[Part], shape: tuple[int, ...], clipped: bool
+    outlines: Outlines,
+    parts: list[Part],
+    shape: tuple[int, ...],
+    field: Bools | None,
+    clipped: bool,
 ) -> dict[str, Any]:
     ellipse, covariance = outlines.ellipse, outlines.centre_covariance_px2
     area, _ = outline_moments(ellipse, outlines.harmonics)
@@ -188,7 +227,7 @@ def _columns(
         "edge_px": outlines.blur_px,
         "chi2_dof": outlines.chi2_dof,
         "sigma_outline_px": np.where(outlines.resolved, outlines.sigma_outline_px, np.nan),
-        "flags": _flags(outlines, parts, shape, clipped),
+        "flags": _flags(outlines, parts, shape, field, clipped),
     }
     # A half turn of the axes changes the sign of the odd orders.
     turned = np.cos(ellipse[:, 4] - columns["angle_rad"]) < 0.0
@@ -200,13 +239,20 @@ def _columns(
 
 
 def _flags(
-    outlines: Outlines, parts: list[Part], shape: tuple[int, ...], clipped: bool
+    outlines: Outlines,
+    parts: list[Part],
+    shape: tuple[int, ...],
+    field: Bools | None,
+    clipped: bool,
 ) -> NDArray[np.object_]:
     ellipse = outlines.ellipse
     rim = points_on(ellipse, outlines.harmonics, np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False))
     reach = outlines.blur_px[:, None]
     beyond = (rim[..., 0] < reach - 0.5) | (rim[..., 0] > shape[1] - 0.5 - reach)
     beyond |= (rim[..., 1] < reach - 0.5) | (rim[..., 1] > shape[0] - 0.5 - reach)
+    if field is not None:
+        column, row = (np.round(rim[..., i]).astype(int) for i in (0, 1))
+        beyond |= ~field[row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)]
     border = np.any(beyond, axis=1)
     hidden = np.zeros(len(parts), dtype=np.bool_)
     blur, own = outlines.blur_px, np.arange(len(parts))

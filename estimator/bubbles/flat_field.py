@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from telerig.arrays import Float32
+from telerig.arrays import Bools, Float32
 from telerig.errors import InputError
 from telerig.estimator.images.noise import check_grey_image
 
@@ -17,6 +17,7 @@ _CLIPPED_SHARE = 0.5
 _WHITE_SHARE = 0.98
 _SHRINK = 8
 _SCREEN_PASSES = 3
+_OUTSIDE, _LEAST_LEVEL = 0.3, 0.2
 
 
 def checked_image(image: NDArray[Any], min_diameter_px: float, min_contrast: float) -> NDArray[Any]:
@@ -87,6 +88,13 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
 def _divisible(image: NDArray[Any]) -> NDArray[Any]:
     """The image in a type that OpenCV divides without a copy, or else in single precision."""
     return image if image.dtype in (np.uint8, np.uint16) else image.astype(np.float32, copy=False)
+
+
+def screen_of_field(image: NDArray[Any], field: Bools) -> Float32:
+    """`screen_level` of an image that shows the screen in a field (rows, columns) alone."""
+    level = float(np.median(image[field]))
+    seen = np.where(field, image, _OUTSIDE * level).astype(np.float32)
+    return np.maximum(screen_level(seen), np.float32(_LEAST_LEVEL * level))
 
 
 def screen_level(image: Float32) -> Float32:

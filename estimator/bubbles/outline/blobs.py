@@ -63,15 +63,19 @@ class Rejected(NamedTuple):
     reason: str
 
 
-def noise_share(ratio: Float32) -> float:
+def noise_share(ratio: Float32, field: Bools | None = None) -> float:
     """Noise of the normalised image where the screen is free, as a share of the background.
 
     From the `high_pass`, which is blind to any plane, of bands of rows of a large image.
+    field : (rows, columns) where the screen is; None for everywhere.
     """
     found, lit = [], []
     for first in range(0, max(len(ratio) - _BAND_ROWS, 0) + 1, _band_step(ratio)):
         band = ratio[first : first + _BAND_ROWS]
-        free = cv2.erode((band > _LIT).view(np.uint8), np.ones((3, 7), np.uint8))
+        bright = band > _LIT
+        if field is not None:
+            bright &= field[first : first + _BAND_ROWS]
+        free = cv2.erode(bright.view(np.uint8), np.ones((3, 7), np.uint8))
         found.append(high_pass(band)[1:-1].ravel())
         lit.append(free[1:-1].ravel() > 0)
     response, free = np.concatenate(found), np.concatenate(lit)

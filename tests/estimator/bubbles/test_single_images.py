@@ -1,0 +1,110 @@
+"""Bubbles of single images: the lit field, regions, masks, clusters; rendered and real images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from places import REAL
+
+from telerig.errors import InputError
+from telerig.estimator.bubbles.detect import find_bubbles
+from telerig.estimator.bubbles.field import lit_field, mask_field, region_field
+from telerig.estimator.bubbles.single_images import CLUSTER_COLUMNS, write_bubbles
+
+PLACES = np.array([(150.0, 140.0), (260.0, 180.0), (200.0, 270.0), (300.0, 300.0)])
+RADIUS_PX = 16.0
+WINDOW = ((60, 60), (370, 60), (370, 380), (60, 380))
+
+
+def picture(framed: bool = True) -> np.ndarray:
+    """Four discs before a lit screen, 12 bits in 16, behind a window in a dark frame."""
+    v, u = np.mgrid[:440, :440].astype(float)
+    level = np.full((440, 440), 30000.0) * (1 - 2e-4 * (u - 220))
+    for a, b in PLACES:
+        level *= 1 - 0.8 / (1 + np.exp((np.hypot(u - a, v - b) - RADIUS_PX) / 0.6))
+    if framed:
+        lit = (u > 60) & (u < 370) & (v > 60) & (v < 380)
+        level = np.where(lit, cv2.GaussianBlur(level, (0, 0), 0.8), 900.0)
+    noise = np.random.default_rng(1).normal(0, 150, level.shape)
+    return (np.clip(level + noise, 0, 65535) // 16 * 16).astype(np.uint16)
+
+
+def test_the_dark_frame_of_a_window_is_left_out() -> None:
+    image = picture()
+    field = lit_field(image)
+    assert field is not None
+    inside = region_field((440, 440), WINDOW, "window")
+    assert np.mean(field & inside) / inside.mean() > 0.85 and not np.any(field & ~inside)
+    found = find_bubbles(image)
+    assert found.field is not None and len(found.accepted) == len(PLACES)
+    off = found.accepted[["u_px", "v_px"]].to_numpy()[:, None] - PLACES
+    assert np.linalg.norm(off, axis=2).min(axis=1).max() < 0.1
+    assert set(found.accepted["flags"]) == {""}
+
+
+def test_an_image_that_is_lit_everywhere_has_no_field() -> None:
+    assert lit_field(picture(framed=False)) is None
+    plain = find_bubbles(picture(framed=False))
+    assert plain.field is None and len(plain.accepted) == len(PLACES)
+
+
+def test_a_bubble_across_the_edge_of_the_region_is_flagged() -> None:
+    image = picture(framed=False)
+    field = region_field(image.shape, ((0, 0), (260, 0), (260, 440), (0, 440)), "region")
+    found = find_bubbles(image, field=field).accepted
+    flags = {round(row.u_px / 10): row.flags for row in found.itertuples()}
+    assert len(found) in (2, 3) and flags.pop(15) == "" and flags.pop(20) == ""
+    assert all("border" in words for words in flags.values())
+
+
+def test_regions_and_masks_that_do_not_fit_are_refused() -> None:
+    for corners, words in (
+        ([[0, 0], [1, 1]], "is no polygon"),
+        ([[0, 0], [np.nan, 1], [2, 2]], "no place in an image"),
+        ([[900, 900], [950, 900], [950, 950]], "lies outside the image of 440 x 440 px"),
+    ):
+        with pytest.raises(InputError, match=words):
+            region_field((440, 440), corners, "--region")
+    with pytest.raises(InputError, match="is 5 x 5 px, the image 440 x 440 px"):
+        mask_field((440, 440), np.ones((5, 5)), "mask.png")
+    with pytest.raises(InputError, match="is black"):
+        mask_field((440, 440), np.zeros((440, 440)), "mask.png")
+
+
+def test_tables_clusters_and_overlays_are_written(tmp_path: Path) -> None:
+    image = picture(framed=False)
+    image[300:360, 60:120] = 4000
+    image[280:330, 100:180] = 4000
+    files = [tmp_path / "plain.png", tmp_path / "clustered.png"]
+    for file, pixels in zip(files, (picture(framed=False), image)):
+        cv2.imwrite(str(file), pixels)
+    words = write_bubbles(files, tmp_path)
+    assert words[0] == "plain: 4 bubbles, 0 clusters"
+    found = pd.read_csv(tmp_path / "detections.csv")
+    assert found.groupby("image").size().to_dict() == {"clustered": 4, "plain": 4}
+    clusters = pd.read_csv(tmp_path / "clusters.csv")
+    assert tuple(clusters.columns) == CLUSTER_COLUMNS
+    assert set(clusters["image"]) == {"clustered"} and clusters["u_px"].between(55, 185).all()
+    for name in ("plain", "clustered"):
+        assert cv2.imread(str(tmp_path / "overlays" / f"{name}.jpg")) is not None
+    with pytest.raises(InputError, match="two images are called plain"):
+        write_bubbles([files[0], tmp_path / "other" / "plain.tif"], tmp_path)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real images are not here")
+def test_real_bubbles_behind_a_window() -> None:
+    """1,014 labelled bubbles; before, the frame around the window was taken for the only one."""
+    (file,) = (REAL / "bubbles_microgravity" / "images").glob("*img006001.png")
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    field = lit_field(image)
+    assert field is not None and 0.6 < field.mean() < 0.75
+    labels = pd.read_csv(REAL / "bubbles_microgravity" / "labels" / "objects.csv")
+    mine = labels[labels["image"].str.endswith("img006001") & (labels["d_px"] > 12)]
+    found = find_bubbles(image)
+    single = found.accepted.drop(index=list(found.clusters))
+    away = mine[["u_px", "v_px"]].to_numpy()[:, None] - single[["u_px", "v_px"]].to_numpy()
+    assert np.mean(np.linalg.norm(away, axis=2).min(axis=1) < 3.0) > 0.25

@@ -44,7 +44,7 @@ _CLOCK_PASSES = 6
 _OUTLIER_SIGMAS, _SUSPICIOUS_SIGMAS = 4.0, 5.0
 _LEAST_KEPT = 0.7
 _SAMPLE_OUTLIER, _SAMPLE_SUSPICIOUS, _BACK = 12.0, 20.0, 0.9
-_PEAK_SAMPLES, _DISPUTED = 8, 4
+_PEAK_SAMPLES, _DISPUTED = 8, 3
 _LEAST_SAMPLES_KEPT = 0.95
 _MOST_ROUNDS, _LEAST_SCALE = 5, 1e-9
 _DELAY_STEP_S, _DELAY_LEAP_S = 3e-5, 2e-3
@@ -481,7 +481,8 @@ class SampleRejection:
             if weight is None:
                 continue
             lost = np.flatnonzero(usable & (weight < 0.5) & ~self._disputed(t_s))
-            for run in np.split(lost, np.flatnonzero(np.diff(lost) > 2 * _PEAK_SAMPLES) + 1):
+            near = 4 * _PEAK_SAMPLES
+            for run in np.split(lost, np.flatnonzero(np.diff(lost) > near) + 1):
                 if len(run) >= _DISPUTED:
                     ends = np.clip(run[[0, -1]] + [-_PEAK_SAMPLES, _PEAK_SAMPLES], 0, len(t_s) - 1)
                     self.disputed_s.append((float(t_s[ends[0]]), float(t_s[ends[1]])))

@@ -132,12 +132,13 @@ def transposed_product(
     out = np.zeros((int(starts[-1]), values[0].shape[-1]))
     for linear, given in zip(factors, values):
         for mine, at, block in _places(linear, starts):
-            share = np.einsum("mij,mik->mjk", block, given[mine])
-            order = np.argsort(at[:, 0], kind="stable")
-            first = np.flatnonzero(np.diff(at[order, 0], prepend=-1))
-            if len(first) < len(order):
-                share = np.add.reduceat(share[order], first, axis=0)
-                at = at[order[first]]
+            share = np.swapaxes(block, -1, -2) @ given[mine]
+            if np.any(np.diff(at[:, 0]) < 0):
+                order = np.argsort(at[:, 0], kind="stable")
+                share, at = share[order], at[order]
+            first = np.flatnonzero(np.diff(at[:, 0], prepend=-1))
+            if len(first) < len(at):
+                share, at = np.add.reduceat(share, first, axis=0), at[first]
             out[at] += share
     return out
 

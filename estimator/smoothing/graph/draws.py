@@ -21,8 +21,9 @@ from telerig.estimator.smoothing.problem.problem import Observations
 from telerig.factors.linear_factors import LinearFactors, product, transposed_product
 
 DRAWS = 16
-_FEWEST_DRAWS, _DRAWN_ROWS = 2, 320_000
-"""Of a long run with many bubbles fewer draws do: what is compared are means over all states."""
+_FEWEST_DRAWS, _DRAWN_ROWS, _ROWS_AT_ONCE = 2, 320_000, 100_000
+"""Of a long run with many bubbles fewer draws do: what is compared are means over all states. Few
+states times draws at once take little memory."""
 _REFINEMENTS = 1
 
 
@@ -57,9 +58,9 @@ def draws_of(
 
     draws : their number; None for `DRAWS`, or fewer for a graph with many states.
     """
-    draws = draws or int(np.clip(_DRAWN_ROWS // (graph.rows or 1), _FEWEST_DRAWS, DRAWS))
-    # of many states one draw after the other takes less memory
-    at_once = draws if graph.rows < _DRAWN_ROWS // DRAWS else 1
+    rows = graph.rows or 1
+    draws = draws or int(np.clip(_DRAWN_ROWS // rows, _FEWEST_DRAWS, DRAWS))
+    at_once = max(1, _ROWS_AT_ONCE // rows)
     rng, parts = np.random.default_rng(seed), list[Draws]()
     for done in range(0, draws, at_once):
         parts.append(_drawn(graph, factors, root, min(at_once, draws - done), rng))

@@ -64,7 +64,10 @@ def region_field(shape: tuple[int, int], corners_px: ArrayLike, where: str) -> B
     corners_px : (n, 2) corners (u, v), n >= 3.  where : named in errors.
     Raises InputError for what is no polygon and for one that lies outside the image.
     """
-    corners = np.asarray(corners_px, float)
+    try:
+        corners = np.asarray(corners_px, float)
+    except (TypeError, ValueError):
+        corners = np.zeros(0)
     if corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3:
         raise InputError(
             "is no polygon", where=where, todo="give three corners or more: [[u, v], [u, v], ...]"

@@ -292,3 +292,20 @@ def test_calibrate_as_a_command_and_from_python_have_the_same_defaults() -> None
     same = {name: name for name in ("model", "solver", "medium", "outlier_sd", "seed")}
     for option, parameter in (same | {"dots": "dots_free"}).items():
         assert command[option].default == python[parameter].default, option
+
+
+def test_bubbles_of_single_images(tmp_path: Path) -> None:
+    v, u = np.mgrid[:200, :260]
+    image = np.where(np.hypot(u - 90, v - 100) < 15, 40, 200).astype(np.uint8)
+    image += np.random.default_rng(0).integers(0, 5, image.shape, np.uint8)
+    tifffile.imwrite(tmp_path / "one.tif", image)
+    text = run("bubbles", tmp_path / "one.tif", "--out", tmp_path / "found", "--quiet")
+    assert "one: 1 bubble, 0 clusters" in text
+    row = pd.read_csv(tmp_path / "found" / "detections.csv").iloc[0]
+    assert row["image"] == "one" and abs(row["u_px"] - 90) < 0.2
+    far = "--region=200,20 250,20 250,180"
+    assert "one: 0 bubbles" in run("bubbles", tmp_path, far, "--out", tmp_path / "far", "--quiet")
+    text = run("bubbles", tmp_path, "--region=1,2,3 4", "--out", tmp_path / "bad", code=2)
+    assert "--region: is no polygon" in text and not (tmp_path / "bad").exists()
+    (tmp_path / "none").mkdir()
+    assert "holds no image" in run("bubbles", tmp_path / "none", code=2)

@@ -64,6 +64,7 @@ def test_a_bubble_across_the_edge_of_the_region_is_flagged() -> None:
 def test_regions_and_masks_that_do_not_fit_are_refused() -> None:
     for corners, words in (
         ([[0, 0], [1, 1]], "is no polygon"),
+        ([[0, 0], [1, 1, 2], [3, 3]], "is no polygon"),
         ([[0, 0], [np.nan, 1], [2, 2]], "no place in an image"),
         ([[900, 900], [950, 900], [950, 950]], "lies outside the image of 440 x 440 px"),
     ):

@@ -31,8 +31,16 @@ GAUGE = (
     "centres held at the middle of the image unless the model frees them; target frame tied to "
     "the nominal dot positions by the dots' priors"
 )
+GAUGE_OF_SCALES = (
+    "rig frame = first camera's frame; the optical axes are nearly parallel, so the depth of each "
+    "camera's origin is where its scale is the stated one; target frame tied to the nominal dot "
+    "positions by the dots' priors"
+)
 BAD_SCATTER_PX = 0.5
 BAD_KEPT = 0.9
+UNEXPLAINED = 0.3
+"""Noise floor over image noise beyond which errors of the lens model can move the angle between
+axes as far as the image centres do."""
 BAD_FLOOR = 5.0
 """Noise floor over image noise beyond which a warning says that the model is incomplete."""
 
@@ -109,7 +117,7 @@ def calibration_from_fit(
         twin=_mirror(fit, nominal_rotvec_deg),
         model=_model(fit),
         diagnostics={
-            "gauge": GAUGE.format(two="two" if len(cameras) <= 2 else "first two"),
+            "gauge": _gauge(problem),
             "weak": weak,
             "tilts_deg": {
                 f"{problem.views[v]}/{problem.cameras[c].name}": t
@@ -124,6 +132,12 @@ def calibration_from_fit(
     )
     statistics |= _space(calibration, problem, state)
     return calibration
+
+
+def _gauge(problem: Problem) -> str:
+    if problem.scales_held:
+        return GAUGE_OF_SCALES
+    return GAUGE.format(two="two" if len(problem.cameras) <= 2 else "first two")
 
 
 def dot_table(problem: Problem) -> pd.DataFrame:
@@ -259,9 +273,11 @@ def _angle_systematic(fit: Fit, angle_rad: float, camera: int) -> float:
     """Return how far the angle (rad) changes if the image centres are held at the image's middle.
 
     With strong perspective, a change of the angle and a change of the centres have similar effects,
-    and an error of the distortion model moves both. The result is 0 if the centres are held anyway.
+    and an error of the distortion model moves both. The result is 0 if the centres are held anyway,
+    and if the model explains the images down to their noise.
     """
-    if fit.centre_held is None:
+    noise = _scatter(fit.robust.problem.covariance_px2 - fit.robust.floor_px**2 * np.eye(2))
+    if fit.centre_held is None or fit.robust.floor_px <= UNEXPLAINED * noise:
         return 0.0
     return float(angle_rad - np.arccos(fit.centre_held[camera, 2, 2]))
 

@@ -24,6 +24,7 @@ from telerig.estimator.calibration.next_view import next_view
 from telerig.estimator.calibration.quality import checks
 from telerig.estimator.calibration.quality.residual_structure import residual_tests
 from telerig.estimator.calibration.quality.split_half import split_half_check
+from telerig.estimator.calibration.quality.telecentricity import telecentricity
 from telerig.estimator.calibration.quality.view_pairing import refuse_copies, wrong_pairs
 from telerig.estimator.calibration.result.calibration import Calibration
 from telerig.estimator.calibration.result_from_fit import Fit, calibration_from_fit
@@ -143,6 +144,8 @@ def _solved(
     start = best_start(problem, start_dots, nominal)
     mirror = mirror_ambiguity.choose_start(start, problem, nominal)
     start = mirror_ambiguity.with_tilt_signs(problem, mirror.state)
+    problem = _with_origin(problem, start)
+    cameras = problem.cameras
     fit = _fit(problem, start, models, progress)
     if len(cameras) > 1 and mirror.decided_by != mirror_ambiguity.BY_PLATE:
         fit, mirror = _on_the_right_side(fit, nominal)
@@ -151,6 +154,7 @@ def _solved(
         *notes,
         *checks.position_notes(problem, start),
         *checks.exchanged_notes(final, solution.state),
+        *checks.parallel_notes(solution.state),
     )
     considered = considered_groups(fit.choice, len(cameras))
     added = considered_words(considered, [c.name for c in cameras])
@@ -164,7 +168,28 @@ def _solved(
     weak = checks.weak_parameters(final, own)
     found = calibration_from_fit(fit, joint, free, weak, nominal_rotvec_deg=nominal, name=name)
     checked = _trust(fit.robust, joint, free)
-    return replace(found, diagnostics={**found.diagnostics, **checked})
+    scale_change = telecentricity(final, solution, fit.models)
+    return replace(
+        found, diagnostics={**found.diagnostics, **checked},
+        statistics={**found.statistics, "telecentricity": scale_change},
+    )  # fmt: skip
+
+
+def _with_origin(problem: Problem, start: State) -> Problem:
+    """Return the problem with scales held at the start's if axes of perspective lenses are nearly
+    parallel, else unchanged.
+    """
+    if len(problem.cameras) < 2 or not mirror_ambiguity.perspective_sign(start, problem):
+        return problem
+    if checks.axes_angle_deg(start) > checks.NEAR_PARALLEL_DEG:
+        return problem
+    scale = INDEX["scale_px_per_mm"]
+    cameras = []
+    for camera, found in zip(problem.cameras, start.intrinsics):
+        intrinsics = camera.intrinsics.copy()
+        intrinsics[scale] = found[scale]
+        cameras.append(replace(camera, intrinsics=intrinsics))
+    return replace(problem, cameras=tuple(cameras), hold_scales=True)
 
 
 def _refuse_wrong_pairs(problem: Problem, dots_mm: Array, cause: Exception | None = None) -> None:
@@ -263,7 +288,7 @@ def best_start(
     fits: list[Solution] = []
     for start in starts:
         perspective = np.any(start.intrinsics[:, INDEX["kappa_per_mm"]] != 0)
-        candidate = problem.with_model("kappa" if perspective else "none")
+        candidate = _with_origin(problem.with_model("kappa" if perspective else "none"), start)
         fits.append(solve(candidate, start, max_iterations=15, relative=1e-4))
     states, costs = [f.state for f in fits], [f.cost for f in fits]
     return mirror_ambiguity.consistent_start(states, costs, problem, nominal or {})

@@ -20,7 +20,7 @@ from itertools import product
 import numpy as np
 
 from telerig.arrays import Array
-from telerig.estimator.calibration.solver.problem import Problem, parameter_unit, prior_sigma
+from telerig.estimator.calibration.solver.problem import Problem, parameter_unit
 from telerig.estimator.calibration.solver.robust_least_squares import Solution
 from telerig.factors.calibration import whitened_error
 from telerig.rig.lens_parameters import GROUPS, INDEX, PLAIN_GROUPS, ordered
@@ -87,7 +87,7 @@ class QuadraticCost:
             [parameter_unit(k)[problem.free_indices(c)] for c, k in enumerate(problem.cameras)]
         )
         prior = np.concatenate(
-            [prior_sigma(k)[problem.free_indices(c)] for c, k in enumerate(problem.cameras)]
+            [problem.prior_sigma(c)[problem.free_indices(c)] for c in range(len(problem.cameras))]
         )
         nominal = [problem.cameras[c].intrinsics[INDEX[p]] for c, p in names]
         there = [solution.state.intrinsics[c, INDEX[p]] for c, p in names]
@@ -186,7 +186,7 @@ def _variance(problem: Problem, solution: Solution, common: Array, dots: Array) 
     error = whitened_error(solution.state, problem.observations(), problem.rho_mm)
     shared = sum(len(f) for f in problem.free)
     weight = np.concatenate([
-        (parameter_unit(k) / prior_sigma(k))[problem.free_indices(c)]
+        (parameter_unit(k) / problem.prior_sigma(c))[problem.free_indices(c)]
         for c, k in enumerate(problem.cameras)
     ])  # fmt: skip
     by_prior = (np.diag(common)[:shared] * weight**2).sum()

@@ -20,6 +20,9 @@ RECOMMENDED_VIEWS = 6
 MINIMUM_DOTS = 4
 PARALLEL_DEG = 3.0
 SMALL_TILT_DEG = 10.0
+NEAR_PARALLEL_DEG = 10.0
+"""Below this angle, where two optical axes come closest is too uncertain to be the origin of lenses
+with perspective: the solver would need hundreds of iterations."""
 PERSPECTIVE = 0.01
 """If kappa * rho (no unit) exceeds this, the image shows the depth of a view. Rho is half
 the diagonal of the field of view, in mm."""
@@ -300,6 +303,24 @@ def _coverage_note(problem: Problem, c: int) -> list[Note]:
         "distortion is extrapolated. Hold the target nearer to the edges in some views"
     )
     return [Note("coverage", words)]
+
+
+def axes_angle_deg(state: State) -> float:
+    """Return the angle between the optical axes of the first two cameras, 0 to 90 degrees."""
+    first, second = state.rig_from_camera[:2, :3, 2]
+    return float(np.degrees(np.arccos(min(abs(first @ second), 1.0))))
+
+
+def parallel_notes(state: State) -> list[Note]:
+    """Return a note if the optical axes of the first two cameras are nearly parallel."""
+    if len(state.rig_from_camera) < 2 or axes_angle_deg(state) > NEAR_PARALLEL_DEG:
+        return []
+    words = (
+        f"the optical axes are nearly parallel ({axes_angle_deg(state):.1f} degrees): depth is the "
+        "least precise coordinate of points in space, and two telecentric cameras would not see "
+        "it; 60-90 degrees between the cameras are best"
+    )
+    return [Note("near-parallel axes", words)]
 
 
 def weak_parameters(problem: Problem, joint: JointCovariance) -> list[str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from telerig.io.results.telecentricity_words import telecentricity_words
+
 if TYPE_CHECKING:
     from telerig.io.results.calibration import CalibrationFile
 
@@ -20,6 +22,7 @@ def summary(calibration: CalibrationFile) -> str:
     if "views" not in s:
         return _imported(calibration)
     lines = [f"Calibration {calibration.name!r}: {calibration.verdict.status}"]
+    lines += [f"  {words}" for words in telecentricity_words(s)]
     lines += [f"  ! {reason}" for reason in calibration.verdict.reasons]
     lines.append(
         f"  {s['views']} views, {s['dots_kept']} of {s['dots_measured']} dots kept "

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from telerig.estimator.calibration.solver.problem import (
-    GAUGE_SIGMA_MM,
     Problem,
     System,
     images_of,
     parameter_unit,
-    prior_sigma,
 )
 from telerig.factors.calibration import State
 from telerig.factors.custom_factors import (
@@ -61,11 +59,11 @@ def nonlinear_graph(problem: Problem, start: State) -> tuple[Any, Any, Keys]:
         free, unit = keys.free[c], keys.unit[c]
         if len(free):
             mean = (camera.intrinsics - start.intrinsics[c])[free] / unit
-            noise = gtsam.noiseModel.Diagonal.Sigmas(prior_sigma(camera)[free] / unit)
+            noise = gtsam.noiseModel.Diagonal.Sigmas(problem.prior_sigma(c)[free] / unit)
             graph.add(gtsam.PriorFactorVector(keys.intrinsics[c], mean, noise))
             values.insert(keys.intrinsics[c], np.zeros(len(free)))
         if c:
-            graph.add(depth_gauge_factor(keys.camera[c], GAUGE_SIGMA_MM, second=c == 1))
+            graph.add(depth_gauge_factor(keys.camera[c], problem.gauge_sigma_mm, second=c == 1))
             values.insert(keys.camera[c], gtsam.Pose3(start.rig_from_camera[c]))
     for key, view in zip(keys.view, start.rig_from_target):
         graph.add(place_factor(key, system.place_sigma_mm))

@@ -36,6 +36,9 @@ from telerig.rig.pose import Pose, rotation_from_rotvec
 from telerig.rig.target import Target
 
 GAUGE_SIGMA_MM = 1e-4
+LOOSE_GAUGE_MM = 1e6
+HELD_SCALE = 1e-7
+"""Relative standard deviation of a scale that is held to fix the depth of a camera's origin."""
 """Standard deviation with which the rig origin is held where the optical axes come closest
 (docs/decisions/003)."""
 
@@ -87,6 +90,8 @@ class Problem:
     plate_shift : (V, C) as in `Observations`.
     solver : "gtsam", "schur", or "auto" for the one that suits the size of the problem.
     outlier_sd : number of standard deviations beyond which a dot is left out.
+    hold_scales : where all lenses have perspective, hold their scales at the nominal ones. The
+        depth of each camera's origin is then where its scale is that, not where the axes meet.
     """
 
     cameras: tuple[Camera, ...]
@@ -106,6 +111,25 @@ class Problem:
     plate_shift: Array
     solver: str = "auto"
     outlier_sd: float = OUTLIER_SD
+    hold_scales: bool = False
+
+    @property
+    def scales_held(self) -> bool:
+        """Whether the scales, and not the optical axes, fix the depths of the cameras' origins."""
+        return self.hold_scales and all("kappa_per_mm" in names for names in self.free)
+
+    @property
+    def gauge_sigma_mm(self) -> float:
+        """The standard deviation that ties the origin to where the optical axes come closest."""
+        return LOOSE_GAUGE_MM if self.scales_held else GAUGE_SIGMA_MM
+
+    def prior_sigma(self, camera: int) -> Array:
+        """Return the standard deviations (20,) of the priors of one camera's intrinsics."""
+        sigma = prior_sigma(self.cameras[camera])
+        if self.scales_held:
+            scale = INDEX["scale_px_per_mm"]
+            sigma[scale] = HELD_SCALE * self.cameras[camera].intrinsics[scale]
+        return sigma
 
     @property
     def rho_mm(self) -> tuple[float, ...]:
@@ -436,7 +460,7 @@ class System:
         cameras = range(len(problem.cameras))
         self.free = [problem.free_indices(c) for c in cameras]
         self.unit = [parameter_unit(k)[f] for k, f in zip(problem.cameras, self.free)]
-        self.sigma = [prior_sigma(k)[f] for k, f in zip(problem.cameras, self.free)]
+        self.sigma = [problem.prior_sigma(c)[f] for c, f in enumerate(self.free)]
         place = slots(problem)
         every = np.arange(place["dots"][0].stop)
         self.camera_places = [
@@ -476,7 +500,9 @@ class System:
             jacobian = np.diag(unit / sigma)
             if c:
                 # only the second camera fixes the origin along the axis of the first camera
-                gauge, by_pose = depth_gauge_residual(state.rig_from_camera[c], GAUGE_SIGMA_MM)
+                gauge, by_pose = depth_gauge_residual(
+                    state.rig_from_camera[c], problem.gauge_sigma_mm
+                )
                 first = 0 if c == 1 else 1
                 value = np.concatenate([value, gauge[first:]])
                 whole = np.zeros((len(value), len(free) + 6))

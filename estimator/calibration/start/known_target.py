@@ -21,6 +21,8 @@ from telerig.factors.calibration import State
 from telerig.rig.lens_parameters import INDEX
 from telerig.rig.pose import nearest_rotation
 
+NEAR_PARALLEL = 0.17
+"""Sine of the angle between two optical axes below which they are nearly parallel."""
 STRONG_PERSPECTIVE = 0.01
 """kappa * rho above which the start takes the perspective that the views show."""
 _FLIP = np.array([1.0, 1.0, -1.0])
@@ -307,7 +309,33 @@ def _assemble(
         kappa = perspective_from_maps(maps, start, c)
         if abs(kappa) * camera.rho_mm > STRONG_PERSPECTIVE:
             intrinsics[c, INDEX["kappa_per_mm"]] = kappa
+    if camera_from_rig is not None and len(problem.cameras) == 2:
+        kappas = intrinsics[:, INDEX["kappa_per_mm"]]
+        parallel = np.linalg.norm(camera_from_rig[1][:2, 2]) < NEAR_PARALLEL
+        if parallel and np.all(kappas != 0):
+            _place_by_scales(start, maps, shifts)
     return start
+
+
+def _place_by_scales(
+    state: State, maps: dict[tuple[int, int], ImageMap], shifts: dict[tuple[int, int], Array]
+) -> None:
+    """Place views and the second camera by how large the target looks, in place.
+
+    Nearly parallel axes tell no depth, but perspective does: x = X / (1 + kappa Z).
+    """
+    scale, kappa = (state.intrinsics[:, INDEX[n]] for n in ("scale_px_per_mm", "kappa_per_mm"))
+    seen: dict[tuple[int, int], Array] = {}
+    for (v, c), m in maps.items():
+        enlarged = float(scale[c]) / rotation_from_jacobian(m.jacobian)[1]
+        seen[v, c] = np.r_[shifts[v, c] * enlarged, (enlarged - 1.0) / kappa[c]]
+    turn = state.rig_from_camera[1, :3, :3]
+    both = [v for v in range(len(state.rig_from_target)) if (v, 0) in seen and (v, 1) in seen]
+    base = np.median([seen[v, 0] - turn @ seen[v, 1] for v in both], axis=0)
+    state.rig_from_camera[1, :3, 3] = base
+    for v, c in seen:
+        if c == 0 or (v, 0) not in seen:
+            state.rig_from_target[v, :3, 3] = seen[v, 0] if c == 0 else base + turn @ seen[v, 1]
 
 
 def perspective_from_maps(

@@ -178,6 +178,16 @@ def choose_solution(state: State, problem: Problem, nominal_rotvec_deg: Nominal)
         angles = [angle_to_nominal_deg(s, nominal_rotvec_deg) for s in (state, other)]
         margin = abs(angles[0] - angles[1])
         nearest = int(np.argmin(angles))
+        if max(angles) < TIE_DEG and perspective == 0:
+            raise CalibrationError(
+                f"the optical axes are nearly parallel: the nominal rotation is right to "
+                f"{max(angles):.0f} degrees, but the two mirror solutions are as near to it, and "
+                "the lenses' perspective is too weak to tell them apart",
+                where="rig.toml [stereo]",
+                todo="turn one camera by 20 degrees or more: nearly parallel telecentric cameras "
+                "do not see depth; if the lenses are ordinary ones, state telecentricity_per_mm = "
+                "1 / working distance in [cameras.NAME]",
+            )
         if margin < TIE_DEG and perspective == 0:
             raise CalibrationError(
                 f"the two mirror solutions are {angles[0]:.0f} and {angles[1]:.0f} degrees from "

@@ -27,6 +27,7 @@ from telerig.io.report.page.page import drawn_over_cores, render_page
 from telerig.io.results.calibration import Status
 from telerig.io.results.manifest import reading
 from telerig.io.results.stale import stale
+from telerig.io.results.telecentricity_words import telecentricity_words
 
 _COLOURS = {
     Status.GOOD: "good",
@@ -84,6 +85,7 @@ def _words(results: CalibrationResults) -> dict[str, Any]:
         "status": file.verdict.status,
         "colour": _COLOURS[file.verdict.status],
         "reasons": file.verdict.reasons,
+        "lenses": telecentricity_words(results.statistics),
         "cameras": results.camera_names,
         "model": file.model.content(),
         "twin": file.twin.content(),

@@ -1,0 +1,206 @@
+"""Simulated rigs of ordinary lenses: does the automatic model state what it does not know?
+
+python benchmarks/ordinary_lenses.py [--rigs 20] [--parallel] [--first-seed 0]
+    [--out benchmarks/results/ordinary_lenses.md]
+
+Two pinhole cameras with focal lengths of 1,000 to 12,000 px, centres off by up to 40 px, every
+second rig with radial distortion. OpenCV projects
+the outlines of the dots, of which the centroid is measured. The bound of a rig is the standard
+deviation that its true model states on the same dots. With --parallel the axes are at 0 to 7
+degrees, and the cameras 0.15 of their distance apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import telerig
+from telerig.estimator.calibration.self_calibration import self_calibrate
+from telerig.rig.camera import Camera
+from telerig.rig.lens_parameters import INDEX
+from telerig.rig.target import Target
+
+Array = NDArray[np.float64]
+SIZE = np.array([1280, 1024])
+FIELD_MM = 100.0
+NOISE_PX = 0.03
+PRINT_MM = 0.005
+TARGET = Target(
+    rows=9, columns=12, pitch_mm=(7.0, 7.0), dot_diameter_mm=3.0, marks=((4, 5), (4, 7), (3, 5)),
+    print_sigma_mm=PRINT_MM, flatness_sigma_mm=PRINT_MM,
+)  # fmt: skip
+_TURN = 2.0 * np.pi / 48 * np.arange(48)
+CIRCLE = 0.5 * TARGET.dot_diameter_mm * np.column_stack([np.cos(_TURN), np.sin(_TURN), 0 * _TURN])
+
+
+def centroids(outlines_px: Array) -> Array:
+    """Centroids (N, 2) of polygons (N, K, 2)."""
+    after = np.roll(outlines_px, -1, axis=1)
+    cross = outlines_px[..., 0] * after[..., 1] - outlines_px[..., 1] * after[..., 0]
+    weighted = np.sum((outlines_px + after) * cross[..., None], axis=1)
+    return weighted / (3.0 * np.sum(cross, axis=1))[:, None]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Two cameras.
+
+    focal_px, distance_mm : (2,) focal lengths, and distances from the middle of the volume.
+    centre_px, radial : (2, 2) image centres, and OpenCV's k1, k2.
+    angle_deg : between the axes. base : distance of the cameras as a share of distance_mm.
+    """
+
+    focal_px: Array
+    centre_px: Array
+    radial: Array
+    angle_deg: float
+    distance_mm: Array
+    base: float = 0.0
+
+    @property
+    def distorted(self) -> bool:
+        return bool(np.any(self.radial))
+
+    @property
+    def model(self) -> str:
+        return "kappa+k1+k2+centre" if self.distorted else "kappa+centre"
+
+
+def rig_of(rng: np.random.Generator, distorted: bool) -> Rig:
+    focal = np.full(2, np.exp(rng.uniform(np.log(1000.0), np.log(12000.0))))
+    focal *= rng.uniform(0.95, 1.05, 2)
+    distance = focal * FIELD_MM / SIZE[0]
+    centre = (SIZE - 1) / 2 + rng.uniform(-40.0, 40.0, (2, 2))
+    # a distortion of up to 10 px at the corner of the image
+    corner = np.linalg.norm(SIZE) / 2 / focal
+    radial = np.zeros((2, 2))
+    if distorted:
+        radial[:, 0] = rng.uniform(2.0, 10.0, 2) / focal / corner**3 * rng.choice([-1.0, 1.0], 2)
+        radial[:, 1] = rng.uniform(-3.0, 3.0, 2) / focal / corner**5
+    return Rig(focal, centre, radial, float(rng.uniform(20.0, 70.0)), distance)
+
+
+def dots_of(rig: Rig, rng: np.random.Generator, views: int = 12) -> pd.DataFrame:
+    ids = TARGET.ids()
+    points = TARGET.nominal_mm(ids) + PRINT_MM * rng.standard_normal((len(ids), 3))
+    points -= points.mean(axis=0)
+    cameras = []
+    for c, turn in enumerate((-0.5, 0.5)):
+        world = Rotation.from_euler("y", turn * rig.angle_deg, degrees=True).as_matrix()
+        away = np.array([-turn * rig.base, 0.0, 1.0]) * rig.distance_mm[c]
+        cameras.append((world, away))
+    tables = []
+    for v in range(views):
+        tilt = rng.uniform(10.0, 32.0)
+        along = rng.uniform(0.0, 2 * np.pi)
+        pose = Rotation.from_rotvec(np.radians(tilt) * np.array([np.cos(along), np.sin(along), 0]))
+        pose = pose * Rotation.from_euler("z", rng.uniform(-180, 180), degrees=True)
+        shift = rng.uniform(-1, 1, 3) * np.array([12.0, 10.0, 15.0])
+        world = pose.apply(points) + shift
+        for c, (turn, away) in enumerate(cameras):
+            matrix = np.array([
+                [rig.focal_px[c], 0, rig.centre_px[c, 0]],
+                [0, rig.focal_px[c], rig.centre_px[c, 1]], [0, 0, 1],
+            ])  # fmt: skip
+            outlines = world[:, None] + pose.apply(CIRCLE)
+            uv, _ = cv2.projectPoints(
+                outlines.reshape(-1, 3), cv2.Rodrigues(turn)[0], away, matrix,
+                np.append(rig.radial[c], [0.0, 0.0]),
+            )  # fmt: skip
+            uv = centroids(uv.reshape(*outlines.shape[:2], 2))
+            uv += NOISE_PX * rng.standard_normal((len(ids), 2))
+            inside = np.all((uv > 10) & (uv < SIZE - 11), axis=1)
+            tables.append(pd.DataFrame({
+                "view": f"{v:02}", "camera": ("left", "right")[c], "dot": ids[inside],
+                "u_px": uv[inside, 0], "v_px": uv[inside, 1],
+                "suu_px2": NOISE_PX**2, "suv_px2": 0.0, "svv_px2": NOISE_PX**2,
+            }))  # fmt: skip
+    return pd.concat(tables, ignore_index=True)
+
+
+def calibrated(rig: Rig, dots: pd.DataFrame, model: str) -> telerig.Calibration:
+    cameras = [
+        Camera.create(name, (int(SIZE[0]), int(SIZE[1])), float(SIZE[0] / FIELD_MM))
+        for name in ("left", "right")
+    ]
+    return self_calibrate(
+        dots, cameras, TARGET, model=model,
+        nominal_rotvec_deg=[0.0, rig.angle_deg + 3.0, 0.0],
+    )  # fmt: skip
+
+
+def errors(rig: Rig, found: telerig.Calibration) -> tuple[Array, Array]:
+    """Errors (5,) of both centres in px and of the angle in degrees, and their stated sds (5,)."""
+    error, sd = [], []
+    for c, camera in enumerate(found.cameras):
+        for k, name in enumerate(("centre_u_px", "centre_v_px")):
+            error.append(camera.intrinsics[INDEX[name]] - rig.centre_px[c, k])
+            free = name in found.free[c]
+            sd.append(found.sd(f"{camera.name}.{name}") if free else 0.0)
+    error.append(found.statistics["axes_angle_deg"] - rig.angle_deg)
+    sd.append(found.statistics["axes_angle_sd_deg"])
+    return np.array(error), np.array(sd)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rigs", type=int, default=20)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--parallel", action="store_true")
+    options = parser.parse_args()
+    lines = [
+        f"# Ordinary lenses{', nearly parallel axes' if options.parallel else ''}", "",
+        "| seed | f px | angle deg | distortion | model | worst error / sd | centre px: error, sd, "
+        "bound | angle deg: error, sd, bound | says so | verdict | s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    good, said, ratios = 0, 0, []
+    for seed in range(options.first_seed, options.first_seed + options.rigs):
+        rng = np.random.default_rng(seed)
+        rig = rig_of(rng, distorted=seed % 2 == 0)
+        if options.parallel:
+            rig = replace(rig, angle_deg=float(seed % 8), base=0.15)
+        dots = dots_of(rig, rng)
+        begun = time.process_time()
+        found = calibrated(rig, dots, "auto")
+        seconds = time.process_time() - begun
+        error, sd = errors(rig, found)
+        _, bound = errors(rig, calibrated(rig, dots, rig.model))
+        z = np.abs(error) / np.maximum(sd, 1e-12)
+        good += bool(z.max() < 3.0)
+        ratios.append(sd / bound)
+        words = "ordinary lens" in "\n".join(found.report().splitlines()[:4])
+        said += words
+        worst = int(np.argmax(z[:4]))
+        distortion, told = ("yes" if yes else "no" for yes in (rig.distorted, words))
+        lines.append(
+            f"| {seed} | {rig.focal_px[0]:.0f} | {rig.angle_deg:.0f} | {distortion} "
+            f"| {found.model['name']} | {min(z.max(), 999):.1f} "
+            f"| {error[worst]:.2f}, {sd[worst]:.2f}, {bound[worst]:.2f} "
+            f"| {error[4]:.3f}, {sd[4]:.3f}, {bound[4]:.3f} | {told} "
+            f"| {found.verdict['status']} | {seconds:.0f} |"
+        )
+        print(lines[-1], flush=True)
+    lines += [
+        "",
+        f"{good} of {options.rigs} rigs: centres and angle within 3 of their standard deviations. "
+        f"{said} of {options.rigs}: said in the first lines. Median standard deviation "
+        f"{np.median(ratios):.2f} of the bound of the true model.",
+    ]  # fmt: skip
+    print(lines[-1])
+    if options.out is not None:
+        options.out.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

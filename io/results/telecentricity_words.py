@@ -1,0 +1,47 @@
+"""The sentences on how telecentric the lenses are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+TELECENTRIC = 1e-3
+"""Relative change of the scale over the depth of the views below which a lens is telecentric."""
+ORDINARY = 0.01
+"""Slope of a corner ray beyond which a lens is an ordinary one: no telecentric lens errs by 0.6
+degrees."""
+
+
+def telecentricity_words(statistics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for each kind of lens.
+
+    statistics : those of `calibration.json`; files of earlier versions have no "telecentricity".
+    """
+    of: Mapping[str, Mapping[str, float]] = statistics.get("telecentricity") or {}
+    ordinary = [name for name, lens in of.items() if lens["perspective"] > ORDINARY]
+    words = [_ordinary(ordinary, of)] if ordinary else []
+    for name, lens in of.items():
+        if name in ordinary:
+            continue
+        depth = lens["depth_mm"]
+        change, sd = (100 * depth * lens[key] for key in ("change_per_mm", "sd_per_mm"))
+        amount = (
+            f"its scale changes by {change:.2g} +- {sd:.1g} % over the views' {depth:.3g} mm of "
+            "depth"
+        )
+        if abs(change) < 100 * TELECENTRIC:
+            words.append(f"camera {name}: telecentric: {amount}")
+        else:
+            words.append(f"camera {name}: not quite telecentric: {amount}")
+    return words
+
+
+def _ordinary(names: list[str], of: Mapping[str, Mapping[str, float]]) -> str:
+    changes = " and ".join(f"{100 * of[name]['change_per_mm']:.2g}" for name in names)
+    kind = "an ordinary lens" if len(names) == 1 else "ordinary lenses"
+    return (
+        f"camera{'s' if len(names) > 1 else ''} {' and '.join(names)}: {kind}, not telecentric: "
+        f"the scale changes by {changes} % per mm of depth. telerig's model covers "
+        "ordinary lenses as a limit only; for richer lens models use OpenCV or mrcal, or go on if "
+        "the residuals are at the images' noise"
+    )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from telerig.arrays import Array
-from telerig.errors import CalibrationError, InputError
+from telerig.errors import CalibrationError, InputError, suggestion
 from telerig.estimator.calibration.result.summary import summary
 from telerig.io.files.atomic import atomic_path, plain
 from telerig.io.files.csv_table import write_table
@@ -287,9 +287,18 @@ class Calibration:
 
         name : the parameter, as in ``covariance_names``; the result has the unit with which this
             name ends. The result is 0 for a parameter that was held fixed.
+
+        Raises InputError, with the most similar name, for one that is no parameter of this rig.
         """
         if name not in self.covariance_names:
-            return 0.0
+            lens = [f"{camera.name}.{p}" for camera in self.cameras for p in PARAMETERS]
+            poses = [f"{c.name}.{p}" for c in self.cameras[1:] for p in POSE_COMPONENTS]
+            if name in lens or name in poses:
+                return 0.0
+            raise InputError(
+                f"no parameter is called {name!r}", where="Calibration.sd",
+                todo=suggestion(name, [*lens, *poses]),
+            )  # fmt: skip
         i = self.covariance_names.index(name)
         return float(np.sqrt(self.covariance[i, i]))
 

@@ -88,6 +88,9 @@ def test_the_file_says_what_others_rely_on(calibration: Calibration, saved: Path
     assert np.shape(data["covariance"]["matrix"]) == (size, size)
     sd = data["cameras"]["left"]["standard_deviations"]["k1"]
     assert sd == pytest.approx(calibration.sd("left.k1"))
+    assert calibration.sd("left.wall_x_rad") == 0.0, "held fixed"
+    with pytest.raises(InputError, match=r"did you mean left\.k1"):
+        calibration.sd("left.K1_")
 
 
 def test_tables(calibration: Calibration, saved: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -536,3 +538,10 @@ def test_bad_input(run: Run) -> None:
         smooth(None, run.calibration, **good)
     with pytest.raises(InputError, match="no camera 'top'"):
         smooth(run.tracks, run.calibration, references=run.references.assign(camera="top"), **good)
+
+
+def test_it_is_reached_without_libraries_that_only_its_work_needs() -> None:
+    code = "import sys, telerig; telerig.smooth; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    later = {"cv2", "filterpy", "gtsam", "h5py", "matplotlib", "pydantic", "scipy", "skimage"}
+    assert not later & set(done.stdout.split())

@@ -55,8 +55,7 @@ class Bubbles:
     """Hold the bubbles of one image.
 
     accepted : table with a row for each bubble and the columns DETECTION_COLUMNS.
-    rejected : table of the shadows that are no bubbles: centre u_px and v_px, radius_px, and the
-        reason in words.
+    shadows : the shadows that are no bubbles.
     noise : standard deviation of the image's noise, as a share of the background's grey level; NaN
         if it was not measured.
     reason : why there are no bubbles, in words; empty if there are some.
@@ -66,11 +65,17 @@ class Bubbles:
     """
 
     accepted: pd.DataFrame
-    rejected: pd.DataFrame
+    shadows: list[Rejected]
     noise: float
     reason: str
     field: Bools | None = None
     clusters: Mapping[int, Array] = dataclass_field(default_factory=dict)
+
+    @property
+    def rejected(self) -> pd.DataFrame:
+        """Return a table of the shadows that are no bubbles: centre u_px and v_px, radius_px, and
+        the reason in words."""
+        return pd.DataFrame(self.shadows, columns=list(Rejected._fields))
 
 
 def detect_bubbles(
@@ -183,12 +188,15 @@ def _without_slender(parts: list[Part]) -> tuple[list[Part], list[Rejected]]:
 def _bubbles(
     columns: dict[str, Any], rejected: list[Rejected], noise: float, reason: str
 ) -> Bubbles:
-    empty = {name: np.empty(0, object if name == "flags" else float) for name in DETECTION_COLUMNS}
-    accepted = pd.DataFrame(columns or empty, columns=DETECTION_COLUMNS, copy=False)
+    *names, flags = DETECTION_COLUMNS
+    numbers = (
+        np.stack([columns[name] for name in names], 1) if columns else np.empty((0, len(names)))
+    )
+    accepted = pd.DataFrame(numbers, columns=names)
+    accepted[flags] = columns.get(flags, np.empty(0, object))
     accepted.attrs["reason"] = reason
     accepted.attrs["noise"] = noise
-    table = pd.DataFrame(rejected, columns=list(Rejected._fields))
-    return Bubbles(accepted, table, noise, reason)
+    return Bubbles(accepted, rejected, noise, reason)
 
 
 def _start(parts: list[Part], blobs: list[Blob], sigma: float, dark_sigma: float) -> Start:
@@ -296,24 +304,30 @@ def _reasons(
     min_contrast: float,
 ) -> list[str]:
     """Return for each fitted outline why it is no bubble; an empty text means that it is one."""
-    reasons = []
-    typical = float(np.median(columns["contrast"]))
-    for i in range(outlines.ellipse.shape[0]):
-        _u, _v, a, b, _ = outlines.ellipse[i]
-        jump = float(np.hypot(*(outlines.ellipse[i, :2] - start.ellipse[i, :2])))
-        known = bool(np.all(np.linalg.eigvalsh(outlines.centre_covariance_px2[i]) > 0.0))
-        if not (known and np.all(np.isfinite(outlines.ellipse[i]))):
-            reasons.append("the outline's fit failed")
-        elif columns["d_eq_px"][i] < min_diameter_px:
-            reasons.append(f"smaller than {min_diameter_px:g} px")
-        elif columns["contrast"][i] < min_contrast:
-            reasons.append(f"contrast {columns['contrast'][i]:.2f} is below {min_contrast:g}")
-        elif a > _MAX_AXIS_RATIO * b:
-            reasons.append(f"{a / b:.1f} times as long as wide")
-        elif outlines.blur_px[i] > _SMUDGE_BLUR * b and columns["contrast"][i] < _SMUDGE * typical:
-            reasons.append("a smudge: blurred beyond its size, fainter than the bubbles")
-        elif jump > 0.3 * a + 2.0 or outlines.coverage[i] < 0.12:
-            reasons.append("too little of its outline can be seen")
+    ellipse, covariance = outlines.ellipse, outlines.centre_covariance_px2
+    finite = np.isfinite(ellipse).all(1) & np.isfinite(covariance).all((1, 2))
+    determinant = np.linalg.det(np.where(finite[:, None, None], covariance, 0.0))
+    known: Bools = finite & (determinant > 0.0) & (covariance[:, 0, 0] > 0.0)
+    d_eq, contrast, (a, b) = columns["d_eq_px"], columns["contrast"], ellipse[:, 2:4].T
+    typical = float(np.median(contrast))
+    smudge: Bools = (outlines.blur_px > _SMUDGE_BLUR * b) & (contrast < _SMUDGE * typical)
+    jump: Array = np.linalg.norm(ellipse[:, :2] - start.ellipse[:, :2], axis=1)
+    unseen = (jump > 0.3 * a + 2.0) | (outlines.coverage < 0.12)
+    reasons = [""] * len(a)
+    for i in np.flatnonzero(
+        ~known | (d_eq < min_diameter_px) | (contrast < min_contrast)
+        | (a > _MAX_AXIS_RATIO * b) | smudge | unseen
+    ).tolist():  # fmt: skip
+        if not known[i]:
+            reasons[i] = "the outline's fit failed"
+        elif d_eq[i] < min_diameter_px:
+            reasons[i] = f"smaller than {min_diameter_px:g} px"
+        elif contrast[i] < min_contrast:
+            reasons[i] = f"contrast {contrast[i]:.2f} is below {min_contrast:g}"
+        elif a[i] > _MAX_AXIS_RATIO * b[i]:
+            reasons[i] = f"{a[i] / b[i]:.1f} times as long as wide"
+        elif smudge[i]:
+            reasons[i] = "a smudge: blurred beyond its size, fainter than the bubbles"
         else:
-            reasons.append("")
+            reasons[i] = "too little of its outline can be seen"
     return reasons

@@ -72,9 +72,7 @@ def normalised(image: NDArray[Any], background: NDArray[Any] | None) -> tuple[Fl
                 where="background",
                 todo="give the level of the lit screen at every pixel",
             )
-    floor = 1e-6 * float(image.max()) + 1e-12
-    if float(screen.min()) < floor:
-        screen = np.maximum(screen, floor)
+    screen = np.maximum(screen, np.float32(1e-6 * float(image.max()) + 1e-12))
     ratio = np.asarray(cv2.divide(_divisible(image), screen, dtype=cv2.CV_32F), np.float32)
     sample = image[::8, ::8]
     clipped = bool(

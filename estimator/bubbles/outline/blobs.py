@@ -20,13 +20,10 @@ from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Float32, Ints
 from telerig.estimator.bubbles.outline.ellipse_geometry import (
-    ELLIPSE_PARAMETERS,
     deepest_concavity,
-    ellipse_basis,
-    foot_points,
-    moved,
     rough_distance,
 )
+from telerig.estimator.bubbles.outline.kernels import disc_counts, fitted_arcs
 from telerig.estimator.bubbles.outline.outline_fit import Outlines
 from telerig.estimator.images.noise import clipped_sigma, high_pass
 
@@ -233,10 +230,7 @@ def _refined(ratio: Float32, traced: list[_Traced]) -> list[Blob]:
 
 
 _TURN_RAD = -0.1
-_POINT_SIGMA_PX = 0.2
-_ROUND_SHARE = 0.12
 _SHORTEST_ARC = 5
-_ROUNDS = 8
 
 
 def contour_moments(contours: list[Array]) -> tuple[Array, Array, Array]:
@@ -359,68 +353,14 @@ def _trimmed(points: Array, bounds: list[int]) -> list[Array]:
     return [arc for arc in arcs if len(arc) >= _SHORTEST_ARC]
 
 
-def _circles(arcs: list[Array]) -> Array:
-    """Circles (B, 5) through arcs, by linear least squares."""
-    circles = np.empty((len(arcs), ELLIPSE_PARAMETERS))
-    for index, arc in enumerate(arcs):
-        middle = np.mean(arc, axis=0)
-        x, y = (arc - middle).T
-        square = x * x + y * y
-        design = np.stack([x, y, np.ones_like(x)])
-        normal = design @ design.T + 1e-9 * np.eye(3)
-        p, q, r = np.linalg.solve(normal, design @ square)
-        radius = np.sqrt(max(r + (p * p + q * q) / 4.0, 0.5))
-        circles[index] = middle[0] + p / 2.0, middle[1] + q / 2.0, radius, radius, 0.0
-    return circles
-
-
 def fit_ellipses(arcs: list[Array]) -> tuple[Array, Array]:
     """Ellipses (B, 5) along B arcs of points, robustly, and the RMS distance of the points (B,).
 
     Short arcs lean towards circles: a - b and the shear carry a prior of 12 % of the radius.
     """
     sizes = np.array([len(arc) for arc in arcs])
-    first = np.cumsum(sizes) - sizes
-    parts = [slice(low, low + size) for low, size in zip(first.tolist(), sizes.tolist())]
-    origin = np.array([np.mean(arc, axis=0) for arc in arcs])
-    points = np.concatenate(arcs) - np.repeat(origin, sizes, axis=0)
-    u, v = points.astype(np.float32).T
-    ellipse = _circles(arcs)
-    ellipse[:, :2] -= origin
-    radius = ellipse[:, 2].copy()
-    rows = np.empty((ELLIPSE_PARAMETERS + 1, u.size), dtype=np.float32)
-    products = np.empty((len(arcs), len(rows), len(rows)))
-    for _ in range(_ROUNDS):
-        foot = foot_points(ellipse, sizes, u, v)
-        ellipse_basis(foot, rows[:ELLIPSE_PARAMETERS])
-        rows[ELLIPSE_PARAMETERS] = foot.distance
-        rows /= _POINT_SIGMA_PX * np.sqrt(1.0 + (foot.distance / 0.6) ** 2)
-        for index, part in enumerate(parts):
-            products[index] = rows[:, part] @ rows[:, part].T
-        information = products[:, :ELLIPSE_PARAMETERS, :ELLIPSE_PARAMETERS]
-        pull = products[:, :ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS]
-        _add_roundness(information, pull, ellipse, _ROUND_SHARE * radius)
-        step: Array = np.asarray(np.linalg.solve(information, pull[..., None])[..., 0], float)
-        reach = np.max(np.abs(step), axis=1)
-        step *= np.minimum(1.0, 0.4 * ellipse[:, 3] / (reach + 1e-12))[:, None]
-        ellipse, _ = moved(ellipse, step)
-        if np.max(reach) < 0.01:
-            break
-    gap = foot_points(ellipse, sizes, u, v).distance
-    ellipse[:, :2] += origin
-    return ellipse, np.sqrt(np.add.reduceat(gap**2, first) / sizes)
-
-
-def _add_roundness(information: Array, pull: Array, ellipse: Array, spread: Array) -> None:
-    weight = 1.0 / spread**2
-    for i, j, sign in ((2, 2, 1.0), (3, 3, 1.0), (2, 3, -1.0), (3, 2, -1.0)):
-        information[:, i, j] += sign * weight
-    information[:, 4, 4] += 4.0 * weight
-    gap = (ellipse[:, 2] - ellipse[:, 3]) * weight
-    pull[:, 2] -= gap
-    pull[:, 3] += gap
-    diagonal = np.arange(ELLIPSE_PARAMETERS)
-    information[:, diagonal, diagonal] += 1e-6
+    ellipses, rms = fitted_arcs(np.concatenate(arcs), sizes)
+    return ellipses, rms
 
 
 _CLEAN_PX, _CLEAN_SHARE = 0.15, 0.012
@@ -582,11 +522,10 @@ def _dark(ellipse: Array, contour: Array, shape: tuple[int, ...]) -> bool:
     high = np.minimum(np.ceil(ellipse[:2] + ellipse[2]) + 1, shape[::-1]).astype(np.int64)
     if np.any(high <= low):
         return False
-    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
-    disc = rough_distance(ellipse, u, v) < 0.0
     blob = cv2.dilate(_filled(contour, low, high), np.ones((2 * _CANVAS_MARGIN_PX + 1,) * 2))
-    seen = np.count_nonzero(disc) / (np.pi * ellipse[2] * ellipse[3])
-    return bool(seen > _LEAST_IN_IMAGE and np.mean(blob[disc]) > _MIN_COVERED)
+    disc, dark = disc_counts(ellipse, low, blob)
+    seen = disc / (np.pi * ellipse[2] * ellipse[3])
+    return bool(seen > _LEAST_IN_IMAGE and dark > _MIN_COVERED * disc)
 
 
 def _covered(ellipses: Array, contour: Array) -> float:

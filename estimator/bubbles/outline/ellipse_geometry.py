@@ -8,14 +8,13 @@ table, whose columns are named here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from telerig.arrays import Array, Float32
+from telerig.arrays import Array
 
 Floats = NDArray[np.floating[Any]]
 Index = NDArray[np.intp]
@@ -24,39 +23,7 @@ Complex = NDArray[np.complex128]
 HARMONICS = (3, 4, 5, 6)
 """Orders of an outline's normal displacement about its ellipse, see `outline_fit`."""
 
-ELLIPSE_PARAMETERS = 5
-"""Displacements: centre along both axes, a, b, and the shear between the axes."""
-
 _SAMPLES = 64
-
-
-@dataclass(frozen=True)
-class Foot:
-    """Hold, for each of N points, the nearest point on the ellipse to which it belongs (its foot).
-
-    cos, sin : (N,) cosine and sine of the foot's eccentric anomaly phi.
-    distance : (N,) distance of the point from the ellipse (px), positive outside.
-    speed : (N,) length (px) of the derivative of the ellipse's point by phi.
-    curvature : (N,) curvature of the ellipse at the foot, in 1/px.
-    normal : (2, N) outward unit normal at the foot, along the major and the minor axis.
-    """
-
-    cos: Floats
-    sin: Floats
-    distance: Floats
-    speed: Floats
-    curvature: Floats
-    normal: Floats
-
-
-def spread(values: Array, counts: Index) -> Float32:
-    """Repeat one value for each of B owners, for all points of this owner.
-
-    values : (..., B); counts : (B,) number of points of each owner, N in all.
-
-    Returns (..., N) in single precision.
-    """
-    return np.repeat(np.asarray(values, dtype=np.float32), counts, axis=-1)
 
 
 def rough_distance(ellipse: Array, u: Floats, v: Floats) -> Array:
@@ -72,61 +39,6 @@ def rough_distance(ellipse: Array, u: Floats, v: Floats) -> Array:
     level = np.sqrt(x * x + y * y) + 1e-12
     slope = np.sqrt((x / a) ** 2 + (y / b) ** 2) + 1e-12
     return np.asarray((level - 1.0) * level / slope)
-
-
-def foot_points(ellipse: Array, counts: Index, u: Floats, v: Floats, *, rounds: int = 2) -> Foot:
-    """Find the nearest points on ellipses.
-
-    ellipse : (B, 5) ellipses.
-    counts : (B,) number of points that belong to each ellipse, N in all.
-    u, v : (N,) pixels of the points, those of the first ellipse first.
-    rounds : number of iterations.
-
-    Iteration by the evolute's centre of curvature: no trigonometry, two rounds are exact to
-    1e-4 px near the outline of an ellipse of axis ratio 2. In the precision of ``u``; the caller
-    keeps coordinates near zero.
-    """
-    a, b = ellipse[:, 2], ellipse[:, 3]
-    cos, sin = np.cos(ellipse[:, 4]), np.sin(ellipse[:, 4])
-    along = -(ellipse[:, 0] * cos + ellipse[:, 1] * sin)
-    across = ellipse[:, 0] * sin - ellipse[:, 1] * cos
-    focal = (a * a - b * b) / np.stack([a * a, b * b])
-    per = np.stack([cos, sin, along, across, a, b, 1.0 / a, 1.0 / b, *focal])
-    cos, sin, along, across, a, b, per_a, per_b, focal_a, focal_b = spread(per, counts)
-    x = u * cos + v * sin + along
-    y = v * cos - u * sin + across
-    x_unit, y_unit = x * per_a, y * per_b
-    scale = 1.0 / np.sqrt(x_unit * x_unit + y_unit * y_unit + 1e-12)
-    cos, sin = x_unit * scale, y_unit * scale
-    for _ in range(rounds):
-        # In units of a along x and of b along y.
-        evolute_x, evolute_y = focal_a * cos * cos * cos, -focal_b * sin * sin * sin
-        ahead = np.square((cos - evolute_x) * a) + np.square((sin - evolute_y) * b)
-        away_x, away_y = x_unit - evolute_x, y_unit - evolute_y
-        scale = np.sqrt(ahead / (np.square(away_x * a) + np.square(away_y * b) + 1e-12))
-        cos, sin = away_x * scale + evolute_x, away_y * scale + evolute_y
-        scale = 1.0 / np.sqrt(cos * cos + sin * sin + 1e-12)
-        cos, sin = cos * scale, sin * scale
-    normal = np.stack([b * cos, a * sin])
-    inverse_speed = 1.0 / np.sqrt(normal[0] * normal[0] + normal[1] * normal[1])
-    normal *= inverse_speed
-    distance = (x - a * cos) * normal[0] + (y - b * sin) * normal[1]
-    curvature = a * b * inverse_speed * inverse_speed * inverse_speed
-    return Foot(cos, sin, distance, 1.0 / inverse_speed, curvature, normal)
-
-
-def ellipse_basis(foot: Foot, out: Floats) -> None:
-    """Write into ``out`` how each parameter of an ellipse moves its outline.
-
-    foot : N points on ellipses.
-    out : (5, N) receives the derivatives of the outward displacement by the centre along the major
-        axis and along the minor axis, by a, by b, and by the shear between the axes.
-    """
-    out[:2] = foot.normal
-    np.multiply(foot.normal[0], foot.cos, out=out[2])
-    np.multiply(foot.normal[1], foot.sin, out=out[3])
-    np.multiply(foot.normal[0], foot.sin, out=out[4])
-    out[4] += foot.normal[1] * foot.cos
 
 
 def harmonic_basis(cos: Floats, sin: Floats) -> Floats:

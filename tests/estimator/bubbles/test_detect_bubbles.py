@@ -17,7 +17,6 @@ from telerig.estimator.bubbles.detect import (
     outline_points,
 )
 from telerig.estimator.bubbles.outline.ellipse_geometry import DETECTION_COLUMNS, HARMONIC_COLUMNS
-from telerig.estimator.bubbles.outline.outline_fit import PARAMETERS, Pixels, normal_equations
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from bubble_outline_renderer import Drawn, centre_bound_px, draw
@@ -235,20 +234,3 @@ def test_clipped_screen_is_flagged() -> None:
 def test_bad_input_is_refused(image: NDArray[np.generic], options: dict[str, object]) -> None:
     with pytest.raises(InputError):
         detect_bubbles(image, **options)  # type: ignore[arg-type]
-
-
-def test_normal_equations_keep_what_little_a_cut_bubble_tells() -> None:
-    """Single precision gave a border bubble a variance of -139 px^2."""
-    rng = np.random.default_rng(5)
-    count = 1300
-    jacobian = rng.standard_normal((PARAMETERS, count)).astype(np.float32)
-    jacobian[1] = jacobian[0] + 1e-4 * jacobian[1]
-    nothing = np.zeros(count, np.float32)
-    pixels = Pixels(
-        np.zeros(count, np.intp), np.array([count]), np.zeros((1, 2)), nothing, nothing, nothing
-    )
-    weight = np.ones(count, np.float32)
-    information, _ = normal_equations(jacobian, nothing, weight, pixels)
-    exact = jacobian.astype(float) @ jacobian.T.astype(float)
-    np.testing.assert_allclose(information[0], exact, rtol=0, atol=1e-12 * np.trace(exact))
-    assert np.linalg.eigvalsh(information[0])[0] > 0

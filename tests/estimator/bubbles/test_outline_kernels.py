@@ -1,0 +1,100 @@
+"""The compiled loops against NumPy, SciPy and brute force."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from telerig import compiled
+from telerig.estimator.bubbles.outline import kernels
+from telerig.estimator.bubbles.outline.outline_fit import blurred_disc, profile_table
+
+
+@pytest.mark.parametrize("many", [9, 17])
+def test_products_keep_what_little_a_cut_bubble_tells(many: int) -> None:
+    """Single precision gave a border bubble a variance of -139 px^2."""
+    rng = np.random.default_rng(5)
+    rows = rng.standard_normal((many, 1300))
+    rows[1] = rows[0] + 1e-4 * rows[1]
+    total = np.zeros((many, many))
+    kernels.products(rows, 1299, total)
+    exact = rows[:, :1299] @ rows[:, :1299].T
+    lower = np.tril_indices(many)
+    np.testing.assert_allclose(total[lower], exact[lower], rtol=0, atol=1e-12 * np.trace(exact))
+    total[lower[::-1]] = total[lower]
+    assert np.linalg.eigvalsh(total)[0] > 0
+
+
+def test_feet_are_the_nearest_points() -> None:
+    rng = np.random.default_rng(6)
+    ellipse = np.array([3.0, -2.0, 20.0, 12.0, 0.7])
+    phi = np.linspace(0.0, 2.0 * np.pi, 40_000, endpoint=False)
+    x, y = 20.0 * np.cos(phi), 12.0 * np.sin(phi)
+    cos, sin = np.cos(0.7), np.sin(0.7)
+    u, v = 3.0 + x * cos - y * sin, -2.0 + x * sin + y * cos
+    some = rng.integers(0, phi.size, 200)
+    off = rng.uniform(0.9, 1.15, 200)
+    points = np.stack([3.0 + off * (u[some] - 3.0), -2.0 + off * (v[some] + 2.0)])
+    foot = np.empty((7, 200))
+    kernels.feet(ellipse, points[0], points[1], foot)
+    away = np.hypot(points[0][:, None] - u, points[1][:, None] - v)
+    nearest = away.argmin(1)
+    np.testing.assert_allclose(np.abs(foot[2]), away.min(1), atol=1e-3)
+    assert np.array_equal(np.abs(foot[2]) < 1e-9, off == 1.0) and np.all((foot[2] > 0) == (off > 1))
+    speed = np.hypot(20.0 * np.sin(phi), 12.0 * np.cos(phi))
+    np.testing.assert_allclose(foot[3], speed[nearest], rtol=2e-3)
+    np.testing.assert_allclose(foot[4], 20.0 * 12.0 / speed[nearest] ** 3, rtol=6e-3)
+
+
+def test_profile_is_that_of_a_blurred_disc_and_survives_nan() -> None:
+    rng = np.random.default_rng(7)
+    distance, curvature = rng.uniform(-4.0, 4.0, 300), rng.uniform(0.02, 1.3, 300)
+    value, by_distance, by_curvature = kernels.profiles(profile_table(), distance, curvature)
+    np.testing.assert_allclose(value, blurred_disc(distance, 1.0 / curvature), atol=1e-3)
+    step = 0.3
+    ends = (blurred_disc(distance + d, 1.0 / curvature) for d in (step / 2, -step / 2))
+    np.testing.assert_allclose(by_distance, np.subtract(*ends) / step, atol=0.02)
+    straight = kernels.profiles(profile_table(), distance, np.zeros(300))[0]
+    np.testing.assert_allclose(straight, ndtr(-distance), atol=1e-4)
+    assert np.isfinite(by_curvature).all()
+    assert kernels.profiles(profile_table(), np.full(3, np.nan), np.full(3, np.nan)).shape == (3, 3)
+
+
+def test_ellipses_along_arcs_are_found_again() -> None:
+    phi = np.linspace(0.3, 3.4, 90)
+    x, y = 30.0 * np.cos(phi), 26.0 * np.sin(phi)
+    one = np.stack(
+        [100.0 + x * np.cos(0.4) - y * np.sin(0.4), 50.0 + x * np.sin(0.4) + y * np.cos(0.4)], 1
+    )
+    other = np.stack([5.0 + 8.0 * np.cos(phi), 9.0 + 8.0 * np.sin(phi)], 1)
+    ellipses, rms = kernels.fitted_arcs(np.concatenate([one, other]), np.array([90, 90]))
+    np.testing.assert_allclose(ellipses[0, :4], [100.0, 50.0, 30.0, 26.0], atol=0.1)
+    np.testing.assert_allclose(ellipses[1, :4], [5.0, 9.0, 8.0, 8.0], atol=1e-3)
+    assert rms.max() < 0.02
+
+
+def test_disc_counts_are_those_of_the_mask() -> None:
+    mask = np.zeros((40, 50), np.uint8)
+    mask[:, 25:] = 7
+    inside, marked = kernels.disc_counts(
+        np.array([125.0, 219.5, 12.0, 8.0, 0.0]), np.array([100, 200]), mask
+    )
+    v, u = np.mgrid[200:240, 100:150]
+    disc = ((u - 125.0) / 12.0) ** 2 + ((v - 219.5) / 8.0) ** 2 < 1
+    assert (inside, marked) == (disc.sum(), (disc & (u >= 125)).sum())
+
+
+def test_compiled_works_without_a_folder_for_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    def njit(cache: bool = False, **options: object) -> object:
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return numba.njit(**options)
+
+    monkeypatch.setattr(compiled, "njit", njit)
+
+    def twice(value: float) -> float:
+        return 2.0 * value
+
+    assert compiled.compiled(twice)(1.5) == 3.0

@@ -182,7 +182,14 @@ def detection(found: Study) -> None:
 def linking(found: Study) -> None:
     """Pairs, tracks and points in space of one frame."""
     run = telerig.load_run(found.folder / "runs" / PRESET)
-    pairs = list(zip(*(found.tables[c.name] for c in found.cameras)))
+    pairs = list(
+        zip(
+            *(
+                [t.assign(frame=f, camera=c.name) for f, t in enumerate(found.tables[c.name])]
+                for c in found.cameras
+            )
+        )
+    )
     calibration = calibration_from_cameras(list(found.cameras), name="truth")
     model_s, model = cpu_s(lambda: estimate_pair_model(pairs, found.cameras))
     parts = []
@@ -192,8 +199,7 @@ def linking(found: Study) -> None:
         maker = RowMaker(found.cameras, model, tracker, None)
         parts.clear()
         for f, (tables, sight) in enumerate(zip(pairs, maker.sights(pairs))):
-            named = tuple(t.assign(frame=f, camera=c.name) for t, c in zip(tables, found.cameras))
-            parts.append(maker.add(f, float(run.t_s[f]), float(run.position_mm[f]), named, sight))
+            parts.append(maker.add(f, float(run.t_s[f]), float(run.position_mm[f]), tables, sight))
         parts.append(maker.finish())
 
     def drift() -> None:

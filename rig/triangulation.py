@@ -73,19 +73,25 @@ def midpoint(
 
     Raises GeometryError if two rays are parallel.
     """
-    cross = np.cross(direction_a, direction_b)
-    sine2 = (cross**2).sum(-1)
+    normal = cross(direction_a, direction_b)
+    sine2 = (normal**2).sum(-1)
     if np.any(sine2 < 1e-8):
         raise GeometryError(
             "the rays of the two cameras are parallel",
             todo="triangulate with two cameras that look in different directions",
         )
     between = origin_b - origin_a
-    along_a = (np.cross(between, direction_b) * cross).sum(-1) / sine2
-    along_b = (np.cross(between, direction_a) * cross).sum(-1) / sine2
+    along_a = (cross(between, direction_b) * normal).sum(-1) / sine2
+    along_b = (cross(between, direction_a) * normal).sum(-1) / sine2
     point_a = origin_a + along_a[..., None] * direction_a
     point_b = origin_b + along_b[..., None] * direction_b
-    return (point_a + point_b) / 2, (between * cross).sum(-1) / np.sqrt(sine2)
+    return (point_a + point_b) / 2, (between * normal).sum(-1) / np.sqrt(sine2)
+
+
+def cross(first: Array, second: Array) -> Array:
+    """Return the cross product of vectors (..., 3); `numpy.cross` is slow for few vectors."""
+    (a, b, c), (d, e, f) = np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0)
+    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], -1)
 
 
 def pixel_covariance(sigma_px: ArrayLike, shape: tuple[int, ...]) -> Array:

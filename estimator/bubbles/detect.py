@@ -305,7 +305,8 @@ def _reasons(
 ) -> list[str]:
     """Return for each fitted outline why it is no bubble; an empty text means that it is one."""
     ellipse, covariance = outlines.ellipse, outlines.centre_covariance_px2
-    finite = np.isfinite(ellipse).all(1) & np.isfinite(covariance).all((1, 2))
+    every = np.concatenate([ellipse, covariance.reshape(-1, 4)], axis=1)
+    finite: Bools = np.asarray(np.isfinite(every).all(1))
     determinant = np.linalg.det(np.where(finite[:, None, None], covariance, 0.0))
     known: Bools = finite & (determinant > 0.0) & (covariance[:, 0, 0] > 0.0)
     d_eq, contrast, (a, b) = columns["d_eq_px"], columns["contrast"], ellipse[:, 2:4].T

@@ -22,8 +22,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri
 
 from telerig.arrays import Array, Bools, Ints
@@ -33,6 +31,7 @@ from telerig.estimator.tracking.filter import (
     FrameMeasurements,
     Track,
     TrackerSettings,
+    update_tracks,
 )
 from telerig.rig.camera import Camera
 from telerig.rig.triangulation import stacked_jacobian
@@ -551,15 +550,17 @@ class Association:
 
     def components(self) -> list[tuple[list[int], list[int]]]:
         """Clusters that share a measurement, each with its edges (indices into the pairs)."""
-        owner, many = self.owner[self.edges], len(self.clusters)
-        column, size = self.pairs.column[self.edges], many + len(self.scan.measured)
-        graph = coo_array((np.ones(len(owner)), (owner, many + column)), (size, size))
-        labels = connected_components(graph, directed=False)[1][:many]
-        groups: dict[int, tuple[list[int], list[int]]] = {int(g): ([], []) for g in labels}
-        for cluster, group in enumerate(labels.tolist()):
-            groups[group][0].append(cluster)
-        for edge, group in zip(self.edges.tolist(), labels[owner].tolist()):
-            groups[group][1].append(edge)
+        owner, columns = self.owner[self.edges].tolist(), self.pairs.column[self.edges].tolist()
+        label, first = list(range(len(self.clusters))), dict[int, int]()
+        for cluster, column in zip(owner, columns):
+            low, high = sorted((label[cluster], label[first.setdefault(column, cluster)]))
+            if low != high:
+                label = [low if own == high else own for own in label]
+        groups: dict[int, tuple[list[int], list[int]]] = {}
+        for cluster, group in enumerate(label):
+            groups.setdefault(group, ([], []))[0].append(cluster)
+        for edge, cluster in zip(self.edges.tolist(), owner):
+            groups[label[cluster]][1].append(edge)
         return list(groups.values())
 
     def outside(self, members: Sequence[int]) -> Common:
@@ -616,26 +617,23 @@ def grow(found: Association, members: Sequence[int], child: Child, mean_gain: Ar
     used = np.array([e for e in child.edges if e >= 0], int)
     common = found.outside(members).informed(pairs.innovation_mm[used], pairs.covariance_mm2[used])
     tracks = [t.copy() for b in child.parents for t in b.tracks]
-    for track, e in zip(tracks, child.edges):
-        column = int(pairs.column[e]) if e >= 0 else -1
-        continue_track(track, column, scan, common, mean_gain)
+    columns = [int(pairs.column[e]) if e >= 0 else -1 for e in child.edges]
+    continue_tracks(tracks, columns, scan, common, mean_gain)
     return Branch(child.score, tracks, _histories(child, pairs, scan.frame))
 
 
-def continue_track(track: Track, column: int, scan: Scan, common: Common, mean_gain: Array) -> None:
-    """Update in place with a measurement's column, or -1."""
-    if column < 0:
-        track.missed(common.shift, mean_gain, common.covariance_mm2)
-        return
-    measured = scan.measured
-    track.update(
-        measured.points_mm[column],
-        measured.covariance_mm2[column],
-        common.shift,
-        mean_gain,
-        common.covariance_mm2,
-    )
-    track.saw(scan.frame, scan.t_s, float(measured.d_eq_mm[column]))
+def continue_tracks(
+    tracks: Sequence[Track], columns: Sequence[int], scan: Scan, common: Common, mean_gain: Array
+) -> None:
+    """Update in place with the measurements' columns, -1 for none."""
+    measured, at = scan.measured, np.array(columns, np.int64)
+    points, covariances = np.full((len(at), 3), np.nan), np.full((len(at), 3, 3), np.nan)
+    points[at >= 0] = measured.points_mm[at[at >= 0]]
+    covariances[at >= 0] = measured.covariance_mm2[at[at >= 0]]
+    update_tracks(tracks, points, covariances, common.shift, mean_gain, common.covariance_mm2)
+    for track, column in zip(tracks, columns):
+        if column >= 0:
+            track.saw(scan.frame, scan.t_s, float(measured.d_eq_mm[column]))
 
 
 def advance(
@@ -649,17 +647,19 @@ def advance(
     found = Association(clusters, scan, common)
     mean_gain = found.mean_gain(other_gains)
     gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
-    out = []
+    out, alone, columns = [], [], []
     for members, edges in found.components():
         first = clusters[members[0]]
         if len(members) == 1 and not first.open and len(first.tracks) == 1 and len(edges) < 2:
             track = first.tracks[0]
             column = int(found.chosen[found.row_of[id(track)]]) if edges else -1
-            continue_track(track, column, scan, found.common, gain)
+            alone.append(track)
+            columns.append(column)
             out.append(Cluster([Branch(0.0, [track], {track.particle: [(scan.frame, column)]})]))
             continue
         every = children(found, members, edges)
         out.append(Cluster([grow(found, members, child, gain) for child in every]))
+    continue_tracks(alone, columns, scan, found.common, gain)
     return out, found.common, mean_gain
 
 
@@ -682,6 +682,5 @@ def follow_labelled(
     covariance = p[:, POSITION] + noise
     common = common.informed(innovations, covariance)
     gains = p @ np.linalg.inv(covariance)
-    for track, column in zip(tracks, at):
-        continue_track(track, column, scan, common, gains.mean(0))
+    continue_tracks(tracks, at, scan, common, gains.mean(0))
     return Common(covariance=common.covariance), list(gains), fresh

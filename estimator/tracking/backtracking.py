@@ -20,9 +20,9 @@ import numpy as np
 import pandas as pd
 
 from telerig.arrays import Array, Bools, Ints
-from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
-from telerig.estimator.bubbles.pairing.matching import Prediction
+from telerig.estimator.bubbles.pairing.matching import Prediction, View
 from telerig.estimator.tracking.association import (
+    Projected,
     gate2,
     pair_pixels,
     projected,
@@ -136,6 +136,24 @@ CENTRE_PX = ["u_px", "v_px", "suu_px2", "suv_px2", "svv_px2"]
 
 
 @dataclass(frozen=True)
+class Sight:
+    """Hold the detections of one frame as arrays; each field for both cameras.
+
+    views : as the pairing compares them. pixels : centres and covariances with the share of the
+    unknown shape. centre_px : (N, 5) the columns CENTRE_PX. a_px, d_eq_px : (N,) major semi-axes
+    and equivalent diameters. given : (N,) ids given by the user, -1 for none. flags : (N,) texts.
+    """
+
+    views: tuple[View, View]
+    pixels: tuple[Pixels, Pixels]
+    centre_px: tuple[Array, Array]
+    a_px: tuple[Array, Array]
+    d_eq_px: tuple[Array, Array]
+    given: tuple[Ints, Ints]
+    flags: tuple[list[str], list[str]]
+
+
+@dataclass(frozen=True)
 class Pairs:
     """Rows of the two tables that show the same bubble, M of them.
 
@@ -186,7 +204,7 @@ class Frame:
     number: int
     t_s: float
     tables: Tables
-    pixels: tuple[Pixels, Pixels]
+    sight: Sight
     offset_px: Array
     pairs: Pairs
     unpaired: tuple[Ints, Ints]
@@ -213,7 +231,7 @@ class Frame:
 
     def owners(self, camera: int) -> Ints:
         """(N,) particle of each of a camera's rows, -1 for none."""
-        out = given_ids(self.tables[camera]).copy()
+        out = self.sight.given[camera].copy()
         taken = self.particle != NO_PARTICLE
         out[self.pairs.rows[taken, camera]] = self.particle[taken]
         for single in self.singles:
@@ -264,8 +282,8 @@ def readings_of(
         out.add(at, who, points, covariances, every)
     for c, camera in enumerate(cameras):
         singles = [
-            (i, place[s.particle], s.point_mm, frame.pixels[c][0][s.row] - frame.offset_px[c],
-             frame.pixels[c][1][s.row])
+            (i, place[s.particle], s.point_mm, frame.sight.pixels[c][0][s.row] - frame.offset_px[c],
+             frame.sight.pixels[c][1][s.row])
             for i, frame in enumerate(frames)
             for s in frame.singles
             if s.camera == c and s.particle in place
@@ -322,13 +340,19 @@ def follow_back(
             readings_of(frames, particles, cameras), motions, settings
         )
         place = {p: k for k, p in enumerate(particles)}
-        changed = False
+        where = np.repeat(np.arange(len(frames)), [len(found) for found in missing])
+        who = np.array([place[p] for found in missing for p in found])
+        every = (points[where, who], covariances[where, who])
+        expected = [projected(camera, *every) for camera in cameras]
+        changed, first = False, 0
         for i, frame in enumerate(frames):
             at = [place[p] for p in missing[i]]
             if at:
                 ids, d_eq = np.array(missing[i]), np.array([sizes[p] for p in missing[i]])
                 predicted = Prediction(ids, points[i, at], covariances[i, at], d_eq)
-                changed |= _claim(frame, predicted, cameras, settings)
+                own = [_of(view, slice(first, first + len(at))) for view in expected]
+                changed |= _claim(frame, predicted, own, cameras, settings)
+                first += len(at)
         if not changed:
             break
 
@@ -357,7 +381,7 @@ def _distance2(
     expected, by_point = stacked_jacobian(cameras, predicted.points_mm[k : k + 1])
     covariance = by_point[0] @ predicted.covariance_mm2[k] @ by_point[0].T
     left = -expected[0]
-    for c, ((centre, noise), row) in enumerate(zip(frame.pixels, rows)):
+    for c, ((centre, noise), row) in enumerate(zip(frame.sight.pixels, rows)):
         at = slice(2 * c, 2 * c + 2)
         covariance[at, at] += noise[row]
         left[at] += centre[row] - frame.offset_px[c]
@@ -379,11 +403,22 @@ def _missing(
     return [[particles[k] for k in np.flatnonzero(row).tolist()] for row in wanted]
 
 
+def _of(expected: Projected, rows: slice) -> Projected:
+    return Projected(*(getattr(expected, field.name)[rows] for field in fields(Projected)))
+
+
 def _claim(
-    frame: Frame, predicted: Prediction, cameras: tuple[Camera, Camera], settings: TrackerSettings
+    frame: Frame,
+    predicted: Prediction,
+    expected: Sequence[Projected],
+    cameras: tuple[Camera, Camera],
+    settings: TrackerSettings,
 ) -> bool:
-    """Give the frame's free detections to the predicted particles; whether any was given."""
-    found = [_nearest(frame, c, predicted, cameras[c], settings) for c in (0, 1)]
+    """Give the frame's free detections to the predicted particles; whether any was given.
+
+    expected : the predicted points in both cameras.
+    """
+    found = [_nearest(frame, c, predicted, expected[c], settings) for c in (0, 1)]
     changed = False
     for k, rows in enumerate(zip(*found)):
         if max(rows) < 0:
@@ -398,16 +433,21 @@ def _claim(
 
 
 def _nearest(
-    frame: Frame, camera: int, predicted: Prediction, view: Camera, settings: TrackerSettings
+    frame: Frame,
+    camera: int,
+    predicted: Prediction,
+    expected: Projected,
+    settings: TrackerSettings,
 ) -> list[int]:
     """The row of each particle in one camera, -1 where there is none or not without a rival."""
     free = np.flatnonzero(frame.owners(camera) == NO_PARTICLE)
-    centre, noise = (a[free] for a in frame.pixels[camera])
-    expected = projected(view, predicted.points_mm, predicted.covariance_mm2)
+    if not len(free):
+        return [-1] * len(predicted.ids)
+    centre, noise = (a[free] for a in frame.sight.pixels[camera])
     scale = px_per_mm(expected.by_point)
     sd2 = np.linalg.eigvalsh(expected.covariance_px2)[:, -1]
     sharp = sd2 <= (_VAGUE * scale * predicted.d_eq_mm) ** 2
-    measured_mm = frame.tables[camera]["d_eq_px"].to_numpy(float)[free] / scale[:, None]
+    measured_mm = frame.sight.d_eq_px[camera][free] / scale[:, None]
     chosen = pair_pixels(
         expected,
         centre - frame.offset_px[camera],
@@ -438,7 +478,7 @@ def _claim_pair(
     taken alone, if only one is. Returns whether anything was taken.
     """
     if _distance2(frame, rows, predicted, k, cameras) <= gate2(settings, 4):
-        uv, noise = zip(*([a[r : r + 1] for a in p] for p, r in zip(frame.pixels, rows)))
+        uv, noise = zip(*([a[r : r + 1] for a in p] for p, r in zip(frame.sight.pixels, rows)))
         found = triangulate(cameras, uv, noise)
         frame.claim(
             Pairs(
@@ -453,7 +493,7 @@ def _claim_pair(
             )
         )
         return True
-    words = [set(flag_words(t.iloc[r : r + 1])[0]) for t, r in zip(frame.tables, rows)]
+    words = [set(flags[r].split("|")) for flags, r in zip(frame.sight.flags, rows)]
     first, second = (bool(w & _DOUBTFUL) for w in words)
     if first == second:
         return False
@@ -529,21 +569,20 @@ def _row(
 ) -> dict[str, Any] | None:
     """None where the point is too uncertain, or no other bubble explains why it is not seen."""
     seen = single.camera
-    mine = frame.tables[seen].iloc[single.row]
     other = cameras[1 - seen]
     view = projected(other, point[None], covariance[None])
     uv, spread = view.uv_px[0] + frame.offset_px[1 - seen], view.covariance_px2[0]
     diameter = single.d_eq_mm * px_per_mm(view.by_point)[0]
     sd = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
-    reach = _outline_over(frame.tables[1 - seen], uv, diameter / 2)
+    reach = _outline_over(frame.sight, 1 - seen, uv, diameter / 2)
     if not (sd <= min(_SHARPNESS * diameter, _SHARPNESS_PX) and reach > 0):
         return None
     behind = spread + (_BEHIND * reach) ** 2 * np.eye(2)
     per_camera = {
-        cameras[seen].name: mine[CENTRE_PX].tolist(),
+        cameras[seen].name: frame.sight.centre_px[seen][single.row].tolist(),
         other.name: [*uv, behind[0, 0], behind[0, 1], behind[1, 1]],
     }
-    flags = sorted({FLAG, *flag_words(frame.tables[seen].iloc[[single.row]])[0]})
+    flags = sorted({FLAG, *frame.sight.flags[seen][single.row].split("|")} - {""})
     return {
         "frame": frame.number,
         "particle": single.particle,
@@ -560,9 +599,9 @@ def _row(
     }
 
 
-def _outline_over(table: pd.DataFrame, uv_px: Array, radius_px: float) -> float:
+def _outline_over(sight: Sight, camera: int, uv_px: Array, radius_px: float) -> float:
     """Semi-axis (px) of the largest outline that covers a part of the disc; 0 if there is none."""
-    away = np.hypot(table["u_px"] - uv_px[0], table["v_px"] - uv_px[1]).to_numpy(float)
-    long = table["a_px"].to_numpy(float)
+    long = sight.a_px[camera]
+    away = np.linalg.norm(sight.centre_px[camera][:, :2] - uv_px, axis=1)
     covering = away < long + 0.5 * radius_px
     return float(np.max(long[covering], initial=0.0))

@@ -16,7 +16,7 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from telerig.arrays import Array, Ints
+from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
 from telerig.factors.bubble_motion import lateral_motion, rise_motion
 from telerig.factors.state_space import exact_step
@@ -509,38 +509,6 @@ class Track:
         """
         return replace(self, filter=copy(self.filter), history=list(self.history))
 
-    def predict(self, step: Transition, control: Array) -> None:
-        """Move the state to the next frame.
-
-        step : the transition over the time between the frames.
-        control : (12,) vector that is added to the state because of the stage's motion.
-        """
-        self.filter.predict(u=control, B=_IDENTITY, F=step.matrix, Q=step.noise)
-
-    def missed(self, shift: Array, mean_gain: Array, common_mm2: Array) -> None:
-        """Update the track for a frame in which it has no measurement.
-
-        shift : (12,) shift of this frame, common to all bubbles.
-        mean_gain : (12, 3) mean Kalman gain of the bubbles that were measured.
-        common_mm2 : (3, 3) covariance of the common position error.
-        """
-        self.misses += 1
-        self.filter.x = self.filter.x + shift
-        self.filter.P = self.filter.P + mean_gain @ common_mm2 @ mean_gain.T
-
-    def update(self, z: Array, r: Array, shift: Array, mean_gain: Array, common_mm2: Array) -> None:
-        """Update the track by a measured position.
-
-        z : (3,) position in mm.  r : (3, 3) its covariance in mm^2.
-        shift : (12,) shift of this frame, common to all bubbles.
-        mean_gain : (12, 3) mean Kalman gain of the bubbles that were measured.
-        common_mm2 : (3, 3) covariance of the common position error.
-        """
-        self.filter.x = self.filter.x + shift
-        self.filter.update(z, R=r)
-        unequal = mean_gain - self.filter.K
-        self.filter.P = self.filter.P + unequal @ common_mm2 @ unequal.T
-
     def saw(self, frame: int, t_s: float, d_eq_mm: float) -> None:
         """Record that the track was measured in a frame.
 
@@ -555,12 +523,65 @@ class Track:
                 self.d_eq_mm = d_eq_mm
 
 
+def predict_tracks(tracks: Sequence[Track], step: Transition, control: Array) -> None:
+    """Move the states of all tracks to the next frame.
+
+    step : the transition over the time between the frames.
+    control : (12,) vector that is added to the states because of the stage's motion.
+    """
+    if not tracks:
+        return
+    x = np.array([t.filter.x for t in tracks]) @ step.matrix.T + control
+    p = step.matrix @ np.array([t.filter.P for t in tracks]) @ step.matrix.T + step.noise
+    for track, own_x, own_p in zip(tracks, x, p):
+        track.filter.x, track.filter.P = own_x, own_p
+
+
+def update_tracks(
+    tracks: Sequence[Track],
+    points_mm: Array,
+    covariances_mm2: Array,
+    shift: Array,
+    mean_gain: Array,
+    common_mm2: Array,
+) -> None:
+    """Update K tracks by measured positions, or for a frame in which they have none.
+
+    points_mm, covariances_mm2 : (K, 3), (K, 3, 3); NaN for tracks without a measurement.
+    shift : (12,) shift of this frame, common to all bubbles.
+    mean_gain : (12, 3) mean Kalman gain of the bubbles that were measured.
+    common_mm2 : (3, 3) covariance of the common position error.
+    """
+    if not tracks:
+        return
+    x = np.array([t.filter.x for t in tracks]) + shift
+    p = np.array([t.filter.P for t in tracks])
+    seen: Bools = np.asarray(np.isfinite(points_mm).all(1))
+    gain = np.zeros((len(tracks), STATES, 3))
+    own, noise = p[seen], covariances_mm2[seen]
+    gain[seen] = own[..., POSITION] @ np.linalg.inv(own[:, POSITION, POSITION] + noise)
+    left = points_mm[seen] - x[seen][:, POSITION]
+    x[seen] += (gain[seen] @ left[..., None])[..., 0]
+    kept = np.tile(_IDENTITY, (len(own), 1, 1))
+    kept[..., POSITION] -= gain[seen]
+    p[seen] = kept @ own @ _t(kept) + gain[seen] @ noise @ _t(gain[seen])  # Joseph's form
+    unequal = mean_gain - gain
+    p += unequal @ common_mm2 @ _t(unequal)
+    for track, own_x, own_p, measured in zip(tracks, x, p, seen.tolist()):
+        track.filter.x, track.filter.P = own_x, own_p
+        track.misses += not measured
+
+
+def _t(matrices: Array) -> Array:
+    return np.swapaxes(matrices, -1, -2)
+
+
 def new_filter(x: Array, p: Array) -> Any:
     """Return a filterpy KalmanFilter that measures the position of a bubble.
 
     x : (12,) first state.  p : (12, 12) its covariance.
 
-    The matrices F, Q and R are given with each prediction and each update.
+    The matrix R, and H for a measured pixel, are given with each update.
     """
     from filterpy.kalman import KalmanFilter
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,6 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import flag_words
 from telerig.estimator.bubbles.pairing.matching import (
     PairModel,
     Prediction,
-    View,
     match_views,
     shared_axis,
     view_of,
@@ -29,6 +29,7 @@ from telerig.estimator.tracking.backtracking import (
     Frame,
     Pairs,
     Pixels,
+    Sight,
     Tables,
     follow_back,
     given_ids,
@@ -61,20 +62,6 @@ class Linked:
     detections: pd.DataFrame
 
 
-@dataclass(frozen=True)
-class Sight:
-    """Hold the detections of one frame as arrays.
-
-    views : as the pairing compares them. pixels : centres and covariances with the share of the
-    unknown shape. d_eq_px : (N,) equivalent diameters. given : (N,) ids given by the user.
-    """
-
-    views: tuple[View, View]
-    pixels: tuple[Pixels, Pixels]
-    d_eq_px: tuple[Array, Array]
-    given: tuple[Ints, Ints]
-
-
 @dataclass
 class RowMaker:
     """Turns frames of detections into finished rows; holds the frames still open, and a few."""
@@ -92,15 +79,19 @@ class RowMaker:
     def sights(self, frames: Sequence[Tables]) -> list[Sight]:
         """Return the detections of several frames as arrays; all frames at once are quicker."""
         axis = shared_axis(self.cameras)
-        of_cameras: list[list[tuple[View, Pixels, Array, Ints]]] = []
+        of_cameras = []
         for camera, tables in zip(self.cameras, zip(*frames)):
             table = pd.concat(tables, ignore_index=True)
-            view, (uv, covariance) = view_of(table, camera, axis), _pixels(table, self._wander)
-            d_eq, ids = table["d_eq_px"].to_numpy(float), given_ids(table)
             ends = np.cumsum([0, *map(len, tables)]).tolist()
-            parts = [slice(low, high) for low, high in pairwise(ends)]
+            view, (uv, covariance) = view_of(table, camera, axis), _pixels(table, self._wander)
+            centre, ids = table[CENTRE_PX].to_numpy(float), given_ids(table)
+            a, d_eq = (table[name].to_numpy(float) for name in ("a_px", "d_eq_px"))
+            flags = ["|".join(words) for words in flag_words(table)]
             of_cameras.append(
-                [(view.of(p), (uv[p], covariance[p]), d_eq[p], ids[p]) for p in parts]
+                [
+                    (view.of(p), (uv[p], covariance[p]), centre[p], a[p], d_eq[p], ids[p], flags[p])
+                    for p in (slice(low, high) for low, high in pairwise(ends))
+                ]
             )
         return [Sight(*zip(*both)) for both in zip(*of_cameras)]
 
@@ -128,7 +119,7 @@ class RowMaker:
         measured = _measured(pairs, unpaired, pixels, offset_px)
         result = self.tracker.update(number, t_s, measured, position_mm)
         self._open[number] = Frame(
-            number, t_s, tables, pixels, offset_px, pairs, unpaired, result.alone, result.motion
+            number, t_s, tables, sight, offset_px, pairs, unpaired, result.alone, result.motion
         )
         self._take_final(result)
         enough = self._waiting >= _PAIRS_AT_ONCE and len(self._closed) > 2 * FRAMES_AFTER
@@ -164,17 +155,22 @@ class RowMaker:
         follow_back([*chain(*window)], changeable, self.cameras, settings)
         hidden = shared_rows(*window, self.cameras, settings)
         self._before = [*self._before, *done][-FRAMES_BEFORE:]
-        found = self._tracks(done)
+        joined = tuple(pd.concat([f.tables[c] for f in done], ignore_index=True) for c in range(2))
+        found = self._tracks(done, joined)
         if hidden:
             found = pd.concat(
                 [found, pd.DataFrame(hidden, columns=found.columns)], ignore_index=True
             )
             found = found.sort_values(["frame", "particle"], kind="stable", ignore_index=True)
-        return Linked(found, _detections(done))
+        return Linked(found, _detections(done, joined))
 
-    def _tracks(self, frames: Sequence[Frame]) -> pd.DataFrame:
-        parts = ([f.tables[c].iloc[f.pairs.rows[:, c]] for f in frames] for c in (0, 1))
-        first, second = (pd.concat(part, ignore_index=True) for part in parts)
+    def _tracks(self, frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
+        first, second = (
+            table.take(
+                np.concatenate([f.pairs.rows[:, c] + start for f, start in zip(frames, ends)])
+            ).reset_index(drop=True)
+            for c, (table, ends) in enumerate(zip(joined, _starts(frames)))
+        )
         bodies = fit_bodies(
             first,
             second,
@@ -183,33 +179,38 @@ class RowMaker:
             gap_sigma_px=float(np.hypot(self.model.frame_px, self.model.rms_px[0])),
         )
         many = [len(f.pairs) for f in frames]
-        table = pd.DataFrame(
-            {
-                "frame": np.repeat([f.number for f in frames], many),
-                "particle": np.concatenate([f.particle for f in frames]),
-                "t_s": np.repeat([f.t_s for f in frames], many),
-            }
-        )
-        table[["x_mm", "y_mm", "z_mm"]] = bodies.points_mm
-        table[COVARIANCE_MM2] = bodies.covariance_mm2[:, *np.triu_indices(3)]
+        table: dict[str, Any] = {
+            "frame": np.repeat([f.number for f in frames], many),
+            "particle": np.concatenate([f.particle for f in frames]),
+            "t_s": np.repeat([f.t_s for f in frames], many),
+        }
+        table |= dict(zip(["x_mm", "y_mm", "z_mm"], bodies.points_mm.T))
+        table |= dict(zip(COVARIANCE_MM2, bodies.covariance_mm2[:, *np.triu_indices(3)].T))
         shape = _shape_share_px2(self.cameras, bodies)
         for c, (camera, rows) in enumerate(zip(self.cameras, (first, second))):
             values = rows[CENTRE_PX].to_numpy(float, copy=True)
             values[:, 2:] += shape[:, c][:, *np.triu_indices(2)]
-            table[[f"{camera.name}_{name}" for name in CENTRE_PX]] = values
+            table |= {f"{camera.name}_{name}": v for name, v in zip(CENTRE_PX, values.T)}
             table[f"{camera.name}_du_px"] = bodies.du_px[:, c]
             table[f"{camera.name}_dv_px"] = bodies.dv_px[:, c]
         table["ray_miss_mm"] = bodies.ray_miss_mm
         table["d_eq_mm"], table["sd_eq_mm"] = bodies.d_eq_mm, bodies.d_eq_sd_mm
         table["confidence"] = np.concatenate([f.pairs.confidence for f in frames])
         table["centre"] = bodies.used
-        table[[f"silhouettes_{x}_mm" for x in "xyz"]] = bodies.silhouette_points_mm
+        table |= dict(zip((f"silhouettes_{x}_mm" for x in "xyz"), bodies.silhouette_points_mm.T))
         ambiguous = np.concatenate([f.pairs.ambiguous for f in frames])
         words = zip(flag_words(first), flag_words(second), ambiguous)
         table["flags"] = [
             "|".join(sorted({*a, *b, *(["ambiguous"] if unsure else [])})) for a, b, unsure in words
         ]
-        return table[table["particle"] != NO_PARTICLE].reset_index(drop=True)
+        found = pd.DataFrame(table)
+        return found[found["particle"] != NO_PARTICLE].reset_index(drop=True)
+
+
+def _starts(frames: Sequence[Frame]) -> Ints:
+    """(2, F) position of each frame's first detection in each camera's joined tables."""
+    many = np.array([[len(table) for table in f.tables] for f in frames], np.int64).reshape(-1, 2)
+    return (np.cumsum(many, axis=0) - many).T
 
 
 def _shape_share_px2(cameras: tuple[Camera, Camera], bodies: Bodies) -> Array:
@@ -310,15 +311,12 @@ def _measured(
     )
 
 
-def _detections(frames: Sequence[Frame]) -> pd.DataFrame:
+def _detections(frames: Sequence[Frame], joined: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Every detection with the id of its track, blank where it has none."""
-    tables = []
-    for frame in frames:
-        for c, table in enumerate(frame.tables):
-            particle = frame.owners(c)
-            known = pd.array(particle, dtype="Int64")
-            known[particle == NO_PARTICLE] = pd.NA
-            tables.append(table.assign(particle=known))
-    joined = pd.concat(tables, ignore_index=True)
+    particle = np.concatenate([frame.owners(c) for c in range(2) for frame in frames])
+    order = [2 * k + c for c in range(2) for k, f in enumerate(frames) for _ in f.sight.given[c]]
+    both = pd.concat(joined, ignore_index=True)
+    both["particle"] = pd.arrays.IntegerArray(particle, particle == NO_PARTICLE)
     leading = ["frame", "camera", "particle"]
-    return joined[leading + [name for name in joined if name not in leading]]
+    both = both[leading + [name for name in both if name not in leading]]
+    return both.take(np.argsort(order, kind="stable")).reset_index(drop=True)

@@ -22,7 +22,7 @@ from telerig.estimator.tracking.association import (
     advance,
     assigned_with_shift,
     best_assignment,
-    continue_track,
+    continue_tracks,
     decide,
     follow_labelled,
     gated_pairs,
@@ -49,6 +49,7 @@ from telerig.estimator.tracking.filter import (
     Transition,
     birth_covariance,
     new_filter,
+    predict_tracks,
     transition,
 )
 from telerig.rig.camera import Camera
@@ -173,14 +174,12 @@ def extend(
         p = np.array([tentative[r].filter.P[:, POSITION] for r in pairs.row[picked]])
         mean_gain = (p @ pairs.information[picked]).mean(0)
     gain = np.zeros((len(common.shift), 3)) if mean_gain is None else mean_gain
-    out = []
-    for i, track in enumerate(tentative):
-        if chosen[i] >= 0 and not safe[i]:
-            continue
-        continue_track(track, int(chosen[i]), scan, common, gain)
-        if chosen[i] >= 0:
-            track.history.append((scan.frame, int(chosen[i])))
-        out.append(track)
+    going = np.flatnonzero((chosen < 0) | safe).tolist()
+    out, columns = [tentative[i] for i in going], chosen[going].tolist()
+    continue_tracks(out, columns, scan, common, gain)
+    for track, column in zip(out, columns):
+        if column >= 0:
+            track.history.append((scan.frame, column))
     return out, common, mean_gain
 
 
@@ -475,10 +474,11 @@ class Tracker:
             return None
         step, control, found = self._motion(self.stage, t_s, position_mm)
         self.common = self.common.predicted(step)
-        for track in self._every():
-            if found.any():
+        every = self._every()
+        if found.any():
+            for track in every:
                 track.filter.x = track.filter.x + np.pad(found, (3, STATES - 6))
-            track.predict(step, control)
+        predict_tracks(every, step, control)
         return Motion(step.matrix, step.noise, step.matrix[:, VELOCITY] @ found + control)
 
     def _follow_labelled(self, scan: Scan) -> list[Array]:

@@ -28,7 +28,7 @@ from telerig.estimator.bubbles.pairing.matching import (
     marginals,
     pair_geometry,
     shared_axis,
-    view_of,
+    views_of,
 )
 from telerig.rig.camera import Camera
 from telerig.statistics import robust_sd
@@ -90,14 +90,11 @@ def estimate_pair_model(
     """
     axis = shared_axis(cameras)
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).astype(int))
-    views = [
-        (view_of(frames[i][0], cameras[0], axis), view_of(frames[i][1], cameras[1], axis))
-        for i in chosen
-    ]
-    used = [pair for pair in views if len(pair[0]) and len(pair[1])]
     model = default_model(cameras)
-    if not used:
+    tables = [frames[i] for i in chosen if len(frames[i][0]) and len(frames[i][1])]
+    if not tables:
         return replace(model, findings=(Finding.NO_DETECTIONS,))
+    used = list(zip(*(views_of(own, c, axis) for own, c in zip(zip(*tables), cameras))))
     model = _populations(model, used)
     geometries = [pair_geometry(*pair) for pair in used]
     points = np.concatenate([g.points_mm.reshape(-1, 3) for g in geometries])

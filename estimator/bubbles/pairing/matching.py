@@ -16,14 +16,14 @@ pairs, and each pair has a posterior probability.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum, auto
-from functools import lru_cache
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from telerig.arrays import Array, Bools, Ints
 from telerig.errors import InputError
@@ -37,9 +37,10 @@ from telerig.estimator.bubbles.outline.ellipse_geometry import (
     columns,
     flag_words,
 )
+from telerig.estimator.bubbles.pairing import kernels
 from telerig.rig import projection
 from telerig.rig.camera import Camera
-from telerig.rig.triangulation import midpoint, stacked_jacobian
+from telerig.rig.triangulation import cross, midpoint, stacked_jacobian
 
 NO_SIZE_FLAGS = ("border", "merged")
 _SCATTER_FACTOR = {"overlap": 2.0, "defocus": 1.5, "saturated": 1.5, "merged": 3.0, "border": 3.0}
@@ -121,15 +122,15 @@ def shared_axis(cameras: tuple[Camera, Camera]) -> Array:
     Raises InputError if both cameras look along nearly the same direction.
     """
     first, second = (c.camera_from_rig.rotation[2] for c in cameras)
-    cross = np.cross(first, second)
-    length = np.linalg.norm(cross)
+    perpendicular = np.cross(first, second)
+    length = np.linalg.norm(perpendicular)
     if length < 0.05:
         raise InputError(
             "both cameras look along nearly the same direction",
             todo="views less than 3 deg apart cannot be matched by a shared coordinate",
         )
-    in_first = (cameras[0].camera_from_rig.rotation @ cross)[:2]
-    return np.asarray(cross / length * np.sign(in_first[np.argmax(np.abs(in_first))]))
+    in_first = (cameras[0].camera_from_rig.rotation @ perpendicular)[:2]
+    return np.asarray(perpendicular / length * np.sign(in_first[np.argmax(np.abs(in_first))]))
 
 
 def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
@@ -175,13 +176,20 @@ def view_of(table: pd.DataFrame, camera: Camera, axis: Array) -> View:
     )  # fmt: skip
 
 
+def views_of(tables: Sequence[pd.DataFrame], camera: Camera, axis: Array) -> list[View]:
+    """Return `view_of` of several tables; all at once are quicker than one after the other."""
+    every = view_of(pd.concat(tables, ignore_index=True), camera, axis)
+    ends = np.cumsum([0, *map(len, tables)]).tolist()
+    return [every.of(slice(low, high)) for low, high in pairwise(ends)]
+
+
 def pair_geometry(first: View, second: View) -> PairGeometry:
     """Compare each detection of the first view with each of the second."""
     views = (first, second)
     origins = (first.origin_mm[:, None], second.origin_mm[None])
     directions = (first.direction[:, None], second.direction[None])
     points, _ = midpoint(origins[0], directions[0], origins[1], directions[1])
-    axis = np.cross(directions[0], directions[1])
+    axis = cross(directions[0], directions[1])
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
     axis *= np.sign(axis @ shared_axis((first.camera, second.camera)))[..., None]
     gap = ((origins[0] - origins[1]) * axis).sum(-1)
@@ -271,12 +279,8 @@ def _finite(values: Array) -> Array:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-Index = NDArray[np.intp]
-
 NEGLIGIBLE = -9.0
 """Log odds below which a pair is never considered: its probability stays under exp(-9)."""
-
-_EXACT_SIDE = 11
 
 
 def best_assignment(log_odds: Array) -> tuple[Ints, Ints]:
@@ -306,67 +310,7 @@ def marginals(log_odds: Array, negligible: float = NEGLIGIBLE) -> Array:
     component the least likely pairs are left out, one unit of log odds after the other, until it
     falls apart.
     """
-    out = np.zeros(log_odds.shape)
-    possible = log_odds > negligible
-    lone = possible & (possible.sum(1) == 1)[:, None] & (possible.sum(0) == 1)
-    out[lone] = 1 / (1 + np.exp(-log_odds[lone]))
-    for i, j in _components(possible & ~lone):
-        block = np.ix_(i, j)
-        part = np.where(possible[block], log_odds[block], -np.inf)
-        if min(len(i), len(j)) > _EXACT_SIDE:
-            out[block] = marginals(log_odds[block], negligible + 1.0)
-        elif len(j) <= len(i):
-            out[block] = _exact(part)
-        else:
-            out[block] = _exact(part.T).T
-    return out
-
-
-def _components(possible: Bools) -> Iterator[tuple[Index, Index]]:
-    """Rows and columns that are connected by possible pairs.
-
-    The smallest row's number spreads over each component; on such small graphs this takes a tenth
-    of the time of `scipy.sparse.csgraph.connected_components`.
-    """
-    rows, none = np.arange(len(possible)), len(possible)
-    while True:
-        columns = np.min(np.where(possible, rows[:, None], none), axis=0, initial=none)
-        spread = np.minimum(rows, np.min(np.where(possible, columns, none), axis=1, initial=none))
-        if np.array_equal(spread, rows):
-            break
-        rows = spread
-    for label in np.unique(columns[columns < none]):
-        yield np.flatnonzero(rows == label), np.flatnonzero(columns == label)
-
-
-@lru_cache(maxsize=16)
-def _without(columns: int) -> tuple[Ints, ...]:
-    """For each column the subsets that do not hold it."""
-    subsets = np.arange(1 << columns)
-    return tuple(subsets[(subsets >> j) & 1 == 0] for j in range(columns))
-
-
-def _exact(log_odds: Array) -> Array:
-    n, m = log_odds.shape
-    peak = np.maximum(log_odds.max(axis=1, initial=0.0), 0.0)
-    weight = np.exp(log_odds - peak[:, None])
-    alone = np.exp(-peak)
-    free = _without(m)
-    forward, backward = np.zeros((n + 1, 1 << m)), np.zeros((n + 1, 1 << m))
-    forward[0, 0], backward[n] = 1.0, 1.0
-    for i in range(n):
-        forward[i + 1] = alone[i] * forward[i]
-        for j in np.flatnonzero(weight[i]):
-            forward[i + 1, free[j] | (1 << j)] += weight[i, j] * forward[i, free[j]]
-    for i in reversed(range(n)):
-        backward[i] = alone[i] * backward[i + 1]
-        for j in np.flatnonzero(weight[i]):
-            backward[i, free[j]] += weight[i, j] * backward[i + 1, free[j] | (1 << j)]
-    out = np.zeros((n, m))
-    for i in range(n):
-        for j in np.flatnonzero(weight[i]):
-            out[i, j] = weight[i, j] * (forward[i, free[j]] @ backward[i + 1, free[j] | (1 << j)])
-    return np.asarray(out / backward[0, 0])
+    return kernels.marginals(np.asarray(log_odds, float), negligible)
 
 
 @dataclass(frozen=True)
@@ -387,6 +331,15 @@ class LogRatioModel:
     def sd(self) -> Array:
         """Return the standard deviation (K,) of each property's difference."""
         return np.sqrt(np.diag(self.scatter))
+
+    @cached_property
+    def uncorrelated(self) -> tuple[Array, Array]:
+        """Return the axes (K, K) in which scatter and population are both uncorrelated (generalised
+        eigenvectors, as columns), and the correlation (K,) of two images of one bubble there."""
+        from scipy.linalg import eigh
+
+        relative, axes = eigh(self.scatter, self.spread)
+        return axes, np.clip(1 - relative / 2, 0.0, 1 - 1e-6)
 
 
 class Finding(Enum):
@@ -507,19 +460,15 @@ class PairModel:
 SAFE_LOG_ODDS = 3.0
 """Posterior log odds (20 to 1) below which a pair is ambiguous."""
 
-_TAIL, _TAIL_PX2, _GATE_SIGMA = 0.02, (0.25, 1.0), 5.0
 _WRONG_SIZE, _WRONG_SIZE_FLAGGED, _WRONG_CONTRAST = 1e-6, 0.02, 0.05
 _IMPOSSIBLE, _IMPOSSIBLE_SIGMA = 0.15, 10.0
 _UNKNOWN_SIZE = 2.0
 """Log odds against a pair with a bubble that is cut or merged: its partner is often unseen."""
 _RARE, _FREEDOM = 2.5, 6.0
-_SHIFT_PASSES = 4
-_NEVER = -1e6
 
 _SEEN = 0.95
 _NEW_SHARE = 0.1
 _TRACK_SIZE_SD = 0.1
-_LARGEST_MAHALANOBIS2 = 60.0
 
 
 @dataclass(frozen=True)
@@ -628,14 +577,9 @@ def common_shift(
     raw = geometry.gap_px - bias
     own = geometry.variance_px2 + bias_variance + (model.scatter_px * geometry.scatter_factor) ** 2
     appearance = appearance_log_odds(geometry, model) + by_tracks
-    shift, uncertainty = 0.0, model.frame_px**2
-    odds = appearance + _gap_log_odds(raw, own + uncertainty, model)
-    for _ in range(_SHIFT_PASSES if model.frame_px > 0 else 0):
-        weight = marginals(odds) / own
-        weight = weight / (1 + (raw - shift) ** 2 / (4 * (own + uncertainty)))
-        precision = weight.sum() + model.frame_px**-2
-        shift, uncertainty = float((weight * raw).sum() / precision), float(1 / precision)
-        odds = appearance + _gap_log_odds(raw - shift, own + uncertainty, model)
+    odds, shift, uncertainty = kernels.common_shift(
+        raw, own, appearance, model.frame_px, model.span_px, NEGLIGIBLE
+    )
     return raw - shift, own + uncertainty, odds, shift
 
 
@@ -654,7 +598,7 @@ def appearance_log_odds(geometry: PairGeometry, model: PairModel) -> Array:
     odds += _ratio_log_odds(model.size, geometry.size, first.log_size, second.log_size, wrong)
     apart = np.abs(geometry.size[..., 0] - model.size.difference[0])
     limit = max(_IMPOSSIBLE, _IMPOSSIBLE_SIGMA * model.size.sd[0])
-    odds[apart > np.where(geometry.scatter_factor > 1, 2 * limit, limit)] = _NEVER
+    odds[apart > np.where(geometry.scatter_factor > 1, 2 * limit, limit)] = kernels.NEVER
     odds -= np.where(np.isfinite(apart), 0.0, _UNKNOWN_SIZE)
     contrasts = (first.log_contrast, second.log_contrast)
     odds += _ratio_log_odds(model.contrast, geometry.contrast, *contrasts, _WRONG_CONTRAST)
@@ -671,43 +615,22 @@ def _prior_log_odds(n1: int, n2: int, unmatched: tuple[float, float]) -> float:
     return float(np.log(pairs / (alone[0] * alone[1])))
 
 
-def _gap_log_odds(gap: Array, variance: Array, model: PairModel) -> Array:
-    """Return log odds from gaps (px) and their variances (px^2), both (N1, N2).
-
-    The density of a true pair's gap is normal with wider tails (for disturbed outlines), and 0
-    beyond a limit. It is compared with a uniform density over the span that both images cover.
-    """
-    core = np.exp(-0.5 * gap**2 / variance)
-    wide = variance + np.clip(3 * variance, *_TAIL_PX2)
-    tail = np.exp(-0.5 * gap**2 / wide) * np.sqrt(variance / wide)
-    density = ((1 - _TAIL) * core + _TAIL * tail) / np.sqrt(2 * np.pi * variance)
-    near = gap**2 < _GATE_SIGMA**2 * wide
-    return np.where(near, np.log(np.maximum(density * model.span_px, 1e-300)), _NEVER)
-
-
 def _ratio_log_odds(
     expected: LogRatioModel, ratio: Array, first: Array, second: Array, wrong: Array | float
 ) -> Array:
     """Log odds of properties: two noisy images of one bubble, or of two from the population.
 
-    In the axes in which scatter and population are both uncorrelated (generalised eigenvectors),
-    two images of one bubble have correlation 1 - scatter / 2; the log odds are those of the two
-    normal distributions. How rare a bubble is counts to ``_RARE`` standard deviations.
+    In the axes in which scatter and population are both uncorrelated, two images of one bubble
+    have correlation 1 - scatter / 2; the log odds are those of the two normal distributions. How
+    rare a bubble is counts to ``_RARE`` standard deviations.
     wrong : chance that one of the measurements says nothing about the bubble.
     """
-    from scipy.linalg import eigh
-
-    relative, axes = eigh(expected.scatter, expected.spread)
-    alike = np.clip(1 - relative / 2, 0.0, 1 - 1e-6)
-    apart = np.nan_to_num(ratio - expected.difference) @ axes
-    own = [np.nan_to_num(v - expected.means[c]) @ axes for c, v in enumerate((first, second))]
-    rare = np.clip(0.5 * (own[0][:, None] + own[1]), -_RARE, _RARE)
-    odds = rare**2 @ (alike / (1 + alike)) + (apart**2).sum(-1) / 4
-    tails = np.log1p(apart**2 @ (0.5 / (1 - alike)) / _FREEDOM)
-    odds -= 0.5 * (_FREEDOM + len(alike)) * tails
-    odds -= 0.5 * np.log1p(-(alike**2)).sum()
-    odds = np.logaddexp(np.log1p(-wrong) + odds, np.log(wrong))
-    return np.where(np.isfinite(ratio).all(-1), odds, 0.0)
+    axes, alike = expected.uncorrelated
+    known = np.broadcast_to(np.asarray(wrong, float), ratio.shape[:2])
+    return kernels.ratio_log_odds(
+        ratio - expected.difference, first - expected.means[0], second - expected.means[1], axes,
+        alike, known, _RARE, _FREEDOM,
+    )  # fmt: skip
 
 
 def track_log_odds(
@@ -724,7 +647,7 @@ def track_log_odds(
     if not tracks:
         return 0.0
     density = _track_density(geometry, model, predicted)
-    expected = (1 - _NEW_SHARE) * _SEEN**2 * density.sum(-1) / tracks + _NEW_SHARE
+    expected = (1 - _NEW_SHARE) * _SEEN**2 * density / tracks + _NEW_SHARE
     cameras = (geometry.views[0].camera, geometry.views[1].camera)
     seen = stacked_jacobian(cameras, np.asarray(predicted.points_mm, float))
     near = [_unmatched_density(geometry, model, predicted, seen, c) for c in range(2)]
@@ -732,19 +655,8 @@ def track_log_odds(
     return np.asarray(np.log(expected) - np.log(alone))
 
 
-def _normal_density(offset: Array, covariance: Array, added: Array) -> Array:
-    """(..., K) of offsets (..., K, D) with the covariances (K, D, D) + ``added`` (...) on their
-    diagonals, not below that at the largest Mahalanobis distance."""
-    values, vectors = np.linalg.eigh(covariance)
-    variance = values + added[..., None, None]
-    along = np.einsum("...ki,kij->...kj", offset, vectors)
-    distance2 = (along**2 / variance).sum(-1)
-    peak = (2 * np.pi) ** (-offset.shape[-1] / 2) / np.sqrt(variance.prod(-1))
-    return np.asarray(peak * np.exp(-0.5 * np.minimum(distance2, _LARGEST_MAHALANOBIS2)))
-
-
 def _track_density(geometry: PairGeometry, model: PairModel, predicted: Prediction) -> Array:
-    """(N1, N2, K) density of a pair's point and size at each track, relative to anywhere."""
+    """(N1, N2) density of a pair's point and size at the tracks, relative to anywhere."""
     first, second = geometry.views
     pixel = model.scatter_px**2 + 0.25 * (
         np.trace(first.covariance_px2, axis1=1, axis2=2)[:, None]
@@ -753,18 +665,19 @@ def _track_density(geometry: PairGeometry, model: PairModel, predicted: Predicti
     pixel = pixel + model.frame_px**2
     sine2 = 1 - (first.direction @ second.direction.T) ** 2
     measured = pixel * geometry.mm_per_px**2 / sine2
-    offset = geometry.points_mm[..., None, :] - predicted.points_mm
-    density = _normal_density(offset, predicted.covariance_mm2, measured)
-    size = 0.25 * (first.log_size.sum(-1)[:, None] + second.log_size.sum(-1))[..., None]
+    variances, axes = np.linalg.eigh(predicted.covariance_mm2)
+    size = 0.25 * (first.log_size.sum(-1)[:, None] + second.log_size.sum(-1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_ratio = size - np.log(np.asarray(predicted.d_eq_mm) / 2)
+        log_expected = np.log(np.asarray(predicted.d_eq_mm, float) / 2)
     population = float(np.sqrt(model.size.spread.mean()))
     sd = min(_TRACK_SIZE_SD, population)
-    of_size = np.exp(-0.5 * (log_ratio / sd) ** 2) * population / sd
-    of_size = np.where(np.isfinite(log_ratio), of_size, 1.0)
+    density = kernels.track_density(
+        geometry.points_mm, measured, size, np.asarray(predicted.points_mm, float), variances,
+        axes, log_expected, sd, population / sd,
+    )  # fmt: skip
     widths = [min(v.camera.image_size_px) / v.camera["scale_px_per_mm"] for v in geometry.views]
     volume_mm3 = widths[0] * widths[1] * model.span_px * np.median(geometry.mm_per_px)
-    return np.asarray(density * of_size * volume_mm3)
+    return np.asarray(density * volume_mm3)
 
 
 def _unmatched_density(
@@ -782,13 +695,9 @@ def _unmatched_density(
     rows = jacobian[:, 2 * c : 2 * c + 2]
     spread = rows @ predicted.covariance_mm2 @ np.swapaxes(rows, 1, 2)
     common = model.scatter_px**2 + model.frame_px**2 + model.bias_px[0] ** 2 / 4
-    covariance = spread + view.covariance_px2[:, None] + common * np.eye(2)
-    uu, uv, vv = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    u, v = np.moveaxis(view.uv_px[:, None] - pixels[:, 2 * c : 2 * c + 2], -1, 0)
-    determinant = uu * vv - uv * uv
-    distance2 = (vv * u * u - 2 * uv * u * v + uu * v * v) / determinant
-    near = np.exp(-0.5 * np.minimum(distance2, _LARGEST_MAHALANOBIS2))
-    density = near / (2 * np.pi * np.sqrt(determinant))
+    density = kernels.pixel_density(
+        view.uv_px, view.covariance_px2, pixels[:, 2 * c : 2 * c + 2], spread + common * np.eye(2)
+    )
     width, height = view.camera.image_size_px
     usual = max(len(view) * model.unmatched_share[c], 1e-3)
     return np.asarray(_SEEN * (1 - _SEEN) * density * width * height / usual)
